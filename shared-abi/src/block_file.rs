@@ -1,0 +1,219 @@
+//! The block file: the container that object 1F50h takes (SYS TEC manual L-1112d_10, chapter 3 figure 2
+//! and chapter 5.1).
+//!
+//! A file is a row of blocks: number 0 (control), 1…N (program data, ascending), FFFFFFFFh (size and CRC
+//! of the program). Each block is one SDO download:
+//!
+//! ```text
+//! u32 number | u32 flash address | u32 size | size bytes | u32 CRC over all of the block before it
+//! ```
+//!
+//! All words are little-endian. The CRC is CRC-32/ISO-HDLC (polynomial EDB88320h reflected); the manual gives its
+//! start value once as 0 and once as FFFFFFFFh, which is one function called in two ways. It is
+//! computed by whoever uses this module, so that this crate needs none of its own.
+
+/// Bytes in front of a block's data.
+pub const HEADER_SIZE: usize = 12;
+/// Bytes of the CRC behind a block's data.
+pub const CRC_SIZE: usize = 4;
+/// Bytes of a block that are not data; `--block-size` counts them.
+pub const FRAMING: usize = HEADER_SIZE + CRC_SIZE;
+/// The largest block the manual allows, framing included (table 1: "container of up to 16384 bytes").
+pub const MAX_BLOCK_SIZE: usize = 16384;
+
+/// The number of the control block.
+pub const NUMBER_CONTROL: u32 = 0;
+/// The number of the last block.
+pub const NUMBER_LAST: u32 = u32::MAX;
+
+/// The twelve bytes in front of a block's data.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Header {
+    /// 0, 1…N or FFFFFFFFh.
+    pub number: u32,
+    /// Where the data goes; 0 in the control block, without meaning in the last one.
+    pub flash_address: u32,
+    /// Number of data bytes.
+    pub size: u32,
+}
+
+impl Header {
+    /// Takes a header apart.
+    #[must_use]
+    pub fn parse(bytes: &[u8; HEADER_SIZE]) -> Self {
+        let [number, flash_address, size] = words(bytes);
+        Self { number, flash_address, size }
+    }
+
+    /// Puts a header together.
+    #[must_use]
+    pub fn emit(&self) -> [u8; HEADER_SIZE] {
+        let mut bytes = [0; HEADER_SIZE];
+        put_words(&mut bytes, &[self.number, self.flash_address, self.size]);
+        bytes
+    }
+}
+
+/// The data of block 0: what the program is for. Each step of knowledge is one length.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Control {
+    /// 8 bytes, all reserved.
+    Plain,
+    /// 12 bytes: size of the program (0 where not told) and whom it is for.
+    Identity(Identity),
+    /// 24 bytes: the same, with version and date.
+    Dated {
+        /// Whom it is for.
+        identity: Identity,
+        /// Version: major in bits 0–7, minor in bits 8–15, release in bits 16–31 (figure 13).
+        version: u32,
+        /// Creation date, seconds since 1970-01-01 UTC.
+        date: u64,
+    },
+}
+
+/// Whom a program is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Identity {
+    /// Size of the program in bytes, 0 where not told.
+    pub app_size: u32,
+    /// Vendor-ID, as in 1018h/1.
+    pub vendor_id: u32,
+    /// Product code, as in 1018h/2.
+    pub product_code: u32,
+}
+
+/// The largest data of block 0.
+pub const CONTROL_MAX: usize = 24;
+
+impl Control {
+    /// Takes the data of block 0 apart; `None` for a length that the manual does not know.
+    #[must_use]
+    pub fn parse(data: &[u8]) -> Option<Self> {
+        let identity =
+            |[app_size, vendor_id, product_code]: [u32; 3]| Identity { app_size, vendor_id, product_code };
+        match data.len() {
+            8 => Some(Self::Plain),
+            12 => Some(Self::Identity(identity(words(data)))),
+            24 => {
+                let [a, b, c, version, low, high] = words(data);
+                let date = u64::from(low) | u64::from(high) << 32;
+                Some(Self::Dated { identity: identity([a, b, c]), version, date })
+            }
+            _ => None,
+        }
+    }
+
+    /// Puts the data of block 0 together; gives the bytes and how many of them count.
+    #[must_use]
+    pub fn emit(&self) -> ([u8; CONTROL_MAX], usize) {
+        let mut bytes = [0; CONTROL_MAX];
+        let put_identity = |bytes: &mut [u8], id: &Identity| {
+            put_words(bytes, &[id.app_size, id.vendor_id, id.product_code]);
+        };
+        let len = match self {
+            Self::Plain => 8,
+            Self::Identity(identity) => {
+                put_identity(&mut bytes, identity);
+                12
+            }
+            Self::Dated { identity, version, date } => {
+                put_identity(&mut bytes, identity);
+                put_words(&mut bytes[12..], &[*version, *date as u32, (*date >> 32) as u32]);
+                24
+            }
+        };
+        (bytes, len)
+    }
+}
+
+/// The data of the last block.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Last {
+    /// Size of the program in bytes, from its region's start.
+    pub program_size: u32,
+    /// CRC over these bytes as they are to lie in flash, gaps read FFh.
+    pub program_crc: u32,
+}
+
+/// Bytes of [`Last`].
+pub const LAST_SIZE: usize = 8;
+
+impl Last {
+    /// Takes the data of the last block apart; `None` for a wrong length.
+    #[must_use]
+    pub fn parse(data: &[u8]) -> Option<Self> {
+        let data: &[u8; LAST_SIZE] = data.try_into().ok()?;
+        let [program_size, program_crc] = words(data);
+        Some(Self { program_size, program_crc })
+    }
+
+    /// Puts the data of the last block together.
+    #[must_use]
+    pub fn emit(&self) -> [u8; LAST_SIZE] {
+        let mut bytes = [0; LAST_SIZE];
+        put_words(&mut bytes, &[self.program_size, self.program_crc]);
+        bytes
+    }
+}
+
+/// The first `N` little-endian words; absent bytes read 0.
+fn words<const N: usize>(bytes: &[u8]) -> [u32; N] {
+    let mut words = [0; N];
+    for (word, chunk) in words.iter_mut().zip(bytes.chunks_exact(4)) {
+        *word = u32::from_le_bytes([chunk[0], chunk[1], chunk[2], chunk[3]]);
+    }
+    words
+}
+
+fn put_words(bytes: &mut [u8], words: &[u32]) {
+    for (chunk, word) in bytes.chunks_exact_mut(4).zip(words) {
+        chunk.copy_from_slice(&word.to_le_bytes());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The offsets of the tables of chapter 5.1, filled with telling bytes.
+    #[test]
+    fn fields_lie_where_the_manual_puts_them() {
+        let header = [1, 0, 0, 0, 0x00, 0x00, 0x01, 0x08, 0x10, 0, 0, 0];
+        let told = Header { number: 1, flash_address: 0x0801_0000, size: 16 };
+        assert_eq!(Header::parse(&header), told);
+        assert_eq!(told.emit(), header);
+
+        // Block 0 of the manual's example call: --vid 0 --pid 1234 --ver 0x00640A01 (V1.10r100).
+        #[rustfmt::skip]
+        let control = [
+            0, 0, 0, 0,
+            0, 0, 0, 0,
+            0xD2, 0x04, 0, 0,
+            0x01, 0x0A, 0x64, 0x00,
+            0x80, 0x51, 0x01, 0, 0, 0, 0, 0,
+        ];
+        let told = Control::Dated {
+            identity: Identity { app_size: 0, vendor_id: 0, product_code: 1234 },
+            version: 0x0064_0A01,
+            date: 86400,
+        };
+        assert_eq!(Control::parse(&control), Some(told));
+        assert_eq!(told.emit(), (control, 24));
+
+        let last = [0x00, 0x10, 0, 0, 0x26, 0x39, 0xF4, 0xCB];
+        let told = Last { program_size: 4096, program_crc: 0xCBF4_3926 };
+        assert_eq!(Last::parse(&last), Some(told));
+        assert_eq!(told.emit(), last);
+    }
+
+    #[test]
+    fn only_the_lengths_of_the_manual_are_control_data() {
+        for len in 0..=32 {
+            let known = matches!(len, 8 | 12 | 24);
+            assert_eq!(Control::parse(&[0; 32][..len]).is_some(), known, "{len}");
+        }
+        assert_eq!(Last::parse(&[0; 7]), None);
+        assert_eq!(Last::parse(&[0; 9]), None);
+    }
+}

@@ -1,0 +1,206 @@
+//! The silicon: what a chip has, as its reference manual states it (RM0090 rev 19, section 3.3
+//! "Embedded flash memory" and section 2.3 "Memory map"). Nothing here is a choice of ours; the
+//! choices are in [`crate::layout`].
+
+/// A half-open range of addresses: `base..base + size`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Region {
+    /// First address.
+    pub base: u32,
+    /// Length in bytes.
+    pub size: u32,
+}
+
+impl Region {
+    /// The region that starts at `base` and is `size` bytes long.
+    #[must_use]
+    pub const fn new(base: u32, size: u32) -> Self {
+        Self { base, size }
+    }
+
+    /// The address behind the last byte. No region of a chip reaches the end of the address space.
+    #[must_use]
+    pub const fn end(&self) -> u32 {
+        self.base + self.size
+    }
+
+    /// Whether the `len` bytes from `address` all lie inside; no address and no length overflows it.
+    #[must_use]
+    pub const fn contains(&self, address: u32, len: u32) -> bool {
+        address >= self.base
+            && len <= self.size
+            && address - self.base <= self.size - len
+            && (len > 0 || address < self.end())
+    }
+
+    /// Whether the two share at least one byte.
+    #[must_use]
+    pub const fn overlaps(&self, other: &Self) -> bool {
+        self.base < other.end() && other.base < self.end()
+    }
+}
+
+/// One erasable unit of the flash.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Sector {
+    /// The number that goes into `FLASH_CR.SNB`.
+    pub number: u8,
+    /// The bytes it covers.
+    pub region: Region,
+}
+
+/// A run of equally large sectors.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SectorRun {
+    /// How many sectors follow one another.
+    pub count: u8,
+    /// Bytes of each.
+    pub size: u32,
+}
+
+/// What one chip has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Geometry {
+    /// Order code without package and temperature range, in lower case.
+    pub chip: &'static str,
+    /// The main flash.
+    pub flash: Region,
+    /// Its sectors, in address order.
+    pub sectors: &'static [SectorRun],
+    /// The RAM that both the CPU and the bus masters reach, as one contiguous range.
+    pub sram: Region,
+    /// Core-coupled RAM: data only, no code and no DMA. Size 0 where the chip has none.
+    pub ccm: Region,
+    /// Number of interrupt lines behind the 16 exceptions of the core.
+    pub interrupts: u16,
+}
+
+const KIB: u32 = 1024;
+
+/// STM32F407VG and STM32F407IG: 1 MiB flash, 112 + 16 KiB SRAM, 64 KiB CCM.
+///
+/// RM0090 table 5 (sectors), table 61 (82 interrupt lines).
+pub const STM32F407VG: Geometry = Geometry {
+    chip: "stm32f407vg",
+    flash: Region::new(0x0800_0000, 1024 * KIB),
+    sectors: &[
+        SectorRun { count: 4, size: 16 * KIB },
+        SectorRun { count: 1, size: 64 * KIB },
+        SectorRun { count: 7, size: 128 * KIB },
+    ],
+    sram: Region::new(0x2000_0000, 128 * KIB),
+    ccm: Region::new(0x1000_0000, 64 * KIB),
+    interrupts: 82,
+};
+
+impl Geometry {
+    /// The sectors in address order.
+    pub fn sectors(&self) -> impl Iterator<Item = Sector> + '_ {
+        let mut next = 0;
+        core::iter::from_fn(move || {
+            let sector = self.sector(next)?;
+            next += 1;
+            Some(sector)
+        })
+    }
+
+    /// The sector of this number, if the chip has it.
+    #[must_use]
+    pub const fn sector(&self, number: u8) -> Option<Sector> {
+        let mut base = self.flash.base;
+        let mut left = number;
+        let mut run = 0;
+        while run < self.sectors.len() {
+            let SectorRun { count, size } = self.sectors[run];
+            if left < count {
+                let region = Region::new(base + left as u32 * size, size);
+                return Some(Sector { number, region });
+            }
+            left -= count;
+            base += count as u32 * size;
+            run += 1;
+        }
+        None
+    }
+
+    /// The sector that holds `address`, if it is in flash.
+    #[must_use]
+    pub const fn sector_at(&self, address: u32) -> Option<Sector> {
+        let mut number = 0;
+        while let Some(sector) = self.sector(number) {
+            if sector.region.contains(address, 1) {
+                return Some(sector);
+            }
+            number += 1;
+        }
+        None
+    }
+
+    /// Whether a region starts and ends where sectors do, so that it can be erased without touching a neighbour.
+    #[must_use]
+    pub const fn is_whole_sectors(&self, region: &Region) -> bool {
+        let starts = match self.sector_at(region.base) {
+            Some(sector) => sector.region.base == region.base,
+            None => false,
+        };
+        let ends = match self.sector_at(region.end() - 1) {
+            Some(sector) => sector.region.end() == region.end(),
+            None => false,
+        };
+        region.size > 0 && starts && ends
+    }
+
+    /// Bytes that a vector table of this chip occupies.
+    #[must_use]
+    pub const fn vector_table_size(&self) -> u32 {
+        (16 + self.interrupts as u32) * 4
+    }
+
+    /// What `VTOR` demands of a vector table's address: the table's size rounded up to a power of two
+    /// (PM0214 section 4.4.4).
+    #[must_use]
+    pub const fn vector_table_alignment(&self) -> u32 {
+        self.vector_table_size().next_power_of_two()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// RM0090 table 5, copied from the manual.
+    #[test]
+    fn sectors_of_the_f407_are_those_of_the_manual() {
+        let table = [
+            (0, 0x0800_0000, 16),
+            (1, 0x0800_4000, 16),
+            (2, 0x0800_8000, 16),
+            (3, 0x0800_C000, 16),
+            (4, 0x0801_0000, 64),
+            (5, 0x0802_0000, 128),
+            (6, 0x0804_0000, 128),
+            (7, 0x0806_0000, 128),
+            (8, 0x0808_0000, 128),
+            (9, 0x080A_0000, 128),
+            (10, 0x080C_0000, 128),
+            (11, 0x080E_0000, 128),
+        ];
+        assert!(STM32F407VG.sectors().eq(table
+            .iter()
+            .map(|&(number, base, kib)| Sector { number, region: Region::new(base, kib * 1024) })));
+        assert_eq!(STM32F407VG.sector_at(0x080F_FFFF).unwrap().number, 11);
+        assert_eq!(STM32F407VG.sector_at(0x0810_0000), None);
+        assert_eq!(STM32F407VG.sector_at(0x07FF_FFFF), None);
+    }
+
+    #[test]
+    fn a_region_does_not_wrap() {
+        let region = Region::new(0x0801_0000, 0x1000);
+        assert!(region.contains(0x0801_0000, 0x1000));
+        assert!(!region.contains(0x0801_0000, 0x1001));
+        assert!(!region.contains(0x0801_0001, 0x1000));
+        assert!(!region.contains(0x0801_0010, u32::MAX));
+        assert!(!region.contains(u32::MAX, 1));
+        assert!(!region.contains(region.end(), 0));
+    }
+}

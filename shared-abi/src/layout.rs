@@ -1,0 +1,266 @@
+//! Who owns which address: the one source of truth.
+//!
+//! One file per board in `layout/` holds **the numbers**; linker scripts, firmware, host tool, tests
+//! and documentation derive theirs from it. [`Layout::checked`] runs when the crate is compiled, so a
+//! layout that breaks a rule does not build, and the compiler's message names the rule.
+
+use core::fmt;
+
+use crate::geometry::{Geometry, Region};
+use crate::{callgate, handoff, warm_start};
+
+pub mod stm32f407g_disc1;
+
+/// Every board that coboot knows, for tools that take a board by name.
+pub const BOARDS: &[&Layout] = &[&stm32f407g_disc1::LAYOUT];
+
+/// The board of this name, as in `--board`.
+#[must_use]
+pub fn by_name(board: &str) -> Option<&'static Layout> {
+    BOARDS.iter().copied().find(|layout| layout.board == board)
+}
+
+/// The memory map of one board.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Layout {
+    /// The name that `--board` and the cargo feature `board-…` use.
+    pub board: &'static str,
+    /// The silicon on it.
+    pub chip: &'static Geometry,
+    /// The bootloader's flash. Its vector table is at the base, where the core looks after a reset.
+    pub bootloader: Region,
+    /// Where the bootloader's code leaves off and the [`callgate`] table begins, from the base on.
+    pub callgate_offset: u32,
+    /// The two homes of the non-volatile parameters, one sector or more each.
+    pub parameters: [Region; 2],
+    /// Flash of program 1, 2, … (sub-index of 1F50h, 1F51h, 1F56h, 1F57h).
+    pub programs: &'static [Region],
+    /// RAM for code and data. The bootloader and the application each have all of it.
+    pub ram: Region,
+    /// Where the bootloader leaves the [`handoff`].
+    pub handoff: Region,
+    /// The [`warm_start`] cell: the last RAM cell of the chip.
+    pub warm_start: Region,
+}
+
+impl Layout {
+    /// Gives the layout back if every rule holds; fails the build with the broken rule's name if not.
+    #[must_use]
+    pub const fn checked(self) -> Self {
+        let chip = self.chip;
+        assert!(
+            self.bootloader.base == chip.flash.base,
+            "layout: the bootloader must start at the base of the flash, where the core fetches its vectors after a reset"
+        );
+        assert!(
+            chip.is_whole_sectors(&self.bootloader),
+            "layout: the bootloader must end at a sector border"
+        );
+        assert!(
+            self.callgate_offset >= chip.vector_table_size(),
+            "layout: the callgate overlaps the bootloader's vector table"
+        );
+        assert!(
+            self.bootloader.contains(self.bootloader.base + self.callgate_offset, callgate::TABLE_SIZE),
+            "layout: the callgate lies outside the bootloader"
+        );
+        let mut i = 0;
+        while i < 2 {
+            let parameters = &self.parameters[i];
+            assert!(
+                chip.is_whole_sectors(parameters),
+                "layout: a parameter region must start and end at sector borders"
+            );
+            assert!(
+                !parameters.overlaps(&self.bootloader),
+                "layout: a parameter region overlaps the bootloader"
+            );
+            i += 1;
+        }
+        assert!(
+            !self.parameters[0].overlaps(&self.parameters[1]),
+            "layout: the two parameter regions overlap"
+        );
+        assert!(
+            !self.programs.is_empty() && self.programs.len() <= 254,
+            "layout: there must be 1 to 254 programs (sub-indices 1 to 254 of 1F50h)"
+        );
+        let mut p = 0;
+        while p < self.programs.len() {
+            let program = &self.programs[p];
+            assert!(chip.is_whole_sectors(program), "layout: a program must start and end at sector borders");
+            assert!(
+                program.base.is_multiple_of(chip.vector_table_alignment()),
+                "layout: a program's vector table is not aligned as VTOR demands"
+            );
+            assert!(!program.overlaps(&self.bootloader), "layout: a program overlaps the bootloader");
+            assert!(
+                !program.overlaps(&self.parameters[0]) && !program.overlaps(&self.parameters[1]),
+                "layout: a program overlaps a parameter region"
+            );
+            let mut q = 0;
+            while q < p {
+                assert!(!program.overlaps(&self.programs[q]), "layout: two programs overlap");
+                q += 1;
+            }
+            p += 1;
+        }
+        assert!(
+            chip.sram.contains(self.ram.base, self.ram.size),
+            "layout: the RAM of the images lies outside the chip's SRAM"
+        );
+        assert!(
+            self.ram.size.is_multiple_of(8),
+            "layout: the initial stack pointer must be a multiple of 8 (AAPCS)"
+        );
+        assert!(
+            !self.ram.overlaps(&self.handoff) && !self.ram.overlaps(&self.warm_start),
+            "layout: the handoff or the warm-start cell lies inside the RAM of the images"
+        );
+        assert!(!self.handoff.overlaps(&self.warm_start), "layout: the handoff overlaps the warm-start cell");
+        assert!(
+            self.handoff.size as usize == size_of::<handoff::Handoff>(),
+            "layout: the handoff region has not the size of the handoff"
+        );
+        assert!(
+            self.warm_start.size as usize == size_of::<warm_start::WarmStart>(),
+            "layout: the warm-start region has not the size of the warm-start cell"
+        );
+        assert!(
+            self.handoff.base.is_multiple_of(4) && self.warm_start.base.is_multiple_of(4),
+            "layout: the handoff and the warm-start cell must be word-aligned"
+        );
+        assert!(
+            self.warm_start.end() == chip.sram.end(),
+            "layout: the warm-start cell must be the last RAM cell of the chip"
+        );
+        assert!(
+            chip.sram.contains(self.handoff.base, self.handoff.size),
+            "layout: the handoff lies outside the chip's SRAM"
+        );
+        self
+    }
+
+    /// Address of the callgate table.
+    #[must_use]
+    pub const fn callgate(&self) -> u32 {
+        self.bootloader.base + self.callgate_offset
+    }
+
+    /// Flash of program `number` (1 is the first, as in the sub-index).
+    #[must_use]
+    pub fn program(&self, number: u8) -> Option<Region> {
+        let index = usize::from(number).checked_sub(1)?;
+        self.programs.get(index).copied()
+    }
+
+    /// The linker's view of this layout: what `build.rs` writes to `layout.x`.
+    #[must_use]
+    pub const fn linker_script(&self, image: Image) -> LinkerScript<'_> {
+        LinkerScript { layout: self, image }
+    }
+}
+
+/// Which image a linker script is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Image {
+    /// The bootloader.
+    Bootloader,
+    /// Program `n`, 1 is the first.
+    Program(u8),
+}
+
+/// Prints the `MEMORY` command and the border symbols that the templates in `linker/` refer to.
+#[derive(Clone, Copy, Debug)]
+pub struct LinkerScript<'a> {
+    layout: &'a Layout,
+    image: Image,
+}
+
+impl fmt::Display for LinkerScript<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let layout = self.layout;
+        let (flash, name) = match self.image {
+            Image::Bootloader => (layout.bootloader, "bootloader"),
+            Image::Program(number) => (layout.program(number).ok_or(fmt::Error)?, "program"),
+        };
+        writeln!(f, "/* {name} of {}, made from shared-abi/src/layout: change it there. */", layout.board)?;
+        writeln!(f, "MEMORY\n{{")?;
+        writeln!(f, "  FLASH : ORIGIN = {:#010x}, LENGTH = {:#x}", flash.base, flash.size)?;
+        writeln!(f, "  RAM   : ORIGIN = {:#010x}, LENGTH = {:#x}", layout.ram.base, layout.ram.size)?;
+        writeln!(f, "}}")?;
+        for (symbol, value) in [
+            ("__vector_table_alignment", layout.chip.vector_table_alignment()),
+            ("__callgate_table", layout.callgate()),
+            ("__callgate_table_size", callgate::TABLE_SIZE),
+            ("__handoff", layout.handoff.base),
+            ("__warm_start", layout.warm_start.base),
+            ("__sram_end", layout.chip.sram.end()),
+        ] {
+            writeln!(f, "{symbol} = {value:#010x};")?;
+        }
+        Ok(())
+    }
+}
+
+/// Prints the memory map as a table for people.
+impl fmt::Display for Layout {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let flash = self.chip.flash;
+        let sram = self.chip.sram;
+        writeln!(
+            f,
+            "{} ({}: flash {} KiB, SRAM {} KiB)",
+            self.board,
+            self.chip.chip,
+            flash.size / 1024,
+            sram.size / 1024
+        )?;
+        writeln!(f)?;
+        writeln!(f, "  {:<14} {:<24} {:>12}   remarks", "region", "addresses", "size")?;
+        self.row(f, "bootloader", self.bootloader)?;
+        writeln!(f, "vector table at +0, callgate at +{:X}h", self.callgate_offset)?;
+        for (name, region) in ["parameters A", "parameters B"].iter().zip(self.parameters) {
+            self.row(f, name, region)?;
+            writeln!(f)?;
+        }
+        for (region, name) in self.programs.iter().zip(PROGRAM_NAMES) {
+            self.row(f, name, *region)?;
+            writeln!(f)?;
+        }
+        self.row(f, "RAM", self.ram)?;
+        writeln!(f, "code and data; the application gets all of it")?;
+        self.row(f, "handoff", self.handoff)?;
+        writeln!(f, "bootloader -> application")?;
+        self.row(f, "warm-start", self.warm_start)?;
+        writeln!(f, "application -> bootloader; the last RAM cell")
+    }
+}
+
+/// Names for the printed map; a layout with more programs prints the first ones.
+const PROGRAM_NAMES: [&str; 4] = ["program 1", "program 2", "program 3", "program 4"];
+
+impl Layout {
+    fn row(&self, f: &mut fmt::Formatter<'_>, name: &str, region: Region) -> fmt::Result {
+        let (first, last) = (region.base, region.end() - 1);
+        write!(
+            f,
+            "  {name:<14} {:04X}_{:04X} - {:04X}_{:04X}    ",
+            first >> 16,
+            first & 0xFFFF,
+            last >> 16,
+            last & 0xFFFF
+        )?;
+        if region.size.is_multiple_of(1024) {
+            write!(f, "{:>8} KiB", region.size / 1024)?;
+        } else {
+            write!(f, "{:>8} B  ", region.size)?;
+        }
+        write!(f, "   ")?;
+        match (self.chip.sector_at(first), self.chip.sector_at(last)) {
+            (Some(a), Some(b)) if a.number == b.number => write!(f, "sector {}; ", a.number),
+            (Some(a), Some(b)) => write!(f, "sectors {}-{}; ", a.number, b.number),
+            _ => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,41 @@
+//! What the bootloader, the application, the host tool and the emulator must agree on.
+//!
+//! | module | what it fixes |
+//! |---|---|
+//! | [`geometry`] | the silicon: flash sectors, RAM, number of interrupts |
+//! | [`layout`] | **the numbers** of each board: who owns which address |
+//! | [`warm_start`] | the last RAM cell: what the application asks of the bootloader across a reset |
+//! | [`handoff`] | what the bootloader tells the application about how it came up |
+//! | [`vectors`] | the proof that a vector table may be jumped to, and the jump |
+//! | [`callgate`] | the bootloader's services for the application, at a fixed address |
+//! | [`block_file`] | the container that object 1F50h takes |
+//!
+//! Everything that crosses a border between two images is `repr(C)`, little-endian and versioned.
+//! This crate has no dependencies, so that a C or foreign application can be held against it easily.
+#![no_std]
+
+pub mod block_file;
+pub mod callgate;
+pub mod geometry;
+pub mod handoff;
+pub mod layout;
+pub mod vectors;
+pub mod warm_start;
+
+/// The check word that guards a record in RAM: a rotating fold over its other words.
+///
+/// It tells a record from the noise of an unpowered RAM; it is no protection against an attacker who
+/// can write RAM. All-zero and all-one records never check (the seed sees to that), and the fold is
+/// simple enough to be written again in C in three lines.
+#[must_use]
+pub const fn check_word(words: &[u32]) -> u32 {
+    const SEED: u32 = 0xC0B0_07A5;
+    let mut fold = SEED;
+    let mut i = 0;
+    while i < words.len() {
+        fold = fold.rotate_left(5) ^ words[i];
+        fold = fold.wrapping_mul(0x9E37_79B1);
+        i += 1;
+    }
+    !fold
+}

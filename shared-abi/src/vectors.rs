@@ -1,0 +1,145 @@
+//! Vector tables: the proof that one may be jumped to, and the jump.
+
+use crate::geometry::Region;
+use crate::layout::Layout;
+
+/// Why a vector table is refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum VectorFault {
+    /// The table's address is not aligned as VTOR demands.
+    Misaligned,
+    /// The initial stack pointer is not in RAM, or not a multiple of 8.
+    StackPointer,
+    /// The reset vector does not point into the program.
+    ResetVector,
+    /// The reset vector lacks the Thumb bit.
+    NotThumb,
+}
+
+/// A vector table that has passed its checks. Only [`VectorTable::check`] makes one, and only one of these can be
+/// [jumped](VectorTable::jump) to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct VectorTable {
+    address: u32,
+    initial_sp: u32,
+    reset: u32,
+}
+
+impl VectorTable {
+    /// Checks the first two words of the table at the start of `program`.
+    ///
+    /// # Errors
+    /// The first rule that it breaks.
+    pub fn check(words: [u32; 2], program: Region, layout: &Layout) -> Result<Self, VectorFault> {
+        let [initial_sp, reset] = words;
+        let chip = layout.chip;
+        if !program.base.is_multiple_of(chip.vector_table_alignment()) {
+            return Err(VectorFault::Misaligned);
+        }
+        // A full descending stack: the pointer may stand right behind the last byte, and needs room below.
+        let on_stack = |ram: &Region| ram.size > 0 && initial_sp > ram.base && initial_sp <= ram.end();
+        if !initial_sp.is_multiple_of(8) || !(on_stack(&layout.ram) || on_stack(&chip.ccm)) {
+            return Err(VectorFault::StackPointer);
+        }
+        let table = chip.vector_table_size();
+        let code = Region::new(program.base + table, program.size - table);
+        if !code.contains(reset & !1, 2) {
+            return Err(VectorFault::ResetVector);
+        }
+        if reset & 1 == 0 {
+            return Err(VectorFault::NotThumb);
+        }
+        Ok(Self { address: program.base, initial_sp, reset })
+    }
+
+    /// Address of the table: what `VTOR` takes.
+    #[must_use]
+    pub const fn address(&self) -> u32 {
+        self.address
+    }
+
+    /// First stack pointer.
+    #[must_use]
+    pub const fn initial_sp(&self) -> u32 {
+        self.initial_sp
+    }
+
+    /// First instruction, with the Thumb bit.
+    #[must_use]
+    pub const fn reset(&self) -> u32 {
+        self.reset
+    }
+
+    /// Starts the image: FPU off and privileged thread mode on the main stack as after a reset, `VTOR`, `MSP`, branch.
+    ///
+    /// # Safety
+    /// No interrupt may be enabled or pending and no bus master active: what they would do next belongs to an image
+    /// that is no more.
+    #[cfg(target_arch = "arm")]
+    pub unsafe fn jump(self) -> ! {
+        const VTOR: u32 = 0xE000_ED08;
+        const CPACR: u32 = 0xE000_ED88;
+        // SAFETY: the addresses are those of ARMv7-M (B3.2.2); the table was checked; the caller vouches for the rest.
+        // Nothing after the write to MSP touches the stack: all operands are in registers.
+        unsafe {
+            core::arch::asm!(
+                "str {table}, [{vtor}]",
+                "str {zero}, [{cpacr}]",
+                "msr CONTROL, {zero}",
+                "msr MSP, {sp}",
+                "dsb",
+                "isb",
+                "bx {reset}",
+                table = in(reg) self.address,
+                vtor = in(reg) VTOR,
+                cpacr = in(reg) CPACR,
+                zero = in(reg) 0,
+                sp = in(reg) self.initial_sp,
+                reset = in(reg) self.reset,
+                options(noreturn),
+            )
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::layout::stm32f407g_disc1::LAYOUT;
+
+    const PROGRAM: Region = LAYOUT.programs[0];
+
+    fn check(sp: u32, reset: u32) -> Result<VectorTable, VectorFault> {
+        VectorTable::check([sp, reset], PROGRAM, &LAYOUT)
+    }
+
+    #[test]
+    fn takes_a_plausible_table() {
+        let table = check(0x2001_FFC0, 0x0801_0189).unwrap();
+        assert_eq!(
+            (table.address(), table.initial_sp(), table.reset()),
+            (0x0801_0000, 0x2001_FFC0, 0x0801_0189)
+        );
+        assert!(check(0x1001_0000, 0x080F_FFFF).is_ok(), "a stack in CCM RAM is fine");
+    }
+
+    #[test]
+    fn refuses_everything_else() {
+        use VectorFault::{Misaligned, NotThumb, ResetVector, StackPointer};
+        for (sp, reset, fault) in [
+            (0xFFFF_FFFF, 0xFFFF_FFFF, StackPointer),
+            (0, 0x0801_0189, StackPointer),
+            (0x2000_0000, 0x0801_0189, StackPointer),
+            (0x2001_FFC8, 0x0801_0189, StackPointer),
+            (0x2001_FFBC, 0x0801_0189, StackPointer),
+            (0x2001_FFC0, 0x0800_0189, ResetVector),
+            (0x2001_FFC0, 0x0810_0001, ResetVector),
+            (0x2001_FFC0, 0x0801_0001, ResetVector),
+            (0x2001_FFC0, 0x0801_0188, NotThumb),
+        ] {
+            assert_eq!(check(sp, reset), Err(fault), "{sp:#x} {reset:#x}");
+        }
+        let program = Region::new(0x0801_0100, 0x1000);
+        assert_eq!(VectorTable::check([0x2001_FFC0, 0x0801_0301], program, &LAYOUT), Err(Misaligned));
+    }
+}

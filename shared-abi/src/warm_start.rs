@@ -1,0 +1,156 @@
+//! The warm-start cell: what the application asks of the bootloader across a reset.
+//!
+//! The cell is the last RAM cell of the chip ([`Layout::warm_start`](crate::layout::Layout::warm_start)), in no image's RAM. It survives a
+//! warm reset and holds noise after a power-on; whatever it holds is treated as hostile input, and it
+//! is read once: [`Cell::take`] consumes it.
+
+use crate::check_word;
+
+/// Tells a warm-start cell, layout version 1 ("CBW1" read as little-endian bytes).
+pub const MAGIC: u32 = u32::from_le_bytes(*b"CBW1");
+
+/// What the next start of the bootloader is asked to do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BootRequest {
+    /// Stay in the bootloader, whatever program is valid (1F51h = 80h, START_BOOTLOADER).
+    Stay,
+    /// Start program `n` once although it may carry no signature; the next reset ends in the bootloader.
+    Trial(u8),
+    /// Start program `n` as the autostart would.
+    Start(u8),
+}
+
+/// The cell as it lies in RAM: 16 bytes, little-endian.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct WarmStart {
+    /// [`MAGIC`].
+    pub magic: u32,
+    /// 1 stay, 2 trial, 3 start.
+    pub request: u32,
+    /// The program number of a trial or start (1 to 254), 0 otherwise.
+    pub argument: u32,
+    /// [`check_word`] over the three words before.
+    pub check: u32,
+}
+
+impl WarmStart {
+    /// A cell that asks for nothing.
+    pub const EMPTY: Self = Self { magic: 0, request: 0, argument: 0, check: 0 };
+
+    /// The cell that carries this request.
+    #[must_use]
+    pub const fn new(request: BootRequest) -> Self {
+        let (request, argument) = match request {
+            BootRequest::Stay => (1, 0),
+            BootRequest::Trial(program) => (2, program as u32),
+            BootRequest::Start(program) => (3, program as u32),
+        };
+        let check = check_word(&[MAGIC, request, argument]);
+        Self { magic: MAGIC, request, argument, check }
+    }
+
+    /// The request in it, or `None` for noise, another version, a wrong check word, an unknown request or
+    /// an argument out of its range.
+    #[must_use]
+    pub fn request(&self) -> Option<BootRequest> {
+        let program = u8::try_from(self.argument).ok();
+        let request = match (self.request, program) {
+            (1, Some(0)) => BootRequest::Stay,
+            (2, Some(program @ 1..=254)) => BootRequest::Trial(program),
+            (3, Some(program @ 1..=254)) => BootRequest::Start(program),
+            _ => return None,
+        };
+        // One encoder decides what is well-formed: magic, words and check must be exactly its.
+        (*self == Self::new(request)).then_some(request)
+    }
+}
+
+/// The cell at its place in RAM.
+#[derive(Debug)]
+pub struct Cell(*mut WarmStart);
+
+impl Cell {
+    /// The cell at `address`.
+    ///
+    /// # Safety
+    /// `address` must be word-aligned RAM of 16 bytes that nothing else in the program uses: the layout's
+    /// warm-start region, which the linker scripts keep out of every image.
+    #[must_use]
+    pub const unsafe fn at(address: *mut WarmStart) -> Self {
+        Self(address)
+    }
+
+    /// Reads the request and empties the cell, so that no later reset finds it again.
+    pub fn take(&mut self) -> Option<BootRequest> {
+        // SAFETY: `at` vouches for the address; volatile, because another image wrote the cell.
+        let found = unsafe { self.0.read_volatile() };
+        self.write(WarmStart::EMPTY);
+        found.request()
+    }
+
+    /// Leaves a request for the bootloader. The write is complete when this returns; reset may follow at once.
+    pub fn put(&mut self, request: BootRequest) {
+        self.write(WarmStart::new(request));
+    }
+
+    fn write(&mut self, value: WarmStart) {
+        // SAFETY: `at` vouches for the address; volatile, because only another image reads the cell.
+        unsafe { self.0.write_volatile(value) };
+        #[cfg(target_arch = "arm")]
+        // SAFETY: `dsb` has no operands; it waits until the store above has reached the RAM.
+        unsafe {
+            core::arch::asm!("dsb", options(nostack, preserves_flags));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_request_survives_the_cell_once() {
+        let requests =
+            [BootRequest::Stay, BootRequest::Trial(1), BootRequest::Start(1), BootRequest::Trial(254)];
+        for request in requests {
+            let mut ram = WarmStart::EMPTY;
+            // SAFETY: `ram` is ours and outlives the cell.
+            let mut cell = unsafe { Cell::at(&raw mut ram) };
+            cell.put(request);
+            assert_eq!(cell.take(), Some(request));
+            assert_eq!(cell.take(), None, "a request is consumed on read");
+        }
+    }
+
+    #[test]
+    fn any_single_bit_error_reads_as_no_request() {
+        for request in [BootRequest::Stay, BootRequest::Trial(3), BootRequest::Start(254)] {
+            let good = WarmStart::new(request);
+            for bit in 0..32 {
+                let flip = 1 << bit;
+                assert_eq!(WarmStart { magic: good.magic ^ flip, ..good }.request(), None);
+                assert_eq!(WarmStart { request: good.request ^ flip, ..good }.request(), None);
+                assert_eq!(WarmStart { argument: good.argument ^ flip, ..good }.request(), None);
+                assert_eq!(WarmStart { check: good.check ^ flip, ..good }.request(), None);
+            }
+        }
+    }
+
+    #[test]
+    fn uniform_ram_reads_as_no_request() {
+        for word in [0, u32::MAX, 0x5555_5555, 0xAAAA_AAAA, MAGIC] {
+            let noise = WarmStart { magic: word, request: word, argument: word, check: word };
+            assert_eq!(noise.request(), None);
+        }
+    }
+
+    #[test]
+    fn a_well_checked_request_for_an_impossible_program_is_refused() {
+        for (request, argument) in [(1, 1), (2, 0), (2, 255), (3, 0), (3, 256), (0, 0), (4, 1)] {
+            let check = check_word(&[MAGIC, request, argument]);
+            let cell = WarmStart { magic: MAGIC, request, argument, check };
+            assert_eq!(cell.request(), None, "{cell:?}");
+        }
+    }
+}
