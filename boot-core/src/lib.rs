@@ -1,3 +1,18 @@
-//! stub
+//! The bootloader without its hardware: sans-IO, `no_std`, no unsafe.
+//!
+//! | module | what it does |
+//! |---|---|
+//! | [`decision`] | bootloader or program, after every reset |
+//! | [`program`] | what is known of a program, and the proof that it may be started |
+//! | [`parameters`] | the power-fail-safe journal of the non-volatile parameters |
+//! | [`download`] | 1F50h, 1F51h, 1F56h, 1F57h: block files into flash |
+//! | [`flash`] | the seam to the flash |
 #![no_std]
 #![forbid(unsafe_code)]
+
+pub mod decision;
+pub mod flash;
+pub mod parameters;
+pub mod program;
+
+pub use program::crc32;

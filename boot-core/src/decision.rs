@@ -1,0 +1,105 @@
+//! The boot decision: bootloader or program, made once after every reset before any peripheral is touched.
+//!
+//! The order is the product's promise (docs/architecture.md): what asks for the bootloader comes first,
+//! so that no program, however broken, can keep a device from being reached.
+
+use core::ops::RangeInclusive;
+
+use shared_abi::warm_start::BootRequest;
+
+use crate::program::{Invalid, VerifiedProgram};
+
+/// What a reset leaves to decide on.
+#[derive(Clone, Copy, Debug)]
+pub struct Circumstances {
+    /// The request in the warm-start cell, consumed.
+    pub request: Option<BootRequest>,
+    /// The entry strap asks for the bootloader.
+    pub strap: bool,
+    /// Resets in a row by which the watchdog ended a running application.
+    pub crash_resets: u32,
+    /// Node-ID of the device; one outside 1 to 127 is no node-ID.
+    pub node_id: u8,
+}
+
+/// What the product is configured for.
+#[derive(Clone, Debug)]
+pub struct Policy {
+    /// The program that starts by itself after a reset, if any.
+    pub autostart: Option<u8>,
+    /// This many crash resets in a row end in the bootloader.
+    pub max_crash_resets: u32,
+    /// Node-IDs with which programs may be started.
+    pub node_ids: RangeInclusive<u8>,
+}
+
+/// Why the device stays in the bootloader.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StayReason {
+    /// The application (or a tool through it) asked for it.
+    Requested,
+    /// The entry strap is set.
+    Strap,
+    /// Too many crash resets in a row.
+    CrashLoop,
+    /// Autostart is off and nothing was asked for.
+    NoAutostart,
+    /// The node-ID is not in the program's range.
+    NodeId,
+    /// The program was not signed, and this is no trial.
+    Unsigned,
+    /// The program may not be started.
+    Program(Invalid),
+}
+
+/// What the bootloader does after a reset.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BootDecision {
+    /// Bootloader mode.
+    Stay(StayReason),
+    /// Jump.
+    Start {
+        /// The program, with the proof of its checks.
+        program: VerifiedProgram,
+        /// Started without a signature, for once.
+        trial: bool,
+    },
+}
+
+/// Decides. `verify` checks a program completely and is asked at most once.
+pub fn decide(
+    circumstances: &Circumstances,
+    policy: &Policy,
+    verify: impl FnOnce(u8) -> Result<VerifiedProgram, Invalid>,
+) -> BootDecision {
+    use BootDecision::{Start, Stay};
+
+    if circumstances.request == Some(BootRequest::Stay) {
+        return Stay(StayReason::Requested);
+    }
+    if circumstances.strap {
+        return Stay(StayReason::Strap);
+    }
+    let (number, trial) = match circumstances.request {
+        // A request is new: whoever makes it knows of the crashes before.
+        Some(BootRequest::Trial(number)) => (number, true),
+        Some(BootRequest::Start(number)) => (number, false),
+        Some(BootRequest::Stay) | None => {
+            if circumstances.crash_resets >= policy.max_crash_resets {
+                return Stay(StayReason::CrashLoop);
+            }
+            match policy.autostart {
+                Some(number) => (number, false),
+                None => return Stay(StayReason::NoAutostart),
+            }
+        }
+    };
+    if !policy.node_ids.contains(&circumstances.node_id) {
+        return Stay(StayReason::NodeId);
+    }
+    match verify(number) {
+        Err(invalid) => Stay(StayReason::Program(invalid)),
+        Ok(program) if !program.signed() && !trial => Stay(StayReason::Unsigned),
+        Ok(program) => Start { trial: trial && !program.signed(), program },
+    }
+}

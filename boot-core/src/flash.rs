@@ -1,0 +1,134 @@
+//! The seam to the flash: what the engine asks of it, and nothing of how it is done.
+
+use core::task::Poll;
+
+use shared_abi::geometry::Sector;
+
+/// Why a flash operation failed, as the controller tells it (RM0090 section 3.8.4, `FLASH_SR`).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FlashError {
+    /// The range is write-protected by option bytes.
+    Protected,
+    /// The operation was refused or failed: sequence, alignment, width or supply.
+    Failed,
+    /// The word reads back differently from what was programmed.
+    Verify,
+}
+
+/// A flash that erases by sectors and programs by words, one operation at a time and without waiting for it.
+///
+/// `read` and the starts may only be called while no operation runs: the engine of this crate sees to it, because on the
+/// F4 a read from busy flash stalls the core.
+pub trait Flash {
+    /// Copies `buffer.len()` bytes from `address` on. Addresses outside the flash read FFh.
+    fn read(&self, address: u32, buffer: &mut [u8]);
+
+    /// Starts to erase one sector.
+    ///
+    /// # Errors
+    /// What the controller says at once; later faults come from [`Flash::poll`].
+    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashError>;
+
+    /// Starts to program one word at a word-aligned address.
+    ///
+    /// # Errors
+    /// What the controller says at once; later faults come from [`Flash::poll`].
+    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashError>;
+
+    /// The outcome of the running operation, `Ready(Ok(()))` when none runs.
+    fn poll(&mut self) -> Poll<Result<(), FlashError>>;
+
+    /// The word at a word-aligned address.
+    fn read_word(&self, address: u32) -> u32 {
+        let mut bytes = [0; 4];
+        self.read(address, &mut bytes);
+        u32::from_le_bytes(bytes)
+    }
+}
+
+/// What an erased word reads as.
+pub const ERASED: u32 = u32::MAX;
+
+/// A row of words being programmed one after the other, each read back.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct WordWriter {
+    address: u32,
+    written: usize,
+    running: bool,
+}
+
+impl WordWriter {
+    pub(crate) const fn new(address: u32) -> Self {
+        Self { address, written: 0, running: false }
+    }
+
+    /// Carries on. `word(i)` gives the i-th of `count` words. `Pending` while the flash works.
+    pub(crate) fn poll<F: Flash>(
+        &mut self,
+        flash: &mut F,
+        count: usize,
+        word: impl Fn(usize) -> u32,
+    ) -> Poll<Result<(), FlashError>> {
+        loop {
+            match flash.poll() {
+                Poll::Pending => return Poll::Pending,
+                Poll::Ready(Err(error)) => return Poll::Ready(Err(error)),
+                Poll::Ready(Ok(())) => {}
+            }
+            let address = self.address + 4 * self.written as u32;
+            if self.running {
+                self.running = false;
+                if flash.read_word(address) != word(self.written) {
+                    return Poll::Ready(Err(FlashError::Verify));
+                }
+                self.written += 1;
+            } else if self.written == count {
+                return Poll::Ready(Ok(()));
+            } else {
+                if let Err(error) = flash.start_program(address, word(self.written)) {
+                    return Poll::Ready(Err(error));
+                }
+                self.running = true;
+            }
+        }
+    }
+}
+
+/// A row of whole sectors being erased one after the other.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct SectorEraser {
+    next: u32,
+    end: u32,
+}
+
+impl SectorEraser {
+    pub(crate) const fn new(region: shared_abi::geometry::Region) -> Self {
+        Self { next: region.base, end: region.end() }
+    }
+
+    /// Carries on. `Pending` while the flash works.
+    pub(crate) fn poll<F: Flash>(
+        &mut self,
+        flash: &mut F,
+        chip: &shared_abi::geometry::Geometry,
+    ) -> Poll<Result<(), FlashError>> {
+        loop {
+            match flash.poll() {
+                Poll::Pending => return Poll::Pending,
+                Poll::Ready(Err(error)) => return Poll::Ready(Err(error)),
+                Poll::Ready(Ok(())) => {}
+            }
+            if self.next >= self.end {
+                return Poll::Ready(Ok(()));
+            }
+            // A checked layout ends at sector borders; a region outside the flash is refused, not looped over.
+            let Some(sector) = chip.sector_at(self.next) else {
+                return Poll::Ready(Err(FlashError::Failed));
+            };
+            self.next = sector.region.end();
+            if let Err(error) = flash.start_erase(sector) {
+                return Poll::Ready(Err(error));
+            }
+        }
+    }
+}

@@ -1,0 +1,283 @@
+//! Non-volatile parameters: a journal over two flash regions that survives a power cut at every operation.
+//!
+//! A region holds slots of six words. Slot 0 is the header; every other slot is one [`Record`], written once. The
+//! latest sound record of a key is its value. When the region is full, the living records are copied to the other
+//! region, whose header is written **last**: until then the old region is the valid one, afterwards the new one is,
+//! and a cut leaves one of the two whole. Each slot carries a CRC, so a torn one reads as absent.
+
+use core::task::Poll;
+
+use shared_abi::geometry::{Geometry, Region};
+
+use crate::crc32;
+use crate::flash::{Flash, FlashError, SectorEraser, WordWriter, ERASED};
+
+const SLOT_WORDS: usize = 6;
+const SLOT_SIZE: u32 = SLOT_WORDS as u32 * 4;
+type Slot = [u32; SLOT_WORDS];
+const BLANK: Slot = [ERASED; SLOT_WORDS];
+
+/// Tells a region's header ("CBNV" read as little-endian bytes).
+const HEADER_MAGIC: u32 = u32::from_le_bytes(*b"CBNV");
+/// Version of the journal's format.
+const FORMAT: u32 = 1;
+/// How often a record that does not read back is tried in a further slot.
+const ATTEMPTS: u8 = 8;
+
+/// What a record is about.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Key {
+    /// Size, CRC and signature of a program (1 to 254).
+    Program(u8),
+    /// How often in a row the watchdog had to reset a running application.
+    CrashCount,
+}
+
+impl Key {
+    /// The first word of the key's records. FFFFFFFFh (erased) and [`HEADER_MAGIC`] are no tags.
+    const fn tag(self) -> u32 {
+        match self {
+            Self::Program(number) => 0x0001_0000 | number as u32,
+            Self::CrashCount => 0x0002_0000,
+        }
+    }
+}
+
+/// The words of a value; what they mean is the key's.
+pub type Value = [u32; 4];
+
+/// Why a value could not be stored. 1F57h says NVDATA.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StoreError {
+    /// The flash refused or failed.
+    Flash(FlashError),
+    /// No slot took the record: the region is worn out.
+    WornOut,
+}
+
+/// The journal. Holds where to read and write; the values stay in flash.
+#[derive(Debug)]
+pub struct Journal {
+    regions: [Region; 2],
+    active: Option<Active>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Active {
+    region: usize,
+    sequence: u32,
+    /// The first slot behind the last one that is not blank.
+    free: u32,
+}
+
+impl Journal {
+    /// Finds the valid region and its end.
+    pub fn open<F: Flash>(flash: &F, regions: [Region; 2]) -> Self {
+        let header = |region: usize| {
+            let slot = read_slot(flash, &regions[region], 0);
+            let sequence = slot[1];
+            (slot == header_slot(sequence)).then_some((region, sequence))
+        };
+        let newest = match (header(0), header(1)) {
+            (Some(a), Some(b)) => Some(if b.1.wrapping_sub(a.1) as i32 > 0 { b } else { a }),
+            (a, b) => a.or(b),
+        };
+        let active = newest.map(|(region, sequence)| {
+            let mut free = slots(&regions[region]);
+            while free > 1 && read_slot(flash, &regions[region], free - 1) == BLANK {
+                free -= 1;
+            }
+            Active { region, sequence, free }
+        });
+        Self { regions, active }
+    }
+
+    /// The value of a key, `None` where it was never stored.
+    pub fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value> {
+        let active = self.active?;
+        let region = &self.regions[active.region];
+        (1..active.free).rev().find_map(|slot| {
+            let slot = tagged_slot(flash, region, slot, key.tag())?;
+            let [_, a, b, c, d, _] = slot;
+            Some([a, b, c, d])
+        })
+    }
+
+    /// Starts to store a value; [`Store::poll`] carries it through.
+    #[must_use]
+    pub fn store(&self, key: Key, value: Value) -> Store {
+        let record = record_slot(key.tag(), value);
+        let state = match self.active {
+            Some(active) if active.free < slots(&self.regions[active.region]) => {
+                let address = slot_address(&self.regions[active.region], active.free);
+                State::Append { writer: WordWriter::new(address) }
+            }
+            active => {
+                let target = active.map_or(0, |active| 1 - active.region);
+                State::Erase { eraser: SectorEraser::new(self.regions[target]) }
+            }
+        };
+        Store { record, attempts: 0, state }
+    }
+}
+
+/// A value on its way into the journal.
+#[derive(Debug)]
+pub struct Store {
+    record: Slot,
+    attempts: u8,
+    state: State,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum State {
+    /// Into the first free slot of the active region.
+    Append { writer: WordWriter },
+    /// Make the other region blank.
+    Erase { eraser: SectorEraser },
+    /// Look for the next living record of the old region, from slot `from` on; `to` is the next slot of the new one.
+    Collect { from: u32, to: u32 },
+    /// Copy one living record.
+    Copy { from: u32, to: u32, slot: Slot, writer: WordWriter },
+    /// The new record itself.
+    Add { to: u32, writer: WordWriter },
+    /// The header, which makes the new region the valid one.
+    Commit { to: u32, sequence: u32, writer: WordWriter },
+}
+
+impl Store {
+    /// Carries on; `Pending` while the flash works. Call again until ready.
+    pub fn poll<F: Flash>(
+        &mut self,
+        journal: &mut Journal,
+        flash: &mut F,
+        chip: &Geometry,
+    ) -> Poll<Result<(), StoreError>> {
+        loop {
+            let target = journal.active.map_or(0, |active| 1 - active.region);
+            let new = journal.regions[target];
+            self.state = match &mut self.state {
+                State::Append { writer } => {
+                    let Poll::Ready(outcome) = write(writer, flash, &self.record) else {
+                        return Poll::Pending;
+                    };
+                    // `store` starts here only with an active region, and nothing takes it away.
+                    let Some(active) = &mut journal.active else {
+                        return Poll::Ready(Err(StoreError::WornOut));
+                    };
+                    active.free += 1;
+                    match outcome {
+                        Ok(()) => return Poll::Ready(Ok(())),
+                        // Left half-charged by a power cut, or worn: leave the slot, take the next.
+                        Err(FlashError::Verify) if self.attempts < ATTEMPTS => {
+                            self.attempts += 1;
+                            let region = &journal.regions[active.region];
+                            if active.free < slots(region) {
+                                State::Append { writer: WordWriter::new(slot_address(region, active.free)) }
+                            } else {
+                                State::Erase { eraser: SectorEraser::new(new) }
+                            }
+                        }
+                        Err(FlashError::Verify) => return Poll::Ready(Err(StoreError::WornOut)),
+                        Err(error) => return Poll::Ready(Err(StoreError::Flash(error))),
+                    }
+                }
+                State::Erase { eraser } => match eraser.poll(flash, chip) {
+                    Poll::Pending => return Poll::Pending,
+                    Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
+                    Poll::Ready(Ok(())) => State::Collect { from: 1, to: 1 },
+                },
+                State::Collect { from, to } => {
+                    let (from, to) = (*from, *to);
+                    match journal.active {
+                        Some(active) if from < active.free => {
+                            let old = &journal.regions[active.region];
+                            match living_slot(flash, old, from, active.free, self.record[0]) {
+                                Some(slot) => {
+                                    let writer = WordWriter::new(slot_address(&new, to));
+                                    State::Copy { from, to, slot, writer }
+                                }
+                                None => State::Collect { from: from + 1, to },
+                            }
+                        }
+                        _ => State::Add { to, writer: WordWriter::new(slot_address(&new, to)) },
+                    }
+                }
+                State::Copy { from, to, slot, writer } => match write(writer, flash, slot) {
+                    Poll::Pending => return Poll::Pending,
+                    Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
+                    Poll::Ready(Ok(())) => State::Collect { from: *from + 1, to: *to + 1 },
+                },
+                State::Add { to, writer } => match write(writer, flash, &self.record) {
+                    Poll::Pending => return Poll::Pending,
+                    Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
+                    Poll::Ready(Ok(())) => {
+                        let sequence = journal.active.map_or(1, |active| active.sequence.wrapping_add(1));
+                        State::Commit { to: *to + 1, sequence, writer: WordWriter::new(slot_address(&new, 0)) }
+                    }
+                },
+                State::Commit { to, sequence, writer } => {
+                    match write(writer, flash, &header_slot(*sequence)) {
+                        Poll::Pending => return Poll::Pending,
+                        Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
+                        Poll::Ready(Ok(())) => {
+                            journal.active = Some(Active { region: target, sequence: *sequence, free: *to });
+                            return Poll::Ready(Ok(()));
+                        }
+                    }
+                }
+            };
+        }
+    }
+}
+
+fn write<F: Flash>(writer: &mut WordWriter, flash: &mut F, slot: &Slot) -> Poll<Result<(), FlashError>> {
+    writer.poll(flash, SLOT_WORDS, |i| slot[i])
+}
+
+const fn slots(region: &Region) -> u32 {
+    region.size / SLOT_SIZE
+}
+
+const fn slot_address(region: &Region, slot: u32) -> u32 {
+    region.base + slot * SLOT_SIZE
+}
+
+fn read_slot<F: Flash>(flash: &F, region: &Region, slot: u32) -> Slot {
+    let mut bytes = [0; SLOT_SIZE as usize];
+    flash.read(slot_address(region, slot), &mut bytes);
+    let mut words = BLANK;
+    for (word, chunk) in words.iter_mut().zip(bytes.chunks_exact(4)) {
+        *word = u32::from_le_bytes([chunk[0], chunk[1], chunk[2], chunk[3]]);
+    }
+    words
+}
+
+/// The slot, if it is a sound record of this tag.
+fn tagged_slot<F: Flash>(flash: &F, region: &Region, slot: u32, tag: u32) -> Option<Slot> {
+    let found = read_slot(flash, region, slot);
+    let [found_tag, a, b, c, d, _] = found;
+    (found_tag == tag && found == record_slot(tag, [a, b, c, d])).then_some(found)
+}
+
+/// The slot, if it is the latest sound record of its tag and not about to be replaced.
+fn living_slot<F: Flash>(flash: &F, region: &Region, slot: u32, free: u32, replaced: u32) -> Option<Slot> {
+    let [tag, ..] = read_slot(flash, region, slot);
+    let record = tagged_slot(flash, region, slot, tag)?;
+    let superseded =
+        tag == replaced || (slot + 1..free).any(|later| tagged_slot(flash, region, later, tag).is_some());
+    (!superseded).then_some(record)
+}
+
+fn record_slot(tag: u32, [a, b, c, d]: Value) -> Slot {
+    let words = [tag, a, b, c, d];
+    let mut bytes = [0; 20];
+    for (chunk, word) in bytes.chunks_exact_mut(4).zip(words) {
+        chunk.copy_from_slice(&word.to_le_bytes());
+    }
+    [tag, a, b, c, d, crc32(&bytes)]
+}
+
+fn header_slot(sequence: u32) -> Slot {
+    record_slot(HEADER_MAGIC, [sequence, !sequence, FORMAT, ERASED])
+}

@@ -1,0 +1,118 @@
+//! The boot stage: from the reset to the jump into a program, or to the bootloader's own `init`.
+//!
+//! It runs before `.bss` is cleared and before any peripheral but the reset flags, the warm-start cell, the flash
+//! controller and the entry strap was touched. It therefore uses the stack and constants alone.
+
+use core::arch::global_asm;
+use core::ops::RangeInclusive;
+
+use boot_core::decision::{decide, BootDecision, Circumstances, Policy};
+use boot_core::parameters::{Journal, Key};
+use boot_core::program::verify;
+use bsp::{pac, BIT_RATE, LAYOUT, NODE_ID};
+use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
+use shared_abi::warm_start::{BootRequest, Cell};
+
+use crate::flash::FlashController;
+use crate::VERSION;
+
+/// What this product does after a reset.
+const POLICY: Policy = Policy { autostart: Some(1), max_crash_resets: 3, node_ids: NODE_IDS };
+/// Node-IDs with which programs may be started.
+const NODE_IDS: RangeInclusive<u8> = 1..=127;
+
+// Reset calls `__pre_init` first of all, from flash. It switches the FPU on (the compiler may use its registers to move
+// data) and copies code and constants to RAM, as Reset will do once more; then the Rust below can run.
+global_asm!(
+    ".section .boot, \"ax\"",
+    ".global __pre_init",
+    ".type __pre_init,%function",
+    ".thumb_func",
+    "__pre_init:",
+    "push {{r4, lr}}",
+    "ldr r0, =0xE000ED88", // CPACR (ARMv7-M B3.2.20)
+    "ldr r1, [r0]",
+    "orr r1, r1, #0xF00000",
+    "str r1, [r0]",
+    "dsb",
+    "ldr r0, =__sdata",
+    "ldr r1, =__edata",
+    "ldr r2, =__sidata",
+    "0:",
+    "cmp r0, r1",
+    "beq 1f",
+    "ldm r2!, {{r3}}",
+    "stm r0!, {{r3}}",
+    "b 0b",
+    "1:",
+    "dsb",
+    "isb",
+    "ldr r0, ={stage}",
+    "blx r0",
+    "pop {{r4, pc}}",
+    ".ltorg",
+    stage = sym stage,
+);
+
+/// Decides, and does not come back if a program is to run.
+extern "C" fn stage() {
+    // SAFETY: nothing else runs yet; `init` takes the peripherals after this has returned and dropped its own.
+    let peripherals = unsafe { pac::Peripherals::steal() };
+    let rcc = peripherals.RCC;
+
+    let reset_cause = ResetCause::from_rcc_csr(rcc.csr().read().bits());
+    rcc.csr().modify(|_, w| w.rmvf().set_bit());
+
+    let request = warm_start_cell().take();
+    let strap = bsp::entry_strap(&rcc, &peripherals.GPIOA);
+
+    let mut flash = FlashController::new(peripherals.FLASH, LAYOUT.chip.flash);
+    let mut journal = Journal::open(&flash, LAYOUT.parameters);
+    let crash_resets = count_crash_resets(&mut journal, &mut flash, reset_cause, request);
+
+    let circumstances = Circumstances { request, strap, crash_resets, node_id: NODE_ID };
+    match decide(&circumstances, &POLICY, |number| verify(&flash, &journal, LAYOUT, number)) {
+        BootDecision::Stay(_) => {}
+        BootDecision::Start { program, trial } => {
+            let handoff = Handoff::new(&BootInfo {
+                node_id: NODE_ID,
+                bit_rate: BIT_RATE,
+                program: program.number(),
+                reset_cause,
+                trial,
+                bootloader_version: VERSION,
+                serial_number: bsp::serial_number(),
+            });
+            // SAFETY: the layout's handoff region, checked to be RAM of that size in no image. No interrupt was enabled
+            // and no bus master started since the reset.
+            unsafe {
+                handoff.write(LAYOUT.handoff.base as *mut Handoff);
+                program.vectors().jump()
+            }
+        }
+    }
+}
+
+/// The warm-start cell of this board.
+pub fn warm_start_cell() -> Cell {
+    // SAFETY: the layout's warm-start region, checked to be RAM of that size that the linker keeps out of every image.
+    unsafe { Cell::at(LAYOUT.warm_start.base as *mut _) }
+}
+
+/// Keeps the number of watchdog resets in a row. A request of somebody ends the row: it is a new beginning.
+fn count_crash_resets(
+    journal: &mut Journal,
+    flash: &mut FlashController,
+    reset_cause: ResetCause,
+    request: Option<BootRequest>,
+) -> u32 {
+    let crashed = matches!(reset_cause, ResetCause::IndependentWatchdog | ResetCause::WindowWatchdog);
+    let before = journal.get(flash, Key::CrashCount).map_or(0, |[count, ..]| count);
+    let now = if crashed && request.is_none() { before.saturating_add(1) } else { 0 };
+    if now != before {
+        let mut store = journal.store(Key::CrashCount, [now, 0, 0, 0]);
+        // Nothing else runs that could be kept waiting. A store that fails costs the count, not the start.
+        while store.poll(journal, flash, LAYOUT.chip).is_pending() {}
+    }
+    now
+}

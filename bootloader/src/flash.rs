@@ -1,0 +1,123 @@
+//! The flash controller (RM0090 section 3), at the level of its registers.
+//!
+//! The HAL's driver does not fit: it erases in units of 128 KiB, programs by bytes and leaves error flags standing.
+
+use core::task::Poll;
+
+use boot_core::flash::{Flash, FlashError};
+use bsp::pac;
+use shared_abi::geometry::{Region, Sector};
+
+/// Section 3.6.1: the two words that open the control register.
+const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
+/// `PSIZE` for words: the supply is 2.7 V or more (table 10).
+const WORDS: u8 = 0b10;
+
+/// The controller and the flash that it guards. The control register is locked whenever no operation runs.
+pub struct FlashController {
+    registers: pac::FLASH,
+    flash: Region,
+    running: bool,
+}
+
+impl FlashController {
+    /// Takes the controller.
+    ///
+    /// Its caches go off: they would show words as they were before they were programmed (section 3.5.4), and a
+    /// bootloader that runs from RAM gains nothing by them.
+    pub fn new(registers: pac::FLASH, flash: Region) -> Self {
+        registers.acr().modify(|_, w| w.dcen().clear_bit().icen().clear_bit().prften().clear_bit());
+        registers.acr().modify(|_, w| w.dcrst().set_bit().icrst().set_bit());
+        registers.acr().modify(|_, w| w.dcrst().clear_bit().icrst().clear_bit());
+        Self { registers, flash, running: false }
+    }
+
+    fn unlock(&mut self) {
+        // What an earlier operation left behind would be taken for the outcome of this one.
+        self.clear_flags();
+        if self.registers.cr().read().lock().bit_is_set() {
+            for key in KEYS {
+                // SAFETY: any word may be written to KEYR; these two unlock the control register.
+                self.registers.keyr().write(|w| unsafe { w.bits(key) });
+            }
+        }
+    }
+
+    fn clear_flags(&mut self) {
+        let flags = self.registers.sr().read().bits();
+        // SAFETY: the flags of SR are cleared by writing them back.
+        self.registers.sr().write(|w| unsafe { w.bits(flags) });
+    }
+
+    fn lock(&mut self) {
+        self.registers.cr().write(|w| w.lock().set_bit());
+    }
+}
+
+impl Flash for FlashController {
+    fn read(&self, address: u32, buffer: &mut [u8]) {
+        for (byte, address) in buffer.iter_mut().zip(address..) {
+            *byte = if self.flash.contains(address, 1) {
+                // SAFETY: the address is inside the memory-mapped flash, which is always readable; volatile, because
+                // the controller changes it behind the compiler's back.
+                unsafe { (address as *const u8).read_volatile() }
+            } else {
+                u8::MAX
+            };
+        }
+    }
+
+    fn read_word(&self, address: u32) -> u32 {
+        if self.flash.contains(address, 4) && address.is_multiple_of(4) {
+            // SAFETY: as above, and aligned.
+            unsafe { (address as *const u32).read_volatile() }
+        } else {
+            u32::MAX
+        }
+    }
+
+    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashError> {
+        self.unlock();
+        self.registers.cr().write(|w| {
+            // SAFETY: the geometry's sector numbers are those that SNB takes (section 3.8.5).
+            unsafe { w.snb().bits(sector.number) };
+            w.ser().set_bit().psize().set(WORDS).eopie().set_bit().errie().set_bit().strt().set_bit()
+        });
+        self.running = true;
+        Ok(())
+    }
+
+    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashError> {
+        if !self.flash.contains(address, 4) || !address.is_multiple_of(4) {
+            return Err(FlashError::Failed);
+        }
+        self.unlock();
+        self.registers
+            .cr()
+            .write(|w| w.pg().set_bit().psize().set(WORDS).eopie().set_bit().errie().set_bit());
+        // SAFETY: the address was checked to be a word of the flash; with PG set, the store starts the operation.
+        unsafe { (address as *mut u32).write_volatile(word) };
+        self.running = true;
+        Ok(())
+    }
+
+    fn poll(&mut self) -> Poll<Result<(), FlashError>> {
+        if !self.running {
+            return Poll::Ready(Ok(()));
+        }
+        let status = self.registers.sr().read();
+        if status.bsy().bit_is_set() {
+            return Poll::Pending;
+        }
+        self.running = false;
+        self.clear_flags();
+        self.lock();
+        Poll::Ready(if status.wrperr().bit_is_set() {
+            Err(FlashError::Protected)
+        } else if status.pgaerr().bit_is_set() || status.pgperr().bit_is_set() || status.pgserr().bit_is_set() {
+            Err(FlashError::Failed)
+        } else {
+            Ok(())
+        })
+    }
+}

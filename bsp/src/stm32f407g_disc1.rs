@@ -1,0 +1,82 @@
+//! STM32F407G-DISC1 with a CAN transceiver on PD0 and PD1.
+
+use shared_abi::layout::{self, Layout};
+use stm32f4xx_hal::can::{Can, CanExt};
+use stm32f4xx_hal::gpio::{GpioExt, Output, Pin};
+use stm32f4xx_hal::pac;
+use stm32f4xx_hal::prelude::*;
+use stm32f4xx_hal::rcc::{Config, RccExt};
+
+use crate::Identity;
+
+/// Who owns which address on this board.
+pub const LAYOUT: &Layout = &layout::stm32f407g_disc1::LAYOUT;
+
+/// What the device says of itself.
+pub const IDENTITY: Identity = Identity {
+    vendor_id: 0,
+    product_code: 0x4007_D151,
+    revision: 0x0001_0000,
+    device_name: "coboot STM32F407G-DISC1",
+    hardware_version: "MB997",
+};
+
+/// Node-ID of a device that was never told another one.
+pub const NODE_ID: u8 = 1;
+
+/// Bit rate of a device that was never told another one, in bit/s.
+pub const BIT_RATE: u32 = 125_000;
+
+/// Crystal on OSC_IN and OSC_OUT, in Hz.
+const HSE: u32 = 8_000_000;
+/// The core's clock, in Hz: the fastest that the chip allows at 3.3 V (datasheet DS8626, table 14).
+pub const SYSCLK: u32 = 168_000_000;
+/// Clock of the bus that CAN1 sits on, in Hz; the chip's limit is 42 MHz.
+const PCLK1: u32 = 42_000_000;
+
+/// The CAN controller that coboot talks through.
+pub type CanController = Can<pac::CAN1>;
+/// The LED that shows life: LD4, green, high is on.
+pub type Led = Pin<'D', 12, Output>;
+
+/// The board's parts, set up.
+pub struct Board {
+    /// The CAN controller with its pins; clocked, not yet configured.
+    pub can: CanController,
+    /// Clock of the CAN controller in Hz, for the bit timing.
+    pub can_clock: u32,
+    /// The LED.
+    pub led: Led,
+}
+
+/// Sets the clocks and pins up, from the state after a reset.
+#[must_use]
+pub fn init(rcc: pac::RCC, can1: pac::CAN1, gpiod: pac::GPIOD) -> Board {
+    let clocks = Config::hse(HSE.Hz()).sysclk(SYSCLK.Hz()).pclk1(PCLK1.Hz());
+    let mut rcc = rcc.freeze(clocks);
+    let gpiod = gpiod.split(&mut rcc);
+    let led = gpiod.pd12.into_push_pull_output();
+    let can = can1.can((gpiod.pd1, gpiod.pd0), &mut rcc);
+    Board { can, can_clock: rcc.clocks.pclk1().raw(), led }
+}
+
+/// Whether the entry strap asks for the bootloader: the blue button B1 on PA0, high when pressed.
+///
+/// Leaves port A as after a reset.
+#[must_use]
+pub fn entry_strap(rcc: &pac::RCC, gpioa: &pac::GPIOA) -> bool {
+    rcc.ahb1enr().modify(|_, w| w.gpioaen().enabled());
+    // The clock needs two cycles before the first access (RM0090 section 7.3.10): reading back waits that long.
+    let _ = rcc.ahb1enr().read();
+    let pressed = gpioa.idr().read().idr0().is_high();
+    rcc.ahb1enr().modify(|_, w| w.gpioaen().disabled());
+    pressed
+}
+
+/// The interrupts in use, under the names that say what they are for.
+pub mod interrupt {
+    /// A frame arrived in receive FIFO 0.
+    pub use super::pac::Interrupt::CAN1_RX0 as CAN_RX;
+    /// A transmit mailbox became free.
+    pub use super::pac::Interrupt::CAN1_TX as CAN_TX;
+}
