@@ -1,0 +1,187 @@
+//! A strict flash: it does what the F4's does, refuses what the F4 would silently spoil, and loses power on demand.
+#![allow(dead_code)]
+
+use std::panic::panic_any;
+use std::task::Poll;
+
+use boot_core::flash::{Flash, FlashError};
+use shared_abi::geometry::{Geometry, Region, Sector};
+
+/// Thrown by the flash when the power goes. Catch it, then [`ModelFlash::power_on`].
+pub struct PowerCut;
+
+/// What the running operation has done when the power goes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Cut {
+    /// Nothing.
+    Before,
+    /// A part: some bits of the word, a part of the sector.
+    Torn(u64),
+    /// All, but nobody has seen it.
+    After,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Operation {
+    Erase(Region),
+    Program { address: u32, word: u32 },
+}
+
+pub struct ModelFlash {
+    chip: &'static Geometry,
+    cells: Vec<u8>,
+    running: Option<Operation>,
+    /// Polls until the running operation ends.
+    polls_left: u32,
+    /// Operations begun since the last `power_on`.
+    pub operations: u32,
+    /// Lose the power in the operation of this number.
+    pub cut: Option<(u32, Cut)>,
+    /// Fail the operation of this number with this error.
+    pub fail: Option<(u32, FlashError)>,
+    /// Every region that was written to or erased.
+    pub touched: Vec<Region>,
+}
+
+impl ModelFlash {
+    pub fn new(chip: &'static Geometry) -> Self {
+        Self {
+            chip,
+            cells: vec![0xFF; chip.flash.size as usize],
+            running: None,
+            polls_left: 0,
+            operations: 0,
+            cut: None,
+            fail: None,
+            touched: Vec::new(),
+        }
+    }
+
+    pub fn power_on(&mut self) {
+        self.running = None;
+        self.operations = 0;
+        self.cut = None;
+    }
+
+    fn index(&self, address: u32) -> usize {
+        (address - self.chip.flash.base) as usize
+    }
+
+    /// Direct access, as by a debug probe.
+    pub fn cells(&self, region: Region) -> &[u8] {
+        let at = self.index(region.base);
+        &self.cells[at..at + region.size as usize]
+    }
+
+    /// Direct access, as by a debug probe.
+    pub fn poke(&mut self, address: u32, bytes: &[u8]) {
+        let at = self.index(address);
+        self.cells[at..at + bytes.len()].copy_from_slice(bytes);
+    }
+
+    fn begin(&mut self, operation: Operation) -> Result<(), FlashError> {
+        assert!(self.running.is_none(), "an operation was started while another one runs");
+        self.operations += 1;
+        let region = match operation {
+            Operation::Erase(region) => region,
+            Operation::Program { address, .. } => Region::new(address, 4),
+        };
+        self.touched.push(region);
+        self.running = Some(operation);
+        self.polls_left = 2;
+        if let Some((number, cut)) = self.cut {
+            if number == self.operations {
+                match cut {
+                    Cut::Before => {}
+                    Cut::After => self.complete(operation, u64::MAX, true),
+                    Cut::Torn(seed) => self.complete(operation, seed, false),
+                }
+                panic_any(PowerCut);
+            }
+        }
+        Ok(())
+    }
+
+    /// Does the operation, or the part of it that the bits of `seed` select.
+    fn complete(&mut self, operation: Operation, seed: u64, whole: bool) {
+        // splitmix64: a different pattern for every operation.
+        let mut state = seed.wrapping_add(u64::from(self.operations));
+        let mut random = move || {
+            state = state.wrapping_add(0x9E37_79B9_7F4A_7C15);
+            let z = (state ^ state >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+            let z = (z ^ z >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
+            z ^ z >> 31
+        };
+        match operation {
+            Operation::Erase(region) => {
+                let at = self.index(region.base);
+                for cell in &mut self.cells[at..at + region.size as usize] {
+                    *cell |= if whole { 0xFF } else { random() as u8 };
+                }
+            }
+            Operation::Program { address, word } => {
+                let at = self.index(address);
+                for (cell, byte) in self.cells[at..at + 4].iter_mut().zip(word.to_le_bytes()) {
+                    *cell &= byte | if whole { 0 } else { random() as u8 };
+                }
+            }
+        }
+    }
+}
+
+impl Flash for ModelFlash {
+    fn read(&self, address: u32, buffer: &mut [u8]) {
+        assert!(self.running.is_none(), "flash was read while it is busy: on the chip the core stalls");
+        for (i, byte) in buffer.iter_mut().enumerate() {
+            let address = address.wrapping_add(i as u32);
+            let inside = self.chip.flash.contains(address, 1);
+            *byte = if inside { self.cells[self.index(address)] } else { 0xFF };
+        }
+    }
+
+    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashError> {
+        assert_eq!(self.chip.sector(sector.number), Some(sector), "no such sector");
+        self.begin(Operation::Erase(sector.region))
+    }
+
+    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashError> {
+        assert!(self.chip.flash.contains(address, 4) && address % 4 == 0, "{address:#x}");
+        self.begin(Operation::Program { address, word })
+    }
+
+    fn poll(&mut self) -> Poll<Result<(), FlashError>> {
+        let Some(operation) = self.running else { return Poll::Ready(Ok(())) };
+        if self.polls_left > 0 {
+            self.polls_left -= 1;
+            return Poll::Pending;
+        }
+        self.running = None;
+        if let Some((number, error)) = self.fail {
+            if number == self.operations {
+                return Poll::Ready(Err(error));
+            }
+        }
+        self.complete(operation, 0, true);
+        Poll::Ready(Ok(()))
+    }
+}
+
+/// Runs `scenario`; true if the power went in it.
+pub fn until_power_cut(scenario: impl FnOnce()) -> bool {
+    let outcome = std::panic::catch_unwind(std::panic::AssertUnwindSafe(scenario));
+    match outcome {
+        Ok(()) => false,
+        Err(cause) if cause.is::<PowerCut>() => true,
+        Err(cause) => std::panic::resume_unwind(cause),
+    }
+}
+
+/// Keeps the expected panics of [`until_power_cut`] out of the test's output.
+pub fn quiet_power_cuts() {
+    let default = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |info| {
+        if !info.payload().is::<PowerCut>() {
+            default(info);
+        }
+    }));
+}

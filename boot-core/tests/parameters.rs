@@ -1,0 +1,144 @@
+//! The journal: what was stored is read, whenever the power goes.
+
+mod model;
+
+use std::task::Poll;
+
+use boot_core::flash::FlashError;
+use boot_core::parameters::{Journal, Key, StoreError, Value};
+use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash};
+use shared_abi::geometry::{Geometry, Region, SectorRun};
+use shared_abi::layout::stm32f407g_disc1::LAYOUT;
+
+/// A chip with sectors so small that the journal is compacted every few records.
+const SMALL: Geometry = Geometry {
+    chip: "small",
+    flash: Region::new(0x0800_0000, 4 * 256),
+    sectors: &[SectorRun { count: 4, size: 256 }],
+    ..shared_abi::geometry::STM32F407VG
+};
+const REGIONS: [Region; 2] = [Region::new(0x0800_0100, 256), Region::new(0x0800_0200, 256)];
+
+fn store(flash: &mut ModelFlash, journal: &mut Journal, key: Key, value: Value) -> Result<(), StoreError> {
+    let mut store = journal.store(key, value);
+    for _ in 0..1_000_000 {
+        if let Poll::Ready(outcome) = store.poll(journal, flash, &SMALL) {
+            return outcome;
+        }
+    }
+    panic!("the store does not end");
+}
+
+#[test]
+fn values_survive_a_restart_and_any_number_of_compactions() {
+    let mut flash = ModelFlash::new(&SMALL);
+    let mut journal = Journal::open(&flash, REGIONS);
+    assert_eq!(journal.get(&flash, Key::CrashCount), None);
+    for i in 0..200 {
+        store(&mut flash, &mut journal, Key::Program(1 + (i % 3) as u8), [i, !i, i * 7, 0]).unwrap();
+        let reopened = Journal::open(&flash, REGIONS);
+        for age in 0..3.min(i + 1) {
+            let j = i - age;
+            for journal in [&journal, &reopened] {
+                let value = journal.get(&flash, Key::Program(1 + (j % 3) as u8));
+                assert_eq!(value, Some([j, !j, j * 7, 0]));
+            }
+        }
+    }
+    let outside = flash.touched.iter().find(|touched| !REGIONS.iter().any(|r| r.contains(touched.base, touched.size)));
+    assert_eq!(outside, None, "the journal wrote outside its regions");
+}
+
+/// Cuts the power at every operation of a long history, in every way, and once more in the recovery.
+#[test]
+fn after_any_cut_the_old_or_the_new_value_is_read_and_the_neighbour_is_untouched() {
+    quiet_power_cuts();
+    const STORES: u32 = 25;
+    let history = |flash: &mut ModelFlash, done: &mut u32| {
+        let mut journal = Journal::open(flash, REGIONS);
+        store(flash, &mut journal, Key::CrashCount, [0xC0FFEE, 0, 0, 0]).unwrap();
+        for i in 1..=STORES {
+            store(flash, &mut journal, Key::Program(1), [i, i, i, i]).unwrap();
+            *done = i;
+        }
+    };
+    let mut flash = ModelFlash::new(&SMALL);
+    let mut done = 0;
+    history(&mut flash, &mut done);
+    let operations = flash.operations;
+    assert!(operations > 200, "the history must contain compactions: {operations}");
+
+    let mut points = 0;
+    for operation in 1..=operations {
+        for cut in [Cut::Before, Cut::After, Cut::Torn(1), Cut::Torn(2), Cut::Torn(3)] {
+            let mut flash = ModelFlash::new(&SMALL);
+            flash.cut = Some((operation, cut));
+            let mut done = 0;
+            assert!(until_power_cut(|| history(&mut flash, &mut done)));
+            flash.power_on();
+            let at = format!("cut {cut:?} at operation {operation}, {done} stores done");
+
+            let check = |flash: &ModelFlash, newest: u32| {
+                let journal = Journal::open(flash, REGIONS);
+                let value = journal.get(flash, Key::Program(1));
+                let expected = [done, newest].map(|i| (i > 0).then_some([i; 4]));
+                assert!(expected.contains(&value), "{at}: {value:?}");
+                if done > 0 {
+                    assert_eq!(journal.get(flash, Key::CrashCount), Some([0xC0FFEE, 0, 0, 0]), "{at}");
+                }
+            };
+            check(&flash, done + 1);
+
+            // The next store, with a second cut in it.
+            for second in 1..=8 {
+                flash.cut = Some((second, cut));
+                let recovered = until_power_cut(|| {
+                    let mut journal = Journal::open(&flash, REGIONS);
+                    store(&mut flash, &mut journal, Key::Program(1), [done + 1; 4]).unwrap();
+                });
+                flash.power_on();
+                check(&flash, done + 1);
+                points += 1;
+                if !recovered {
+                    break;
+                }
+            }
+            let mut journal = Journal::open(&flash, REGIONS);
+            store(&mut flash, &mut journal, Key::Program(1), [777; 4]).unwrap();
+            let journal = Journal::open(&flash, REGIONS);
+            assert_eq!(journal.get(&flash, Key::Program(1)), Some([777; 4]), "{at}");
+        }
+    }
+    assert!(points > 1000, "{points}");
+}
+
+#[test]
+fn noise_in_both_regions_is_an_empty_journal() {
+    let mut flash = ModelFlash::new(&SMALL);
+    for (region, byte) in REGIONS.iter().zip([0x00, 0xA5]) {
+        flash.poke(region.base, &[byte; 256]);
+    }
+    let mut journal = Journal::open(&flash, REGIONS);
+    assert_eq!(journal.get(&flash, Key::Program(1)), None);
+    store(&mut flash, &mut journal, Key::Program(1), [5; 4]).unwrap();
+    assert_eq!(Journal::open(&flash, REGIONS).get(&flash, Key::Program(1)), Some([5; 4]));
+}
+
+#[test]
+fn errors_of_the_flash_are_told_and_the_old_value_stays() {
+    for operation in 1..=6 {
+        let mut flash = ModelFlash::new(&SMALL);
+        let mut journal = Journal::open(&flash, REGIONS);
+        store(&mut flash, &mut journal, Key::Program(1), [1; 4]).unwrap();
+        flash.fail = Some((flash.operations + operation, FlashError::Protected));
+        let outcome = store(&mut flash, &mut journal, Key::Program(1), [2; 4]);
+        assert_eq!(outcome, Err(StoreError::Flash(FlashError::Protected)));
+        assert_eq!(Journal::open(&flash, REGIONS).get(&flash, Key::Program(1)), Some([1; 4]));
+    }
+}
+
+#[test]
+fn the_real_regions_hold_hundreds_of_records_between_two_erases() {
+    let slots = LAYOUT.parameters[0].size / 24;
+    assert!(slots > 600, "{slots}");
+}
