@@ -1,2 +1,146 @@
-//! stub
-fn main() {}
+//! The jobs of the repository: `cargo xtask` lists them.
+//!
+//! One file per job. This crate depends on the standard library and on `shared-abi` alone, so that it
+//! compiles in seconds on a machine that has a Rust toolchain and nothing else; the jobs that need more
+//! call [`setup`] first.
+#![forbid(unsafe_code)]
+
+use std::process::ExitCode;
+
+mod args;
+mod arrows;
+mod build;
+mod demo;
+mod elf;
+mod emulate;
+mod json;
+mod layout;
+mod lint;
+mod process;
+mod setup;
+mod size;
+mod symbols;
+mod test;
+mod workspace;
+
+use args::Args;
+
+/// What a job gives back: nothing, or what went wrong and what to do about it, in words.
+type Outcome<T = ()> = Result<T, String>;
+
+/// One job.
+struct Job {
+    /// The word behind `cargo xtask`.
+    name: &'static str,
+    /// One line for the list.
+    about: &'static str,
+    /// The text of `cargo xtask NAME --help`.
+    help: &'static str,
+    /// Carries it out.
+    run: fn(Args) -> Outcome,
+}
+
+/// In the order in which a newcomer meets them.
+const JOBS: &[Job] = &[
+    Job {
+        name: "demo",
+        about: "the main job: flash, start, call back and flash again on an emulated board",
+        help: demo::HELP,
+        run: demo::run,
+    },
+    Job { name: "test", about: "every test, with one summary at the end", help: test::HELP, run: test::run },
+    Job {
+        name: "build",
+        about: "the firmware of a board: bootloader and both versions of the application",
+        help: build::HELP,
+        run: build::run,
+    },
+    Job {
+        name: "emulate",
+        about: "an emulated board for other programs to talk to",
+        help: emulate::HELP,
+        run: emulate::run,
+    },
+    Job {
+        name: "layout",
+        about: "the memory map of a board, or its linker fragment",
+        help: layout::HELP,
+        run: layout::run,
+    },
+    Job {
+        name: "size",
+        about: "the bootloader's flash against its budget",
+        help: size::HELP,
+        run: size::run,
+    },
+    Job {
+        name: "arrows",
+        about: "who depends on whom, against the rules of the house",
+        help: arrows::HELP,
+        run: arrows::run,
+    },
+    Job {
+        name: "lint",
+        about: "formatting and clippy, of host and firmware, warnings denied",
+        help: lint::HELP,
+        run: lint::run,
+    },
+    Job {
+        name: "setup",
+        about: "what the other jobs need on this machine, installed where missing",
+        help: setup::HELP,
+        run: setup::run,
+    },
+];
+
+fn main() -> ExitCode {
+    let mut words = std::env::args().skip(1);
+    let outcome = match words.next().as_deref() {
+        None | Some("help" | "--help" | "-h") => {
+            print!("{}", overview());
+            Ok(())
+        }
+        Some(name) => match JOBS.iter().find(|job| job.name == name) {
+            None => Err(format!("there is no job \"{name}\".\n\n{}", overview())),
+            Some(job) => {
+                let args = Args::new(words);
+                if args.asks_for_help() {
+                    print!("{}", job.help);
+                    Ok(())
+                } else {
+                    (job.run)(args)
+                }
+            }
+        },
+    };
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(problem) => {
+            eprintln!("\nxtask: {problem}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn overview() -> String {
+    let mut text =
+        String::from("usage: cargo xtask JOB [OPTIONS]    (cargo xtask JOB --help tells more)\n\n");
+    for job in JOBS {
+        text += &format!("  {:<9} {}\n", job.name, job.about);
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_job_has_a_help_text_that_starts_with_its_usage() {
+        for job in JOBS {
+            assert!(job.help.starts_with(&format!("usage: cargo xtask {}", job.name)), "{}", job.name);
+            assert!(job.help.ends_with('\n'), "{}", job.name);
+            assert!(overview().contains(job.about));
+        }
+    }
+}

@@ -1,0 +1,358 @@
+//! `cargo xtask arrows`: who may depend on whom.
+//!
+//! The house stands on a few independent walls. The emulator knows nothing of our drivers, so that a
+//! mistake in one does not cancel out in the other; the application knows nothing of `boot-core`, so
+//! that it can be replaced; the wire code knows nothing of us at all; and nothing that leaves the desk
+//! links the GPL-2.0 library under the emulator. This check reads the manifests as cargo does, and the
+//! emulator's sources.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::args::Args;
+use crate::json::Value;
+use crate::{process, workspace, Outcome};
+
+pub const HELP: &str = "\
+usage: cargo xtask arrows
+
+Checks the dependencies between the crates against the rules in xtask/src/arrows.rs, and that the
+emulator takes nothing but the geometry of the silicon from shared-abi.
+";
+
+/// What one of our crates may depend on, of ours. Dev- and build-dependencies are held to the same row.
+struct Rule {
+    name: &'static str,
+    may_use: &'static [&'static str],
+}
+
+/// The arrows. A new crate needs a row.
+const RULES: &[Rule] = &[
+    Rule { name: "shared-abi", may_use: &[] },
+    Rule { name: "canopen", may_use: &[] },
+    Rule { name: "boot-core", may_use: &["canopen", "shared-abi"] },
+    Rule { name: "bsp", may_use: &["shared-abi"] },
+    Rule { name: "bootloader", may_use: &["boot-core", "bsp", "shared-abi"] },
+    Rule { name: "app-template", may_use: &["canopen", "bsp", "shared-abi"] },
+    Rule { name: "coflash", may_use: &["canopen", "shared-abi"] },
+    Rule { name: "emulator", may_use: &["shared-abi"] },
+    Rule { name: "coboot-tests", may_use: &["boot-core", "canopen", "coflash", "emulator", "shared-abi"] },
+    Rule { name: "xtask", may_use: &["shared-abi"] },
+];
+
+/// Who may link the GPL-2.0 library.
+const MAY_LINK_UNICORN: &[&str] = &["emulator", "coboot-tests"];
+
+/// The one module of shared-abi that tells of the silicon and not of our choices.
+const GEOMETRY: &str = "geometry";
+
+pub fn run(args: Args) -> Outcome {
+    args.none_left()?;
+    let metadata = process::output(process::cargo("metadata").args(["--no-deps", "--format-version", "1"]))?;
+    let packages = packages(&Value::parse(&metadata)?)?;
+    let mut broken = broken_arrows(&packages);
+    let Some(emulator) = packages.iter().find(|package| package.name == "emulator") else {
+        return Err("the workspace has no crate \"emulator\".".into());
+    };
+    for path in sources(&emulator.folder)? {
+        let source = fs::read_to_string(&path)
+            .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&path)))?;
+        for (line, module) in foreign_modules(&source) {
+            broken.push(format!(
+                "{}:{line}: the emulator uses shared_abi::{module}; of shared-abi it may use `{GEOMETRY}` alone \
+                 (its knowledge comes from the reference manual)",
+                workspace::shown(&path)
+            ));
+        }
+    }
+    if broken.is_empty() {
+        println!("{} crates, and every arrow points where it may.", packages.len());
+        return Ok(());
+    }
+    for line in &broken {
+        println!("{line}");
+    }
+    Err(format!("{} arrows point where they must not; the rules stand in xtask/src/arrows.rs.", broken.len()))
+}
+
+/// A crate of the workspace.
+#[derive(Debug, PartialEq, Eq)]
+struct Package {
+    name: String,
+    folder: PathBuf,
+    /// Names of all dependencies by their real names, with their kind (`normal`, `dev`, `build`).
+    dependencies: Vec<(String, &'static str)>,
+}
+
+/// Reads what `cargo metadata --no-deps` printed.
+fn packages(metadata: &Value) -> Outcome<Vec<Package>> {
+    let package = |value: &Value| -> Option<Package> {
+        let mut dependencies = Vec::new();
+        for dependency in value.get("dependencies").items() {
+            let kind = match dependency.get("kind").text() {
+                None => "normal",
+                Some("dev") => "dev",
+                Some(_) => "build",
+            };
+            dependencies.push((dependency.get("name").text()?.to_owned(), kind));
+        }
+        let manifest = Path::new(value.get("manifest_path").text()?);
+        Some(Package {
+            name: value.get("name").text()?.to_owned(),
+            folder: manifest.parent()?.to_owned(),
+            dependencies,
+        })
+    };
+    let found: Option<Vec<_>> = metadata.get("packages").items().iter().map(package).collect();
+    found
+        .filter(|packages| !packages.is_empty())
+        .ok_or_else(|| "cargo metadata printed something unexpected.".into())
+}
+
+/// The arrows that no rule allows, in words.
+fn broken_arrows(packages: &[Package]) -> Vec<String> {
+    let rules: BTreeMap<_, _> = RULES.iter().map(|rule| (rule.name, rule.may_use)).collect();
+    let mut broken = Vec::new();
+    for package in packages {
+        let name = package.name.as_str();
+        let Some(may_use) = rules.get(name) else {
+            broken.push(format!("{name}: a crate without a rule; give it a row in xtask/src/arrows.rs"));
+            continue;
+        };
+        for (dependency, kind) in &package.dependencies {
+            let dependency = dependency.as_str();
+            let ours =
+                rules.contains_key(dependency) || packages.iter().any(|package| package.name == dependency);
+            // A crate names itself among its dev-dependencies to test with all its features.
+            let itself = dependency == name && *kind == "dev";
+            if ours && !itself && !may_use.contains(&dependency) {
+                broken.push(format!("{name} -> {dependency} ({kind}): not among its arrows ({may_use:?})"));
+            }
+            if dependency.starts_with("unicorn") && !MAY_LINK_UNICORN.contains(&name) {
+                broken.push(format!(
+                    "{name} -> {dependency} ({kind}): only {MAY_LINK_UNICORN:?} may link it, it is GPL-2.0"
+                ));
+            }
+            if name == "shared-abi" && *kind == "normal" {
+                broken.push(format!("{name} -> {dependency}: shared-abi has no dependencies"));
+            }
+        }
+    }
+    broken
+}
+
+/// All Rust sources below a crate's folder.
+fn sources(folder: &Path) -> Outcome<Vec<PathBuf>> {
+    let mut sources = Vec::new();
+    let mut folders = vec![folder.to_owned()];
+    while let Some(folder) = folders.pop() {
+        let entries = fs::read_dir(&folder)
+            .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&folder)))?;
+        for path in entries.flatten().map(|entry| entry.path()) {
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|extension| extension == "rs") {
+                sources.push(path);
+            }
+        }
+    }
+    sources.sort();
+    Ok(sources)
+}
+
+/// Uses of shared-abi other than `shared_abi::geometry`, with the number of their line. Of a group
+/// (`use shared_abi::{…}`) each foreign member; an alias of the crate as a whole counts as foreign.
+fn foreign_modules(source: &str) -> Vec<(usize, String)> {
+    let mut found = Vec::new();
+    // Comments are cut away (in place, so that line numbers hold): text may speak of anything.
+    let code: String = source
+        .split_inclusive('\n')
+        .map(|line| match line.find("//") {
+            Some(at) => format!("{}\n", &line[..at]),
+            None => line.to_owned(),
+        })
+        .collect();
+    for (at, krate) in code.match_indices("shared_abi") {
+        let part_of_a_word = |letter: char| letter.is_alphanumeric() || letter == '_';
+        let rest = &code[at + krate.len()..];
+        if code[..at].ends_with(part_of_a_word) || rest.starts_with(part_of_a_word) {
+            continue;
+        }
+        let line = code[..at].matches('\n').count() + 1;
+        let Some(path) = rest.trim_start().strip_prefix("::") else {
+            found.push((line, "(the crate under another name)".to_owned()));
+            continue;
+        };
+        let path = path.trim_start();
+        match path.strip_prefix('{') {
+            None => found.extend(foreign(path).map(|module| (line, module))),
+            Some(group) => found.extend(members(group).filter_map(foreign).map(|module| (line, module))),
+        }
+    }
+    found
+}
+
+/// The first word of a path, unless it is the geometry.
+fn foreign(path: &str) -> Option<String> {
+    let end = path.find(|letter: char| !letter.is_alphanumeric() && letter != '_').unwrap_or(path.len());
+    let module = if end == 0 { path.get(..1).unwrap_or("") } else { &path[..end] };
+    (module != GEOMETRY).then(|| module.to_owned())
+}
+
+/// The members of a group whose opening brace was taken away; braces inside belong to a member.
+fn members(group: &str) -> impl Iterator<Item = &str> {
+    let mut depth = 1;
+    let mut borders = vec![0];
+    for (at, letter) in group.char_indices() {
+        match letter {
+            '{' => depth += 1,
+            '}' => depth -= 1,
+            ',' if depth == 1 => borders.push(at + 1),
+            _ => {}
+        }
+        if depth == 0 {
+            borders.push(at + 1);
+            break;
+        }
+    }
+    let ranges: Vec<_> = borders.windows(2).map(|pair| (pair[0], pair[1] - 1)).collect();
+    ranges.into_iter().map(|(from, to)| group[from..to].trim()).filter(|member| !member.is_empty())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A workspace of these arrows: `from -> to`, `from dev to`, `from build to`.
+    fn workspace_of(arrows: &[&str]) -> Vec<Package> {
+        let mut packages: Vec<Package> = Vec::new();
+        for arrow in arrows {
+            let words: Vec<_> = arrow.split(' ').collect();
+            let kind = match words[1] {
+                "dev" => "dev",
+                "build" => "build",
+                _ => "normal",
+            };
+            let dependency = (words[2].to_owned(), kind);
+            match packages.iter_mut().find(|package| package.name == words[0]) {
+                Some(package) => package.dependencies.push(dependency),
+                None => packages.push(Package {
+                    name: words[0].to_owned(),
+                    folder: PathBuf::new(),
+                    dependencies: vec![dependency],
+                }),
+            }
+        }
+        packages
+    }
+
+    #[test]
+    fn the_arrows_of_the_house_are_allowed() {
+        let house = workspace_of(&[
+            "canopen -> heapless",
+            "boot-core -> canopen",
+            "boot-core build shared-abi",
+            "bootloader -> boot-core",
+            "bootloader -> bsp",
+            "app-template -> canopen",
+            "app-template -> bsp",
+            "coflash -> canopen",
+            "emulator -> shared-abi",
+            "emulator -> unicorn-engine",
+            "coboot-tests -> emulator",
+            "coboot-tests dev unicorn-engine",
+            "xtask -> shared-abi",
+            "shared-abi dev proptest",
+            "canopen dev canopen",
+        ]);
+        assert_eq!(broken_arrows(&house), Vec::<String>::new());
+    }
+
+    #[test]
+    fn each_wall_holds() {
+        for arrow in [
+            "app-template -> boot-core",
+            "app-template dev boot-core",
+            "canopen -> shared-abi",
+            "canopen dev boot-core",
+            "shared-abi -> canopen",
+            "shared-abi -> crc",
+            "emulator -> canopen",
+            "emulator -> bsp",
+            "emulator dev boot-core",
+            "bootloader -> canopen",
+            "bootloader build coflash",
+            "coflash -> emulator",
+            "coflash -> unicorn-engine",
+            "boot-core dev unicorn-engine-sys",
+            "coboot-tests -> bootloader",
+            "xtask -> emulator",
+            "newcomer -> crc",
+        ] {
+            let broken = broken_arrows(&workspace_of(&[arrow]));
+            assert!(!broken.is_empty(), "{arrow} passed");
+            assert!(broken[0].starts_with(arrow.split(' ').next().unwrap()), "{broken:?}");
+        }
+    }
+
+    #[test]
+    fn an_arrow_to_a_crate_without_a_rule_is_broken_too() {
+        let house = workspace_of(&["newcomer -> crc", "canopen -> newcomer"]);
+        assert_eq!(broken_arrows(&house).len(), 2);
+    }
+
+    /// The form is that of `cargo metadata --format-version 1 --no-deps`; renamed and of every kind.
+    #[test]
+    fn metadata_is_read_by_the_real_names() {
+        let text = r#"{"packages":[{"name":"canopen","manifest_path":"/x/canopen/Cargo.toml","dependencies":[
+            {"name":"heapless","source":"registry","req":"^0.9","kind":null,"rename":null,"optional":false},
+            {"name":"boot-core","source":null,"req":"*","kind":"dev","rename":"innocent","path":"/x/boot-core"},
+            {"name":"crc","source":"registry","req":"^3","kind":"build","rename":null,"target":"cfg(unix)"}
+        ]}],"workspace_members":[]}"#;
+        let packages = packages(&Value::parse(text).unwrap()).unwrap();
+        assert_eq!(
+            packages,
+            [Package {
+                name: "canopen".into(),
+                folder: "/x/canopen".into(),
+                dependencies: vec![
+                    ("heapless".into(), "normal"),
+                    ("boot-core".into(), "dev"),
+                    ("crc".into(), "build")
+                ],
+            }]
+        );
+        assert_eq!(broken_arrows(&packages).len(), 1);
+        assert!(super::packages(&Value::parse("{}").unwrap()).is_err());
+        assert!(super::packages(&Value::parse(r#"{"packages":[{"name":1}]}"#).unwrap()).is_err());
+    }
+
+    #[test]
+    fn the_emulator_may_use_the_geometry_alone() {
+        let modules = |source| foreign_modules(source);
+        assert_eq!(modules("use shared_abi::geometry::{Geometry, Region};\n"), []);
+        assert_eq!(modules("use shared_abi::geometry;\nlet x = my_shared_abi::layout;"), []);
+        assert_eq!(modules("// shared_abi::layout\n/// [`shared_abi::layout`]\nuse a; // shared_abi::x"), []);
+        assert_eq!(modules("use shared_abi::{geometry::{Region, Sector}, geometry};"), []);
+        assert_eq!(modules("\nuse shared_abi::layout::Layout;"), [(2, "layout".into())]);
+        assert_eq!(
+            modules("use shared_abi::{geometry::{Region, Sector}, handoff,\n  warm_start::{WarmStart}};"),
+            [(1, "handoff".into()), (1, "warm_start".into())]
+        );
+        assert_eq!(modules("let y = shared_abi::vectors::check(0);"), [(1, "vectors".into())]);
+        assert_eq!(modules("use shared_abi::*;"), [(1, "*".into())]);
+        assert_eq!(modules("use shared_abi as abi;").len(), 1);
+        assert_eq!(modules("extern crate shared_abi;").len(), 1);
+        assert_eq!(modules("use shared_abi::{").len(), 0);
+    }
+
+    #[test]
+    fn every_rule_speaks_of_crates_that_have_one() {
+        for rule in RULES {
+            for used in rule.may_use {
+                assert!(RULES.iter().any(|other| other.name == *used), "{} -> {used}", rule.name);
+            }
+        }
+    }
+}

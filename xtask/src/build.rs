@@ -1,0 +1,102 @@
+//! `cargo xtask build`: the images that go onto the chip.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use shared_abi::geometry::Region;
+use shared_abi::layout::Layout;
+
+use crate::args::Args;
+use crate::setup::{Part, Setup};
+use crate::size::{self, Flash};
+use crate::workspace::{PROFILE, TARGET};
+use crate::{process, workspace, Outcome};
+
+pub const HELP: &str = "\
+usage: cargo xtask build [--board BOARD] [--yes]
+
+Builds the bootloader and both versions of the application, and puts them into
+target/firmware/BOARD/ as bootloader.elf, app-v1.elf and app-v2.elf.
+
+  --board BOARD   the board (default: stm32f407g-disc1)
+  --yes           installs what is missing with sudo
+";
+
+/// The built images of one board.
+pub struct Images {
+    /// The folder they are in.
+    pub dir: PathBuf,
+    /// The bootloader among them.
+    pub bootloader: PathBuf,
+}
+
+pub fn run(mut args: Args) -> Outcome {
+    let board = workspace::board(&mut args)?;
+    let setup = Setup::from(&mut args);
+    args.none_left()?;
+    setup.prepare(&[Part::Firmware])?;
+    images(board).map(drop)
+}
+
+/// Builds all images of a board and prints their sizes.
+///
+/// # Errors
+/// When one does not build, or is no image of this board.
+pub fn images(board: &Layout) -> Outcome<Images> {
+    let dir = workspace::firmware_dir(board);
+    fs::create_dir_all(&dir)
+        .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&dir)))?;
+    let program = board.programs[0];
+    let image = |package, features: &str, name: &str, region| {
+        image(&Build { board, package, features }, &dir.join(name), region)
+    };
+    let bootloader = image("bootloader", "", "bootloader.elf", board.bootloader)?;
+    image("app-template", "version-1", "app-v1.elf", program)?;
+    image("app-template", "version-2", "app-v2.elf", program)?;
+    Ok(Images { dir: dir.clone(), bootloader })
+}
+
+/// One call of cargo: the package is also the name of its program.
+struct Build<'a> {
+    board: &'a Layout,
+    package: &'a str,
+    /// Besides the one that chooses the board.
+    features: &'a str,
+}
+
+/// The arguments that make cargo work on a firmware package for a board; for `cargo clippy`, too.
+pub fn firmware_args(package: &str, board: &Layout, features: &str) -> Vec<String> {
+    let features = format!("board-{},{features}", board.board);
+    // A folder of its own: another target and profile, built while host crates may be building.
+    let target_dir = workspace::target_dir().join("fw").display().to_string();
+    [
+        ["--package", package],
+        ["--target", TARGET],
+        ["--profile", PROFILE],
+        ["--features", features.trim_end_matches(',')],
+        ["--target-dir", &target_dir],
+    ]
+    .concat()
+    .into_iter()
+    .chain(["--no-default-features"])
+    .map(str::to_owned)
+    .collect()
+}
+
+fn image(build: &Build<'_>, to: &Path, region: Region) -> Outcome<PathBuf> {
+    let &Build { board, package, features } = build;
+    process::run(process::cargo("build").args(firmware_args(package, board, features)))?;
+    let built = workspace::target_dir().join("fw").join(TARGET).join(PROFILE).join(package);
+    let file = fs::read(&built).map_err(|error| {
+        format!("cargo built {package}, but {} cannot be read: {error}.", built.display())
+    })?;
+    // Left alone when nothing changed, so that whoever looks at the time sees no change.
+    if fs::read(to).ok().as_ref() != Some(&file) {
+        fs::write(to, &file)
+            .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(to)))?;
+    }
+    let flash = Flash::of(&size::read(to)?, region)
+        .map_err(|problem| format!("{}: {problem}", workspace::shown(to)))?;
+    println!("  {:<52} {:>6} of {} bytes", workspace::shown(to), flash.used, region.size);
+    Ok(to.to_owned())
+}

@@ -1,0 +1,71 @@
+//! `cargo xtask layout`: the memory map, for people and for linkers.
+
+use shared_abi::layout::{Image, Layout};
+
+use crate::args::Args;
+use crate::{workspace, Outcome};
+
+pub const HELP: &str = "\
+usage: cargo xtask layout [--board BOARD] [--ld IMAGE]
+
+Prints the memory map of a board from the one source of truth, shared-abi/src/layout/.
+
+  --board BOARD   the board (default: stm32f407g-disc1)
+  --ld IMAGE      prints the linker's MEMORY and border symbols instead, for an IMAGE of
+                  `bootloader` or `program-N` (N from 1); a C application includes it too
+";
+
+pub fn run(mut args: Args) -> Outcome {
+    let board = workspace::board(&mut args)?;
+    let ld = args.value("--ld")?;
+    args.none_left()?;
+    match ld {
+        None => print!("{board}"),
+        Some(image) => print!("{}", board.linker_script(image_by_name(board, &image)?)),
+    }
+    Ok(())
+}
+
+fn image_by_name(board: &Layout, name: &str) -> Outcome<Image> {
+    if name == "bootloader" {
+        return Ok(Image::Bootloader);
+    }
+    let number = name.strip_prefix("program-").and_then(|number| number.parse().ok());
+    match number {
+        Some(number) if board.program(number).is_some() => Ok(Image::Program(number)),
+        _ => {
+            Err(format!("--ld takes `bootloader` or `program-1` to `program-{}` here.", board.programs.len()))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use shared_abi::layout::stm32f407g_disc1::LAYOUT;
+
+    use super::*;
+
+    #[test]
+    fn an_image_is_chosen_by_name_and_only_one_that_exists() {
+        assert_eq!(image_by_name(&LAYOUT, "bootloader"), Ok(Image::Bootloader));
+        assert_eq!(image_by_name(&LAYOUT, "program-1"), Ok(Image::Program(1)));
+        for wrong in ["program-0", "program-2", "program-", "program-256", "program-x", "app", ""] {
+            assert!(image_by_name(&LAYOUT, wrong).is_err(), "{wrong}");
+        }
+    }
+
+    /// The map in the README is the one that `cargo xtask layout` prints.
+    #[test]
+    fn the_readme_shows_the_map_as_it_is() {
+        let readme = fs::read_to_string(workspace::root().join("README.md")).unwrap();
+        let (_, behind) =
+            readme.split_once("<!-- memory map: `cargo xtask layout` prints it -->\n\n```text\n").unwrap();
+        let (copy, _) = behind.split_once("```").unwrap();
+        let map = LAYOUT.to_string();
+        // Blanks at the end of a line are not worth keeping in a document.
+        let lines = |text: &str| text.lines().map(|line| line.trim_end().to_owned()).collect::<Vec<_>>();
+        assert_eq!(lines(copy), lines(&map), "copy the output of `cargo xtask layout` into README.md");
+    }
+}

@@ -1,0 +1,43 @@
+//! `cargo xtask lint`: formatting and clippy, with warnings denied.
+
+use crate::args::Args;
+use crate::setup::{Part, Setup};
+use crate::{build, process, workspace, Outcome};
+
+pub const HELP: &str = "\
+usage: cargo xtask lint [--board BOARD] [--yes]
+
+Checks the formatting of every crate, and runs clippy over host crates (with their tests) and
+over the firmware of a board, with warnings denied.
+
+  --board BOARD   the board (default: stm32f407g-disc1)
+  --yes           installs what is missing with sudo
+";
+
+/// The firmware packages and the features that each is looked at with, besides the board's.
+const FIRMWARE: &[(&str, &str)] =
+    &[("bsp", ""), ("bootloader", ""), ("app-template", "version-1"), ("app-template", "version-2")];
+
+pub fn run(mut args: Args) -> Outcome {
+    let board = workspace::board(&mut args)?;
+    let setup = Setup::from(&mut args);
+    args.none_left()?;
+    setup.prepare(&[Part::Lint, Part::Firmware, Part::Emulator])?;
+
+    process::run(process::cargo("fmt").args(["--all", "--check"]))
+        .map_err(|_| "some files are not formatted; `cargo fmt --all` does it.".to_owned())?;
+    process::run(process::cargo("clippy").current_dir(workspace::root()).args([
+        "--all-targets",
+        "--",
+        "--deny",
+        "warnings",
+    ]))?;
+    for (package, features) in FIRMWARE {
+        process::run(
+            process::cargo("clippy")
+                .args(build::firmware_args(package, board, features))
+                .args(["--", "--deny", "warnings"]),
+        )?;
+    }
+    Ok(())
+}

@@ -1,0 +1,94 @@
+//! Starting other programs.
+
+use std::env;
+use std::ffi::OsStr;
+use std::process::{Command, Stdio};
+
+use crate::workspace;
+use crate::Outcome;
+
+/// The cargo that started us, on this workspace, in the caller's folder.
+pub fn cargo(subcommand: &str) -> Command {
+    let mut command = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    command.arg(subcommand).arg("--manifest-path").arg(workspace::root().join("Cargo.toml"));
+    if env::var_os("CARGO_TARGET_DIR").is_some() {
+        // It may be relative, and a job may start cargo in another folder.
+        command.env("CARGO_TARGET_DIR", workspace::target_dir());
+    }
+    command
+}
+
+/// Runs a program to its end; what it prints is seen.
+///
+/// # Errors
+/// When it cannot be started, or fails.
+pub fn run(command: &mut Command) -> Outcome {
+    let status = command.status().map_err(|error| not_started(command, &error))?;
+    if status.success() {
+        Ok(())
+    } else {
+        Err(format!("`{}` failed ({status}); what it printed above says why.", line(command)))
+    }
+}
+
+/// Runs a program to its end and gives back what it printed to its standard output.
+///
+/// # Errors
+/// When it cannot be started, fails, or prints no UTF-8.
+pub fn output(command: &mut Command) -> Outcome<String> {
+    let output = command.stdin(Stdio::null()).output().map_err(|error| not_started(command, &error))?;
+    if !output.status.success() {
+        let said = String::from_utf8_lossy(&output.stderr);
+        return Err(format!("`{}` failed ({}): {}", line(command), output.status, said.trim()));
+    }
+    String::from_utf8(output.stdout).map_err(|_| format!("`{}` printed what is no text.", line(command)))
+}
+
+/// Whether a program can be started and ends well; what it prints is not shown.
+pub fn succeeds(program: impl AsRef<OsStr>, args: &[&str]) -> bool {
+    let mut command = Command::new(program);
+    command.args(args).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+    command.status().is_ok_and(|status| status.success())
+}
+
+/// Why a program could not be started.
+pub fn not_started(command: &Command, error: &std::io::Error) -> String {
+    format!("`{}` could not be started: {error}.", line(command))
+}
+
+/// A command as a person would type it, as far as that is needed to recognise it.
+pub fn line(command: &Command) -> String {
+    let mut line = String::from("");
+    let name = std::path::Path::new(command.get_program()).file_name().unwrap_or(command.get_program());
+    line += &name.to_string_lossy();
+    let mut args = command.get_args().peekable();
+    while let Some(arg) = args.next() {
+        if arg == "--manifest-path" {
+            args.next();
+            continue;
+        }
+        line.push(' ');
+        line += &arg.to_string_lossy();
+    }
+    line
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_failing_program_is_named_with_its_arguments() {
+        let problem = run(Command::new("sh").args(["-c", "exit 3"])).unwrap_err();
+        assert!(problem.contains("`sh -c exit 3`") && problem.contains('3'), "{problem}");
+        let problem = run(&mut Command::new("no-such-program-here")).unwrap_err();
+        assert!(problem.contains("no-such-program-here"), "{problem}");
+    }
+
+    #[test]
+    fn output_is_the_standard_output_and_an_error_brings_the_other_one() {
+        assert_eq!(output(Command::new("sh").args(["-c", "echo a; echo b >&2"])), Ok("a\n".into()));
+        let problem = output(Command::new("sh").args(["-c", "echo a; echo b >&2; exit 1"])).unwrap_err();
+        assert!(problem.ends_with(": b"), "{problem}");
+    }
+}

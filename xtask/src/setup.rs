@@ -1,0 +1,351 @@
+//! What the jobs need on a machine, installed where it is missing and where that is allowed.
+//!
+//! A fresh Debian 12 or Ubuntu 24.04 with rustup, git and a C compiler is enough to start from. When
+//! nothing is missing this takes a fraction of a second.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::{env, fs};
+
+use crate::args::Args;
+use crate::workspace::TARGET;
+use crate::{process, workspace, Outcome};
+
+pub const HELP: &str = "\
+usage: cargo xtask setup [--yes]
+
+Brings the machine to where every other job runs: the Rust target thumbv7em-none-eabihf, rustfmt and
+clippy (by rustup); cmake, make and libclang to build the emulator's CPU, python3 with venv (by apt-get); and
+a Python environment in target/python with tests/python/requirements.txt.
+
+The other jobs do this themselves, each for what it needs. As root it installs what is missing; for
+anyone else it stops with the line to run, or, with --yes, runs that line.
+
+  --yes           installs missing packages with sudo
+";
+
+/// A part of the product that needs something on the machine.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// Code for the chip: the Rust target.
+    Firmware,
+    /// The emulator: Unicorn is C built by cmake, and its bindings are made with libclang.
+    Emulator,
+    /// The third-party CANopen client: a Python environment.
+    Python,
+    /// Formatter and linter.
+    Lint,
+}
+
+/// How far the set-up may go.
+pub struct Setup {
+    /// Whether packages may be installed through sudo.
+    yes: bool,
+}
+
+pub fn run(mut args: Args) -> Outcome {
+    let setup = Setup::from(&mut args);
+    args.none_left()?;
+    setup.prepare(&[Part::Firmware, Part::Emulator, Part::Python, Part::Lint])?;
+    println!("Everything is there.");
+    Ok(())
+}
+
+impl Setup {
+    /// Takes `--yes`.
+    pub fn from(args: &mut Args) -> Self {
+        Self { yes: args.flag("--yes") }
+    }
+
+    /// Sees to it that what these parts need is there.
+    ///
+    /// # Errors
+    /// When something is missing and may not or cannot be installed; the message has the line to run.
+    pub fn prepare(&self, parts: &[Part]) -> Outcome {
+        self.packages(parts)?;
+        if parts.contains(&Part::Firmware) {
+            rust_target()?;
+        }
+        if parts.contains(&Part::Lint) {
+            rust_components()?;
+        }
+        if parts.contains(&Part::Python) {
+            python_environment()?;
+        }
+        Ok(())
+    }
+
+    /// Debian's packages.
+    fn packages(&self, parts: &[Part]) -> Outcome {
+        let missing = missing_packages(parts, Tool::is_there);
+        if missing.is_empty() {
+            return Ok(());
+        }
+        let by_hand = format!(
+            "sudo apt-get update && sudo apt-get install -y --no-install-recommends {}",
+            missing.join(" ")
+        );
+        if !process::succeeds("apt-get", &["--version"]) {
+            return Err(format!(
+                "these are missing, by the names of Debian's packages: {}. There is no apt-get here to install \
+                 them with; do it with this system's package manager and try again.",
+                missing.join(", ")
+            ));
+        }
+        let root = process::output(Command::new("id").arg("-u")).is_ok_and(|id| id.trim() == "0");
+        if !root && !self.yes {
+            return Err(format!(
+                "some packages are missing. Run this line and try again:\n\n    {by_hand}\n\n\
+                 (or add --yes, and it is run for you.)"
+            ));
+        }
+        println!("Installing {} ...", missing.join(", "));
+        let apt_get = |words: &[&str]| {
+            let mut command = if root { Command::new("env") } else { Command::new("sudo") };
+            if !root {
+                command.arg("env");
+            }
+            command.args([
+                "DEBIAN_FRONTEND=noninteractive",
+                "apt-get",
+                "-qq",
+                "-o",
+                "DPkg::Lock::Timeout=300",
+            ]);
+            process::run(command.args(words))
+        };
+        // A fresh machine has no package lists. Where one source of several cannot be reached, the
+        // install may still work, and tells if not.
+        let _ = apt_get(&["update"]);
+        let install = ["install", "-y", "--no-install-recommends"];
+        apt_get(&[&install[..], &missing[..]].concat())
+            .map_err(|problem| format!("{problem} By hand it is:\n\n    {by_hand}"))?;
+        let still = missing_packages(parts, Tool::is_there);
+        if still.is_empty() {
+            Ok(())
+        } else {
+            Err(format!(
+                "{} installed well, and still nothing is found of it; is another cmake, clang or python3 in front \
+                 of the system's in PATH?",
+                still.join(", ")
+            ))
+        }
+    }
+}
+
+/// A program or library that Debian packages.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Tool {
+    CCompiler,
+    Make,
+    Cmake,
+    Libclang,
+    Python,
+    Venv,
+}
+
+impl Tool {
+    /// The package that brings it, on Debian and Ubuntu.
+    fn package(self) -> &'static str {
+        match self {
+            Self::CCompiler => "build-essential",
+            Self::Make => "make",
+            Self::Cmake => "cmake",
+            Self::Libclang => "libclang-dev",
+            Self::Python => "python3",
+            Self::Venv => "python3-venv",
+        }
+    }
+
+    fn is_there(self) -> bool {
+        match self {
+            Self::CCompiler => {
+                let compiler = env::var_os("CC").unwrap_or_else(|| "cc".into());
+                process::succeeds(compiler, &["--version"])
+            }
+            // cmake takes either.
+            Self::Make => {
+                process::succeeds("make", &["--version"]) || process::succeeds("ninja", &["--version"])
+            }
+            Self::Cmake => process::succeeds("cmake", &["--version"]),
+            Self::Libclang => libclang_is_there(),
+            Self::Python => process::succeeds("python3", &["--version"]),
+            // Debian's python3 comes without ensurepip.
+            Self::Venv => process::succeeds("python3", &["-c", "import venv, ensurepip"]),
+        }
+    }
+}
+
+/// The packages that these parts need and that are not there, each once.
+fn missing_packages(parts: &[Part], is_there: impl Fn(Tool) -> bool) -> Vec<&'static str> {
+    let mut tools = Vec::new();
+    for part in parts {
+        tools.extend_from_slice(match part {
+            Part::Emulator => &[Tool::CCompiler, Tool::Make, Tool::Cmake, Tool::Libclang],
+            Part::Python if !python_environment_is_there() => &[Tool::Python, Tool::Venv],
+            Part::Python | Part::Firmware | Part::Lint => &[],
+        });
+    }
+    let missing: BTreeSet<_> = tools.into_iter().filter(|&tool| !is_there(tool)).map(Tool::package).collect();
+    missing.into_iter().collect()
+}
+
+/// libclang with the compiler's own headers, where the bindings' generator (clang-sys) looks for it.
+fn libclang_is_there() -> bool {
+    if env::var_os("LIBCLANG_PATH").is_some() {
+        // Whoever sets it knows better; the build tells if not.
+        return true;
+    }
+    let homes = ["/usr/lib/llvm-*/lib", "/usr/lib/*-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/local/lib"];
+    let library = homes.iter().any(|home| {
+        // `libclang-14.so.14` and the like; libclang-cpp is another library.
+        ["libclang.so", "libclang.so.*", "libclang-1*", "libclang-2*"]
+            .iter()
+            .any(|name| exists(&format!("{home}/{name}")))
+    });
+    let headers = ["/usr/lib/llvm-*/lib/clang", "/usr/lib/clang", "/usr/lib64/clang", "/usr/local/lib/clang"];
+    library && headers.iter().any(|home| exists(&format!("{home}/*/include/stdbool.h")))
+}
+
+/// Whether a path exists; a part of it may hold one `*`.
+fn exists(pattern: &str) -> bool {
+    fn below(folder: &Path, parts: &[&str]) -> bool {
+        let Some((part, rest)) = parts.split_first() else { return folder.exists() };
+        match part.split_once('*') {
+            None => below(&folder.join(part), rest),
+            Some((start, end)) => fs::read_dir(folder).into_iter().flatten().flatten().any(|entry| {
+                let name = entry.file_name();
+                let name = name.to_string_lossy();
+                name.len() >= start.len() + end.len()
+                    && name.starts_with(start)
+                    && name.ends_with(end)
+                    && below(&entry.path(), rest)
+            }),
+        }
+    }
+    let parts: Vec<_> = pattern.trim_start_matches('/').split('/').collect();
+    below(Path::new("/"), &parts)
+}
+
+fn rust_target() -> Outcome {
+    let is_there = || -> Outcome<bool> {
+        let sysroot = process::output(Command::new("rustc").args(["--print", "sysroot"]))?;
+        Ok(Path::new(sysroot.trim()).join("lib/rustlib").join(TARGET).join("lib").is_dir())
+    };
+    if is_there()? {
+        return Ok(());
+    }
+    println!("Adding the Rust target {TARGET} ...");
+    let added = process::run(Command::new("rustup").args(["target", "add", TARGET]));
+    if added.is_ok() && is_there()? {
+        return Ok(());
+    }
+    Err(format!(
+        "the Rust target {TARGET} is missing and could not be added. With rustup (https://rustup.rs) and a \
+         connection, this line does it:\n\n    rustup target add {TARGET}"
+    ))
+}
+
+fn rust_components() -> Outcome {
+    let is_there = |name: &str| process::succeeds(name, &["--version"]);
+    let missing: Vec<_> = [("rustfmt", "rustfmt"), ("clippy", "clippy-driver")]
+        .into_iter()
+        .filter(|(_, program)| !is_there(program))
+        .map(|(component, _)| component)
+        .collect();
+    if missing.is_empty() {
+        return Ok(());
+    }
+    println!("Adding {} to the Rust toolchain ...", missing.join(" and "));
+    process::run(Command::new("rustup").args(["component", "add"]).args(&missing)).map_err(|_| {
+        format!(
+            "{} could not be added. With rustup and a connection, this line does it:\n\n    \
+             rustup component add {}",
+            missing.join(" and "),
+            missing.join(" ")
+        )
+    })
+}
+
+/// The interpreter of the Python environment.
+pub fn python() -> PathBuf {
+    workspace::target_dir().join("python/bin/python")
+}
+
+fn requirements() -> PathBuf {
+    workspace::root().join("tests/python/requirements.txt")
+}
+
+/// What was installed into the environment: a copy of the requirements, written last.
+fn stamp() -> PathBuf {
+    workspace::target_dir().join("python/requirements.installed")
+}
+
+fn python_environment_is_there() -> bool {
+    let wanted = fs::read(requirements()).ok();
+    wanted.is_some() && fs::read(stamp()).ok() == wanted && process::succeeds(python(), &["--version"])
+}
+
+fn python_environment() -> Outcome {
+    if python_environment_is_there() {
+        return Ok(());
+    }
+    let home = workspace::target_dir().join("python");
+    println!("Making a Python environment in {} ...", workspace::shown(&home));
+    process::run(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&home))?;
+    process::run(
+        Command::new(python())
+            .args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-input", "-r"])
+            .arg(requirements()),
+    )
+    .map_err(|problem| format!("{problem} It needs a connection to the Python package index, once."))?;
+    fs::copy(requirements(), stamp())
+        .map(drop)
+        .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&stamp())))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_what_a_part_needs_and_is_missing_is_installed_and_once() {
+        let nothing = |_| false;
+        assert_eq!(missing_packages(&[Part::Firmware, Part::Lint], nothing), Vec::<&str>::new());
+        assert_eq!(
+            missing_packages(&[Part::Emulator, Part::Emulator], nothing),
+            ["build-essential", "cmake", "libclang-dev", "make"]
+        );
+        assert_eq!(
+            missing_packages(&[Part::Emulator], |tool| !matches!(tool, Tool::Cmake | Tool::Libclang)),
+            ["cmake", "libclang-dev"]
+        );
+        assert!(missing_packages(&[Part::Emulator, Part::Python], |_| true).is_empty());
+    }
+
+    #[test]
+    fn a_pattern_finds_what_is_there() {
+        let root = env!("CARGO_MANIFEST_DIR");
+        assert!(exists(&format!("{root}/src/setup.rs")));
+        assert!(exists(&format!("{root}/s*c/set*.rs")));
+        assert!(exists(&format!("{root}/*/setup.rs")));
+        assert!(!exists(&format!("{root}/*/setup.py")));
+        assert!(!exists(&format!("{root}/src/setup.rs*setup.rs")));
+        assert!(!exists("/no/such/folder/*/at.all"));
+    }
+
+    /// Exact versions alone, so that every machine runs the same client.
+    #[test]
+    fn every_python_requirement_is_pinned() {
+        let text = fs::read_to_string(requirements()).unwrap();
+        let lines: Vec<_> =
+            text.lines().filter(|line| !line.starts_with('#') && !line.trim().is_empty()).collect();
+        assert!(lines.iter().any(|line| line.starts_with("canopen==")));
+        for line in lines {
+            let (name, version) = line.split_once("==").unwrap_or_else(|| panic!("{line} is not pinned"));
+            assert!(!name.is_empty() && version.starts_with(|c: char| c.is_ascii_digit()), "{line}");
+            assert!(!version.contains('*'), "{line}");
+        }
+    }
+}

@@ -1,0 +1,134 @@
+//! `cargo xtask test`: every test, with one summary at the end.
+
+use std::io::{BufRead, BufReader, Write};
+use std::process::Stdio;
+use std::time::Instant;
+
+use crate::args::Args;
+use crate::setup::{self, Part, Setup};
+use crate::{build, process, workspace, Outcome};
+
+pub const HELP: &str = "\
+usage: cargo xtask test [--board BOARD] [--yes] [ARGS]
+
+Sets the machine up, builds the firmware and runs the tests of all host crates, among them those that
+run the firmware in the emulator and those that use a third-party CANopen client.
+
+  --board BOARD   the board (default: stm32f407g-disc1)
+  --yes           installs what is missing with sudo
+  ARGS            go to cargo test: `cargo xtask test -p canopen sdo`, `cargo xtask test -- --nocapture`
+
+The tests find what was built by these variables: COBOOT_BOARD, COBOOT_FIRMWARE_DIR (bootloader.elf,
+app-v1.elf, app-v2.elf) and COBOOT_PYTHON (an interpreter with tests/python/requirements.txt installed).
+";
+
+pub fn run(mut args: Args) -> Outcome {
+    let board = workspace::board(&mut args)?;
+    let setup = Setup::from(&mut args);
+    setup.prepare(&[Part::Firmware, Part::Emulator, Part::Python])?;
+    let images = build::images(board)?;
+
+    let started = Instant::now();
+    let mut cargo = process::cargo("test");
+    cargo
+        .arg("--no-fail-fast")
+        .args(args.rest())
+        .current_dir(workspace::root())
+        .env("COBOOT_BOARD", board.board)
+        .env("COBOOT_FIRMWARE_DIR", &images.dir)
+        .env("COBOOT_PYTHON", setup::python())
+        .stdout(Stdio::piped());
+    let mut tests = cargo.spawn().map_err(|error| process::not_started(&cargo, &error))?;
+    let mut summary = Summary::default();
+    if let Some(printed) = tests.stdout.take() {
+        let mut printed = BufReader::new(printed);
+        let mut line = Vec::new();
+        // By bytes: a test may print what is no text.
+        while printed.read_until(b'\n', &mut line).is_ok_and(|len| len > 0) {
+            let mut out = std::io::stdout().lock();
+            let _ = out.write_all(&line).and_then(|()| out.flush());
+            summary.take(&String::from_utf8_lossy(&line));
+            line.clear();
+        }
+    }
+    let status = tests.wait().map_err(|error| process::not_started(&cargo, &error))?;
+
+    println!();
+    for name in &summary.names_of_failed {
+        println!("FAILED: {name}");
+    }
+    println!("{} test programs in {} s", summary.programs, started.elapsed().as_secs());
+    println!("{}", summary.line());
+    match (status.success(), summary.failed, summary.programs) {
+        (true, 0, 1..) => Ok(()),
+        (true, 0, 0) => Err("no test ran.".into()),
+        (_, 0, _) => Err("something did not build, or a test program broke off; see above.".into()),
+        (_, failed, _) => Err(format!("{failed} tests failed; their output stands above.")),
+    }
+}
+
+/// The totals of many test programs.
+#[derive(Debug, Default, PartialEq, Eq)]
+struct Summary {
+    passed: u32,
+    failed: u32,
+    ignored: u32,
+    programs: u32,
+    names_of_failed: Vec<String>,
+}
+
+impl Summary {
+    /// Takes one line of what a test program prints.
+    fn take(&mut self, line: &str) {
+        let line = line.trim_end();
+        if let Some((_, counts)) = line.strip_prefix("test result: ").and_then(|line| line.split_once(". ")) {
+            let count = |what: &str| -> u32 {
+                let field = counts.split("; ").find_map(|field| field.strip_suffix(what));
+                field.and_then(|number| number.trim().parse().ok()).unwrap_or(0)
+            };
+            self.passed += count(" passed");
+            self.failed += count(" failed");
+            self.ignored += count(" ignored");
+            self.programs += 1;
+        } else if let Some(name) =
+            line.strip_prefix("test ").and_then(|line| line.strip_suffix(" ... FAILED"))
+        {
+            self.names_of_failed.push(name.to_owned());
+        }
+    }
+
+    /// The line that ends a run; `.ci/run` repeats it.
+    fn line(&self) -> String {
+        let mut line = format!("{} passed, {} failed", self.passed, self.failed);
+        if self.ignored > 0 {
+            line += &format!(", {} skipped", self.ignored);
+        }
+        line
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Lines as libtest prints them.
+    #[test]
+    fn totals_are_summed_over_the_programs() {
+        let mut summary = Summary::default();
+        for line in [
+            "running 3 tests",
+            "test crc ... ok",
+            "test flash::cut ... FAILED",
+            "test slow ... ignored, takes an hour",
+            "test result: FAILED. 1 passed; 1 failed; 1 ignored; 0 measured; 4 filtered out; finished in 0.01s",
+            "the word passed in another line: 7 passed; 7 failed",
+            "test result: ok. 20 passed; 0 failed; 0 ignored; 0 measured; 0 filtered out; finished in 2.00s\n",
+        ] {
+            summary.take(line);
+        }
+        assert_eq!(summary.line(), "21 passed, 1 failed, 1 skipped");
+        assert_eq!(summary.programs, 2);
+        assert_eq!(summary.names_of_failed, ["flash::cut"]);
+        assert_eq!(Summary::default().line(), "0 passed, 0 failed");
+    }
+}

@@ -1,0 +1,53 @@
+//! Where things are, and which board is meant.
+
+use std::env;
+use std::path::{Path, PathBuf};
+
+use shared_abi::layout::{self, Layout};
+
+use crate::args::Args;
+use crate::Outcome;
+
+/// What the firmware runs on: Armv7E-M with the single-precision FPU.
+pub const TARGET: &str = "thumbv7em-none-eabihf";
+/// Cargo's profile of everything that goes onto the chip.
+pub const PROFILE: &str = "firmware";
+/// The board taken where `--board` names none.
+const DEFAULT_BOARD: &str = "stm32f407g-disc1";
+
+/// The root of the repository.
+pub fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("this crate lies one folder below the root")
+}
+
+/// Cargo's folder for what it builds; ours for the firmware and the Python environment.
+pub fn target_dir() -> PathBuf {
+    match env::var_os("CARGO_TARGET_DIR") {
+        // Relative to the folder that cargo was started in, as cargo itself reads it.
+        Some(dir) => env::current_dir().unwrap_or_default().join(dir),
+        None => root().join("target"),
+    }
+}
+
+/// Where the built images of a board are put.
+pub fn firmware_dir(board: &Layout) -> PathBuf {
+    target_dir().join("firmware").join(board.board)
+}
+
+/// Takes `--board`.
+///
+/// # Errors
+/// When there is no such board.
+pub fn board(args: &mut Args) -> Outcome<&'static Layout> {
+    let name = args.value("--board")?;
+    let name = name.as_deref().unwrap_or(DEFAULT_BOARD);
+    layout::by_name(name).ok_or_else(|| {
+        let known: Vec<_> = layout::BOARDS.iter().map(|layout| layout.board).collect();
+        format!("there is no board \"{name}\"; there is: {}.", known.join(", "))
+    })
+}
+
+/// A path as it is shown to a person: from the root on where it lies below it.
+pub fn shown(path: &Path) -> String {
+    path.strip_prefix(root()).unwrap_or(path).display().to_string()
+}
