@@ -1,0 +1,283 @@
+//! Block files: read, verified and written. The format itself is in [`shared_abi::block_file`].
+
+use crc::{Crc, Table, CRC_32_ISO_HDLC};
+use shared_abi::block_file::{Control, Header, Last, CRC_SIZE, HEADER_SIZE, NUMBER_CONTROL, NUMBER_LAST};
+pub use shared_abi::block_file::{Identity, FRAMING, MAX_BLOCK_SIZE};
+
+use crate::image::AddressRange;
+use crate::read::{Cause, Place, ReadError};
+
+/// The CRC of blocks and programs: polynomial EDB88320h reflected (manual L-1112d_10, chapter 3.1).
+pub const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISO_HDLC);
+
+/// The most data bytes that a block can have.
+pub const MAX_DATA: usize = MAX_BLOCK_SIZE - FRAMING;
+
+/// The most bytes from a program's start to its last one. No microcontroller's flash comes near it; what exceeds it
+/// holds data for two memories.
+pub const MAX_PROGRAM_SIZE: u32 = 64 * 1024 * 1024;
+
+/// One block, as one SDO download takes it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Block {
+    /// 0, 1…N or FFFFFFFFh.
+    pub number: u32,
+    /// Where the data goes.
+    pub flash_address: u32,
+    /// The data: control, program or the last block's eight bytes.
+    pub data: Vec<u8>,
+}
+
+impl Block {
+    /// The bytes of the block with header and CRC.
+    #[must_use]
+    pub fn emit(&self) -> Vec<u8> {
+        let header = Header {
+            number: self.number,
+            flash_address: self.flash_address,
+            // A block is never larger than `MAX_DATA`.
+            size: self.data.len() as u32,
+        };
+        let mut bytes = Vec::with_capacity(FRAMING + self.data.len());
+        bytes.extend_from_slice(&header.emit());
+        bytes.extend_from_slice(&self.data);
+        bytes.extend_from_slice(&CRC.checksum(&bytes).to_le_bytes());
+        bytes
+    }
+}
+
+/// A whole block file whose numbers, sizes and CRCs are right.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct BlockFile {
+    blocks: Vec<Block>,
+    control: Control,
+    last: Last,
+}
+
+impl BlockFile {
+    /// Puts a file together from the blocks of the program, whose region starts at `start`.
+    ///
+    /// `blocks` are (address, data) in address order and not before `start`; each has at most [`MAX_DATA`] bytes.
+    /// `control` makes block 0 when the program's size is known.
+    pub(crate) fn new(start: u32, blocks: Vec<(u32, Vec<u8>)>, control: impl FnOnce(u32) -> Control) -> Self {
+        let program_size = blocks.last().map_or(0, |(address, data)| address - start + data.len() as u32);
+        let program_crc = program_crc(start, program_size, blocks.iter().map(|(a, d)| (*a, d.as_slice())));
+        let control = control(program_size);
+        // Flash address 0: the older manual (L-1112e_5) asks for it, the newer one allows anything.
+        let last = Last { program_size, program_crc };
+        let (bytes, len) = control.emit();
+        let block = |number, flash_address, data| Block { number, flash_address, data };
+        let mut all = vec![block(NUMBER_CONTROL, 0, bytes[..len].to_vec())];
+        all.extend((1..).zip(blocks).map(|(number, (address, data))| block(number, address, data)));
+        all.push(block(NUMBER_LAST, 0, last.emit().to_vec()));
+        Self { blocks: all, control, last }
+    }
+
+    /// Whether bytes begin like a block file: block 0 at address 0 with one of the known lengths.
+    #[must_use]
+    pub fn looks_like(bytes: &[u8]) -> bool {
+        bytes.first_chunk().is_some_and(|header| {
+            let Header { number, flash_address, size } = Header::parse(header);
+            number == NUMBER_CONTROL && flash_address == 0 && matches!(size, 8 | 12 | 24)
+        })
+    }
+
+    /// Reads a file and checks every number, size and CRC in it.
+    ///
+    /// # Errors
+    /// The first fault, with its offset.
+    pub fn parse(bytes: &[u8]) -> Result<Self, ReadError> {
+        let mut blocks: Vec<Block> = Vec::new();
+        let mut offset = 0;
+        let last = loop {
+            let place = Place::Offset(offset);
+            let (block, len) = parse_block(&bytes[offset..], place)?;
+            let expected = blocks.len() as u32;
+            let is_last = block.number == NUMBER_LAST && expected > 0;
+            if block.number != expected && !is_last {
+                return Err(place.fault(Cause::BlockNumber { found: block.number, expected }));
+            }
+            offset += len;
+            let data_len = block.data.len();
+            let last = is_last.then(|| Last::parse(&block.data));
+            check_order(blocks.last(), &block, place)?;
+            blocks.push(block);
+            match last {
+                Some(Some(last)) => break last,
+                Some(None) => return Err(place.fault(Cause::LastSize(data_len))),
+                None if offset == bytes.len() => {
+                    return Err(Place::File.fault(Cause::NoEnd("its last block (number FFFFFFFFh)")))
+                }
+                None => {}
+            }
+        };
+        if offset != bytes.len() {
+            let words = "there is more behind the last block: not one block file, or damaged";
+            return Err(Place::Offset(offset).fault(Cause::Malformed(words)));
+        }
+        let control = &blocks[0].data;
+        let control =
+            Control::parse(control).ok_or(Place::Offset(0).fault(Cause::ControlSize(control.len())))?;
+        let file = Self { blocks, control, last };
+        if file.program_blocks().is_empty() {
+            return Err(Place::File.fault(Cause::NoData));
+        }
+        // The file does not say where its program starts. It is the first byte, or whatever lies the program's size
+        // before the end of the last byte.
+        let span = file.span();
+        let by_end = (u64::from(span.last) + 1).checked_sub(last.program_size.into());
+        let fits = |start| file.starts_at(start);
+        if fits(span.first) || by_end.and_then(|start| u32::try_from(start).ok()).is_some_and(fits) {
+            return Ok(file);
+        }
+        Err(Place::Offset(offset - FRAMING - 8).fault(file.program_fault()))
+    }
+
+    /// Checks a file that was read from elsewhere against the region that it is to go into: every block inside, and
+    /// size and CRC counted from the region's start, as the device counts them.
+    ///
+    /// # Errors
+    /// [`Cause::Outside`] or [`Cause::ProgramCrc`].
+    pub fn check_region(&self, region: AddressRange) -> Result<(), ReadError> {
+        let mut offset = self.blocks[0].data.len() + FRAMING;
+        for block in self.program_blocks() {
+            let (first, last) = (block.flash_address, last_address(block));
+            if !region.contains(&AddressRange { first, last }) {
+                return Err(Place::Offset(offset).fault(Cause::Outside { first, last, region }));
+            }
+            offset += block.data.len() + FRAMING;
+        }
+        if self.starts_at(region.first) {
+            Ok(())
+        } else {
+            Err(Place::Offset(offset).fault(self.program_fault()))
+        }
+    }
+
+    /// Whether size and CRC of the last block are those of the blocks, counted from `start`.
+    fn starts_at(&self, start: u32) -> bool {
+        let span = self.span();
+        let Last { program_size, program_crc: crc } = self.last;
+        // Blocks that reach behind the size would not be covered by the CRC.
+        let covered = start <= span.first
+            && program_size <= MAX_PROGRAM_SIZE
+            && u64::from(start) + u64::from(program_size) > u64::from(span.last);
+        let blocks = self.program_blocks().iter().map(|block| (block.flash_address, block.data.as_slice()));
+        covered && program_crc(start, program_size, blocks) == crc
+    }
+
+    fn program_fault(&self) -> Cause {
+        Cause::ProgramCrc { size: self.last.program_size, crc: self.last.program_crc }
+    }
+
+    /// All blocks in the order of their downloads: control, program, last.
+    #[must_use]
+    pub fn blocks(&self) -> &[Block] {
+        &self.blocks
+    }
+
+    /// The blocks that carry the program: 1…N.
+    #[must_use]
+    pub fn program_blocks(&self) -> &[Block] {
+        let end = self.blocks.len().saturating_sub(1).max(1);
+        &self.blocks[1..end]
+    }
+
+    /// From the program's first byte in a block to its last one.
+    #[must_use]
+    pub fn span(&self) -> AddressRange {
+        let blocks = self.program_blocks();
+        AddressRange {
+            first: blocks.first().map_or(0, |block| block.flash_address),
+            last: blocks.last().map_or(0, last_address),
+        }
+    }
+
+    /// What block 0 says.
+    #[must_use]
+    pub fn control(&self) -> &Control {
+        &self.control
+    }
+
+    /// Bytes of the program, from its region's start on.
+    #[must_use]
+    pub fn program_size(&self) -> u32 {
+        self.last.program_size
+    }
+
+    /// CRC of the program: what 1F56h reads when it is in the device.
+    #[must_use]
+    pub fn program_crc(&self) -> u32 {
+        self.last.program_crc
+    }
+
+    /// The bytes of the file.
+    #[must_use]
+    pub fn emit(&self) -> Vec<u8> {
+        self.blocks.iter().flat_map(Block::emit).collect()
+    }
+}
+
+fn last_address(block: &Block) -> u32 {
+    block.flash_address.saturating_add((block.data.len() as u32).saturating_sub(1))
+}
+
+/// One block from the front of `bytes`, and how long it is.
+fn parse_block(bytes: &[u8], place: Place) -> Result<(Block, usize), ReadError> {
+    let cut_off = |what, needed| place.fault(Cause::CutOff { what, needed, found: bytes.len() });
+    let header = bytes.first_chunk().ok_or_else(|| cut_off("the header of a block", HEADER_SIZE))?;
+    let Header { number, flash_address, size } = Header::parse(header);
+    if size as usize > MAX_DATA {
+        return Err(place.fault(Cause::BlockSize { number, size }));
+    }
+    let crc_at = HEADER_SIZE + size as usize;
+    let crc = bytes.get(crc_at..).and_then(|rest| rest.first_chunk::<CRC_SIZE>());
+    let crc = crc.ok_or_else(|| cut_off("a block", crc_at + CRC_SIZE))?;
+    let (found, needed) = (u32::from_le_bytes(*crc), CRC.checksum(&bytes[..crc_at]));
+    if found != needed {
+        return Err(place.fault(Cause::BlockCrc { number, found, needed }));
+    }
+    let data = bytes[HEADER_SIZE..crc_at].to_vec();
+    Ok((Block { number, flash_address, data }, crc_at + CRC_SIZE))
+}
+
+/// Checks that a program block has data, ends inside the address space and lies behind the one before it.
+fn check_order(before: Option<&Block>, block: &Block, place: Place) -> Result<(), ReadError> {
+    if matches!(block.number, NUMBER_CONTROL | NUMBER_LAST) {
+        return Ok(());
+    }
+    let address = block.flash_address;
+    if block.data.is_empty() {
+        return Err(place.fault(Cause::Malformed("the block has no data")));
+    }
+    if u64::from(address) + block.data.len() as u64 > 1 << 32 {
+        return Err(place.fault(Cause::AddressOverflow { address, what: "the address space" }));
+    }
+    match before {
+        Some(before) if before.number != NUMBER_CONTROL && address <= last_address(before) => {
+            Err(place.fault(Cause::Malformed("the block does not lie behind the one before it")))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// CRC of the first `size` bytes from `start`, as they are to lie in flash: erased bytes read FFh.
+///
+/// The blocks lie between `start` and `start + size`, in address order.
+fn program_crc<'a>(start: u32, size: u32, blocks: impl Iterator<Item = (u32, &'a [u8])>) -> u32 {
+    const ERASED: [u8; 4096] = [0xFF; 4096];
+    let blocks = blocks.map(|(address, data)| (u64::from(address), data));
+    let end = u64::from(start) + u64::from(size);
+    let mut digest = CRC.digest();
+    let mut at = u64::from(start);
+    for (address, data) in blocks.chain([(end, [].as_slice())]) {
+        while at < address {
+            let gap = (address - at).min(ERASED.len() as u64);
+            digest.update(&ERASED[..gap as usize]);
+            at += gap;
+        }
+        digest.update(data);
+        at += data.len() as u64;
+    }
+    digest.finalize()
+}

@@ -1,0 +1,181 @@
+//! No input may make a reader panic, and nothing damaged may pass for firmware.
+
+use coflash::block_file::BlockFile;
+use coflash::convert::{blocks_of, Options};
+use coflash::read::{self, Firmware, Format};
+use proptest::prelude::*;
+
+macro_rules! data {
+    ($name:literal) => {
+        ($name, include_bytes!(concat!("data/", $name)).as_slice())
+    };
+}
+
+const FILES: [(&str, &[u8]); 8] = [
+    data!("program.elf"),
+    data!("program.hex"),
+    data!("program-srec_cat.hex"),
+    data!("program.s2"),
+    data!("program.s3"),
+    data!("plain-400.blk"),
+    data!("identity-110.blk"),
+    data!("release-110.blk"),
+];
+
+/// The file's meaning, or why it has none.
+fn meaning(bytes: &[u8], format: Option<Format>) -> Result<BlockFile, String> {
+    let firmware = read::read(bytes, format, Some(0x0801_0000)).map_err(|error| error.to_string())?;
+    blocks_of(firmware, &Options::default()).map(|done| done.file).map_err(|error| error.to_string())
+}
+
+#[test]
+fn a_file_cut_off_anywhere_is_refused() {
+    for (name, bytes) in FILES {
+        let whole = meaning(bytes, None).unwrap();
+        for len in 0..bytes.len() {
+            // What may be absent: the line end of the last line, and whatever of an ELF no segment refers to.
+            if let Ok(read) = meaning(&bytes[..len], None) {
+                let harmless = bytes[len..].trim_ascii().is_empty() || name.ends_with(".elf") && len >= 0x373;
+                assert!(harmless && read == whole, "{name} cut to {len} bytes passed");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_damaged_text_or_block_file_never_means_something_else() {
+    for (name, bytes) in FILES.into_iter().filter(|(name, _)| !name.ends_with(".elf")) {
+        let whole = meaning(bytes, None).unwrap();
+        for at in 0..bytes.len() {
+            for bit in 0..8 {
+                let mut damaged = bytes.to_vec();
+                damaged[at] ^= 1 << bit;
+                // A flipped bit may turn a digit's case or a line end, and nothing else. (No checksum of an S-record
+                // covers its type, which tells how long the address is: there the format itself is at an end.)
+                let srec_type = name.contains(".s") && at > 0 && bytes[at - 1] == b'S';
+                if let Ok(read) = meaning(&damaged, None) {
+                    assert!(read == whole || srec_type, "{name}: bit {bit} of byte {at}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn an_empty_or_foreign_file_is_named_so() {
+    assert_eq!(meaning(b"", None).unwrap_err(), "the file: is empty");
+    for bytes in [b"\0".as_slice(), b"PK\x03\x04", b"#!/bin/sh", b"\n\n", &[0; 64], &[0xFF; 64]] {
+        assert!(meaning(bytes, None).unwrap_err().contains("no firmware file"), "{bytes:?}");
+    }
+}
+
+#[test]
+fn a_damaged_block_file_is_named_with_its_offset() {
+    let good = include_bytes!("data/plain-400.blk").as_slice();
+    let with = |at: usize, value: u8| {
+        let mut bytes = good.to_vec();
+        bytes[at] = value;
+        meaning(&bytes, Some(Format::BlockFile)).unwrap_err()
+    };
+    let crc_of = |block: &[u8]| coflash::block_file::CRC.checksum(block).to_le_bytes();
+    // Data of block 1, which starts behind the 24 bytes of block 0.
+    assert!(with(0x30, 0).starts_with("offset 0x18: CRC of block 1 is 0x39a6fa3b"), "{}", with(0x30, 0));
+    assert!(
+        with(0x21, 0xFF).starts_with("offset 0x18: block 1 has 65478 data bytes"),
+        "{}",
+        with(0x21, 0xFF)
+    );
+    let mut renumbered = good.to_vec();
+    renumbered[0x18] = 2;
+    let crc = crc_of(&renumbered[0x18..0x2EA]);
+    renumbered[0x2EA..0x2EE].copy_from_slice(&crc);
+    let error = meaning(&renumbered, None).unwrap_err();
+    assert!(error.starts_with("offset 0x18: block 2 follows where block 1 must"), "{error}");
+    let mut doubled = good.to_vec();
+    doubled.extend_from_slice(good);
+    assert!(meaning(&doubled, None)
+        .unwrap_err()
+        .starts_with("offset 0x373: there is more behind the last block"));
+    let no_program = [&good[..0x18], &good[0x35B..]].concat();
+    assert_eq!(meaning(&no_program, None).unwrap_err(), "the file: holds no data");
+    let mut wrong_crc = good.to_vec();
+    wrong_crc[0x36B] ^= 1;
+    let crc = crc_of(&wrong_crc[0x35B..0x36F]);
+    wrong_crc[0x36F..].copy_from_slice(&crc);
+    let error = meaning(&wrong_crc, None).unwrap_err();
+    assert!(error.starts_with("offset 0x35b: the last block says 4001 bytes"), "{error}");
+}
+
+fn format() -> impl Strategy<Value = Option<Format>> {
+    prop::sample::select(vec![
+        None,
+        Some(Format::IntelHex),
+        Some(Format::SRecord),
+        Some(Format::Elf),
+        Some(Format::BlockFile),
+        Some(Format::Raw),
+    ])
+}
+
+proptest! {
+    #[test]
+    fn random_bytes_never_panic(format in format(), bytes in prop::collection::vec(any::<u8>(), 0..600)) {
+        let _ = meaning(&bytes, format);
+    }
+
+    #[test]
+    fn random_damage_never_panics(
+        file in prop::sample::select(FILES.to_vec()),
+        damage in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..8),
+        len in any::<prop::sample::Index>(),
+    ) {
+        let mut bytes = file.1.to_vec();
+        for (at, value) in damage {
+            let at = at.index(bytes.len());
+            bytes[at] = value;
+        }
+        let len = len.index(bytes.len() * 2).min(bytes.len());
+        let _ = meaning(&bytes[..len], None);
+    }
+
+    /// Random text made of the formats' own alphabet gets further into the readers than random bytes.
+    #[test]
+    fn random_records_never_panic(lines in prop::collection::vec("[:S][0-9A-F]{2,24}", 1..20)) {
+        let _ = meaning(lines.join("\n").as_bytes(), None);
+    }
+
+    /// What conversion cuts into blocks is the memory that went in, whatever the pieces and the block size.
+    #[test]
+    fn blocks_hold_exactly_the_image(
+        pieces in prop::collection::btree_map(0u32..4000, any::<u8>(), 1..300),
+        block_size in 24usize..300,
+    ) {
+        let hex: String = pieces
+            .iter()
+            .map(|(address, byte)| {
+                let [high, low] = (*address as u16).to_be_bytes();
+                let sum = 1u8.wrapping_add(high).wrapping_add(low).wrapping_add(*byte).wrapping_neg();
+                format!(":01{high:02X}{low:02X}00{byte:02X}{sum:02X}\n")
+            })
+            .chain([":00000001FF\n".to_string()])
+            .collect();
+        let Firmware::Image(image) = read::read(hex.as_bytes(), None, None).unwrap() else { panic!() };
+        let options = Options { block_size, ..Options::default() };
+        let file = blocks_of(Firmware::Image(image), &options).unwrap().file;
+        let mut memory = [0xFFu8; 4096];
+        let mut covered = [false; 4096];
+        for block in file.program_blocks() {
+            prop_assert!(block.data.len() + 16 <= block_size);
+            prop_assert!(block.flash_address % 4 == 0);
+            for (address, byte) in (block.flash_address as usize..).zip(&block.data) {
+                prop_assert!(!covered[address]);
+                (memory[address], covered[address]) = (*byte, true);
+            }
+        }
+        for address in 0..4096 {
+            let expected = pieces.get(&(address as u32)).copied().unwrap_or(0xFF);
+            prop_assert_eq!(memory[address], expected);
+        }
+        prop_assert_eq!(BlockFile::parse(&file.emit()).unwrap(), file);
+    }
+}

@@ -1,0 +1,176 @@
+//! Conversion against block files made by other tools (`data/make.sh`) and against literals from the manual's tables.
+
+use coflash::block_file::BlockFile;
+use coflash::convert::{blocks_of, convert, ConvertError, Converted, GapFill, Label, Options, Region};
+use coflash::image::{AddressRange, Image};
+use coflash::read::{self, Firmware, Format};
+use shared_abi::layout::stm32f407g_disc1::LAYOUT;
+
+macro_rules! data {
+    ($name:literal) => {
+        include_bytes!(concat!("data/", $name)).as_slice()
+    };
+}
+
+fn image(bytes: &[u8]) -> Image {
+    match read::read(bytes, None, None).unwrap() {
+        Firmware::Image(image) => image,
+        Firmware::Blocks(_) => panic!("a block file"),
+    }
+}
+
+fn board() -> Region {
+    Region::Strict(LAYOUT.programs[0].into())
+}
+
+const IDENTITY: Label = Label::Device { vendor_id: 0, product_code: 1234 };
+const RELEASE: Label =
+    Label::Release { vendor_id: 0, product_code: 1234, version: 0x0064_0A01, date: 1_420_070_400 };
+
+#[test]
+fn every_format_of_one_program_gives_the_same_block_file() {
+    let plain = Options { region: board(), ..Options::default() };
+    for (name, bytes) in [
+        ("program.elf", data!("program.elf")),
+        ("program.hex", data!("program.hex")),
+        ("program-srec_cat.hex", data!("program-srec_cat.hex")),
+        ("program.s3", data!("program.s3")),
+    ] {
+        let image = image(bytes);
+        for (expected, options) in [
+            (data!("plain-400.blk"), plain),
+            (data!("plain-400.blk"), Options::default()),
+            (data!("identity-110.blk"), Options { block_size: 0x110, label: IDENTITY, ..plain }),
+            (data!("release-110.blk"), Options { block_size: 0x110, label: RELEASE, ..plain }),
+        ] {
+            let Converted { file, left_out } = convert(&image, &options).unwrap();
+            assert!(file.emit() == expected, "{name}, {options:?}");
+            assert_eq!(left_out, 0);
+        }
+    }
+}
+
+#[test]
+fn short_addresses_read_the_same_memory() {
+    let short = image(data!("program.s2"));
+    let moved = short.segments().map(|(address, data)| (address + 0x0800_0000, data));
+    let elf = image(data!("program.elf"));
+    assert!(moved.eq(elf.segments()));
+}
+
+#[test]
+fn a_block_file_is_read_back_and_taken_as_it_is() {
+    for bytes in [data!("plain-400.blk"), data!("identity-110.blk"), data!("release-110.blk")] {
+        let firmware = read::read(bytes, None, None).unwrap();
+        let done = blocks_of(firmware, &Options { region: board(), ..Options::default() }).unwrap();
+        assert!(done.file.emit() == bytes);
+        assert_eq!(done.file.program_size(), 0xFA1);
+    }
+}
+
+/// A program of five bytes, block by block as the tables of chapter 5.1 draw it; CRCs from Python's `zlib.crc32`.
+#[test]
+fn a_small_program_byte_by_byte() {
+    let image = image(b":020000040801F1\n:050000000102030405EC\n:00000001FF\n");
+    let Converted { file, .. } = convert(&image, &Options::default()).unwrap();
+    #[rustfmt::skip]
+    let expected = [
+        0, 0, 0, 0,  0, 0, 0, 0,  8, 0, 0, 0,  0, 0, 0, 0, 0, 0, 0, 0,  0x73, 0xED, 0xD9, 0x09,
+        1, 0, 0, 0,  0, 0, 1, 8,  5, 0, 0, 0,  1, 2, 3, 4, 5,  0x6C, 0x8E, 0xAE, 0x57,
+        0xFF, 0xFF, 0xFF, 0xFF,  0, 0, 0, 0,  8, 0, 0, 0,
+            5, 0, 0, 0,  0xF4, 0x99, 0x0B, 0x47,  0x12, 0x88, 0x99, 0x41,
+    ];
+    assert_eq!(file.emit(), expected);
+}
+
+#[test]
+fn gaps_inside_a_block_take_the_fill_and_count_in_the_crc() {
+    // 01 at 08010000h, a gap of six bytes, 02 at 08010007h.
+    let image = image(b":020000040801F1\n:0100000001FE\n:0100070002F6\n:00000001FF\n");
+    let data = |gap_fill| {
+        let file = convert(&image, &Options { gap_fill: GapFill::new(gap_fill), ..Options::default() })
+            .unwrap()
+            .file;
+        (file.program_blocks()[0].data.clone(), file.program_crc())
+    };
+    // CRCs: zlib.crc32 over the eight bytes.
+    assert_eq!(data(0xFFFF_FFFF), (vec![1, 255, 255, 255, 255, 255, 255, 2], 0x08A9_57C5));
+    assert_eq!(data(0x0000_00A5), (vec![1, 0xA5, 0xA5, 0xA5, 0xA5, 0xA5, 0xA5, 2], 0xD575_ECB9));
+    assert_eq!(data(0x4433_2211), (vec![1, 0x22, 0x33, 0x44, 0x11, 0x22, 0x33, 2], 0x173E_DAA0));
+}
+
+#[test]
+fn the_region_decides_about_data_outside() {
+    let elf = image(data!("program.elf"));
+    let with = |region| convert(&elf, &Options { region, ..Options::default() });
+    let range = |first, last| AddressRange { first, last };
+
+    let error = with(Region::Strict(range(0x0801_0000, 0x0801_0F9F))).unwrap_err().to_string();
+    assert!(
+        error.starts_with(
+            "offset 0x362: the data at 0x08010f90..=0x08010fa0 lies outside 0x08010000..=0x08010f9f"
+        ),
+        "{error}"
+    );
+    // The manual's --start_address/--end_address leave it out.
+    let cut = with(Region::Cut(range(0x0801_0000, 0x0801_02C5))).unwrap();
+    assert_eq!((cut.file.program_size(), cut.left_out), (0x2C6, 8 + 17));
+    let error = with(Region::Cut(range(0, 0xFFFF))).unwrap_err().to_string();
+    assert_eq!(error, "the file: holds no data inside 0x00000000..=0x0000ffff");
+    // The size counts from the region's start.
+    let early = with(Region::Strict(range(0x0800_FF00, 0x080F_FFFF))).unwrap();
+    assert_eq!(early.file.program_size(), 0xFA1 + 0x100);
+    assert!(matches!(with(Region::Cut(range(2, 0xFFFF_FFFF))), Err(ConvertError::Start(2))));
+    assert!(matches!(with(Region::Cut(range(8, 4))), Err(ConvertError::Range(_))));
+}
+
+#[test]
+fn a_block_file_for_another_place_is_refused() {
+    let file = BlockFile::parse(data!("plain-400.blk")).unwrap();
+    let range = |first, last| AddressRange { first, last };
+    assert!(file.check_region(range(0x0801_0000, 0x080F_FFFF)).is_ok());
+    let error = file.check_region(range(0x0801_0000, 0x0801_0FFF - 0x60)).unwrap_err().to_string();
+    assert!(error.starts_with("offset 0x2ee: the data at 0x08010f44..=0x08010fa0 lies outside"), "{error}");
+    // The device would count size and CRC from its region's start.
+    let error = file.check_region(range(0x0800_0000, 0x080F_FFFF)).unwrap_err().to_string();
+    assert!(error.contains("does not fit the blocks"), "{error}");
+}
+
+#[test]
+fn a_block_size_holds_every_block() {
+    let elf = image(data!("program.elf"));
+    let with = |block_size, label| convert(&elf, &Options { block_size, label, ..Options::default() });
+    for (least, label) in [(24, Label::None), (28, IDENTITY), (40, RELEASE)] {
+        let file = with(least, label).unwrap().file;
+        assert!(file.blocks().iter().all(|block| block.emit().len() <= least));
+        let error = with(least - 1, label).unwrap_err().to_string();
+        assert!(error.contains(&format!("must be {least} to 16384")), "{error}");
+    }
+    assert!(with(16384, Label::None).is_ok());
+    assert!(with(16385, Label::None).is_err());
+}
+
+#[test]
+fn two_memories_in_one_file_are_not_one_program() {
+    let image = image(b":0100000001FE\n:02000004FFFFFC\n:01FFFF0002FF\n:00000001FF\n");
+    let error = convert(&image, &Options::default()).unwrap_err().to_string();
+    assert!(error.starts_with("the file: the data spans 0x00000000..=0xffffffff"), "{error}");
+    // The end of the address space itself is no problem.
+    let top = AddressRange { first: 0xFFFF_FF00, last: 0xFFFF_FFFF };
+    let file = convert(&image, &Options { region: Region::Cut(top), ..Options::default() }).unwrap().file;
+    assert_eq!((file.program_size(), file.span().last), (0x100, 0xFFFF_FFFF));
+    assert!(BlockFile::parse(&file.emit()).is_ok());
+}
+
+#[test]
+fn a_raw_file_goes_where_it_is_told() {
+    let bytes = data!("program.bin");
+    let read = |address| read::read(bytes, Some(Format::Raw), address);
+    let Firmware::Image(raw) = read(Some(0x0801_0000)).unwrap() else { panic!() };
+    let file = convert(&raw, &Options { region: board(), ..Options::default() }).unwrap().file;
+    let gapless = BlockFile::parse(data!("plain-400.blk")).unwrap();
+    assert_eq!((file.program_size(), file.program_crc()), (gapless.program_size(), gapless.program_crc()));
+    assert!(read(None).unwrap_err().to_string().contains("give --start-address"));
+    assert!(read(Some(0xFFFF_FF00)).is_err());
+    assert!(read::read(bytes, None, None).unwrap_err().to_string().contains("no firmware file"));
+}

@@ -1,0 +1,46 @@
+"""Writes the block files that conversion of program.* must give, from the manual's tables alone (L-1112d_10,
+chapter 5.1): blocks of 0x110 bytes as in the manual's example call, and the default of 0x400 bytes."""
+import re
+import struct
+import subprocess
+import zlib
+
+START = 0x08010000
+
+
+def block(number, address, data):
+    body = struct.pack("<III", number, address, len(data)) + data
+    return body + struct.pack("<I", zlib.crc32(body))
+
+
+def memory():
+    """Address -> byte, as GNU objdump shows the load addresses of the sections."""
+    text = subprocess.run(["arm-none-eabi-objdump", "-h", "program.elf"], capture_output=True, text=True, check=True)
+    image = open("program.elf", "rb").read()
+    found = {}
+    for line in text.stdout.splitlines():
+        match = re.match(r"\s*\d+ \.(vectors|text|far|data)\s+(\w+)\s+\w+\s+(\w+)\s+(\w+)", line)
+        if match:
+            size, load, offset = (int(field, 16) for field in match.groups()[1:])
+            found.update((load + i, image[offset + i]) for i in range(size))
+    return found
+
+
+def block_file(control, block_size):
+    found = memory()
+    flash = bytes(found.get(a, 0xFF) for a in range(START, max(found) + 1))
+    assert flash == open("program.bin", "rb").read()
+    out, number, address = block(0, 0, control(len(flash))), 1, START
+    while any(a >= address for a in found):
+        # A block starts at the word of the first byte that is not in a block yet, and ends with its last byte.
+        address = min(a for a in found if a >= address) & ~3
+        last = max(a for a in found if a < address + block_size - 16)
+        out += block(number, address, flash[address - START:last + 1 - START])
+        number, address = number + 1, address + block_size - 16
+    return out + block(0xFFFFFFFF, 0, struct.pack("<II", len(flash), zlib.crc32(flash)))
+
+
+open("plain-400.blk", "wb").write(block_file(lambda size: bytes(8), 0x400))
+open("identity-110.blk", "wb").write(block_file(lambda size: struct.pack("<III", size, 0, 1234), 0x110))
+open("release-110.blk", "wb").write(
+    block_file(lambda size: struct.pack("<IIIIq", size, 0, 1234, 0x00640A01, 1420070400), 0x110))
