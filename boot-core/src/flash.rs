@@ -6,7 +6,7 @@ use shared_abi::geometry::Sector;
 
 /// Why a flash operation failed, as the controller tells it (RM0090 section 3.8.4, `FLASH_SR`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum FlashError {
+pub enum FlashFault {
     /// The range is write-protected by option bytes.
     Protected,
     /// The operation was refused or failed: sequence, alignment, width or supply.
@@ -27,16 +27,16 @@ pub trait Flash {
     ///
     /// # Errors
     /// What the controller says at once; later faults come from [`Flash::poll`].
-    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashError>;
+    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashFault>;
 
     /// Starts to program one word at a word-aligned address.
     ///
     /// # Errors
     /// What the controller says at once; later faults come from [`Flash::poll`].
-    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashError>;
+    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashFault>;
 
     /// The outcome of the running operation, `Ready(Ok(()))` when none runs.
-    fn poll(&mut self) -> Poll<Result<(), FlashError>>;
+    fn poll(&mut self) -> Poll<Result<(), FlashFault>>;
 
     /// The word at a word-aligned address.
     fn read_word(&self, address: u32) -> u32 {
@@ -68,7 +68,7 @@ impl WordWriter {
         flash: &mut F,
         count: usize,
         word: impl Fn(usize) -> u32,
-    ) -> Poll<Result<(), FlashError>> {
+    ) -> Poll<Result<(), FlashFault>> {
         loop {
             match flash.poll() {
                 Poll::Pending => return Poll::Pending,
@@ -79,7 +79,7 @@ impl WordWriter {
             if self.running {
                 self.running = false;
                 if flash.read_word(address) != word(self.written) {
-                    return Poll::Ready(Err(FlashError::Verify));
+                    return Poll::Ready(Err(FlashFault::Verify));
                 }
                 self.written += 1;
             } else if self.written == count {
@@ -111,7 +111,7 @@ impl SectorEraser {
         &mut self,
         flash: &mut F,
         chip: &shared_abi::geometry::Geometry,
-    ) -> Poll<Result<(), FlashError>> {
+    ) -> Poll<Result<(), FlashFault>> {
         loop {
             match flash.poll() {
                 Poll::Pending => return Poll::Pending,
@@ -123,7 +123,7 @@ impl SectorEraser {
             }
             // A checked layout ends at sector borders; a region outside the flash is refused, not looped over.
             let Some(sector) = chip.sector_at(self.next) else {
-                return Poll::Ready(Err(FlashError::Failed));
+                return Poll::Ready(Err(FlashFault::Failed));
             };
             self.next = sector.region.end();
             if let Err(error) = flash.start_erase(sector) {

@@ -2,6 +2,7 @@
 //!
 //! | module | what it does |
 //! |---|---|
+//! | [`bootloader`] | the object dictionary and everything behind it |
 //! | [`decision`] | bootloader or program, after every reset |
 //! | [`program`] | what is known of a program, and the proof that it may be started |
 //! | [`parameters`] | the power-fail-safe journal of the non-volatile parameters |
@@ -10,7 +11,9 @@
 #![no_std]
 #![forbid(unsafe_code)]
 
+pub mod bootloader;
 pub mod decision;
+pub mod download;
 pub mod flash;
 pub mod parameters;
 pub mod program;

@@ -10,7 +10,7 @@ use core::task::Poll;
 use shared_abi::geometry::{Geometry, Region};
 
 use crate::crc32;
-use crate::flash::{Flash, FlashError, SectorEraser, WordWriter, ERASED};
+use crate::flash::{Flash, FlashFault, SectorEraser, WordWriter, ERASED};
 
 const SLOT_WORDS: usize = 6;
 const SLOT_SIZE: u32 = SLOT_WORDS as u32 * 4;
@@ -50,7 +50,7 @@ pub type Value = [u32; 4];
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StoreError {
     /// The flash refused or failed.
-    Flash(FlashError),
+    Flash(FlashFault),
     /// No slot took the record: the region is worn out.
     WornOut,
 }
@@ -169,7 +169,7 @@ impl Store {
                     match outcome {
                         Ok(()) => return Poll::Ready(Ok(())),
                         // Left half-charged by a power cut, or worn: leave the slot, take the next.
-                        Err(FlashError::Verify) if self.attempts < ATTEMPTS => {
+                        Err(FlashFault::Verify) if self.attempts < ATTEMPTS => {
                             self.attempts += 1;
                             let region = &journal.regions[active.region];
                             if active.free < slots(region) {
@@ -178,7 +178,7 @@ impl Store {
                                 State::Erase { eraser: SectorEraser::new(new) }
                             }
                         }
-                        Err(FlashError::Verify) => return Poll::Ready(Err(StoreError::WornOut)),
+                        Err(FlashFault::Verify) => return Poll::Ready(Err(StoreError::WornOut)),
                         Err(error) => return Poll::Ready(Err(StoreError::Flash(error))),
                     }
                 }
@@ -231,7 +231,7 @@ impl Store {
     }
 }
 
-fn write<F: Flash>(writer: &mut WordWriter, flash: &mut F, slot: &Slot) -> Poll<Result<(), FlashError>> {
+fn write<F: Flash>(writer: &mut WordWriter, flash: &mut F, slot: &Slot) -> Poll<Result<(), FlashFault>> {
     writer.poll(flash, SLOT_WORDS, |i| slot[i])
 }
 

@@ -4,7 +4,7 @@ mod model;
 
 use std::task::Poll;
 
-use boot_core::flash::FlashError;
+use boot_core::flash::FlashFault;
 use boot_core::parameters::{Journal, Key, StoreError, Value};
 use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash};
 use shared_abi::geometry::{Geometry, Region, SectorRun};
@@ -130,9 +130,9 @@ fn errors_of_the_flash_are_told_and_the_old_value_stays() {
         let mut flash = ModelFlash::new(&SMALL);
         let mut journal = Journal::open(&flash, REGIONS);
         store(&mut flash, &mut journal, Key::Program(1), [1; 4]).unwrap();
-        flash.fail = Some((flash.operations + operation, FlashError::Protected));
+        flash.fail = Some((flash.operations + operation, FlashFault::Protected));
         let outcome = store(&mut flash, &mut journal, Key::Program(1), [2; 4]);
-        assert_eq!(outcome, Err(StoreError::Flash(FlashError::Protected)));
+        assert_eq!(outcome, Err(StoreError::Flash(FlashFault::Protected)));
         assert_eq!(Journal::open(&flash, REGIONS).get(&flash, Key::Program(1)), Some([1; 4]));
     }
 }

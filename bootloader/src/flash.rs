@@ -4,7 +4,7 @@
 
 use core::task::Poll;
 
-use boot_core::flash::{Flash, FlashError};
+use boot_core::flash::{Flash, FlashFault};
 use bsp::pac;
 use shared_abi::geometry::{Region, Sector};
 
@@ -76,7 +76,7 @@ impl Flash for FlashController {
         }
     }
 
-    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashError> {
+    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashFault> {
         self.unlock();
         self.registers.cr().write(|w| {
             // SAFETY: the geometry's sector numbers are those that SNB takes (section 3.8.5).
@@ -87,9 +87,9 @@ impl Flash for FlashController {
         Ok(())
     }
 
-    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashError> {
+    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashFault> {
         if !self.flash.contains(address, 4) || !address.is_multiple_of(4) {
-            return Err(FlashError::Failed);
+            return Err(FlashFault::Failed);
         }
         self.unlock();
         self.registers
@@ -101,7 +101,7 @@ impl Flash for FlashController {
         Ok(())
     }
 
-    fn poll(&mut self) -> Poll<Result<(), FlashError>> {
+    fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
         if !self.running {
             return Poll::Ready(Ok(()));
         }
@@ -113,9 +113,9 @@ impl Flash for FlashController {
         self.clear_flags();
         self.lock();
         Poll::Ready(if status.wrperr().bit_is_set() {
-            Err(FlashError::Protected)
+            Err(FlashFault::Protected)
         } else if status.pgaerr().bit_is_set() || status.pgperr().bit_is_set() || status.pgserr().bit_is_set() {
-            Err(FlashError::Failed)
+            Err(FlashFault::Failed)
         } else {
             Ok(())
         })

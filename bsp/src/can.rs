@@ -53,9 +53,6 @@ impl BitTiming {
 ///
 /// Joining takes 11 recessive bits on the bus; the controller waits for them by itself and this function does not.
 /// Interrupts of receive FIFO 0 and of the mailboxes are on.
-///
-/// # Panics
-/// Never: identifiers beyond the 28 filters in pairs of 2 are not configured (and no caller has so many).
 pub fn start<I>(controller: I, timing: BitTiming, identifiers: &[StandardId]) -> Can<I>
 where
     I: Instance + MasterInstance + bxcan::FilterOwner,
@@ -72,9 +69,28 @@ where
 fn set_filters<I: MasterInstance + bxcan::FilterOwner>(can: &mut Can<I>, identifiers: &[StandardId]) {
     let mut filters = can.modify_filters();
     filters.clear();
-    for (bank, pair) in identifiers.chunks(2).enumerate() {
-        let [first, second] = [pair[0], pair[pair.len() - 1]].map(ListEntry16::data_frames_with_id);
-        filters.enable_bank(bank as u8, Fifo::Fifo0, [first, second]);
+    for (bank, four) in identifiers.chunks(4).enumerate() {
+        // A bank lists four identifiers; a shorter row repeats its first one.
+        let entry = |i| ListEntry16::data_frames_with_id(four.get(i).copied().unwrap_or(four[0]));
+        filters.enable_bank(bank as u8, Fifo::Fifo0, [entry(0), entry(1), entry(2), entry(3)]);
+    }
+}
+
+/// The identifier of this value; only its 11 bits count.
+#[must_use]
+pub fn standard_id(raw: u16) -> StandardId {
+    StandardId::new(raw & 0x7FF).unwrap_or(StandardId::MAX)
+}
+
+/// The next frame from the FIFO, `None` when it is empty. An overrun is left for the caller's next round: the frames that
+/// are there are still good.
+pub fn receive<I: Instance, F: embedded_can::Frame>(fifo: &mut bxcan::Rx0<I>) -> Option<F> {
+    loop {
+        match fifo.receive() {
+            Ok(frame) => return convert(&frame),
+            Err(nb::Error::WouldBlock) => return None,
+            Err(nb::Error::Other(bxcan::OverrunError { .. })) => {}
+        }
     }
 }
 
@@ -85,5 +101,40 @@ pub fn convert<F: embedded_can::Frame, G: embedded_can::Frame>(frame: &F) -> Opt
         G::new_remote(frame.id(), frame.dlc())
     } else {
         G::new(frame.id(), frame.data())
+    }
+}
+
+/// The transmit side: mailboxes, and the one frame that may wait for them.
+pub struct Transmitter<I: Instance> {
+    mailboxes: bxcan::Tx<I>,
+    waiting: Option<bxcan::Frame>,
+}
+
+impl<I: Instance> Transmitter<I> {
+    /// Takes the mailboxes.
+    pub const fn new(mailboxes: bxcan::Tx<I>) -> Self {
+        Self { mailboxes, waiting: None }
+    }
+
+    /// Acknowledges the mailbox interrupt, then sends what `next` gives for as long as the mailboxes take it.
+    ///
+    /// Frames of one identifier leave in order: the mailboxes take the second only when the first is on its way.
+    pub fn pump<F: embedded_can::Frame>(&mut self, mut next: impl FnMut() -> Option<F>) {
+        self.mailboxes.clear_interrupt_flags();
+        while let Some(frame) = self.waiting.take().or_else(|| next().as_ref().and_then(convert)) {
+            match self.mailboxes.transmit(&frame) {
+                // A frame of lower priority may have had to leave its mailbox: it goes next.
+                Ok(status) => self.waiting = status.dequeued_frame().cloned(),
+                Err(_) => {
+                    self.waiting = Some(frame);
+                    break;
+                }
+            }
+        }
+    }
+
+    /// Whether everything given to it is on the bus and acknowledged.
+    pub fn is_idle(&self) -> bool {
+        self.waiting.is_none() && self.mailboxes.is_idle()
     }
 }

@@ -31,8 +31,8 @@ pub const BIT_RATE: u32 = 125_000;
 const HSE: u32 = 8_000_000;
 /// The core's clock, in Hz: the fastest that the chip allows at 3.3 V (datasheet DS8626, table 14).
 pub const SYSCLK: u32 = 168_000_000;
-/// Clock of the bus that CAN1 sits on, in Hz; the chip's limit is 42 MHz.
-const PCLK1: u32 = 42_000_000;
+/// Clock of the CAN controller, in Hz: that of APB1, whose limit is 42 MHz.
+pub const CAN_CLOCK: u32 = 42_000_000;
 
 /// The CAN controller that coboot talks through.
 pub type CanController = Can<pac::CAN1>;
@@ -43,8 +43,6 @@ pub type Led = Pin<'D', 12, Output>;
 pub struct Board {
     /// The CAN controller with its pins; clocked, not yet configured.
     pub can: CanController,
-    /// Clock of the CAN controller in Hz, for the bit timing.
-    pub can_clock: u32,
     /// The LED.
     pub led: Led,
 }
@@ -52,12 +50,12 @@ pub struct Board {
 /// Sets the clocks and pins up, from the state after a reset.
 #[must_use]
 pub fn init(rcc: pac::RCC, can1: pac::CAN1, gpiod: pac::GPIOD) -> Board {
-    let clocks = Config::hse(HSE.Hz()).sysclk(SYSCLK.Hz()).pclk1(PCLK1.Hz());
+    let clocks = Config::hse(HSE.Hz()).sysclk(SYSCLK.Hz()).pclk1(CAN_CLOCK.Hz());
     let mut rcc = rcc.freeze(clocks);
     let gpiod = gpiod.split(&mut rcc);
     let led = gpiod.pd12.into_push_pull_output();
     let can = can1.can((gpiod.pd1, gpiod.pd0), &mut rcc);
-    Board { can, can_clock: rcc.clocks.pclk1().raw(), led }
+    Board { can, led }
 }
 
 /// Whether the entry strap asks for the bootloader: the blue button B1 on PA0, high when pressed.
@@ -73,10 +71,3 @@ pub fn entry_strap(rcc: &pac::RCC, gpioa: &pac::GPIOA) -> bool {
     pressed
 }
 
-/// The interrupts in use, under the names that say what they are for.
-pub mod interrupt {
-    /// A frame arrived in receive FIFO 0.
-    pub use super::pac::Interrupt::CAN1_RX0 as CAN_RX;
-    /// A transmit mailbox became free.
-    pub use super::pac::Interrupt::CAN1_TX as CAN_TX;
-}

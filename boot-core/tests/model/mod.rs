@@ -4,7 +4,7 @@
 use std::panic::panic_any;
 use std::task::Poll;
 
-use boot_core::flash::{Flash, FlashError};
+use boot_core::flash::{Flash, FlashFault};
 use shared_abi::geometry::{Geometry, Region, Sector};
 
 /// Thrown by the flash when the power goes. Catch it, then [`ModelFlash::power_on`].
@@ -38,7 +38,7 @@ pub struct ModelFlash {
     /// Lose the power in the operation of this number.
     pub cut: Option<(u32, Cut)>,
     /// Fail the operation of this number with this error.
-    pub fail: Option<(u32, FlashError)>,
+    pub fail: Option<(u32, FlashFault)>,
     /// Every region that was written to or erased.
     pub touched: Vec<Region>,
 }
@@ -79,7 +79,7 @@ impl ModelFlash {
         self.cells[at..at + bytes.len()].copy_from_slice(bytes);
     }
 
-    fn begin(&mut self, operation: Operation) -> Result<(), FlashError> {
+    fn begin(&mut self, operation: Operation) -> Result<(), FlashFault> {
         assert!(self.running.is_none(), "an operation was started while another one runs");
         self.operations += 1;
         let region = match operation {
@@ -139,17 +139,17 @@ impl Flash for ModelFlash {
         }
     }
 
-    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashError> {
+    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashFault> {
         assert_eq!(self.chip.sector(sector.number), Some(sector), "no such sector");
         self.begin(Operation::Erase(sector.region))
     }
 
-    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashError> {
+    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashFault> {
         assert!(self.chip.flash.contains(address, 4) && address % 4 == 0, "{address:#x}");
         self.begin(Operation::Program { address, word })
     }
 
-    fn poll(&mut self) -> Poll<Result<(), FlashError>> {
+    fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
         let Some(operation) = self.running else { return Poll::Ready(Ok(())) };
         if self.polls_left > 0 {
             self.polls_left -= 1;

@@ -1,0 +1,380 @@
+//! The object dictionary: declared once as a table, its values behind a trait.
+//!
+//! ```
+//! use canopen::od::{Access, Address, DataType, Entry, Objects};
+//! use canopen::AbortCode;
+//!
+//! const ENTRIES: &[Entry] = &[
+//!     Entry::var(0x1000, "Device type", DataType::Unsigned32, Access::Const).default(0x1000_0000),
+//!     Entry::record(0x1018, "Identity object", 1),
+//!     Entry::sub(0x1018, 1, "Vendor-ID", DataType::Unsigned32, Access::Const),
+//! ];
+//!
+//! struct Device;
+//!
+//! impl Objects for Device {
+//!     fn entries(&self) -> &'static [Entry] {
+//!         ENTRIES
+//!     }
+//!
+//!     fn read(&mut self, at: Address, buf: &mut [u8]) -> Result<usize, AbortCode> {
+//!         match (at.index, at.sub) {
+//!             (0x1000, 0) => canopen::od::put(buf, &0x1000_0000_u32.to_le_bytes()),
+//!             (0x1018, 1) => canopen::od::put(buf, &0x0000_0123_u32.to_le_bytes()),
+//!             _ => Err(AbortCode::NO_DATA),
+//!         }
+//!     }
+//! }
+//! ```
+//!
+//! The SDO server checks every access against the table before it asks for a value, so that an implementation sees
+//! only accesses that the table allows:
+//!
+//! | the client | abort |
+//! |---|---|
+//! | names an index that is not in the table | 06020000h |
+//! | names a sub-index that is not in the table | 06090011h |
+//! | writes `const` or `ro` | 06010002h |
+//! | reads `wo` | 06010001h |
+//! | writes more, or fewer, bytes than the type has | 06070012h, 06070013h |
+//! | sends another number of bytes than it announced | 06070010h |
+
+use core::fmt;
+
+use crate::sdo::AbortCode;
+
+/// Index and sub-index: the "multiplexer" of an SDO.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Address {
+    /// The object.
+    pub index: u16,
+    /// Its part; 0 for an object without parts.
+    pub sub: u8,
+}
+
+impl Address {
+    /// The address of a value.
+    #[must_use]
+    pub const fn new(index: u16, sub: u8) -> Self {
+        Self { index, sub }
+    }
+}
+
+/// `1F50h/1`.
+impl fmt::Display for Address {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:04X}h/{}", self.index, self.sub)
+    }
+}
+
+/// Data types of CiA 301 table 44, with their codes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum DataType {
+    /// One byte, 0 or 1.
+    Boolean = 0x01,
+    /// Signed, 1 byte.
+    Integer8 = 0x02,
+    /// Signed, 2 bytes.
+    Integer16 = 0x03,
+    /// Signed, 4 bytes.
+    Integer32 = 0x04,
+    /// Unsigned, 1 byte.
+    Unsigned8 = 0x05,
+    /// Unsigned, 2 bytes.
+    Unsigned16 = 0x06,
+    /// Unsigned, 4 bytes.
+    Unsigned32 = 0x07,
+    /// Text, of any length up to [`VALUE_MAX`](crate::sdo::server::VALUE_MAX).
+    VisibleString = 0x09,
+    /// Bytes, of any length up to [`VALUE_MAX`](crate::sdo::server::VALUE_MAX).
+    OctetString = 0x0A,
+    /// Data of any length, never held as a whole.
+    Domain = 0x0F,
+    /// Unsigned, 8 bytes.
+    Unsigned64 = 0x1B,
+}
+
+impl DataType {
+    /// Bytes of a value; `None` where that differs from value to value.
+    #[must_use]
+    pub const fn size(self) -> Option<u32> {
+        match self {
+            Self::Boolean | Self::Integer8 | Self::Unsigned8 => Some(1),
+            Self::Integer16 | Self::Unsigned16 => Some(2),
+            Self::Integer32 | Self::Unsigned32 => Some(4),
+            Self::Unsigned64 => Some(8),
+            Self::VisibleString | Self::OctetString | Self::Domain => None,
+        }
+    }
+}
+
+/// What a client may do with a value (CiA 301 table 43).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Access {
+    /// Read; it never changes.
+    Const,
+    /// Read.
+    Ro,
+    /// Write.
+    Wo,
+    /// Both.
+    Rw,
+}
+
+impl Access {
+    /// Whether an upload is allowed.
+    #[must_use]
+    pub const fn is_readable(self) -> bool {
+        !matches!(self, Self::Wo)
+    }
+
+    /// Whether a download is allowed.
+    #[must_use]
+    pub const fn is_writable(self) -> bool {
+        matches!(self, Self::Wo | Self::Rw)
+    }
+}
+
+/// What an entry is part of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// An object of one value (VAR, or DOMAIN by its type).
+    Var,
+    /// Sub-index 0 of an object whose values are all of one type; its value is the highest sub-index.
+    Array(u8),
+    /// Sub-index 0 of an object of values of any type; its value is the highest sub-index.
+    Record(u8),
+    /// A value of an array or record.
+    Sub,
+}
+
+/// The value that an object has before anyone writes it.
+#[cfg(feature = "names")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DefaultValue {
+    /// None is given.
+    None,
+    /// A number.
+    Number(u64),
+    /// A text.
+    Text(&'static str),
+}
+
+/// One value of the object dictionary.
+#[derive(Clone, Copy, Debug)]
+pub struct Entry {
+    /// Where it is.
+    pub at: Address,
+    /// How its bytes are to be read.
+    pub data_type: DataType,
+    /// What a client may do with it.
+    pub access: Access,
+    /// What it is part of.
+    pub kind: Kind,
+    /// What it is called. For [`Kind::Array`] and [`Kind::Record`] it is the name of the whole object.
+    #[cfg(feature = "names")]
+    pub name: &'static str,
+    /// The value before anyone writes it.
+    #[cfg(feature = "names")]
+    pub default: DefaultValue,
+}
+
+impl Entry {
+    const fn new(at: Address, name: &'static str, data_type: DataType, access: Access, kind: Kind) -> Self {
+        #[cfg(not(feature = "names"))]
+        let _ = name;
+        Self {
+            at,
+            data_type,
+            access,
+            kind,
+            #[cfg(feature = "names")]
+            name,
+            #[cfg(feature = "names")]
+            default: DefaultValue::None,
+        }
+    }
+
+    /// An object of one value.
+    #[must_use]
+    pub const fn var(index: u16, name: &'static str, data_type: DataType, access: Access) -> Self {
+        Self::new(Address::new(index, 0), name, data_type, access, Kind::Var)
+    }
+
+    /// The head of an object with parts of one type: its sub-index 0. The server answers it from the table.
+    #[must_use]
+    pub const fn array(index: u16, name: &'static str, highest: u8) -> Self {
+        Self::new(Address::new(index, 0), name, DataType::Unsigned8, Access::Const, Kind::Array(highest))
+    }
+
+    /// The head of an object with parts of different types: its sub-index 0. The server answers it from the table.
+    #[must_use]
+    pub const fn record(index: u16, name: &'static str, highest: u8) -> Self {
+        Self::new(Address::new(index, 0), name, DataType::Unsigned8, Access::Const, Kind::Record(highest))
+    }
+
+    /// A part of an array or record; it follows its head in the table.
+    #[must_use]
+    pub const fn sub(index: u16, sub: u8, name: &'static str, data_type: DataType, access: Access) -> Self {
+        Self::new(Address::new(index, sub), name, data_type, access, Kind::Sub)
+    }
+
+    /// With another access. A head that is not `const` is read from and written to the implementation (1003h/0).
+    #[must_use]
+    pub const fn access(mut self, access: Access) -> Self {
+        self.access = access;
+        self
+    }
+
+    /// With a number as default value.
+    #[must_use]
+    #[cfg_attr(not(feature = "names"), allow(unused_mut))]
+    pub const fn default(mut self, value: u64) -> Self {
+        #[cfg(not(feature = "names"))]
+        let _ = value;
+        #[cfg(feature = "names")]
+        {
+            self.default = DefaultValue::Number(value);
+        }
+        self
+    }
+
+    /// With a text as default value.
+    #[must_use]
+    #[cfg_attr(not(feature = "names"), allow(unused_mut))]
+    pub const fn default_text(mut self, value: &'static str) -> Self {
+        #[cfg(not(feature = "names"))]
+        let _ = value;
+        #[cfg(feature = "names")]
+        {
+            self.default = DefaultValue::Text(value);
+        }
+        self
+    }
+}
+
+/// Looks an entry up.
+///
+/// # Errors
+/// [`AbortCode::NO_OBJECT`] if no entry has the index, [`AbortCode::NO_SUB_INDEX`] if none of those has the sub-index.
+pub fn find(entries: &[Entry], at: Address) -> Result<&Entry, AbortCode> {
+    let mut code = AbortCode::NO_OBJECT;
+    for entry in entries {
+        if entry.at == at {
+            return Ok(entry);
+        }
+        if entry.at.index == at.index {
+            code = AbortCode::NO_SUB_INDEX;
+        }
+    }
+    Err(code)
+}
+
+/// One table of two, in the order given. `N` is the length of both together.
+#[must_use]
+pub const fn concat<const A: usize, const B: usize, const N: usize>(a: [Entry; A], b: [Entry; B]) -> [Entry; N] {
+    assert!(A + B == N && A > 0, "od::concat: the lengths do not add up");
+    let mut entries = [a[0]; N];
+    let mut i = 0;
+    while i < N {
+        entries[i] = if i < A { a[i] } else { b[i - A] };
+        i += 1;
+    }
+    entries
+}
+
+/// Puts a value to the front of `buf`: the last line of most arms of [`Objects::read`].
+///
+/// # Errors
+/// [`AbortCode::OUT_OF_MEMORY`] if it does not fit.
+pub fn put(buf: &mut [u8], value: &[u8]) -> Result<usize, AbortCode> {
+    buf.get_mut(..value.len()).ok_or(AbortCode::OUT_OF_MEMORY)?.copy_from_slice(value);
+    Ok(value.len())
+}
+
+/// The values behind the table.
+///
+/// Variables and strings are read and written as a whole; **domains** are streamed and never held as a whole by the
+/// server. An error becomes the SDO abort that the client gets.
+///
+/// A domain download is `download_start`, `download_data` any number of times, and then exactly one of `download_end`
+/// and `download_cancel`: the latter if the client aborts or begins something else, if the time is up, if an earlier call
+/// returned an error or the sizes do not match. After an error of `download_start` neither comes.
+pub trait Objects {
+    /// The table.
+    fn entries(&self) -> &'static [Entry];
+
+    /// Reads a variable (little-endian) or string into `buf` and gives its length.
+    ///
+    /// # Errors
+    /// The abort that the client gets.
+    fn read(&mut self, at: Address, buf: &mut [u8]) -> Result<usize, AbortCode>;
+
+    /// Writes a variable (little-endian) or string. The length of a variable is that of its type.
+    ///
+    /// # Errors
+    /// The abort that the client gets.
+    fn write(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
+        let _ = (at, data);
+        Err(AbortCode::UNSUPPORTED_ACCESS)
+    }
+
+    /// A domain is about to be written, with this many bytes where the client tells.
+    ///
+    /// # Errors
+    /// The abort that the client gets.
+    fn download_start(&mut self, at: Address, size: Option<u32>) -> Result<(), AbortCode> {
+        let _ = (at, size);
+        Err(AbortCode::UNSUPPORTED_ACCESS)
+    }
+
+    /// Bytes that [`download_data`](Self::download_data) could take at present. The server holds its answer back, and with it the
+    /// client, until there is room for a segment (7 bytes).
+    fn download_space(&mut self, at: Address) -> usize {
+        let _ = at;
+        usize::MAX
+    }
+
+    /// The next bytes of the domain.
+    ///
+    /// # Errors
+    /// The abort that the client gets.
+    fn download_data(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
+        let _ = (at, data);
+        Err(AbortCode::UNSUPPORTED_ACCESS)
+    }
+
+    /// The domain is complete. An error becomes the abort in place of the last acknowledgement.
+    ///
+    /// # Errors
+    /// The abort that the client gets.
+    fn download_end(&mut self, at: Address) -> Result<(), AbortCode> {
+        let _ = at;
+        Ok(())
+    }
+
+    /// The domain stays incomplete.
+    fn download_cancel(&mut self, at: Address) {
+        let _ = at;
+    }
+
+    /// A domain is about to be read; gives its size where it is known.
+    ///
+    /// # Errors
+    /// The abort that the client gets.
+    fn upload_start(&mut self, at: Address) -> Result<Option<u32>, AbortCode> {
+        let _ = at;
+        Err(AbortCode::UNSUPPORTED_ACCESS)
+    }
+
+    /// Bytes of the domain from `offset` on. It fills `buf`, unless the domain ends before; 0 is the end.
+    /// The same offset can be asked for again, when a block transfer has to be repeated.
+    ///
+    /// # Errors
+    /// The abort that the client gets.
+    fn upload_data(&mut self, at: Address, offset: u32, buf: &mut [u8]) -> Result<usize, AbortCode> {
+        let _ = (at, offset, buf);
+        Err(AbortCode::UNSUPPORTED_ACCESS)
+    }
+}
