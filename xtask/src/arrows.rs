@@ -4,7 +4,7 @@
 //! mistake in one does not cancel out in the other; the application knows nothing of `boot-core`, so
 //! that it can be replaced; the wire code knows nothing of us at all; and nothing that leaves the desk
 //! links the GPL-2.0 library under the emulator. This check reads the manifests as cargo does, and the
-//! emulator's sources.
+//! sources where a manifest does not tell: the emulator's, and the roots of the crates without `unsafe`.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -17,8 +17,9 @@ use crate::{process, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask arrows
 
-Checks the dependencies between the crates against the rules in xtask/src/arrows.rs, and that the
-emulator takes nothing but the geometry of the silicon from shared-abi.
+Checks the dependencies between the crates against the rules in xtask/src/arrows.rs; that the
+emulator takes nothing but the geometry of the silicon from shared-abi; and that the pure crates
+forbid unsafe code.
 ";
 
 /// What one of our crates may depend on, of ours. Dev- and build-dependencies are held to the same row.
@@ -41,6 +42,11 @@ const RULES: &[Rule] = &[
     Rule { name: "xtask", may_use: &["shared-abi"] },
 ];
 
+/// The crates that need no `unsafe` and say so to the compiler.
+const PURE: &[&str] = &["canopen", "boot-core", "coflash", "xtask"];
+/// How they say it.
+const FORBID: &str = "#![forbid(unsafe_code)]";
+
 /// Who may link the GPL-2.0 library.
 const MAY_LINK_UNICORN: &[&str] = &["emulator", "coboot-tests"];
 
@@ -56,14 +62,20 @@ pub fn run(args: Args) -> Outcome {
         return Err("the workspace has no crate \"emulator\".".into());
     };
     for path in sources(&emulator.folder)? {
-        let source = fs::read_to_string(&path)
-            .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&path)))?;
-        for (line, module) in foreign_modules(&source) {
+        for (line, module) in foreign_modules(&read(&path)?) {
             broken.push(format!(
                 "{}:{line}: the emulator uses shared_abi::{module}; of shared-abi it may use `{GEOMETRY}` alone \
                  (its knowledge comes from the reference manual)",
                 workspace::shown(&path)
             ));
+        }
+    }
+    for package in packages.iter().filter(|package| PURE.contains(&package.name.as_str())) {
+        let roots = ["src/lib.rs", "src/main.rs"].map(|root| package.folder.join(root));
+        for root in roots.iter().filter(|root| root.exists()) {
+            if !read(root)?.lines().any(|line| line.trim() == FORBID) {
+                broken.push(format!("{}: {FORBID} is missing", workspace::shown(root)));
+            }
         }
     }
     if broken.is_empty() {
@@ -73,7 +85,11 @@ pub fn run(args: Args) -> Outcome {
     for line in &broken {
         println!("{line}");
     }
-    Err(format!("{} arrows point where they must not; the rules stand in xtask/src/arrows.rs.", broken.len()))
+    Err(format!("{} rules of the house are broken; they stand in xtask/src/arrows.rs.", broken.len()))
+}
+
+fn read(path: &Path) -> Outcome<String> {
+    fs::read_to_string(path).map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(path)))
 }
 
 /// A crate of the workspace.
