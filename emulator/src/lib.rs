@@ -1,4 +1,7 @@
 //! An emulated STM32F4 on a virtual CAN bus: it runs the very ELF files that go onto the board.
 
+pub mod bus;
+pub mod bxcan;
+pub mod frame;
 pub mod peripheral;
 pub mod time;

@@ -1,0 +1,4 @@
+//! The CAN bus.
+
+pub mod confinement;
+pub mod node;

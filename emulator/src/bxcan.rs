@@ -1,0 +1,982 @@
+//! The bxCAN controller CAN1 (RM0090 rev 19, section 32 "Controller area network (bxCAN)"), registers and behaviour
+//! taken from the manual.
+//!
+//! The controller itself never decides what is on the wire. It offers frames and counters to the
+//! [`Bus`](crate::bus::Bus) through [`BusNode`], and the bus tells it what happened and when. As long as no bus has
+//! looked at it, it behaves like a controller whose transceiver hears a recessive line: it can be set up and comes
+//! out of initialisation, and its frames wait.
+//!
+//! Not modelled, and reported when asked for: time-triggered mode, CAN2. MSR.SAMP and MSR.RX always read recessive.
+
+pub mod filters;
+#[cfg(test)]
+mod tests;
+
+use std::collections::VecDeque;
+
+use crate::bus::confinement::{Confinement, ErrorState};
+use crate::bus::node::{BusEvent, BusNode, ErrorKind, Line, Wait};
+use crate::frame::{ExtendedId, Frame, Id, StandardId};
+use crate::peripheral::{Peripheral, Unmodelled};
+use crate::time::{Span, Time};
+use filters::Filters;
+
+/// Interrupt lines of CAN1 (RM0090, table 61).
+pub mod lines {
+    /// A transmit request has been performed.
+    pub const TX: u16 = 19;
+    /// FIFO 0.
+    pub const RX0: u16 = 20;
+    /// FIFO 1.
+    pub const RX1: u16 = 21;
+    /// Status change and error.
+    pub const SCE: u16 = 22;
+}
+
+/// CAN_MCR.
+mod mcr {
+    pub const INRQ: u32 = 1 << 0;
+    pub const SLEEP: u32 = 1 << 1;
+    pub const TXFP: u32 = 1 << 2;
+    pub const RFLM: u32 = 1 << 3;
+    pub const NART: u32 = 1 << 4;
+    pub const AWUM: u32 = 1 << 5;
+    pub const ABOM: u32 = 1 << 6;
+    pub const TTCM: u32 = 1 << 7;
+    pub const RESET: u32 = 1 << 15;
+    pub const DBF: u32 = 1 << 16;
+    pub const AFTER_RESET: u32 = DBF | SLEEP;
+    pub const KEPT: u32 = INRQ | SLEEP | TXFP | RFLM | NART | AWUM | ABOM | DBF;
+}
+
+/// CAN_MSR.
+mod msr {
+    pub const INAK: u32 = 1 << 0;
+    pub const SLAK: u32 = 1 << 1;
+    pub const ERRI: u32 = 1 << 2;
+    pub const WKUI: u32 = 1 << 3;
+    pub const SLAKI: u32 = 1 << 4;
+    pub const TXM: u32 = 1 << 8;
+    pub const RXM: u32 = 1 << 9;
+    pub const SAMP: u32 = 1 << 10;
+    pub const RX: u32 = 1 << 11;
+}
+
+/// One byte of CAN_TSR: the flags of one mailbox.
+mod tsr {
+    pub const RQCP: u32 = 1 << 0;
+    pub const TXOK: u32 = 1 << 1;
+    pub const ALST: u32 = 1 << 2;
+    pub const TERR: u32 = 1 << 3;
+    pub const ABRQ: u32 = 1 << 7;
+}
+
+/// CAN_RFxR.
+mod rfr {
+    pub const FULL: u32 = 1 << 3;
+    pub const FOVR: u32 = 1 << 4;
+    pub const RFOM: u32 = 1 << 5;
+}
+
+/// CAN_IER.
+mod ier {
+    pub const TMEIE: u32 = 1 << 0;
+    /// FMPIE0; FIFO 1 has the same three bits, three places higher.
+    pub const FMPIE: u32 = 1 << 1;
+    pub const FFIE: u32 = 1 << 2;
+    pub const FOVIE: u32 = 1 << 3;
+    pub const EWGIE: u32 = 1 << 8;
+    pub const EPVIE: u32 = 1 << 9;
+    pub const BOFIE: u32 = 1 << 10;
+    pub const LECIE: u32 = 1 << 11;
+    pub const ERRIE: u32 = 1 << 15;
+    pub const WKUIE: u32 = 1 << 16;
+    pub const SLKIE: u32 = 1 << 17;
+    pub const ALL: u32 = 0x0003_8F7F;
+}
+
+/// CAN_ESR.
+mod esr {
+    pub const EWGF: u32 = 1 << 0;
+    pub const EPVF: u32 = 1 << 1;
+    pub const BOFF: u32 = 1 << 2;
+    pub const LEC_SHIFT: u32 = 4;
+}
+
+/// CAN_BTR.
+mod btr {
+    pub const LBKM: u32 = 1 << 30;
+    pub const SILM: u32 = 1 << 31;
+    pub const ALL: u32 = LBKM | SILM | 3 << 24 | 7 << 20 | 15 << 16 | 0x3FF;
+    pub const AFTER_RESET: u32 = 0x0123_0000;
+}
+
+/// CAN_TIxR and CAN_RIxR.
+mod ir {
+    pub const TXRQ: u32 = 1 << 0;
+    pub const RTR: u32 = 1 << 1;
+    pub const IDE: u32 = 1 << 2;
+}
+
+/// A frame becomes one of at most eight bytes, whatever the DLC says (ISO 11898-1:2015, table 5).
+const MAX_DLC: u32 = 8;
+/// CAN_TDTxR.TGT.
+const TGT: u32 = 1 << 8;
+/// Recessive sequences on the way out of bus-off.
+const RECOVERY_SEQUENCES: u32 = 128;
+/// Bits of one such sequence.
+const SEQUENCE_BITS: u64 = 11;
+const PICOS: u64 = 1_000_000_000_000;
+
+/// The two modes off the bus.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Rest {
+    /// INAK is set.
+    Initialisation,
+    /// SLAK is set.
+    Sleep,
+}
+
+/// Operating mode (RM0090, 32.4).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Mode {
+    /// Off the bus.
+    Resting(Rest),
+    /// On its way to normal mode: INAK or SLAK goes out once 11 recessive bits have been seen.
+    Synchronising { from: Rest, since: Time },
+    /// On the bus.
+    Normal,
+}
+
+/// The way out of bus-off.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Recovery {
+    /// Not bus-off.
+    None,
+    /// Bus-off; with ABOM clear the software has to go through initialisation mode first.
+    Held,
+    /// Counts recessive sequences.
+    Counting { since: Time, left: u32 },
+}
+
+/// What the protocol engine is doing: MSR.TXM and MSR.RXM.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Activity {
+    Idle,
+    Transmitting,
+    Receiving,
+}
+
+/// A transmit mailbox (RM0090, 32.7.1).
+#[derive(Clone, Copy, Debug, Default)]
+struct Mailbox {
+    tir: u32,
+    tdtr: u32,
+    tdlr: u32,
+    tdhr: u32,
+    /// RQCP, TXOK, ALST, TERR.
+    flags: u32,
+    state: MailboxState,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+enum MailboxState {
+    #[default]
+    Empty,
+    /// TXRQ is set. `order` counts the requests of the controller.
+    Pending { since: Time, order: u64 },
+    /// Its frame is on the wire; `abort`: ABRQ waits for the outcome.
+    Transmit { since: Time, order: u64, abort: bool },
+}
+
+impl Mailbox {
+    fn frame(&self) -> Frame {
+        let dlc = (self.tdtr & 0xF).min(MAX_DLC) as u8;
+        let id = if self.tir & ir::IDE == 0 {
+            StandardId::new((self.tir >> 21) as u16).map(Id::Standard)
+        } else {
+            ExtendedId::new(self.tir >> 3).map(Id::Extended)
+        };
+        // 32 bits less the 21 or 3 shifted out fit 11 or 29.
+        let id = id.unwrap_or(Id::Standard(StandardId::MAX));
+        let frame = if self.tir & ir::RTR == 0 {
+            let mut data = [0; 8];
+            data[..4].copy_from_slice(&self.tdlr.to_le_bytes());
+            data[4..].copy_from_slice(&self.tdhr.to_le_bytes());
+            Frame::data_frame(id, &data[..usize::from(dlc)])
+        } else {
+            Frame::remote_frame(id, dlc)
+        };
+        frame.expect("the DLC is at most 8")
+    }
+
+    fn order(&self) -> Option<u64> {
+        match self.state {
+            MailboxState::Empty => None,
+            MailboxState::Pending { order, .. } | MailboxState::Transmit { order, .. } => Some(order),
+        }
+    }
+
+    /// The request is over.
+    fn complete(&mut self) {
+        self.state = MailboxState::Empty;
+        self.flags |= tsr::RQCP;
+    }
+}
+
+/// A received frame as its four registers show it.
+#[derive(Clone, Copy, Debug, Default)]
+struct RxMailbox {
+    rir: u32,
+    rdtr: u32,
+    rdlr: u32,
+    rdhr: u32,
+}
+
+impl RxMailbox {
+    fn new(frame: &Frame, filter_index: u8) -> Self {
+        let id = match frame.id() {
+            Id::Standard(id) => u32::from(id.as_raw()) << 21,
+            Id::Extended(id) => id.as_raw() << 3 | ir::IDE,
+        };
+        let word = |at: usize| {
+            let mut bytes = [0; 4];
+            for (to, from) in bytes.iter_mut().zip(frame.data().iter().skip(at)) {
+                *to = *from;
+            }
+            u32::from_le_bytes(bytes)
+        };
+        Self {
+            rir: id | if frame.is_remote() { ir::RTR } else { 0 },
+            rdtr: u32::from(filter_index) << 8 | u32::from(frame.dlc()),
+            rdlr: word(0),
+            rdhr: word(4),
+        }
+    }
+}
+
+/// A receive FIFO of three frames (RM0090, 32.7.3).
+#[derive(Clone, Debug, Default)]
+struct Fifo {
+    frames: VecDeque<RxMailbox>,
+    /// What the output mailbox shows when nothing is in the FIFO: the last frame released.
+    stale: RxMailbox,
+    full: bool,
+    overrun: bool,
+}
+
+const FIFO_DEPTH: usize = 3;
+
+impl Fifo {
+    fn store(&mut self, frame: RxMailbox, locked: bool) {
+        if self.frames.len() == FIFO_DEPTH {
+            self.overrun = true;
+            if locked {
+                return;
+            }
+            self.frames.pop_back();
+        }
+        self.frames.push_back(frame);
+        self.full |= self.frames.len() == FIFO_DEPTH;
+    }
+
+    fn release(&mut self) {
+        if let Some(frame) = self.frames.pop_front() {
+            self.stale = frame;
+        }
+    }
+
+    fn output(&self) -> &RxMailbox {
+        self.frames.front().unwrap_or(&self.stale)
+    }
+
+    fn read_status(&self) -> u32 {
+        // At most FIFO_DEPTH.
+        let pending = self.frames.len() as u32;
+        pending | if self.full { rfr::FULL } else { 0 } | if self.overrun { rfr::FOVR } else { 0 }
+    }
+
+    fn write_status(&mut self, value: u32) {
+        self.full &= value & rfr::FULL == 0;
+        self.overrun &= value & rfr::FOVR == 0;
+        if value & rfr::RFOM != 0 {
+            self.release();
+        }
+    }
+
+    /// Whether an interrupt is active; `enabled`: FMPIE, FFIE and FOVIE of this FIFO at their FIFO 0 places.
+    fn interrupt(&self, enabled: u32) -> bool {
+        enabled & ier::FMPIE != 0 && !self.frames.is_empty()
+            || enabled & ier::FFIE != 0 && self.full
+            || enabled & ier::FOVIE != 0 && self.overrun
+    }
+}
+
+/// The controller CAN1.
+#[derive(Clone, Debug)]
+pub struct BxCan {
+    clock_hz: u32,
+    on_bus: bool,
+    attention: Option<Time>,
+    epoch: u32,
+    mode: Mode,
+    /// A wish to leave normal mode, and since when.
+    leaving: Option<(Time, Rest)>,
+    recovery: Recovery,
+    activity: Activity,
+    confinement: Confinement,
+    mcr: u32,
+    /// ERRI, WKUI, SLAKI.
+    msr_flags: u32,
+    ier: u32,
+    btr: u32,
+    last_error: u32,
+    mailboxes: [Mailbox; 3],
+    requests: u64,
+    fifos: [Fifo; 2],
+    filters: Filters,
+}
+
+impl Default for BxCan {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl BxCan {
+    /// CAN1 behind a reset, without a clock.
+    #[must_use]
+    pub fn new() -> Self {
+        Self {
+            clock_hz: 0,
+            on_bus: false,
+            attention: None,
+            epoch: 0,
+            mode: Mode::Resting(Rest::Sleep),
+            leaving: None,
+            recovery: Recovery::None,
+            activity: Activity::Idle,
+            confinement: Confinement::default(),
+            mcr: mcr::AFTER_RESET,
+            msr_flags: 0,
+            ier: 0,
+            btr: btr::AFTER_RESET,
+            last_error: 0,
+            mailboxes: [Mailbox::default(); 3],
+            requests: 0,
+            fifos: [Fifo::default(), Fifo::default()],
+            filters: Filters::default(),
+        }
+    }
+
+    /// The APB1 clock, in Hz; 0 while the controller has none. The bit rate follows.
+    pub fn set_clock(&mut self, hz: u32) {
+        self.clock_hz = hz;
+    }
+
+    /// Whether the bus has to look before the CPU may go on: a transmission is requested, or the mode changes.
+    #[must_use]
+    pub fn wants_attention(&self) -> bool {
+        self.on_bus && self.attention.is_some()
+    }
+
+    /// The nominal bit time that BTR and the clock make (RM0090, 32.7.7): (1 + TS1 + 1 + TS2 + 1) time quanta of
+    /// BRP + 1 clock cycles. `None` without a clock.
+    #[must_use]
+    pub fn bit_time(&self) -> Option<Span> {
+        self.quanta(1 + self.segment_1() + self.segment_2())
+    }
+
+    /// The bit rate in bit/s, rounded down; 0 without a clock.
+    #[must_use]
+    pub fn bit_rate(&self) -> u32 {
+        let cycles = self.cycles(1 + self.segment_1() + self.segment_2());
+        // Not above the clock, which fits.
+        (u64::from(self.clock_hz) / cycles) as u32
+    }
+
+    /// The sample point in tenths of a per cent of the bit time, rounded down.
+    #[must_use]
+    pub fn sample_point_permille(&self) -> u32 {
+        let before = 1 + self.segment_1();
+        (before * 1000 / (before + self.segment_2())) as u32
+    }
+
+    /// Error counters.
+    #[must_use]
+    pub fn error_counters(&self) -> Confinement {
+        self.confinement
+    }
+
+    fn segment_1(&self) -> u64 {
+        u64::from(self.btr >> 16 & 15) + 1
+    }
+
+    fn segment_2(&self) -> u64 {
+        u64::from(self.btr >> 20 & 7) + 1
+    }
+
+    /// Clock cycles of so many time quanta.
+    fn cycles(&self, quanta: u64) -> u64 {
+        quanta * (u64::from(self.btr & 0x3FF) + 1)
+    }
+
+    /// So many time quanta. At most 25 × 1024 cycles, so the product stays below 2^55.
+    fn quanta(&self, count: u64) -> Option<Span> {
+        (self.cycles(count) * PICOS).checked_div(u64::from(self.clock_hz)).map(Span)
+    }
+
+    fn bus_off(&self) -> bool {
+        self.recovery != Recovery::None
+    }
+
+    // --- modes -----------------------------------------------------------------------------------------------------
+
+    /// Goes where INRQ and SLEEP say, at once where the bus has no part in it.
+    fn follow_mode_bits(&mut self, now: Time) {
+        let target = match (self.mcr & mcr::INRQ != 0, self.mcr & mcr::SLEEP != 0) {
+            (true, false) => Some(Rest::Initialisation),
+            (false, true) => Some(Rest::Sleep),
+            (false, false) => None,
+            // No arrow of the mode diagram (RM0090, figure "bxCAN operating modes") takes both.
+            (true, true) => return self.leaving = None,
+        };
+        match (self.mode, target) {
+            (Mode::Resting(_) | Mode::Synchronising { .. }, Some(rest)) => self.rest(rest),
+            (Mode::Resting(from), None) => {
+                self.mode = Mode::Synchronising { from, since: now };
+                self.attend(now);
+            }
+            (Mode::Synchronising { .. }, None) => {}
+            (Mode::Normal, Some(rest)) => {
+                self.leaving = Some((now, rest));
+                self.attend(now);
+            }
+            (Mode::Normal, None) => self.leaving = None,
+        }
+    }
+
+    fn rest(&mut self, rest: Rest) {
+        if rest == Rest::Sleep && self.mode != Mode::Resting(Rest::Sleep) && self.ier & ier::SLKIE != 0 {
+            self.msr_flags |= msr::SLAKI;
+        }
+        self.mode = Mode::Resting(rest);
+        self.leaving = None;
+        if self.bus_off() {
+            self.recovery = Recovery::Held;
+        }
+    }
+
+    fn attend(&mut self, now: Time) {
+        self.attention.get_or_insert(now);
+    }
+
+    /// MCR.RESET: back to sleep, FIFOs and requests gone, the configuration stays.
+    fn master_reset(&mut self, now: Time) {
+        self.forget();
+        self.mcr = mcr::AFTER_RESET;
+        self.attend(now);
+    }
+
+    fn forget(&mut self) {
+        self.epoch = self.epoch.wrapping_add(1);
+        self.mode = Mode::Resting(Rest::Sleep);
+        self.leaving = None;
+        self.recovery = Recovery::None;
+        self.activity = Activity::Idle;
+        self.confinement = Confinement::default();
+        self.msr_flags = 0;
+        self.last_error = 0;
+        for mailbox in &mut self.mailboxes {
+            mailbox.state = MailboxState::Empty;
+            mailbox.flags = 0;
+        }
+        self.fifos = [Fifo::default(), Fifo::default()];
+    }
+
+    /// Without a bus the line is recessive for ever.
+    fn hear_nothing(&mut self, now: Time) {
+        if let Some((_, rest)) = self.leaving {
+            self.rest(rest);
+        }
+        if let Some(wait) = self.wait() {
+            if let Some(due) = self.next_event() {
+                if due <= now {
+                    self.event(BusEvent::Recessive { sequences: wait.sequences }, now);
+                }
+            }
+        }
+    }
+
+    // --- transmission ----------------------------------------------------------------------------------------------
+
+    /// The pending mailbox that goes first (RM0090, 32.7.1): in the order of the requests with TXFP, else by
+    /// identifier, then by mailbox number.
+    fn next_mailbox(&self, now: Time) -> Option<usize> {
+        let pending = self.mailboxes.iter().enumerate().filter_map(|(n, mailbox)| match mailbox.state {
+            MailboxState::Pending { since, order } if since <= now => Some((n, mailbox, order)),
+            _ => None,
+        });
+        if self.mcr & mcr::TXFP != 0 {
+            pending.min_by_key(|&(.., order)| order).map(|(n, ..)| n)
+        } else {
+            pending.min_by_key(|&(n, mailbox, _)| (mailbox.frame().arbitration_key(), n)).map(|(n, ..)| n)
+        }
+    }
+
+    /// The mailbox that would go last, if any waits.
+    fn last_mailbox(&self) -> Option<usize> {
+        let waiting = (0..3).filter_map(|n| self.mailboxes[n].order().map(|order| (n, order)));
+        if self.mcr & mcr::TXFP != 0 {
+            waiting.max_by_key(|&(_, order)| order).map(|(n, _)| n)
+        } else {
+            waiting.max_by_key(|&(n, _)| (self.mailboxes[n].frame().arbitration_key(), n)).map(|(n, _)| n)
+        }
+    }
+
+    fn read_tsr(&self) -> u32 {
+        let mut value = 0;
+        for (n, mailbox) in self.mailboxes.iter().enumerate() {
+            value |= mailbox.flags << (8 * n);
+            match mailbox.state {
+                MailboxState::Empty => value |= 1 << (26 + n),
+                MailboxState::Transmit { abort: true, .. } => value |= tsr::ABRQ << (8 * n),
+                _ => {}
+            }
+        }
+        let waiting = self.mailboxes.iter().filter(|mailbox| mailbox.state != MailboxState::Empty).count();
+        let last = self.last_mailbox();
+        if waiting > 1 {
+            value |= last.map_or(0, |n| 1 << (29 + n));
+        }
+        let free = self.mailboxes.iter().position(|mailbox| mailbox.state == MailboxState::Empty);
+        // At most 2: the next free mailbox, or with none free the one that goes last.
+        value | (free.or(last).unwrap_or(0) as u32) << 24
+    }
+
+    fn write_tsr(&mut self, value: u32) {
+        for (n, mailbox) in self.mailboxes.iter_mut().enumerate() {
+            let bits = value >> (8 * n);
+            if bits & tsr::RQCP != 0 {
+                mailbox.flags = 0;
+            }
+            mailbox.flags &= !(bits & (tsr::TXOK | tsr::ALST | tsr::TERR));
+            if bits & tsr::ABRQ != 0 {
+                match &mut mailbox.state {
+                    MailboxState::Empty => {}
+                    MailboxState::Pending { .. } => {
+                        mailbox.flags &= !tsr::TXOK;
+                        mailbox.complete();
+                    }
+                    MailboxState::Transmit { abort, .. } => *abort = true,
+                }
+            }
+        }
+    }
+
+    fn write_mailbox(&mut self, n: usize, register: u32, value: u32, now: Time) -> Result<(), Unmodelled> {
+        let order = self.requests;
+        let mailbox = &mut self.mailboxes[n];
+        if mailbox.state != MailboxState::Empty {
+            return Err(Unmodelled(format!(
+                "transmit mailbox {n} is written while it is not empty (TME{n} = 0): the write has no effect"
+            )));
+        }
+        match register {
+            0x0 => {
+                mailbox.tir = value & !ir::TXRQ;
+                if value & ir::TXRQ != 0 {
+                    mailbox.flags = 0;
+                    mailbox.state = MailboxState::Pending { since: now, order };
+                    self.requests += 1;
+                    self.attend(now);
+                }
+            }
+            0x4 => {
+                mailbox.tdtr = value & 0xF;
+                if value & TGT != 0 {
+                    return Err(Unmodelled(format!("TDT{n}R.TGT: transmit global time is not modelled")));
+                }
+            }
+            0x8 => mailbox.tdlr = value,
+            _ => mailbox.tdhr = value,
+        }
+        Ok(())
+    }
+
+    /// The frame on the wire ended without success for one of the reasons `flag` (ALST, TERR).
+    fn transmission_failed(&mut self, flag: u32) {
+        let no_retry = self.mcr & mcr::NART != 0;
+        for mailbox in &mut self.mailboxes {
+            if let MailboxState::Transmit { since, order, abort } = mailbox.state {
+                mailbox.flags = mailbox.flags & !(tsr::TXOK | tsr::ALST | tsr::TERR) | flag;
+                if no_retry || abort {
+                    mailbox.complete();
+                } else {
+                    mailbox.state = MailboxState::Pending { since, order };
+                }
+            }
+        }
+    }
+
+    // --- reception and errors --------------------------------------------------------------------------------------
+
+    fn store(&mut self, frame: &Frame) {
+        if let Some(found) = self.filters.accept(frame) {
+            let locked = self.mcr & mcr::RFLM != 0;
+            self.fifos[found.fifo].store(RxMailbox::new(frame, found.index), locked);
+        }
+    }
+
+    fn esr_flags(&self) -> u32 {
+        let passive = self.confinement.state() != ErrorState::Active;
+        let flags =
+            [(self.confinement.warning(), esr::EWGF), (passive, esr::EPVF), (self.bus_off(), esr::BOFF)];
+        flags.into_iter().filter(|(set, _)| *set).map(|(_, flag)| flag).sum()
+    }
+
+    /// Counts an error (or a success, `kind` = `None`), and raises ERRI for what is new and enabled.
+    fn count(&mut self, kind: Option<ErrorKind>, now: Time, count: impl FnOnce(&mut Confinement)) {
+        let before = self.esr_flags();
+        count(&mut self.confinement);
+        if self.confinement.state() == ErrorState::BusOff && !self.bus_off() {
+            self.recovery = if self.mcr & mcr::ABOM != 0 {
+                Recovery::Counting { since: now, left: RECOVERY_SEQUENCES }
+            } else {
+                Recovery::Held
+            };
+        }
+        let new = self.esr_flags() & !before;
+        self.last_error = match kind {
+            None => 0,
+            Some(ErrorKind::Stuff) => 1,
+            Some(ErrorKind::Form) => 2,
+            Some(ErrorKind::Acknowledge) => 3,
+            Some(ErrorKind::BitRecessive) => 4,
+            Some(ErrorKind::BitDominant) => 5,
+            Some(ErrorKind::Crc) => 6,
+        };
+        let enabled = [(esr::EWGF, ier::EWGIE), (esr::EPVF, ier::EPVIE), (esr::BOFF, ier::BOFIE)];
+        let flagged = enabled.into_iter().any(|(flag, enable)| new & flag != 0 && self.ier & enable != 0);
+        if flagged || kind.is_some() && self.ier & ier::LECIE != 0 {
+            self.msr_flags |= msr::ERRI;
+        }
+    }
+
+    fn read_esr(&self) -> u32 {
+        let tec = u32::from(self.confinement.tec().min(255));
+        self.esr_flags()
+            | self.last_error << esr::LEC_SHIFT
+            | tec << 16
+            | u32::from(self.confinement.rec()) << 24
+    }
+
+    fn read_msr(&self) -> u32 {
+        let mode = match self.mode {
+            Mode::Resting(Rest::Initialisation) | Mode::Synchronising { from: Rest::Initialisation, .. } => {
+                msr::INAK
+            }
+            Mode::Resting(Rest::Sleep) | Mode::Synchronising { from: Rest::Sleep, .. } => msr::SLAK,
+            Mode::Normal => 0,
+        };
+        let activity = match self.activity {
+            Activity::Idle => 0,
+            Activity::Transmitting => msr::TXM,
+            Activity::Receiving => msr::RXM,
+        };
+        mode | activity | self.msr_flags | msr::SAMP | msr::RX
+    }
+}
+
+/// The transmit mailbox and the register in it, or the receive FIFO and the register in it.
+enum Mail {
+    Transmit(usize, u32),
+    Receive(usize, u32),
+}
+
+fn mail(offset: u32) -> Option<Mail> {
+    let at = |base: u32| (((offset - base) / 0x10) as usize, offset & 0xC);
+    match offset {
+        0x180..=0x1AC => {
+            let (n, register) = at(0x180);
+            Some(Mail::Transmit(n, register))
+        }
+        0x1B0..=0x1CC => {
+            let (n, register) = at(0x1B0);
+            Some(Mail::Receive(n, register))
+        }
+        _ => None,
+    }
+}
+
+impl Peripheral for BxCan {
+    fn name(&self) -> &'static str {
+        "CAN1"
+    }
+
+    fn read(&mut self, offset: u32, now: Time) -> Result<u32, Unmodelled> {
+        self.advance(now);
+        Ok(match offset {
+            0x00 => self.mcr,
+            0x04 => self.read_msr(),
+            0x08 => self.read_tsr(),
+            0x0C => self.fifos[0].read_status(),
+            0x10 => self.fifos[1].read_status(),
+            0x14 => self.ier,
+            0x18 => self.read_esr(),
+            0x1C => self.btr,
+            0x200.. => self.filters.read(offset)?,
+            _ => match mail(offset) {
+                Some(Mail::Transmit(n, register)) => {
+                    let mailbox = &self.mailboxes[n];
+                    match register {
+                        0x0 if mailbox.state == MailboxState::Empty => mailbox.tir,
+                        0x0 => mailbox.tir | ir::TXRQ,
+                        0x4 => mailbox.tdtr,
+                        0x8 => mailbox.tdlr,
+                        _ => mailbox.tdhr,
+                    }
+                }
+                Some(Mail::Receive(n, register)) => {
+                    let output = self.fifos[n].output();
+                    match register {
+                        0x0 => output.rir,
+                        0x4 => output.rdtr,
+                        0x8 => output.rdlr,
+                        _ => output.rdhr,
+                    }
+                }
+                None => return Err(Unmodelled(format!("CAN1 has no register at offset {offset:#x}"))),
+            },
+        })
+    }
+
+    fn write(&mut self, offset: u32, value: u32, now: Time) -> Result<(), Unmodelled> {
+        self.advance(now);
+        match offset {
+            0x00 => {
+                if value & mcr::RESET != 0 {
+                    self.master_reset(now);
+                    return Ok(());
+                }
+                self.mcr = value & mcr::KEPT;
+                if self.mcr & mcr::ABOM != 0 && self.mode == Mode::Normal && self.recovery == Recovery::Held {
+                    self.recovery = Recovery::Counting { since: now, left: RECOVERY_SEQUENCES };
+                }
+                self.follow_mode_bits(now);
+                if value & mcr::TTCM != 0 {
+                    return Err(Unmodelled(
+                        "MCR.TTCM: time triggered communication mode is not modelled, the bit stays clear"
+                            .into(),
+                    ));
+                }
+                if value & !(mcr::KEPT | mcr::TTCM | mcr::RESET) != 0 {
+                    return Err(Unmodelled(format!("MCR: reserved bits set in {value:#010x}")));
+                }
+            }
+            0x04 => self.msr_flags &= !(value & (msr::ERRI | msr::WKUI | msr::SLAKI)),
+            0x08 => self.write_tsr(value),
+            0x0C => self.fifos[0].write_status(value),
+            0x10 => self.fifos[1].write_status(value),
+            0x14 => {
+                self.ier = value & ier::ALL;
+                if value & !ier::ALL != 0 {
+                    return Err(Unmodelled(format!("IER: reserved bits set in {value:#010x}")));
+                }
+            }
+            0x18 => self.last_error = value >> esr::LEC_SHIFT & 7,
+            0x1C => {
+                if !matches!(
+                    self.mode,
+                    Mode::Resting(Rest::Initialisation)
+                        | Mode::Synchronising { from: Rest::Initialisation, .. }
+                ) {
+                    return Err(Unmodelled(
+                        "BTR is written outside initialisation mode: the write has no effect".into(),
+                    ));
+                }
+                self.btr = value & btr::ALL;
+            }
+            0x200.. => self.filters.write(offset, value)?,
+            _ => match mail(offset) {
+                Some(Mail::Transmit(n, register)) => self.write_mailbox(n, register, value, now)?,
+                Some(Mail::Receive(n, _)) => {
+                    return Err(Unmodelled(format!(
+                        "receive mailbox {n} is written: its registers are read-only"
+                    )))
+                }
+                None => return Err(Unmodelled(format!("CAN1 has no register at offset {offset:#x}"))),
+            },
+        }
+        Ok(())
+    }
+
+    fn advance(&mut self, now: Time) {
+        if !self.on_bus {
+            self.hear_nothing(now);
+        }
+    }
+
+    fn next_event(&self) -> Option<Time> {
+        if self.on_bus {
+            return None; // the bus knows
+        }
+        let wait = self.wait()?;
+        Some(wait.since + Span(wait.bit.0 * SEQUENCE_BITS * u64::from(wait.sequences)))
+    }
+
+    fn interrupts(&self, active: &mut Vec<u16>) {
+        let transmitted = self.mailboxes.iter().any(|mailbox| mailbox.flags & tsr::RQCP != 0);
+        let status = [(ier::ERRIE, msr::ERRI), (ier::WKUIE, msr::WKUI), (ier::SLKIE, msr::SLAKI)]
+            .into_iter()
+            .any(|(enable, flag)| self.ier & enable != 0 && self.msr_flags & flag != 0);
+        let lines = [
+            (self.ier & ier::TMEIE != 0 && transmitted, lines::TX),
+            (self.fifos[0].interrupt(self.ier), lines::RX0),
+            (self.fifos[1].interrupt(self.ier >> 3), lines::RX1),
+            (status, lines::SCE),
+        ];
+        active.extend(lines.into_iter().filter(|(set, _)| *set).map(|(_, line)| line));
+    }
+
+    fn reset(&mut self) {
+        self.forget();
+        let fresh = Self::new();
+        *self = Self { clock_hz: self.clock_hz, on_bus: self.on_bus, epoch: self.epoch, ..fresh };
+    }
+}
+
+impl BusNode for BxCan {
+    fn line(&self) -> Option<Line> {
+        if self.mode != Mode::Normal || self.bus_off() {
+            return None;
+        }
+        Some(Line {
+            bit: self.bit_time()?,
+            sample: self.quanta(1 + self.segment_1())?,
+            silent: self.btr & btr::SILM != 0,
+            loopback: self.btr & btr::LBKM != 0,
+        })
+    }
+
+    fn epoch(&self) -> u32 {
+        self.epoch
+    }
+
+    fn confinement(&self) -> Confinement {
+        self.confinement
+    }
+
+    fn request(&self, now: Time) -> Option<Frame> {
+        self.next_mailbox(now).map(|n| self.mailboxes[n].frame())
+    }
+
+    fn next_request(&self, now: Time) -> Option<Time> {
+        let later = self.mailboxes.iter().filter_map(|mailbox| match mailbox.state {
+            MailboxState::Pending { since, .. } if since > now => Some(since),
+            _ => None,
+        });
+        later.min()
+    }
+
+    fn wait(&self) -> Option<Wait> {
+        let (since, sequences) = match (self.mode, self.recovery) {
+            (Mode::Synchronising { since, .. }, _) => (since, 1),
+            (Mode::Normal, Recovery::Counting { since, left }) => (since, left),
+            _ => return None,
+        };
+        Some(Wait { since, sequences, bit: self.bit_time()? })
+    }
+
+    fn leaving(&self) -> Option<Time> {
+        self.leaving.map(|(since, _)| since)
+    }
+
+    fn event(&mut self, event: BusEvent, now: Time) {
+        match event {
+            BusEvent::Started { own } => {
+                if self.mode == Mode::Resting(Rest::Sleep) {
+                    self.msr_flags |= msr::WKUI;
+                    if self.mcr & mcr::AWUM != 0 {
+                        self.mcr &= !mcr::SLEEP;
+                        self.follow_mode_bits(now);
+                    }
+                } else if self.mode == Mode::Normal && !self.bus_off() {
+                    self.activity = if own { Activity::Transmitting } else { Activity::Receiving };
+                }
+                if own {
+                    if let Some(n) = self.next_mailbox(now) {
+                        if let MailboxState::Pending { since, order } = self.mailboxes[n].state {
+                            self.mailboxes[n].state = MailboxState::Transmit { since, order, abort: false };
+                        }
+                    }
+                }
+            }
+            BusEvent::ArbitrationLost => {
+                self.activity = Activity::Receiving;
+                self.transmission_failed(tsr::ALST);
+            }
+            BusEvent::Transmitted => {
+                for mailbox in &mut self.mailboxes {
+                    if matches!(mailbox.state, MailboxState::Transmit { .. }) {
+                        mailbox.flags = tsr::TXOK;
+                        mailbox.complete();
+                    }
+                }
+                self.count(None, now, Confinement::transmitted);
+            }
+            BusEvent::TransmitFailed { kind, exempt } => {
+                self.transmission_failed(tsr::TERR);
+                self.count(Some(kind), now, |counters| counters.transmit_failed(exempt));
+            }
+            BusEvent::Received(frame) => {
+                self.store(&frame);
+                if self.btr & btr::LBKM == 0 {
+                    self.count(None, now, Confinement::received);
+                }
+            }
+            BusEvent::Missed => self.count(None, now, Confinement::received),
+            BusEvent::ReceiveFailed { kind, first } => {
+                self.count(Some(kind), now, |counters| counters.receive_failed(first));
+            }
+            BusEvent::Recessive { sequences } => self.heard_recessive(sequences, now),
+            BusEvent::Released => {
+                if let Some((_, rest)) = self.leaving {
+                    self.rest(rest);
+                }
+            }
+            BusEvent::Ended => self.activity = Activity::Idle,
+        }
+    }
+
+    fn resolved(&mut self, now: Time) {
+        self.on_bus = true;
+        if self.attention.is_some_and(|since| since <= now) {
+            self.attention = None;
+        }
+    }
+}
+
+impl BxCan {
+    fn heard_recessive(&mut self, sequences: u32, now: Time) {
+        if let Mode::Synchronising { .. } = self.mode {
+            if sequences == 0 {
+                return;
+            }
+            self.mode = Mode::Normal;
+            if self.recovery == Recovery::Held {
+                self.recovery = Recovery::Counting { since: now, left: RECOVERY_SEQUENCES - 1 };
+            }
+            return;
+        }
+        if let Recovery::Counting { left, .. } = self.recovery {
+            match left.saturating_sub(sequences) {
+                0 => {
+                    self.recovery = Recovery::None;
+                    self.confinement.recovered();
+                }
+                left => self.recovery = Recovery::Counting { since: now, left },
+            }
+        }
+    }
+}
