@@ -12,6 +12,7 @@
 //! | [`sdo`] | wire codec, abort codes, server, client |
 //! | [`nmt`], [`heartbeat`] | network management of a slave, heartbeat producer |
 //! | [`node`] | all of a slave tied together for one node-ID |
+//! | [`device`] | the objects that every device has |
 //! | [`program`] | program download: the words of CiA 302-3 |
 #![no_std]
 #![forbid(unsafe_code)]

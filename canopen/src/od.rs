@@ -273,7 +273,10 @@ pub fn find(entries: &[Entry], at: Address) -> Result<&Entry, AbortCode> {
 
 /// One table of two, in the order given. `N` is the length of both together.
 #[must_use]
-pub const fn concat<const A: usize, const B: usize, const N: usize>(a: [Entry; A], b: [Entry; B]) -> [Entry; N] {
+pub const fn concat<const A: usize, const B: usize, const N: usize>(
+    a: [Entry; A],
+    b: [Entry; B],
+) -> [Entry; N] {
     assert!(A + B == N && A > 0, "od::concat: the lengths do not add up");
     let mut entries = [a[0]; N];
     let mut i = 0;

@@ -1,0 +1,103 @@
+//! Network management of a slave (CiA 301 section 7.3.2).
+
+use embedded_can::Frame as _;
+
+use crate::frame::{CobId, Frame, NodeId};
+
+/// The state of a node, with the byte that boot-up and heartbeat carry.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum NmtState {
+    /// Seen on the bus once, as the boot-up message.
+    Initialisation = 0x00,
+    /// Neither SDO nor PDO are served.
+    Stopped = 0x04,
+    /// All is served.
+    Operational = 0x05,
+    /// SDO is served, PDO is not.
+    PreOperational = 0x7F,
+}
+
+impl NmtState {
+    /// From the byte of a heartbeat; the toggle bit of node guarding is not looked at.
+    #[must_use]
+    pub const fn from_byte(byte: u8) -> Option<Self> {
+        match byte & 0x7F {
+            0x00 => Some(Self::Initialisation),
+            0x04 => Some(Self::Stopped),
+            0x05 => Some(Self::Operational),
+            0x7F => Some(Self::PreOperational),
+            _ => None,
+        }
+    }
+}
+
+/// What a master asks of a node, with the command specifier.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum NmtCommand {
+    /// Go OPERATIONAL.
+    Start = 0x01,
+    /// Go STOPPED.
+    Stop = 0x02,
+    /// Go PRE-OPERATIONAL.
+    EnterPreOperational = 0x80,
+    /// Restart the device.
+    ResetNode = 0x81,
+    /// Restart communication: a new node-ID comes into force.
+    ResetCommunication = 0x82,
+}
+
+impl NmtCommand {
+    /// The command in a frame that addresses `node` or all nodes. Every other frame, of whatever form, is none.
+    #[must_use]
+    pub fn parse(frame: &Frame, node: NodeId) -> Option<Self> {
+        if frame.cob_id() != Some(CobId::NMT) {
+            return None;
+        }
+        let [command, addressed] = *frame.exactly()?;
+        if addressed != 0 && addressed != node.get() {
+            return None;
+        }
+        match command {
+            0x01 => Some(Self::Start),
+            0x02 => Some(Self::Stop),
+            0x80 => Some(Self::EnterPreOperational),
+            0x81 => Some(Self::ResetNode),
+            0x82 => Some(Self::ResetCommunication),
+            _ => None,
+        }
+    }
+
+    /// The frame that a master sends; without a node it addresses all of them.
+    #[must_use]
+    pub fn emit(self, node: Option<NodeId>) -> Frame {
+        Frame::of(CobId::NMT, &[self as u8, node.map_or(0, NodeId::get)])
+    }
+}
+
+/// The boot-up message of a node.
+#[must_use]
+pub fn boot_up(node: NodeId) -> Frame {
+    state_message(node, NmtState::Initialisation)
+}
+
+/// The heartbeat of a node in this state.
+#[must_use]
+pub fn state_message(node: NodeId, state: NmtState) -> Frame {
+    Frame::of(CobId::heartbeat(node), &[state as u8])
+}
+
+/// The node and the state in a boot-up or heartbeat message, for whoever listens to them.
+#[must_use]
+pub fn parse_state_message(frame: &Frame) -> Option<(NodeId, NmtState)> {
+    let id = frame.cob_id()?.get();
+    if id & !0x7F != 0x700 {
+        return None;
+    }
+    let node = NodeId::new((id & 0x7F) as u8)?;
+    match frame.data() {
+        [byte] => Some((node, NmtState::from_byte(*byte)?)),
+        _ => None,
+    }
+}

@@ -1,0 +1,144 @@
+//! A slave: NMT, boot-up, heartbeat and SDO server of one node-ID.
+//!
+//! The owner passes every frame received to [`Node::handle`], then fetches frames with [`Node::poll`] until there are
+//! none, and does the latter again at least once every few milliseconds (or at [`Node::next_deadline`]).
+
+use crate::frame::{Frame, NodeId};
+use crate::heartbeat::Heartbeat;
+use crate::nmt::{self, NmtCommand, NmtState};
+use crate::od::Objects;
+use crate::sdo::server::{Config as SdoConfig, SdoServer};
+use crate::time::Instant;
+
+/// What Start and Stop of the NMT master do to the node.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum NmtPolicy {
+    /// It stays PRE-OPERATIONAL, as a bootloader does: there is nothing to operate, and SDO must be served.
+    #[default]
+    StayPreOperational,
+    /// It follows the master.
+    Follow,
+}
+
+/// What can be chosen about a node.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Config {
+    /// Period of the heartbeat in milliseconds, 0 for none.
+    pub heartbeat_ms: u16,
+    /// Whether it follows Start and Stop.
+    pub nmt: NmtPolicy,
+    /// The SDO server's part.
+    pub sdo: SdoConfig,
+}
+
+/// What the NMT master asked for.
+///
+/// The node has already done its own part of Start, Stop and `EnterPreOperational`. The two resets are the owner's: it
+/// restarts the device, or calls [`Node::restart`] with the node-ID that is now in force.
+pub type NmtEvent = NmtCommand;
+
+/// A slave on the bus.
+#[derive(Debug)]
+pub struct Node {
+    id: NodeId,
+    config: Config,
+    state: NmtState,
+    heartbeat: Heartbeat,
+    sdo: SdoServer,
+}
+
+impl Node {
+    /// A node that has yet to say its boot-up.
+    #[must_use]
+    pub const fn new(id: NodeId, config: Config) -> Self {
+        Self {
+            id,
+            config,
+            state: NmtState::Initialisation,
+            heartbeat: Heartbeat::new(config.heartbeat_ms, Instant::from_millis(0)),
+            sdo: SdoServer::new(id, config.sdo),
+        }
+    }
+
+    /// Its node-ID.
+    #[must_use]
+    pub const fn id(&self) -> NodeId {
+        self.id
+    }
+
+    /// Its NMT state; [`NmtState::Initialisation`] until the boot-up is fetched.
+    #[must_use]
+    pub const fn state(&self) -> NmtState {
+        self.state
+    }
+
+    /// Whether the SDO server has nothing in hand: no transfer, no answer to be fetched.
+    #[must_use]
+    pub const fn is_sdo_idle(&self) -> bool {
+        self.sdo.is_idle()
+    }
+
+    /// Starts anew under this node-ID, as after Reset communication: a transfer ends, the boot-up is said again.
+    pub fn restart(&mut self, id: NodeId, objects: &mut impl Objects) {
+        self.sdo.reset(objects);
+        *self = Self::new(id, Config { heartbeat_ms: self.heartbeat.period_ms(), ..self.config });
+    }
+
+    /// Takes the value of 1017h: the heartbeat's period in milliseconds, 0 for none. The same value again changes
+    /// nothing, so that it may be called after every frame.
+    pub fn set_heartbeat_ms(&mut self, period_ms: u16, now: Instant) {
+        self.heartbeat.set_period(period_ms, now);
+    }
+
+    /// Takes a frame, whatever it is, and tells what the NMT master asked for.
+    pub fn handle(&mut self, frame: &Frame, now: Instant, objects: &mut impl Objects) -> Option<NmtEvent> {
+        // Before its boot-up a node takes part in nothing.
+        if self.state == NmtState::Initialisation {
+            return None;
+        }
+        if let Some(command) = NmtCommand::parse(frame, self.id) {
+            self.command(command, objects);
+            return Some(command);
+        }
+        if self.state != NmtState::Stopped {
+            self.sdo.handle(frame, now, objects);
+        }
+        None
+    }
+
+    /// The next frame to send, until there is none.
+    pub fn poll(&mut self, now: Instant, objects: &mut impl Objects) -> Option<Frame> {
+        if self.state == NmtState::Initialisation {
+            self.state = NmtState::PreOperational;
+            self.heartbeat = Heartbeat::new(self.heartbeat.period_ms(), now);
+            return Some(nmt::boot_up(self.id));
+        }
+        if let Some(answer) = self.sdo.poll(now, objects) {
+            return Some(answer);
+        }
+        self.heartbeat.take_due(now).then(|| nmt::state_message(self.id, self.state))
+    }
+
+    /// When [`poll`](Self::poll) will have something to do although no frame came; `None` for never.
+    #[must_use]
+    pub fn next_deadline(&self) -> Option<Instant> {
+        match (self.sdo.next_deadline(), self.heartbeat.deadline()) {
+            (Some(sdo), Some(heartbeat)) => Some(sdo.earlier(heartbeat)),
+            (sdo, heartbeat) => sdo.or(heartbeat),
+        }
+    }
+
+    fn command(&mut self, command: NmtCommand, objects: &mut impl Objects) {
+        let state = match (command, self.config.nmt) {
+            (NmtCommand::Start, NmtPolicy::Follow) => NmtState::Operational,
+            (NmtCommand::Stop, NmtPolicy::Follow) => {
+                // A stopped node serves no SDO, so nothing could end the transfer properly.
+                self.sdo.reset(objects);
+                NmtState::Stopped
+            }
+            (NmtCommand::EnterPreOperational, NmtPolicy::Follow) => NmtState::PreOperational,
+            _ => return,
+        };
+        self.state = state;
+    }
+}

@@ -1,0 +1,292 @@
+//! Program download: the words of CiA 302-3 that both sides share, with the additions of the SYS TEC bootloader
+//! (manual L-1112d_10, tables 1 to 3).
+
+use core::fmt;
+
+use crate::sdo::AbortCode;
+
+/// Device type.
+pub const DEVICE_TYPE: u16 = 0x1000;
+/// Error register.
+pub const ERROR_REGISTER: u16 = 0x1001;
+/// Pre-defined error field.
+pub const ERROR_FIELD: u16 = 0x1003;
+/// Manufacturer device name.
+pub const DEVICE_NAME: u16 = 0x1008;
+/// Manufacturer hardware version.
+pub const HARDWARE_VERSION: u16 = 0x1009;
+/// Manufacturer software version.
+pub const SOFTWARE_VERSION: u16 = 0x100A;
+/// COB-ID of the emergency object.
+pub const COB_ID_EMCY: u16 = 0x1014;
+/// Producer heartbeat time, in milliseconds.
+pub const HEARTBEAT_TIME: u16 = 0x1017;
+/// Identity: 1 vendor-ID, 2 product code, 3 revision, 4 serial number.
+pub const IDENTITY: u16 = 0x1018;
+/// Program data; the sub-index is the program's number.
+pub const PROGRAM_DATA: u16 = 0x1F50;
+/// Program control: takes a [`ProgramControl`].
+pub const PROGRAM_CONTROL: u16 = 0x1F51;
+/// Program software identification: the program's CRC.
+pub const PROGRAM_ID: u16 = 0x1F56;
+/// Flash status identification: gives a [`FlashStatus`].
+pub const FLASH_STATUS: u16 = 0x1F57;
+
+/// What 1000h of the bootloader reads. An application has another value: this is how a host tells them apart.
+pub const BOOTLOADER_DEVICE_TYPE: u32 = 0x1000_0000;
+
+/// What can be written to 1F51h.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum ProgramControl {
+    /// Stop the program. A bootloader runs none: acknowledged, nothing happens.
+    Stop = 0x00,
+    /// Start the program.
+    Start = 0x01,
+    /// Set the flash status back to "no error".
+    ResetStat = 0x02,
+    /// Erase the program.
+    Clear = 0x03,
+    /// Go back from the application to the bootloader.
+    StartBootloader = 0x80,
+    /// Mark the program as valid, so that it starts by itself.
+    SetSignature = 0x83,
+    /// Mark the program as not valid.
+    ClrSignature = 0x84,
+}
+
+/// The error is what an SDO server answers to such a value: 06090030h.
+impl TryFrom<u8> for ProgramControl {
+    type Error = AbortCode;
+
+    fn try_from(value: u8) -> Result<Self, AbortCode> {
+        match value {
+            0x00 => Ok(Self::Stop),
+            0x01 => Ok(Self::Start),
+            0x02 => Ok(Self::ResetStat),
+            0x03 => Ok(Self::Clear),
+            0x80 => Ok(Self::StartBootloader),
+            0x83 => Ok(Self::SetSignature),
+            0x84 => Ok(Self::ClrSignature),
+            _ => Err(AbortCode::INVALID_VALUE),
+        }
+    }
+}
+
+/// What reading 1F51h of a program gives (CiA 302-3): whether it runs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum ProgramState {
+    /// It does not run: this is the bootloader.
+    Stopped = 0,
+    /// It runs: this is the application.
+    Running = 1,
+}
+
+/// The word of 1F57h.
+///
+/// Bit 0 busy, bits 1–7 error code, bits 8–15 reserved, bits 16–31 detail of the manufacturer.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct FlashStatus {
+    /// A command is being carried out.
+    pub busy: bool,
+    /// How the last command ended, `None` for well.
+    pub error: Option<FlashError>,
+    /// More about the error, for the manufacturer.
+    pub detail: u16,
+}
+
+impl FlashStatus {
+    /// No command runs, and the last one ended well.
+    pub const OK: Self = Self { busy: false, error: None, detail: 0 };
+    /// A command is being carried out.
+    pub const BUSY: Self = Self { busy: true, error: None, detail: 0 };
+
+    /// The last command ended with this error.
+    #[must_use]
+    pub const fn failed(error: FlashError, detail: u16) -> Self {
+        Self { busy: false, error: Some(error), detail }
+    }
+
+    /// Takes the word of 1F57h apart.
+    #[must_use]
+    pub const fn from_word(word: u32) -> Self {
+        let code = word as u8 & 0xFE;
+        let error = if code == 0 { None } else { Some(FlashError::from_code(code)) };
+        Self { busy: word & 1 != 0, error, detail: (word >> 16) as u16 }
+    }
+
+    /// The word of 1F57h.
+    #[must_use]
+    pub const fn to_word(self) -> u32 {
+        let code = match self.error {
+            Some(error) => error.code(),
+            None => 0,
+        };
+        (self.detail as u32) << 16 | code as u32 | self.busy as u32
+    }
+}
+
+/// Why a command to the bootloader failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FlashError {
+    /// There is no valid program to start.
+    NoValidProgram,
+    /// The data written to 1F50h are not in the expected form.
+    Format,
+    /// The CRC of the data is wrong.
+    Crc,
+    /// The program's flash is not erased.
+    NotCleared,
+    /// The flash could not be written.
+    Write,
+    /// An address outside the program's flash.
+    Address,
+    /// A protected part of the flash.
+    Secured,
+    /// The non-volatile parameters could not be read or written.
+    NvData,
+    /// None of the others.
+    Unspecified,
+    /// The program is for another vendor's devices.
+    WrongVendorId,
+    /// The program is for another product.
+    WrongProductId,
+    /// Programming is not allowed, or not at present.
+    NoAccess,
+    /// Data were written while a command was still being carried out.
+    Busy,
+    /// The blocks came in a wrong order.
+    Sequence,
+    /// A code that this version does not know, as read from another device.
+    Other(u8),
+}
+
+impl FlashError {
+    /// The error code where it stands in the word: bit 0 is always clear.
+    #[must_use]
+    pub const fn code(self) -> u8 {
+        match self {
+            Self::NoValidProgram => 0x02,
+            Self::Format => 0x04,
+            Self::Crc => 0x06,
+            Self::NotCleared => 0x08,
+            Self::Write => 0x0A,
+            Self::Address => 0x0C,
+            Self::Secured => 0x0E,
+            Self::NvData => 0x10,
+            Self::Unspecified => 0x7E,
+            Self::WrongVendorId => 0x80,
+            Self::WrongProductId => 0x82,
+            Self::NoAccess => 0x84,
+            Self::Busy => 0x86,
+            Self::Sequence => 0x88,
+            Self::Other(code) => code & 0xFE,
+        }
+    }
+
+    const fn from_code(code: u8) -> Self {
+        match code {
+            0x02 => Self::NoValidProgram,
+            0x04 => Self::Format,
+            0x06 => Self::Crc,
+            0x08 => Self::NotCleared,
+            0x0A => Self::Write,
+            0x0C => Self::Address,
+            0x0E => Self::Secured,
+            0x10 => Self::NvData,
+            0x7E => Self::Unspecified,
+            0x80 => Self::WrongVendorId,
+            0x82 => Self::WrongProductId,
+            0x84 => Self::NoAccess,
+            0x86 => Self::Busy,
+            0x88 => Self::Sequence,
+            code => Self::Other(code),
+        }
+    }
+}
+
+impl fmt::Display for FlashError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::NoValidProgram => "there is no valid program to start",
+            Self::Format => "the data are not in the expected form",
+            Self::Crc => "the CRC is wrong",
+            Self::NotCleared => "the program has to be cleared first",
+            Self::Write => "the flash could not be written",
+            Self::Address => "an address lies outside the program's flash",
+            Self::Secured => "this part of the flash is protected",
+            Self::NvData => "the non-volatile parameters could not be read or written",
+            Self::Unspecified => "unspecified error",
+            Self::WrongVendorId => "the program is for another vendor's devices",
+            Self::WrongProductId => "the program is for another product",
+            Self::NoAccess => "programming is not allowed at present",
+            Self::Busy => "a command is still being carried out",
+            Self::Sequence => "the blocks came in a wrong order",
+            Self::Other(code) => return write!(f, "unknown flash error {code:02X}h"),
+        })
+    }
+}
+
+impl core::error::Error for FlashError {}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Table 3 of the manual, copied.
+    #[test]
+    fn the_words_of_1f57_are_those_of_the_manual() {
+        use FlashError as E;
+        let table = [
+            (0x0000_0002, E::NoValidProgram),
+            (0x0000_0004, E::Format),
+            (0x0000_0006, E::Crc),
+            (0x0000_0008, E::NotCleared),
+            (0x0000_000A, E::Write),
+            (0x0000_000C, E::Address),
+            (0x0000_000E, E::Secured),
+            (0x0000_0010, E::NvData),
+            (0x0000_007E, E::Unspecified),
+            (0x0000_0080, E::WrongVendorId),
+            (0x0000_0082, E::WrongProductId),
+            (0x0000_0084, E::NoAccess),
+            (0x0000_0086, E::Busy),
+            (0x0000_0088, E::Sequence),
+        ];
+        for (word, error) in table {
+            assert_eq!(FlashStatus::failed(error, 0).to_word(), word);
+            assert_eq!(FlashStatus::from_word(word), FlashStatus::failed(error, 0));
+        }
+        assert_eq!((FlashStatus::OK.to_word(), FlashStatus::BUSY.to_word()), (0, 1));
+        assert_eq!(FlashStatus::from_word(0), FlashStatus::OK);
+        assert_eq!(FlashStatus::from_word(1), FlashStatus::BUSY);
+    }
+
+    #[test]
+    fn detail_busy_and_foreign_codes_survive() {
+        let status = FlashStatus::from_word(0x1234_0021);
+        assert_eq!(status, FlashStatus { busy: true, error: Some(FlashError::Other(0x20)), detail: 0x1234 });
+        assert_eq!(status.to_word(), 0x1234_0021);
+    }
+
+    /// Table 2 of the manual, copied.
+    #[test]
+    fn program_control_knows_the_commands_of_the_manual_alone() {
+        use ProgramControl as P;
+        let table = [
+            (0x00, P::Stop),
+            (0x01, P::Start),
+            (0x02, P::ResetStat),
+            (0x03, P::Clear),
+            (0x80, P::StartBootloader),
+            (0x83, P::SetSignature),
+            (0x84, P::ClrSignature),
+        ];
+        for value in 0..=u8::MAX {
+            let known = table.iter().find(|(code, _)| *code == value).map(|(_, command)| *command);
+            assert_eq!(P::try_from(value).ok(), known, "{value:02X}h");
+        }
+        assert_eq!(P::try_from(4), Err(AbortCode(0x0609_0030)));
+    }
+}

@@ -1,0 +1,399 @@
+//! The eight bytes of an SDO frame as named fields (CiA 301 section 7.2.4.3).
+//!
+//! [`Request`] is what a client sends, [`Response`] what a server sends. The top three bits of byte 0 are the command
+//! specifier; reserved bits are sent as 0 and not looked at when received. Multi-byte fields are little-endian.
+//!
+//! Segments of a block transfer have no command specifier and are a type of their own: [`BlockSegment`].
+
+use core::ops::Deref;
+
+use crate::od::Address;
+use crate::sdo::AbortCode;
+
+/// Up to `N` bytes of data that travel in one frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Chunk<const N: usize> {
+    bytes: [u8; N],
+    len: u8,
+}
+
+impl<const N: usize> Chunk<N> {
+    /// The first `N` bytes of `data`, or all of them if there are fewer.
+    #[must_use]
+    pub fn new(data: &[u8]) -> Self {
+        let len = data.len().min(N);
+        let mut bytes = [0; N];
+        bytes[..len].copy_from_slice(&data[..len]);
+        Self { bytes, len: len as u8 }
+    }
+
+    /// How many of the `N` bytes carry no data: the field "n" of the standard.
+    const fn unused(&self) -> u8 {
+        N as u8 - self.len
+    }
+
+    /// From the field "n" and the bytes of the frame.
+    fn with_unused(bytes: &[u8], unused: u8) -> Self {
+        Self::new(&bytes[..N.saturating_sub(usize::from(unused))])
+    }
+}
+
+impl<const N: usize> Deref for Chunk<N> {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        &self.bytes[..usize::from(self.len)]
+    }
+}
+
+/// What an initiate frame carries besides the address.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Payload {
+    /// All of the data, 1 to 4 bytes (e = 1, s = 1).
+    Expedited(Chunk<4>),
+    /// All of the data; how many bytes of the four count is not told (e = 1, s = 0).
+    Unsized([u8; 4]),
+    /// Segments follow (e = 0), of this many bytes altogether where it is told (s = 1).
+    Segmented(Option<u32>),
+}
+
+impl Payload {
+    /// The payload that announces `size` bytes as segments.
+    const fn segmented(announced: bool, field: [u8; 4]) -> Self {
+        Self::Segmented(if announced { Some(u32::from_le_bytes(field)) } else { None })
+    }
+
+    fn parse(command: u8, field: [u8; 4]) -> Self {
+        let announced = command & 0x01 != 0;
+        match (command & 0x02 != 0, announced) {
+            (true, true) => Self::Expedited(Chunk::with_unused(&field, command >> 2 & 0x03)),
+            (true, false) => Self::Unsized(field),
+            (false, _) => Self::segmented(announced, field),
+        }
+    }
+
+    /// The low bits of byte 0, and bytes 4 to 7.
+    fn emit(&self) -> (u8, [u8; 4]) {
+        match self {
+            Self::Expedited(data) => ((data.unused() & 0x03) << 2 | 0x03, data.bytes),
+            Self::Unsized(data) => (0x02, *data),
+            Self::Segmented(Some(size)) => (0x01, size.to_le_bytes()),
+            Self::Segmented(None) => (0x00, [0; 4]),
+        }
+    }
+}
+
+/// One segment of a segmented transfer, in either direction.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Segment {
+    /// Starts at 0 and alternates.
+    pub toggle: bool,
+    /// No more segments follow ("c").
+    pub last: bool,
+    /// The data, 0 to 7 bytes.
+    pub data: Chunk<7>,
+}
+
+impl Segment {
+    fn parse(bytes: &[u8; 8]) -> Self {
+        let data = Chunk::with_unused(&bytes[1..], bytes[0] >> 1 & 0x07);
+        Self { toggle: toggle_of(bytes[0]), last: bytes[0] & 0x01 != 0, data }
+    }
+
+    fn emit(&self, specifier: u8) -> [u8; 8] {
+        let mut bytes = [0; 8];
+        bytes[0] = specifier | toggle_bit(self.toggle) | self.data.unused() << 1 | u8::from(self.last);
+        bytes[1..].copy_from_slice(&self.data.bytes);
+        bytes
+    }
+}
+
+/// One segment of a block transfer, in either direction. Whether all seven bytes of the last one count is told by the
+/// end of the transfer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BlockSegment {
+    /// No more segments follow ("c").
+    pub last: bool,
+    /// Its place in the sub-block, 1 to 127.
+    pub seqno: u8,
+    /// The data.
+    pub data: [u8; 7],
+}
+
+impl BlockSegment {
+    /// `None` for sequence number 0, which no segment has: this is how an abort (80h) stays recognisable between them.
+    #[must_use]
+    pub fn parse(bytes: &[u8; 8]) -> Option<Self> {
+        let [head, data @ ..] = *bytes;
+        let seqno = head & 0x7F;
+        (seqno != 0).then_some(Self { last: head & 0x80 != 0, seqno, data })
+    }
+
+    /// The bytes of the frame.
+    #[must_use]
+    pub fn emit(&self) -> [u8; 8] {
+        let mut bytes = [0; 8];
+        bytes[0] = u8::from(self.last) << 7 | self.seqno & 0x7F;
+        bytes[1..].copy_from_slice(&self.data);
+        bytes
+    }
+}
+
+/// The end of a block transfer, from the side that sent the data.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BlockEnd {
+    /// Bytes of the last segment that are no data, 0 to 7 ("n").
+    pub unused: u8,
+    /// CRC over all data, 0 where it was not agreed on.
+    pub crc: u16,
+}
+
+impl BlockEnd {
+    fn parse(bytes: &[u8; 8]) -> Self {
+        Self { unused: bytes[0] >> 2 & 0x07, crc: u16::from_le_bytes([bytes[1], bytes[2]]) }
+    }
+
+    fn emit(&self) -> [u8; 8] {
+        let [low, high] = self.crc.to_le_bytes();
+        [0xC1 | (self.unused & 0x07) << 2, low, high, 0, 0, 0, 0, 0]
+    }
+}
+
+/// How far the receiver of a block transfer got, and what it takes next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BlockAck {
+    /// The last segment of the sub-block that arrived in order; 0 for none.
+    pub ackseq: u8,
+    /// Segments of the next sub-block, 1 to 127.
+    pub blksize: u8,
+}
+
+/// What a client sends.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Request {
+    /// Initiate download (ccs 1).
+    InitiateDownload(Address, Payload),
+    /// Download segment (ccs 0).
+    DownloadSegment(Segment),
+    /// Initiate upload (ccs 2).
+    InitiateUpload(Address),
+    /// Upload segment (ccs 3), with its toggle bit.
+    UploadSegment(bool),
+    /// Abort (cs 4).
+    Abort(Address, AbortCode),
+    /// Initiate block download (ccs 6, cs 0).
+    InitiateBlockDownload {
+        /// What is written.
+        at: Address,
+        /// The client can make a CRC.
+        crc: bool,
+        /// Bytes to come, where told.
+        size: Option<u32>,
+    },
+    /// End block download (ccs 6, cs 1).
+    EndBlockDownload(BlockEnd),
+    /// Initiate block upload (ccs 5, cs 0).
+    InitiateBlockUpload {
+        /// What is read.
+        at: Address,
+        /// The client can check a CRC.
+        crc: bool,
+        /// Segments per sub-block, 1 to 127.
+        blksize: u8,
+        /// Protocol switch threshold: up to this many bytes the server may answer with another protocol; 0 for never.
+        pst: u8,
+    },
+    /// End block upload (ccs 5, cs 1): the client has checked everything.
+    EndBlockUpload,
+    /// Block upload response (ccs 5, cs 2).
+    AckBlockUpload(BlockAck),
+    /// Start block upload (ccs 5, cs 3).
+    StartBlockUpload,
+}
+
+impl Request {
+    /// `None` for an unknown command specifier.
+    #[must_use]
+    pub fn parse(bytes: &[u8; 8]) -> Option<Self> {
+        let command = bytes[0];
+        let at = address(bytes);
+        let field = field(bytes);
+        Some(match command >> 5 {
+            0 => Self::DownloadSegment(Segment::parse(bytes)),
+            1 => Self::InitiateDownload(at, Payload::parse(command, field)),
+            2 => Self::InitiateUpload(at),
+            3 => Self::UploadSegment(toggle_of(command)),
+            4 => Self::Abort(at, AbortCode(u32::from_le_bytes(field))),
+            5 => match command & 0x03 {
+                0 => Self::InitiateBlockUpload { at, crc: crc_of(command), blksize: bytes[4], pst: bytes[5] },
+                1 => Self::EndBlockUpload,
+                2 => Self::AckBlockUpload(BlockAck { ackseq: bytes[1], blksize: bytes[2] }),
+                _ => Self::StartBlockUpload,
+            },
+            6 => match command & 0x01 {
+                0 => Self::InitiateBlockDownload { at, crc: crc_of(command), size: size_of(command, field) },
+                _ => Self::EndBlockDownload(BlockEnd::parse(bytes)),
+            },
+            _ => return None,
+        })
+    }
+
+    /// The bytes of the frame.
+    #[must_use]
+    pub fn emit(&self) -> [u8; 8] {
+        match *self {
+            Self::InitiateDownload(at, payload) => {
+                let (bits, field) = payload.emit();
+                with_address(0x20 | bits, at, field)
+            }
+            Self::DownloadSegment(segment) => segment.emit(0x00),
+            Self::InitiateUpload(at) => with_address(0x40, at, [0; 4]),
+            Self::UploadSegment(toggle) => bare(0x60 | toggle_bit(toggle)),
+            Self::Abort(at, code) => with_address(0x80, at, code.0.to_le_bytes()),
+            Self::InitiateBlockDownload { at, crc, size } => {
+                with_address(0xC0 | crc_bit(crc) | size_bit(size), at, size.unwrap_or(0).to_le_bytes())
+            }
+            Self::EndBlockDownload(end) => end.emit(),
+            Self::InitiateBlockUpload { at, crc, blksize, pst } => {
+                with_address(0xA0 | crc_bit(crc), at, [blksize, pst, 0, 0])
+            }
+            Self::EndBlockUpload => bare(0xA1),
+            Self::AckBlockUpload(ack) => [0xA2, ack.ackseq, ack.blksize, 0, 0, 0, 0, 0],
+            Self::StartBlockUpload => bare(0xA3),
+        }
+    }
+}
+
+/// What a server sends.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Response {
+    /// Initiate download (scs 3).
+    InitiateDownload(Address),
+    /// Download segment (scs 1), with its toggle bit.
+    DownloadSegment(bool),
+    /// Initiate upload (scs 2).
+    InitiateUpload(Address, Payload),
+    /// Upload segment (scs 0).
+    UploadSegment(Segment),
+    /// Abort (cs 4).
+    Abort(Address, AbortCode),
+    /// Initiate block download (scs 5, ss 0).
+    InitiateBlockDownload {
+        /// What is written.
+        at: Address,
+        /// The server checks a CRC.
+        crc: bool,
+        /// Segments of the first sub-block, 1 to 127.
+        blksize: u8,
+    },
+    /// End block download (scs 5, ss 1).
+    EndBlockDownload,
+    /// Block download response (scs 5, ss 2).
+    AckBlockDownload(BlockAck),
+    /// Initiate block upload (scs 6, ss 0).
+    InitiateBlockUpload {
+        /// What is read.
+        at: Address,
+        /// The server makes a CRC.
+        crc: bool,
+        /// Bytes to come, where told.
+        size: Option<u32>,
+    },
+    /// End block upload (scs 6, ss 1).
+    EndBlockUpload(BlockEnd),
+}
+
+impl Response {
+    /// `None` for an unknown command specifier.
+    #[must_use]
+    pub fn parse(bytes: &[u8; 8]) -> Option<Self> {
+        let command = bytes[0];
+        let at = address(bytes);
+        let field = field(bytes);
+        Some(match command >> 5 {
+            0 => Self::UploadSegment(Segment::parse(bytes)),
+            1 => Self::DownloadSegment(toggle_of(command)),
+            2 => Self::InitiateUpload(at, Payload::parse(command, field)),
+            3 => Self::InitiateDownload(at),
+            4 => Self::Abort(at, AbortCode(u32::from_le_bytes(field))),
+            5 => match command & 0x03 {
+                0 => Self::InitiateBlockDownload { at, crc: crc_of(command), blksize: bytes[4] },
+                1 => Self::EndBlockDownload,
+                2 => Self::AckBlockDownload(BlockAck { ackseq: bytes[1], blksize: bytes[2] }),
+                _ => return None,
+            },
+            6 => match command & 0x01 {
+                0 => Self::InitiateBlockUpload { at, crc: crc_of(command), size: size_of(command, field) },
+                _ => Self::EndBlockUpload(BlockEnd::parse(bytes)),
+            },
+            _ => return None,
+        })
+    }
+
+    /// The bytes of the frame.
+    #[must_use]
+    pub fn emit(&self) -> [u8; 8] {
+        match *self {
+            Self::InitiateDownload(at) => with_address(0x60, at, [0; 4]),
+            Self::DownloadSegment(toggle) => bare(0x20 | toggle_bit(toggle)),
+            Self::InitiateUpload(at, payload) => {
+                let (bits, field) = payload.emit();
+                with_address(0x40 | bits, at, field)
+            }
+            Self::UploadSegment(segment) => segment.emit(0x00),
+            Self::Abort(at, code) => with_address(0x80, at, code.0.to_le_bytes()),
+            Self::InitiateBlockDownload { at, crc, blksize } => {
+                with_address(0xA0 | crc_bit(crc), at, [blksize, 0, 0, 0])
+            }
+            Self::EndBlockDownload => bare(0xA1),
+            Self::AckBlockDownload(ack) => [0xA2, ack.ackseq, ack.blksize, 0, 0, 0, 0, 0],
+            Self::InitiateBlockUpload { at, crc, size } => {
+                with_address(0xC0 | crc_bit(crc) | size_bit(size), at, size.unwrap_or(0).to_le_bytes())
+            }
+            Self::EndBlockUpload(end) => end.emit(),
+        }
+    }
+}
+
+fn address(bytes: &[u8; 8]) -> Address {
+    Address { index: u16::from_le_bytes([bytes[1], bytes[2]]), sub: bytes[3] }
+}
+
+fn field(bytes: &[u8; 8]) -> [u8; 4] {
+    [bytes[4], bytes[5], bytes[6], bytes[7]]
+}
+
+fn with_address(command: u8, at: Address, field: [u8; 4]) -> [u8; 8] {
+    let [low, high] = at.index.to_le_bytes();
+    let [a, b, c, d] = field;
+    [command, low, high, at.sub, a, b, c, d]
+}
+
+const fn bare(command: u8) -> [u8; 8] {
+    [command, 0, 0, 0, 0, 0, 0, 0]
+}
+
+const fn toggle_of(command: u8) -> bool {
+    command & 0x10 != 0
+}
+
+fn toggle_bit(toggle: bool) -> u8 {
+    u8::from(toggle) << 4
+}
+
+const fn crc_of(command: u8) -> bool {
+    command & 0x04 != 0
+}
+
+fn crc_bit(crc: bool) -> u8 {
+    u8::from(crc) << 2
+}
+
+/// The size that an initiate of a block transfer announces: told in bit 1, unlike elsewhere.
+fn size_of(command: u8, field: [u8; 4]) -> Option<u32> {
+    (command & 0x02 != 0).then(|| u32::from_le_bytes(field))
+}
+
+fn size_bit(size: Option<u32>) -> u8 {
+    u8::from(size.is_some()) << 1
+}

@@ -1,0 +1,261 @@
+//! The SDO client against answers written by hand from CiA 301 section 7.2.4.3.
+
+mod common;
+
+use canopen::sdo::client::{Buffer, Config, Download, SdoError, Step, Transfer, Upload};
+use canopen::{AbortCode, Address, CobId, Frame};
+use common::{at, node, request, response};
+
+const CONFIG: Config = Config { timeout_ms: 1000 };
+
+/// A client and the bytes that it has to send next, or how it ended.
+#[track_caller]
+fn sends(client: &mut impl Transfer, now: u32, bytes: [u8; 8]) {
+    assert_eq!(client.poll(at(now)), Step::Send(request(bytes)));
+    assert_eq!(client.poll(at(now)), Step::Wait(at(now + 1000)));
+}
+
+#[track_caller]
+fn ends(client: &mut impl Transfer, now: u32, result: Result<(), SdoError>) {
+    assert_eq!(client.poll(at(now)), Step::Done(result));
+    // Nothing brings it back.
+    client.handle(&response([0x60, 0, 0x20, 0, 0, 0, 0, 0]), at(now));
+    client.abort(AbortCode::GENERAL);
+    assert_eq!(client.poll(at(now)), Step::Done(result));
+}
+
+/// It sends this abort and then ends.
+#[track_caller]
+fn aborts(client: &mut impl Transfer, now: u32, bytes: [u8; 8], error: SdoError) {
+    assert_eq!(client.poll(at(now)), Step::Send(request(bytes)));
+    ends(client, now, Err(error));
+}
+
+fn download(data: &[u8]) -> Download<&[u8]> {
+    Download::new(node(), Address::new(0x2000, 3), data, CONFIG)
+}
+
+fn upload() -> Upload<Vec<u8>> {
+    Upload::new(node(), Address::new(0x2000, 3), Vec::new(), CONFIG)
+}
+
+#[test]
+fn downloads_up_to_four_bytes_in_one_frame() {
+    let table: [(&[u8], [u8; 8]); 4] = [
+        (&[1], [0x2F, 0x00, 0x20, 3, 1, 0, 0, 0]),
+        (&[1, 2], [0x2B, 0x00, 0x20, 3, 1, 2, 0, 0]),
+        (&[1, 2, 3], [0x27, 0x00, 0x20, 3, 1, 2, 3, 0]),
+        (&[1, 2, 3, 4], [0x23, 0x00, 0x20, 3, 1, 2, 3, 4]),
+    ];
+    for (data, bytes) in table {
+        let mut client = download(data);
+        sends(&mut client, 0, bytes);
+        assert_eq!(client.progress(), 0);
+        client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(1));
+        ends(&mut client, 1, Ok(()));
+        assert_eq!(client.progress(), data.len() as u32);
+    }
+}
+
+#[test]
+fn downloads_more_in_segments() {
+    let data: Vec<u8> = (1..=16).collect();
+    let mut client = download(&data);
+    sends(&mut client, 0, [0x21, 0x00, 0x20, 3, 16, 0, 0, 0]);
+    client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(0));
+    sends(&mut client, 0, [0x00, 1, 2, 3, 4, 5, 6, 7]);
+    assert_eq!(client.progress(), 0);
+    client.handle(&response([0x20, 0, 0, 0, 0, 0, 0, 0]), at(0));
+    sends(&mut client, 0, [0x10, 8, 9, 10, 11, 12, 13, 14]);
+    assert_eq!(client.progress(), 7);
+    client.handle(&response([0x30, 0, 0, 0, 0, 0, 0, 0]), at(0));
+    sends(&mut client, 0, [0x0B, 15, 16, 0, 0, 0, 0, 0]);
+    client.handle(&response([0x20, 0, 0, 0, 0, 0, 0, 0]), at(0));
+    ends(&mut client, 0, Ok(()));
+    assert_eq!(client.progress(), 16);
+
+    // Seven bytes end in a full segment, none in an empty one.
+    let mut client = download(&data[..7]);
+    sends(&mut client, 0, [0x21, 0x00, 0x20, 3, 7, 0, 0, 0]);
+    client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(0));
+    sends(&mut client, 0, [0x01, 1, 2, 3, 4, 5, 6, 7]);
+    let mut client = download(&[]);
+    sends(&mut client, 0, [0x21, 0x00, 0x20, 3, 0, 0, 0, 0]);
+    client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(0));
+    sends(&mut client, 0, [0x0F, 0, 0, 0, 0, 0, 0, 0]);
+}
+
+#[test]
+fn uploads_expedited() {
+    let table: [([u8; 8], &[u8]); 5] = [
+        ([0x4F, 0x00, 0x20, 3, 1, 9, 9, 9], &[1]),
+        ([0x4B, 0x00, 0x20, 3, 1, 2, 9, 9], &[1, 2]),
+        ([0x47, 0x00, 0x20, 3, 1, 2, 3, 9], &[1, 2, 3]),
+        ([0x43, 0x00, 0x20, 3, 1, 2, 3, 4], &[1, 2, 3, 4]),
+        // The size is not told.
+        ([0x42, 0x00, 0x20, 3, 1, 2, 3, 4], &[1, 2, 3, 4]),
+    ];
+    for (bytes, data) in table {
+        let mut client = upload();
+        sends(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
+        client.handle(&response(bytes), at(0));
+        ends(&mut client, 0, Ok(()));
+        assert_eq!(client.progress(), data.len() as u32);
+        assert_eq!(client.into_sink(), data);
+    }
+}
+
+#[test]
+fn uploads_segmented() {
+    for announce in [[0x41, 0x00, 0x20, 3, 9, 0, 0, 0], [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]] {
+        let mut client = upload();
+        sends(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
+        client.handle(&response(announce), at(0));
+        sends(&mut client, 0, [0x60, 0, 0, 0, 0, 0, 0, 0]);
+        client.handle(&response([0x00, 1, 2, 3, 4, 5, 6, 7]), at(0));
+        assert_eq!(client.progress(), 7);
+        sends(&mut client, 0, [0x70, 0, 0, 0, 0, 0, 0, 0]);
+        client.handle(&response([0x1B, 8, 9, 0, 0, 0, 0, 0]), at(0));
+        ends(&mut client, 0, Ok(()));
+        assert_eq!(client.into_sink(), (1..=9).collect::<Vec<u8>>());
+    }
+}
+
+#[test]
+fn a_buffer_takes_what_fits_and_no_more() {
+    let mut bytes = [0; 4];
+    let mut buffer = Buffer::new(&mut bytes);
+    let mut client = Upload::new(node(), Address::new(0x1018, 1), &mut buffer, CONFIG);
+    sends(&mut client, 0, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]);
+    client.handle(&response([0x43, 0x18, 0x10, 1, 1, 2, 3, 4]), at(0));
+    ends(&mut client, 0, Ok(()));
+    assert_eq!(buffer.filled(), [1, 2, 3, 4]);
+
+    let out_of_memory = [0x80, 0x18, 0x10, 1, 0x05, 0x00, 0x04, 0x05];
+    let error = SdoError::Client(AbortCode(0x0504_0005));
+    // Announced...
+    let mut bytes = [0; 4];
+    let mut client = Upload::new(node(), Address::new(0x1018, 1), Buffer::new(&mut bytes), CONFIG);
+    sends(&mut client, 0, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]);
+    client.handle(&response([0x41, 0x18, 0x10, 1, 5, 0, 0, 0]), at(0));
+    aborts(&mut client, 0, out_of_memory, error);
+    // ...and not announced.
+    let mut client = Upload::new(node(), Address::new(0x1018, 1), Buffer::new(&mut bytes), CONFIG);
+    sends(&mut client, 0, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]);
+    client.handle(&response([0x40, 0x18, 0x10, 1, 0, 0, 0, 0]), at(0));
+    sends(&mut client, 0, [0x60, 0, 0, 0, 0, 0, 0, 0]);
+    client.handle(&response([0x01, 1, 2, 3, 4, 5, 6, 7]), at(0));
+    aborts(&mut client, 0, out_of_memory, error);
+}
+
+#[test]
+fn an_abort_of_the_server_is_reported() {
+    let abort = response([0x80, 0x00, 0x20, 3, 0x30, 0x00, 0x09, 0x06]);
+    let error = Err(SdoError::Server(AbortCode(0x0609_0030)));
+    let mut client = download(&[1]);
+    sends(&mut client, 0, [0x2F, 0x00, 0x20, 3, 1, 0, 0, 0]);
+    client.handle(&abort, at(0));
+    ends(&mut client, 0, error);
+    let mut client = download(&[1, 2, 3, 4, 5]);
+    sends(&mut client, 0, [0x21, 0x00, 0x20, 3, 5, 0, 0, 0]);
+    client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(0));
+    sends(&mut client, 0, [0x05, 1, 2, 3, 4, 5, 0, 0]);
+    client.handle(&abort, at(0));
+    ends(&mut client, 0, error);
+    let mut client = upload();
+    sends(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
+    client.handle(&abort, at(0));
+    ends(&mut client, 0, error);
+    assert_eq!(
+        SdoError::Server(AbortCode(0x0609_0030)).to_string(),
+        "the device refused: 06090030h (invalid value for parameter)"
+    );
+}
+
+#[test]
+fn silence_is_a_time_out_that_the_server_is_told() {
+    let mut client = upload();
+    let start = u32::MAX - 100;
+    assert_eq!(client.poll(at(start)), Step::Send(request([0x40, 0x00, 0x20, 3, 0, 0, 0, 0])));
+    assert_eq!(client.poll(at(start.wrapping_add(999))), Step::Wait(at(899)));
+    let timeout = [0x80, 0x00, 0x20, 3, 0x00, 0x00, 0x04, 0x05];
+    aborts(&mut client, 899, timeout, SdoError::NoAnswer);
+    let mut client = download(&[1, 2, 3, 4, 5]);
+    sends(&mut client, 0, [0x21, 0x00, 0x20, 3, 5, 0, 0, 0]);
+    client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(999));
+    sends(&mut client, 999, [0x05, 1, 2, 3, 4, 5, 0, 0]);
+    assert_eq!(client.poll(at(1998)), Step::Wait(at(1999)));
+    aborts(&mut client, 1999, timeout, SdoError::NoAnswer);
+}
+
+#[test]
+fn answers_that_break_the_protocol_abort() {
+    let command = [0x80, 0x00, 0x20, 3, 0x01, 0x00, 0x04, 0x05];
+    let toggle = [0x80, 0x00, 0x20, 3, 0x00, 0x00, 0x03, 0x05];
+    let length = [0x80, 0x00, 0x20, 3, 0x10, 0x00, 0x07, 0x06];
+    let initiated = |data| {
+        let mut client = download(data);
+        let _ = client.poll(at(0));
+        client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(0));
+        let _ = client.poll(at(0));
+        client
+    };
+    let mut client = initiated(&[1, 2, 3, 4, 5]);
+    client.handle(&response([0x30, 0, 0, 0, 0, 0, 0, 0]), at(0));
+    aborts(&mut client, 0, toggle, SdoError::Client(AbortCode(0x0503_0000)));
+    for wrong in [[0x00; 8], [0xE0; 8], [0x60, 0x00, 0x20, 3, 0, 0, 0, 0]] {
+        let mut client = initiated(&[1, 2, 3, 4, 5]);
+        client.handle(&response(wrong), at(0));
+        aborts(&mut client, 0, command, SdoError::Client(AbortCode(0x0504_0001)));
+    }
+    let announced = || {
+        let mut client = upload();
+        let _ = client.poll(at(0));
+        client.handle(&response([0x41, 0x00, 0x20, 3, 5, 0, 0, 0]), at(0));
+        let _ = client.poll(at(0));
+        client
+    };
+    // Toggle, too many, too few.
+    for (bytes, abort, code) in [
+        ([0x15, 1, 2, 3, 4, 5, 0, 0], toggle, 0x0503_0000),
+        ([0x00, 1, 2, 3, 4, 5, 6, 7], length, 0x0607_0010),
+        ([0x07, 1, 2, 3, 4, 0, 0, 0], length, 0x0607_0010),
+        ([0x20, 0, 0, 0, 0, 0, 0, 0], command, 0x0504_0001),
+    ] {
+        let mut client = announced();
+        client.handle(&response(bytes), at(0));
+        aborts(&mut client, 0, abort, SdoError::Client(AbortCode(code)));
+    }
+}
+
+#[test]
+fn frames_of_others_and_late_answers_change_nothing() {
+    let mut client = upload();
+    // Before it asked, nothing is an answer.
+    client.handle(&response([0x43, 0x00, 0x20, 3, 9, 9, 9, 9]), at(0));
+    sends(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
+    let other_node = canopen::NodeId::new(6).unwrap();
+    for frame in [
+        Frame::of(CobId::sdo_response(other_node), &[0x43, 0x00, 0x20, 3, 9, 9, 9, 9]),
+        Frame::of(CobId::sdo_response(node()), &[0x43, 0x00, 0x20, 3, 9, 9, 9]),
+        Frame::of(CobId::heartbeat(node()), &[0x7F]),
+        // The answer to an earlier transfer that had timed out.
+        response([0x43, 0x00, 0x10, 0, 9, 9, 9, 9]),
+        response([0x60, 0x00, 0x10, 0, 0, 0, 0, 0]),
+    ] {
+        client.handle(&frame, at(0));
+        assert_eq!(client.poll(at(0)), Step::Wait(at(1000)), "{frame}");
+    }
+    client.handle(&response([0x4F, 0x00, 0x20, 3, 1, 0, 0, 0]), at(0));
+    ends(&mut client, 0, Ok(()));
+    assert_eq!(client.into_sink(), [1]);
+}
+
+#[test]
+fn a_caller_can_give_up() {
+    let mut client = download(&[1, 2, 3, 4, 5]);
+    sends(&mut client, 0, [0x21, 0x00, 0x20, 3, 5, 0, 0, 0]);
+    client.abort(AbortCode::GENERAL);
+    let general = [0x80, 0x00, 0x20, 3, 0x00, 0x00, 0x00, 0x08];
+    aborts(&mut client, 0, general, SdoError::Client(AbortCode(0x0800_0000)));
+}

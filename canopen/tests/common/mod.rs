@@ -1,0 +1,149 @@
+//! A device to test against, and the wire between the two ends.
+#![allow(dead_code, missing_docs)]
+
+use canopen::od::{put, Access, DataType, Entry};
+use canopen::{AbortCode, Address, CobId, Frame, Instant, NodeId, Objects};
+
+pub const NODE: u8 = 5;
+
+pub fn node() -> NodeId {
+    NodeId::new(NODE).unwrap()
+}
+
+pub fn at(millis: u32) -> Instant {
+    Instant::from_millis(millis)
+}
+
+/// What the client sends to the server.
+pub fn request(bytes: [u8; 8]) -> Frame {
+    Frame::of(CobId::sdo_request(node()), &bytes)
+}
+
+/// What the server sends to the client.
+pub fn response(bytes: [u8; 8]) -> Frame {
+    Frame::of(CobId::sdo_response(node()), &bytes)
+}
+
+const ENTRIES: &[Entry] = &[
+    Entry::var(0x1000, "Device type", DataType::Unsigned32, Access::Const).default(0x1000_0000),
+    Entry::var(0x1008, "Manufacturer device name", DataType::VisibleString, Access::Const),
+    Entry::var(0x1017, "Producer heartbeat time", DataType::Unsigned16, Access::Rw),
+    Entry::record(0x1018, "Identity object", 4),
+    Entry::sub(0x1018, 1, "Vendor-ID", DataType::Unsigned32, Access::Const),
+    Entry::array(0x1F50, "Program data", 1),
+    Entry::sub(0x1F50, 1, "Program number 1", DataType::Domain, Access::Wo),
+    Entry::array(0x1F51, "Program control", 1),
+    Entry::sub(0x1F51, 1, "Program number 1", DataType::Unsigned8, Access::Rw),
+    Entry::var(0x2000, "Domain", DataType::Domain, Access::Rw),
+    Entry::var(0x2001, "Text", DataType::VisibleString, Access::Rw),
+    Entry::var(0x2002, "Secret", DataType::Unsigned32, Access::Wo),
+    Entry::var(0x2003, "Long", DataType::Unsigned64, Access::Rw),
+];
+
+/// What the device has heard about the domain.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Event {
+    Start(Option<u32>),
+    End(Vec<u8>),
+    Cancel,
+}
+
+/// A domain at 2000h and 1F50h/1, and values that can be written.
+#[derive(Debug, Default)]
+pub struct Device {
+    pub heartbeat: u16,
+    pub control: u8,
+    pub text: Vec<u8>,
+    pub long: u64,
+    /// The domain as it was last completed; what an upload reads.
+    pub domain: Vec<u8>,
+    /// Whether an upload tells the size.
+    pub tells_size: bool,
+    pub incoming: Option<Vec<u8>>,
+    pub events: Vec<Event>,
+    /// Room left for domain data; `None` for any.
+    pub space: Option<usize>,
+    /// Refuses the end of a domain download.
+    pub refuse_end: Option<AbortCode>,
+}
+
+impl Objects for Device {
+    fn entries(&self) -> &'static [Entry] {
+        ENTRIES
+    }
+
+    fn read(&mut self, at: Address, buf: &mut [u8]) -> Result<usize, AbortCode> {
+        match (at.index, at.sub) {
+            (0x1000, 0) => put(buf, &0x1000_0000_u32.to_le_bytes()),
+            (0x1008, 0) => put(buf, b"coboot bootloader"),
+            (0x1017, 0) => put(buf, &self.heartbeat.to_le_bytes()),
+            (0x1018, 1) => put(buf, &0x0102_0304_u32.to_le_bytes()),
+            (0x1F51, 1) => put(buf, &[self.control]),
+            (0x2001, 0) => put(buf, &self.text),
+            (0x2003, 0) => put(buf, &self.long.to_le_bytes()),
+            _ => panic!("the table does not allow a read of {at}"),
+        }
+    }
+
+    fn write(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
+        match (at.index, at.sub) {
+            (0x1017, 0) => self.heartbeat = u16::from_le_bytes(data.try_into().unwrap()),
+            (0x1F51, 1) => {
+                if data[0] == 0x7F {
+                    return Err(AbortCode::INVALID_VALUE);
+                }
+                self.control = data[0];
+            }
+            (0x2001, 0) => self.text = data.to_vec(),
+            (0x2002, 0) => assert_eq!(data.len(), 4),
+            (0x2003, 0) => self.long = u64::from_le_bytes(data.try_into().unwrap()),
+            _ => panic!("the table does not allow a write of {at}"),
+        }
+        Ok(())
+    }
+
+    fn download_start(&mut self, _at: Address, size: Option<u32>) -> Result<(), AbortCode> {
+        assert!(self.incoming.is_none(), "the last download neither ended nor was cancelled");
+        self.incoming = Some(Vec::new());
+        self.events.push(Event::Start(size));
+        Ok(())
+    }
+
+    fn download_space(&mut self, _at: Address) -> usize {
+        self.space.unwrap_or(usize::MAX)
+    }
+
+    fn download_data(&mut self, _at: Address, data: &[u8]) -> Result<(), AbortCode> {
+        if let Some(space) = &mut self.space {
+            *space = space.checked_sub(data.len()).expect("data in spite of no space");
+        }
+        self.incoming.as_mut().expect("data outside a download").extend(data);
+        Ok(())
+    }
+
+    fn download_end(&mut self, _at: Address) -> Result<(), AbortCode> {
+        let data = self.incoming.take().expect("end outside a download");
+        if let Some(code) = self.refuse_end {
+            return Err(code);
+        }
+        self.domain.clone_from(&data);
+        self.events.push(Event::End(data));
+        Ok(())
+    }
+
+    fn download_cancel(&mut self, _at: Address) {
+        self.incoming.take().expect("cancel outside a download");
+        self.events.push(Event::Cancel);
+    }
+
+    fn upload_start(&mut self, _at: Address) -> Result<Option<u32>, AbortCode> {
+        Ok(self.tells_size.then_some(self.domain.len() as u32))
+    }
+
+    fn upload_data(&mut self, _at: Address, offset: u32, buf: &mut [u8]) -> Result<usize, AbortCode> {
+        let rest = &self.domain[offset as usize..];
+        let len = rest.len().min(buf.len());
+        buf[..len].copy_from_slice(&rest[..len]);
+        Ok(len)
+    }
+}
