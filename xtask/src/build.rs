@@ -1,7 +1,7 @@
 //! `cargo xtask build`: the images that go onto the chip.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
@@ -43,17 +43,20 @@ pub fn run(mut args: Args) -> Outcome {
 /// # Errors
 /// When one does not build, or is no image of this board.
 pub fn images(board: &Layout) -> Outcome<Images> {
-    let dir = workspace::firmware_dir(board);
-    fs::create_dir_all(&dir)
-        .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&dir)))?;
+    let bootloader = bootloader(board)?;
     let program = board.programs[0];
-    let image = |package, features: &str, name: &str, region| {
-        image(&Build { board, package, features }, &dir.join(name), region)
-    };
-    let bootloader = image("bootloader", "", "bootloader.elf", board.bootloader)?;
-    image("app-template", "version-1", "app-v1.elf", program)?;
-    image("app-template", "version-2", "app-v2.elf", program)?;
-    Ok(Images { dir: dir.clone(), bootloader })
+    // Version 1 is the template as it stands.
+    image(&Build { board, package: "app-template", features: "" }, "app-v1.elf", program)?;
+    image(&Build { board, package: "app-template", features: "version-2" }, "app-v2.elf", program)?;
+    Ok(Images { dir: workspace::firmware_dir(board), bootloader })
+}
+
+/// Builds the bootloader of a board and prints its size.
+///
+/// # Errors
+/// When it does not build, or is no image of this board.
+pub fn bootloader(board: &Layout) -> Outcome<PathBuf> {
+    image(&Build { board, package: "bootloader", features: "" }, "bootloader.elf", board.bootloader)
 }
 
 /// One call of cargo: the package is also the name of its program.
@@ -83,20 +86,25 @@ pub fn firmware_args(package: &str, board: &Layout, features: &str) -> Vec<Strin
     .collect()
 }
 
-fn image(build: &Build<'_>, to: &Path, region: Region) -> Outcome<PathBuf> {
+/// Builds an image and puts it, by its name there, into the board's folder.
+fn image(build: &Build<'_>, name: &str, region: Region) -> Outcome<PathBuf> {
     let &Build { board, package, features } = build;
+    let dir = workspace::firmware_dir(board);
+    fs::create_dir_all(&dir)
+        .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&dir)))?;
+    let to = dir.join(name);
     process::run(process::cargo("build").args(firmware_args(package, board, features)))?;
     let built = workspace::target_dir().join("fw").join(TARGET).join(PROFILE).join(package);
     let file = fs::read(&built).map_err(|error| {
         format!("cargo built {package}, but {} cannot be read: {error}.", built.display())
     })?;
     // Left alone when nothing changed, so that whoever looks at the time sees no change.
-    if fs::read(to).ok().as_ref() != Some(&file) {
-        fs::write(to, &file)
-            .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(to)))?;
+    if fs::read(&to).ok().as_ref() != Some(&file) {
+        fs::write(&to, &file)
+            .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&to)))?;
     }
-    let flash = Flash::of(&size::read(to)?, region)
-        .map_err(|problem| format!("{}: {problem}", workspace::shown(to)))?;
-    println!("  {:<52} {:>6} of {} bytes", workspace::shown(to), flash.used, region.size);
-    Ok(to.to_owned())
+    let flash = Flash::of(&size::read(&to)?, region)
+        .map_err(|problem| format!("{}: {problem}", workspace::shown(&to)))?;
+    println!("  {:<52} {:>6} of {} bytes", workspace::shown(&to), flash.used, region.size);
+    Ok(to)
 }

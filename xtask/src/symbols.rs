@@ -7,7 +7,7 @@
 /// the compiler's default depends on its version.
 pub fn crate_of(symbol: &str) -> Option<&str> {
     if let Some(path) = symbol.strip_prefix("_ZN") {
-        let (first, _) = counted(path)?;
+        let first = counted(path)?;
         let inner = first.trim_start_matches('_');
         return match inner.strip_prefix("$LT$") {
             // `<dyn T as …>`, `<&mut T …>`: step over what stands before the path.
@@ -34,16 +34,17 @@ pub fn crate_of(symbol: &str) -> Option<&str> {
             }
             None => rest,
         };
-        counted(rest).map(|(name, _)| name).filter(|name| *name == word(name))
+        let (len, name) = rest.split_at(rest.find(|c: char| !c.is_ascii_digit())?);
+        // A `_` stands between where the name itself starts with a digit or a `_`.
+        let name = name.strip_prefix('_').unwrap_or(name);
+        name.get(..len.parse().ok()?).filter(|name| !name.is_empty() && *name == word(name))
     })
 }
 
-/// `<length><that many bytes>` and what follows.
-fn counted(text: &str) -> Option<(&str, &str)> {
-    let digits = text.len() - text.trim_start_matches(|c: char| c.is_ascii_digit()).len();
-    let len: usize = text[..digits].parse().ok()?;
-    let rest = &text[digits..];
-    (rest.is_char_boundary(len) && 0 < len && len <= rest.len()).then(|| rest.split_at(len))
+/// The name in `<length><that many bytes>…`.
+fn counted(text: &str) -> Option<&str> {
+    let (len, name) = text.split_at(text.find(|c: char| !c.is_ascii_digit())?);
+    name.get(..len.parse().ok()?).filter(|name| !name.is_empty())
 }
 
 /// The identifier at the start of a text.
@@ -68,6 +69,7 @@ mod tests {
         // Examples of RFC 2603.
         assert_eq!(crate_of("_RNvNtCs1234_7mycrate3foo3bar"), Some("mycrate"));
         assert_eq!(crate_of("_RNvC7mycrate3foo"), Some("mycrate"));
+        assert_eq!(crate_of("_RNvC6_123foo3bar"), Some("123foo"));
     }
 
     #[test]
