@@ -20,7 +20,8 @@ fn main() {
     let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
     fs::write(out.join("memory.x"), layout.linker_script(image).to_string()).expect("OUT_DIR is writable");
 
-    let templates = PathBuf::from(env::var_os("CARGO_MANIFEST_DIR").expect("cargo sets it")).join("../linker");
+    let templates =
+        PathBuf::from(env::var_os("CARGO_MANIFEST_DIR").expect("cargo sets it")).join("../linker");
     println!("cargo:rerun-if-changed={}", templates.display());
     println!("cargo:rustc-link-search={}", out.display());
     println!("cargo:rustc-link-search={}", templates.display());

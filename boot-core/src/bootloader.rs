@@ -2,7 +2,9 @@
 
 use canopen::device::{self, Device};
 use canopen::od::{concat, put, Access, Address, DataType, Entry, Objects};
-use canopen::program::{ProgramControl, ProgramState, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID};
+use canopen::program::{
+    ProgramControl, ProgramState, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID,
+};
 use canopen::AbortCode;
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;

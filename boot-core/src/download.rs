@@ -9,7 +9,9 @@ use core::task::Poll;
 
 use canopen::program::{FlashError, FlashStatus, ProgramControl};
 use canopen::sdo::AbortCode;
-use shared_abi::block_file::{Control, Header, Last, CRC_SIZE, FRAMING, HEADER_SIZE, NUMBER_CONTROL, NUMBER_LAST};
+use shared_abi::block_file::{
+    Control, Header, Last, CRC_SIZE, FRAMING, HEADER_SIZE, NUMBER_CONTROL, NUMBER_LAST,
+};
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
@@ -75,9 +77,16 @@ enum Session {
 enum Reception {
     Idle,
     /// The header is not complete.
-    Header { program: u8, len: usize },
+    Header {
+        program: u8,
+        len: usize,
+    },
     /// The header was judged good.
-    Data { program: u8, len: usize, header: Header },
+    Data {
+        program: u8,
+        len: usize,
+        header: Header,
+    },
 }
 
 /// What is being done to the flash. A piece of work belongs to one program.
@@ -196,7 +205,9 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
                         self.work = Some(self.store_record(program, ProgramRecord { signed, ..record }));
                     }
                 }
-                None if command == ProgramControl::SetSignature => state.error = Some(FlashError::NoValidProgram),
+                None if command == ProgramControl::SetSignature => {
+                    state.error = Some(FlashError::NoValidProgram)
+                }
                 None => {}
             },
         }
@@ -321,7 +332,8 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
                     self.programs[index].session = Session::Idle;
                 }
                 let region = self.layout.program(program);
-                let plausible = region.is_some_and(|region| check_vectors(flash, region, self.layout).is_ok());
+                let plausible =
+                    region.is_some_and(|region| check_vectors(flash, region, self.layout).is_ok());
                 if crc == last.program_crc && plausible {
                     let record = ProgramRecord { size: last.program_size, crc, signed: false };
                     self.work = Some(self.store_record(program, record));
@@ -423,7 +435,8 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
                 let secured = [self.layout.bootloader, self.layout.parameters[0], self.layout.parameters[1]];
                 let touches = |region: &Region| {
                     // `u64`: an address near the end of the address space must not wrap.
-                    u64::from(region.base) < u64::from(target.0) + u64::from(target.1) && target.0 < region.end()
+                    u64::from(region.base) < u64::from(target.0) + u64::from(target.1)
+                        && target.0 < region.end()
                 };
                 let secured = secured.iter().any(touches);
                 return Err(unfit(if secured { FlashError::Secured } else { FlashError::Address }));
@@ -457,7 +470,8 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
                 Ok(None)
             }
             NUMBER_LAST => {
-                let last = Last::parse(&self.buffer[HEADER_SIZE..data_end]).ok_or(unfit(FlashError::Format))?;
+                let last =
+                    Last::parse(&self.buffer[HEADER_SIZE..data_end]).ok_or(unfit(FlashError::Format))?;
                 // The first two vectors at least: without them under the CRC nothing can be started.
                 if last.program_size < 8 {
                     return Err(unfit(FlashError::Format));

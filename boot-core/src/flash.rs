@@ -46,6 +46,28 @@ pub trait Flash {
     }
 }
 
+impl<F: Flash> Flash for &mut F {
+    fn read(&self, address: u32, buffer: &mut [u8]) {
+        (**self).read(address, buffer);
+    }
+
+    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashFault> {
+        (**self).start_erase(sector)
+    }
+
+    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashFault> {
+        (**self).start_program(address, word)
+    }
+
+    fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
+        (**self).poll()
+    }
+
+    fn read_word(&self, address: u32) -> u32 {
+        (**self).read_word(address)
+    }
+}
+
 /// What an erased word reads as.
 pub const ERASED: u32 = u32::MAX;
 

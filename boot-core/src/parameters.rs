@@ -213,7 +213,11 @@ impl Store {
                     Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
                     Poll::Ready(Ok(())) => {
                         let sequence = journal.active.map_or(1, |active| active.sequence.wrapping_add(1));
-                        State::Commit { to: *to + 1, sequence, writer: WordWriter::new(slot_address(&new, 0)) }
+                        State::Commit {
+                            to: *to + 1,
+                            sequence,
+                            writer: WordWriter::new(slot_address(&new, 0)),
+                        }
                     }
                 },
                 State::Commit { to, sequence, writer } => {

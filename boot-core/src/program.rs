@@ -125,7 +125,11 @@ impl VerifiedProgram {
 ///
 /// # Errors
 /// The rule that it breaks.
-pub fn check_vectors<F: Flash>(flash: &F, region: Region, layout: &Layout) -> Result<VectorTable, VectorFault> {
+pub fn check_vectors<F: Flash>(
+    flash: &F,
+    region: Region,
+    layout: &Layout,
+) -> Result<VectorTable, VectorFault> {
     let words = [flash.read_word(region.base), flash.read_word(region.base + 4)];
     VectorTable::check(words, region, layout)
 }

@@ -45,7 +45,8 @@ fn values_survive_a_restart_and_any_number_of_compactions() {
             }
         }
     }
-    let outside = flash.touched.iter().find(|touched| !REGIONS.iter().any(|r| r.contains(touched.base, touched.size)));
+    let outside =
+        flash.touched.iter().find(|touched| !REGIONS.iter().any(|r| r.contains(touched.base, touched.size)));
     assert_eq!(outside, None, "the journal wrote outside its regions");
 }
 

@@ -114,7 +114,8 @@ impl Flash for FlashController {
         self.lock();
         Poll::Ready(if status.wrperr().bit_is_set() {
             Err(FlashFault::Protected)
-        } else if status.pgaerr().bit_is_set() || status.pgperr().bit_is_set() || status.pgserr().bit_is_set() {
+        } else if status.pgaerr().bit_is_set() || status.pgperr().bit_is_set() || status.pgserr().bit_is_set()
+        {
             Err(FlashFault::Failed)
         } else {
             Ok(())

@@ -43,7 +43,7 @@ mod app {
     use bxcan::Rx0;
     use canopen::device::Device;
     use canopen::nmt::NmtCommand;
-    use canopen::node::{Config, Node, NmtPolicy};
+    use canopen::node::{Config, NmtPolicy, Node};
     use canopen::program::BOOTLOADER_DEVICE_TYPE;
     use canopen::{CobId, Frame, Instant, NodeId};
     use cortex_m::peripheral::SCB;
@@ -123,11 +123,8 @@ mod app {
             revision: IDENTITY.revision,
             serial_number: bsp::serial_number(),
         };
-        let config = Config {
-            heartbeat_ms: HEARTBEAT_MS,
-            nmt: NmtPolicy::StayPreOperational,
-            ..Config::default()
-        };
+        let config =
+            Config { heartbeat_ms: HEARTBEAT_MS, nmt: NmtPolicy::StayPreOperational, ..Config::default() };
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();
         (

@@ -70,4 +70,3 @@ pub fn entry_strap(rcc: &pac::RCC, gpioa: &pac::GPIOA) -> bool {
     rcc.ahb1enr().modify(|_, w| w.gpioaen().disabled());
     pressed
 }
-

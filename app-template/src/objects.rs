@@ -1,0 +1,101 @@
+//! The object dictionary of the application, with the 1F51h callback that calls the bootloader back.
+
+use bsp::{IDENTITY, LAYOUT};
+use canopen::device::{self, Device};
+use canopen::od::{concat, put, Access, Address, DataType, Entry, Objects};
+use canopen::program::{
+    FlashStatus, ProgramControl, ProgramState, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID,
+};
+use canopen::AbortCode;
+
+use crate::coboot::{self, Start};
+
+/// 1000h: no standardised profile. Anything but the bootloader's 10000000h tells a host that the application runs.
+const DEVICE_TYPE: u32 = 0;
+/// 1017h, in ms.
+pub const HEARTBEAT_MS: u16 = 500;
+/// 100Ah.
+const SOFTWARE_VERSION: &str = if cfg!(feature = "version-2") { "2.0.0" } else { "1.0.0" };
+
+/// What coboot needs of an application: keep these when you add your own.
+const PROGRAM_ENTRIES: [Entry; 6] = [
+    Entry::array(PROGRAM_CONTROL, "Program control", 1),
+    Entry::sub(PROGRAM_CONTROL, 1, "Program control 1", DataType::Unsigned8, Access::Rw),
+    Entry::array(PROGRAM_ID, "Program software identification", 1),
+    Entry::sub(PROGRAM_ID, 1, "Program software identification 1", DataType::Unsigned32, Access::Ro),
+    Entry::array(FLASH_STATUS, "Flash status identification", 1),
+    Entry::sub(FLASH_STATUS, 1, "Flash status identification 1", DataType::Unsigned32, Access::Ro),
+];
+
+/// The object dictionary.
+static ENTRIES: [Entry; 17] = concat(device::ENTRIES, PROGRAM_ENTRIES);
+
+/// The application's state, as far as the bus sees it.
+pub struct Application {
+    device: Device,
+    program_crc: u32,
+    called_back: bool,
+}
+
+impl Application {
+    /// From how the device came up. Asks the bootloader for the CRC over this program, once.
+    pub fn new(start: &Start) -> Self {
+        let device = Device {
+            device_type: DEVICE_TYPE,
+            name: IDENTITY.device_name,
+            hardware_version: IDENTITY.hardware_version,
+            software_version: SOFTWARE_VERSION,
+            heartbeat_ms: HEARTBEAT_MS,
+            vendor_id: IDENTITY.vendor_id,
+            product_code: IDENTITY.product_code,
+            revision: IDENTITY.revision,
+            serial_number: start.serial_number,
+        };
+        Self { device, program_crc: coboot::own_crc(LAYOUT).unwrap_or(0), called_back: false }
+    }
+
+    /// Whether the device shall go back to the bootloader.
+    pub fn is_called_back(&self) -> bool {
+        self.called_back
+    }
+
+    /// The 1F51h callback. It runs before the SDO answer is sent, so it only notes what is to be done: `main` waits until
+    /// the answer is on the bus, then leaves.
+    fn program_control(&mut self, command: ProgramControl) -> Result<(), AbortCode> {
+        match command {
+            ProgramControl::StartBootloader => {
+                self.called_back = true;
+                Ok(())
+            }
+            // It runs already.
+            ProgramControl::Start => Ok(()),
+            // The bootloader's to do; this program cannot do it to itself.
+            _ => Err(AbortCode::DEVICE_STATE),
+        }
+    }
+}
+
+impl Objects for Application {
+    fn entries(&self) -> &'static [Entry] {
+        &ENTRIES
+    }
+
+    fn read(&mut self, at: Address, buf: &mut [u8]) -> Result<usize, AbortCode> {
+        if let Some(read) = self.device.read(at, buf) {
+            return read;
+        }
+        match at.index {
+            PROGRAM_CONTROL => put(buf, &[ProgramState::Running as u8]),
+            PROGRAM_ID => put(buf, &self.program_crc.to_le_bytes()),
+            FLASH_STATUS => put(buf, &FlashStatus::OK.to_word().to_le_bytes()),
+            _ => Err(AbortCode::NO_DATA),
+        }
+    }
+
+    fn write(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
+        match (at.index, data) {
+            (PROGRAM_CONTROL, &[value]) => self.program_control(ProgramControl::try_from(value)?),
+            _ => Err(AbortCode::UNSUPPORTED_ACCESS),
+        }
+    }
+}

@@ -1,0 +1,476 @@
+//! Program download by block file: every block and command, in and out of order, on a strict flash.
+
+mod model;
+
+use boot_core::bootloader::Bootloader;
+use boot_core::download::Step;
+use boot_core::flash::FlashFault;
+use boot_core::parameters::Journal;
+use boot_core::program::{verify, Invalid};
+use canopen::device::Device;
+use canopen::od::{Address, Objects};
+use canopen::AbortCode;
+use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash};
+use shared_abi::geometry::{Geometry, Region, SectorRun, STM32F407VG};
+use shared_abi::layout::Layout;
+use shared_abi::warm_start::BootRequest;
+
+/// The F407 with sectors a 64th of their size: the same shape, and cheap to erase in a model.
+static CHIP: Geometry = Geometry {
+    chip: "small-f407",
+    flash: Region::new(0x0800_0000, 0x4400),
+    sectors: &[
+        SectorRun { count: 4, size: 0x200 },
+        SectorRun { count: 1, size: 0x400 },
+        SectorRun { count: 7, size: 0x800 },
+    ],
+    interrupts: 4,
+    ..STM32F407VG
+};
+const LAYOUT: Layout = Layout {
+    board: "model",
+    chip: &CHIP,
+    bootloader: Region::new(0x0800_0000, 0x400),
+    callgate_offset: 0x200,
+    parameters: [Region::new(0x0800_0400, 0x200), Region::new(0x0800_0600, 0x200)],
+    programs: &[Region::new(0x0800_0800, 0x3C00)],
+    ram: Region::new(0x2000_0000, 0x1_FFC0),
+    handoff: Region::new(0x2001_FFC0, 48),
+    warm_start: Region::new(0x2001_FFF0, 16),
+}
+.checked();
+static LAYOUT_REF: &Layout = &LAYOUT;
+const PROGRAM: Region = LAYOUT.programs[0];
+
+const DATA: Address = Address::new(0x1F50, 1);
+const CONTROL: Address = Address::new(0x1F51, 1);
+const IDENTIFICATION: Address = Address::new(0x1F56, 1);
+const STATUS: Address = Address::new(0x1F57, 1);
+
+const CLEAR: u8 = 0x03;
+const START: u8 = 0x01;
+const SET_SIGNATURE: u8 = 0x83;
+const CLR_SIGNATURE: u8 = 0x84;
+
+const DEVICE: Device = Device {
+    device_type: 0x1000_0000,
+    name: "model",
+    hardware_version: "0",
+    software_version: "0",
+    heartbeat_ms: 0,
+    vendor_id: 0,
+    product_code: 0,
+    revision: 0,
+    serial_number: 0,
+};
+
+struct Bench<'f> {
+    node: Bootloader<'static, &'f mut ModelFlash>,
+}
+
+impl<'f> Bench<'f> {
+    fn new(flash: &'f mut ModelFlash) -> Self {
+        let buffer = Box::leak(vec![0; 256].into_boxed_slice());
+        Self { node: Bootloader::new(DEVICE, LAYOUT_REF, flash, buffer) }
+    }
+
+    fn settle(&mut self) {
+        for _ in 0..1_000_000 {
+            if self.node.step() == Step::Idle {
+                return;
+            }
+        }
+        panic!("the work does not end");
+    }
+
+    fn word(&mut self, at: Address) -> u32 {
+        let mut bytes = [0; 4];
+        let len = self.node.read(at, &mut bytes).unwrap();
+        assert!(len <= 4);
+        u32::from_le_bytes(bytes)
+    }
+
+    fn status(&mut self) -> u32 {
+        self.word(STATUS)
+    }
+
+    /// A command, carried out; gives the status.
+    fn command(&mut self, command: u8) -> u32 {
+        self.node.write(CONTROL, &[command]).unwrap();
+        self.settle();
+        self.status()
+    }
+
+    /// A block in SDO segments; the abort, if any, and then the status when all work is done.
+    fn block(&mut self, block: &[u8]) -> (Result<(), AbortCode>, u32) {
+        let outcome = self.transfer(block);
+        self.settle();
+        (outcome, self.status())
+    }
+
+    fn transfer(&mut self, block: &[u8]) -> Result<(), AbortCode> {
+        self.node.download_start(DATA, Some(block.len() as u32))?;
+        for segment in block.chunks(7) {
+            // As the SDO server does it: an error ends the transfer and cancels the consumer.
+            if let Err(abort) = self.node.download_data(DATA, segment) {
+                self.node.download_cancel(DATA);
+                return Err(abort);
+            }
+        }
+        self.node.download_end(DATA)
+    }
+
+    fn good(&mut self, block: &[u8]) {
+        assert_eq!(self.block(block), (Ok(()), 0));
+    }
+
+    fn install(&mut self, program: &[u8]) {
+        assert_eq!(self.command(CLEAR), 0);
+        for block in block_file(program, 96) {
+            self.good(&block);
+        }
+    }
+}
+
+fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    for word in [number, address, data.len() as u32] {
+        bytes.extend(word.to_le_bytes());
+    }
+    bytes.extend(data);
+    bytes.extend(crc32(&bytes).to_le_bytes());
+    bytes
+}
+
+/// CRC-32/ISO-HDLC from its definition (reflected polynomial EDB88320h), bit by bit.
+fn crc32(bytes: &[u8]) -> u32 {
+    !bytes.iter().fold(u32::MAX, |crc, byte| {
+        (0..8).fold(
+            crc ^ u32::from(*byte),
+            |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xEDB8_8320 } else { crc >> 1 },
+        )
+    })
+}
+
+fn last(program: &[u8]) -> Vec<u8> {
+    let mut data = (program.len() as u32).to_le_bytes().to_vec();
+    data.extend(crc32(program).to_le_bytes());
+    block(u32::MAX, 0, &data)
+}
+
+fn block_file(program: &[u8], chunk: usize) -> Vec<Vec<u8>> {
+    let mut file = vec![block(0, 0, &[0; 8])];
+    for (i, data) in program.chunks(chunk).enumerate() {
+        file.push(block(1 + i as u32, PROGRAM.base + (i * chunk) as u32, data));
+    }
+    file.push(last(program));
+    file
+}
+
+/// A program with a plausible vector table, filled with `seed`.
+fn program(len: usize, seed: u8) -> Vec<u8> {
+    let mut bytes: Vec<u8> = (0..len).map(|i| (i as u8).wrapping_mul(31) ^ seed).collect();
+    bytes[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
+    bytes[4..8].copy_from_slice(&(PROGRAM.base + 0x101).to_le_bytes());
+    bytes
+}
+
+/// Which program would start after a reset, told by its first data byte; `Err` for none.
+fn autostart(flash: &ModelFlash) -> Result<u8, Invalid> {
+    let journal = Journal::open(flash, LAYOUT.parameters);
+    let verified = verify(flash, &journal, &LAYOUT, 1)?;
+    if verified.signed() {
+        Ok(flash.cells(PROGRAM)[8] ^ 8_u8.wrapping_mul(31))
+    } else {
+        Err(Invalid::Absent)
+    }
+}
+
+#[test]
+fn a_program_goes_in_block_by_block_and_survives_a_restart() {
+    let image = program(1000, 0x11);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    bench.install(&image);
+    assert_eq!(bench.word(IDENTIFICATION), crc32(&image));
+    assert_eq!(bench.command(SET_SIGNATURE), 0);
+
+    assert_eq!(&flash.cells(PROGRAM)[..1000], image);
+    assert!(flash.cells(PROGRAM)[1000..].iter().all(|byte| *byte == 0xFF));
+    assert_eq!(autostart(&flash), Ok(0x11));
+    let mut bench = Bench::new(&mut flash);
+    assert_eq!((bench.word(IDENTIFICATION), bench.status()), (crc32(&image), 0));
+}
+
+/// CRC-32 of the digits 1 to 9, from the CRC catalogue (CRC-32/ISO-HDLC, "check").
+#[test]
+fn the_crc_is_the_one_of_the_catalogue() {
+    assert_eq!(boot_core::crc32(b"123456789"), 0xCBF4_3926);
+    assert_eq!(crc32(b"123456789"), 0xCBF4_3926);
+}
+
+#[test]
+fn blocks_may_begin_and_end_at_any_byte() {
+    for chunk in [1, 3, 5, 7, 33] {
+        let image = program(120, 0x22);
+        let mut flash = ModelFlash::new(&CHIP);
+        let mut bench = Bench::new(&mut flash);
+        assert_eq!(bench.command(CLEAR), 0);
+        for block in block_file(&image, chunk) {
+            bench.good(&block);
+        }
+        assert_eq!(&flash.cells(PROGRAM)[..120], image, "blocks of {chunk}");
+    }
+}
+
+#[test]
+fn status_is_busy_from_the_acknowledgement_to_the_end_of_the_work() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    bench.node.write(CONTROL, &[CLEAR]).unwrap();
+    assert_eq!(bench.status(), 1);
+    assert_eq!(bench.node.step(), Step::Erasing);
+    assert_eq!(bench.status(), 1);
+    // Whoever writes now is told to wait, and harms nothing.
+    assert_eq!(bench.node.download_start(DATA, Some(24)), Err(AbortCode(0x0800_0022)));
+    assert_eq!(bench.status(), 0x87, "busy, and MAN_BUSY");
+    assert_eq!(bench.node.write(CONTROL, &[CLEAR]), Err(AbortCode(0x0800_0022)));
+    bench.settle();
+    assert_eq!(bench.status(), 0);
+}
+
+/// Each wrong block: the abort, the status of table 3, an untouched flash, and the right block right behind it.
+#[test]
+fn every_wrong_block_is_refused_and_the_next_attempt_works() {
+    let image = program(192, 0x33);
+    let good = block_file(&image, 96);
+    let at = PROGRAM.base;
+    let mut bad_crc = good[1].clone();
+    bad_crc[20] ^= 1;
+    let mut short = good[1].clone();
+    short.pop();
+    let mut long = good[1].clone();
+    long.push(0);
+    let mut size_lies = good[1].clone();
+    size_lies[8] += 1;
+    let secured = AbortCode(0x0800_0020);
+    let cases: Vec<(&str, Vec<u8>, AbortCode, u32)> = vec![
+        ("wrong CRC", bad_crc, AbortCode(0x0800_0020), 0x06),
+        ("one byte short", short, AbortCode(0x0607_0010), 0x04),
+        ("one byte long", long, AbortCode(0x0607_0010), 0x04),
+        ("size does not fit", size_lies, AbortCode(0x0607_0010), 0x04),
+        ("shorter than a header", vec![1, 0, 0, 0], AbortCode(0x0607_0013), 0x04),
+        ("no data", block(1, at, &[]), AbortCode(0x0800_0020), 0x04),
+        ("larger than the buffer", block(1, at, &[0; 257 - 16]), AbortCode(0x0607_0012), 0x04),
+        ("next block too early", good[2].clone(), AbortCode(0x0800_0022), 0x88),
+        ("last block too early", last(&image), AbortCode(0x0800_0022), 0x88),
+        ("huge number", block(0xFFFF_FFFE, at, &[0; 8]), AbortCode(0x0800_0022), 0x88),
+        ("behind the program", block(1, PROGRAM.end(), &[0; 8]), AbortCode(0x0800_0020), 0x0C),
+        ("over the program's end", block(1, PROGRAM.end() - 4, &[0; 8]), AbortCode(0x0800_0020), 0x0C),
+        ("outside the flash", block(1, 0x2000_0000, &[0; 8]), AbortCode(0x0800_0020), 0x0C),
+        ("wrapping round the address space", block(1, 0xFFFF_FFFC, &[0; 8]), AbortCode(0x0800_0020), 0x0C),
+        ("over the bootloader", block(1, 0x0800_0000, &[0; 8]), secured, 0x0E),
+        ("over the parameters", block(1, 0x0800_0400, &[0; 8]), secured, 0x0E),
+        ("from the parameters into the program", block(1, at - 4, &[0; 8]), secured, 0x0E),
+    ];
+    for (what, bad, abort, status) in cases {
+        let mut flash = ModelFlash::new(&CHIP);
+        let mut bench = Bench::new(&mut flash);
+        assert_eq!(bench.command(CLEAR), 0);
+        bench.good(&good[0]);
+        bench.node.flash().touched.clear();
+        assert_eq!(bench.block(&bad), (Err(abort), status), "{what}");
+        assert_eq!(bench.node.flash().touched, [], "{what}: the flash was touched");
+        for block in &good[1..] {
+            bench.good(block);
+        }
+        assert_eq!(bench.command(SET_SIGNATURE), 0, "{what}");
+        assert_eq!(autostart(&flash), Ok(0x33), "{what}");
+    }
+}
+
+#[test]
+fn control_and_last_blocks_of_other_lengths_or_sizes_are_refused() {
+    let image = program(96, 0x44);
+    let good = block_file(&image, 96);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    assert_eq!(bench.command(CLEAR), 0);
+    assert_eq!(bench.block(&block(0, 0, &[0; 16])), (Err(AbortCode(0x0800_0020)), 0x04));
+    bench.good(&good[0]);
+    bench.good(&good[1]);
+    for (data, status) in [
+        (vec![0; 7], 0x04),
+        (vec![0; 12], 0x04),
+        ([0_u32.to_le_bytes(), [0; 4]].concat(), 0x04),
+        ([7_u32.to_le_bytes(), [0; 4]].concat(), 0x04),
+        ([(PROGRAM.size + 1).to_le_bytes(), [0; 4]].concat(), 0x0C),
+        ([u32::MAX.to_le_bytes(), [0; 4]].concat(), 0x0C),
+    ] {
+        assert_eq!(bench.block(&block(u32::MAX, 0, &data)), (Err(AbortCode(0x0800_0020)), status));
+    }
+    bench.good(&good[2]);
+}
+
+#[test]
+fn a_program_whose_crc_or_vectors_are_wrong_is_no_program() {
+    let image = program(96, 0x55);
+    let mut other = image.clone();
+    other[50] ^= 1;
+    let mut nowhere = image.clone();
+    nowhere[4..8].copy_from_slice(&0x0800_0101_u32.to_le_bytes());
+    for (stored, told) in [(&image, &other), (&nowhere, &nowhere)] {
+        let mut flash = ModelFlash::new(&CHIP);
+        let mut bench = Bench::new(&mut flash);
+        assert_eq!(bench.command(CLEAR), 0);
+        bench.good(&block(0, 0, &[0; 8]));
+        bench.good(&block(1, PROGRAM.base, stored));
+        assert_eq!(bench.block(&last(told)), (Ok(()), 0x02));
+        assert_eq!(bench.word(IDENTIFICATION), crc32(stored), "1F56h shows what is in flash");
+        assert_eq!(bench.command(SET_SIGNATURE), 0x02);
+        assert_eq!(bench.command(START), 0x02);
+        assert_eq!(bench.node.take_leave(), None);
+        bench.install(&image);
+    }
+}
+
+#[test]
+fn an_installed_program_must_be_cleared_first_and_what_is_not_blank_is_not_written() {
+    let image = program(96, 0x66);
+    let good = block_file(&image, 96);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    bench.install(&image);
+    assert_eq!(bench.block(&good[0]), (Err(AbortCode(0x0800_0022)), 0x08));
+    // After a power cut in the middle of a download there is no program, but the flash is not blank.
+    flash.poke(PROGRAM.base + 90, &[0]);
+    flash.poke(LAYOUT.parameters[0].base, &[0; 0x200]);
+    let mut bench = Bench::new(&mut flash);
+    bench.good(&good[0]);
+    assert_eq!(bench.block(&good[1]), (Err(AbortCode(0x0800_0022)), 0x08));
+    bench.install(&image);
+}
+
+#[test]
+fn signature_and_start() {
+    let image = program(96, 0x77);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    assert_eq!(bench.command(START), 0x02, "NOVALPROG");
+    assert_eq!(bench.command(SET_SIGNATURE), 0x02);
+    assert_eq!(bench.command(CLR_SIGNATURE), 0, "nothing to take away");
+    assert_eq!(bench.node.take_leave(), None);
+    assert_eq!(bench.command(0x02), 0, "RESET_STAT");
+
+    bench.install(&image);
+    assert_eq!(bench.command(START), 0);
+    assert_eq!(bench.node.take_leave(), Some(BootRequest::Trial(1)));
+    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    assert_eq!(bench.command(START), 0);
+    assert_eq!(bench.node.take_leave(), Some(BootRequest::Start(1)));
+    assert_eq!(bench.command(CLR_SIGNATURE), 0);
+    assert_eq!(autostart(&flash), Err(Invalid::Absent));
+
+    let mut bench = Bench::new(&mut flash);
+    assert_eq!(bench.node.write(CONTROL, &[0x80]), Ok(()));
+    assert_eq!(bench.node.write(CONTROL, &[0x00]), Ok(()));
+    for unknown in [0x04, 0x05, 0x7F, 0x81, 0x82, 0x85, 0xFF] {
+        assert_eq!(bench.node.write(CONTROL, &[unknown]), Err(AbortCode(0x0609_0030)), "{unknown:#x}");
+    }
+    assert_eq!(bench.command(CLEAR), 0);
+    assert_eq!(bench.word(IDENTIFICATION), 0);
+    assert_eq!(bench.command(START), 0x02);
+}
+
+#[test]
+fn a_transfer_cut_off_in_the_middle_leaves_no_trace() {
+    let image = program(192, 0x88);
+    let good = block_file(&image, 96);
+    for cut in 0..good[1].len() {
+        let mut flash = ModelFlash::new(&CHIP);
+        let mut bench = Bench::new(&mut flash);
+        assert_eq!(bench.command(CLEAR), 0);
+        bench.good(&good[0]);
+        bench.node.flash().touched.clear();
+        bench.node.download_start(DATA, None).unwrap();
+        bench.node.download_data(DATA, &good[1][..cut]).unwrap();
+        bench.node.download_cancel(DATA);
+        assert_eq!(bench.node.flash().touched, []);
+        for block in &good[1..] {
+            bench.good(block);
+        }
+    }
+}
+
+#[test]
+fn faults_of_the_flash_are_told_and_clear_begins_anew() {
+    let image = program(192, 0x99);
+    let good = block_file(&image, 96);
+    for (fault, status) in
+        [(FlashFault::Failed, 0x0A), (FlashFault::Verify, 0x0A), (FlashFault::Protected, 0x0E)]
+    {
+        let mut flash = ModelFlash::new(&CHIP);
+        let mut bench = Bench::new(&mut flash);
+        bench.node.flash().fail = Some((3, fault));
+        assert_eq!(bench.command(CLEAR), status);
+        assert_eq!(bench.command(CLEAR), 0);
+        bench.good(&good[0]);
+        let operations = bench.node.flash().operations;
+        bench.node.flash().fail = Some((operations + 5, fault));
+        assert_eq!(bench.block(&good[1]), (Ok(()), status));
+        assert_eq!(bench.block(&good[1]).1, 0x88, "half a block is in flash: only CLEAR helps");
+        bench.install(&image);
+        let operations = bench.node.flash().operations;
+        bench.node.flash().fail = Some((operations + 2, fault));
+        let after = bench.command(SET_SIGNATURE);
+        let expected = if fault == FlashFault::Verify { 0 } else { 0x10 };
+        assert_eq!(after, expected, "NVDATA, unless another slot of the journal took it");
+    }
+}
+
+/// An update, cut at every operation: what starts afterwards is the old program or the new one, whole, or nothing;
+/// and the update then completes.
+#[test]
+fn an_update_cut_anywhere_leaves_the_old_the_new_or_no_program() {
+    quiet_power_cuts();
+    let (old, new) = (program(200, 0xA0), program(300, 0xB0));
+    let mut installed = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut installed);
+    bench.install(&old);
+    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    assert_eq!(autostart(&installed), Ok(0xA0));
+
+    let update = |flash: &mut ModelFlash| {
+        let mut bench = Bench::new(flash);
+        bench.install(&new);
+        assert_eq!(bench.command(SET_SIGNATURE), 0);
+    };
+    let cells = installed.cells(CHIP.flash).to_vec();
+    let fresh = || {
+        let mut flash = ModelFlash::new(&CHIP);
+        flash.poke(CHIP.flash.base, &cells);
+        flash
+    };
+    let mut flash = fresh();
+    update(&mut flash);
+    let operations = flash.operations;
+    assert!(operations > 80, "{operations}");
+    let mut seen = [0; 3];
+    for operation in 1..=operations {
+        for cut in [Cut::Before, Cut::After, Cut::Torn(7), Cut::Torn(8)] {
+            let mut flash = fresh();
+            flash.cut = Some((operation, cut));
+            assert!(until_power_cut(|| update(&mut flash)));
+            flash.power_on();
+            match autostart(&flash) {
+                Ok(0xA0) => seen[0] += 1,
+                Ok(0xB0) => seen[1] += 1,
+                Err(_) => seen[2] += 1,
+                other => panic!("cut {cut:?} at operation {operation}: {other:?} would start"),
+            }
+            update(&mut flash);
+            assert_eq!(autostart(&flash), Ok(0xB0), "cut {cut:?} at operation {operation}");
+        }
+    }
+    assert!(seen.iter().all(|count| *count > 0), "old, new, none: {seen:?}");
+}
