@@ -1,0 +1,106 @@
+//! The boot decision: the order of the product's promise.
+
+mod model;
+
+use boot_core::decision::{decide, BootDecision, Circumstances, Policy, StayReason};
+use boot_core::parameters::{Journal, Key};
+use boot_core::program::{verify, Invalid, ProgramRecord, VerifiedProgram};
+use model::ModelFlash;
+use shared_abi::layout::stm32f407g_disc1::LAYOUT;
+use shared_abi::vectors::VectorFault;
+use shared_abi::warm_start::BootRequest;
+
+const QUIET: Circumstances = Circumstances { request: None, strap: false, crash_resets: 0, node_id: 5 };
+
+fn policy() -> Policy {
+    Policy { autostart: Some(1), max_crash_resets: 3, node_ids: 1..=100 }
+}
+
+/// A program of 64 bytes as a download leaves it, and its verdict.
+fn check(signed: bool, damage: impl FnOnce(&mut ModelFlash)) -> Result<VerifiedProgram, Invalid> {
+    let mut flash = ModelFlash::new(LAYOUT.chip);
+    let mut bytes = vec![0xA5; 64];
+    bytes[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
+    bytes[4..8].copy_from_slice(&0x0801_0189_u32.to_le_bytes());
+    flash.poke(0x0801_0000, &bytes);
+    let mut journal = Journal::open(&flash, LAYOUT.parameters);
+    let record = ProgramRecord { size: 64, crc: boot_core::crc32(&bytes), signed };
+    let mut store = journal.store(Key::Program(1), record.value());
+    while store.poll(&mut journal, &mut flash, LAYOUT.chip).is_pending() {}
+    damage(&mut flash);
+    verify(&flash, &Journal::open(&flash, LAYOUT.parameters), &LAYOUT, 1)
+}
+
+fn signed() -> Result<VerifiedProgram, Invalid> {
+    check(true, |_| {})
+}
+
+fn unsigned() -> Result<VerifiedProgram, Invalid> {
+    check(false, |_| {})
+}
+
+#[test]
+fn a_signed_program_starts_by_itself() {
+    let decision = decide(&QUIET, &policy(), |number| {
+        assert_eq!(number, 1);
+        signed()
+    });
+    assert_eq!(decision, BootDecision::Start { program: signed().unwrap(), trial: false });
+}
+
+/// Whatever asks for the bootloader comes before whatever asks for a program, and then no program is even looked at.
+#[test]
+fn what_asks_for_the_bootloader_wins() {
+    let stay = |circumstances: Circumstances, policy: Policy| match decide(&circumstances, &policy, |_| {
+        panic!("the program was looked at")
+    }) {
+        BootDecision::Stay(reason) => reason,
+        start => panic!("{start:?}"),
+    };
+    let request = |request| Circumstances { request: Some(request), ..QUIET };
+    assert_eq!(stay(request(BootRequest::Stay), policy()), StayReason::Requested);
+    assert_eq!(stay(Circumstances { strap: true, ..QUIET }, policy()), StayReason::Strap);
+    assert_eq!(stay(Circumstances { strap: true, ..request(BootRequest::Start(1)) }, policy()), StayReason::Strap);
+    assert_eq!(stay(Circumstances { crash_resets: 3, ..QUIET }, policy()), StayReason::CrashLoop);
+    assert_eq!(stay(QUIET, Policy { autostart: None, ..policy() }), StayReason::NoAutostart);
+    for node_id in [0, 101, 127, 255] {
+        assert_eq!(stay(Circumstances { node_id, ..QUIET }, policy()), StayReason::NodeId);
+    }
+}
+
+#[test]
+fn without_signature_a_program_starts_as_a_trial_alone() {
+    assert_eq!(decide(&QUIET, &policy(), |_| unsigned()), BootDecision::Stay(StayReason::Unsigned));
+    let start = Circumstances { request: Some(BootRequest::Start(1)), ..QUIET };
+    assert_eq!(decide(&start, &policy(), |_| unsigned()), BootDecision::Stay(StayReason::Unsigned));
+    let trial = Circumstances { request: Some(BootRequest::Trial(1)), crash_resets: 9, ..QUIET };
+    let policy = Policy { autostart: None, ..policy() };
+    let expected = BootDecision::Start { program: unsigned().unwrap(), trial: true };
+    assert_eq!(decide(&trial, &policy, |_| unsigned()), expected);
+    let expected = BootDecision::Start { program: signed().unwrap(), trial: false };
+    assert_eq!(decide(&trial, &policy, |_| signed()), expected, "a signed program is on no trial");
+}
+
+#[test]
+fn a_request_for_a_program_that_is_not_there_stays() {
+    let start = Circumstances { request: Some(BootRequest::Start(7)), ..QUIET };
+    let flash = ModelFlash::new(LAYOUT.chip);
+    let journal = Journal::open(&flash, LAYOUT.parameters);
+    let decision = decide(&start, &policy(), |number| verify(&flash, &journal, &LAYOUT, number));
+    assert_eq!(decision, BootDecision::Stay(StayReason::Program(Invalid::NoSuchProgram)));
+    let decision = decide(&QUIET, &policy(), |number| verify(&flash, &journal, &LAYOUT, number));
+    assert_eq!(decision, BootDecision::Stay(StayReason::Program(Invalid::Absent)));
+}
+
+#[test]
+fn any_damage_to_a_program_keeps_it_from_starting() {
+    for offset in 8..64 {
+        for bit in 0..8 {
+            let damaged = check(true, |flash| flash.poke(0x0801_0000 + offset, &[0xA5 ^ 1 << bit]));
+            assert_eq!(damaged, Err(Invalid::Crc));
+        }
+    }
+    let erased = check(true, |flash| flash.poke(0x0801_0000, &[0xFF; 64]));
+    assert_eq!(erased, Err(Invalid::Vectors(VectorFault::StackPointer)));
+    assert!(check(true, |flash| flash.poke(0x0801_0040, &[0])).is_ok(), "what lies behind its size is not its own");
+}
