@@ -1,1 +1,3 @@
-//! stub
+//! What the tests and the demonstration share: the built firmware, and the bench that it runs on.
+
+pub mod firmware;

@@ -1,0 +1,46 @@
+//! The images that `cargo xtask build` made.
+
+use std::path::PathBuf;
+use std::{env, fs};
+
+use shared_abi::layout::{self, Layout};
+
+/// The images by the names that `cargo xtask build` gives them.
+pub const BOOTLOADER: &str = "bootloader.elf";
+/// Version 1 of the application.
+pub const APP_V1: &str = "app-v1.elf";
+/// Version 2 of the application.
+pub const APP_V2: &str = "app-v2.elf";
+
+/// The board that the images are for: `COBOOT_BOARD`, or the first one.
+///
+/// # Panics
+/// If there is no such board.
+#[must_use]
+pub fn board() -> &'static Layout {
+    match env::var("COBOOT_BOARD") {
+        Ok(name) => layout::by_name(&name).unwrap_or_else(|| panic!("COBOOT_BOARD: no board is called {name:?}")),
+        Err(_) => layout::BOARDS[0],
+    }
+}
+
+/// The folder of the images: `COBOOT_FIRMWARE_DIR`, or where `cargo xtask build` puts them.
+#[must_use]
+pub fn dir() -> PathBuf {
+    env::var_os("COBOOT_FIRMWARE_DIR").map_or_else(
+        || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../target/firmware").join(board().board),
+        PathBuf::from,
+    )
+}
+
+/// The bytes of an image.
+///
+/// # Panics
+/// If it was not built; the message says how to.
+#[must_use]
+pub fn elf(name: &str) -> Vec<u8> {
+    let path = dir().join(name);
+    fs::read(&path).unwrap_or_else(|error| {
+        panic!("{}: {error}. Build the firmware first: `cargo xtask build`, or run `cargo xtask test`.", path.display())
+    })
+}
