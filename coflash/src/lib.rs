@@ -6,9 +6,44 @@
 //! | [`image`] | memory contents with holes |
 //! | [`convert`] | an image into blocks |
 //! | [`block_file`] | the container that 1F50h takes: read, verified, written |
+//! | [`adapter`] | ways to a CAN bus, chosen by URL |
+//! | [`session`] | SDO with one node: values, commands, status |
+//! | [`flash`] | the update procedure, with its steps as events |
+//! | [`info`] | what a device says about itself |
+//! | [`error`] | what can go wrong with a device, with numbers and advice |
+//!
+//! Flashing a file takes these lines:
+//!
+//! ```no_run
+//! use coflash::convert::{blocks_of, Options, Region};
+//! use coflash::flash::{flash, FlashOptions};
+//! use coflash::session::{Session, Timing};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let layout = shared_abi::layout::by_name("stm32f407g-disc1").ok_or("unknown board")?;
+//! let options = Options { region: Region::Strict(layout.programs[0].into()), ..Options::default() };
+//! let firmware = coflash::read::load("app.elf".as_ref(), None, None)?;
+//! let blocks = blocks_of(firmware, &options)?.file;
+//!
+//! let mut bus = coflash::adapter::open("socketcand://127.0.0.1:29536/can0")?;
+//! let node = canopen::NodeId::new(1).ok_or("no such node-ID")?;
+//! let mut session = Session::new(&mut bus, node, Timing::default());
+//! flash(&mut session, &blocks, &FlashOptions::default(), &mut |event| println!("{event}"))?;
+//! # Ok(())
+//! # }
+//! ```
 #![forbid(unsafe_code)]
 
+pub mod adapter;
 pub mod block_file;
 pub mod convert;
+pub mod error;
+pub mod flash;
 pub mod image;
+pub mod info;
 pub mod read;
+pub mod session;
+
+pub use adapter::Adapter;
+pub use error::Error;
+pub use session::Session;

@@ -172,9 +172,8 @@ proptest! {
                 (memory[address], covered[address]) = (*byte, true);
             }
         }
-        for address in 0..4096 {
-            let expected = pieces.get(&(address as u32)).copied().unwrap_or(0xFF);
-            prop_assert_eq!(memory[address], expected);
+        for (address, byte) in (0..).zip(memory) {
+            prop_assert_eq!(byte, pieces.get(&address).copied().unwrap_or(0xFF));
         }
         prop_assert_eq!(BlockFile::parse(&file.emit()).unwrap(), file);
     }

@@ -1,0 +1,277 @@
+//! What can go wrong with a device: what happened, a stable number, and what to do next.
+
+use std::fmt;
+use std::time::Duration;
+
+use canopen::program::{FlashError, FlashStatus};
+use canopen::sdo::AbortCode;
+use canopen::NodeId;
+
+use crate::adapter::AdapterError;
+use crate::session::{DeviceType, Doing};
+
+/// Why a conversation with a device ended early.
+///
+/// `Display` says what happened, [`advice`](Self::advice) what to do next.
+#[derive(Debug)]
+pub enum Error {
+    /// The CAN adapter failed.
+    Adapter(AdapterError),
+    /// The user gave up.
+    Cancelled,
+    /// The device does not answer.
+    NoAnswer {
+        /// Which one.
+        node: NodeId,
+        /// What it was asked.
+        doing: Doing,
+    },
+    /// The device answered with an SDO abort, and 1F57h does not say more.
+    Refused {
+        /// Which one.
+        node: NodeId,
+        /// What it was asked.
+        doing: Doing,
+        /// The abort code.
+        code: AbortCode,
+    },
+    /// The device's answer was none: wrong toggle, wrong command, wrong length.
+    Protocol {
+        /// What it was asked.
+        doing: Doing,
+        /// The code that the device was sent.
+        code: AbortCode,
+    },
+    /// 1F57h says that the bootloader could not do what it was told.
+    Failed {
+        /// What it was told.
+        doing: Doing,
+        /// Why it could not.
+        error: FlashError,
+        /// More about it, from the device's maker.
+        detail: u16,
+        /// The abort code, where the SDO was refused.
+        code: Option<AbortCode>,
+    },
+    /// 1F57h stays busy.
+    Busy {
+        /// Which device.
+        node: NodeId,
+        /// What it was told.
+        doing: Doing,
+        /// How long it was waited for.
+        waited: Duration,
+    },
+    /// The application does not go back to the bootloader.
+    NoBootloader {
+        /// Which device.
+        node: NodeId,
+        /// What runs instead, `None` where nothing answers.
+        running: Option<DeviceType>,
+        /// The abort code, where the application refused.
+        code: Option<AbortCode>,
+    },
+    /// The program in the device is not that of the file.
+    WrongCrc {
+        /// What 1F56h reads.
+        device: u32,
+        /// What the file says.
+        file: u32,
+    },
+    /// The program does not come up.
+    StartFailed {
+        /// Which device.
+        node: NodeId,
+        /// What answers instead, `None` where nothing does.
+        running: Option<DeviceType>,
+        /// What 1F57h says, if something.
+        status: Option<FlashStatus>,
+    },
+}
+
+impl From<AdapterError> for Error {
+    fn from(error: AdapterError) -> Self {
+        Self::Adapter(error)
+    }
+}
+
+impl Error {
+    /// The stable number: the manual's (L-1112e_5, table 5, which holds all of the newer manual's) where it has one,
+    /// otherwise 60000100h plus the word of 1F57h, and 6000030xh for adapters.
+    #[must_use]
+    pub const fn number(&self) -> u32 {
+        match self {
+            Self::Adapter(error) => error.number(),
+            Self::WrongCrc { .. } => 0x6000_0001,
+            Self::Failed { error, .. } => flash_error_number(*error),
+            Self::NoBootloader { .. } => 0x6000_0010,
+            Self::Cancelled => 0x6000_0011,
+            Self::NoAnswer { .. } => 0x6000_0013,
+            Self::StartFailed { .. } => 0x6000_0014,
+            Self::Busy { .. } => 0x6000_0016,
+            Self::Refused { .. } | Self::Protocol { .. } => 0x6000_0025,
+        }
+    }
+
+    /// What to do next.
+    #[must_use]
+    pub fn advice(&self) -> String {
+        match self {
+            Self::Adapter(error) => error.advice().to_string(),
+            Self::Cancelled => "run the same command again when you like".to_string(),
+            Self::NoAnswer { node, .. } => format!(
+                "check that node {node} is the right one, that the device has power, that both sides use the same bit \
+                 rate and that the bus is terminated; a slow device may need a longer --sdo-timeout"
+            ),
+            Self::Refused { code, .. } => refusal_advice(*code).to_string(),
+            Self::Protocol { .. } => "look for a second tool or a second device with this node-ID on the bus; a longer \
+                                      --sdo-timeout helps against answers that come late"
+                .to_string(),
+            Self::Failed { error, .. } => failure_advice(*error).to_string(),
+            Self::Busy { .. } => "give it more time with --timeout, or switch the device off and on".to_string(),
+            Self::NoBootloader { code: Some(_), .. } => {
+                "this application cannot be called back: bring the device into the bootloader by its entry strap, or \
+                 within its rescue window after power-on"
+                    .to_string()
+            }
+            Self::NoBootloader { .. } => "switch the device off and on and run the command again; if its application \
+                                          ignores the call, use the entry strap"
+                .to_string(),
+            Self::WrongCrc { .. } => {
+                "check that the file was made for this board and this program number, and run the command again"
+                    .to_string()
+            }
+            Self::StartFailed { running: Some(running), .. } if running.is_bootloader() => {
+                "check that the program was linked for this board and program number; the device waits in the \
+                 bootloader for another one"
+                    .to_string()
+            }
+            Self::StartFailed { .. } => "the program may not speak CANopen, use another node-ID or bit rate, or crash; \
+                                         flash another one after calling the bootloader by power-on or entry strap"
+                .to_string(),
+        }
+    }
+}
+
+/// The manual's number for an error of 1F57h.
+const fn flash_error_number(error: FlashError) -> u32 {
+    match error {
+        FlashError::NoValidProgram => 0x6000_0001,
+        FlashError::Format => 0x6000_0002,
+        FlashError::Crc => 0x6000_0003,
+        FlashError::NotCleared => 0x6000_0004,
+        FlashError::Write => 0x6000_0005,
+        FlashError::Address => 0x6000_0006,
+        FlashError::Secured => 0x6000_0007,
+        // "An error that is unknown to the tool."
+        FlashError::Unspecified | FlashError::Other(_) => 0x6000_0008,
+        // Newer than the manual's list.
+        FlashError::NvData
+        | FlashError::WrongVendorId
+        | FlashError::WrongProductId
+        | FlashError::NoAccess
+        | FlashError::Busy
+        | FlashError::Sequence => 0x6000_0100 + error.code() as u32,
+    }
+}
+
+fn failure_advice(error: FlashError) -> &'static str {
+    match error {
+        FlashError::NoValidProgram => "flash a program, and let it be signed",
+        FlashError::Format => "check that the file is a block file for this bootloader, or convert it again",
+        FlashError::Crc => "run the command again; if it happens again, check bus and terminators",
+        FlashError::NotCleared => {
+            "run the flash command, which erases first; another tool may be at work on the device"
+        }
+        FlashError::Write => {
+            "run the command again; if it happens again, the flash may be worn out or write-protected"
+        }
+        FlashError::Address => "check --board and --program: the file is for another memory map",
+        FlashError::Secured => "the file wants to write into the bootloader: check how the program is linked",
+        FlashError::NvData => {
+            "run the command again; if it happens again, the device cannot store its parameters"
+        }
+        FlashError::WrongVendorId | FlashError::WrongProductId => {
+            "check that file and device belong together (coflash info shows the device's identity)"
+        }
+        FlashError::NoAccess => "the device forbids updates at present: ask its maker how to unlock it",
+        FlashError::Busy => {
+            "wait a moment and run the command again; another tool may be at work on the device"
+        }
+        FlashError::Sequence => "run the command again; another tool may be at work on the device",
+        FlashError::Unspecified | FlashError::Other(_) => {
+            "run the command again, or switch the device off and on first"
+        }
+    }
+}
+
+fn refusal_advice(code: AbortCode) -> &'static str {
+    match code {
+        AbortCode::NO_OBJECT => "the device has no such object: is it a device with this bootloader?",
+        AbortCode::NO_SUB_INDEX => "the device has no such program: check --program",
+        AbortCode::LENGTH | AbortCode::LENGTH_TOO_HIGH | AbortCode::OUT_OF_MEMORY => {
+            "the block may be larger than the bootloader's buffer: convert with a smaller --block-size"
+        }
+        AbortCode::TIMEOUT | AbortCode::TOGGLE | AbortCode::COMMAND => {
+            "frames were lost, or a second tool is at work on the device: check the bus and run the command again"
+        }
+        _ => "run the command again; if it happens again, the abort code tells what the device objects to",
+    }
+}
+
+impl fmt::Display for Error {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Adapter(error) => error.fmt(f),
+            Self::Cancelled => f.write_str("cancelled"),
+            Self::NoAnswer { node, doing } => write!(f, "node {node} does not answer ({doing})"),
+            Self::Refused { node, doing, code } => write!(f, "node {node} refuses {doing}: abort {code}"),
+            Self::Protocol { doing, code } => write!(f, "the answer to {doing} is invalid: {code}"),
+            Self::Failed { doing, error, detail, code } => {
+                write!(f, "{doing} failed: {error} (1F57h reads {:02X}h", error.code())?;
+                if *detail != 0 {
+                    write!(f, ", detail {detail:04X}h")?;
+                }
+                match code {
+                    Some(code) => write!(f, ", abort {code})"),
+                    None => f.write_str(")"),
+                }
+            }
+            Self::Busy { node, doing, waited } => {
+                write!(f, "node {node} is still busy {doing} after {:.1} s", waited.as_secs_f64())
+            }
+            Self::NoBootloader { node, running, code } => {
+                match running {
+                    Some(running) => write!(f, "node {node} stays in {running}")?,
+                    None => write!(f, "node {node} does not come back in the bootloader")?,
+                }
+                match code {
+                    Some(code) => write!(f, ": it refuses the call with abort {code}"),
+                    None => Ok(()),
+                }
+            }
+            Self::WrongCrc { device, file } => {
+                write!(f, "the program in the device has CRC {device:08X}h, that of the file {file:08X}h")
+            }
+            Self::StartFailed { node, running, status } => {
+                match running {
+                    Some(running) => write!(f, "the program does not start: node {node} stays in {running}")?,
+                    None => write!(f, "the program does not start: node {node} does not answer")?,
+                }
+                match status.and_then(|status| status.error) {
+                    Some(error) => write!(f, "; {error} (1F57h reads {:02X}h)", error.code()),
+                    None => Ok(()),
+                }
+            }
+        }
+    }
+}
+
+impl std::error::Error for Error {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        match self {
+            Self::Adapter(error) => Some(error),
+            _ => None,
+        }
+    }
+}

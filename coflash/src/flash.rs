@@ -1,0 +1,448 @@
+//! The update of a device: the procedure of the manual (L-1112d_10, "Prinzipieller Ablauf"), steps 2 to 15.
+//!
+//! Step 1, making the blocks, is [`convert`](crate::convert). Everything that can be judged without the device was
+//! judged there.
+
+use std::fmt;
+use std::time::Duration;
+
+use canopen::program::{self, FlashError, ProgramControl};
+use canopen::{AbortCode, Address};
+
+use crate::block_file::{Block, BlockFile};
+use crate::error::Error;
+use crate::session::{DeviceType, Doing, Session};
+
+/// What to do beyond the download itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FlashOptions {
+    /// The program: sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
+    pub program: u8,
+    /// How often one block is sent again after a CRC error or a broken transfer.
+    pub repeats: u32,
+    /// Start the program once and call it back before it is signed (steps 10 to 13).
+    pub trial_run: bool,
+    /// Start the program at the end (step 15).
+    pub start: bool,
+}
+
+impl Default for FlashOptions {
+    fn default() -> Self {
+        Self { program: 1, repeats: 3, trial_run: false, start: true }
+    }
+}
+
+/// What happens during an update. `Display` has words for people.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Event {
+    /// Step 2: this is running on the device.
+    Found(DeviceType),
+    /// Step 3: the application is asked to go back to the bootloader.
+    CallingBack,
+    /// Step 3 has worked.
+    InBootloader,
+    /// Step 4: the program is being erased.
+    Erasing,
+    /// Step 5: it is erased.
+    Erased {
+        /// How long that took.
+        took: Duration,
+    },
+    /// Steps 6 to 9: so far the transfer has come.
+    Progress {
+        /// Bytes of the block file that are in the device.
+        done: usize,
+        /// Bytes of the block file.
+        total: usize,
+    },
+    /// A block is sent again.
+    Repeating {
+        /// Its number.
+        block: u32,
+        /// How often it has been sent again, this time included.
+        repeat: u32,
+        /// How often it may be.
+        of: u32,
+        /// Why.
+        why: RepeatReason,
+    },
+    /// The bootloader computed the CRC that the file says.
+    Verified {
+        /// The CRC.
+        crc: u32,
+    },
+    /// Step 10: the program starts for a trial.
+    TrialStarting,
+    /// Step 13: it ran, and came back when called.
+    TrialPassed(DeviceType),
+    /// Step 14: the program is signed, so that it starts by itself.
+    Signed,
+    /// Step 15: the program starts.
+    Starting,
+    /// It runs.
+    Started(DeviceType),
+}
+
+impl fmt::Display for Event {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Found(running) => write!(f, "found {running}"),
+            Self::CallingBack => f.write_str("calling the application back to the bootloader"),
+            Self::InBootloader => f.write_str("the bootloader is running"),
+            Self::Erasing => f.write_str("erasing the old program"),
+            Self::Erased { took } => write!(f, "erased in {:.1} s", took.as_secs_f64()),
+            Self::Progress { done, total } => write!(f, "{done} of {total} bytes"),
+            Self::Repeating { block, repeat, of, why } => {
+                write!(f, "sending block {block} again, {repeat} of {of}: {why}")
+            }
+            Self::Verified { crc } => write!(f, "verified: CRC {crc:08X}h"),
+            Self::TrialStarting => f.write_str("starting the program for a trial"),
+            Self::TrialPassed(running) => write!(f, "the trial went well: {running} came up and came back"),
+            Self::Signed => f.write_str("signed: the program starts by itself from now on"),
+            Self::Starting => f.write_str("starting the program"),
+            Self::Started(running) => write!(f, "running: {running}"),
+        }
+    }
+}
+
+/// Why a block is sent again.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RepeatReason {
+    /// The bootloader found its CRC wrong.
+    Crc,
+    /// The bootloader was still busy with something else.
+    Busy,
+    /// The transfer was aborted by the device with a code that speaks of lost frames.
+    Broken(AbortCode),
+    /// The transfer got no answer.
+    NoAnswer,
+}
+
+impl fmt::Display for RepeatReason {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Crc => f.write_str("its CRC arrived wrong"),
+            Self::Busy => f.write_str("the bootloader was busy"),
+            Self::Broken(code) => write!(f, "the transfer broke: {code}"),
+            Self::NoAnswer => f.write_str("no answer"),
+        }
+    }
+}
+
+/// What an update did.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Report {
+    /// Bytes of the program, from its region's start on.
+    pub program_size: u32,
+    /// CRC of the program in the device: what 1F56h reads.
+    pub program_crc: u32,
+    /// Blocks that had to be sent again.
+    pub repeats: u32,
+    /// How long all of it took, on the bus's clock.
+    pub took: Duration,
+    /// What runs now, if the program was started.
+    pub running: Option<DeviceType>,
+}
+
+/// How often an application is asked to go back to the bootloader.
+const CALLS: u32 = 2;
+
+/// Puts a program into a device: finds out what runs there, calls the bootloader, erases, sends the blocks, compares
+/// the CRC, and as the options say tries, signs and starts it.
+///
+/// A run that was interrupted at any point can be started again at once.
+///
+/// # Errors
+/// The first step that fails ends the procedure. Until the program is signed, the device comes up in the bootloader.
+pub fn flash(
+    session: &mut Session<'_>,
+    file: &BlockFile,
+    options: &FlashOptions,
+    tell: &mut dyn FnMut(Event),
+) -> Result<Report, Error> {
+    let began = session.now();
+    let number = options.program;
+    enter_bootloader(session, number, tell)?;
+    erase(session, number, tell)?;
+    let repeats = send_blocks(session, file, options, tell)?;
+    verify(session, number, file.program_crc(), tell)?;
+    if options.trial_run {
+        tell(Event::TrialStarting);
+        let running = start(session, number)?;
+        call_back(session, number)?;
+        tell(Event::TrialPassed(running));
+    }
+    sign(session, number, tell)?;
+    let running = if options.start {
+        tell(Event::Starting);
+        let running = start(session, number)?;
+        tell(Event::Started(running));
+        Some(running)
+    } else {
+        None
+    };
+    let took = session.now().saturating_sub(began);
+    Ok(Report { program_size: file.program_size(), program_crc: file.program_crc(), repeats, took, running })
+}
+
+/// Steps 2 and 3: afterwards the bootloader is running.
+///
+/// # Errors
+/// [`Error::NoAnswer`] where nothing answers, [`Error::NoBootloader`] where the application does not go back.
+pub fn enter_bootloader(
+    session: &mut Session<'_>,
+    number: u8,
+    tell: &mut dyn FnMut(Event),
+) -> Result<(), Error> {
+    let running = find(session)?;
+    tell(Event::Found(running));
+    if running.is_bootloader() {
+        return Ok(());
+    }
+    tell(Event::CallingBack);
+    call_back(session, number)?;
+    tell(Event::InBootloader);
+    Ok(())
+}
+
+/// Step 2: what is running, or [`Error::NoAnswer`]. A device that was just reset misses a few requests, so that the
+/// question is repeated for as long as a restart may take.
+///
+/// # Errors
+/// [`Error::NoAnswer`], and what a [read](Session::read) has.
+pub fn find(session: &mut Session<'_>) -> Result<DeviceType, Error> {
+    let deadline = session.now() + session.timing().boot;
+    loop {
+        if let Some(running) = session.device_type()? {
+            return Ok(running);
+        }
+        if session.now() >= deadline {
+            let at = Address::new(program::DEVICE_TYPE, 0);
+            return Err(Error::NoAnswer { node: session.node(), doing: Doing::Read(at) });
+        }
+        let pause = session.timing().poll_first;
+        session.await_boot_up(pause)?;
+    }
+}
+
+/// Steps 3 and 12, 13: asks the application to go back to the bootloader and waits until it has.
+///
+/// # Errors
+/// [`Error::NoBootloader`].
+pub fn call_back(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
+    let node = session.node();
+    let mut seen = None;
+    for _ in 0..CALLS {
+        match session.command(number, ProgramControl::StartBootloader) {
+            // A device that resets at once may not get its answer out.
+            Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
+            Err(Error::Refused { code, .. }) => {
+                let running = session.device_type()?;
+                return Err(Error::NoBootloader { node, running, code: Some(code) });
+            }
+            Err(error) => return Err(error),
+        }
+        seen = settle(session, |running| running.is_bootloader())?;
+        if seen.is_some_and(DeviceType::is_bootloader) {
+            return Ok(());
+        }
+    }
+    Err(Error::NoBootloader { node, running: seen, code: None })
+}
+
+/// Waits for a restarting device, [`Timing::boot`](crate::session::Timing::boot) at most, until what it runs is what is
+/// `wanted`; gives what answered last.
+fn settle(
+    session: &mut Session<'_>,
+    wanted: impl Fn(DeviceType) -> bool,
+) -> Result<Option<DeviceType>, Error> {
+    let deadline = session.now() + session.timing().boot;
+    loop {
+        // The boot-up message says when to look; without it (it may get lost) a look now and then does.
+        let pause = session.timing().sdo;
+        session.await_boot_up(pause)?;
+        let seen = session.device_type()?;
+        if seen.is_some_and(&wanted) || session.now() >= deadline {
+            return Ok(seen);
+        }
+    }
+}
+
+/// Steps 4 and 5: erases the program.
+///
+/// # Errors
+/// [`Error::Failed`] with what 1F57h says, [`Error::Busy`], [`Error::NoAnswer`].
+pub fn erase(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
+    tell(Event::Erasing);
+    let began = session.now();
+    execute(session, number, ProgramControl::Clear)?;
+    tell(Event::Erased { took: session.now().saturating_sub(began) });
+    Ok(())
+}
+
+/// Step 14: signs the program, so that it starts by itself.
+///
+/// # Errors
+/// As [`erase`].
+pub fn sign(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
+    execute(session, number, ProgramControl::SetSignature)?;
+    tell(Event::Signed);
+    Ok(())
+}
+
+/// Gives a command that may be repeated, and waits until it is carried out.
+fn execute(session: &mut Session<'_>, number: u8, command: ProgramControl) -> Result<(), Error> {
+    let doing = Doing::Command(command);
+    let mut attempt = 1;
+    loop {
+        match session.command(number, command) {
+            Ok(()) => break,
+            Err(Error::NoAnswer { .. } | Error::Protocol { .. }) if attempt < session.timing().attempts => {
+                attempt += 1;
+                // The command may have arrived, and the device may be silent because it carries it out.
+                session.await_idle(number, doing)?;
+            }
+            Err(Error::Refused { code, .. }) => return Err(explain(session, number, doing, code)),
+            Err(error) => return Err(error),
+        }
+    }
+    let status = session.await_idle(number, doing)?;
+    match status.error {
+        None => Ok(()),
+        Some(error) => Err(Error::Failed { doing, error, detail: status.detail, code: None }),
+    }
+}
+
+/// What an SDO abort means: 1F57h tells it best, if it tells something.
+fn explain(session: &mut Session<'_>, number: u8, doing: Doing, code: AbortCode) -> Error {
+    match session.status(number) {
+        Ok(status) => match status.error {
+            Some(error) => Error::Failed { doing, error, detail: status.detail, code: Some(code) },
+            None => Error::Refused { node: session.node(), doing, code },
+        },
+        Err(_) => Error::Refused { node: session.node(), doing, code },
+    }
+}
+
+/// Steps 6 to 9: all blocks; gives how many had to be repeated.
+fn send_blocks(
+    session: &mut Session<'_>,
+    file: &BlockFile,
+    options: &FlashOptions,
+    tell: &mut dyn FnMut(Event),
+) -> Result<u32, Error> {
+    let blocks: Vec<(&Block, Vec<u8>)> = file.blocks().iter().map(|block| (block, block.emit())).collect();
+    let total = blocks.iter().map(|(_, bytes)| bytes.len()).sum();
+    let mut done = 0;
+    let mut repeats = 0;
+    tell(Event::Progress { done, total });
+    for (block, bytes) in &blocks {
+        repeats += send_block(session, block.number, bytes, options, &mut |event| match event {
+            Event::Progress { done: part, .. } => tell(Event::Progress { done: done + part, total }),
+            event => tell(event),
+        })?;
+        done += bytes.len();
+        tell(Event::Progress { done, total });
+    }
+    Ok(repeats)
+}
+
+/// Steps 7 and 8 for one block, with repetition; gives how often it was repeated.
+fn send_block(
+    session: &mut Session<'_>,
+    block: u32,
+    bytes: &[u8],
+    options: &FlashOptions,
+    tell: &mut dyn FnMut(Event),
+) -> Result<u32, Error> {
+    let doing = Doing::Block(block);
+    let at = Address::new(program::PROGRAM_DATA, options.program);
+    let mut repeat = 0;
+    // Whether a transfer ended without our knowing how: its block may have arrived.
+    let mut in_doubt = false;
+    loop {
+        let mut progress = |part: u32| tell(Event::Progress { done: part as usize, total: bytes.len() });
+        let sent = session.write(at, bytes, doing, &mut progress);
+        if let Err(error @ (Error::Adapter(_) | Error::Cancelled)) = sent {
+            return Err(error);
+        }
+        let status = session.await_idle(options.program, doing)?;
+        let failed = |error, code| Err(Error::Failed { doing, error, detail: status.detail, code });
+        let (why, otherwise) = match (sent, status.error) {
+            (Ok(()), None) => return Ok(repeat),
+            // It had arrived, and the bootloader waits for the next one. Should that not be so, the next one and at the
+            // latest the program's CRC will tell.
+            (_, Some(FlashError::Sequence)) if in_doubt => return Ok(repeat),
+            (Err(Error::Refused { code, .. }), Some(error)) => (repeatable(error), failed(error, Some(code))),
+            (_, Some(error)) => (repeatable(error), failed(error, None)),
+            (Err(error @ Error::Refused { code, .. }), None) => {
+                let broken = matches!(
+                    code,
+                    AbortCode::TOGGLE | AbortCode::TIMEOUT | AbortCode::COMMAND | AbortCode::CRC
+                );
+                (broken.then_some(RepeatReason::Broken(code)), Err(error))
+            }
+            (Err(error), None) => {
+                in_doubt = true;
+                (Some(RepeatReason::NoAnswer), Err(error))
+            }
+        };
+        match why {
+            Some(why) if repeat < options.repeats => {
+                repeat += 1;
+                tell(Event::Repeating { block, repeat, of: options.repeats, why });
+            }
+            _ => return otherwise,
+        }
+    }
+}
+
+/// Whether sending a block again can help against this error.
+fn repeatable(error: FlashError) -> Option<RepeatReason> {
+    match error {
+        FlashError::Crc => Some(RepeatReason::Crc),
+        FlashError::Busy => Some(RepeatReason::Busy),
+        _ => None,
+    }
+}
+
+/// Compares the CRC that the bootloader computed with the file's (manual, chapter 5.2, step 4).
+///
+/// # Errors
+/// [`Error::WrongCrc`].
+pub fn verify(
+    session: &mut Session<'_>,
+    number: u8,
+    crc: u32,
+    tell: &mut dyn FnMut(Event),
+) -> Result<(), Error> {
+    let device = session.read_number(Address::new(program::PROGRAM_ID, number))?;
+    if device != crc {
+        return Err(Error::WrongCrc { device, file: crc });
+    }
+    tell(Event::Verified { crc });
+    Ok(())
+}
+
+/// Steps 10, 11 and 15: starts the program and waits until it answers; gives what it says it is.
+///
+/// # Errors
+/// [`Error::StartFailed`].
+pub fn start(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Error> {
+    let node = session.node();
+    let failed = |running, status| Error::StartFailed { node, running, status };
+    match session.command(number, ProgramControl::Start) {
+        // A device that resets at once may not get its answer out.
+        Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
+        Err(Error::Refused { .. }) => {
+            let running = session.device_type()?;
+            return Err(failed(running, session.status(number).ok()));
+        }
+        Err(error) => return Err(error),
+    }
+    match settle(session, |running| !running.is_bootloader())? {
+        Some(running) if !running.is_bootloader() => Ok(running),
+        Some(running) => Err(failed(Some(running), session.status(number).ok())),
+        None => Err(failed(None, None)),
+    }
+}

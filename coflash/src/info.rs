@@ -1,0 +1,160 @@
+//! What a device says about itself.
+
+use std::fmt;
+
+use canopen::program::{self, FlashStatus, ProgramState};
+use canopen::{AbortCode, Address};
+
+use crate::error::Error;
+use crate::flash::find;
+use crate::session::{DeviceType, Session};
+
+/// What a device says about itself. What it does not have is `None`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DeviceInfo {
+    /// Its node-ID.
+    pub node: canopen::NodeId,
+    /// 1000h: bootloader or application.
+    pub device_type: DeviceType,
+    /// 1001h, error register.
+    pub error_register: Option<u32>,
+    /// 1008h, device name.
+    pub name: Option<String>,
+    /// 1009h, hardware version.
+    pub hardware_version: Option<String>,
+    /// 100Ah, software version.
+    pub software_version: Option<String>,
+    /// 1018h/1 to 4: vendor-ID, product code, revision, serial number.
+    pub identity: [Option<u32>; 4],
+    /// Its programs, from number 1 on.
+    pub programs: Vec<ProgramInfo>,
+}
+
+/// What a device says about one of its programs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ProgramInfo {
+    /// Sub-index of 1F51h, 1F56h and 1F57h.
+    pub number: u8,
+    /// 1F51h: 0 stopped, 1 running.
+    pub control: Option<u32>,
+    /// 1F56h: CRC of the program.
+    pub crc: Option<u32>,
+    /// 1F57h.
+    pub status: Option<FlashStatus>,
+}
+
+/// Asks a device for all of it.
+///
+/// # Errors
+/// [`Error::NoAnswer`] and the like; an object that the device does not have is no error.
+pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
+    let device_type = find(session)?;
+    let mut text = |index| optional(session.read_text(Address::new(index, 0)));
+    let name = text(program::DEVICE_NAME)?;
+    let hardware_version = text(program::HARDWARE_VERSION)?;
+    let software_version = text(program::SOFTWARE_VERSION)?;
+    let mut number = |index, sub| optional(session.read_number(Address::new(index, sub)));
+    let error_register = number(program::ERROR_REGISTER, 0)?;
+    let mut identity = [None; 4];
+    for (sub, value) in (1..).zip(&mut identity) {
+        *value = number(program::IDENTITY, sub)?;
+    }
+    // The highest sub-index is the number of programs; a device without the object has none.
+    let count = number(program::PROGRAM_CONTROL, 0)?.map_or(0, |count| count.min(254) as u8);
+    let mut programs = Vec::new();
+    for sub in 1..=count {
+        let control = number(program::PROGRAM_CONTROL, sub)?;
+        let crc = number(program::PROGRAM_ID, sub)?;
+        let status = number(program::FLASH_STATUS, sub)?.map(FlashStatus::from_word);
+        programs.push(ProgramInfo { number: sub, control, crc, status });
+    }
+    Ok(DeviceInfo {
+        node: session.node(),
+        device_type,
+        error_register,
+        name,
+        hardware_version,
+        software_version,
+        identity,
+        programs,
+    })
+}
+
+/// Makes the absence of an object a value.
+fn optional<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
+    match read {
+        Ok(value) => Ok(Some(value)),
+        Err(Error::Refused { code, .. }) if absent(code) => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
+fn absent(code: AbortCode) -> bool {
+    matches!(
+        code,
+        AbortCode::NO_OBJECT
+            | AbortCode::NO_SUB_INDEX
+            | AbortCode::UNSUPPORTED_ACCESS
+            | AbortCode::WRITE_ONLY
+            | AbortCode::NO_DATA
+    )
+}
+
+impl fmt::Display for DeviceInfo {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        const ABSENT: &str = "not told";
+        let text = |value: &Option<String>| value.clone().unwrap_or_else(|| ABSENT.to_string());
+        let hex = |value: Option<u32>| value.map_or(ABSENT.to_string(), |value| format!("{value:08X}h"));
+        let [vendor, product, revision, serial] = self.identity.map(hex);
+        writeln!(f, "node {}: {}", self.node, self.device_type)?;
+        for (name, value) in [
+            ("device name", text(&self.name)),
+            ("hardware version", text(&self.hardware_version)),
+            ("software version", text(&self.software_version)),
+            ("vendor-ID", vendor),
+            ("product code", product),
+            ("revision", revision),
+            ("serial number", serial),
+            (
+                "error register",
+                match self.error_register {
+                    None => ABSENT.to_string(),
+                    Some(0) => "00h (no error)".to_string(),
+                    Some(bits) => format!("{bits:02X}h"),
+                },
+            ),
+        ] {
+            writeln!(f, "  {name:<17} {value}")?;
+        }
+        self.programs.iter().try_for_each(|program| write!(f, "{program}"))
+    }
+}
+
+impl fmt::Display for ProgramInfo {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        const STOPPED: u32 = ProgramState::Stopped as u32;
+        const RUNNING: u32 = ProgramState::Running as u32;
+        writeln!(f, "  program {}", self.number)?;
+        match self.control {
+            None => {}
+            Some(STOPPED) => writeln!(f, "    state           stopped")?,
+            Some(RUNNING) => writeln!(f, "    state           running")?,
+            Some(other) => writeln!(f, "    state           {other:02X}h")?,
+        }
+        if let Some(crc) = self.crc {
+            writeln!(f, "    CRC             {crc:08X}h")?;
+        }
+        if let Some(status) = self.status {
+            write!(f, "    status          ")?;
+            match status.error {
+                None => f.write_str("ok")?,
+                Some(error) => write!(f, "{error} ({:02X}h)", error.code())?,
+            }
+            if status.detail != 0 {
+                write!(f, ", detail {:04X}h", status.detail)?;
+            }
+            writeln!(f, "{}", if status.busy { ", busy" } else { "" })?;
+        }
+        Ok(())
+    }
+}

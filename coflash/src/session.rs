@@ -1,0 +1,383 @@
+//! A conversation with one node: SDO reads and writes, commands and their outcome, over any [`Adapter`].
+
+use std::fmt;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::Arc;
+use std::time::Duration;
+
+use canopen::program::{self, FlashStatus, ProgramControl, BOOTLOADER_DEVICE_TYPE};
+use canopen::sdo::client::{Buffer, Config};
+use canopen::sdo::{Download, SdoError, Step, Transfer, Upload};
+use canopen::{AbortCode, Address, CobId, Frame, Instant, NodeId};
+
+use crate::adapter::Adapter;
+use crate::error::Error;
+
+/// How long to wait for what.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Timing {
+    /// The answer to one SDO request. The manual's default.
+    pub sdo: Duration,
+    /// How often a read, or a write that may be repeated, is tried when no answer comes.
+    pub attempts: u32,
+    /// A command's execution (erase, program, check): how long 1F57h may read busy, or the device be silent.
+    pub command: Duration,
+    /// A restart: how long a device may take until it answers again.
+    pub boot: Duration,
+    /// The first pause between two looks at a device that is at work. It doubles from look to look …
+    pub poll_first: Duration,
+    /// … up to this one, so that the bus is not flooded.
+    pub poll_most: Duration,
+}
+
+impl Default for Timing {
+    fn default() -> Self {
+        Self {
+            sdo: Duration::from_millis(500),
+            attempts: 3,
+            command: Duration::from_secs(60),
+            boot: Duration::from_secs(5),
+            poll_first: Duration::from_millis(10),
+            poll_most: Duration::from_millis(250),
+        }
+    }
+}
+
+/// What the host was about when something went wrong.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Doing {
+    /// Reading an object.
+    Read(Address),
+    /// Writing an object.
+    Write(Address),
+    /// Carrying out a command of 1F51h.
+    Command(ProgramControl),
+    /// Writing a block of the program.
+    Block(u32),
+}
+
+impl fmt::Display for Doing {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Read(at) => write!(f, "reading {at}"),
+            Self::Write(at) => write!(f, "writing {at}"),
+            Self::Block(u32::MAX) => f.write_str("writing the last block"),
+            Self::Block(number) => write!(f, "writing block {number}"),
+            Self::Command(command) => f.write_str(match command {
+                ProgramControl::Stop => "stopping the program",
+                ProgramControl::Start => "starting the program",
+                ProgramControl::ResetStat => "clearing the status",
+                ProgramControl::Clear => "erasing the program",
+                ProgramControl::StartBootloader => "calling the bootloader",
+                ProgramControl::SetSignature => "setting the signature",
+                ProgramControl::ClrSignature => "clearing the signature",
+            }),
+        }
+    }
+}
+
+/// The largest value that is read as a whole. No object of a bootloader comes near it.
+const VALUE_MAX: usize = 4096;
+/// The longest wait in one piece: how soon a cancelled session notices.
+const SLICE: Duration = Duration::from_millis(100);
+
+/// A conversation with one node.
+pub struct Session<'a> {
+    adapter: &'a mut dyn Adapter,
+    node: NodeId,
+    timing: Timing,
+    cancelled: Option<Arc<AtomicBool>>,
+}
+
+impl fmt::Debug for Session<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Session")
+            .field("node", &self.node)
+            .field("timing", &self.timing)
+            .finish_non_exhaustive()
+    }
+}
+
+impl<'a> Session<'a> {
+    /// A conversation with `node`. Nothing is sent yet.
+    pub fn new(adapter: &'a mut dyn Adapter, node: NodeId, timing: Timing) -> Self {
+        Self { adapter, node, timing, cancelled: None }
+    }
+
+    /// Ends with [`Error::Cancelled`] as soon as `flag` is set: a transfer under way is aborted.
+    pub fn cancel_by(&mut self, flag: Arc<AtomicBool>) {
+        self.cancelled = Some(flag);
+    }
+
+    /// The node.
+    #[must_use]
+    pub fn node(&self) -> NodeId {
+        self.node
+    }
+
+    /// How long it waits for what.
+    #[must_use]
+    pub fn timing(&self) -> &Timing {
+        &self.timing
+    }
+
+    /// The time on the bus.
+    #[must_use]
+    pub fn now(&self) -> Duration {
+        self.adapter.now()
+    }
+
+    /// Reads a value of up to 4096 bytes. A read that gets no answer is repeated.
+    ///
+    /// # Errors
+    /// [`Error::NoAnswer`], [`Error::Refused`], [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn read(&mut self, at: Address) -> Result<Vec<u8>, Error> {
+        let attempts = self.timing.attempts.max(1);
+        let mut attempt = 1;
+        loop {
+            match self.read_once(at) {
+                // An answer that came late, to a request given up, spoils the next one: then, too, ask again.
+                Err(Error::NoAnswer { .. } | Error::Protocol { .. }) if attempt < attempts => attempt += 1,
+                result => return result,
+            }
+        }
+    }
+
+    /// Reads a value without repetition; otherwise as [`read`](Self::read).
+    ///
+    /// # Errors
+    /// As [`read`](Self::read).
+    pub fn read_once(&mut self, at: Address) -> Result<Vec<u8>, Error> {
+        let mut bytes = [0; VALUE_MAX];
+        let mut upload = Upload::new(self.node, at, Buffer::new(&mut bytes), self.config());
+        self.run(&mut upload, Doing::Read(at), &mut |_| {})?;
+        Ok(upload.sink().filled().to_vec())
+    }
+
+    /// Reads an unsigned number of up to 32 bits.
+    ///
+    /// # Errors
+    /// As [`read`](Self::read), and [`Error::Protocol`] for a value of another length.
+    pub fn read_number(&mut self, at: Address) -> Result<u32, Error> {
+        let bytes = self.read(at)?;
+        number(&bytes).ok_or(Error::Protocol { doing: Doing::Read(at), code: AbortCode::LENGTH })
+    }
+
+    /// Reads a text. What is not ASCII, or would move the cursor, is replaced.
+    ///
+    /// # Errors
+    /// As [`read`](Self::read).
+    pub fn read_text(&mut self, at: Address) -> Result<String, Error> {
+        let bytes = self.read(at)?;
+        let text = bytes.split(|byte| *byte == 0).next().unwrap_or_default();
+        let visible = |byte: &u8| if matches!(byte, b' '..=b'~') { char::from(*byte) } else { '?' };
+        Ok(text.iter().map(visible).collect())
+    }
+
+    /// Writes a value, once. `progress` is told how many bytes have arrived.
+    ///
+    /// # Errors
+    /// [`Error::NoAnswer`], [`Error::Refused`], [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn write(
+        &mut self,
+        at: Address,
+        data: &[u8],
+        doing: Doing,
+        progress: &mut dyn FnMut(u32),
+    ) -> Result<(), Error> {
+        let mut download = Download::new(self.node, at, data, self.config());
+        self.run(&mut download, doing, progress)
+    }
+
+    /// Writes a command to 1F51h of a program, once; how it went is in [`status`](Self::status).
+    ///
+    /// # Errors
+    /// As [`write`](Self::write).
+    pub fn command(&mut self, number: u8, command: ProgramControl) -> Result<(), Error> {
+        let at = Address::new(program::PROGRAM_CONTROL, number);
+        self.write(at, &[command as u8], Doing::Command(command), &mut |_| {})
+    }
+
+    /// Reads 1F57h of a program.
+    ///
+    /// # Errors
+    /// As [`read_number`](Self::read_number).
+    pub fn status(&mut self, number: u8) -> Result<FlashStatus, Error> {
+        self.read_number(Address::new(program::FLASH_STATUS, number)).map(FlashStatus::from_word)
+    }
+
+    /// Waits until 1F57h of a program is no longer busy, and gives what it says then. Silence counts as busy: a device
+    /// may be unable to answer while it erases.
+    ///
+    /// # Errors
+    /// [`Error::Busy`] or [`Error::NoAnswer`] when [`Timing::command`] has passed, and what [`read`](Self::read) has.
+    pub fn await_idle(&mut self, number: u8, doing: Doing) -> Result<FlashStatus, Error> {
+        let began = self.now();
+        let at = Address::new(program::FLASH_STATUS, number);
+        let mut pause = self.timing.poll_first;
+        loop {
+            let silence = match self.read_once(at) {
+                Ok(bytes) => {
+                    let word = self::number(&bytes)
+                        .ok_or(Error::Protocol { doing: Doing::Read(at), code: AbortCode::LENGTH })?;
+                    let status = FlashStatus::from_word(word);
+                    if !status.busy {
+                        return Ok(status);
+                    }
+                    None
+                }
+                Err(error @ (Error::NoAnswer { .. } | Error::Protocol { .. })) => Some(error),
+                Err(error) => return Err(error),
+            };
+            let waited = self.now().saturating_sub(began);
+            if waited >= self.timing.command {
+                return Err(silence.unwrap_or(Error::Busy { node: self.node, doing, waited }));
+            }
+            self.wait(pause)?;
+            pause = (pause * 2).min(self.timing.poll_most);
+        }
+    }
+
+    /// Reads 1000h once: `None` where no answer comes.
+    ///
+    /// # Errors
+    /// What [`read`](Self::read) has apart from [`Error::NoAnswer`].
+    pub fn device_type(&mut self) -> Result<Option<DeviceType>, Error> {
+        let at = Address::new(program::DEVICE_TYPE, 0);
+        match self.read_once(at) {
+            Ok(bytes) => {
+                let value = number(&bytes);
+                let value =
+                    value.ok_or(Error::Protocol { doing: Doing::Read(at), code: AbortCode::LENGTH })?;
+                Ok(Some(DeviceType(value)))
+            }
+            Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Lets time pass on the bus. Frames that come are not for anyone.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn wait(&mut self, time: Duration) -> Result<(), Error> {
+        self.listen(time, |_| false).map(|_| ())
+    }
+
+    /// Waits for the node's boot-up message, `time` at most; tells whether it came.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn await_boot_up(&mut self, time: Duration) -> Result<bool, Error> {
+        let boot_up = Frame::of(CobId::heartbeat(self.node), &[0]);
+        self.listen(time, |frame| *frame == boot_up)
+    }
+
+    /// Receives until `enough` says so, `time` at most; tells whether it did.
+    fn listen(&mut self, time: Duration, enough: impl Fn(&Frame) -> bool) -> Result<bool, Error> {
+        let deadline = self.now() + time;
+        loop {
+            self.check_cancelled()?;
+            let left = deadline.saturating_sub(self.now());
+            if let Some(frame) = self.adapter.receive(left.min(SLICE))? {
+                if enough(&frame) {
+                    return Ok(true);
+                }
+            }
+            if self.now() >= deadline {
+                return Ok(false);
+            }
+        }
+    }
+
+    fn config(&self) -> Config {
+        Config { timeout_ms: u32::try_from(self.timing.sdo.as_millis()).unwrap_or(u32::MAX / 4) }
+    }
+
+    fn check_cancelled(&self) -> Result<(), Error> {
+        match &self.cancelled {
+            Some(flag) if flag.load(Ordering::Relaxed) => Err(Error::Cancelled),
+            _ => Ok(()),
+        }
+    }
+
+    /// Runs one transfer to its end.
+    fn run(
+        &mut self,
+        transfer: &mut impl Transfer,
+        doing: Doing,
+        progress: &mut dyn FnMut(u32),
+    ) -> Result<(), Error> {
+        self.check_cancelled()?;
+        // Answers to requests that were given up are no answers to this one.
+        let mut stale = 0;
+        while stale < 1000 && self.adapter.receive(Duration::ZERO)?.is_some() {
+            stale += 1;
+        }
+        let mut cancelled = false;
+        let mut told = 0;
+        loop {
+            if !cancelled && self.check_cancelled().is_err() {
+                cancelled = true;
+                transfer.abort(AbortCode::GENERAL);
+            }
+            match transfer.poll(self.instant()) {
+                Step::Send(frame) => self.adapter.send(&frame)?,
+                Step::Wait(until) => {
+                    let now = self.instant();
+                    let left = if now.has_reached(until) { 0 } else { until.since(now) };
+                    let left = Duration::from_millis(left.into());
+                    if let Some(frame) = self.adapter.receive(left.min(SLICE))? {
+                        let now = self.instant();
+                        transfer.handle(&frame, now);
+                        if transfer.progress() != told {
+                            told = transfer.progress();
+                            progress(told);
+                        }
+                    }
+                }
+                Step::Done(_) if cancelled => return Err(Error::Cancelled),
+                Step::Done(Ok(())) => return Ok(()),
+                Step::Done(Err(SdoError::NoAnswer)) => {
+                    return Err(Error::NoAnswer { node: self.node, doing })
+                }
+                Step::Done(Err(SdoError::Server(code))) => {
+                    return Err(Error::Refused { node: self.node, doing, code })
+                }
+                Step::Done(Err(SdoError::Client(code))) => return Err(Error::Protocol { doing, code }),
+            }
+        }
+    }
+
+    /// The bus time as the state machines count it: they compare by difference, so wrapping is right.
+    fn instant(&self) -> Instant {
+        Instant::from_millis(self.now().as_millis() as u32)
+    }
+}
+
+/// What 1000h reads.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct DeviceType(pub u32);
+
+impl DeviceType {
+    /// Whether it is the bootloader's; everything else is an application's.
+    #[must_use]
+    pub const fn is_bootloader(self) -> bool {
+        self.0 == BOOTLOADER_DEVICE_TYPE
+    }
+}
+
+impl fmt::Display for DeviceType {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let who = if self.is_bootloader() { "the bootloader" } else { "an application" };
+        write!(f, "{who} (device type {:08X}h)", self.0)
+    }
+}
+
+/// A little-endian number of one to four bytes.
+fn number(bytes: &[u8]) -> Option<u32> {
+    if !(1..=4).contains(&bytes.len()) {
+        return None;
+    }
+    Some(bytes.iter().rev().fold(0, |number, byte| number << 8 | u32::from(*byte)))
+}

@@ -1,0 +1,354 @@
+//! A device that is none: an adapter with virtual time whose other end plays a bootloader and an application, written
+//! from the manual and from CiA 301 byte by byte, without the product's own server.
+
+use std::collections::VecDeque;
+use std::io;
+use std::time::Duration;
+
+use canopen::{CobId, Frame};
+use coflash::adapter::{Adapter, AdapterError};
+
+pub const NODE: u8 = 5;
+pub const APPLICATION: u32 = 0x0002_0192;
+pub const BOOTLOADER: u32 = 0x1000_0000;
+
+/// How the device treats a block or a command.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// As it should.
+    Accept,
+    /// Acknowledged; then 1F57h reads this.
+    Status(u32),
+    /// Refused with an abort.
+    Abort(u32),
+    /// Refused with an abort; then 1F57h reads the second.
+    AbortStatus(u32, u32),
+    /// Carried out, and the acknowledge is lost.
+    LoseAnswer,
+    /// Never arrived.
+    LoseRequest,
+    /// Acknowledged and forgotten.
+    Ignore,
+}
+
+type Script<T> = Box<dyn FnMut(T) -> Outcome>;
+
+pub struct Fake {
+    pub now: Duration,
+    /// What runs: device type; `None` while it restarts or is absent.
+    pub running: Option<u32>,
+    restart: Option<(Duration, Option<u32>)>,
+    busy_until: Duration,
+    status: u32,
+    /// What 1F56h reads instead of the last block's CRC.
+    pub crc: Option<u32>,
+    /// Whether the device answers nothing while it is busy.
+    pub deaf_while_busy: bool,
+    pub erase_time: Duration,
+    pub restart_time: Duration,
+    /// What START starts.
+    pub starts: Option<u32>,
+    /// How long an answer takes.
+    pub latency: Duration,
+    pub on_block: Script<u32>,
+    pub on_command: Script<u8>,
+    /// Frames that come before each answer.
+    pub noise: Vec<Frame>,
+    /// After so many frames the adapter is gone.
+    pub frames_left: usize,
+    /// What was asked, in short words.
+    pub log: Vec<String>,
+    /// The blocks that were taken, without framing of SDO.
+    pub blocks: Vec<Vec<u8>>,
+    next_block: u32,
+    download: Option<Download>,
+    upload: Option<(Vec<u8>, u8)>,
+    outbox: VecDeque<(Duration, Frame)>,
+    pub sent: Vec<Frame>,
+}
+
+struct Download {
+    at: (u16, u8),
+    size: usize,
+    data: Vec<u8>,
+    toggle: u8,
+}
+
+impl Fake {
+    pub fn new(running: u32) -> Self {
+        Self {
+            now: Duration::from_secs(1000),
+            running: Some(running),
+            restart: None,
+            busy_until: Duration::ZERO,
+            status: 0,
+            crc: None,
+            deaf_while_busy: false,
+            erase_time: Duration::from_secs(2),
+            restart_time: Duration::from_millis(300),
+            starts: Some(APPLICATION),
+            latency: Duration::from_micros(500),
+            on_block: Box::new(|_| Outcome::Accept),
+            on_command: Box::new(|_| Outcome::Accept),
+            noise: Vec::new(),
+            frames_left: usize::MAX,
+            log: Vec::new(),
+            blocks: Vec::new(),
+            next_block: 0,
+            download: None,
+            upload: None,
+            outbox: VecDeque::new(),
+            sent: Vec::new(),
+        }
+    }
+
+    /// The log without what is read.
+    pub fn writes(&self) -> Vec<&str> {
+        self.log.iter().map(String::as_str).filter(|entry| !entry.starts_with("read")).collect()
+    }
+
+    pub fn count(&self, entry: &str) -> usize {
+        self.log.iter().filter(|found| *found == entry).count()
+    }
+
+    fn answer(&mut self, data: [u8; 8]) {
+        self.outbox.extend(self.noise.iter().map(|frame| (self.now, *frame)));
+        let id = CobId::new(0x580 + u16::from(NODE)).unwrap();
+        self.outbox.push_back((self.now + self.latency, Frame::of(id, &data)));
+    }
+
+    fn abort(&mut self, at: (u16, u8), code: u32) {
+        (self.download, self.upload) = (None, None);
+        self.answer(initiate(0x80, at, code));
+    }
+
+    fn busy(&self) -> bool {
+        self.now < self.busy_until
+    }
+
+    fn tick(&mut self) {
+        if let Some((at, next)) = self.restart.filter(|(at, _)| *at <= self.now) {
+            (self.restart, self.running) = (None, next);
+            if next.is_some() {
+                let id = CobId::new(0x700 + u16::from(NODE)).unwrap();
+                self.outbox.push_back((at, Frame::of(id, &[0])));
+            }
+        }
+    }
+
+    fn restart_into(&mut self, next: Option<u32>) {
+        self.running = None;
+        (self.download, self.upload) = (None, None);
+        self.restart = Some((self.now + self.restart_time, next));
+    }
+
+    fn request(&mut self, bytes: [u8; 8]) {
+        let at = (u16::from_le_bytes([bytes[1], bytes[2]]), bytes[3]);
+        let word = u32::from_le_bytes(bytes[4..].try_into().unwrap());
+        match bytes[0] {
+            // Initiate upload.
+            0x40 => {
+                self.log.push(format!("read {:04X}/{}", at.0, at.1));
+                match self.value(at) {
+                    Ok(value) if value.len() <= 4 => {
+                        let mut word = [0; 4];
+                        word[..value.len()].copy_from_slice(&value);
+                        let command = 0x43 | ((4 - value.len() as u8) << 2);
+                        self.answer(initiate(command, at, u32::from_le_bytes(word)));
+                    }
+                    Ok(value) => {
+                        self.answer(initiate(0x41, at, value.len() as u32));
+                        self.upload = Some((value, 0));
+                    }
+                    Err(code) => self.abort(at, code),
+                }
+            }
+            // Upload segment.
+            command @ (0x60 | 0x70) => {
+                let Some((value, toggle)) = &mut self.upload else { return self.abort((0, 0), 0x0504_0001) };
+                assert_eq!(command & 0x10, *toggle);
+                let chunk: Vec<u8> = value.drain(..value.len().min(7)).collect();
+                let last = u8::from(value.is_empty());
+                let mut data = [0; 8];
+                data[0] = *toggle | (7 - chunk.len() as u8) << 1 | last;
+                data[1..=chunk.len()].copy_from_slice(&chunk);
+                *toggle ^= 0x10;
+                self.answer(data);
+            }
+            // Initiate download, segmented with size.
+            0x21 => {
+                self.download = Some(Download { at, size: word as usize, data: Vec::new(), toggle: 0 });
+                if at.0 == 0x1F50 && self.busy() {
+                    self.status = 0x86;
+                    return self.abort(at, 0x0800_0022);
+                }
+                self.answer(initiate(0x60, at, 0));
+            }
+            // Initiate download, expedited with size.
+            command if command & 0xE3 == 0x23 => {
+                let len = 4 - usize::from(command >> 2 & 3);
+                self.write(at, bytes[4..4 + len].to_vec(), initiate(0x60, at, 0));
+            }
+            // Download segment.
+            command if command & 0xE0 == 0 => {
+                let Some(download) = &mut self.download else { return self.abort((0, 0), 0x0504_0001) };
+                assert_eq!(command & 0x10, download.toggle);
+                let len = 7 - usize::from(command >> 1 & 7);
+                download.data.extend_from_slice(&bytes[1..=len]);
+                let answer = [0x20 | download.toggle, 0, 0, 0, 0, 0, 0, 0];
+                download.toggle ^= 0x10;
+                if command & 1 == 0 {
+                    return self.answer(answer);
+                }
+                let Some(download) = self.download.take() else { return };
+                assert_eq!(download.data.len(), download.size);
+                self.write(download.at, download.data, answer);
+            }
+            0x80 => {
+                self.log.push(format!("abort {word:08X}"));
+                (self.download, self.upload) = (None, None);
+            }
+            other => panic!("unexpected command {other:02X}"),
+        }
+    }
+
+    fn value(&self, at: (u16, u8)) -> Result<Vec<u8>, u32> {
+        let number = |value: u32| Ok(value.to_le_bytes().to_vec());
+        match at {
+            (0x1000, 0) => number(self.running.unwrap()),
+            (0x1001, 0) => Ok(vec![0]),
+            (0x1008, 0) => Ok(b"a device with a long name".to_vec()),
+            (0x100A, 0) => Ok(b"v1\x1B\0junk".to_vec()),
+            (0x1018, 1) => number(0x03F),
+            (0x1018, 2) => number(1234),
+            (0x1F51, 0) => Ok(vec![1]),
+            (0x1F51, 1) => Ok(vec![u8::from(self.running == Some(APPLICATION))]),
+            (0x1F56, 1) => {
+                let last = self.blocks.last().filter(|block| block[0] == 0xFF);
+                let crc = last.map_or(0, |block| u32::from_le_bytes(block[16..20].try_into().unwrap()));
+                number(self.crc.unwrap_or(crc))
+            }
+            (0x1F57, 1) => number(if self.busy() { 1 } else { self.status }),
+            (0x1018 | 0x1F51 | 0x1F56 | 0x1F57, _) => Err(0x0609_0011),
+            _ => Err(0x0602_0000),
+        }
+    }
+
+    fn write(&mut self, at: (u16, u8), data: Vec<u8>, answer: [u8; 8]) {
+        let outcome = match at {
+            (0x1F51, 1) => {
+                self.log.push(format!("command {:02X}", data[0]));
+                (self.on_command)(data[0])
+            }
+            (0x1F50, 1) => {
+                let number = u32::from_le_bytes(data[..4].try_into().unwrap());
+                self.log.push(format!("block {}", number as i32));
+                (self.on_block)(number)
+            }
+            _ => return self.abort(at, 0x0602_0000),
+        };
+        match outcome {
+            Outcome::Abort(code) => return self.abort(at, code),
+            Outcome::AbortStatus(code, status) => {
+                self.status = status;
+                return self.abort(at, code);
+            }
+            Outcome::LoseRequest => return,
+            Outcome::LoseAnswer => {}
+            _ => self.answer(answer),
+        }
+        match outcome {
+            Outcome::Ignore => {}
+            Outcome::Status(status) => {
+                self.status = status;
+                self.busy_until = self.now + Duration::from_millis(30);
+            }
+            _ => self.carry_out(at, data),
+        }
+    }
+
+    fn carry_out(&mut self, at: (u16, u8), data: Vec<u8>) {
+        self.status = 0;
+        let in_bootloader = self.running == Some(BOOTLOADER);
+        match (at.0, data[0]) {
+            (0x1F50, _) if in_bootloader => {
+                let number = u32::from_le_bytes(data[..4].try_into().unwrap());
+                let last = number == u32::MAX && self.next_block > 0;
+                if number != self.next_block && !last {
+                    self.status = 0x88;
+                    return;
+                }
+                self.next_block = number.wrapping_add(1);
+                self.busy_until = self.now + Duration::from_millis(4);
+                self.blocks.push(data);
+            }
+            (0x1F51, 0x03) if in_bootloader => {
+                self.busy_until = self.now + self.erase_time;
+                self.blocks.clear();
+                self.next_block = 0;
+            }
+            (0x1F51, 0x83) if in_bootloader => self.busy_until = self.now + Duration::from_millis(20),
+            (0x1F51, 0x01) if in_bootloader => match self.starts {
+                Some(BOOTLOADER) => self.status = 0x02,
+                next => self.restart_into(next),
+            },
+            (0x1F51, 0x80) if !in_bootloader => self.restart_into(Some(BOOTLOADER)),
+            (0x1F51, 0x80) => {}
+            other => panic!("unexpected write {other:X?}"),
+        }
+    }
+}
+
+/// An initiate frame or an abort: command, index, sub-index, 32 bits.
+fn initiate(command: u8, (index, sub): (u16, u8), word: u32) -> [u8; 8] {
+    let [low, high] = index.to_le_bytes();
+    let [a, b, c, d] = word.to_le_bytes();
+    [command, low, high, sub, a, b, c, d]
+}
+
+impl Adapter for Fake {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        // About what a frame takes at 500 kbit/s.
+        self.now += Duration::from_micros(250);
+        self.tick();
+        if self.frames_left == 0 {
+            let source = io::Error::from(io::ErrorKind::BrokenPipe);
+            return Err(AdapterError::Lost { adapter: "fake".to_string(), source });
+        }
+        self.frames_left -= 1;
+        self.sent.push(*frame);
+        let request = frame.cob_id() == CobId::new(0x600 + u16::from(NODE));
+        let hears = self.running.is_some() && !(self.deaf_while_busy && self.busy());
+        match frame.exactly() {
+            Some(bytes) if request && hears => self.request(*bytes),
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        let until = self.now + timeout;
+        loop {
+            self.tick();
+            match self.outbox.front() {
+                Some((at, _)) if *at <= until => {
+                    let (at, frame) = self.outbox.pop_front().unwrap();
+                    self.now = self.now.max(at);
+                    return Ok(Some(frame));
+                }
+                _ => {}
+            }
+            match self.restart {
+                Some((at, _)) if at <= until => self.now = self.now.max(at),
+                _ => {
+                    self.now = until;
+                    return Ok(None);
+                }
+            }
+        }
+    }
+
+    fn now(&self) -> Duration {
+        self.now
+    }
+}

@@ -1,0 +1,510 @@
+//! The update procedure against a device that plays every failure of the manual.
+
+mod fake;
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::Arc;
+use std::time::Duration;
+
+use canopen::{CobId, Frame, NodeId};
+use coflash::block_file::BlockFile;
+use coflash::error::Error;
+use coflash::flash::{flash, Event, FlashOptions, RepeatReason, Report};
+use coflash::info::info;
+use coflash::session::{Session, Timing};
+use coflash::Adapter;
+use embedded_can::{Frame as _, StandardId};
+use fake::{Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
+use proptest::prelude::*;
+
+fn file() -> BlockFile {
+    BlockFile::parse(include_bytes!("data/identity-110.blk")).unwrap()
+}
+
+/// Five blocks: 0, 1 to 4 (three of code, one of text and data), -1.
+const BLOCKS: usize = 6;
+
+fn node() -> NodeId {
+    NodeId::new(NODE).unwrap()
+}
+
+fn run(fake: &mut Fake, options: FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
+    let mut events = Vec::new();
+    let mut session = Session::new(fake, node(), Timing::default());
+    let result = flash(&mut session, &file(), &options, &mut |event| events.push(event));
+    (result, events)
+}
+
+fn fails(fake: &mut Fake) -> Error {
+    run(fake, FlashOptions::default()).0.unwrap_err()
+}
+
+/// The first `times` times that `number` comes the outcome, then all is well.
+fn script<T: PartialEq + Copy + 'static>(
+    number: T,
+    times: usize,
+    outcome: Outcome,
+) -> Box<dyn FnMut(T) -> Outcome> {
+    let mut left = times;
+    Box::new(move |came| {
+        if came == number && left > 0 {
+            left -= 1;
+            return outcome;
+        }
+        Outcome::Accept
+    })
+}
+
+#[test]
+fn the_whole_procedure_from_a_running_application() {
+    let mut fake = Fake::new(APPLICATION);
+    let (report, events) = run(&mut fake, FlashOptions::default());
+    let report = report.unwrap();
+    // Commands and their order: the manual's steps 3, 4, 6 to 9, 14 and 15.
+    let steps = [
+        "command 80",
+        "command 03",
+        "block 0",
+        "block 1",
+        "block 2",
+        "block 3",
+        "block 4",
+        "block -1",
+        "command 83",
+        "command 01",
+    ];
+    assert_eq!(fake.writes(), steps);
+    assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"));
+    assert_eq!(fake.running, Some(APPLICATION));
+    assert_eq!(
+        (report.program_size, report.repeats, report.running.map(|running| running.0)),
+        (4001, 0, Some(APPLICATION))
+    );
+    assert_eq!(report.program_crc, file().program_crc());
+    let words: Vec<String> = events
+        .iter()
+        .filter(|event| !matches!(event, Event::Progress { .. }))
+        .map(Event::to_string)
+        .collect();
+    assert_eq!(words[0], "found an application (device type 00020192h)");
+    assert_eq!(
+        words[1..4],
+        [
+            "calling the application back to the bootloader",
+            "the bootloader is running",
+            "erasing the old program"
+        ]
+    );
+    assert_eq!(words[4][..9], *"erased in");
+    assert_eq!(
+        words[6..],
+        [
+            "signed: the program starts by itself from now on",
+            "starting the program",
+            "running: an application (device type 00020192h)"
+        ]
+    );
+}
+
+#[test]
+fn progress_never_goes_back_and_ends_complete() {
+    let mut fake = Fake::new(BOOTLOADER);
+    let total_bytes = include_bytes!("data/identity-110.blk").len();
+    let mut last = 0;
+    let (_, events) = run(&mut fake, FlashOptions::default());
+    let mut seen = 0;
+    for event in events {
+        if let Event::Progress { done, total } = event {
+            assert!(done >= last && total == total_bytes);
+            (last, seen) = (done, seen + 1);
+        }
+    }
+    assert_eq!(last, total_bytes);
+    assert!(seen > 100, "about one for each segment of seven bytes: {seen}");
+}
+
+#[test]
+fn in_the_bootloader_no_call_and_without_start_none() {
+    let mut fake = Fake::new(BOOTLOADER);
+    let report = run(&mut fake, FlashOptions { start: false, ..FlashOptions::default() }).0.unwrap();
+    assert_eq!((fake.writes()[0], *fake.writes().last().unwrap()), ("command 03", "command 83"));
+    assert_eq!((report.running, fake.running), (None, Some(BOOTLOADER)));
+}
+
+#[test]
+fn a_trial_run_comes_before_the_signature() {
+    let mut fake = Fake::new(BOOTLOADER);
+    run(&mut fake, FlashOptions { trial_run: true, ..FlashOptions::default() }).0.unwrap();
+    assert_eq!(fake.writes()[1 + BLOCKS..], ["command 01", "command 80", "command 83", "command 01"]);
+    // A program that fails its trial is never signed.
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.starts = None;
+    let error = run(&mut fake, FlashOptions { trial_run: true, ..FlashOptions::default() }).0.unwrap_err();
+    assert_eq!((error.number(), fake.count("command 83")), (0x6000_0014, 0));
+}
+
+#[test]
+fn nobody_there() {
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.running = None;
+    let began = fake.now;
+    let error = fails(&mut fake);
+    assert_eq!(error.number(), 0x6000_0013);
+    assert_eq!(error.to_string(), "node 5 does not answer (reading 1000h/0)");
+    assert!(error.advice().contains("bit rate"));
+    let waited = fake.now - began;
+    assert!(
+        waited >= Timing::default().boot && waited < Timing::default().boot + Duration::from_secs(1),
+        "{waited:?}"
+    );
+}
+
+#[test]
+fn a_device_that_is_just_restarting_is_waited_for() {
+    let mut fake = Fake::new(APPLICATION);
+    fake.restart_time = Duration::from_millis(3500);
+    run(&mut fake, FlashOptions::default()).0.unwrap();
+    assert_eq!((fake.count("command 80"), fake.count("command 01")), (1, 1));
+}
+
+/// Table 3, and table 10 of the manual for the numbers that it has.
+const STATUS: [(u32, u32, &str); 14] = [
+    (0x02, 0x6000_0001, "no valid program"),
+    (0x04, 0x6000_0002, "expected form"),
+    (0x06, 0x6000_0003, "CRC"),
+    (0x08, 0x6000_0004, "cleared"),
+    (0x0A, 0x6000_0005, "written"),
+    (0x0C, 0x6000_0006, "outside"),
+    (0x0E, 0x6000_0007, "protected"),
+    (0x10, 0x6000_0110, "non-volatile"),
+    (0x7E, 0x6000_0008, "unspecified"),
+    (0x80, 0x6000_0180, "vendor"),
+    (0x82, 0x6000_0182, "product"),
+    (0x84, 0x6000_0184, "not allowed"),
+    (0x86, 0x6000_0186, "carried out"),
+    (0x88, 0x6000_0188, "order"),
+];
+
+#[test]
+fn every_status_of_the_manual_has_its_number_and_words() {
+    for (status, number, words) in STATUS {
+        for outcome in [Outcome::Status(status), Outcome::AbortStatus(0x0800_0020, status)] {
+            let mut fake = Fake::new(BOOTLOADER);
+            fake.on_block = script(2, usize::MAX, outcome);
+            let error = fails(&mut fake);
+            let text = error.to_string();
+            assert_eq!(error.number(), number, "{text}");
+            assert!(text.starts_with("writing block 2 failed: ") && text.contains(words), "{text}");
+            assert!(text.contains(&format!("1F57h reads {status:02X}h")), "{text}");
+            assert!(!error.advice().is_empty());
+            assert_eq!(fake.count("command 83") + fake.count("block 3"), 0, "the procedure ends here");
+            let repeatable = matches!(status, 0x06 | 0x86);
+            assert_eq!(fake.count("block 2"), if repeatable { 4 } else { 1 }, "{text}");
+
+            let mut fake = Fake::new(BOOTLOADER);
+            fake.on_command = script(0x03, usize::MAX, outcome);
+            let error = fails(&mut fake);
+            assert_eq!(error.number(), number);
+            assert!(error.to_string().starts_with("erasing the program failed: "), "{error}");
+            assert_eq!(fake.writes(), ["command 03"]);
+
+            let mut fake = Fake::new(BOOTLOADER);
+            fake.on_command = script(0x83, usize::MAX, outcome);
+            let error = fails(&mut fake);
+            assert_eq!(error.number(), number);
+            assert!(error.to_string().starts_with("setting the signature failed: "), "{error}");
+            assert_eq!(fake.count("command 01"), 0);
+        }
+    }
+}
+
+#[test]
+fn an_unknown_status_and_its_detail_are_shown() {
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.on_block = script(1, 1, Outcome::Status(0xBEEF_0020));
+    let error = fails(&mut fake);
+    assert_eq!(error.number(), 0x6000_0008);
+    assert!(error.to_string().contains("detail BEEFh"), "{error}");
+}
+
+#[test]
+fn a_block_is_repeated_as_often_as_allowed() {
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.on_block = script(2, 2, Outcome::Status(0x06));
+    let (report, events) = run(&mut fake, FlashOptions { repeats: 2, ..FlashOptions::default() });
+    assert_eq!(report.unwrap().repeats, 2);
+    assert_eq!(fake.count("block 2"), 3);
+    assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"));
+    let again = Event::Repeating { block: 2, repeat: 2, of: 2, why: RepeatReason::Crc };
+    assert!(events.contains(&again));
+
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.on_block = script(2, 3, Outcome::Status(0x06));
+    let error = run(&mut fake, FlashOptions { repeats: 2, ..FlashOptions::default() }).0.unwrap_err();
+    assert_eq!((error.number(), fake.count("block 2"), fake.count("block 3")), (0x6000_0003, 3, 0));
+}
+
+#[test]
+fn a_refusal_without_status_gives_the_abort_code() {
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.on_block = script(1, 1, Outcome::Abort(0x0607_0012));
+    let error = fails(&mut fake);
+    assert_eq!((error.number(), fake.count("block 1")), (0x6000_0025, 1));
+    let text = error.to_string();
+    assert!(text.starts_with("node 5 refuses writing block 1: abort 06070012h"), "{text}");
+    assert!(error.advice().contains("--block-size"));
+    // Codes that speak of lost frames: once more.
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.on_block = script(1, 1, Outcome::Abort(0x0504_0000));
+    assert_eq!(run(&mut fake, FlashOptions::default()).0.unwrap().repeats, 1);
+}
+
+#[test]
+fn a_lost_answer_or_request_costs_a_repeat_and_nothing_else() {
+    for block in [0, 1, 3, u32::MAX] {
+        for outcome in [Outcome::LoseAnswer, Outcome::LoseRequest] {
+            let mut fake = Fake::new(BOOTLOADER);
+            fake.on_block = script(block, 1, outcome);
+            let report = run(&mut fake, FlashOptions::default()).0.unwrap();
+            // The last block may be sent twice; its second copy is the same.
+            fake.blocks.dedup();
+            assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"), "{block} {outcome:?}");
+            assert_eq!(report.repeats, 1);
+        }
+    }
+    for command in [0x80, 0x03, 0x83, 0x01] {
+        for outcome in [Outcome::LoseAnswer, Outcome::LoseRequest] {
+            let mut fake = Fake::new(APPLICATION);
+            fake.on_command = script(command, 1, outcome);
+            let result = run(&mut fake, FlashOptions::default()).0;
+            // START is given once: a program that is already running would not know what to do with it.
+            let fatal = command == 0x01 && outcome == Outcome::LoseRequest;
+            assert_eq!(result.is_err(), fatal, "{command:02X} {outcome:?} {result:?}");
+        }
+    }
+}
+
+#[test]
+fn a_long_erase_is_waited_for_without_flooding_the_bus() {
+    for deaf in [false, true] {
+        let mut fake = Fake::new(BOOTLOADER);
+        fake.erase_time = Duration::from_secs(16);
+        fake.deaf_while_busy = deaf;
+        run(&mut fake, FlashOptions::default()).0.unwrap();
+        let reads = fake.count("read 1F57/1");
+        assert!(reads < 16 * 5 + 30, "{reads} reads");
+    }
+}
+
+#[test]
+fn busy_for_ever_is_given_up() {
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.erase_time = Duration::from_secs(100_000);
+    let error = fails(&mut fake);
+    assert_eq!(error.number(), 0x6000_0016);
+    assert!(error.to_string().starts_with("node 5 is still busy erasing the program after 60"), "{error}");
+    fake = Fake::new(BOOTLOADER);
+    fake.erase_time = Duration::from_secs(100_000);
+    fake.deaf_while_busy = true;
+    assert_eq!(fails(&mut fake).number(), 0x6000_0013);
+}
+
+#[test]
+fn an_application_that_does_not_go_back() {
+    let mut fake = Fake::new(APPLICATION);
+    fake.on_command = script(0x80, usize::MAX, Outcome::Ignore);
+    let error = fails(&mut fake);
+    assert_eq!((error.number(), fake.count("command 80")), (0x6000_0010, 2));
+    assert_eq!(error.to_string(), "node 5 stays in an application (device type 00020192h)");
+    assert_eq!(fake.writes(), ["command 80"; 2], "nothing was erased");
+
+    let mut fake = Fake::new(APPLICATION);
+    fake.on_command = script(0x80, usize::MAX, Outcome::Abort(0x0602_0000));
+    let error = fails(&mut fake);
+    assert_eq!((error.number(), fake.count("command 80")), (0x6000_0010, 1));
+    assert!(error.to_string().contains("refuses the call with abort 06020000h"), "{error}");
+    assert!(error.advice().contains("entry strap"));
+}
+
+#[test]
+fn a_wrong_program_crc_is_never_signed() {
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.crc = Some(0x1234_5678);
+    let error = fails(&mut fake);
+    assert_eq!(error.number(), 0x6000_0001);
+    assert!(error.to_string().contains("CRC 12345678h, that of the file "), "{error}");
+    assert_eq!(fake.count("command 83"), 0);
+}
+
+#[test]
+fn a_program_that_does_not_come_up() {
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.starts = Some(BOOTLOADER);
+    let error = fails(&mut fake);
+    assert_eq!(error.number(), 0x6000_0014);
+    assert_eq!(
+        error.to_string(),
+        "the program does not start: node 5 stays in the bootloader (device type 10000000h); there is no valid \
+         program to start (1F57h reads 02h)"
+    );
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.starts = None;
+    let error = fails(&mut fake);
+    assert_eq!(error.to_string(), "the program does not start: node 5 does not answer");
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.on_command = script(0x01, 1, Outcome::AbortStatus(0x0800_0022, 0x02));
+    assert_eq!(fails(&mut fake).number(), 0x6000_0014);
+}
+
+#[test]
+fn what_others_say_on_the_bus_is_passed_over() {
+    let other = |id: u16, data: &[u8]| Frame::of(CobId::new(id).unwrap(), data);
+    let mut fake = Fake::new(APPLICATION);
+    fake.noise = vec![
+        // Another node's answer to a similar question, and its abort.
+        other(0x586, &[0x43, 0x00, 0x10, 0, 0, 0, 0, 0x10]),
+        other(0x586, &[0x80, 0x57, 0x1F, 1, 0, 0, 2, 6]),
+        // Heartbeats, emergencies, an answer that is too short, a remote frame.
+        other(0x705, &[0x7F]),
+        other(0x706, &[0]),
+        other(0x085, &[0; 8]),
+        other(0x585, &[0x80, 0, 0]),
+        Frame::new_remote(StandardId::new(0x585).unwrap(), 8).unwrap(),
+    ];
+    run(&mut fake, FlashOptions::default()).0.unwrap();
+    assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"));
+}
+
+#[test]
+fn answers_that_come_late_do_not_stand_for_others() {
+    let mut fake = Fake::new(BOOTLOADER);
+    // Each answer takes longer than the time-out: nothing may ever be taken for done.
+    fake.latency = Duration::from_millis(700);
+    assert!(run(&mut fake, FlashOptions::default()).0.is_err());
+    assert_eq!(fake.count("command 83"), 0);
+    // With a longer time-out all is well.
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.latency = Duration::from_millis(700);
+    let timing = Timing { sdo: Duration::from_secs(2), ..Timing::default() };
+    let mut session = Session::new(&mut fake, node(), timing);
+    flash(&mut session, &file(), &FlashOptions::default(), &mut |_| {}).unwrap();
+}
+
+#[test]
+fn cancelling_aborts_the_transfer() {
+    let mut fake = Fake::new(BOOTLOADER);
+    let flag = Arc::new(AtomicBool::new(false));
+    let mut session = Session::new(&mut fake, node(), Timing::default());
+    session.cancel_by(flag.clone());
+    let result = flash(&mut session, &file(), &FlashOptions::default(), &mut |event| {
+        if matches!(event, Event::Progress { done, .. } if done > 300) {
+            flag.store(true, Ordering::Relaxed);
+        }
+    });
+    assert_eq!(result.unwrap_err().number(), 0x6000_0011);
+    assert_eq!(*fake.log.last().unwrap(), "abort 08000000");
+    // The next run needs nothing but to be started.
+    run(&mut fake, FlashOptions::default()).0.unwrap();
+}
+
+#[test]
+fn an_adapter_that_goes_away_ends_it_at_any_frame() {
+    let mut fake = Fake::new(APPLICATION);
+    run(&mut fake, FlashOptions::default()).0.unwrap();
+    for frames in 0..fake.sent.len() {
+        let mut fake = Fake::new(APPLICATION);
+        fake.frames_left = frames;
+        let error = fails(&mut fake);
+        assert_eq!(error.number(), 0x6000_0303, "{error}");
+    }
+}
+
+#[test]
+fn another_program_number_is_another_sub_index() {
+    let mut fake = Fake::new(BOOTLOADER);
+    let error = run(&mut fake, FlashOptions { program: 2, ..FlashOptions::default() }).0.unwrap_err();
+    assert!(fake.sent[1].data()[..4] == [0x2F, 0x51, 0x1F, 2], "{:?}", fake.sent[1]);
+    assert_eq!(error.number(), 0x6000_0025);
+}
+
+#[test]
+fn info_in_words() {
+    let mut fake = Fake::new(APPLICATION);
+    let mut session = Session::new(&mut fake, node(), Timing::default());
+    let text = info(&mut session).unwrap().to_string();
+    assert_eq!(
+        text,
+        "\
+node 5: an application (device type 00020192h)
+  device name       a device with a long name
+  hardware version  not told
+  software version  v1?
+  vendor-ID         0000003Fh
+  product code      000004D2h
+  revision          not told
+  serial number     not told
+  error register    00h (no error)
+  program 1
+    state           running
+    CRC             00000000h
+    status          ok
+"
+    );
+}
+
+/// A bus on which anything may come at any time.
+struct Chaos {
+    now: Duration,
+    frames: Vec<(u16, Vec<u8>)>,
+    next: usize,
+}
+
+impl Adapter for Chaos {
+    fn send(&mut self, _: &Frame) -> Result<(), coflash::adapter::AdapterError> {
+        Ok(())
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::adapter::AdapterError> {
+        if timeout.is_zero() {
+            return Ok(None);
+        }
+        self.now += Duration::from_millis(10).min(timeout);
+        let (id, data) = &self.frames[self.next % self.frames.len()];
+        self.next += 1;
+        Ok(Some(Frame::of(CobId::new(*id).unwrap(), data)))
+    }
+
+    fn now(&self) -> Duration {
+        self.now
+    }
+}
+
+proptest! {
+    /// No answer of a device makes the host panic or hang, and none makes it believe that a program is in.
+    #[test]
+    fn no_device_can_break_the_host(
+        frames in prop::collection::vec(
+            (
+                prop::sample::select(vec![0x585u16, 0x585, 0x585, 0x705, 0x085]),
+                prop_oneof![
+                    prop::collection::vec(any::<u8>(), 0..9),
+                    (prop::sample::select(vec![0x60u8, 0x20, 0x30, 0x43, 0x41, 0x80, 0x00]), any::<[u8; 7]>())
+                        .prop_map(|(command, rest)| [&[command][..], &rest].concat()),
+                    Just(vec![0x43, 0x00, 0x10, 0, 0, 0, 0, 0x10]),
+                    Just(vec![0x60, 0x51, 0x1F, 1, 0, 0, 0, 0]),
+                    Just(vec![0x43, 0x57, 0x1F, 1, 0, 0, 0, 0]),
+                ],
+            ),
+            1..12,
+        ),
+    ) {
+        let mut chaos = Chaos { now: Duration::ZERO, frames, next: 0 };
+        let timing = Timing { command: Duration::from_secs(2), ..Timing::default() };
+        let mut session = Session::new(&mut chaos, node(), timing);
+        let result = flash(&mut session, &file(), &FlashOptions::default(), &mut |_| {});
+        prop_assert!(result.is_err());
+        prop_assert!(chaos.now < Duration::from_secs(600), "{:?}", chaos.now);
+        let mut session = Session::new(&mut chaos, node(), timing);
+        let _ = info(&mut session);
+    }
+}
