@@ -15,7 +15,7 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        let server = SdoServer::new(node(), Config { timeout_ms: 1000 });
+        let server = SdoServer::new(node(), Config { timeout_ms: 1000, ..Config::default() });
         Self { server, device: Device::default(), now: 0 }
     }
 

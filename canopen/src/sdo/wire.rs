@@ -238,6 +238,18 @@ impl Request {
         })
     }
 
+    /// Whether it belongs to block upload (ccs 5).
+    #[must_use]
+    pub const fn is_block_upload(&self) -> bool {
+        matches!(
+            self,
+            Self::InitiateBlockUpload { .. }
+                | Self::StartBlockUpload
+                | Self::AckBlockUpload(_)
+                | Self::EndBlockUpload
+        )
+    }
+
     /// The bytes of the frame.
     #[must_use]
     pub fn emit(&self) -> [u8; 8] {

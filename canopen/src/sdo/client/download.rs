@@ -1,0 +1,220 @@
+//! Writing a value.
+
+use crate::frame::{Frame, NodeId};
+use crate::od::Address;
+use crate::sdo::block::{check_blksize, Crc16, SEGMENT};
+use crate::sdo::client::{means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer};
+use crate::sdo::wire::{BlockAck, BlockEnd, BlockSegment, Chunk, Payload, Request, Response, Segment};
+use crate::sdo::AbortCode;
+use crate::time::Instant;
+
+/// Sub-blocks in a row of which nothing arrives, until the transfer is given up.
+const HOPELESS: u8 = 10;
+
+/// Writes a value: expedited up to four bytes; above that segmented, or as blocks where that is asked for.
+#[derive(Debug)]
+pub struct Download<D> {
+    link: Link,
+    data: D,
+    state: State,
+}
+
+#[derive(Debug)]
+enum State {
+    Initiating,
+    Segments {
+        /// Of the segment that is on its way.
+        toggle: bool,
+        /// Where the data end that are on their way.
+        sent: usize,
+    },
+    InitiatingBlock {
+        fallback: bool,
+    },
+    Blocks(SubBlock),
+    /// All data have arrived; the server checks them.
+    EndingBlock,
+}
+
+/// A sub-block on its way.
+#[derive(Clone, Copy, Debug)]
+struct SubBlock {
+    /// The server checks a CRC.
+    crc: bool,
+    blksize: u8,
+    /// Where its data begin.
+    base: usize,
+    /// The last segment sent.
+    seqno: u8,
+    /// Sub-blocks before this one of which nothing arrived.
+    in_vain: u8,
+}
+
+impl<D: AsRef<[u8]>> Download<D> {
+    /// Writes `data` to `at` of `node`. Nothing is sent before the first [`poll`](Transfer::poll).
+    pub fn new(node: NodeId, at: Address, data: D, config: Config) -> Self {
+        let link = Link::new(node, at, config, initiate(at, data.as_ref()));
+        Self { link, data, state: State::Initiating }
+    }
+
+    /// The same as blocks. Up to four bytes still go expedited.
+    pub fn as_blocks(node: NodeId, at: Address, data: D, config: Config, block: Block) -> Self {
+        let mut download = Self::new(node, at, data, config);
+        let len = download.data.as_ref().len();
+        if !is_expedited(len) {
+            let size = u32::try_from(len).ok();
+            download.link.request = Some(Request::InitiateBlockDownload { at, crc: true, size });
+            download.state = State::InitiatingBlock { fallback: block.fallback };
+        }
+        download
+    }
+
+    fn answer(&mut self, bytes: &[u8; 8]) -> Result<Next, SdoError> {
+        let data = self.data.as_ref();
+        match (Response::parse(bytes), &mut self.state) {
+            (Some(Response::InitiateDownload(at)), State::Initiating) if at == self.link.at => {
+                if is_expedited(data.len()) {
+                    self.link.progress = data.len() as u32;
+                    return Ok(Next::Done(None));
+                }
+                let (segment, sent) = segment(data, 0, false);
+                self.state = State::Segments { toggle: false, sent };
+                Ok(Next::Send(Request::DownloadSegment(segment)))
+            }
+            (Some(Response::DownloadSegment(answered)), State::Segments { toggle, sent }) => {
+                if answered != *toggle {
+                    return Err(SdoError::Client(AbortCode::TOGGLE));
+                }
+                self.link.progress = *sent as u32;
+                if *sent == data.len() {
+                    return Ok(Next::Done(None));
+                }
+                *toggle = !*toggle;
+                let (segment, end) = segment(data, *sent, *toggle);
+                *sent = end;
+                Ok(Next::Send(Request::DownloadSegment(segment)))
+            }
+            (Some(Response::InitiateBlockDownload { at, crc, blksize }), State::InitiatingBlock { .. })
+                if at == self.link.at =>
+            {
+                let blksize = check_blksize(blksize).map_err(SdoError::Client)?;
+                self.state = State::Blocks(SubBlock { crc, blksize, base: 0, seqno: 0, in_vain: 0 });
+                Ok(Next::Wait)
+            }
+            (Some(Response::Abort(_, code)), State::InitiatingBlock { fallback: true })
+                if means_unknown(code) =>
+            {
+                self.state = State::Initiating;
+                Ok(Next::Send(initiate(self.link.at, data)))
+            }
+            (Some(Response::AckBlockDownload(ack)), State::Blocks(sub_block)) => {
+                let arrived = sub_block.acknowledged(ack, data).map_err(SdoError::Client)?;
+                self.link.progress = sub_block.base as u32;
+                let Some(crc) = arrived else { return Ok(Next::Wait) };
+                let unused = data.len().next_multiple_of(SEGMENT).max(SEGMENT) - data.len();
+                self.state = State::EndingBlock;
+                Ok(Next::Send(Request::EndBlockDownload(BlockEnd { unused: unused as u8, crc })))
+            }
+            // The server's acknowledgement once more.
+            (Some(Response::AckBlockDownload(_)), State::EndingBlock) => Ok(Next::Wait),
+            (Some(Response::EndBlockDownload), State::EndingBlock) => Ok(Next::Done(None)),
+            (response, _) => self.link.unexpected(response),
+        }
+    }
+}
+
+/// Whether this many bytes fit into the initiate.
+const fn is_expedited(len: usize) -> bool {
+    matches!(len, 1..=4)
+}
+
+fn initiate(at: Address, data: &[u8]) -> Request {
+    let payload = if is_expedited(data.len()) {
+        Payload::Expedited(Chunk::new(data))
+    } else {
+        // What does not fit into 32 bits is announced as being of unknown size.
+        Payload::Segmented(u32::try_from(data.len()).ok())
+    };
+    Request::InitiateDownload(at, payload)
+}
+
+/// The segment from `start` on, and where its data end.
+fn segment(data: &[u8], start: usize, toggle: bool) -> (Segment, usize) {
+    let chunk = Chunk::new(&data[start..]);
+    let end = start + chunk.len();
+    (Segment { toggle, last: end == data.len(), data: chunk }, end)
+}
+
+impl SubBlock {
+    /// Where the data end that were sent.
+    fn sent(&self, data: &[u8]) -> usize {
+        (self.base + usize::from(self.seqno) * SEGMENT).min(data.len())
+    }
+
+    /// Whether all of it is sent. Empty data have one segment, too.
+    fn is_sent(&self, data: &[u8]) -> bool {
+        self.seqno == self.blksize || (self.seqno > 0 && self.sent(data) == data.len())
+    }
+
+    fn next(&mut self, data: &[u8]) -> BlockSegment {
+        let chunk = Chunk::<SEGMENT>::new(&data[self.sent(data)..]);
+        self.seqno += 1;
+        let mut bytes = [0; SEGMENT];
+        bytes[..chunk.len()].copy_from_slice(&chunk);
+        BlockSegment { last: self.sent(data) == data.len(), seqno: self.seqno, data: bytes }
+    }
+
+    /// On with the next sub-block, from behind the last segment that arrived. If that was the last of all it gives
+    /// the CRC over all data, 0 where it is not wanted.
+    fn acknowledged(&mut self, ack: BlockAck, data: &[u8]) -> Result<Option<u16>, AbortCode> {
+        let blksize = check_blksize(ack.blksize)?;
+        if ack.ackseq > self.seqno {
+            // Before all is sent: the acknowledgement of the sub-block before, once more.
+            return if self.is_sent(data) { Err(AbortCode::SEQUENCE_NUMBER) } else { Ok(None) };
+        }
+        let all = self.is_sent(data) && ack.ackseq == self.seqno && self.sent(data) == data.len();
+        self.in_vain = if ack.ackseq == 0 { self.in_vain + 1 } else { 0 };
+        if self.in_vain == HOPELESS {
+            return Err(AbortCode::SEQUENCE_NUMBER);
+        }
+        self.base = (self.base + usize::from(ack.ackseq) * SEGMENT).min(data.len());
+        self.blksize = blksize;
+        self.seqno = 0;
+        if !all {
+            return Ok(None);
+        }
+        let mut crc = Crc16::new();
+        if self.crc {
+            crc.update(data);
+        }
+        Ok(Some(crc.get()))
+    }
+}
+
+impl<D: AsRef<[u8]>> Transfer for Download<D> {
+    fn handle(&mut self, frame: &Frame, now: Instant) {
+        if let Some(bytes) = self.link.answer(frame) {
+            let next = self.answer(bytes);
+            self.link.advance(next, now);
+        }
+    }
+
+    fn poll(&mut self, now: Instant) -> Step {
+        let data = self.data.as_ref();
+        match &mut self.state {
+            State::Blocks(sub_block) if self.link.result.is_none() && !sub_block.is_sent(data) => {
+                let segment = sub_block.next(data);
+                self.link.send(segment.emit(), now)
+            }
+            _ => self.link.poll(now),
+        }
+    }
+
+    fn progress(&self) -> u32 {
+        self.link.progress
+    }
+
+    fn abort(&mut self, code: AbortCode) {
+        self.link.abort(code);
+    }
+}

@@ -1,0 +1,241 @@
+//! The SDO client: one value per transfer, [`Download`] or [`Upload`].
+//!
+//! A transfer is driven through [`Transfer`]: [`handle`](Transfer::handle) takes frames, whatever they are, and
+//! [`poll`](Transfer::poll) tells what to do next. A blocking caller loops over one transfer, a caller with many nodes
+//! keeps one transfer per node and passes every frame to all of them.
+//!
+//! ```
+//! use canopen::sdo::client::{Config, Step, Transfer, Upload};
+//! use canopen::{Address, Frame, Instant, NodeId};
+//!
+//! # fn send(_: &Frame) {}
+//! # fn receive(_until: Instant) -> Option<Frame> { None }
+//! # let mut clock = (0..).step_by(100).map(Instant::from_millis);
+//! # let mut now = || clock.next().unwrap();
+//! let node = NodeId::new(5).unwrap();
+//! let mut upload = Upload::new(node, Address::new(0x1018, 1), Vec::new(), Config::default());
+//! let result = loop {
+//!     match upload.poll(now()) {
+//!         Step::Send(frame) => send(&frame),
+//!         Step::Wait(until) => {
+//!             if let Some(frame) = receive(until) {
+//!                 upload.handle(&frame, now());
+//!             }
+//!         }
+//!         Step::Done(result) => break result,
+//!     }
+//! };
+//! let bytes = upload.into_sink();
+//! # assert_eq!(result, Err(canopen::sdo::SdoError::NoAnswer));
+//! ```
+//!
+//! A block transfer has many frames to send, or to receive, between two answers. A caller should take in what has arrived
+//! between two [`Step::Send`], so that a refusal in the middle is heard in the middle.
+
+use core::fmt;
+
+use crate::frame::{CobId, Frame, NodeId};
+use crate::od::Address;
+use crate::sdo::block::BLKSIZE_MAX;
+use crate::sdo::wire::{Request, Response};
+use crate::sdo::AbortCode;
+use crate::time::Instant;
+
+mod download;
+mod upload;
+
+pub use download::Download;
+pub use upload::{Buffer, Sink, Upload};
+
+/// What can be chosen about a transfer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Config {
+    /// How long the server may take for an answer, in milliseconds.
+    pub timeout_ms: u32,
+}
+
+impl Default for Config {
+    /// One second.
+    fn default() -> Self {
+        Self { timeout_ms: 1000 }
+    }
+}
+
+/// What can be chosen about a block transfer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Block {
+    /// Whether to go on segmented if the server does not know block transfer.
+    pub fallback: bool,
+    /// Upload: segments of a sub-block, 1 to 127.
+    pub blksize: u8,
+    /// Upload: up to this many bytes the server may answer without blocks; 0 for never.
+    pub pst: u8,
+    /// Upload: how long a sub-block may pause before what came is acknowledged and the rest asked for again, in
+    /// milliseconds. Less than the server's time-out.
+    pub repeat_ms: u32,
+}
+
+impl Default for Block {
+    /// With fallback, 127 segments, without blocks up to 21 bytes, 300 ms.
+    fn default() -> Self {
+        Self { fallback: true, blksize: BLKSIZE_MAX, pst: 21, repeat_ms: 300 }
+    }
+}
+
+/// Why a transfer failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SdoError {
+    /// The server did not answer in time; the transfer was aborted with 05040000h.
+    NoAnswer,
+    /// The server aborted.
+    Server(AbortCode),
+    /// This side aborted: the server's answer broke the protocol, or the target of an upload refused.
+    Client(AbortCode),
+}
+
+impl fmt::Display for SdoError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NoAnswer => f.write_str("the device did not answer in time"),
+            Self::Server(code) => write!(f, "the device refused: {code}"),
+            Self::Client(code) => write!(f, "transfer aborted from this side: {code}"),
+        }
+    }
+}
+
+impl core::error::Error for SdoError {}
+
+/// What to do next about a transfer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Step {
+    /// Send this frame, and ask again.
+    Send(Frame),
+    /// Wait for frames, until then at the latest.
+    Wait(Instant),
+    /// It is over; the answer stays the same from now on.
+    Done(Result<(), SdoError>),
+}
+
+/// A transfer that is going on.
+pub trait Transfer {
+    /// Takes a frame, whatever it is.
+    fn handle(&mut self, frame: &Frame, now: Instant);
+
+    /// Tells what to do next.
+    fn poll(&mut self, now: Instant) -> Step;
+
+    /// Bytes of data that have arrived at the other side for certain, or have arrived here.
+    fn progress(&self) -> u32;
+
+    /// Gives up: the server is sent this abort.
+    fn abort(&mut self, code: AbortCode);
+}
+
+/// What both directions share: the server, the clock, and the frame that waits to be sent.
+#[derive(Debug)]
+struct Link {
+    node: NodeId,
+    at: Address,
+    timeout_ms: u32,
+    /// Waits to be fetched by `poll`.
+    request: Option<Request>,
+    /// When something last moved.
+    moved: Instant,
+    result: Option<Result<(), SdoError>>,
+    progress: u32,
+}
+
+/// What follows from an answer.
+enum Next {
+    Send(Request),
+    Wait,
+    /// Well done; with a last word to the server, where it wants one.
+    Done(Option<Request>),
+}
+
+impl Link {
+    fn new(node: NodeId, at: Address, config: Config, request: Request) -> Self {
+        Self {
+            node,
+            at,
+            timeout_ms: config.timeout_ms,
+            request: Some(request),
+            moved: Instant::default(),
+            result: None,
+            progress: 0,
+        }
+    }
+
+    /// The eight bytes of an answer, if the frame is one and one is waited for.
+    fn answer<'f>(&self, frame: &'f Frame) -> Option<&'f [u8; 8]> {
+        let waiting = self.result.is_none() && self.request.is_none();
+        if !waiting || frame.cob_id() != Some(CobId::sdo_response(self.node)) {
+            return None;
+        }
+        frame.exactly()
+    }
+
+    fn deadline(&self) -> Instant {
+        self.moved + self.timeout_ms
+    }
+
+    fn poll(&mut self, now: Instant) -> Step {
+        if let Some(request) = self.request.take() {
+            return self.send(request.emit(), now);
+        }
+        match self.result {
+            Some(result) => Step::Done(result),
+            None if now.has_reached(self.deadline()) => {
+                self.result = Some(Err(SdoError::NoAnswer));
+                self.send(Request::Abort(self.at, AbortCode::TIMEOUT).emit(), now)
+            }
+            None => Step::Wait(self.deadline()),
+        }
+    }
+
+    fn send(&mut self, bytes: [u8; 8], now: Instant) -> Step {
+        self.moved = now;
+        Step::Send(Frame::of(CobId::sdo_request(self.node), &bytes))
+    }
+
+    /// Takes what follows from an answer.
+    fn advance(&mut self, next: Result<Next, SdoError>, now: Instant) {
+        self.moved = now;
+        match next {
+            Ok(Next::Send(request)) => self.request = Some(request),
+            Ok(Next::Wait) => {}
+            Ok(Next::Done(farewell)) => {
+                self.request = farewell;
+                self.result = Some(Ok(()));
+            }
+            Err(SdoError::Client(code)) => self.abort(code),
+            Err(error) => self.result = Some(Err(error)),
+        }
+    }
+
+    fn abort(&mut self, code: AbortCode) {
+        if self.result.is_none() {
+            self.request = Some(Request::Abort(self.at, code));
+            self.result = Some(Err(SdoError::Client(code)));
+        }
+    }
+
+    /// An answer that has no place here. The late answer to an earlier transfer's initiate says nothing about this one.
+    fn unexpected(&self, response: Option<Response>) -> Result<Next, SdoError> {
+        match response {
+            Some(Response::Abort(_, code)) => Err(SdoError::Server(code)),
+            Some(
+                Response::InitiateDownload(at)
+                | Response::InitiateUpload(at, _)
+                | Response::InitiateBlockDownload { at, .. }
+                | Response::InitiateBlockUpload { at, .. },
+            ) if at != self.at => Ok(Next::Wait),
+            _ => Err(SdoError::Client(AbortCode::COMMAND)),
+        }
+    }
+}
+
+/// Whether this is how a server says that it does not know block transfer. Some use the general error for it.
+fn means_unknown(code: AbortCode) -> bool {
+    matches!(code, AbortCode::COMMAND | AbortCode::UNSUPPORTED_ACCESS | AbortCode::GENERAL)
+}

@@ -1,0 +1,284 @@
+//! Reading a value.
+
+use crate::frame::{Frame, NodeId};
+use crate::od::Address;
+use crate::sdo::block::{Receiver, BLKSIZE_MAX};
+use crate::sdo::client::{means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer};
+use crate::sdo::wire::{BlockAck, BlockSegment, Payload, Request, Response};
+use crate::sdo::AbortCode;
+use crate::time::Instant;
+
+/// Where an upload goes.
+pub trait Sink {
+    /// The server announces this many bytes. Not called where it does not.
+    ///
+    /// # Errors
+    /// The abort that the server gets.
+    fn announce(&mut self, size: u32) -> Result<(), AbortCode> {
+        let _ = size;
+        Ok(())
+    }
+
+    /// The next bytes.
+    ///
+    /// # Errors
+    /// The abort that the server gets.
+    fn write(&mut self, data: &[u8]) -> Result<(), AbortCode>;
+}
+
+impl<S: Sink + ?Sized> Sink for &mut S {
+    fn announce(&mut self, size: u32) -> Result<(), AbortCode> {
+        (**self).announce(size)
+    }
+
+    fn write(&mut self, data: &[u8]) -> Result<(), AbortCode> {
+        (**self).write(data)
+    }
+}
+
+/// A borrowed buffer as the target of an upload. What does not fit aborts it with 05040005h.
+#[derive(Debug)]
+pub struct Buffer<'b> {
+    bytes: &'b mut [u8],
+    len: usize,
+}
+
+impl<'b> Buffer<'b> {
+    /// An empty target.
+    pub fn new(bytes: &'b mut [u8]) -> Self {
+        Self { bytes, len: 0 }
+    }
+
+    /// What has arrived.
+    #[must_use]
+    pub fn filled(&self) -> &[u8] {
+        &self.bytes[..self.len]
+    }
+}
+
+impl Sink for Buffer<'_> {
+    fn announce(&mut self, size: u32) -> Result<(), AbortCode> {
+        if size as usize > self.bytes.len() {
+            return Err(AbortCode::OUT_OF_MEMORY);
+        }
+        Ok(())
+    }
+
+    fn write(&mut self, data: &[u8]) -> Result<(), AbortCode> {
+        let end = self.len + data.len();
+        self.bytes.get_mut(self.len..end).ok_or(AbortCode::OUT_OF_MEMORY)?.copy_from_slice(data);
+        self.len = end;
+        Ok(())
+    }
+}
+
+/// It grows with what really arrives; what a server merely announces takes no memory.
+#[cfg(feature = "alloc")]
+impl Sink for alloc::vec::Vec<u8> {
+    fn write(&mut self, data: &[u8]) -> Result<(), AbortCode> {
+        self.extend_from_slice(data);
+        Ok(())
+    }
+}
+
+/// Reads a value, as the server wants to send it.
+#[derive(Debug)]
+pub struct Upload<S> {
+    link: Link,
+    sink: S,
+    /// How many bytes the server told.
+    announced: Option<u32>,
+    state: State,
+    block: Block,
+}
+
+#[derive(Debug)]
+enum State {
+    Initiating,
+    Segments {
+        /// Of the segment that was asked for.
+        toggle: bool,
+    },
+    InitiatingBlock,
+    Blocks(Receiver),
+}
+
+impl<S: Sink> Upload<S> {
+    /// Reads `at` of `node` into `sink`. Nothing is sent before the first [`poll`](Transfer::poll).
+    pub fn new(node: NodeId, at: Address, sink: S, config: Config) -> Self {
+        let link = Link::new(node, at, config, Request::InitiateUpload(at));
+        Self { link, sink, announced: None, state: State::Initiating, block: Block::default() }
+    }
+
+    /// The same, as blocks.
+    pub fn as_blocks(node: NodeId, at: Address, sink: S, config: Config, block: Block) -> Self {
+        let mut upload = Self::new(node, at, sink, config);
+        let blksize = block.blksize.clamp(1, BLKSIZE_MAX);
+        upload.block = Block { blksize, ..block };
+        upload.link.request = Some(Request::InitiateBlockUpload { at, crc: true, blksize, pst: block.pst });
+        upload.state = State::InitiatingBlock;
+        upload
+    }
+
+    /// What has arrived; all of it once the transfer is done and well.
+    pub fn sink(&self) -> &S {
+        &self.sink
+    }
+
+    /// The target back.
+    pub fn into_sink(self) -> S {
+        self.sink
+    }
+
+    fn answer(&mut self, bytes: &[u8; 8]) -> Result<Next, SdoError> {
+        match (Response::parse(bytes), &mut self.state) {
+            (response, State::Blocks(receiver)) => {
+                if receiver.is_complete() {
+                    return self.end_of_blocks(bytes, response);
+                }
+                self.block_segment(bytes)
+            }
+            (
+                Some(Response::InitiateUpload(at, payload)),
+                // A server may answer a block upload without blocks: that is what pst is for.
+                State::Initiating | State::InitiatingBlock,
+            ) if at == self.link.at => match payload {
+                Payload::Expedited(data) => self.take(&data).map(|()| Next::Done(None)),
+                Payload::Unsized(data) => self.take(&data).map(|()| Next::Done(None)),
+                Payload::Segmented(announced) => {
+                    self.announce(announced)?;
+                    self.state = State::Segments { toggle: false };
+                    Ok(Next::Send(Request::UploadSegment(false)))
+                }
+            },
+            (Some(Response::UploadSegment(segment)), State::Segments { toggle }) => {
+                if segment.toggle != *toggle {
+                    return Err(SdoError::Client(AbortCode::TOGGLE));
+                }
+                *toggle = !*toggle;
+                let next = Request::UploadSegment(*toggle);
+                self.take(&segment.data)?;
+                if segment.last {
+                    self.check_length()?;
+                    return Ok(Next::Done(None));
+                }
+                Ok(Next::Send(next))
+            }
+            (Some(Response::InitiateBlockUpload { at, crc, size }), State::InitiatingBlock)
+                if at == self.link.at =>
+            {
+                self.announce(size)?;
+                let mut receiver = Receiver::new(crc);
+                receiver.open(self.block.blksize);
+                self.state = State::Blocks(receiver);
+                Ok(Next::Send(Request::StartBlockUpload))
+            }
+            (Some(Response::Abort(_, code)), State::InitiatingBlock)
+                if self.block.fallback && means_unknown(code) =>
+            {
+                self.state = State::Initiating;
+                Ok(Next::Send(Request::InitiateUpload(self.link.at)))
+            }
+            (response, _) => self.link.unexpected(response),
+        }
+    }
+
+    /// A frame within a sub-block.
+    fn block_segment(&mut self, bytes: &[u8; 8]) -> Result<Next, SdoError> {
+        let State::Blocks(receiver) = &mut self.state else { return Ok(Next::Wait) };
+        let Some(segment) = BlockSegment::parse(bytes) else {
+            // No segment has sequence number 0, and an abort is the one answer that looks like this.
+            return match Response::parse(bytes) {
+                Some(Response::Abort(_, code)) => Err(SdoError::Server(code)),
+                _ => Err(SdoError::Client(AbortCode::SEQUENCE_NUMBER)),
+            };
+        };
+        let received = receiver.take(&segment).map_err(SdoError::Client)?;
+        let next = match received.ackseq {
+            Some(ackseq) => acknowledge(receiver, ackseq, self.block.blksize),
+            None => Next::Wait,
+        };
+        if let Some(data) = received.data {
+            self.take(&data)?;
+        }
+        Ok(next)
+    }
+
+    /// A frame behind the last segment.
+    fn end_of_blocks(&mut self, bytes: &[u8; 8], response: Option<Response>) -> Result<Next, SdoError> {
+        let State::Blocks(receiver) = &mut self.state else { return Ok(Next::Wait) };
+        if receiver.is_duplicate_of_tail(bytes) {
+            return Ok(Next::Wait);
+        }
+        let Some(Response::EndBlockUpload(end)) = response else { return self.link.unexpected(response) };
+        let tail = receiver.finish(&end).map_err(SdoError::Client)?;
+        self.take(&tail)?;
+        self.check_length()?;
+        Ok(Next::Done(Some(Request::EndBlockUpload)))
+    }
+
+    fn announce(&mut self, size: Option<u32>) -> Result<(), SdoError> {
+        self.announced = size;
+        match size {
+            Some(size) => self.sink.announce(size).map_err(SdoError::Client),
+            None => Ok(()),
+        }
+    }
+
+    /// Passes data on; more than was announced are refused.
+    fn take(&mut self, data: &[u8]) -> Result<(), SdoError> {
+        let total = self.link.progress.checked_add(data.len() as u32);
+        let total = total.filter(|total| *total <= self.announced.unwrap_or(u32::MAX));
+        self.link.progress = total.ok_or(SdoError::Client(AbortCode::LENGTH))?;
+        self.sink.write(data).map_err(SdoError::Client)
+    }
+
+    fn check_length(&self) -> Result<(), SdoError> {
+        match self.announced {
+            Some(size) if size != self.link.progress => Err(SdoError::Client(AbortCode::LENGTH)),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Acknowledges a sub-block, which opens the next one.
+fn acknowledge(receiver: &mut Receiver, ackseq: u8, blksize: u8) -> Next {
+    if !receiver.is_complete() {
+        receiver.open(blksize);
+    }
+    Next::Send(Request::AckBlockUpload(BlockAck { ackseq, blksize }))
+}
+
+impl<S: Sink> Transfer for Upload<S> {
+    fn handle(&mut self, frame: &Frame, now: Instant) {
+        if let Some(bytes) = self.link.answer(frame) {
+            let next = self.answer(bytes);
+            self.link.advance(next, now);
+        }
+    }
+
+    fn poll(&mut self, now: Instant) -> Step {
+        // A sub-block that stopped short: its end was lost.
+        if let State::Blocks(receiver) = &mut self.state {
+            let idle = self.link.result.is_none() && self.link.request.is_none();
+            if idle && receiver.is_within() {
+                let repeat = self.link.moved + self.block.repeat_ms.min(self.link.timeout_ms);
+                if !now.has_reached(repeat) {
+                    return Step::Wait(repeat);
+                }
+                let ackseq = receiver.close();
+                let next = acknowledge(receiver, ackseq, self.block.blksize);
+                self.link.advance(Ok(next), now);
+            }
+        }
+        self.link.poll(now)
+    }
+
+    fn progress(&self) -> u32 {
+        self.link.progress
+    }
+
+    fn abort(&mut self, code: AbortCode) {
+        self.link.abort(code);
+    }
+}
