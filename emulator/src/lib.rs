@@ -2,6 +2,10 @@
 
 pub mod bus;
 pub mod bxcan;
+pub mod cortex;
+pub mod cpu;
 pub mod frame;
+pub mod machine;
+pub mod periph;
 pub mod peripheral;
 pub mod time;

@@ -1,0 +1,997 @@
+//! The Cortex-M4: instructions by Unicorn, exceptions by us.
+//!
+//! Unicorn runs instructions and nothing else: it stacks nothing, knows no priorities and no NVIC. This module enters
+//! and leaves exceptions (DDI 0403E section B1.5) and turns what stops Unicorn into an [`Exit`].
+//!
+//! **Time.** One instruction takes one cycle, charged when its block (a straight run of code up to a branch) starts;
+//! entering an exception takes 12 cycles, leaving one 10. Code stops at block borders only, so an interrupt comes at
+//! most one block late. A CPU with wait states takes some 1.3 cycles an instruction; budgets measured here want that
+//! much reserve.
+
+use unicorn_engine::unicorn_const::{uc_error, Arch, HookType, MemType, Mode, Prot, TlbEntry, TlbType};
+use unicorn_engine::{ArmCpuModel, RegisterARM, Unicorn};
+
+use crate::cortex::exceptions::{Masks, BUS_FAULT, HARD_FAULT, MEM_MANAGE, NMI, SV_CALL, USAGE_FAULT};
+use crate::cortex::scs::{cfsr, hfsr};
+use crate::machine::chip::{
+    Chip, BOOT_ALIAS, OPTION_PAGE, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS, PRIVATE, SRAM_ALIAS,
+    SYSTEM_PAGE,
+};
+use crate::machine::memory::{HostMemory, PAGE};
+use crate::machine::report::Access;
+use crate::machine::Error;
+use crate::time::Time;
+
+/// Cycles from recognition of an exception to its first instruction (PM0214 section 2.3.7).
+const ENTRY_CYCLES: u64 = 12;
+/// Cycles of an exception return.
+const RETURN_CYCLES: u64 = 10;
+
+// Unicorn's exception numbers, as its interrupt hook hands them over.
+const EXCP_UDEF: u32 = 1;
+const EXCP_SWI: u32 = 2;
+const EXCP_PREFETCH_ABORT: u32 = 3;
+const EXCP_DATA_ABORT: u32 = 4;
+const EXCP_BKPT: u32 = 7;
+const EXCP_EXCEPTION_EXIT: u32 = 8;
+const EXCP_NOCP: u32 = 17;
+const EXCP_INVSTATE: u32 = 18;
+
+const XPSR_IT_T_IPSR: u32 = 0x0700_FC00 | 0x1FF;
+const XPSR_T: u32 = 1 << 24;
+const XPSR_ALIGNED: u32 = 1 << 9;
+const CONTROL_NPRIV: u32 = 1 << 0;
+const CONTROL_SPSEL: u32 = 1 << 1;
+const CONTROL_FPCA: u32 = 1 << 2;
+
+/// Words of the basic and of the extended stack frame.
+const BASIC_FRAME: u32 = 8;
+const EXTENDED_FRAME: u32 = 26;
+
+/// Why the CPU came back from translated code.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Exit {
+    /// The slice is over, or the chip wanted to leave.
+    Slice,
+    /// WFI was executed.
+    WaitForInterrupt,
+    /// WFE (or YIELD) was executed.
+    WaitForEvent,
+    /// SVC was executed.
+    SupervisorCall,
+    /// An exception return; the value that went to the PC.
+    ExceptionReturn(u32),
+    /// The program wanted flash that is busy.
+    FlashBusy,
+    /// A fault.
+    Fault(Fault),
+}
+
+/// A fault before its escalation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Fault {
+    /// A configurable fault: its exception number, its CFSR bits, and the address for BFAR.
+    Configurable {
+        /// BusFault or UsageFault.
+        exception: u16,
+        /// Bits of CFSR.
+        status: u32,
+        /// Address of a precise bus fault.
+        address: Option<u32>,
+    },
+    /// One that goes to HardFault at once: its HFSR bit.
+    Hard(u32),
+}
+
+impl Fault {
+    fn bus(status: u32, address: Option<u32>) -> Self {
+        Self::Configurable { exception: BUS_FAULT, status, address }
+    }
+
+    fn usage(status: u32) -> Self {
+        Self::Configurable { exception: USAGE_FAULT, status, address: None }
+    }
+}
+
+/// What became of an attempt to enter an exception.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Entry {
+    /// The CPU is in the handler.
+    Taken,
+    /// A fault while stacking or fetching the vector; the CPU is where it was.
+    Failed(Fault),
+    /// The priority is too high for any fault to be taken: lockup (DDI 0403E B1.5.15).
+    Lockup,
+}
+
+/// What the hooks leave for the caller.
+#[derive(Debug, Default)]
+struct Notes {
+    exception: Option<u32>,
+    fault: Option<Fault>,
+    flash_busy: bool,
+    invalid_instruction: bool,
+    /// An instruction of the FPU that is switched off lies in the block, at this address.
+    fpu_instruction: Option<u32>,
+    /// Pages of RAM that code was fetched from.
+    executed: Vec<bool>,
+    /// Pages of flash that code was fetched from.
+    flash_executed: Vec<bool>,
+}
+
+/// Hint instructions that end a block.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Hint {
+    Yield,
+    Wfe,
+    Wfi,
+}
+
+struct State {
+    chip: Chip,
+    notes: Notes,
+}
+
+/// The CPU with the chip that it runs in.
+pub struct Cpu {
+    uc: Unicorn<'static, State>,
+}
+
+fn failed(doing: &'static str) -> impl Fn(uc_error) -> Error {
+    move |error| Error::Engine { doing, error: format!("{error:?}") }
+}
+
+impl Cpu {
+    /// Builds the CPU around `chip`.
+    pub fn new(chip: Chip) -> Result<Self, Error> {
+        let pages = |memory: &HostMemory| vec![false; memory.size() / PAGE as usize];
+        let notes = Notes {
+            executed: pages(&chip.sram),
+            flash_executed: pages(&chip.flash.array),
+            ..Notes::default()
+        };
+        let mut uc = Unicorn::new_with_data(Arch::ARM, Mode::THUMB | Mode::MCLASS, State { chip, notes })
+            .map_err(failed("starting the CPU emulation"))?;
+        uc.ctl_set_cpu_model(ArmCpuModel::CORTEX_M4 as i32).map_err(failed("choosing the CPU"))?;
+        uc.ctl_set_tlb_type(TlbType::VIRTUAL).map_err(failed("choosing the TLB"))?;
+        uc.ctl_exits_enable().map_err(failed("choosing the exits"))?;
+        let mut cpu = Self { uc };
+        cpu.map_memories()?;
+        cpu.add_hooks().map_err(failed("adding the hooks"))?;
+        Ok(cpu)
+    }
+
+    fn map_memories(&mut self) -> Result<(), Error> {
+        let state = self.uc.get_data();
+        let (sram_base, sram_size) = (state.chip.geometry.sram.base, state.chip.geometry.sram.size);
+        let ccm_base = state.chip.geometry.ccm.base;
+        let flash_base = state.chip.geometry.flash.base;
+        let pointer = |memory: &HostMemory| (memory.as_ptr(), memory.size() as u64);
+        let chip = &state.chip;
+        let blocks = [
+            (flash_base, pointer(&chip.flash.array), Prot::READ | Prot::EXEC),
+            (sram_base, pointer(&chip.sram), Prot::ALL),
+            (ccm_base, pointer(&chip.ccm), Prot::READ | Prot::WRITE),
+            (SYSTEM_PAGE.base, pointer(&chip.system), Prot::READ),
+            (OPTION_PAGE.base, pointer(&chip.options), Prot::READ),
+        ];
+        let with_ccm = chip.geometry.ccm.size > 0;
+        for (base, (memory, len), perms) in blocks {
+            if base == ccm_base && !with_ccm {
+                continue;
+            }
+            // SAFETY: the memory belongs to the chip, which the engine's data owns: the engine is closed before its
+            // data is dropped. Its length is a multiple of the page size (`HostMemory::new`).
+            unsafe { self.uc.mem_map_ptr(base.into(), len, perms, memory.cast()) }
+                .map_err(failed("mapping memory"))?;
+        }
+        for region in [PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS, PRIVATE] {
+            let base = region.base;
+            self.uc
+                .mmio_map(
+                    u64::from(base),
+                    u64::from(region.size.next_multiple_of(PAGE)),
+                    Some(move |uc: &mut Unicorn<'_, State>, offset: u64, size: usize| {
+                        let chip = &mut uc.get_data_mut().chip;
+                        u64::from(chip.load(base + offset as u32, size as u8))
+                    }),
+                    Some(move |uc: &mut Unicorn<'_, State>, offset: u64, size: usize, value: u64| {
+                        let chip = &mut uc.get_data_mut().chip;
+                        chip.store(base + offset as u32, size as u8, value as u32);
+                    }),
+                )
+                .map_err(failed("mapping peripherals"))?;
+        }
+        self.uc
+            .mmio_map(
+                SRAM_ALIAS.into(),
+                u64::from(sram_size) * 32,
+                Some(|uc: &mut Unicorn<'_, State>, offset: u64, _size: usize| {
+                    let chip = &uc.get_data().chip;
+                    chip.sram_bit(SRAM_ALIAS + offset as u32)
+                        .map_or(0, |(byte, bit)| u64::from(chip.sram.bytes()[byte] >> bit & 1))
+                }),
+                Some(move |uc: &mut Unicorn<'_, State>, offset: u64, _size: usize, value: u64| {
+                    let chip = &mut uc.get_data_mut().chip;
+                    if let Some((byte, bit)) = chip.sram_bit(SRAM_ALIAS + offset as u32) {
+                        let cell = &mut chip.sram.bytes_mut()[byte];
+                        *cell = *cell & !(1 << bit) | (value as u8 & 1) << bit;
+                    }
+                }),
+            )
+            .map_err(failed("mapping the bit-band alias"))?;
+        Ok(())
+    }
+
+    fn add_hooks(&mut self) -> Result<(), uc_error> {
+        let geometry = self.uc.get_data().chip.geometry;
+        self.uc.add_block_hook(1, 0, |uc, address, size| on_block(uc, address as u32, size))?;
+        self.uc.add_tlb_hook(1, 0, |uc, address, kind| on_tlb_miss(uc, address as u32, kind))?;
+        self.uc.add_intr_hook(|uc, number| {
+            uc.get_data_mut().notes.exception = Some(number);
+            let _ = uc.emu_stop();
+        })?;
+        self.uc.add_insn_invalid_hook(|uc| {
+            uc.get_data_mut().notes.invalid_instruction = true;
+            false
+        })?;
+        // A hook over an address keeps the translator from storing straight into its page, so RAM is left out.
+        let ram = geometry.sram;
+        for (begin, end) in [(0, ram.base - 1), (ram.end(), u32::MAX)] {
+            self.uc.add_mem_hook(
+                HookType::MEM_READ_UNMAPPED | HookType::MEM_WRITE_UNMAPPED,
+                begin.into(),
+                end.into(),
+                |uc, kind, address, size, value| on_unmapped(uc, kind, address as u32, size, value as u32),
+            )?;
+        }
+        for region in [geometry.flash, SYSTEM_PAGE, OPTION_PAGE] {
+            self.uc.add_mem_hook(
+                HookType::MEM_WRITE_PROT,
+                region.base.into(),
+                u64::from(region.end() - 1),
+                |uc, _, address, size, value| on_protected_write(uc, address as u32, size, value as u64),
+            )?;
+        }
+        Ok(())
+    }
+
+    /// The chip.
+    #[must_use]
+    pub fn chip(&self) -> &Chip {
+        &self.uc.get_data().chip
+    }
+
+    /// The chip, to be changed.
+    pub fn chip_mut(&mut self) -> &mut Chip {
+        &mut self.uc.get_data_mut().chip
+    }
+
+    // --- registers ---------------------------------------------------------------------------------------------------
+
+    /// A register of the CPU. The names are Unicorn's own constants, so they are always there.
+    #[must_use]
+    pub fn register(&self, register: RegisterARM) -> u32 {
+        read(&self.uc, register)
+    }
+
+    fn set(&mut self, register: RegisterARM, value: u32) {
+        let _ = self.uc.reg_write(register, u64::from(value));
+    }
+
+    /// The address of the next instruction.
+    #[must_use]
+    pub fn pc(&self) -> u32 {
+        self.register(RegisterARM::PC)
+    }
+
+    /// The mask registers.
+    #[must_use]
+    pub fn masks(&self) -> Masks {
+        masks(&self.uc)
+    }
+
+    /// The exception that the CPU is in; 0 in thread mode.
+    #[must_use]
+    pub fn ipsr(&self) -> u32 {
+        self.register(RegisterARM::IPSR) & 0x1FF
+    }
+
+    /// Thread mode without privilege hides the stack pointers and masks from Unicorn's accessors. This runs `act` with
+    /// privilege.
+    fn privileged<R>(&mut self, act: impl FnOnce(&mut Self) -> R) -> R {
+        let unprivileged = self.ipsr() == 0 && self.register(RegisterARM::CONTROL) & CONTROL_NPRIV != 0;
+        if !unprivileged {
+            return act(self);
+        }
+        self.set_ipsr(u32::from(HARD_FAULT));
+        let result = act(self);
+        self.set_ipsr(0);
+        result
+    }
+
+    fn set_ipsr(&mut self, number: u32) {
+        let xpsr = self.register(RegisterARM::XPSR);
+        self.set(RegisterARM::XPSR_NZCVQG, xpsr & !0x1FF | number);
+    }
+
+    /// Unicorn keeps a digest of the CPU's mode, which writing IPSR or CONTROL leaves stale; writing the flags renews
+    /// it.
+    fn renew_mode(&mut self) {
+        let flags = self.register(RegisterARM::XPSR) & 0xF000_0000;
+        self.set(RegisterARM::APSR_NZCV, flags);
+        let ipsr = self.ipsr();
+        self.chip_mut().scs.ipsr = u16::try_from(ipsr).unwrap_or(0);
+    }
+
+    /// Thread mode, privileged: sets CONTROL whatever it was. In handler mode afterwards if `handler` is not 0.
+    fn set_mode(&mut self, control: u32, handler: u32) {
+        // Only privileged code may write CONTROL, and only thread mode SPSEL: go to a handler, drop nPRIV, go to thread
+        // mode, write the lot.
+        self.set_ipsr(u32::from(HARD_FAULT));
+        self.set(RegisterARM::CONTROL, 0);
+        self.set_ipsr(0);
+        self.set(RegisterARM::CONTROL, control);
+        if handler != 0 {
+            self.set_ipsr(handler);
+        }
+        self.renew_mode();
+    }
+
+    /// Reset: SP and PC from the vector table at address 0, everything else as the architecture says; what it leaves
+    /// open is 0. A vector that cannot be fetched or run faults as on the chip.
+    pub fn reset(&mut self) {
+        use RegisterARM as R;
+        self.set_mode(0, 0);
+        for register in
+            [R::R0, R::R1, R::R2, R::R3, R::R4, R::R5, R::R6, R::R7, R::R8, R::R9, R::R10, R::R11, R::R12]
+        {
+            self.set(register, 0);
+        }
+        self.set(R::LR, u32::MAX);
+        for register in [R::PRIMASK, R::BASEPRI, R::FAULTMASK, R::FPSCR, R::PSP] {
+            self.set(register, 0);
+        }
+        let sp = self.peek(BOOT_ALIAS).unwrap_or(0) & !3;
+        let entry = self.peek(BOOT_ALIAS + 4).unwrap_or(0);
+        self.set(R::MSP, sp);
+        self.set(R::XPSR_NZCVQG, if entry & 1 != 0 { XPSR_T } else { 0 });
+        self.set(R::PC, entry);
+        self.renew_mode();
+        let notes = &mut self.uc.get_data_mut().notes;
+        *notes = Notes {
+            executed: std::mem::take(&mut notes.executed),
+            flash_executed: std::mem::take(&mut notes.flash_executed),
+            ..Notes::default()
+        };
+        let chip = self.chip_mut();
+        chip.block = (0, 0);
+        chip.flush_tlb = true;
+    }
+
+    /// Drops every translation and what the translator knows of the memory.
+    pub fn forget_translations(&mut self) {
+        let notes = &mut self.uc.get_data_mut().notes;
+        notes.executed.fill(false);
+        notes.flash_executed.fill(false);
+        let _ = self.uc.ctl_flush_tb();
+        let _ = self.uc.ctl_flush_tlb();
+        self.chip_mut().stale.clear();
+        self.chip_mut().flush_tlb = false;
+    }
+
+    // --- memory ------------------------------------------------------------------------------------------------------
+
+    /// The memory block behind `address` with the offset in it. Only plain memory, no peripherals.
+    fn memory(chip: &Chip, address: u32) -> Option<(&HostMemory, usize)> {
+        let geometry = chip.geometry;
+        let flash_alias = shared_abi::geometry::Region::new(BOOT_ALIAS, geometry.flash.size);
+        for (region, memory) in [
+            (geometry.sram, &chip.sram),
+            (geometry.flash, &chip.flash.array),
+            (flash_alias, &chip.flash.array),
+            (geometry.ccm, &chip.ccm),
+            (SYSTEM_PAGE, &chip.system),
+            (OPTION_PAGE, &chip.options),
+        ] {
+            if region.contains(address, 1) {
+                return Some((memory, (address - region.base) as usize));
+            }
+        }
+        None
+    }
+
+    /// Copies memory into `buffer`; whether all of it is memory.
+    #[must_use]
+    pub fn read_memory(&self, address: u32, buffer: &mut [u8]) -> bool {
+        let Some((memory, offset)) = Self::memory(self.chip(), address) else { return buffer.is_empty() };
+        match memory.bytes().get(offset..offset + buffer.len()) {
+            Some(bytes) => {
+                buffer.copy_from_slice(bytes);
+                true
+            }
+            None => false,
+        }
+    }
+
+    fn peek(&self, address: u32) -> Option<u32> {
+        let mut word = [0; 4];
+        self.read_memory(address, &mut word).then(|| u32::from_le_bytes(word))
+    }
+
+    /// Writes into SRAM or CCM; whether all of it lies there. Translations of it are dropped.
+    pub fn write_ram(&mut self, address: u32, bytes: &[u8]) -> bool {
+        let chip = self.chip_mut();
+        let geometry = chip.geometry;
+        let Ok(len) = u32::try_from(bytes.len()) else { return false };
+        for (region, memory) in [(geometry.sram, &mut chip.sram), (geometry.ccm, &mut chip.ccm)] {
+            if region.contains(address, len) {
+                let at = (address - region.base) as usize;
+                memory.bytes_mut()[at..at + bytes.len()].copy_from_slice(bytes);
+                if len > 0 {
+                    chip.stale.push((address, len));
+                }
+                return true;
+            }
+        }
+        false
+    }
+
+    fn poke(&mut self, address: u32, word: u32) -> bool {
+        // A stack is no code: no translation needs dropping, or the chip would be as confused.
+        let chip = self.chip_mut();
+        let geometry = chip.geometry;
+        for (region, memory) in [(geometry.sram, &mut chip.sram), (geometry.ccm, &mut chip.ccm)] {
+            if region.contains(address, 4) {
+                let at = (address - region.base) as usize;
+                memory.bytes_mut()[at..at + 4].copy_from_slice(&word.to_le_bytes());
+                return true;
+            }
+        }
+        false
+    }
+
+    // --- running -----------------------------------------------------------------------------------------------------
+
+    /// Runs translated code until the chip's slice ends or something else happens.
+    pub fn run(&mut self) -> Exit {
+        self.drop_stale();
+        self.chip_mut().leave = false;
+        let exit = self.enter(None);
+        let Some(address) = self.uc.get_data_mut().notes.fpu_instruction.take() else { return exit };
+        // The FPU is off: run up to its instruction, which faults.
+        if address != self.pc() {
+            let _ = self.uc.ctl_remove_cache(u64::from(self.pc()), u64::from(address) + 4);
+            self.chip_mut().leave = false;
+            let exit = self.enter(Some(address));
+            if exit != Exit::WaitForInterrupt || self.pc() != address {
+                return exit;
+            }
+        }
+        Exit::Fault(Fault::usage(cfsr::NOCP))
+    }
+
+    fn enter(&mut self, until: Option<u32>) -> Exit {
+        if let Some(until) = until {
+            let _ = self.uc.ctl_set_exits(&[u64::from(until)]);
+        }
+        let thumb = self.register(RegisterARM::XPSR) & XPSR_T != 0;
+        let begin = self.pc() | u32::from(thumb);
+        let result = self.uc.emu_start(u64::from(begin), 0, 0, 0);
+        if until.is_some() {
+            let _ = self.uc.ctl_set_exits(&[]);
+        }
+        self.why(result)
+    }
+
+    fn drop_stale(&mut self) {
+        for (address, len) in std::mem::take(&mut self.chip_mut().stale) {
+            if !self.was_executed(address, len) {
+                continue;
+            }
+            let _ = self.uc.ctl_remove_cache(u64::from(address), u64::from(address) + u64::from(len));
+        }
+        if std::mem::take(&mut self.chip_mut().flush_tlb) {
+            let _ = self.uc.ctl_flush_tlb();
+        }
+    }
+
+    /// Whether code was fetched from a page of this range; only then can there be translations of it.
+    fn was_executed(&self, address: u32, len: u32) -> bool {
+        let State { chip, notes } = self.uc.get_data();
+        let geometry = chip.geometry;
+        for (region, pages) in [(geometry.flash, &notes.flash_executed), (geometry.sram, &notes.executed)] {
+            if region.contains(address, len) {
+                let first = (address - region.base) / PAGE;
+                let last = (address - region.base + len.max(1) - 1) / PAGE;
+                return pages[first as usize..=last as usize].contains(&true);
+            }
+        }
+        true
+    }
+
+    fn why(&mut self, result: Result<(), uc_error>) -> Exit {
+        let pc = self.pc();
+        let notes = &mut self.uc.get_data_mut().notes;
+        let exception = notes.exception.take();
+        let fault = notes.fault.take();
+        let busy = std::mem::take(&mut notes.flash_busy);
+        let invalid = std::mem::take(&mut notes.invalid_instruction);
+        if busy {
+            self.uncharge(pc);
+            return Exit::FlashBusy;
+        }
+        if let Some(fault) = fault {
+            self.uncharge(pc);
+            return Exit::Fault(fault);
+        }
+        if invalid {
+            return self.invalid(pc);
+        }
+        match exception {
+            Some(EXCP_SWI) => Exit::SupervisorCall,
+            Some(EXCP_EXCEPTION_EXIT) => Exit::ExceptionReturn(pc | 1),
+            Some(EXCP_BKPT) => Exit::Fault(Fault::Hard(hfsr::DEBUGEVT)),
+            Some(EXCP_DATA_ABORT) => {
+                self.uncharge(pc);
+                Exit::Fault(Fault::usage(cfsr::UNALIGNED))
+            }
+            Some(EXCP_PREFETCH_ABORT) => Exit::Fault(Fault::bus(cfsr::IBUSERR, None)),
+            Some(EXCP_NOCP) => Exit::Fault(Fault::usage(cfsr::NOCP)),
+            Some(EXCP_INVSTATE) => Exit::Fault(Fault::usage(cfsr::INVSTATE)),
+            Some(EXCP_UDEF) | Some(_) => Exit::Fault(Fault::usage(cfsr::UNDEFINSTR)),
+            None => match result {
+                // A write may have asked to leave in the very block that ends in WFI.
+                Ok(()) if self.chip().leave && !matches!(self.last_hint(pc), Some(Hint::Wfi)) => Exit::Slice,
+                Ok(()) => Exit::WaitForInterrupt,
+                // Every error of memory goes through a hook that notes a fault; what is left is an access that the
+                // model denies without one.
+                Err(_) => Exit::Fault(Fault::bus(cfsr::PRECISERR, None)),
+            },
+        }
+    }
+
+    /// The hint instruction that ended the last block, if the CPU stands right behind it.
+    fn last_hint(&self, pc: u32) -> Option<Hint> {
+        let (start, size) = self.chip().block;
+        if size == 0 || pc != start.wrapping_add(size) {
+            return None;
+        }
+        match count_instructions(self.chip(), start, size).last {
+            0xBF10 | 0xF3AF_8001 => Some(Hint::Yield),
+            0xBF20 | 0xF3AF_8002 => Some(Hint::Wfe),
+            0xBF30 | 0xF3AF_8003 => Some(Hint::Wfi),
+            _ => None,
+        }
+    }
+
+    /// Unicorn calls WFE, YIELD, undefined instructions and a clear Thumb bit all by the same name.
+    fn invalid(&mut self, pc: u32) -> Exit {
+        if self.register(RegisterARM::XPSR) & XPSR_T == 0 {
+            return Exit::Fault(Fault::usage(cfsr::INVSTATE));
+        }
+        match self.last_hint(pc) {
+            Some(Hint::Wfe) => Exit::WaitForEvent,
+            Some(_) => Exit::Slice,
+            None => {
+                self.uncharge(pc);
+                Exit::Fault(Fault::usage(cfsr::UNDEFINSTR))
+            }
+        }
+    }
+
+    /// A block was charged as a whole when it started, but ended at `pc`: gives back the rest.
+    fn uncharge(&mut self, pc: u32) {
+        let chip = self.chip_mut();
+        let (start, size) = chip.block;
+        if pc < start || pc >= start.wrapping_add(size) {
+            return;
+        }
+        let rest = count_instructions(chip, pc, start + size - pc).instructions;
+        chip.clock.cycles = chip.clock.cycles.saturating_sub(rest);
+        chip.counters.instructions = chip.counters.instructions.saturating_sub(rest);
+    }
+
+    // --- exceptions --------------------------------------------------------------------------------------------------
+
+    /// The exception that is to be taken now.
+    #[must_use]
+    pub fn deliverable(&mut self) -> Option<u16> {
+        if !self.chip().check_exceptions {
+            return None;
+        }
+        let masks = self.privileged(|cpu| cpu.masks());
+        self.chip().scs.exceptions.deliverable(masks)
+    }
+
+    /// Whether WFI ends.
+    #[must_use]
+    pub fn wakes(&mut self) -> bool {
+        let masks = self.privileged(|cpu| cpu.masks());
+        self.chip().scs.exceptions.wakes(masks)
+    }
+
+    /// Where the vector of `exception` is.
+    #[must_use]
+    pub fn vector_address(&self, exception: u16) -> u32 {
+        self.chip().scs.vtor.wrapping_add(4 * u32::from(exception))
+    }
+
+    /// Enters `exception` (DDI 0403E B1.5.6).
+    pub fn enter_exception(&mut self, exception: u16) -> Entry {
+        use RegisterARM as R;
+        let Some(handler) = self.peek(self.vector_address(exception)) else {
+            if exception == HARD_FAULT || exception == NMI {
+                return Entry::Lockup;
+            }
+            return Entry::Failed(Fault::Hard(hfsr::VECTTBL));
+        };
+        let thread = self.ipsr() == 0;
+        let control = self.register(R::CONTROL);
+        let on_psp = thread && control & CONTROL_SPSEL != 0;
+        let floating = control & CONTROL_FPCA != 0;
+        let words = if floating { EXTENDED_FRAME } else { BASIC_FRAME };
+        let sp = self.register(R::SP);
+        let aligns = self.chip().scs.aligns_stack() || floating;
+        let padding = aligns && sp & 4 != 0;
+        let frame = sp.wrapping_sub(4 * words).wrapping_sub(if padding { 4 } else { 0 });
+        let xpsr = self.register(R::XPSR) & !XPSR_ALIGNED | if padding { XPSR_ALIGNED } else { 0 };
+        let mut contents = vec![
+            self.register(R::R0),
+            self.register(R::R1),
+            self.register(R::R2),
+            self.register(R::R3),
+            self.register(R::R12),
+            self.register(R::LR),
+            self.pc(),
+            xpsr,
+        ];
+        if floating {
+            contents.extend((0..16).map(|n| self.single(n)));
+            contents.extend([self.register(R::FPSCR), 0]);
+        }
+        let stacked =
+            (frame..).step_by(4).zip(contents).fold(true, |ok, (at, word)| self.poke(at, word) && ok);
+        if !stacked && exception != HARD_FAULT && exception != NMI {
+            return Entry::Failed(Fault::bus(cfsr::STKERR, None));
+        }
+        self.set(R::SP, frame);
+        let return_to = match (thread, on_psp) {
+            (false, _) => 0xFFFF_FFF1,
+            (true, false) => 0xFFFF_FFF9,
+            (true, true) => 0xFFFF_FFFD,
+        } & if floating { !0x10_u32 } else { !0 };
+        if control & (CONTROL_SPSEL | CONTROL_FPCA) != 0 {
+            self.set_mode(control & CONTROL_NPRIV, u32::from(exception));
+        }
+        self.set(R::LR, return_to);
+        let flags = self.register(R::XPSR) & !XPSR_IT_T_IPSR;
+        let thumb = if handler & 1 != 0 { XPSR_T } else { 0 };
+        self.set(R::XPSR_NZCVQG, flags | thumb | u32::from(exception));
+        self.set(R::PC, handler);
+        self.renew_mode();
+        let chip = self.chip_mut();
+        chip.scs.exceptions.enter(exception);
+        chip.check_exceptions = chip.scs.exceptions.any_pending();
+        chip.clock.cycles += ENTRY_CYCLES;
+        if let Some(count) = chip.counters.exceptions.get_mut(usize::from(exception)) {
+            *count += 1;
+        }
+        Entry::Taken
+    }
+
+    /// Leaves the present exception by `value` (DDI 0403E B1.5.8); the fault that a bad value or stack leads to.
+    pub fn return_from_exception(&mut self, value: u32) -> Result<(), Fault> {
+        use RegisterARM as R;
+        let leaving = u16::try_from(self.ipsr()).unwrap_or(0);
+        let (handler, on_psp) = match value & 0xF {
+            0x1 => (true, false),
+            0x9 => (false, false),
+            0xD => (false, true),
+            _ => return Err(Fault::usage(cfsr::INVPC)),
+        };
+        if value | 0x1F != u32::MAX || !self.chip().scs.exceptions.is_active(leaving) {
+            return Err(Fault::usage(cfsr::INVPC));
+        }
+        let nested = self.chip().scs.exceptions.active_count() > 1;
+        if handler != nested {
+            return Err(Fault::usage(cfsr::INVPC));
+        }
+        let floating = value & 0x10 == 0;
+        let words = if floating { EXTENDED_FRAME } else { BASIC_FRAME };
+        let frame = if on_psp { self.register(R::PSP) } else { self.register(R::MSP) };
+        let mut contents = Vec::new();
+        for at in (frame..).step_by(4).take(words as usize) {
+            match self.peek(at) {
+                Some(word) => contents.push(word),
+                None => return Err(Fault::bus(cfsr::UNSTKERR, None)),
+            }
+        }
+        let xpsr = contents[7];
+        let back_to = xpsr & 0x1FF;
+        if handler == (back_to == 0) {
+            return Err(Fault::usage(cfsr::INVPC));
+        }
+        let npriv = self.register(R::CONTROL) & CONTROL_NPRIV;
+        if leaving != NMI {
+            self.set(R::FAULTMASK, 0);
+        }
+        let sp = frame + 4 * words + if xpsr & XPSR_ALIGNED != 0 { 4 } else { 0 };
+        self.set(if on_psp { R::PSP } else { R::MSP }, sp);
+        for (register, word) in [R::R0, R::R1, R::R2, R::R3, R::R12, R::LR].into_iter().zip(&contents) {
+            self.set(register, *word);
+        }
+        if floating {
+            for (n, word) in (0..16).zip(&contents[8..24]) {
+                self.set_single(n, *word);
+            }
+            self.set(R::FPSCR, contents[24]);
+        }
+        let control =
+            npriv | if on_psp { CONTROL_SPSEL } else { 0 } | if floating { CONTROL_FPCA } else { 0 };
+        if handler && control & !CONTROL_NPRIV == 0 {
+            self.set_ipsr(back_to);
+        } else {
+            // Thread mode's SPSEL is what the value says; a handler keeps its own (0).
+            let control = if handler { control & !CONTROL_SPSEL } else { control };
+            self.set_mode(control, back_to);
+        }
+        self.set(R::XPSR_NZCVQG, xpsr & !XPSR_ALIGNED);
+        self.set(R::PC, contents[6] & !1 | xpsr >> 24 & 1);
+        self.renew_mode();
+        let chip = self.chip_mut();
+        chip.scs.exceptions.leave(leaving);
+        chip.check_exceptions = chip.scs.exceptions.any_pending();
+        chip.clock.cycles += RETURN_CYCLES;
+        Ok(())
+    }
+
+    fn single_register(n: i32) -> i32 {
+        RegisterARM::S0 as i32 + n
+    }
+
+    fn single(&self, n: i32) -> u32 {
+        self.uc.reg_read(Self::single_register(n)).unwrap_or(0) as u32
+    }
+
+    fn set_single(&mut self, n: i32, value: u32) {
+        let _ = self.uc.reg_write(Self::single_register(n), u64::from(value));
+    }
+
+    /// Takes a fault: at its own priority if it is enabled and high enough, as HardFault otherwise (DDI 0403E B1.5.10).
+    pub fn take_fault(&mut self, fault: Fault) -> Entry {
+        let mut fault = fault;
+        // A fault while entering a fault's handler escalates once, to HardFault; then there is nothing higher.
+        for _ in 0..3 {
+            let masks = self.privileged(|cpu| cpu.masks());
+            let scs = &mut self.chip_mut().scs;
+            let current = scs.exceptions.execution_priority(masks);
+            let exception = match fault {
+                Fault::Configurable { exception, status, address } => {
+                    scs.cfsr |= status;
+                    if let Some(address) = address {
+                        scs.bfar = address;
+                        scs.cfsr |= cfsr::BFARVALID;
+                    }
+                    let taken = scs.exceptions.is_enabled(exception)
+                        && scs.exceptions.group_priority(exception) < current;
+                    if taken {
+                        exception
+                    } else {
+                        scs.hfsr |= hfsr::FORCED;
+                        HARD_FAULT
+                    }
+                }
+                Fault::Hard(status) => {
+                    scs.hfsr |= status;
+                    HARD_FAULT
+                }
+            };
+            if exception == HARD_FAULT && current <= -1 {
+                return Entry::Lockup;
+            }
+            match self.enter_exception(exception) {
+                Entry::Failed(next) => fault = next,
+                entry => return entry,
+            }
+        }
+        Entry::Lockup
+    }
+
+    /// Carries out SVC: the call is taken if its priority allows, and is a HardFault otherwise.
+    pub fn supervisor_call(&mut self) -> Entry {
+        let masks = self.privileged(|cpu| cpu.masks());
+        let exceptions = &self.chip().scs.exceptions;
+        if exceptions.group_priority(SV_CALL) < exceptions.execution_priority(masks) {
+            match self.enter_exception(SV_CALL) {
+                Entry::Failed(fault) => self.take_fault(fault),
+                entry => entry,
+            }
+        } else {
+            self.take_fault(Fault::Hard(hfsr::FORCED))
+        }
+    }
+
+    /// The fault of a write that the bus refused after the CPU had gone on.
+    #[must_use]
+    pub fn late_bus_fault() -> Fault {
+        Fault::bus(cfsr::IMPRECISERR, None)
+    }
+}
+
+fn read(uc: &Unicorn<'_, State>, register: RegisterARM) -> u32 {
+    uc.reg_read(register).unwrap_or(0) as u32
+}
+
+fn masks(uc: &Unicorn<'_, State>) -> Masks {
+    Masks {
+        primask: read(uc, RegisterARM::PRIMASK) & 1 != 0,
+        faultmask: read(uc, RegisterARM::FAULTMASK) & 1 != 0,
+        basepri: (read(uc, RegisterARM::BASEPRI) & 0xFF) as u8,
+    }
+}
+
+// The hooks of loads and stores never stop the engine themselves: it would put the PC back to the instruction, which then
+// runs twice. They set `Chip::leave`, and the next block does not start.
+//
+// --- hooks -----------------------------------------------------------------------------------------------------------
+
+fn stop(uc: &mut Unicorn<'_, State>) {
+    uc.get_data_mut().chip.leave = true;
+    let _ = uc.emu_stop();
+}
+
+/// A block is about to run.
+fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
+    let state = uc.get_data_mut();
+    let chip = &mut state.chip;
+    if chip.leave || chip.clock.cycles >= chip.slice_end {
+        return stop(uc);
+    }
+    if is_flash(chip, address) && is_flash_busy(chip) {
+        state.notes.flash_busy = true;
+        return stop(uc);
+    }
+    if chip.check_exceptions {
+        let masks = masks(uc);
+        if uc.get_data().chip.scs.exceptions.deliverable(masks).is_some() {
+            return stop(uc);
+        }
+    }
+    let state = uc.get_data_mut();
+    let chip = &mut state.chip;
+    let block = count_instructions(chip, address, size);
+    if block.fpu.is_some() && !chip.scs.fpu_enabled() {
+        state.notes.fpu_instruction = block.fpu;
+        return stop(uc);
+    }
+    let chip = &mut uc.get_data_mut().chip;
+    chip.block = (address, size);
+    chip.clock.cycles += block.instructions;
+    chip.counters.instructions += block.instructions;
+}
+
+/// A look over the instructions of a block.
+struct Block {
+    instructions: u64,
+    /// The first one of the FPU, looked for only while the FPU is off.
+    fpu: Option<u32>,
+    /// Encoding of the last one; a 16-bit one has zeros above.
+    last: u32,
+}
+
+fn count_instructions(chip: &Chip, address: u32, size: u32) -> Block {
+    let mut block = Block { instructions: 0, fpu: None, last: 0 };
+    let Some((memory, offset)) = Cpu::memory(chip, address) else { return block };
+    let Some(code) = memory.bytes().get(offset..(offset + size as usize)) else { return block };
+    let watch_fpu = !chip.scs.fpu_enabled();
+    let mut at = 0;
+    while at + 2 <= code.len() {
+        let first = u16::from_le_bytes([code[at], code[at + 1]]);
+        // DDI 0403E A5.1: the upper five bits 11101, 11110, 11111 start a 32-bit instruction.
+        let wide = first >> 11 >= 0b11101;
+        // Coprocessor space (A5.3.18) with coprocessor number 10 or 11.
+        if watch_fpu && wide && first & 0xEC00 == 0xEC00 && block.fpu.is_none() {
+            let coprocessor = code.get(at + 3).map(|byte| byte & 0x0F);
+            if matches!(coprocessor, Some(0xA | 0xB)) {
+                block.fpu = Some(address + at as u32);
+            }
+        }
+        block.instructions += 1;
+        block.last = u32::from(first);
+        at += 2;
+        if wide {
+            let second = code.get(at..at + 2).map_or(0, |half| u16::from_le_bytes([half[0], half[1]]));
+            block.last = block.last << 16 | u32::from(second);
+            at += 2;
+        }
+    }
+    block
+}
+
+fn is_flash(chip: &Chip, address: u32) -> bool {
+    address < chip.geometry.flash.size || chip.geometry.flash.contains(address, 1)
+}
+
+fn is_flash_busy(chip: &mut Chip) -> bool {
+    let Some(until) = chip.flash.busy_until() else { return false };
+    let now: Time = chip.now();
+    until > now
+}
+
+/// The translator asks what lies in a page. Memory is where it is, flash also at 0; RAM pages are executable only once
+/// something was executed there, because stores to executable pages are slow.
+fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Option<TlbEntry> {
+    let state = uc.get_data_mut();
+    let chip = &mut state.chip;
+    let geometry = chip.geometry;
+    let entry = |paddr: u32, perms| Some(TlbEntry { paddr: u64::from(paddr), perms });
+    if is_flash(chip, address) {
+        let paddr = if address < geometry.flash.size { geometry.flash.base + address } else { address };
+        return match kind {
+            // Its own entry, which allows nothing else: the store itself is carried out by its hook.
+            MemType::WRITE => entry(paddr, Prot::WRITE),
+            MemType::READ if is_flash_busy(chip) => {
+                state.notes.flash_busy = true;
+                None
+            }
+            _ => {
+                if kind == MemType::FETCH {
+                    state.notes.flash_executed[((paddr - geometry.flash.base) / PAGE) as usize] = true;
+                }
+                entry(paddr, Prot::READ | Prot::EXEC)
+            }
+        };
+    }
+    if geometry.sram.contains(address, 1) {
+        let page = ((address - geometry.sram.base) / PAGE) as usize;
+        if kind == MemType::FETCH {
+            state.notes.executed[page] = true;
+        }
+        let perms = if state.notes.executed[page] { Prot::ALL } else { Prot::READ | Prot::WRITE };
+        return entry(address, perms);
+    }
+    if kind == MemType::FETCH {
+        let pc = address;
+        chip.report(Access::Fetch, pc, 2, 0, pc, "no code can be executed here".into());
+        // Peripheral and system space are never executable by the default memory map (PM0214 section 2.2.2).
+        let never = matches!(address, 0x4000_0000..=0x5FFF_FFFF | 0xA000_0000..);
+        state.notes.fault = Some(if never {
+            Fault::Configurable { exception: MEM_MANAGE, status: cfsr::IACCVIOL, address: None }
+        } else {
+            Fault::bus(cfsr::IBUSERR, None)
+        });
+        return None;
+    }
+    entry(address, Prot::READ | Prot::WRITE)
+}
+
+/// A load or store where nothing is.
+fn on_unmapped(uc: &mut Unicorn<'_, State>, kind: MemType, address: u32, size: usize, value: u32) -> bool {
+    let pc = read(uc, RegisterARM::PC);
+    let state = uc.get_data_mut();
+    let size = size as u8;
+    let what = "nothing answers here: bus fault".into();
+    if kind == MemType::WRITE_UNMAPPED {
+        state.chip.report(Access::Write, address, size, value, pc, what);
+        state.notes.fault.get_or_insert(Fault::bus(cfsr::IMPRECISERR, None));
+    } else {
+        state.chip.report(Access::Read, address, size, 0, pc, what);
+        state.notes.fault.get_or_insert(Fault::bus(cfsr::PRECISERR, Some(address)));
+    }
+    false
+}
+
+/// A store to flash, or to what is read-only for good.
+fn on_protected_write(uc: &mut Unicorn<'_, State>, address: u32, size: usize, value: u64) -> bool {
+    let pc = read(uc, RegisterARM::PC);
+    let chip = &mut uc.get_data_mut().chip;
+    if is_flash(chip, address) {
+        let bytes = value.to_le_bytes();
+        chip.store_flash(address, &bytes[..size.min(8)], pc);
+    } else {
+        let what = "read-only memory: the write is lost".into();
+        chip.report(Access::Write, address, size as u8, value as u32, pc, what);
+    }
+    true
+}

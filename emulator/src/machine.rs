@@ -1,0 +1,489 @@
+//! One emulated board: chip and CPU in virtual time.
+
+pub mod chip;
+pub mod clock;
+pub mod image;
+pub mod memory;
+pub mod report;
+
+use shared_abi::geometry::Geometry;
+
+use crate::bxcan::BxCan;
+use crate::cpu::{Cpu, Entry, Exit};
+use crate::periph::flash::Noise;
+pub use crate::periph::flash::{Cut, FlashCut, FlashTimes};
+use crate::time::{Span, Time};
+use chip::Chip;
+pub use chip::Counters;
+pub use image::LoadedImage;
+pub use report::{Access, Report};
+
+/// How a machine is set up.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Options {
+    /// Chooses what RAM holds at power-on, and how a power failure tears a flash operation.
+    pub seed: u64,
+    /// Crystal at OSC_IN, in Hz; 0 for none.
+    pub hse_hz: u32,
+    /// Which of the datasheet's times flash operations take.
+    pub flash_times: FlashTimes,
+    /// The 96-bit unique ID.
+    pub unique_id: [u32; 3],
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            hse_hz: 8_000_000,
+            flash_times: FlashTimes::Typical,
+            unique_id: [0x0034_0025, 0x3137_470C, 0x3338_3235],
+        }
+    }
+}
+
+/// Why the chip came out of reset.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ResetCause {
+    /// Power came up.
+    PowerOn,
+    /// NRST was pulled low.
+    Pin,
+    /// AIRCR.SYSRESETREQ.
+    Software,
+    /// The independent watchdog ran out.
+    IndependentWatchdog,
+}
+
+/// Why [`Machine::run_until`] came back.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stop {
+    /// The deadline is reached (or passed by a block of code at most).
+    Deadline,
+    /// The CAN controller wants something of the bus: a frame is to be sent, or its mode changes.
+    Attention,
+    /// The chip went through a reset; it is at its first instruction again.
+    Reset(ResetCause),
+    /// The power cut that was armed struck; the machine is off.
+    PowerCut,
+    /// The CPU has locked up: a fault within the HardFault handler. Only a reset (the watchdog's, perhaps) helps. Told
+    /// once; the machine can be run on.
+    Lockup,
+}
+
+/// What can go wrong with setting up a machine.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The CPU emulation refused.
+    #[error("{doing}: {error}")]
+    Engine {
+        /// What was being done.
+        doing: &'static str,
+        /// Its own word.
+        error: String,
+    },
+    /// The image cannot be used.
+    #[error("{0}")]
+    Image(String),
+    /// An address is not where it has to be.
+    #[error("{len} bytes at {address:08X}h are not all in {wanted}")]
+    Address {
+        /// First address.
+        address: u32,
+        /// Length.
+        len: usize,
+        /// What they should have been in.
+        wanted: &'static str,
+    },
+}
+
+/// What the CPU does when it does not execute.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Activity {
+    Off,
+    Runs,
+    /// WFI.
+    Sleeps,
+    /// WFE: ends at this time at the latest.
+    Dozes {
+        until: Time,
+    },
+    LockedUp,
+}
+
+/// A WFE ends after this time even without an event: SEV is invisible to the model, and the architecture allows WFE to
+/// end for no reason (DDI 0403E B1.5.18).
+const DOZE: Span = Span::from_micros(10);
+
+/// One board.
+pub struct Machine {
+    cpu: Cpu,
+    options: Options,
+    activity: Activity,
+    /// The time while the power is off.
+    off_time: Time,
+    power_cycles: u64,
+}
+
+impl Machine {
+    /// A board with an erased flash and no power.
+    ///
+    /// # Errors
+    /// [`Error::Engine`] where the CPU emulation cannot be set up.
+    pub fn new(chip: &'static Geometry, options: Options) -> Result<Self, Error> {
+        let cpu = Cpu::new(Chip::new(chip, &options))?;
+        Ok(Self { cpu, options, activity: Activity::Off, off_time: Time(0), power_cycles: 0 })
+    }
+
+    /// Stores an ELF file in flash as a debug probe does: what it does not cover stays.
+    ///
+    /// # Errors
+    /// [`Error::Image`] or [`Error::Address`]; the flash is as before then.
+    pub fn load(&mut self, image: &[u8]) -> Result<LoadedImage, Error> {
+        let (segments, entry) = image::parse_elf(image)?;
+        for segment in &segments {
+            self.check_flash(segment.address, segment.bytes.len())?;
+        }
+        let mut loaded = LoadedImage { segments: Vec::new(), entry };
+        for segment in segments {
+            self.load_bin(segment.address, &segment.bytes)?;
+            loaded.segments.push((segment.address, u32::try_from(segment.bytes.len()).unwrap_or(u32::MAX)));
+        }
+        Ok(loaded)
+    }
+
+    /// Stores bytes in flash as a debug probe does.
+    ///
+    /// # Errors
+    /// [`Error::Address`] where they are not all in flash.
+    pub fn load_bin(&mut self, address: u32, bytes: &[u8]) -> Result<(), Error> {
+        let offset = self.check_flash(address, bytes.len())?;
+        let chip = self.cpu.chip_mut();
+        chip.flash.preset(offset, bytes);
+        let changed = chip.flash.take_changed();
+        let base = chip.geometry.flash.base;
+        chip.stale.extend(changed.into_iter().map(|(offset, len)| (base + offset, len)));
+        Ok(())
+    }
+
+    fn check_flash(&self, address: u32, len: usize) -> Result<u32, Error> {
+        let flash = self.cpu.chip().geometry.flash;
+        match u32::try_from(len) {
+            Ok(bytes) if flash.contains(address, bytes) => Ok(address - flash.base),
+            _ => Err(Error::Address { address, len, wanted: "flash" }),
+        }
+    }
+
+    // --- power and reset ---------------------------------------------------------------------------------------------
+
+    /// Power comes up at `now`: RAM holds noise, the chip starts at its reset vector.
+    pub fn power_on(&mut self, now: Time) {
+        self.power_cycles += 1;
+        let mut noise = Noise(self.options.seed ^ self.power_cycles.wrapping_mul(0xA24B_AED4_963E_E407));
+        let hse_hz = self.options.hse_hz;
+        let chip = self.cpu.chip_mut();
+        for memory in [&mut chip.sram, &mut chip.ccm] {
+            for word in memory.bytes_mut().chunks_exact_mut(8) {
+                word.copy_from_slice(&noise.word().to_le_bytes());
+            }
+        }
+        chip.power_on(now, hse_hz);
+        self.cpu.forget_translations();
+        self.start();
+    }
+
+    /// The power goes; a flash operation that runs is torn.
+    pub fn power_off(&mut self) {
+        if self.activity != Activity::Off {
+            self.off_time = self.now();
+            self.activity = Activity::Off;
+            let seed = self.options.seed ^ self.power_cycles;
+            let chip = self.cpu.chip_mut();
+            chip.flash.lose_power(seed);
+            // Off, CAN1 is recessive: as behind a reset.
+            crate::peripheral::Peripheral::reset(&mut chip.can1);
+        }
+    }
+
+    /// NRST is pulled low and released.
+    pub fn reset_pin(&mut self) {
+        if self.is_powered() {
+            self.reset(ResetCause::Pin);
+        }
+    }
+
+    /// Whether the power is on.
+    #[must_use]
+    pub fn is_powered(&self) -> bool {
+        self.activity != Activity::Off
+    }
+
+    fn reset(&mut self, cause: ResetCause) {
+        let chip = self.cpu.chip_mut();
+        chip.reset(cause);
+        chip.counters.resets += 1;
+        self.start();
+    }
+
+    fn start(&mut self) {
+        self.cpu.reset();
+        self.activity = Activity::Runs;
+    }
+
+    /// Cuts the power at a flash operation, counted from this call on; `None` takes the order back. A cut ends
+    /// [`Self::run_until`] with [`Stop::PowerCut`].
+    pub fn cut_power_at(&mut self, cut: Option<FlashCut>) {
+        self.cpu.chip_mut().flash.cut_power_at(cut);
+    }
+
+    // --- time --------------------------------------------------------------------------------------------------------
+
+    /// The machine's virtual time.
+    #[must_use]
+    pub fn now(&self) -> Time {
+        if self.is_powered() {
+            self.cpu.chip().now()
+        } else {
+            self.off_time
+        }
+    }
+
+    /// Runs until `deadline`, or until something the outside must see, and says which. Where it says
+    /// [`Stop::Deadline`], [`Self::now`] is at `deadline` or less than a block of code past it.
+    pub fn run_until(&mut self, deadline: Time) -> Stop {
+        self.cpu.chip_mut().deadline = deadline;
+        loop {
+            if !self.is_powered() {
+                self.off_time = self.off_time.max(deadline);
+                return Stop::Deadline;
+            }
+            let chip = self.cpu.chip_mut();
+            chip.advance();
+            if chip.flash.power_has_failed() {
+                self.power_off();
+                return Stop::PowerCut;
+            }
+            if let Some(cause) = chip.reset_request.take() {
+                self.reset(cause);
+                return Stop::Reset(cause);
+            }
+            if std::mem::take(&mut chip.attention) {
+                return Stop::Attention;
+            }
+            if chip.now() >= deadline {
+                return Stop::Deadline;
+            }
+            if self.step() == Entry::Lockup {
+                self.activity = Activity::LockedUp;
+                return Stop::Lockup;
+            }
+        }
+    }
+
+    /// Lets one thing happen: a run of code, an exception taken, or time passing.
+    fn step(&mut self) -> Entry {
+        let chip = self.cpu.chip_mut();
+        let now = chip.now();
+        if let Some(until) = chip.hold_until {
+            if now < until {
+                let target = chip.next_stop().min(until);
+                self.skip_to(target);
+                let chip = self.cpu.chip_mut();
+                let passed = chip.now() - now;
+                chip.counters.flash_stall_time.0 += passed.0;
+                return Entry::Taken;
+            }
+            chip.hold_until = None;
+        }
+        match self.activity {
+            Activity::Runs => self.execute(),
+            Activity::Sleeps if self.cpu.wakes() => {
+                self.activity = Activity::Runs;
+                Entry::Taken
+            }
+            Activity::Dozes { until } if now >= until || self.cpu.wakes() => {
+                self.activity = Activity::Runs;
+                Entry::Taken
+            }
+            Activity::Dozes { until } => {
+                let target = self.cpu.chip().next_stop().min(until);
+                self.skip_to(target);
+                Entry::Taken
+            }
+            Activity::Sleeps | Activity::LockedUp | Activity::Off => {
+                let target = self.cpu.chip().next_stop();
+                self.skip_to(target);
+                Entry::Taken
+            }
+        }
+    }
+
+    /// Lets time pass up to `target`, and at least a cycle.
+    fn skip_to(&mut self, target: Time) {
+        let clock = &mut self.cpu.chip_mut().clock;
+        let before = clock.cycles;
+        clock.skip_to(target);
+        clock.cycles = clock.cycles.max(before + 1);
+    }
+
+    fn execute(&mut self) -> Entry {
+        if std::mem::take(&mut self.cpu.chip_mut().bus_error) {
+            return self.cpu.take_fault(Cpu::late_bus_fault());
+        }
+        if let Some(exception) = self.cpu.deliverable() {
+            if self.flash_holds(self.cpu.vector_address(exception)) {
+                return Entry::Taken;
+            }
+            return self.settle(|cpu| cpu.enter_exception(exception));
+        }
+        self.cpu.chip_mut().limit_slice();
+        match self.cpu.run() {
+            Exit::Slice => Entry::Taken,
+            Exit::WaitForInterrupt => {
+                let chip = self.cpu.chip_mut();
+                if chip.scs.sleeps_deeply() {
+                    let pc = chip.block.0;
+                    let what = "SLEEPDEEP is set: Stop and Standby are not modelled, the CPU sleeps".into();
+                    chip.report(Access::Read, pc, 2, 0, pc, what);
+                }
+                self.activity = Activity::Sleeps;
+                Entry::Taken
+            }
+            Exit::WaitForEvent => {
+                self.activity = Activity::Dozes { until: self.now() + DOZE };
+                Entry::Taken
+            }
+            Exit::SupervisorCall => self.cpu.supervisor_call(),
+            Exit::ExceptionReturn(value) => match self.cpu.return_from_exception(value) {
+                Ok(()) => {
+                    if self.cpu.ipsr() == 0 && self.cpu.chip().scs.sleeps_on_exit() {
+                        self.activity = Activity::Sleeps;
+                    }
+                    Entry::Taken
+                }
+                Err(fault) => self.cpu.take_fault(fault),
+            },
+            Exit::FlashBusy => {
+                let chip = self.cpu.chip_mut();
+                chip.hold_until = chip.flash.busy_until();
+                chip.counters.flash_stalls += 1;
+                Entry::Taken
+            }
+            Exit::Fault(fault) => self.cpu.take_fault(fault),
+        }
+    }
+
+    fn settle(&mut self, enter: impl FnOnce(&mut Cpu) -> Entry) -> Entry {
+        match enter(&mut self.cpu) {
+            Entry::Failed(fault) => self.cpu.take_fault(fault),
+            entry => entry,
+        }
+    }
+
+    /// Whether reading `address` has to wait for the flash; the wait begins then.
+    fn flash_holds(&mut self, address: u32) -> bool {
+        let chip = self.cpu.chip_mut();
+        let in_flash = chip.geometry.flash.contains(address, 4) || address < chip.geometry.flash.size;
+        let busy = chip.flash.busy_until().filter(|_| in_flash);
+        if busy.is_some() {
+            chip.hold_until = busy;
+            chip.counters.flash_stalls += 1;
+        }
+        busy.is_some()
+    }
+
+    // --- looking and touching ----------------------------------------------------------------------------------------
+
+    /// CAN controller `n`; 0 is CAN1, the only one.
+    ///
+    /// # Panics
+    /// When there is no such controller.
+    pub fn can_mut(&mut self, n: usize) -> &mut BxCan {
+        assert_eq!(n, 0, "the STM32F407's CAN2 is not modelled");
+        &mut self.cpu.chip_mut().can1
+    }
+
+    /// The flash array.
+    #[must_use]
+    pub fn flash(&self) -> &[u8] {
+        self.cpu.chip().flash.array.bytes()
+    }
+
+    /// Copies memory (flash, RAM, CCM, system page) into `buffer`.
+    ///
+    /// # Errors
+    /// [`Error::Address`] where it is not all memory.
+    pub fn read_memory(&self, address: u32, buffer: &mut [u8]) -> Result<(), Error> {
+        if self.cpu.read_memory(address, buffer) {
+            Ok(())
+        } else {
+            Err(Error::Address { address, len: buffer.len(), wanted: "memory" })
+        }
+    }
+
+    /// Writes into RAM.
+    ///
+    /// # Errors
+    /// [`Error::Address`] where it is not all RAM.
+    pub fn write_ram(&mut self, address: u32, bytes: &[u8]) -> Result<(), Error> {
+        if self.cpu.write_ram(address, bytes) {
+            Ok(())
+        } else {
+            Err(Error::Address { address, len: bytes.len(), wanted: "RAM" })
+        }
+    }
+
+    /// The program counter.
+    #[must_use]
+    pub fn pc(&self) -> u32 {
+        self.cpu.pc()
+    }
+
+    /// Drives a pin from outside (`Some`), or lets it go (`None`). Ports that the chip does not have are ignored.
+    pub fn set_pin(&mut self, port: char, pin: u8, level: Option<bool>) {
+        if let Some(index) = port_index(port) {
+            self.cpu.chip_mut().gpio[index].set_outside(pin, level);
+        }
+    }
+
+    /// The level at a pin; low where there is no such port.
+    #[must_use]
+    pub fn pin(&self, port: char, pin: u8) -> bool {
+        port_index(port).is_some_and(|index| self.cpu.chip().gpio[index].level(pin))
+    }
+
+    /// What the program did that the model does not cover, or that the chip would punish.
+    #[must_use]
+    pub fn reports(&self) -> &[Report] {
+        self.cpu.chip().reports.as_slice()
+    }
+
+    /// Forgets the reports.
+    pub fn clear_reports(&mut self) {
+        self.cpu.chip_mut().reports.clear();
+    }
+
+    /// What was counted.
+    #[must_use]
+    pub fn counters(&self) -> Counters {
+        let chip = self.cpu.chip();
+        Counters { cycles: chip.clock.cycles, ..chip.counters.clone() }
+    }
+
+    /// The core clock that the program has set up, in Hz.
+    #[must_use]
+    pub fn core_clock(&self) -> u32 {
+        self.cpu.chip().clocks().hclk
+    }
+
+    /// CFSR and HFSR: why a fault was taken.
+    #[must_use]
+    pub fn fault_status(&self) -> (u32, u32) {
+        let scs = &self.cpu.chip().scs;
+        (scs.cfsr, scs.hfsr)
+    }
+}
+
+fn port_index(port: char) -> Option<usize> {
+    ('A'..='I').position(|name| name == port.to_ascii_uppercase())
+}

@@ -1,0 +1,688 @@
+//! Everything of the chip that is not the instruction set: memories, peripherals, clocks, and who answers where.
+
+use shared_abi::geometry::{Geometry, Region};
+
+use super::clock::CycleClock;
+use super::memory::{HostMemory, PAGE};
+use super::report::{Access, Report, Reports};
+use super::{Options, ResetCause};
+use crate::bxcan::BxCan;
+use crate::cortex::exceptions::SYS_TICK;
+use crate::cortex::scs::{Effect, Scs};
+use crate::periph::crc::Crc;
+use crate::periph::flash::{Flash, Store};
+use crate::periph::gpio::Gpio;
+use crate::periph::iwdg::Iwdg;
+use crate::periph::pwr::Pwr;
+use crate::periph::rcc::{self, Clocks, Rcc, HSI_HZ};
+use crate::periph::syscfg::Syscfg;
+use crate::peripheral::{Peripheral, Unmodelled};
+use crate::time::Time;
+
+/// Where flash (or whatever the boot pins choose) shows up for the reset vector.
+pub const BOOT_ALIAS: u32 = 0;
+/// Page of the system memory that holds the unique ID and the flash size.
+pub const SYSTEM_PAGE: Region = Region::new(0x1FFF_7000, PAGE);
+const UNIQUE_ID: u32 = 0x1FFF_7A10;
+const FLASH_SIZE: u32 = 0x1FFF_7A22;
+/// Page of the option bytes.
+pub const OPTION_PAGE: Region = Region::new(0x1FFF_C000, PAGE);
+/// AHB1 and APB peripherals.
+pub const PERIPHERALS: Region = Region::new(0x4000_0000, 0x0008_0000);
+/// AHB2: USB OTG FS, DCMI, crypto, RNG.
+pub const PERIPHERALS_AHB2: Region = Region::new(0x5000_0000, 0x0006_1000);
+/// Private peripheral bus: DWT, system control space, DBGMCU.
+pub const PRIVATE: Region = Region::new(0xE000_0000, 0x0010_0000);
+const ITM: u32 = 0xE000_0000;
+const DWT: u32 = 0xE000_1000;
+const SCS: u32 = 0xE000_E000;
+const DBGMCU: u32 = 0xE004_2000;
+/// Device 413h (STM32F405/407), revision Y (RM0090 section 38.6.1).
+const DBGMCU_IDCODE: u32 = 0x100F_6413;
+
+/// Bit-band alias of the first MiB of SRAM space (PM0214 section 2.2.5); as much as there is SRAM is mapped.
+pub const SRAM_ALIAS: u32 = 0x2200_0000;
+/// Bit-band alias of the first MiB of peripheral space.
+pub const PERIPHERAL_ALIAS: Region = Region::new(0x4200_0000, 0x0200_0000);
+
+/// A modelled block.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Block {
+    Crc,
+    Rcc,
+    Flash,
+    Gpio(usize),
+    Iwdg,
+    Pwr,
+    Syscfg,
+    Can1,
+}
+
+/// Who answers at an address, with the offset in its registers.
+enum Place {
+    Block { block: Block, offset: u32, enable: ClockEnable },
+    Scs(u32),
+    Dwt(u32),
+    Dbgmcu(u32),
+    Itm,
+    Nobody,
+}
+
+/// Where RCC enables the clock of a block: register offset and bit; `None` for a block that is always clocked.
+type ClockEnable = Option<(u32, u32)>;
+
+/// Start, block, and its clock.
+const BLOCKS: [(u32, Block, ClockEnable); 16] = [
+    (0x4000_3000, Block::Iwdg, None),
+    (0x4000_6400, Block::Can1, Some((rcc::APB1ENR, 25))),
+    (0x4000_7000, Block::Pwr, Some((rcc::APB1ENR, 28))),
+    (0x4001_3800, Block::Syscfg, Some((rcc::APB2ENR, 14))),
+    (0x4002_0000, Block::Gpio(0), Some((rcc::AHB1ENR, 0))),
+    (0x4002_0400, Block::Gpio(1), Some((rcc::AHB1ENR, 1))),
+    (0x4002_0800, Block::Gpio(2), Some((rcc::AHB1ENR, 2))),
+    (0x4002_0C00, Block::Gpio(3), Some((rcc::AHB1ENR, 3))),
+    (0x4002_1000, Block::Gpio(4), Some((rcc::AHB1ENR, 4))),
+    (0x4002_1400, Block::Gpio(5), Some((rcc::AHB1ENR, 5))),
+    (0x4002_1800, Block::Gpio(6), Some((rcc::AHB1ENR, 6))),
+    (0x4002_1C00, Block::Gpio(7), Some((rcc::AHB1ENR, 7))),
+    (0x4002_2000, Block::Gpio(8), Some((rcc::AHB1ENR, 8))),
+    (0x4002_3000, Block::Crc, Some((rcc::AHB1ENR, 12))),
+    (0x4002_3800, Block::Rcc, None),
+    (0x4002_3C00, Block::Flash, None),
+];
+/// Every block of the F4 occupies this much.
+const BLOCK_SIZE: u32 = 0x400;
+
+/// Names of blocks that are not modelled, for reports (RM0090 table 1).
+const UNMODELLED: [(u32, &str); 44] = [
+    (0x4000_0000, "TIM2"),
+    (0x4000_0400, "TIM3"),
+    (0x4000_0800, "TIM4"),
+    (0x4000_0C00, "TIM5"),
+    (0x4000_1000, "TIM6"),
+    (0x4000_1400, "TIM7"),
+    (0x4000_1800, "TIM12"),
+    (0x4000_1C00, "TIM13"),
+    (0x4000_2000, "TIM14"),
+    (0x4000_2800, "RTC"),
+    (0x4000_2C00, "WWDG"),
+    (0x4000_3400, "I2S2ext"),
+    (0x4000_3800, "SPI2"),
+    (0x4000_3C00, "SPI3"),
+    (0x4000_4000, "I2S3ext"),
+    (0x4000_4400, "USART2"),
+    (0x4000_4800, "USART3"),
+    (0x4000_4C00, "UART4"),
+    (0x4000_5000, "UART5"),
+    (0x4000_5400, "I2C1"),
+    (0x4000_5800, "I2C2"),
+    (0x4000_5C00, "I2C3"),
+    (0x4000_6800, "CAN2"),
+    (0x4000_7400, "DAC"),
+    (0x4001_0000, "TIM1"),
+    (0x4001_0400, "TIM8"),
+    (0x4001_1000, "USART1"),
+    (0x4001_1400, "USART6"),
+    (0x4001_2000, "ADC"),
+    (0x4001_2C00, "SDIO"),
+    (0x4001_3000, "SPI1"),
+    (0x4001_3C00, "EXTI"),
+    (0x4001_4000, "TIM9"),
+    (0x4001_4400, "TIM10"),
+    (0x4001_4800, "TIM11"),
+    (0x4002_4000, "the backup SRAM"),
+    (0x4002_6000, "DMA1"),
+    (0x4002_6400, "DMA2"),
+    (0x4002_8000, "Ethernet"),
+    (0x4004_0000, "USB OTG HS"),
+    (0x5000_0000, "USB OTG FS"),
+    (0x5005_0000, "DCMI"),
+    (0x5006_0000, "CRYP/HASH"),
+    (0x5006_0800, "RNG"),
+];
+
+/// What the machine counts.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Counters {
+    /// Instructions executed since the machine was made.
+    pub instructions: u64,
+    /// CPU cycles since the last power-on, sleep and stalls included.
+    pub cycles: u64,
+    /// Exceptions taken, by exception number (16 is interrupt line 0).
+    pub exceptions: Vec<u64>,
+    /// Resets since the last power-on, the power-on itself not counted.
+    pub resets: u64,
+    /// Sectors erased.
+    pub sectors_erased: u64,
+    /// Units of flash programmed.
+    pub units_programmed: u64,
+    /// Flash operations refused with an error flag.
+    pub flash_refused: u64,
+    /// How often the CPU stood still because it wanted the flash while that was busy.
+    pub flash_stalls: u64,
+    /// How long it stood still for that, altogether.
+    pub flash_stall_time: crate::time::Span,
+}
+
+/// The chip around the CPU.
+pub struct Chip {
+    /// What the chip has.
+    pub geometry: &'static Geometry,
+    /// From cycles to time.
+    pub clock: CycleClock,
+    /// Core registers and exceptions.
+    pub scs: Scs,
+    /// Flash interface and array.
+    pub flash: Flash,
+    /// Clocks and reset flags.
+    pub rcc: Rcc,
+    /// The watchdog.
+    pub iwdg: Iwdg,
+    /// The ports.
+    pub gpio: [Gpio; 9],
+    /// CAN1.
+    pub can1: BxCan,
+    pwr: Pwr,
+    crc: Crc,
+    syscfg: Syscfg,
+    dbgmcu: [u32; 3],
+    /// SRAM1 and SRAM2, contiguous.
+    pub sram: HostMemory,
+    /// Core-coupled memory.
+    pub ccm: HostMemory,
+    /// The page with unique ID and flash size.
+    pub system: HostMemory,
+    /// The page with the option bytes.
+    pub options: HostMemory,
+    /// What went wrong.
+    pub reports: Reports,
+    /// What was done.
+    pub counters: Counters,
+
+    /// The CPU goes on until its cycle count reaches this.
+    pub slice_end: u64,
+    /// The owner's deadline, which the slice never passes.
+    pub deadline: Time,
+    /// The CPU leaves translated code at the end of the present block.
+    pub leave: bool,
+    /// An exception is pending that might be taken when the masks allow.
+    pub check_exceptions: bool,
+    /// The bus (CAN) must look.
+    pub attention: bool,
+    /// A system reset was asked for.
+    pub reset_request: Option<ResetCause>,
+    /// The CPU stands still until then: the bus to the flash is held.
+    pub hold_until: Option<Time>,
+    /// An imprecise bus error came back for a write.
+    pub bus_error: bool,
+    /// Translations hold code that has changed since: (address, length).
+    pub stale: Vec<(u32, u32)>,
+    /// The translator's memory of what may be read must go: an operation started, and loads from flash must be noticed.
+    pub flush_tlb: bool,
+    /// That was done for the operation that runs.
+    guarded: bool,
+    /// The block that runs: address and length in bytes.
+    pub block: (u32, u32),
+
+    clocks: Clocks,
+    lines: Vec<u16>,
+}
+
+impl Chip {
+    /// The chip without power.
+    #[must_use]
+    pub fn new(geometry: &'static Geometry, options: &Options) -> Self {
+        let mut system = HostMemory::new(SYSTEM_PAGE.size, 0xFF);
+        let place = |memory: &mut HostMemory, address: u32, bytes: &[u8]| {
+            let at = (address - SYSTEM_PAGE.base) as usize;
+            memory.bytes_mut()[at..at + bytes.len()].copy_from_slice(bytes);
+        };
+        for (i, word) in (0..).zip(options.unique_id) {
+            place(&mut system, UNIQUE_ID + 4 * i, &word.to_le_bytes());
+        }
+        let kib = u16::try_from(geometry.flash.size / 1024).unwrap_or(u16::MAX);
+        place(&mut system, FLASH_SIZE, &kib.to_le_bytes());
+        let rcc = Rcc::new(options.hse_hz);
+        Self {
+            geometry,
+            clock: CycleClock::new(Time(0), HSI_HZ),
+            scs: Scs::new(geometry.interrupts, HSI_HZ.into()),
+            flash: Flash::new(geometry, options.flash_times),
+            clocks: rcc.clocks(),
+            rcc,
+            iwdg: Iwdg::default(),
+            gpio: ['A', 'B', 'C', 'D', 'E', 'F', 'G', 'H', 'I'].map(Gpio::new),
+            can1: BxCan::new(),
+            pwr: Pwr::default(),
+            crc: Crc::default(),
+            syscfg: Syscfg::default(),
+            dbgmcu: [0; 3],
+            sram: HostMemory::new(geometry.sram.size, 0),
+            ccm: HostMemory::new(geometry.ccm.size.max(PAGE), 0),
+            system,
+            options: HostMemory::new(OPTION_PAGE.size, 0xFF),
+            reports: Reports::default(),
+            counters: Counters {
+                instructions: 0,
+                cycles: 0,
+                exceptions: vec![0; usize::from(16 + geometry.interrupts)],
+                resets: 0,
+                sectors_erased: 0,
+                units_programmed: 0,
+                flash_refused: 0,
+                flash_stalls: 0,
+                flash_stall_time: crate::time::Span(0),
+            },
+            slice_end: 0,
+            deadline: Time(0),
+            leave: false,
+            check_exceptions: false,
+            attention: false,
+            reset_request: None,
+            hold_until: None,
+            bus_error: false,
+            stale: Vec::new(),
+            flush_tlb: false,
+            guarded: false,
+            block: (0, 0),
+            lines: Vec::new(),
+        }
+    }
+
+    /// The virtual time.
+    #[must_use]
+    pub fn now(&self) -> Time {
+        self.clock.now()
+    }
+
+    /// A system reset of everything but the CPU: RAM stays, the flags in RCC_CSR gather.
+    pub fn reset(&mut self, cause: ResetCause) {
+        self.rcc.note_reset(cause);
+        let (crc, pwr, syscfg): (&mut dyn Peripheral, _, _) =
+            (&mut self.crc, &mut self.pwr, &mut self.syscfg);
+        for block in [crc, pwr, syscfg, &mut self.rcc, &mut self.flash, &mut self.iwdg, &mut self.can1] {
+            block.reset();
+        }
+        for port in &mut self.gpio {
+            port.reset();
+        }
+        let option_bytes = self.flash.option_bytes();
+        self.options.bytes_mut()[..option_bytes.len()].copy_from_slice(&option_bytes);
+        self.apply_clocks();
+        self.scs = Scs::new(self.geometry.interrupts, self.clock.hz());
+        self.leave = false;
+        self.check_exceptions = false;
+        self.reset_request = None;
+        self.hold_until = None;
+        self.bus_error = false;
+        if self.flash.hardware_watchdog() {
+            let now = self.now();
+            // The key that starts it cannot be refused.
+            let _ = self.iwdg.write(0x00, 0xCCCC, now);
+            self.rcc.force_lsi(now);
+        }
+        self.take_flash_changes();
+    }
+
+    /// Power-on: as a reset, but nothing is remembered.
+    pub fn power_on(&mut self, now: Time, hse_hz: u32) {
+        self.clock = CycleClock::new(now, HSI_HZ);
+        self.rcc = Rcc::new(hse_hz);
+        self.dbgmcu = [0; 3];
+        self.counters.resets = 0;
+        self.attention = false;
+        self.reset(ResetCause::PowerOn);
+    }
+
+    fn apply_clocks(&mut self) {
+        self.clocks = self.rcc.clocks();
+        let now = self.now();
+        self.clock.set_hz(self.clocks.hclk);
+        self.scs.systick.set_clock(self.clocks.hclk.into(), now);
+        let can_clocked = self.rcc.plain(rcc::APB1ENR) & 1 << 25 != 0;
+        self.can1.set_clock(if can_clocked { self.clocks.pclk1 } else { 0 });
+    }
+
+    /// The clock tree as set up.
+    #[must_use]
+    pub fn clocks(&self) -> Clocks {
+        self.clocks
+    }
+
+    /// Lets everything happen that is due, and finds out what interrupts follow.
+    pub fn advance(&mut self) {
+        let now = self.now();
+        let hclk = self.clocks;
+        self.rcc.advance(now);
+        if self.rcc.clocks() != hclk {
+            self.apply_clocks();
+            self.leave = true;
+        }
+        self.flash.advance(now);
+        self.settle_flash();
+        self.iwdg.advance(now);
+        self.can1.advance(now);
+        if self.iwdg.has_expired() {
+            self.reset_request = Some(ResetCause::IndependentWatchdog);
+            self.leave = true;
+        }
+        if self.scs.systick.advance(now) {
+            self.scs.exceptions.pend(SYS_TICK);
+        }
+        self.update_lines();
+    }
+
+    fn update_lines(&mut self) {
+        let mut lines = std::mem::take(&mut self.lines);
+        lines.clear();
+        self.flash.interrupts(&mut lines);
+        self.can1.interrupts(&mut lines);
+        self.scs.exceptions.set_levels(&lines);
+        self.lines = lines;
+        self.check_exceptions = self.scs.exceptions.any_pending();
+    }
+
+    fn take_flash_changes(&mut self) {
+        let base = self.geometry.flash.base;
+        for (offset, len) in self.flash.take_changed() {
+            self.stale.push((base + offset, len));
+            self.leave = true;
+        }
+        self.counters.sectors_erased = self.flash.counters.sectors_erased;
+        self.counters.units_programmed = self.flash.counters.units_programmed;
+        self.counters.flash_refused = self.flash.counters.refused;
+    }
+
+    /// When something happens next without the CPU's doing.
+    #[must_use]
+    pub fn next_event(&self) -> Option<Time> {
+        [
+            self.flash.next_event(),
+            self.iwdg.next_event(),
+            self.can1.next_event(),
+            self.rcc.next_event(),
+            self.scs.systick.next_event(),
+        ]
+        .into_iter()
+        .flatten()
+        .min()
+    }
+
+    /// The deadline or the next event, whichever comes first. An event that is due already has had its chance.
+    #[must_use]
+    pub fn next_stop(&self) -> Time {
+        let now = self.now();
+        self.next_event().filter(|&event| event > now).map_or(self.deadline, |event| event.min(self.deadline))
+    }
+
+    /// Sets the end of the CPU's run to the deadline or the next event, whichever comes first.
+    pub fn limit_slice(&mut self) {
+        let until = self.next_stop();
+        self.slice_end = self.clock.cycle_at(until);
+    }
+
+    /// Notes an access that is not as it should be.
+    pub fn report(&mut self, access: Access, address: u32, size: u8, value: u32, pc: u32, what: String) {
+        let time = self.now();
+        self.reports.add(Report { time, address, pc, size, access, value, what, count: 1 });
+    }
+
+    // --- accesses by the CPU -----------------------------------------------------------------------------------------
+
+    /// The CPU loads `size` bytes (1, 2 or 4) from a peripheral address.
+    pub fn load(&mut self, address: u32, size: u8) -> u32 {
+        if PERIPHERAL_ALIAS.contains(address, 1) {
+            let (word, bit) = bit_band(PERIPHERALS.base, address - PERIPHERAL_ALIAS.base);
+            return self.load_word(word, 4) >> bit & 1;
+        }
+        let word = self.load_word(address & !3, size);
+        word >> (8 * (address & 3)) & mask(size)
+    }
+
+    /// The CPU stores `size` bytes to a peripheral address.
+    pub fn store(&mut self, address: u32, size: u8, value: u32) {
+        if PERIPHERAL_ALIAS.contains(address, 1) {
+            // The bus matrix reads the word, changes the bit, writes the word (PM0214 section 2.2.5).
+            let (word, bit) = bit_band(PERIPHERALS.base, address - PERIPHERAL_ALIAS.base);
+            let old = self.load_word(word, 4);
+            self.store_word(word, 4, old & !(1 << bit) | (value & 1) << bit);
+        } else if size == 4 {
+            self.store_word(address, 4, value);
+        } else {
+            let shift = 8 * (address & 3);
+            let old = self.load_word(address & !3, size);
+            let mask = mask(size) << shift;
+            self.store_word(address & !3, size, old & !mask | value << shift & mask);
+        }
+    }
+
+    /// Word-sized bit-band access to SRAM: (offset of the byte, bit).
+    #[must_use]
+    pub fn sram_bit(&self, address: u32) -> Option<(usize, u32)> {
+        let offset = address.checked_sub(SRAM_ALIAS)?;
+        let byte = (offset / 32) as usize;
+        (byte < self.sram.size()).then_some((byte, offset / 4 % 8))
+    }
+
+    /// Who answers at a word-aligned peripheral address.
+    fn place(address: u32) -> Place {
+        let within = |base: u32, size: u32| Some(address.wrapping_sub(base)).filter(|&offset| offset < size);
+        let block = BLOCKS.iter().find_map(|&(base, block, enable)| {
+            within(base, BLOCK_SIZE).map(|offset| Place::Block { block, offset, enable })
+        });
+        block
+            .or_else(|| within(SCS, PAGE).map(Place::Scs))
+            .or_else(|| within(DWT, PAGE).map(Place::Dwt))
+            .or_else(|| within(DBGMCU, 0x10).map(Place::Dbgmcu))
+            .or_else(|| within(ITM, PAGE).map(|_| Place::Itm))
+            .unwrap_or(Place::Nobody)
+    }
+
+    fn block_mut(&mut self, block: Block) -> &mut dyn Peripheral {
+        match block {
+            Block::Crc => &mut self.crc,
+            Block::Rcc => &mut self.rcc,
+            Block::Flash => &mut self.flash,
+            Block::Gpio(port) => &mut self.gpio[port],
+            Block::Iwdg => &mut self.iwdg,
+            Block::Pwr => &mut self.pwr,
+            Block::Syscfg => &mut self.syscfg,
+            Block::Can1 => &mut self.can1,
+        }
+    }
+
+    fn has_clock(&self, enable: ClockEnable) -> bool {
+        enable.is_none_or(|(register, bit)| self.rcc.plain(register) & 1 << bit != 0)
+    }
+
+    fn unknown(address: u32) -> Unmodelled {
+        let block = UNMODELLED.iter().rev().find(|&&(base, _)| address >= base && address - base < 0x1_0000);
+        Unmodelled(match block {
+            Some(&(base, name)) => {
+                format!("{name} is not modelled (offset {:X}h); it reads as 0", address - base)
+            }
+            None => "no peripheral is known here; it reads as 0".into(),
+        })
+    }
+
+    fn load_word(&mut self, address: u32, size: u8) -> u32 {
+        let now = self.now();
+        let result = match Self::place(address) {
+            Place::Block { block, offset, enable } if self.has_clock(enable) => {
+                self.block_mut(block).read(offset, now)
+            }
+            Place::Block { block, .. } => {
+                let name = self.block_mut(block).name();
+                Err(Unmodelled(format!("{name} has no clock (RCC enables it); it reads as 0")))
+            }
+            Place::Scs(offset) => {
+                if self.scs.systick.advance(now) {
+                    self.scs.exceptions.pend(SYS_TICK);
+                }
+                self.scs.read(offset, now)
+            }
+            Place::Dwt(offset) => self.scs.read_dwt(offset, self.clock.cycles),
+            Place::Dbgmcu(0) => Ok(DBGMCU_IDCODE),
+            Place::Dbgmcu(offset) => Ok(self.dbgmcu[offset as usize / 4 - 1]),
+            // Stimulus ports that nobody listens to are ready.
+            Place::Itm => Ok(1),
+            Place::Nobody => Err(Self::unknown(address)),
+        };
+        self.settle_flash();
+        result.unwrap_or_else(|Unmodelled(what)| {
+            self.report(Access::Read, address, size, 0, self.block.0, what);
+            0
+        })
+    }
+
+    fn store_word(&mut self, address: u32, size: u8, value: u32) {
+        let now = self.now();
+        let result = match Self::place(address) {
+            Place::Block { block, offset, enable } if self.has_clock(enable) => {
+                self.store_block(block, offset, value, now)
+            }
+            Place::Block { block, .. } => {
+                let name = self.block_mut(block).name();
+                Err(Unmodelled(format!("{name} has no clock (RCC enables it); the write is lost")))
+            }
+            Place::Scs(offset) => self.store_scs(offset, value, now),
+            Place::Dwt(offset) => self.scs.write_dwt(offset, value, self.clock.cycles),
+            Place::Dbgmcu(0) | Place::Itm => Ok(()),
+            Place::Dbgmcu(offset) => {
+                self.dbgmcu[offset as usize / 4 - 1] = value;
+                Ok(())
+            }
+            Place::Nobody => Err(Self::unknown(address)),
+        };
+        if let Err(Unmodelled(what)) = result {
+            self.report(Access::Write, address, size, value, self.block.0, what);
+        }
+        self.after_write();
+    }
+
+    fn store_block(&mut self, block: Block, offset: u32, value: u32, now: Time) -> Result<(), Unmodelled> {
+        let resets_before = self.reset_bits();
+        let result = self.block_mut(block).write(offset, value, now);
+        match block {
+            Block::Rcc => {
+                self.reset_blocks(resets_before);
+                if offset == rcc::APB1ENR || self.rcc.clocks() != self.clocks {
+                    self.apply_clocks();
+                    self.leave = true;
+                }
+            }
+            Block::Iwdg if self.iwdg.is_running() => self.rcc.force_lsi(now),
+            Block::Flash => {
+                if self.flash.take_bus_error() {
+                    self.bus_error = true;
+                    self.leave = true;
+                }
+                self.settle_flash();
+            }
+            Block::Can1 if self.can1.wants_attention() => {
+                self.attention = true;
+                self.leave = true;
+            }
+            _ => {}
+        }
+        result
+    }
+
+    /// After anything that may have started, ended or waited for a flash operation.
+    fn settle_flash(&mut self) {
+        if let Some(until) = self.flash.take_wait() {
+            self.hold_until = Some(until);
+            self.leave = true;
+        }
+        let busy = self.flash.busy_until().is_some();
+        if busy && !self.guarded {
+            self.flush_tlb = true;
+            self.leave = true;
+        }
+        self.guarded = busy;
+        if self.flash.power_has_failed() {
+            self.leave = true;
+        }
+        self.take_flash_changes();
+    }
+
+    fn store_scs(&mut self, offset: u32, value: u32, now: Time) -> Result<(), Unmodelled> {
+        if self.scs.systick.advance(now) {
+            self.scs.exceptions.pend(SYS_TICK);
+        }
+        match self.scs.write(offset, value, now)? {
+            Effect::None => {}
+            Effect::FpuAccess => self.leave = true,
+            Effect::SystemReset => {
+                self.reset_request = Some(ResetCause::Software);
+                self.leave = true;
+            }
+        }
+        Ok(())
+    }
+
+    /// A write may have raised a line, started something, or ended something.
+    fn after_write(&mut self) {
+        self.update_lines();
+        self.limit_slice();
+    }
+
+    /// The reset bits of the modelled blocks: each sits 20h before the enable bit.
+    fn reset_bits(&self) -> [bool; BLOCKS.len()] {
+        BLOCKS.map(|(_, _, enable)| {
+            enable.is_some_and(|(register, bit)| self.rcc.plain(register - 0x20) & 1 << bit != 0)
+        })
+    }
+
+    fn reset_blocks(&mut self, before: [bool; BLOCKS.len()]) {
+        let after = self.reset_bits();
+        for (index, (_, block, _)) in BLOCKS.into_iter().enumerate() {
+            if after[index] && !before[index] {
+                self.block_mut(block).reset();
+            }
+        }
+    }
+
+    /// The CPU stores into the flash array.
+    pub fn store_flash(&mut self, address: u32, bytes: &[u8], pc: u32) {
+        let now = self.now();
+        let offset = address.wrapping_sub(self.geometry.flash.base) % self.geometry.flash.size;
+        let erased_needed = {
+            let array = &self.flash.array.bytes()[offset as usize..];
+            array.iter().zip(bytes).any(|(old, new)| new & !old != 0)
+        };
+        let size = u8::try_from(bytes.len()).unwrap_or(u8::MAX);
+        let mut word = [0; 4];
+        for (to, from) in word.iter_mut().zip(bytes) {
+            *to = *from;
+        }
+        let value = u32::from_le_bytes(word);
+        match self.flash.store(offset, bytes, now) {
+            Store::Started if erased_needed => {
+                let what = "programs a 1 over a 0: the bit stays 0".into();
+                self.report(Access::Write, address, size, value, pc, what);
+            }
+            Store::Started => {}
+            Store::Refused(why) => {
+                self.report(Access::Write, address, size, value, pc, format!("flash not programmed: {why}"));
+            }
+        }
+        self.settle_flash();
+        self.after_write();
+    }
+}
+
+/// The byte-in-word address and bit that a bit-band alias offset stands for.
+fn bit_band(base: u32, alias_offset: u32) -> (u32, u32) {
+    let byte = alias_offset / 32;
+    let bit = alias_offset / 4 % 8;
+    (base + (byte & !3), bit + 8 * (byte & 3))
+}
+
+fn mask(size: u8) -> u32 {
+    match size {
+        1 => 0xFF,
+        2 => 0xFFFF,
+        _ => u32::MAX,
+    }
+}

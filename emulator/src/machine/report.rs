@@ -1,0 +1,96 @@
+//! What the machine tells its owner about a program that leaves the path.
+
+use crate::time::Time;
+
+/// What kind of access a report is about.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Access {
+    /// A load.
+    Read,
+    /// A store.
+    Write,
+    /// An instruction fetch.
+    Fetch,
+}
+
+impl std::fmt::Display for Access {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Read => "read",
+            Self::Write => "write",
+            Self::Fetch => "fetch",
+        })
+    }
+}
+
+/// An access that the model does not cover, or that the chip would punish or ignore. Each pair of address and program
+/// counter is reported once, with a count.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Report {
+    /// When it happened first.
+    pub time: Time,
+    /// The address accessed.
+    pub address: u32,
+    /// The instruction that did it, or the first one of its straight run of code where the instruction itself cannot
+    /// be told.
+    pub pc: u32,
+    /// Bytes accessed.
+    pub size: u8,
+    /// Load, store or fetch.
+    pub access: Access,
+    /// What a store wrote, at the first time.
+    pub value: u32,
+    /// What is wrong, in words.
+    pub what: String,
+    /// How often it happened.
+    pub count: u64,
+}
+
+impl std::fmt::Display for Report {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}: {} of {} at {:08X}h", self.time, self.access, self.size, self.address)?;
+        if self.access == Access::Write {
+            write!(f, " = {:X}h", self.value)?;
+        }
+        write!(f, ", pc {:08X}h: {}", self.pc, self.what)?;
+        if self.count > 1 {
+            write!(f, " ({} times)", self.count)?;
+        }
+        Ok(())
+    }
+}
+
+/// The most reports that are kept: a program that runs wild must not fill the host's memory.
+const MOST: usize = 1_000;
+
+/// The reports of one machine.
+#[derive(Clone, Debug, Default)]
+pub struct Reports {
+    list: Vec<Report>,
+    /// Distinct reports beyond the limit.
+    pub dropped: u64,
+}
+
+impl Reports {
+    /// Adds one, or counts up the one there is for the same address, program counter and access.
+    pub fn add(&mut self, report: Report) {
+        let same = |r: &Report| r.address == report.address && r.pc == report.pc && r.access == report.access;
+        match self.list.iter().position(same) {
+            Some(known) => self.list[known].count += 1,
+            None if self.list.len() < MOST => self.list.push(report),
+            None => self.dropped += 1,
+        }
+    }
+
+    /// All of them, in the order in which they first happened.
+    #[must_use]
+    pub fn as_slice(&self) -> &[Report] {
+        &self.list
+    }
+
+    /// Forgets them.
+    pub fn clear(&mut self) {
+        self.list.clear();
+        self.dropped = 0;
+    }
+}

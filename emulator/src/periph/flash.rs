@@ -1,0 +1,788 @@
+//! Embedded flash interface (RM0090 section 3) and the flash array itself.
+//!
+//! Programming clears bits and never sets one, as on the chip: the F4 does not check that the target is erased. While
+//! an operation runs (BSY) the array answers neither fetches nor data reads; the machine stalls the CPU then.
+
+use shared_abi::geometry::{Geometry, Sector};
+
+use crate::machine::memory::HostMemory;
+use crate::peripheral::{Peripheral, Unmodelled};
+use crate::time::{Span, Time};
+
+/// Interrupt line of the flash (RM0090 table 61).
+const LINE: u16 = 4;
+
+const KEY1: u32 = 0x4567_0123;
+const KEY2: u32 = 0xCDEF_89AB;
+const OPTKEY1: u32 = 0x0819_2A3B;
+const OPTKEY2: u32 = 0x4C5D_6E7F;
+
+const SR_EOP: u32 = 1 << 0;
+const SR_OPERR: u32 = 1 << 1;
+const SR_WRPERR: u32 = 1 << 4;
+const SR_PGAERR: u32 = 1 << 5;
+const SR_PGPERR: u32 = 1 << 6;
+const SR_PGSERR: u32 = 1 << 7;
+const SR_BSY: u32 = 1 << 16;
+const SR_CLEARABLE: u32 = SR_EOP | SR_OPERR | SR_WRPERR | SR_PGAERR | SR_PGPERR | SR_PGSERR;
+
+const CR_PG: u32 = 1 << 0;
+const CR_SER: u32 = 1 << 1;
+const CR_MER: u32 = 1 << 2;
+const CR_SNB: u32 = 0xF << 3;
+const CR_PSIZE: u32 = 3 << 8;
+const CR_STRT: u32 = 1 << 16;
+const CR_EOPIE: u32 = 1 << 24;
+const CR_ERRIE: u32 = 1 << 25;
+const CR_LOCK: u32 = 1 << 31;
+const CR_KEPT: u32 = CR_PG | CR_SER | CR_MER | CR_SNB | CR_PSIZE | CR_EOPIE | CR_ERRIE;
+
+const OPTCR_OPTLOCK: u32 = 1 << 0;
+const OPTCR_OPTSTRT: u32 = 1 << 1;
+/// Factory option bytes: no protection, BOR off, software watchdog (section 3.10.5).
+const OPTCR_FACTORY: u32 = 0x0FFF_AAED;
+
+const ACR_MASK: u32 = 0x0000_1F07;
+
+/// Which of the datasheet's times operations take.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum FlashTimes {
+    /// The typical ones.
+    #[default]
+    Typical,
+    /// The longest ones.
+    Worst,
+}
+
+/// Erase times in milliseconds by parallelism x8, x16, x32, x64: (typical, worst). STM32F405/407 datasheet
+/// (DocID022152 rev 8) tables 40 and 41; x64 needs the external voltage and has no maximum there: the x32 one is used.
+const ERASE_16_KIB: [(u64, u64); 4] = [(400, 800), (300, 600), (250, 500), (230, 500)];
+const ERASE_64_KIB: [(u64, u64); 4] = [(1_200, 2_400), (700, 1_400), (550, 1_100), (490, 1_100)];
+const ERASE_128_KIB: [(u64, u64); 4] = [(2_000, 4_000), (1_300, 2_600), (1_000, 2_000), (875, 2_000)];
+const ERASE_MASS: [(u64, u64); 4] = [(16_000, 32_000), (11_000, 22_000), (8_000, 16_000), (6_900, 16_000)];
+/// Programming one unit of any width takes this many microseconds (the same tables): (typical, worst).
+const PROGRAM: (u64, u64) = (16, 100);
+
+/// What an operation does to the array when it ends.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Operation {
+    /// These bytes are programmed at this offset of the array.
+    Program {
+        /// Offset from the start of the flash.
+        offset: u32,
+        /// What was written; bits that are 0 in the array stay 0.
+        bytes: Vec<u8>,
+    },
+    /// These sectors are erased; one, or all of them.
+    Erase {
+        /// In address order.
+        sectors: Vec<Sector>,
+    },
+    /// The option bytes are programmed.
+    Options {
+        /// The value of OPTCR without its lock and start bits.
+        optcr: u32,
+    },
+}
+
+/// Where within an operation the power fails.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Cut {
+    /// Before it changed anything.
+    Before,
+    /// When it was complete.
+    After,
+    /// In the middle: some bits of a word are programmed, some bytes of a sector erased; which ones follows from the
+    /// seed.
+    Torn {
+        /// Chooses the bits.
+        seed: u64,
+    },
+}
+
+/// Cut the power at a flash operation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FlashCut {
+    /// The operation, counted from 0 since the cut was asked for.
+    pub operation: u64,
+    /// Where in it.
+    pub when: Cut,
+}
+
+/// How often the flash was used.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct FlashCounters {
+    /// Sectors erased.
+    pub sectors_erased: u64,
+    /// Units programmed, of whatever width.
+    pub units_programmed: u64,
+    /// Operations refused with an error flag.
+    pub refused: u64,
+}
+
+#[derive(Clone, Debug)]
+struct Running {
+    operation: Operation,
+    ends: Time,
+}
+
+/// State of an unlock sequence.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Lock {
+    Locked,
+    /// The first key was right.
+    HalfOpen,
+    Open,
+    /// A key was wrong: closed until the next reset.
+    Barred,
+}
+
+/// What a store by the CPU to the array came to.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Store {
+    /// An operation started.
+    Started,
+    /// Refused; an error flag says why.
+    Refused(&'static str),
+}
+
+/// The flash interface registers and the array.
+pub struct Flash {
+    geometry: &'static Geometry,
+    times: FlashTimes,
+    /// The array.
+    pub array: HostMemory,
+    acr: u32,
+    sr: u32,
+    cr: u32,
+    lock: Lock,
+    option_lock: Lock,
+    /// OPTCR as programmed, and as written but not yet programmed.
+    options: u32,
+    options_written: u32,
+    running: Option<Running>,
+    /// Ranges of the array that changed since the machine last asked, as (offset, length).
+    changed: Vec<(u32, u32)>,
+    /// A bus error that the last register write caused.
+    bus_error: bool,
+    /// When the operation that a register write had to wait for ended.
+    waited_until: Option<Time>,
+    cut: Option<FlashCut>,
+    power_failed: bool,
+    /// Usage.
+    pub counters: FlashCounters,
+}
+
+impl Flash {
+    /// An erased flash of the chip.
+    #[must_use]
+    pub fn new(geometry: &'static Geometry, times: FlashTimes) -> Self {
+        Self {
+            geometry,
+            times,
+            array: HostMemory::new(geometry.flash.size, 0xFF),
+            acr: 0,
+            sr: 0,
+            cr: 0,
+            lock: Lock::Locked,
+            option_lock: Lock::Locked,
+            options: OPTCR_FACTORY & !(OPTCR_OPTLOCK | OPTCR_OPTSTRT),
+            options_written: OPTCR_FACTORY & !(OPTCR_OPTLOCK | OPTCR_OPTSTRT),
+            running: None,
+            changed: Vec::new(),
+            bus_error: false,
+            waited_until: None,
+            cut: None,
+            power_failed: false,
+            counters: FlashCounters::default(),
+        }
+    }
+
+    /// When the running operation ends, if one runs.
+    #[must_use]
+    pub fn busy_until(&self) -> Option<Time> {
+        self.running.as_ref().map(|running| running.ends)
+    }
+
+    /// The wait states that are set (ACR.LATENCY).
+    #[must_use]
+    pub fn latency(&self) -> u32 {
+        self.acr & 7
+    }
+
+    /// Takes the ranges (offset, length) that changed; the machine drops its translations of them.
+    pub fn take_changed(&mut self) -> Vec<(u32, u32)> {
+        std::mem::take(&mut self.changed)
+    }
+
+    /// Takes the bus error of the last register write.
+    pub fn take_bus_error(&mut self) -> bool {
+        std::mem::take(&mut self.bus_error)
+    }
+
+    /// Takes the time up to which the bus was held because a write had to wait for the running operation.
+    pub fn take_wait(&mut self) -> Option<Time> {
+        self.waited_until.take()
+    }
+
+    /// Arms a power cut; operations are counted from now on.
+    pub fn cut_power_at(&mut self, cut: Option<FlashCut>) {
+        self.cut = cut;
+    }
+
+    /// Whether the armed power cut struck; [`Self::lose_power`] clears it.
+    #[must_use]
+    pub fn power_has_failed(&self) -> bool {
+        self.power_failed
+    }
+
+    /// Writes into the array as a debug probe does, whatever the locks say.
+    pub fn preset(&mut self, offset: u32, bytes: &[u8]) {
+        let start = offset as usize;
+        self.array.bytes_mut()[start..start + bytes.len()].copy_from_slice(bytes);
+        self.changed.push((offset, u32::try_from(bytes.len()).unwrap_or(u32::MAX)));
+    }
+
+    /// The power fails now: what runs is torn. `seed` chooses how.
+    pub fn lose_power(&mut self, seed: u64) {
+        if let Some(running) = self.running.take() {
+            self.tear(&running.operation, seed);
+        }
+        self.cut = None;
+        self.power_failed = false;
+    }
+
+    fn width(&self) -> u32 {
+        1 << ((self.cr & CR_PSIZE) >> 8)
+    }
+
+    fn pick(&self, (typical, worst): (u64, u64)) -> u64 {
+        match self.times {
+            FlashTimes::Typical => typical,
+            FlashTimes::Worst => worst,
+        }
+    }
+
+    fn erase_time(&self, sectors: &[Sector]) -> Span {
+        let width = ((self.cr & CR_PSIZE) >> 8) as usize;
+        let table = match sectors {
+            [one] if one.region.size <= 16 * 1024 => ERASE_16_KIB,
+            [one] if one.region.size <= 64 * 1024 => ERASE_64_KIB,
+            [_] => ERASE_128_KIB,
+            _ => ERASE_MASS,
+        };
+        Span::from_millis(self.pick(table[width]))
+    }
+
+    /// nWRP: a zero protects the sector (section 3.6.5).
+    fn is_protected(&self, sector: Sector) -> bool {
+        self.options >> 16 & 1 << sector.number == 0
+    }
+
+    fn refuse(&mut self, flag: u32, why: &'static str) -> Store {
+        self.sr |= flag;
+        if self.cr & CR_ERRIE != 0 {
+            self.sr |= SR_OPERR;
+        }
+        self.counters.refused += 1;
+        Store::Refused(why)
+    }
+
+    /// The CPU stores `bytes` (1, 2, 4 or 8) at `offset` of the array.
+    pub fn store(&mut self, offset: u32, bytes: &[u8], now: Time) -> Store {
+        let start = self.wait_until_idle(now);
+        let len = u32::try_from(bytes.len()).unwrap_or(u32::MAX);
+        if self.lock != Lock::Open {
+            return self.refuse(SR_PGSERR, "the flash is locked");
+        }
+        if self.cr & CR_PG == 0 {
+            return self.refuse(SR_PGSERR, "FLASH_CR.PG is not set");
+        }
+        if len != self.width() {
+            return self.refuse(SR_PGPERR, "the width of the store is not the one of FLASH_CR.PSIZE");
+        }
+        if offset / 16 != (offset + len - 1) / 16 {
+            return self.refuse(SR_PGAERR, "the store crosses a row of 128 bits");
+        }
+        let Some(sector) = self.geometry.sector_at(self.geometry.flash.base + offset) else {
+            return self.refuse(SR_PGSERR, "the address is beyond the flash");
+        };
+        if self.is_protected(sector) {
+            return self.refuse(SR_WRPERR, "the option bytes protect the sector");
+        }
+        let takes = Span::from_micros(self.pick(PROGRAM));
+        self.start(Operation::Program { offset, bytes: bytes.to_vec() }, takes, start);
+        Store::Started
+    }
+
+    /// Where a write must wait for the running operation, ends it; returns when the write takes effect.
+    fn wait_until_idle(&mut self, now: Time) -> Time {
+        match self.busy_until() {
+            Some(ends) if ends > now => {
+                self.waited_until = Some(ends);
+                self.advance(ends);
+                ends
+            }
+            _ => {
+                self.advance(now);
+                now
+            }
+        }
+    }
+
+    fn start(&mut self, operation: Operation, takes: Span, now: Time) {
+        if let Some(cut) = &mut self.cut {
+            if cut.operation == 0 {
+                let when = cut.when;
+                self.cut = None;
+                self.power_failed = true;
+                match when {
+                    Cut::Before => {}
+                    Cut::After => self.complete(&operation),
+                    Cut::Torn { seed } => self.tear(&operation, seed),
+                }
+                return;
+            }
+            cut.operation -= 1;
+        }
+        self.running = Some(Running { operation, ends: now + takes });
+    }
+
+    fn start_erase(&mut self, now: Time) -> Result<(), Unmodelled> {
+        let all: Vec<Sector> = self.geometry.sectors().collect();
+        let sectors = match (self.cr & CR_SER != 0, self.cr & CR_MER != 0) {
+            (true, false) => {
+                let number = (self.cr & CR_SNB) >> 3;
+                match all.into_iter().find(|sector| u32::from(sector.number) == number) {
+                    Some(sector) => vec![sector],
+                    None => {
+                        self.refuse(SR_PGSERR, "no such sector");
+                        return Err(Unmodelled(format!("FLASH_CR.SNB names sector {number}: there is none")));
+                    }
+                }
+            }
+            (false, true) => all,
+            _ => {
+                self.refuse(SR_PGSERR, "neither SER nor MER");
+                return Err(Unmodelled("FLASH_CR.STRT without exactly one of SER and MER".into()));
+            }
+        };
+        if self.cr & CR_PG != 0 {
+            self.refuse(SR_PGSERR, "PG is set");
+            return Err(Unmodelled("FLASH_CR.STRT while PG is set".into()));
+        }
+        if sectors.iter().any(|&sector| self.is_protected(sector)) {
+            self.refuse(SR_WRPERR, "the option bytes protect the sector");
+            return Ok(());
+        }
+        let takes = self.erase_time(&sectors);
+        self.start(Operation::Erase { sectors }, takes, now);
+        Ok(())
+    }
+
+    fn offset_of(&self, sector: &Sector) -> (usize, usize) {
+        ((sector.region.base - self.geometry.flash.base) as usize, sector.region.size as usize)
+    }
+
+    fn complete(&mut self, operation: &Operation) {
+        match operation {
+            Operation::Program { offset, bytes } => {
+                self.counters.units_programmed += 1;
+                self.and_bytes(*offset, bytes);
+            }
+            Operation::Erase { sectors } => {
+                for sector in sectors {
+                    self.counters.sectors_erased += 1;
+                    let (start, len) = self.offset_of(sector);
+                    self.array.bytes_mut()[start..start + len].fill(0xFF);
+                    self.changed.push((sector.region.base - self.geometry.flash.base, sector.region.size));
+                }
+            }
+            Operation::Options { optcr } => self.options = *optcr,
+        }
+    }
+
+    fn and_bytes(&mut self, offset: u32, bytes: &[u8]) {
+        let array = &mut self.array.bytes_mut()[offset as usize..];
+        for (cell, byte) in array.iter_mut().zip(bytes) {
+            *cell &= byte;
+        }
+        self.changed.push((offset, u32::try_from(bytes.len()).unwrap_or(u32::MAX)));
+    }
+
+    /// Carries an operation out in part.
+    fn tear(&mut self, operation: &Operation, seed: u64) {
+        let mut noise = Noise(seed);
+        match operation {
+            Operation::Program { offset, bytes } => {
+                // Each bit that should become 0 does so or not.
+                let torn: Vec<u8> = bytes.iter().map(|byte| byte | noise.byte()).collect();
+                self.and_bytes(*offset, &torn);
+            }
+            Operation::Erase { sectors } => {
+                // A cell on its way to 1 reads as what it was, as 1, or as either.
+                for sector in sectors {
+                    let (start, len) = self.offset_of(sector);
+                    for cell in &mut self.array.bytes_mut()[start..start + len] {
+                        *cell |= noise.byte();
+                    }
+                    self.changed.push((sector.region.base - self.geometry.flash.base, sector.region.size));
+                }
+            }
+            // The option bytes are double-checked by their complements; a torn set loads as the factory one.
+            Operation::Options { .. } => self.options = OPTCR_FACTORY & !(OPTCR_OPTLOCK | OPTCR_OPTSTRT),
+        }
+    }
+
+    fn turn(lock: Lock, value: u32, first: u32, second: u32) -> Lock {
+        match (lock, value) {
+            (Lock::Locked, key) if key == first => Lock::HalfOpen,
+            (Lock::HalfOpen, key) if key == second => Lock::Open,
+            _ => Lock::Barred,
+        }
+    }
+
+    fn write_key(&mut self, value: u32) -> Result<(), Unmodelled> {
+        self.lock = Self::turn(self.lock, value, KEY1, KEY2);
+        if self.lock == Lock::Barred {
+            self.bus_error = true;
+            return Err(Unmodelled(
+                "wrong key sequence at FLASH_KEYR: FLASH_CR is locked until the next reset, and the chip answers \
+                 with a bus error"
+                    .into(),
+            ));
+        }
+        Ok(())
+    }
+
+    fn write_cr(&mut self, value: u32, now: Time) -> Result<(), Unmodelled> {
+        if self.lock != Lock::Open {
+            return Err(Unmodelled("FLASH_CR is written while it is locked: the chip ignores it".into()));
+        }
+        let start = self.wait_until_idle(now);
+        self.cr = value & CR_KEPT;
+        if value & CR_LOCK != 0 {
+            self.lock = Lock::Locked;
+            return Ok(());
+        }
+        if value & CR_STRT != 0 {
+            return self.start_erase(start);
+        }
+        Ok(())
+    }
+
+    fn write_optcr(&mut self, value: u32, now: Time) -> Result<(), Unmodelled> {
+        if self.option_lock != Lock::Open {
+            return Err(Unmodelled("FLASH_OPTCR is written while it is locked: the chip ignores it".into()));
+        }
+        let start = self.wait_until_idle(now);
+        self.options_written = value & 0x0FFF_FFEC;
+        if value & OPTCR_OPTLOCK != 0 {
+            self.option_lock = Lock::Locked;
+        } else if value & OPTCR_OPTSTRT != 0 {
+            // Option bytes lie in a sector of their own; the datasheet gives no time: that of a 16 KiB sector.
+            let takes = Span::from_millis(self.pick(ERASE_16_KIB[2]));
+            self.start(Operation::Options { optcr: self.options_written }, takes, start);
+        }
+        Ok(())
+    }
+
+    /// The sixteen option bytes as they read at 1FFF_C000 (section 3.6.1): each value with its complement.
+    #[must_use]
+    pub fn option_bytes(&self) -> [u8; 16] {
+        let mut bytes = [0xFF; 16];
+        let low = self.options as u16;
+        let high = (self.options >> 16 & 0x0FFF) as u16;
+        bytes[0..2].copy_from_slice(&low.to_le_bytes());
+        bytes[2..4].copy_from_slice(&(!low).to_le_bytes());
+        bytes[8..10].copy_from_slice(&high.to_le_bytes());
+        bytes[10..12].copy_from_slice(&(!high).to_le_bytes());
+        bytes
+    }
+
+    /// Option bit WDG_SW clear: the watchdog starts by itself after reset (section 3.6.2).
+    #[must_use]
+    pub fn hardware_watchdog(&self) -> bool {
+        self.options & 1 << 5 == 0
+    }
+}
+
+impl Peripheral for Flash {
+    fn name(&self) -> &'static str {
+        "FLASH"
+    }
+
+    fn read(&mut self, offset: u32, now: Time) -> Result<u32, Unmodelled> {
+        self.advance(now);
+        Ok(match offset {
+            0x00 => self.acr,
+            // The key registers are write-only.
+            0x04 | 0x08 => 0,
+            0x0C => self.sr | if self.running.is_some() { SR_BSY } else { 0 },
+            0x10 => {
+                let locked = if self.lock == Lock::Open { 0 } else { CR_LOCK };
+                let erasing =
+                    matches!(&self.running, Some(Running { operation: Operation::Erase { .. }, .. }));
+                self.cr | locked | if erasing { CR_STRT } else { 0 }
+            }
+            0x14 => self.options_written | if self.option_lock == Lock::Open { 0 } else { OPTCR_OPTLOCK },
+            _ => return Err(Unmodelled("the flash interface has no such register".into())),
+        })
+    }
+
+    fn write(&mut self, offset: u32, value: u32, now: Time) -> Result<(), Unmodelled> {
+        self.advance(now);
+        match offset {
+            0x00 => {
+                // The cache reset bits act at once and stay as written.
+                self.acr = value & ACR_MASK;
+                Ok(())
+            }
+            0x04 => self.write_key(value),
+            0x08 => {
+                self.option_lock = Self::turn(self.option_lock, value, OPTKEY1, OPTKEY2);
+                if self.option_lock == Lock::Barred {
+                    self.bus_error = true;
+                    return Err(Unmodelled(
+                        "wrong key sequence at FLASH_OPTKEYR: FLASH_OPTCR is locked until the next reset"
+                            .into(),
+                    ));
+                }
+                Ok(())
+            }
+            0x0C => {
+                self.sr &= !(value & SR_CLEARABLE);
+                Ok(())
+            }
+            0x10 => self.write_cr(value, now),
+            0x14 => self.write_optcr(value, now),
+            _ => Err(Unmodelled("the flash interface has no such register".into())),
+        }
+    }
+
+    fn advance(&mut self, now: Time) {
+        if self.busy_until().is_some_and(|ends| ends <= now) {
+            if let Some(Running { operation, .. }) = self.running.take() {
+                self.complete(&operation);
+                if self.cr & CR_EOPIE != 0 {
+                    self.sr |= SR_EOP;
+                }
+            }
+        }
+    }
+
+    fn next_event(&self) -> Option<Time> {
+        self.busy_until()
+    }
+
+    fn interrupts(&self, active: &mut Vec<u16>) {
+        let end = self.cr & CR_EOPIE != 0 && self.sr & SR_EOP != 0;
+        let error = self.cr & CR_ERRIE != 0 && self.sr & SR_OPERR != 0;
+        if end || error {
+            active.push(LINE);
+        }
+    }
+
+    /// System reset: an operation that runs is broken off (section 3.4.1: its contents are not protected).
+    fn reset(&mut self) {
+        if let Some(running) = self.running.take() {
+            // A fixed seed: a reset is no power failure, but leaves the same kind of half-done work.
+            self.tear(&running.operation, 0x5EED);
+        }
+        self.acr = 0;
+        self.sr = 0;
+        self.cr = 0;
+        self.lock = Lock::Locked;
+        self.option_lock = Lock::Locked;
+        self.options_written = self.options;
+        self.bus_error = false;
+        self.waited_until = None;
+    }
+}
+
+/// A small generator (SplitMix64) for noise that must be the same each time.
+#[derive(Clone, Debug)]
+pub struct Noise(pub u64);
+
+impl Noise {
+    /// The next 64 bits.
+    pub fn word(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        z ^ (z >> 31)
+    }
+
+    fn byte(&mut self) -> u8 {
+        self.word().to_le_bytes()[0]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shared_abi::geometry::STM32F407VG;
+
+    const KEYR: u32 = 0x04;
+    const SR: u32 = 0x0C;
+    const CR: u32 = 0x10;
+    const X32: u32 = 2 << 8;
+
+    fn unlocked() -> Flash {
+        let mut flash = Flash::new(&STM32F407VG, FlashTimes::Typical);
+        flash.write(KEYR, 0x4567_0123, Time(0)).unwrap();
+        flash.write(KEYR, 0xCDEF_89AB, Time(0)).unwrap();
+        flash
+    }
+
+    fn status(flash: &mut Flash, now: Time) -> u32 {
+        flash.read(SR, now).unwrap()
+    }
+
+    #[test]
+    fn programming_a_word_takes_16_us_and_clears_bits_only() {
+        let mut flash = unlocked();
+        flash.write(CR, CR_PG | X32, Time(0)).unwrap();
+        assert_eq!(flash.store(8, &0x1234_5678_u32.to_le_bytes(), Time(0)), Store::Started);
+        assert_eq!(status(&mut flash, Time(15_999_999)), 0x0001_0000);
+        assert_eq!(flash.array.bytes()[8..12], [0xFF; 4]);
+        assert_eq!(status(&mut flash, Time(16_000_000)), 0);
+        assert_eq!(flash.array.bytes()[8..12], [0x78, 0x56, 0x34, 0x12]);
+        assert_eq!(flash.store(8, &0xFFFF_F00F_u32.to_le_bytes(), Time(20_000_000)), Store::Started);
+        flash.advance(Time(40_000_000));
+        assert_eq!(flash.array.bytes()[8..12], [0x08, 0x50, 0x34, 0x12]);
+        assert_eq!(flash.take_changed(), [(8, 4), (8, 4)]);
+    }
+
+    #[test]
+    fn erasing_takes_the_times_of_the_datasheet() {
+        for (times, sector, width, ms) in [
+            (FlashTimes::Typical, 0, 2, 250),
+            (FlashTimes::Worst, 3, 2, 500),
+            (FlashTimes::Typical, 4, 2, 550),
+            (FlashTimes::Worst, 4, 0, 2_400),
+            (FlashTimes::Typical, 11, 2, 1_000),
+            (FlashTimes::Worst, 5, 2, 2_000),
+        ] {
+            let mut flash = unlocked();
+            flash.times = times;
+            flash.write(CR, CR_SER | sector << 3 | width << 8, Time(0)).unwrap();
+            flash.write(CR, CR_SER | sector << 3 | width << 8 | CR_STRT, Time(0)).unwrap();
+            assert_eq!(flash.next_event(), Some(Time(ms * 1_000_000_000)), "sector {sector}");
+        }
+    }
+
+    #[test]
+    fn an_erase_fills_its_sector_and_no_other() {
+        let mut flash = unlocked();
+        flash.array.bytes_mut().fill(0);
+        flash.write(CR, CR_SER | 4 << 3 | X32 | CR_STRT, Time(0)).unwrap();
+        flash.advance(Time(u64::MAX));
+        let array = flash.array.bytes();
+        assert!(array[0x1_0000..0x2_0000].iter().all(|&byte| byte == 0xFF));
+        assert!(array[..0x1_0000].iter().chain(&array[0x2_0000..]).all(|&byte| byte == 0));
+        assert_eq!(flash.counters.sectors_erased, 1);
+    }
+
+    #[test]
+    fn a_wrong_key_locks_until_reset_with_a_bus_error() {
+        let mut flash = Flash::new(&STM32F407VG, FlashTimes::Typical);
+        flash.write(KEYR, 0x4567_0123, Time(0)).unwrap();
+        assert!(flash.write(KEYR, 0, Time(0)).is_err());
+        assert!(flash.take_bus_error());
+        let _ = flash.write(KEYR, 0x4567_0123, Time(0));
+        let _ = flash.write(KEYR, 0xCDEF_89AB, Time(0));
+        assert_eq!(flash.read(CR, Time(0)), Ok(0x8000_0000));
+        flash.reset();
+        flash.write(KEYR, 0x4567_0123, Time(0)).unwrap();
+        flash.write(KEYR, 0xCDEF_89AB, Time(0)).unwrap();
+        assert_eq!(flash.read(CR, Time(0)), Ok(0));
+    }
+
+    #[test]
+    fn each_refusal_has_its_flag() {
+        let mut flash = unlocked();
+        let word = 0_u32.to_le_bytes();
+        assert!(matches!(flash.store(0, &word, Time(0)), Store::Refused(_)));
+        assert_eq!(status(&mut flash, Time(0)), 0x80, "PGSERR: PG not set");
+        flash.write(SR, 0x80, Time(0)).unwrap();
+        flash.write(CR, CR_PG, Time(0)).unwrap();
+        flash.store(0, &word, Time(0));
+        assert_eq!(status(&mut flash, Time(0)), 0x40, "PGPERR: x8 is set");
+        flash.write(SR, 0x40, Time(0)).unwrap();
+        flash.write(CR, CR_PG | X32, Time(0)).unwrap();
+        flash.store(14, &word, Time(0));
+        assert_eq!(status(&mut flash, Time(0)), 0x20, "PGAERR: crosses a row");
+        flash.write(SR, 0x20, Time(0)).unwrap();
+        flash.options &= !(1 << 16);
+        flash.write(CR, CR_PG | X32 | CR_ERRIE, Time(0)).unwrap();
+        flash.store(0, &word, Time(0));
+        assert_eq!(status(&mut flash, Time(0)), 0x12, "WRPERR, and OPERR because of ERRIE");
+        let mut lines = Vec::new();
+        flash.interrupts(&mut lines);
+        assert_eq!(lines, [4]);
+        assert!(flash.array.bytes().iter().all(|&byte| byte == 0xFF), "nothing was written");
+    }
+
+    #[test]
+    fn end_of_operation_shows_only_with_its_interrupt_enabled() {
+        let mut flash = unlocked();
+        flash.write(CR, CR_PG | X32 | CR_EOPIE, Time(0)).unwrap();
+        flash.store(0, &[0; 4], Time(0));
+        flash.advance(Time(16_000_000));
+        assert_eq!(status(&mut flash, Time(16_000_000)), 1);
+        let mut lines = Vec::new();
+        flash.interrupts(&mut lines);
+        assert_eq!(lines, [4]);
+        flash.write(SR, 1, Time(16_000_000)).unwrap();
+        assert_eq!(status(&mut flash, Time(16_000_000)), 0);
+    }
+
+    #[test]
+    fn a_write_while_busy_waits_for_the_end() {
+        let mut flash = unlocked();
+        flash.write(CR, CR_PG | X32, Time(0)).unwrap();
+        flash.store(0, &[0; 4], Time(0));
+        flash.store(4, &[0; 4], Time(1_000_000));
+        assert_eq!(flash.take_wait(), Some(Time(16_000_000)));
+        assert_eq!(flash.busy_until(), Some(Time(32_000_000)));
+    }
+
+    #[test]
+    fn a_locked_register_does_not_change() {
+        let mut flash = Flash::new(&STM32F407VG, FlashTimes::Typical);
+        assert!(flash.write(CR, CR_PG, Time(0)).is_err());
+        assert_eq!(flash.read(CR, Time(0)), Ok(CR_LOCK));
+    }
+
+    /// RM0090 section 3.10.5 and 3.6.1.
+    #[test]
+    fn option_bytes_read_as_from_the_factory() {
+        let mut flash = Flash::new(&STM32F407VG, FlashTimes::Typical);
+        assert_eq!(flash.read(0x14, Time(0)), Ok(0x0FFF_AAED));
+        assert_eq!(flash.option_bytes()[..4], [0xEC, 0xAA, 0x13, 0x55]);
+    }
+
+    #[test]
+    fn power_cuts_strike_before_after_and_in_the_middle() {
+        for (when, wanted) in
+            [(Cut::Before, Some([0xFF; 4])), (Cut::After, Some([0; 4])), (Cut::Torn { seed: 1 }, None)]
+        {
+            let mut flash = unlocked();
+            flash.write(CR, CR_PG | X32, Time(0)).unwrap();
+            flash.cut_power_at(Some(FlashCut { operation: 1, when }));
+            flash.store(0, &[0; 4], Time(0));
+            flash.advance(Time(16_000_000));
+            assert!(!flash.power_has_failed());
+            assert_eq!(flash.array.bytes()[..4], [0; 4]);
+            flash.store(4, &[0; 4], Time(20_000_000));
+            assert!(flash.power_has_failed());
+            let found = &flash.array.bytes()[4..8];
+            match wanted {
+                Some(bytes) => assert_eq!(found, bytes),
+                None => assert!(found != [0xFF; 4] && found != [0; 4], "torn: {found:02X?}"),
+            }
+        }
+    }
+}

@@ -1,0 +1,437 @@
+//! Reset and clock control (RM0090 section 7, STM32F405/407).
+
+use crate::machine::ResetCause;
+use crate::peripheral::{Peripheral, Unmodelled};
+use crate::time::{Span, Time};
+
+/// High-speed internal oscillator, Hz.
+pub const HSI_HZ: u32 = 16_000_000;
+
+// Start-up times, typical, from the datasheet (DocID022152 rev 8, section 5.3.8 to 5.3.10).
+const HSI_START: Span = Span(2_200_000);
+const HSE_START: Span = Span::from_millis(2);
+const LSI_START: Span = Span::from_micros(15);
+const LSE_START: Span = Span::from_millis(2_000);
+/// The maximum at the upper end of the VCO range.
+const PLL_LOCK: Span = Span::from_micros(200);
+
+const CR_HSION: u32 = 1 << 0;
+const CR_HSIRDY: u32 = 1 << 1;
+const CR_HSEON: u32 = 1 << 16;
+const CR_HSERDY: u32 = 1 << 17;
+const CR_HSEBYP: u32 = 1 << 18;
+const CR_CSSON: u32 = 1 << 19;
+const CR_PLLON: u32 = 1 << 24;
+const CR_PLLRDY: u32 = 1 << 25;
+const CR_PLLI2SON: u32 = 1 << 26;
+const CR_PLLI2SRDY: u32 = 1 << 27;
+const CR_TRIM: u32 = 0x1F << 3;
+const CR_RESET: u32 = 0x0000_0083;
+
+const CSR_LSION: u32 = 1 << 0;
+const CSR_LSIRDY: u32 = 1 << 1;
+const CSR_RMVF: u32 = 1 << 24;
+const CSR_BORRSTF: u32 = 1 << 25;
+const CSR_PINRSTF: u32 = 1 << 26;
+const CSR_PORRSTF: u32 = 1 << 27;
+const CSR_SFTRSTF: u32 = 1 << 28;
+const CSR_IWDGRSTF: u32 = 1 << 29;
+
+const BDCR_LSEON: u32 = 1 << 0;
+const BDCR_LSERDY: u32 = 1 << 1;
+const BDCR_BDRST: u32 = 1 << 16;
+
+/// The frequencies that the program has set up, in Hz.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Clocks {
+    /// The CPU, the AHB, SysTick.
+    pub hclk: u32,
+    /// APB1: CAN among others.
+    pub pclk1: u32,
+    /// APB2.
+    pub pclk2: u32,
+}
+
+/// An oscillator or PLL: off, or on and ready at a time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Source {
+    Off,
+    On { ready: Time },
+}
+
+impl Source {
+    fn switch(&mut self, on: bool, start: Span, now: Time) {
+        match (on, *self) {
+            (true, Source::Off) => *self = Source::On { ready: now + start },
+            (false, Source::On { .. }) => *self = Source::Off,
+            _ => {}
+        }
+    }
+
+    fn is_on(self) -> bool {
+        self != Source::Off
+    }
+
+    fn is_ready(self, now: Time) -> bool {
+        matches!(self, Source::On { ready } if ready <= now)
+    }
+
+    fn next_event(self, now: Time) -> Option<Time> {
+        match self {
+            Source::On { ready } if ready > now => Some(ready),
+            _ => None,
+        }
+    }
+}
+
+/// A register that is kept as written: (offset, reset value, bits that exist).
+const PLAIN: [(u32, u32, u32); 19] = [
+    (0x0C, 0, 0x0000_0000),              // CIR: see `write`
+    (0x10, 0, 0x22E0_11FF),              // AHB1RSTR
+    (0x14, 0, 0x0000_00F1),              // AHB2RSTR
+    (0x18, 0, 0x0000_0001),              // AHB3RSTR
+    (0x20, 0, 0x36FE_C9FF),              // APB1RSTR
+    (0x24, 0, 0x0007_5933),              // APB2RSTR
+    (AHB1ENR, 0x0010_0000, 0x7E74_11FF), // AHB1ENR
+    (AHB2ENR, 0, 0x0000_00F1),           // AHB2ENR
+    (AHB3ENR, 0, 0x0000_0001),           // AHB3ENR
+    (APB1ENR, 0, 0x36FE_C9FF),           // APB1ENR
+    (APB2ENR, 0, 0x0007_5F33),           // APB2ENR
+    (0x50, 0x7E67_91FF, 0x7E67_91FF),    // AHB1LPENR
+    (0x54, 0x0000_00F1, 0x0000_00F1),    // AHB2LPENR
+    (0x58, 0x0000_0001, 0x0000_0001),    // AHB3LPENR
+    (0x60, 0x36FE_C9FF, 0x36FE_C9FF),    // APB1LPENR
+    (0x64, 0x0007_5F33, 0x0007_5F33),    // APB2LPENR
+    (0x80, 0, 0xFFFF_FFFF),              // SSCGR
+    (0x84, 0x2000_3000, 0x7000_7FC0),    // PLLI2SCFGR
+    (PLLCFGR, 0x2400_3010, 0x0F43_7FFF), // PLLCFGR
+];
+
+const PLLCFGR: u32 = 0x04;
+/// Offset of RCC_AHB1ENR.
+pub const AHB1ENR: u32 = 0x30;
+/// Offset of RCC_AHB2ENR.
+pub const AHB2ENR: u32 = 0x34;
+/// Offset of RCC_AHB3ENR.
+pub const AHB3ENR: u32 = 0x38;
+/// Offset of RCC_APB1ENR.
+pub const APB1ENR: u32 = 0x40;
+/// Offset of RCC_APB2ENR.
+pub const APB2ENR: u32 = 0x44;
+
+/// The clock tree and the reset flags.
+#[derive(Clone, Debug)]
+pub struct Rcc {
+    /// Frequency of the crystal or clock at OSC_IN; 0 where there is none.
+    hse_hz: u32,
+    plain: [u32; PLAIN.len()],
+    hsi: Source,
+    hse: Source,
+    pll: Source,
+    plli2s: Source,
+    lsi: Source,
+    lse: Source,
+    cr_rest: u32,
+    cfgr: u32,
+    /// The source that feeds the system clock, as SWS shows it.
+    sws: u32,
+    csr_flags: u32,
+    bdcr_rest: u32,
+    now: Time,
+}
+
+impl Rcc {
+    /// As after power-on, with a crystal of `hse_hz`; 0 means that there is none.
+    #[must_use]
+    pub fn new(hse_hz: u32) -> Self {
+        Self {
+            hse_hz,
+            plain: PLAIN.map(|(_, reset, _)| reset),
+            hsi: Source::On { ready: Time(0) },
+            hse: Source::Off,
+            pll: Source::Off,
+            plli2s: Source::Off,
+            lsi: Source::Off,
+            lse: Source::Off,
+            cr_rest: CR_RESET & CR_TRIM,
+            cfgr: 0,
+            sws: 0,
+            csr_flags: CSR_PORRSTF | CSR_PINRSTF | CSR_BORRSTF,
+            bdcr_rest: 0,
+            now: Time(0),
+        }
+    }
+
+    /// Adds the flags of a reset. Every internal reset pulls NRST low too, so the pin's flag comes with it
+    /// (section 7.1.1).
+    pub fn note_reset(&mut self, cause: ResetCause) {
+        self.csr_flags |= CSR_PINRSTF
+            | match cause {
+                ResetCause::PowerOn => CSR_PORRSTF | CSR_BORRSTF,
+                ResetCause::Pin => 0,
+                ResetCause::Software => CSR_SFTRSTF,
+                ResetCause::IndependentWatchdog => CSR_IWDGRSTF,
+            };
+    }
+
+    /// The watchdog forces the LSI on (section 21.3).
+    pub fn force_lsi(&mut self, now: Time) {
+        self.lsi.switch(true, LSI_START, now);
+    }
+
+    /// A register that is kept as written; 0 for any other.
+    #[must_use]
+    pub fn plain(&self, offset: u32) -> u32 {
+        PLAIN.iter().position(|&(at, _, _)| at == offset).map_or(0, |index| self.plain[index])
+    }
+
+    fn pll_hz(&self) -> u32 {
+        let cfgr = self.plain(PLLCFGR);
+        let input = if cfgr & 1 << 22 != 0 { self.hse_hz } else { HSI_HZ };
+        let (m, n) = (cfgr & 0x3F, cfgr >> 6 & 0x1FF);
+        let p = 2 * ((cfgr >> 16 & 3) + 1);
+        let vco = u64::from(input) * u64::from(n) / u64::from(m.max(1));
+        u32::try_from(vco / u64::from(p)).unwrap_or(u32::MAX)
+    }
+
+    /// What the program has set up.
+    #[must_use]
+    pub fn clocks(&self) -> Clocks {
+        let sysclk = match self.sws {
+            0 => HSI_HZ,
+            1 => self.hse_hz,
+            _ => self.pll_hz(),
+        };
+        let ahb_shift = match self.cfgr >> 4 & 0xF {
+            field @ 8..=11 => field - 7,
+            field @ 12..=15 => field - 6,
+            _ => 0,
+        };
+        let apb_shift = |field: u32| if field & 4 != 0 { (field & 3) + 1 } else { 0 };
+        let hclk = (sysclk >> ahb_shift).max(1);
+        Clocks {
+            hclk,
+            pclk1: (hclk >> apb_shift(self.cfgr >> 10 & 7)).max(1),
+            pclk2: (hclk >> apb_shift(self.cfgr >> 13 & 7)).max(1),
+        }
+    }
+
+    /// Takes the source that SW asks for as soon as it is ready (section 7.2.6).
+    fn follow_sw(&mut self, now: Time) {
+        let wanted = self.cfgr & 3;
+        let ready = match wanted {
+            0 => self.hsi.is_ready(now),
+            1 => self.hse.is_ready(now),
+            2 => self.pll.is_ready(now),
+            _ => false,
+        };
+        if ready {
+            self.sws = wanted;
+        }
+    }
+
+    fn cr(&self, now: Time) -> u32 {
+        let bits = |source: Source, on, ready| {
+            (if source.is_on() { on } else { 0 }) | (if source.is_ready(now) { ready } else { 0 })
+        };
+        self.cr_rest
+            | bits(self.hsi, CR_HSION, CR_HSIRDY)
+            | bits(self.hse, CR_HSEON, CR_HSERDY)
+            | bits(self.pll, CR_PLLON, CR_PLLRDY)
+            | bits(self.plli2s, CR_PLLI2SON, CR_PLLI2SRDY)
+    }
+
+    fn write_cr(&mut self, value: u32, now: Time) -> Result<(), Unmodelled> {
+        self.cr_rest = value & (CR_TRIM | CR_HSEBYP | CR_CSSON);
+        let pll_from_hse = self.plain(PLLCFGR) & 1 << 22 != 0;
+        let uses = |source| self.sws == source;
+        // What feeds the system clock cannot be switched off (section 7.3.1).
+        let hse_fed = uses(1) || uses(2) && pll_from_hse;
+        let hsi_fed = uses(0) || uses(2) && !pll_from_hse;
+        let pll_fed = uses(2);
+        self.hsi.switch(value & CR_HSION != 0 || hsi_fed, HSI_START, now);
+        if self.hse_hz > 0 {
+            self.hse.switch(value & CR_HSEON != 0 || hse_fed, HSE_START, now);
+        }
+        self.pll.switch(value & CR_PLLON != 0 || pll_fed, PLL_LOCK, now);
+        self.plli2s.switch(value & CR_PLLI2SON != 0, PLL_LOCK, now);
+        if self.hse_hz == 0 && value & CR_HSEON != 0 {
+            return Err(Unmodelled(
+                "HSEON is set, but this board has no crystal: HSERDY will never come".into(),
+            ));
+        }
+        if value & CR_CSSON != 0 {
+            return Err(Unmodelled("the clock security system is not modelled".into()));
+        }
+        Ok(())
+    }
+}
+
+impl Peripheral for Rcc {
+    fn name(&self) -> &'static str {
+        "RCC"
+    }
+
+    fn read(&mut self, offset: u32, now: Time) -> Result<u32, Unmodelled> {
+        self.advance(now);
+        Ok(match offset {
+            0x00 => self.cr(now),
+            0x08 => self.cfgr | self.sws << 2,
+            0x70 => {
+                self.bdcr_rest
+                    | (if self.lse.is_on() { BDCR_LSEON } else { 0 })
+                    | (if self.lse.is_ready(now) { BDCR_LSERDY } else { 0 })
+            }
+            0x74 => {
+                self.csr_flags
+                    | (if self.lsi.is_on() { CSR_LSION } else { 0 })
+                    | (if self.lsi.is_ready(now) { CSR_LSIRDY } else { 0 })
+            }
+            _ if PLAIN.iter().any(|&(at, _, _)| at == offset) => self.plain(offset),
+            _ => return Err(Unmodelled("RCC has no such register on the STM32F407".into())),
+        })
+    }
+
+    fn write(&mut self, offset: u32, value: u32, now: Time) -> Result<(), Unmodelled> {
+        self.advance(now);
+        match offset {
+            0x00 => {
+                let result = self.write_cr(value, now);
+                self.follow_sw(now);
+                return result;
+            }
+            PLLCFGR if self.pll.is_on() => {
+                return Err(Unmodelled("PLLCFGR is written while the PLL is on: the chip ignores it".into()));
+            }
+            0x08 => {
+                self.cfgr = value & !0b1100;
+                self.follow_sw(now);
+            }
+            0x0C if value & 0xFF_FF00 & !0x9F_0000 != 0 => {
+                return Err(Unmodelled("the clock interrupts are not modelled".into()));
+            }
+            0x0C => {}
+            0x70 => {
+                self.lse.switch(value & BDCR_LSEON != 0, LSE_START, now);
+                self.bdcr_rest = value & 0x0001_8304;
+                if value & BDCR_BDRST != 0 {
+                    self.lse = Source::Off;
+                    self.bdcr_rest = BDCR_BDRST;
+                }
+            }
+            0x74 => {
+                self.lsi.switch(value & CSR_LSION != 0, LSI_START, now);
+                if value & CSR_RMVF != 0 {
+                    self.csr_flags = 0;
+                }
+            }
+            _ => {
+                let Some(index) = PLAIN.iter().position(|&(at, _, _)| at == offset) else {
+                    return Err(Unmodelled("RCC has no such register on the STM32F407".into()));
+                };
+                self.plain[index] = value & PLAIN[index].2;
+            }
+        }
+        Ok(())
+    }
+
+    fn advance(&mut self, now: Time) {
+        self.now = now;
+        self.follow_sw(now);
+    }
+
+    fn next_event(&self) -> Option<Time> {
+        // Only a pending switch of the system clock acts by itself; the ready flags are computed when read.
+        if self.cfgr & 3 == self.sws {
+            return None;
+        }
+        match self.cfgr & 3 {
+            0 => self.hsi.next_event(self.now),
+            1 => self.hse.next_event(self.now),
+            2 => self.pll.next_event(self.now),
+            _ => None,
+        }
+    }
+
+    fn interrupts(&self, _active: &mut Vec<u16>) {}
+
+    /// System reset: everything but the reset flags, the LSI's request and the backup domain (section 7.1.1).
+    fn reset(&mut self) {
+        let fresh = Self::new(self.hse_hz);
+        *self = Self {
+            csr_flags: self.csr_flags,
+            lse: self.lse,
+            bdcr_rest: self.bdcr_rest,
+            now: self.now,
+            ..fresh
+        };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: u64 = 1_000_000_000;
+
+    /// The usual set-up of the F407: 8 MHz crystal, M 8, N 336, P 2 give 168 MHz, APB1 a quarter, APB2 a half.
+    #[test]
+    fn the_pll_makes_168_mhz_from_an_8_mhz_crystal() {
+        let mut rcc = Rcc::new(8_000_000);
+        assert_eq!(rcc.clocks(), Clocks { hclk: 16_000_000, pclk1: 16_000_000, pclk2: 16_000_000 });
+        rcc.write(0x00, CR_RESET | CR_HSEON, Time(0)).unwrap();
+        assert_eq!(rcc.read(0x00, Time(2 * MS - 1)).unwrap() & CR_HSERDY, 0);
+        assert_eq!(rcc.read(0x00, Time(2 * MS)).unwrap() & CR_HSERDY, CR_HSERDY);
+        rcc.write(PLLCFGR, 1 << 22 | 336 << 6 | 8, Time(2 * MS)).unwrap();
+        rcc.write(0x00, CR_RESET | CR_HSEON | CR_PLLON, Time(2 * MS)).unwrap();
+        // PPRE1 /4, PPRE2 /2, SW = PLL: asked for before the PLL is ready.
+        rcc.write(0x08, 0b100 << 13 | 0b101 << 10 | 2, Time(2 * MS)).unwrap();
+        assert_eq!(rcc.clocks().hclk, 16_000_000);
+        assert_eq!(rcc.next_event(), Some(Time(2 * MS) + PLL_LOCK));
+        rcc.advance(Time(3 * MS));
+        assert_eq!(rcc.clocks(), Clocks { hclk: 168_000_000, pclk1: 42_000_000, pclk2: 84_000_000 });
+        assert_eq!(rcc.read(0x08, Time(3 * MS)).unwrap() & 0b1100, 0b1000);
+        // Neither the PLL nor its source can be switched off now.
+        rcc.write(0x00, CR_RESET, Time(3 * MS)).unwrap();
+        assert_eq!(rcc.clocks().hclk, 168_000_000);
+        assert!(rcc.write(PLLCFGR, 0, Time(3 * MS)).is_err());
+        rcc.reset();
+        assert_eq!(rcc.clocks().hclk, 16_000_000);
+    }
+
+    #[test]
+    fn reset_values_are_those_of_the_manual() {
+        let mut rcc = Rcc::new(8_000_000);
+        for (offset, value) in [
+            (0x00, 0x0000_0083),
+            (0x04, 0x2400_3010),
+            (0x08, 0),
+            (0x30, 0x0010_0000),
+            (0x50, 0x7E67_91FF),
+            (0x60, 0x36FE_C9FF),
+            (0x74, 0x0E00_0000),
+            (0x84, 0x2000_3000),
+        ] {
+            assert_eq!(rcc.read(offset, Time(0)), Ok(value), "offset {offset:02X}h");
+        }
+    }
+
+    #[test]
+    fn reset_flags_gather_until_they_are_removed() {
+        let mut rcc = Rcc::new(8_000_000);
+        rcc.write(0x74, CSR_RMVF, Time(0)).unwrap();
+        assert_eq!(rcc.read(0x74, Time(0)), Ok(0));
+        rcc.note_reset(ResetCause::Software);
+        rcc.reset();
+        assert_eq!(rcc.read(0x74, Time(0)), Ok(0x1400_0000));
+        rcc.note_reset(ResetCause::IndependentWatchdog);
+        assert_eq!(rcc.read(0x74, Time(0)), Ok(0x3400_0000));
+    }
+
+    #[test]
+    fn without_a_crystal_hse_never_gets_ready() {
+        let mut rcc = Rcc::new(0);
+        assert!(rcc.write(0x00, CR_RESET | CR_HSEON, Time(0)).is_err());
+        assert_eq!(rcc.read(0x00, Time(u64::MAX)).unwrap() & CR_HSERDY, 0);
+    }
+}

@@ -1,0 +1,56 @@
+//! System configuration controller and external interrupts, as plain registers (RM0090 sections 9 and 12).
+
+use crate::peripheral::{Peripheral, Unmodelled};
+use crate::time::Time;
+
+/// SYSCFG: memory remap, the EXTI multiplexers, the compensation cell.
+#[derive(Clone, Debug, Default)]
+pub struct Syscfg {
+    memrmp: u32,
+    pmc: u32,
+    exticr: [u32; 4],
+    cmpcr: u32,
+}
+
+impl Peripheral for Syscfg {
+    fn name(&self) -> &'static str {
+        "SYSCFG"
+    }
+
+    fn read(&mut self, offset: u32, _now: Time) -> Result<u32, Unmodelled> {
+        Ok(match offset {
+            0x00 => self.memrmp,
+            0x04 => self.pmc,
+            0x08..=0x14 => self.exticr[(offset as usize - 8) / 4],
+            // READY follows at once when the cell is powered.
+            0x20 => self.cmpcr | self.cmpcr << 8,
+            _ => return Err(Unmodelled("SYSCFG has no such register".into())),
+        })
+    }
+
+    fn write(&mut self, offset: u32, value: u32, _now: Time) -> Result<(), Unmodelled> {
+        match offset {
+            0x00 if value & 3 == 0 => self.memrmp = 0,
+            0x00 => {
+                return Err(Unmodelled("memory remap (SYSCFG_MEMRMP): flash stays at address 0".into()));
+            }
+            0x04 => self.pmc = value & 1 << 23,
+            0x08..=0x14 => self.exticr[(offset as usize - 8) / 4] = value & 0xFFFF,
+            0x20 => self.cmpcr = value & 1,
+            _ => return Err(Unmodelled("SYSCFG has no such register".into())),
+        }
+        Ok(())
+    }
+
+    fn advance(&mut self, _now: Time) {}
+
+    fn next_event(&self) -> Option<Time> {
+        None
+    }
+
+    fn interrupts(&self, _active: &mut Vec<u16>) {}
+
+    fn reset(&mut self) {
+        *self = Self::default();
+    }
+}
