@@ -105,7 +105,7 @@ pub enum Entry {
 }
 
 /// What the hooks leave for the caller.
-#[derive(Debug, Default)]
+#[derive(Default)]
 struct Notes {
     exception: Option<u32>,
     fault: Option<Fault>,
@@ -113,6 +113,8 @@ struct Notes {
     invalid_instruction: bool,
     /// An instruction of the FPU that is switched off lies in the block, at this address.
     fpu_instruction: Option<u32>,
+    /// Blocks looked at.
+    blocks: Blocks,
     /// Pages of RAM that code was fetched from.
     executed: Vec<bool>,
     /// Pages of flash that code was fetched from.
@@ -362,8 +364,10 @@ impl Cpu {
         *notes = Notes {
             executed: std::mem::take(&mut notes.executed),
             flash_executed: std::mem::take(&mut notes.flash_executed),
+            blocks: std::mem::take(&mut notes.blocks),
             ..Notes::default()
         };
+        notes.blocks.forget();
         let chip = self.chip_mut();
         chip.block = (0, 0);
         chip.flush_tlb = true;
@@ -374,6 +378,7 @@ impl Cpu {
         let notes = &mut self.uc.get_data_mut().notes;
         notes.executed.fill(false);
         notes.flash_executed.fill(false);
+        notes.blocks.forget();
         let _ = self.uc.ctl_flush_tb();
         let _ = self.uc.ctl_flush_tlb();
         self.chip_mut().stale.clear();
@@ -490,6 +495,7 @@ impl Cpu {
                 continue;
             }
             let _ = self.uc.ctl_remove_cache(u64::from(address), u64::from(address) + u64::from(len));
+            self.uc.get_data_mut().notes.blocks.forget();
         }
         if std::mem::take(&mut self.chip_mut().flush_tlb) {
             let _ = self.uc.ctl_flush_tlb();
@@ -859,39 +865,64 @@ fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
         }
     }
     let state = uc.get_data_mut();
+    let block = state.notes.blocks.look(&state.chip, address, size);
     let chip = &mut state.chip;
-    let block = count_instructions(chip, address, size);
     if block.fpu.is_some() && !chip.scs.fpu_enabled() {
         state.notes.fpu_instruction = block.fpu;
         return stop(uc);
     }
-    let chip = &mut uc.get_data_mut().chip;
     chip.block = (address, size);
     chip.clock.cycles += block.instructions;
     chip.counters.instructions += block.instructions;
 }
 
 /// A look over the instructions of a block.
+#[derive(Clone, Copy, Debug, Default)]
 struct Block {
     instructions: u64,
-    /// The first one of the FPU, looked for only while the FPU is off.
+    /// The first one of the FPU.
     fpu: Option<u32>,
     /// Encoding of the last one; a 16-bit one has zeros above.
     last: u32,
 }
 
+/// Remembers the blocks looked at last. Whoever changes code forgets them; a program that changes its own in RAM is
+/// charged for the block as it was.
+struct Blocks(Vec<(u32, u32, Block)>);
+
+impl Default for Blocks {
+    fn default() -> Self {
+        Self(vec![(0, 0, Block::default()); Self::SIZE])
+    }
+}
+
+impl Blocks {
+    const SIZE: usize = 4096;
+
+    fn look(&mut self, chip: &Chip, address: u32, size: u32) -> Block {
+        let slot = &mut self.0[(address >> 1) as usize % Self::SIZE];
+        if (slot.0, slot.1) != (address, size) {
+            *slot = (address, size, count_instructions(chip, address, size));
+        }
+        slot.2
+    }
+
+    fn forget(&mut self) {
+        self.0.fill((0, 0, Block::default()));
+    }
+}
+
 fn count_instructions(chip: &Chip, address: u32, size: u32) -> Block {
-    let mut block = Block { instructions: 0, fpu: None, last: 0 };
+    let mut block = Block::default();
     let Some((memory, offset)) = Cpu::memory(chip, address) else { return block };
     let Some(code) = memory.bytes().get(offset..(offset + size as usize)) else { return block };
-    let watch_fpu = !chip.scs.fpu_enabled();
     let mut at = 0;
     while at + 2 <= code.len() {
         let first = u16::from_le_bytes([code[at], code[at + 1]]);
         // DDI 0403E A5.1: the upper five bits 11101, 11110, 11111 start a 32-bit instruction.
         let wide = first >> 11 >= 0b11101;
         // Coprocessor space (A5.3.18) with coprocessor number 10 or 11.
-        if watch_fpu && wide && first & 0xEC00 == 0xEC00 && block.fpu.is_none() {
+        if wide && first & 0xEC00 == 0xEC00 && block.fpu.is_none() {
             let coprocessor = code.get(at + 3).map(|byte| byte & 0x0F);
             if matches!(coprocessor, Some(0xA | 0xB)) {
                 block.fpu = Some(address + at as u32);
