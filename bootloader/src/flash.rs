@@ -32,6 +32,8 @@ impl FlashController {
         Self { registers, flash, running: false }
     }
 
+    /// Opens the control register for one operation. (A `write` starts from the register's reset value, in which LOCK is
+    /// set: whoever writes it has to clear that.)
     fn unlock(&mut self) {
         // What an earlier operation left behind would be taken for the outcome of this one.
         self.clear_flags();
@@ -81,7 +83,7 @@ impl Flash for FlashController {
         self.registers.cr().write(|w| {
             // SAFETY: the geometry's sector numbers are those that SNB takes (section 3.8.5).
             unsafe { w.snb().bits(sector.number) };
-            w.ser().set_bit().psize().set(WORDS).eopie().set_bit().errie().set_bit().strt().set_bit()
+            w.lock().clear_bit().psize().set(WORDS).ser().set_bit().strt().set_bit()
         });
         self.running = true;
         Ok(())
@@ -92,9 +94,7 @@ impl Flash for FlashController {
             return Err(FlashFault::Failed);
         }
         self.unlock();
-        self.registers
-            .cr()
-            .write(|w| w.pg().set_bit().psize().set(WORDS).eopie().set_bit().errie().set_bit());
+        self.registers.cr().write(|w| w.lock().clear_bit().psize().set(WORDS).pg().set_bit());
         // SAFETY: the address was checked to be a word of the flash; with PG set, the store starts the operation.
         unsafe { (address as *mut u32).write_volatile(word) };
         self.running = true;

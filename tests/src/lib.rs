@@ -1,3 +1,4 @@
 //! What the tests and the demonstration share: the built firmware, and the bench that it runs on.
 
+pub mod bench;
 pub mod firmware;

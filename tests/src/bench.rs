@@ -1,0 +1,178 @@
+//! The bench: one emulated board with the built firmware on a bus, and a port for the host, all in virtual time.
+
+use std::cell::{Cell, RefCell};
+use std::rc::Rc;
+use std::time::Duration;
+
+use canopen::NodeId;
+use coflash::adapter::{Adapter, AdapterError};
+use coflash::session::{Session, Timing};
+use emulator::bus::{Outcome, Record};
+use emulator::machine::{Machine, Options, Stop};
+use emulator::time::{Span, Time};
+use emulator::world::{MachineId, PortId, World};
+
+use crate::firmware;
+
+/// The node-ID and bit rate of a board that was never told others (bsp's board file).
+pub const NODE: u8 = 1;
+/// See [`NODE`].
+pub const BIT_RATE: u32 = 125_000;
+
+/// One board on a bus.
+pub struct Bench {
+    /// All of it.
+    pub world: World<Machine>,
+    /// The board.
+    pub device: MachineId,
+    port: PortId,
+    heard: Rc<RefCell<Vec<Record>>>,
+    clock: Rc<Cell<Time>>,
+}
+
+impl Bench {
+    /// A board with the bootloader in its flash, and no power yet.
+    #[must_use]
+    pub fn new() -> Self {
+        Self::with(Options::default())
+    }
+
+    /// The same, on a chip of your choice.
+    ///
+    /// # Panics
+    /// If the emulator cannot be set up, or the firmware was not built.
+    #[must_use]
+    pub fn with(options: Options) -> Self {
+        let mut machine = Machine::new(firmware::board().chip, options).expect("the emulator starts");
+        machine.load(&firmware::elf(firmware::BOOTLOADER)).expect("the bootloader's ELF fits the flash");
+        let mut world = World::empty();
+        let heard = Rc::new(RefCell::new(Vec::new()));
+        let ears = Rc::clone(&heard);
+        world.add_sink(move |record| ears.borrow_mut().push(record.clone()));
+        let device = world.add_machine(machine);
+        let port = world.add_host_port(BIT_RATE);
+        Self { world, device, port, heard, clock: Rc::default() }
+    }
+
+    /// The board.
+    pub fn machine(&mut self) -> &mut Machine {
+        self.world.machine_mut(self.device)
+    }
+
+    /// Virtual time.
+    #[must_use]
+    pub fn time(&self) -> Time {
+        self.world.now()
+    }
+
+    /// Virtual time while a session borrows the bench: as of the host's last look at the bus.
+    #[must_use]
+    pub fn clock(&self) -> Rc<Cell<Time>> {
+        Rc::clone(&self.clock)
+    }
+
+    /// Switches the power on.
+    pub fn power_on(&mut self) {
+        let now = self.world.now();
+        self.machine().power_on(now);
+    }
+
+    /// Cuts the power.
+    pub fn power_off(&mut self) {
+        self.machine().power_off();
+    }
+
+    /// Lets time pass.
+    pub fn run_ms(&mut self, ms: u64) {
+        self.world.run_for(Span::from_millis(ms));
+    }
+
+    /// Runs until the board says its boot-up; gives the time of it.
+    ///
+    /// # Panics
+    /// If that takes more than `within_ms`.
+    pub fn await_boot_up(&mut self, within_ms: u64) -> Time {
+        let from = self.time();
+        let deadline = from + Span::from_millis(within_ms);
+        loop {
+            match self.world.run_until_frame_or(self.port, deadline) {
+                Some((at, frame)) if frame.raw_id() == 0x700 + u32::from(NODE) && frame.data() == [0] => return at,
+                Some(_) => {}
+                None => panic!("no boot-up within {within_ms} ms; the bus said {:?}", self.frames_since(from)),
+            }
+        }
+    }
+
+    /// Every good frame since a point of time, as identifier and data.
+    #[must_use]
+    pub fn frames_since(&self, from: Time) -> Vec<(Time, u32, Vec<u8>)> {
+        let heard = self.heard.borrow();
+        let good = heard.iter().filter(|record| record.end >= from && record.outcome == Outcome::Good);
+        good.map(|record| (record.end, record.frame.raw_id(), record.frame.data().to_vec())).collect()
+    }
+
+    /// Every record of the bus so far, errors included.
+    #[must_use]
+    pub fn records(&self) -> Vec<Record> {
+        self.heard.borrow().clone()
+    }
+
+    /// Resets and other events of the board that nobody has asked for yet.
+    pub fn events(&mut self) -> Vec<(Time, Stop)> {
+        std::iter::from_fn(|| self.world.news()).map(|news| (news.at, news.stop)).collect()
+    }
+
+    /// A host's session with the board.
+    ///
+    /// # Panics
+    /// Never: the node-ID is a good one.
+    pub fn session(&mut self) -> Session<'_> {
+        let node = NodeId::new(NODE).expect("1 to 127");
+        Session::new(self, node, Timing::default())
+    }
+
+    /// Fails if the firmware touched anything that the emulator does not model.
+    ///
+    /// # Panics
+    /// With the list of what it touched.
+    pub fn assert_nothing_unmodelled(&mut self) {
+        let reports = self.machine().reports();
+        assert!(reports.is_empty(), "the firmware touched what the emulator does not model: {reports:#?}");
+    }
+}
+
+impl Default for Bench {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+fn convert<F: embedded_can::Frame, G: embedded_can::Frame>(frame: &F) -> Option<G> {
+    if frame.is_remote_frame() {
+        G::new_remote(frame.id(), frame.dlc())
+    } else {
+        G::new(frame.id(), frame.data())
+    }
+}
+
+/// The host's way to the bus, in virtual time: waiting lets the board run.
+impl Adapter for Bench {
+    fn send(&mut self, frame: &canopen::Frame) -> Result<(), AdapterError> {
+        if let Some(frame) = convert(frame) {
+            self.world.send(self.port, frame);
+        }
+        Ok(())
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<canopen::Frame>, AdapterError> {
+        let nanos = u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX / 1000);
+        let deadline = self.world.now() + Span::from_nanos(nanos);
+        let received = self.world.run_until_frame_or(self.port, deadline);
+        self.clock.set(self.world.now());
+        Ok(received.and_then(|(_, frame)| convert(&frame)))
+    }
+
+    fn now(&self) -> Duration {
+        Duration::from_nanos(self.world.now().0 / 1000)
+    }
+}
