@@ -8,6 +8,7 @@ use canopen::NodeId;
 use coflash::adapter::{Adapter, AdapterError};
 use coflash::session::{Session, Timing};
 use emulator::bus::{Outcome, Record};
+use emulator::frame::Frame;
 use emulator::machine::{Machine, Options, Stop};
 use emulator::time::{Span, Time};
 use emulator::world::{MachineId, PortId, World};
@@ -96,18 +97,22 @@ impl Bench {
         let deadline = from + Span::from_millis(within_ms);
         loop {
             match self.world.run_until_frame_or(self.port, deadline) {
-                Some((at, frame)) if frame.raw_id() == 0x700 + u32::from(NODE) && frame.data() == [0] => return at,
+                Some((at, frame)) if frame.raw_id() == 0x700 + u32::from(NODE) && frame.data() == [0] => {
+                    return at
+                }
                 Some(_) => {}
-                None => panic!("no boot-up within {within_ms} ms; the bus said {:?}", self.frames_since(from)),
+                None => {
+                    panic!("no boot-up within {within_ms} ms; the bus said {:?}", self.frames_since(from))
+                }
             }
         }
     }
 
-    /// Every good frame since a point of time, as identifier and data.
+    /// Every good frame that began at or after a point of time, as identifier and data.
     #[must_use]
     pub fn frames_since(&self, from: Time) -> Vec<(Time, u32, Vec<u8>)> {
         let heard = self.heard.borrow();
-        let good = heard.iter().filter(|record| record.end >= from && record.outcome == Outcome::Good);
+        let good = heard.iter().filter(|record| record.start >= from && record.outcome == Outcome::Good);
         good.map(|record| (record.end, record.frame.raw_id(), record.frame.data().to_vec())).collect()
     }
 
@@ -120,6 +125,29 @@ impl Bench {
     /// Resets and other events of the board that nobody has asked for yet.
     pub fn events(&mut self) -> Vec<(Time, Stop)> {
         std::iter::from_fn(|| self.world.news()).map(|news| (news.at, news.stop)).collect()
+    }
+
+    /// Sends a raw frame from the host, and waits for nothing.
+    ///
+    /// # Panics
+    /// If the frame is no frame.
+    pub fn post(&mut self, id: u16, data: &[u8]) {
+        self.world.send(self.port, Frame::standard(id, data).expect("11 bits, 8 bytes"));
+    }
+
+    /// Sends a raw frame from the host and gives the next frame with identifier `answer`, within 100 ms.
+    ///
+    /// # Panics
+    /// If the frame is no frame.
+    pub fn ask(&mut self, id: u16, data: &[u8], answer: u32) -> Option<Vec<u8>> {
+        self.post(id, data);
+        let deadline = self.time() + Span::from_millis(100);
+        loop {
+            let (_, frame) = self.world.run_until_frame_or(self.port, deadline)?;
+            if frame.raw_id() == answer {
+                return Some(frame.data().to_vec());
+            }
+        }
     }
 
     /// A host's session with the board.

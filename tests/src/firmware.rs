@@ -3,6 +3,8 @@
 use std::path::PathBuf;
 use std::{env, fs};
 
+use coflash::block_file::BlockFile;
+use coflash::convert::{blocks_of, Options, Region};
 use shared_abi::layout::{self, Layout};
 
 /// The images by the names that `cargo xtask build` gives them.
@@ -19,7 +21,9 @@ pub const APP_V2: &str = "app-v2.elf";
 #[must_use]
 pub fn board() -> &'static Layout {
     match env::var("COBOOT_BOARD") {
-        Ok(name) => layout::by_name(&name).unwrap_or_else(|| panic!("COBOOT_BOARD: no board is called {name:?}")),
+        Ok(name) => {
+            layout::by_name(&name).unwrap_or_else(|| panic!("COBOOT_BOARD: no board is called {name:?}"))
+        }
         Err(_) => layout::BOARDS[0],
     }
 }
@@ -33,6 +37,18 @@ pub fn dir() -> PathBuf {
     )
 }
 
+/// An application's image as the blocks that the device takes.
+///
+/// # Panics
+/// If it was not built, or does not fit the board.
+#[must_use]
+pub fn blocks(name: &str) -> BlockFile {
+    let _ = elf(name);
+    let image = coflash::read::load(&dir().join(name), None, None).expect("an ELF of ours");
+    let options = Options { region: Region::Strict(board().programs[0].into()), ..Options::default() };
+    blocks_of(image, &options).expect("it lies in the program's flash").file
+}
+
 /// The bytes of an image.
 ///
 /// # Panics
@@ -41,6 +57,9 @@ pub fn dir() -> PathBuf {
 pub fn elf(name: &str) -> Vec<u8> {
     let path = dir().join(name);
     fs::read(&path).unwrap_or_else(|error| {
-        panic!("{}: {error}. Build the firmware first: `cargo xtask build`, or run `cargo xtask test`.", path.display())
+        panic!(
+            "{}: {error}. Build the firmware first: `cargo xtask build`, or run `cargo xtask test`.",
+            path.display()
+        )
     })
 }

@@ -179,14 +179,17 @@ fn every_segment_lies_in_its_own_flash_and_in_the_images_ram() {
 #[test]
 fn every_symbol_lies_in_its_own_flash_or_in_the_images_ram() {
     let layout = firmware::board();
-    for (image, flash) in [(firmware::BOOTLOADER, layout.bootloader), (firmware::APP_V1, layout.programs[0])] {
+    for (image, flash) in [(firmware::BOOTLOADER, layout.bootloader), (firmware::APP_V1, layout.programs[0])]
+    {
         let elf = firmware::elf(image);
         let file = ElfFile32::<Endianness>::parse(&*elf).unwrap();
         let mut count = 0;
         for symbol in file.symbols() {
             // Numbers (absolute symbols) and names of sections that are not loaded have no place in memory.
             let SymbolSection::Section(section) = symbol.section() else { continue };
-            let SectionFlags::Elf { sh_flags } = file.section_by_index(section).unwrap().flags() else { continue };
+            let SectionFlags::Elf { sh_flags } = file.section_by_index(section).unwrap().flags() else {
+                continue;
+            };
             if sh_flags & u64::from(object::elf::SHF_ALLOC) == 0 {
                 continue;
             }
@@ -244,9 +247,15 @@ fn the_bootloader_runs_from_ram() {
             || name.contains("callgate");
         let address = symbol.address() as u32 & !1;
         if start_up {
-            assert!(layout.bootloader.contains(address, 2), "{name} at {address:#x} runs before the copy to RAM");
+            assert!(
+                layout.bootloader.contains(address, 2),
+                "{name} at {address:#x} runs before the copy to RAM"
+            );
         } else {
-            assert!(layout.ram.contains(address, 2), "{name} at {address:#x} would stall while flash is busy");
+            assert!(
+                layout.ram.contains(address, 2),
+                "{name} at {address:#x} would stall while flash is busy"
+            );
             in_ram += 1;
         }
     }

@@ -1,19 +1,9 @@
 //! The main job, with the real images on the emulated chip: flash, start, call back, flash again, survive a power cut.
 
 use canopen::Address;
-use coflash::convert::{blocks_of, Options, Region};
-use coflash::flash::{flash, Event, FlashOptions};
-use coflash::block_file::BlockFile;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
-
-fn blocks(image: &str) -> BlockFile {
-    let layout = firmware::board();
-    let path = firmware::dir().join(image);
-    let firmware = coflash::read::load(&path, None, None).unwrap();
-    let options = Options { region: Region::Strict(layout.programs[0].into()), ..Options::default() };
-    blocks_of(firmware, &options).unwrap().file
-}
+use coflash::flash::{flash, Event, FlashOptions};
 
 #[test]
 fn an_empty_board_says_boot_up_and_serves_its_objects() {
@@ -34,17 +24,27 @@ fn the_main_job() {
     bench.await_boot_up(100);
 
     let mut events = Vec::new();
-    let report = flash(&mut bench.session(), &blocks(firmware::APP_V1), &FlashOptions::default(), &mut |event| {
-        events.push(event);
-    })
+    let report = flash(
+        &mut bench.session(),
+        &firmware::blocks(firmware::APP_V1),
+        &FlashOptions::default(),
+        &mut |event| {
+            events.push(event);
+        },
+    )
     .unwrap();
     assert!(matches!(events.last(), Some(Event::Started(_))), "{events:?}");
     let mut session = bench.session();
     assert_eq!(session.read_text(Address::new(0x100A, 0)).unwrap(), "1.0.0");
-    assert_eq!(session.read_number(Address::new(0x1F56, 1)).unwrap(), report.program_crc, "through the callgate");
+    assert_eq!(
+        session.read_number(Address::new(0x1F56, 1)).unwrap(),
+        report.program_crc,
+        "through the callgate"
+    );
     assert_eq!(session.read_number(Address::new(0x1F51, 1)).unwrap(), 1, "running");
 
-    flash(&mut bench.session(), &blocks(firmware::APP_V2), &FlashOptions::default(), &mut |_| {}).unwrap();
+    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V2), &FlashOptions::default(), &mut |_| {})
+        .unwrap();
     assert_eq!(bench.session().read_text(Address::new(0x100A, 0)).unwrap(), "2.0.0");
 
     bench.power_off();

@@ -11,7 +11,6 @@ use canopen::Address;
 use coboot_tests::bench::{Bench, BIT_RATE, NODE};
 use coboot_tests::firmware;
 use coflash::block_file::BlockFile;
-use coflash::convert::{blocks_of, Options, Region};
 use coflash::flash::{flash, Event, FlashOptions};
 use emulator::candump;
 use emulator::time::Time;
@@ -19,7 +18,8 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 type Outcome<T> = Result<T, Box<dyn std::error::Error>>;
 
-const USAGE: &str = "usage: demo [--trace FILE]    (run it as `cargo xtask demo`, which builds everything first)";
+const USAGE: &str =
+    "usage: demo [--trace FILE]    (run it as `cargo xtask demo`, which builds everything first)";
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -62,7 +62,7 @@ fn demo(trace: Option<&str>) -> Outcome<()> {
     introduce(&mut bench)?;
 
     chapter("Version 1 goes into the board");
-    let v1 = convert(firmware::APP_V1)?;
+    let v1 = convert(firmware::APP_V1);
     install(&mut bench, &v1)?;
     introduce(&mut bench)?;
     heartbeat(&mut bench)?;
@@ -75,7 +75,7 @@ fn demo(trace: Option<&str>) -> Outcome<()> {
     introduce(&mut bench)?;
 
     chapter("Version 2 goes into the board");
-    let v2 = convert(firmware::APP_V2)?;
+    let v2 = convert(firmware::APP_V2);
     install(&mut bench, &v2)?;
     introduce(&mut bench)?;
 
@@ -137,28 +137,32 @@ fn heartbeat(bench: &mut Bench) -> Outcome<()> {
 }
 
 /// An application's ELF, as the blocks that the device takes.
-fn convert(image: &str) -> Outcome<BlockFile> {
-    let program = firmware::board().programs[0];
-    let loaded = coflash::read::load(&firmware::dir().join(image), None, None)?;
-    let options = Options { region: Region::Strict(program.into()), ..Options::default() };
-    let file = blocks_of(loaded, &options)?.file;
+fn convert(image: &str) -> BlockFile {
+    let file = firmware::blocks(image);
     let (size, crc) = (file.program_size(), file.program_crc());
-    println!("               {image} converted: {size} bytes in blocks of up to {}, CRC {crc:08X}h", options.block_size);
-    Ok(file)
+    println!(
+        "               {image} converted: {size} bytes in {} blocks, CRC {crc:08X}h",
+        file.blocks().len()
+    );
+    file
 }
 
 /// The whole procedure, told step by step.
 fn install(bench: &mut Bench, file: &BlockFile) -> Outcome<()> {
     let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stdout());
     // The rate and the remaining time are those of the watcher's clock.
-    let style = ProgressStyle::with_template("               {bar:36} {bytes} of {total_bytes}, {bytes_per_sec}, {eta} left")?;
+    let style = ProgressStyle::with_template(
+        "               {bar:36} {bytes} of {total_bytes}, {bytes_per_sec}, {eta} left",
+    )?;
     bar.set_style(style.progress_chars("=> "));
     let clock = bench.clock();
+    let mut complete = false;
     let outcome = flash(&mut bench.session(), file, &FlashOptions::default(), &mut |event| match event {
         Event::Progress { done, total } => {
             bar.set_length(total as u64);
             bar.set_position(done as u64);
-            if done == total {
+            if done == total && !complete {
+                complete = true;
                 bar.finish();
                 say(clock.get(), &format!("all {total} bytes are in the device"));
             }
@@ -167,6 +171,9 @@ fn install(bench: &mut Bench, file: &BlockFile) -> Outcome<()> {
     });
     let report = outcome?;
     let rate = f64::from(report.program_size) / report.took.as_secs_f64() / 1024.0;
-    say(bench.time(), &format!("the update took {:.1} s on the bus ({rate:.1} KiB/s)", report.took.as_secs_f64()));
+    say(
+        bench.time(),
+        &format!("the update took {:.1} s on the bus ({rate:.1} KiB/s)", report.took.as_secs_f64()),
+    );
     Ok(())
 }

@@ -1,0 +1,342 @@
+//! The device seen from the bus: what it refuses, what it survives, and that it is never silent.
+
+use canopen::program::{FlashError, ProgramControl};
+use canopen::Address;
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::firmware;
+use coflash::error::Error;
+use coflash::flash::{flash, Event, FlashOptions};
+use coflash::session::Doing;
+use emulator::machine::{Options, ResetCause, Stop};
+use emulator::time::{Span, Time};
+
+const DATA: Address = Address::new(0x1F50, 1);
+const CONTROL: Address = Address::new(0x1F51, 1);
+const STATUS: Address = Address::new(0x1F57, 1);
+const VERSION: Address = Address::new(0x100A, 0);
+const REQUEST: u16 = 0x600 + NODE as u16;
+const RESPONSE: u32 = 0x580 + NODE as u32;
+const HEARTBEAT: u32 = 0x700 + NODE as u32;
+
+/// A board in its bootloader, with nothing installed.
+fn empty_board() -> Bench {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    bench
+}
+
+/// A board that runs version 1.
+fn running_board() -> Bench {
+    let mut bench = empty_board();
+    install(&mut bench, firmware::APP_V1);
+    bench
+}
+
+fn install(bench: &mut Bench, image: &str) {
+    let file = firmware::blocks(image);
+    flash(&mut bench.session(), &file, &FlashOptions::default(), &mut |_| {}).unwrap();
+}
+
+fn call_back(bench: &mut Bench) {
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up(1000);
+}
+
+/// Puts the flash of program 1 aside, to see whether anything touches it.
+fn program_flash(bench: &mut Bench) -> Vec<u8> {
+    bench.machine().flash()[0x1_0000..].to_vec()
+}
+
+fn crc32(bytes: &[u8]) -> u32 {
+    !bytes.iter().fold(u32::MAX, |crc, byte| {
+        (0..8).fold(
+            crc ^ u32::from(*byte),
+            |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xEDB8_8320 } else { crc >> 1 },
+        )
+    })
+}
+
+fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
+    let mut bytes: Vec<u8> =
+        [number, address, data.len() as u32].iter().flat_map(|w| w.to_le_bytes()).collect();
+    bytes.extend(data);
+    bytes.extend(crc32(&bytes).to_le_bytes());
+    bytes
+}
+
+/// Sends a block; gives the abort code and, when all is done, the status.
+fn send(bench: &mut Bench, block: &[u8]) -> (Option<u32>, u32) {
+    let mut session = bench.session();
+    let outcome = session.write(DATA, block, Doing::Block(0), &mut |_| {});
+    let abort = match outcome {
+        Ok(()) => None,
+        Err(Error::Refused { code, .. }) => Some(code.0),
+        Err(error) => panic!("{error}"),
+    };
+    let status = session.await_idle(1, Doing::Read(STATUS)).unwrap();
+    (abort, status.to_word())
+}
+
+#[test]
+fn wrong_blocks_are_refused_with_abort_and_status_and_the_right_one_is_taken() {
+    let mut bench = empty_board();
+    bench.session().command(1, ProgramControl::Clear).unwrap();
+    assert_eq!(bench.session().await_idle(1, Doing::Read(STATUS)).unwrap().to_word(), 0);
+    let blank = program_flash(&mut bench);
+    let mut bad_crc = block(1, 0x0801_0000, &[1; 100]);
+    bad_crc[50] ^= 0x10;
+    assert_eq!(
+        send(&mut bench, &block(1, 0x0801_0000, &[1; 100])),
+        (Some(0x0800_0022), 0x88),
+        "before block 0"
+    );
+    assert_eq!(send(&mut bench, &block(0, 0, &[0; 8])), (None, 0));
+    for (what, bad, abort, status) in [
+        ("wrong CRC", bad_crc, 0x0800_0020, 0x06),
+        ("wrong sequence", block(2, 0x0801_0000, &[1; 100]), 0x0800_0022, 0x88),
+        ("over the bootloader", block(1, 0x0800_0000, &[1; 100]), 0x0800_0020, 0x0E),
+        ("outside the flash", block(1, 0x0810_0000, &[1; 100]), 0x0800_0020, 0x0C),
+        ("too large", block(1, 0x0801_0000, &[1; 16384 - 15]), 0x0607_0012, 0x04),
+    ] {
+        assert_eq!(send(&mut bench, &bad), (Some(abort), status), "{what}");
+        assert_eq!(program_flash(&mut bench), blank, "{what}");
+    }
+    assert_eq!(send(&mut bench, &block(1, 0x0801_0000, &[1; 100])), (None, 0));
+    assert_eq!(program_flash(&mut bench)[..101], [&[1; 100][..], &[0xFF]].concat());
+}
+
+#[test]
+fn the_largest_block_of_the_manual_is_taken() {
+    let mut bench = empty_board();
+    bench.session().command(1, ProgramControl::Clear).unwrap();
+    bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
+    assert_eq!(send(&mut bench, &block(0, 0, &[0; 8])), (None, 0));
+    let data: Vec<u8> = (0..16384 - 16).map(|i| (i % 251) as u8).collect();
+    assert_eq!(send(&mut bench, &block(1, 0x0801_0000, &data)), (None, 0));
+    assert_eq!(program_flash(&mut bench)[..data.len()], data);
+}
+
+#[test]
+fn commands_without_a_program_and_unknown_ones() {
+    let mut bench = empty_board();
+    for command in [ProgramControl::Start, ProgramControl::SetSignature] {
+        bench.session().command(1, command).unwrap();
+        let status = bench.session().await_idle(1, Doing::Command(command)).unwrap();
+        assert_eq!(status.error, Some(FlashError::NoValidProgram), "{command:?}");
+    }
+    bench.session().command(1, ProgramControl::ResetStat).unwrap();
+    assert_eq!(bench.session().read_number(STATUS).unwrap(), 0);
+    let refused = bench.session().write(CONTROL, &[0x42], Doing::Read(CONTROL), &mut |_| {});
+    assert!(matches!(refused, Err(Error::Refused { code, .. }) if code.0 == 0x0609_0030), "{refused:?}");
+    assert_eq!(bench.events(), [], "no reset");
+}
+
+#[test]
+fn a_transfer_that_breaks_off_does_not_block_the_next_one() {
+    let mut bench = empty_board();
+    bench.session().command(1, ProgramControl::Clear).unwrap();
+    bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
+    // Initiate a segmented download of 24 bytes (21h, size indicated), send one segment, fall silent.
+    let initiated = bench.ask(REQUEST, &[0x21, 0x50, 0x1F, 0x01, 24, 0, 0, 0], RESPONSE);
+    assert_eq!(initiated.as_deref(), Some(&[0x60, 0x50, 0x1F, 0x01, 0, 0, 0, 0][..]));
+    let segment = bench.ask(REQUEST, &[0x00, 0, 0, 0, 0, 0, 0, 0], RESPONSE);
+    assert_eq!(segment.as_deref(), Some(&[0x20, 0, 0, 0, 0, 0, 0, 0][..]));
+    // Somebody else begins at once, and is served.
+    assert_eq!(send(&mut bench, &block(0, 0, &[0; 8])), (None, 0));
+    // Once more, and this time the server's time-out frees the transfer: abort 05040000h for 1F50h/1.
+    bench.ask(REQUEST, &[0x21, 0x50, 0x1F, 0x01, 24, 0, 0, 0], RESPONSE);
+    let from = bench.time();
+    bench.run_ms(5000);
+    let said: Vec<_> = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == RESPONSE).collect();
+    assert_eq!(said.len(), 1, "{said:?}");
+    assert_eq!(said[0].2, [0x80, 0x50, 0x1F, 0x01, 0x00, 0x00, 0x04, 0x05]);
+    assert_eq!(send(&mut bench, &block(1, 0x0801_0000, &[7; 64])), (None, 0));
+}
+
+/// The power goes at eleven points of an update: during the erase, between blocks, in the middle of one.
+#[test]
+fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
+    for after_ms in [30, 500, 3000, 7600, 7700, 8000, 8500, 9000, 10000, 11000, 11200] {
+        let mut bench = running_board();
+        call_back(&mut bench);
+        let file = firmware::blocks(firmware::APP_V2);
+        // The host pulls the plug by its own clock: the update is given up at that time, then the power goes.
+        let deadline = bench.time() + Span::from_millis(after_ms);
+        let clock = bench.clock();
+        let flag = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
+        let mut session = bench.session();
+        session.cancel_by(std::sync::Arc::clone(&flag));
+        let outcome = flash(&mut session, &file, &FlashOptions::default(), &mut |_| {
+            if clock.get() >= deadline {
+                flag.store(true, std::sync::atomic::Ordering::Relaxed);
+            }
+        });
+        assert!(matches!(outcome, Err(Error::Cancelled)), "cut at {after_ms} ms: {outcome:?}");
+        bench.power_off();
+        bench.run_ms(100);
+        bench.power_on();
+        bench.await_boot_up(1000);
+        let running = bench.session().device_type().unwrap().unwrap();
+        assert!(running.is_bootloader(), "cut at {after_ms} ms");
+        install(&mut bench, firmware::APP_V2);
+        assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0", "cut at {after_ms} ms");
+        bench.assert_nothing_unmodelled();
+    }
+}
+
+#[test]
+fn a_trial_run_comes_back_to_the_bootloader_and_an_unsigned_program_does_not_start_by_itself() {
+    let mut bench = empty_board();
+    let file = firmware::blocks(firmware::APP_V1);
+    let options = FlashOptions { trial_run: true, start: false, ..FlashOptions::default() };
+    let mut trial_passed = false;
+    flash(&mut bench.session(), &file, &options, &mut |event| {
+        trial_passed |= matches!(event, Event::TrialPassed(_));
+    })
+    .unwrap();
+    assert!(trial_passed);
+    bench.session().command(1, ProgramControl::ClrSignature).unwrap();
+    bench.session().await_idle(1, Doing::Command(ProgramControl::ClrSignature)).unwrap();
+    let running = |bench: &mut Bench| {
+        bench.power_off();
+        bench.run_ms(100);
+        bench.power_on();
+        bench.await_boot_up(1000);
+        bench.session().device_type().unwrap().unwrap()
+    };
+    assert!(running(&mut bench).is_bootloader());
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    bench.await_boot_up(1000);
+    assert!(!bench.session().device_type().unwrap().unwrap().is_bootloader(), "started on request, for once");
+    assert!(running(&mut bench).is_bootloader(), "and not again");
+}
+
+/// The promise of 1F51h = 80h: the answer is on the bus, then at least 10 ms pass, then the device resets.
+#[test]
+fn the_answer_to_the_call_back_is_on_the_bus_well_before_the_reset() {
+    let mut bench = running_board();
+    bench.events();
+    let from = bench.time();
+    call_back(&mut bench);
+    let frames = bench.frames_since(from);
+    let answer = frames.iter().find(|(_, id, _)| *id == RESPONSE).expect("an answer");
+    assert_eq!(answer.2, [0x60, 0x51, 0x1F, 0x01, 0, 0, 0, 0]);
+    let events = bench.events();
+    let [(reset, Stop::Reset(ResetCause::Software))] = events[..] else { panic!("{events:?}") };
+    assert!(reset - answer.0 >= Span::from_millis(10), "answered at {}, reset at {reset}", answer.0);
+    let boot_up = frames.iter().find(|(_, id, data)| *id == HEARTBEAT && data[..] == [0]).expect("a boot-up");
+    assert!(boot_up.0 > reset);
+}
+
+/// While 960 KiB are being erased: each SDO is answered within 5 ms, and the heartbeat keeps its period within 10 %.
+#[test]
+fn never_silent_during_an_erase() {
+    let mut bench = running_board();
+    call_back(&mut bench);
+    let from = bench.time();
+    bench.session().command(1, ProgramControl::Clear).unwrap();
+    let mut slowest = Span(0);
+    let mut busy = 0;
+    loop {
+        bench.run_ms(7);
+        let asked = bench.time();
+        let answer = bench.ask(REQUEST, &[0x40, 0x57, 0x1F, 0x01, 0, 0, 0, 0], RESPONSE).expect("an answer");
+        slowest = slowest.max(bench.time() - asked);
+        if answer[4] & 1 == 0 {
+            break;
+        }
+        busy += 1;
+    }
+    assert!(busy > 500, "the erase must have lasted: {busy} busy answers");
+    // Both frames of the exchange are part of the measured time.
+    assert!(slowest <= Span::from_millis(5), "{} us", slowest.0 / 1_000_000);
+    let beats: Vec<Time> = bench
+        .frames_since(from)
+        .into_iter()
+        .filter(|(_, id, _)| *id == HEARTBEAT)
+        .map(|(at, ..)| at)
+        .collect();
+    assert!(beats.len() >= 7, "{beats:?}");
+    for pair in beats.windows(2) {
+        let period = pair[1] - pair[0];
+        assert!((900..=1100).contains(&(period.0 / 1_000_000_000)), "{} ms", period.0 / 1_000_000_000);
+    }
+    assert_eq!(bench.machine().counters().flash_stalls, 0);
+}
+
+#[test]
+fn the_entry_strap_holds_the_device_in_the_bootloader() {
+    let mut bench = running_board();
+    bench.power_off();
+    bench.machine().set_pin('A', 0, Some(true));
+    bench.power_on();
+    bench.await_boot_up(1000);
+    assert!(bench.session().device_type().unwrap().unwrap().is_bootloader());
+    bench.machine().set_pin('A', 0, Some(false));
+    bench.power_off();
+    bench.power_on();
+    bench.await_boot_up(1000);
+    assert!(!bench.session().device_type().unwrap().unwrap().is_bootloader());
+}
+
+#[test]
+fn nmt_resets_restart_the_device_or_the_communication() {
+    let mut bench = running_board();
+    call_back(&mut bench);
+    bench.events();
+    // Reset communication (82h) to this node: a boot-up, and no reset of the chip.
+    let boot_up = bench.ask(0, &[0x82, NODE], HEARTBEAT);
+    assert_eq!(boot_up.as_deref(), Some(&[0][..]));
+    assert_eq!(bench.events(), []);
+    // Start (01h) to all: the bootloader stays PRE-OPERATIONAL (7Fh).
+    bench.post(0, &[0x01, 0]);
+    let from = bench.time();
+    bench.run_ms(1100);
+    assert!(bench.frames_since(from).iter().any(|(_, id, data)| *id == HEARTBEAT && data[..] == [0x7F]));
+    // Reset node (81h) to another node is not for us; to all it is, and then the autostart applies.
+    bench.post(0, &[0x81, NODE + 1]);
+    bench.run_ms(100);
+    assert_eq!(bench.events(), []);
+    bench.post(0, &[0x81, 0]);
+    bench.await_boot_up(1000);
+    assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0");
+}
+
+/// Whatever the RAM holds at power-on (the warm-start cell and the handoff among it), it asks for nothing.
+#[test]
+fn noise_in_the_ram_is_no_request() {
+    let mut installed = running_board();
+    let flash_image = installed.machine().flash().to_vec();
+    for seed in 0..20 {
+        let mut bench = Bench::with(Options { seed, ..Options::default() });
+        bench.machine().load_bin(0x0800_0000, &flash_image).unwrap();
+        bench.power_on();
+        bench.await_boot_up(1000);
+        let running = bench.session().device_type().unwrap().unwrap();
+        assert!(!running.is_bootloader(), "seed {seed}: the program starts as after any power-on");
+    }
+}
+
+/// The callgate runs without the bootloader's RAM: all that the application does not use is garbage when it calls.
+#[test]
+fn the_callgate_needs_nothing_of_the_bootloaders_ram() {
+    let mut bench = running_board();
+    let crc = bench.session().read_number(Address::new(0x1F56, 1)).unwrap();
+    let layout = firmware::board();
+    let program = layout.programs[0];
+    bench.power_off();
+    bench.power_on();
+    // Stop at the application's first instructions, and spoil the RAM that the bootloader was in.
+    while !program.contains(bench.machine().pc(), 2) {
+        let next = bench.time() + Span::from_micros(10);
+        bench.world.run_until(next);
+        assert!(next < Time(30_000_000_000_000), "the application does not start");
+    }
+    // The application clears its own statics at the bottom; its stack is at the top.
+    let garbage: Vec<u8> = (0..0x1_F000_u32).map(|i| (i.wrapping_mul(0x9E37_79B1) >> 24) as u8).collect();
+    bench.machine().write_ram(0x2000_0400, &garbage[0x400..]).unwrap();
+    bench.await_boot_up(1000);
+    assert_eq!(bench.session().read_number(Address::new(0x1F56, 1)).unwrap(), crc);
+    assert_eq!(crc, firmware::blocks(firmware::APP_V1).program_crc());
+}
