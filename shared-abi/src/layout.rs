@@ -218,22 +218,30 @@ impl fmt::Display for Layout {
         )?;
         writeln!(f)?;
         writeln!(f, "  {:<14} {:<24} {:>12}   remarks", "region", "addresses", "size")?;
-        self.row(f, "bootloader", self.bootloader)?;
-        writeln!(f, "vector table at +0, callgate at +{:X}h", self.callgate_offset)?;
-        for (name, region) in ["parameters A", "parameters B"].iter().zip(self.parameters) {
-            self.row(f, name, region)?;
-            writeln!(f)?;
+        let map = [
+            ("bootloader", self.bootloader, "vector table, then the callgate"),
+            ("parameters A", self.parameters[0], ""),
+            ("parameters B", self.parameters[1], ""),
+        ];
+        let programs = self.programs.iter().zip(PROGRAM_NAMES).map(|(region, name)| (name, *region, ""));
+        let ram = [
+            ("RAM", self.ram, "code and data; the application gets all of it"),
+            ("handoff", self.handoff, "bootloader -> application"),
+            ("warm-start", self.warm_start, "application -> bootloader; the last RAM cell"),
+        ];
+        for (name, region, remark) in map.into_iter().chain(programs).chain(ram) {
+            self.row(f, name, region, remark)?;
         }
-        for (region, name) in self.programs.iter().zip(PROGRAM_NAMES) {
-            self.row(f, name, *region)?;
-            writeln!(f)?;
-        }
-        self.row(f, "RAM", self.ram)?;
-        writeln!(f, "code and data; the application gets all of it")?;
-        self.row(f, "handoff", self.handoff)?;
-        writeln!(f, "bootloader -> application")?;
-        self.row(f, "warm-start", self.warm_start)?;
-        writeln!(f, "application -> bootloader; the last RAM cell")
+        writeln!(f, "\n  The callgate is at {}.", Address(self.callgate()))
+    }
+}
+
+/// An address as the manuals print it: `0800_0000`.
+struct Address(u32);
+
+impl fmt::Display for Address {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:04X}_{:04X}", self.0 >> 16, self.0 & 0xFFFF)
     }
 }
 
@@ -241,26 +249,28 @@ impl fmt::Display for Layout {
 const PROGRAM_NAMES: [&str; 4] = ["program 1", "program 2", "program 3", "program 4"];
 
 impl Layout {
-    fn row(&self, f: &mut fmt::Formatter<'_>, name: &str, region: Region) -> fmt::Result {
+    fn row(&self, f: &mut fmt::Formatter<'_>, name: &str, region: Region, remark: &str) -> fmt::Result {
         let (first, last) = (region.base, region.end() - 1);
-        write!(
-            f,
-            "  {name:<14} {:04X}_{:04X} - {:04X}_{:04X}    ",
-            first >> 16,
-            first & 0xFFFF,
-            last >> 16,
-            last & 0xFFFF
-        )?;
-        if region.size.is_multiple_of(1024) {
-            write!(f, "{:>8} KiB", region.size / 1024)?;
-        } else {
-            write!(f, "{:>8} B  ", region.size)?;
+        write!(f, "  {name:<14} {} - {}    ", Address(first), Address(last))?;
+        match region.size {
+            size if size.is_multiple_of(1024) => write!(f, "{:>8} KiB", size / 1024)?,
+            size => write!(f, "{size:>8} B  ")?,
         }
-        write!(f, "   ")?;
-        match (self.chip.sector_at(first), self.chip.sector_at(last)) {
-            (Some(a), Some(b)) if a.number == b.number => write!(f, "sector {}; ", a.number),
-            (Some(a), Some(b)) => write!(f, "sectors {}-{}; ", a.number, b.number),
-            _ => Ok(()),
+        let sectors = match (self.chip.sector_at(first), self.chip.sector_at(last)) {
+            (Some(a), Some(b)) if a.number == b.number => {
+                write!(f, "   sector {}", a.number)?;
+                true
+            }
+            (Some(a), Some(b)) => {
+                write!(f, "   sectors {}-{}", a.number, b.number)?;
+                true
+            }
+            _ => false,
+        };
+        match (remark.is_empty(), sectors) {
+            (true, _) => writeln!(f),
+            (false, true) => writeln!(f, ": {remark}"),
+            (false, false) => writeln!(f, "   {remark}"),
         }
     }
 }
