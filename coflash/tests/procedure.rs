@@ -40,11 +40,11 @@ fn fails(fake: &mut Fake) -> Error {
 }
 
 /// The first `times` times that `number` comes the outcome, then all is well.
-fn script<T: PartialEq + Copy + 'static>(
+fn script<T: PartialEq + Copy + Send + 'static>(
     number: T,
     times: usize,
     outcome: Outcome,
-) -> Box<dyn FnMut(T) -> Outcome> {
+) -> Box<dyn FnMut(T) -> Outcome + Send> {
     let mut left = times;
     Box::new(move |came| {
         if came == number && left > 0 {

@@ -1,6 +1,9 @@
 //! A device that is none: an adapter with virtual time whose other end plays a bootloader and an application, written
 //! from the manual and from CiA 301 byte by byte, without the product's own server.
 
+// Each test uses its part of it.
+#![allow(dead_code)]
+
 use std::collections::VecDeque;
 use std::io;
 use std::time::Duration;
@@ -31,7 +34,7 @@ pub enum Outcome {
     Ignore,
 }
 
-type Script<T> = Box<dyn FnMut(T) -> Outcome>;
+type Script<T> = Box<dyn FnMut(T) -> Outcome + Send>;
 
 pub struct Fake {
     pub now: Duration,

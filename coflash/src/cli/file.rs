@@ -1,0 +1,136 @@
+//! The firmware file and how to read it: what `convert` and `flash` share.
+
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use coflash::convert::{blocks_of, Converted, GapFill, Label, Options, Region, DEFAULT_BLOCK_SIZE};
+use coflash::image::AddressRange;
+use coflash::read::{self, Format};
+use shared_abi::layout;
+
+use super::{number, Failure};
+
+/// How to read a firmware file and cut it into blocks.
+#[derive(Debug, Args)]
+pub(super) struct Source {
+    /// The board: takes the program's region from its memory map, and refuses data outside.
+    #[arg(long, value_name = "BOARD", value_parser = board)]
+    board: Option<&'static layout::Layout>,
+
+    /// The first address of the program's region; data before it is left out.
+    #[arg(long, alias = "start_address", value_name = "ADDRESS", value_parser = number, conflicts_with = "board")]
+    start_address: Option<u32>,
+
+    /// The last address of the program's region; data behind it is left out.
+    #[arg(long, alias = "end_address", value_name = "ADDRESS", value_parser = number, conflicts_with = "board")]
+    end_address: Option<u32>,
+
+    /// Bytes of a block, its 16 bytes of framing included: at most the bootloader's buffer.
+    #[arg(long, alias = "block_size", value_name = "BYTES", value_parser = number, default_value = "0x400")]
+    block_size: u32,
+
+    /// What fills gaps inside a block: a byte, or a 32-bit pattern.
+    #[arg(long, alias = "gap_fill", value_name = "VALUE", value_parser = number, default_value = "0xFFFFFFFF")]
+    gap_fill: u32,
+
+    /// The file's format, if the first bytes do not tell it.
+    #[arg(short = 'I', long = "input-format", value_name = "FORMAT", ignore_case = true)]
+    format: Option<FormatName>,
+}
+
+const _: () = assert!(DEFAULT_BLOCK_SIZE == 0x400, "the help text says so");
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum FormatName {
+    /// Intel HEX.
+    #[value(alias = "hex")]
+    Ihex,
+    /// Motorola S-record.
+    #[value(aliases = ["s1", "s2", "s3", "s5", "s9"])]
+    Srec,
+    /// ELF executable.
+    Elf,
+    /// Raw binary; needs --start-address or --board.
+    #[value(alias = "bin")]
+    Binary,
+    /// Block file.
+    Block,
+}
+
+impl From<FormatName> for Format {
+    fn from(name: FormatName) -> Self {
+        match name {
+            FormatName::Ihex => Self::IntelHex,
+            FormatName::Srec => Self::SRecord,
+            FormatName::Elf => Self::Elf,
+            FormatName::Binary => Self::Raw,
+            FormatName::Block => Self::BlockFile,
+        }
+    }
+}
+
+fn board(name: &str) -> Result<&'static layout::Layout, String> {
+    layout::by_name(name).ok_or_else(|| {
+        let known: Vec<&str> = layout::BOARDS.iter().map(|layout| layout.board).collect();
+        format!("known boards: {}", known.join(", "))
+    })
+}
+
+impl Source {
+    /// Reads `file` for program `number` and makes its blocks. No device is needed, and none is touched.
+    pub(super) fn blocks(&self, file: &Path, program: u8, label: Label) -> Result<Converted, Failure> {
+        let region = self.region(program)?;
+        let options = Options {
+            region,
+            block_size: self.block_size as usize,
+            gap_fill: GapFill::new(self.gap_fill),
+            label,
+        };
+        let raw_address = match region {
+            Region::Unknown => None,
+            Region::Strict(range) | Region::Cut(range) => Some(range.first),
+        };
+        let firmware = read::load(file, self.format.map(Format::from), raw_address)?;
+        blocks_of(firmware, &options).map_err(|error| Failure::convert(error, file))
+    }
+
+    fn region(&self, program: u8) -> Result<Region, Failure> {
+        match (self.board, self.start_address, self.end_address) {
+            (Some(layout), ..) => match layout.program(program) {
+                Some(region) => Ok(Region::Strict(region.into())),
+                None => {
+                    let what = format!("{} has no program {program}", layout.board);
+                    let advice = format!("its programs are 1 to {}", layout.programs.len());
+                    Err(Failure::usage(&what, advice))
+                }
+            },
+            (None, None, None) => Ok(Region::Unknown),
+            (None, first, last) => {
+                let AddressRange { first: least, last: most } = AddressRange::ALL;
+                let (first, last) = (first.unwrap_or(least), last.unwrap_or(most));
+                Ok(Region::Cut(AddressRange { first, last }))
+            }
+        }
+    }
+}
+
+/// A firmware file as a positional argument.
+#[derive(Debug, Args)]
+pub(super) struct Input {
+    /// The firmware: Intel HEX, Motorola S-record, ELF, raw binary or block file.
+    #[arg(value_name = "FILE")]
+    pub(super) file: PathBuf,
+}
+
+/// Says what was left out, if something was.
+pub(super) fn warn_left_out(file: &Path, converted: &Converted) {
+    if converted.left_out > 0 {
+        let _ = writeln!(
+            std::io::stderr(),
+            "warning: {}: {} bytes outside the address range were left out [0x60002001]",
+            file.display(),
+            converted.left_out
+        );
+    }
+}

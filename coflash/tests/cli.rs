@@ -1,0 +1,329 @@
+//! The program as a user runs it: files, exit codes, words, and an update over a real socket.
+
+mod fake;
+
+use std::fs;
+use std::io::{ErrorKind, Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::thread;
+use std::time::Duration;
+
+use canopen::Frame;
+use coflash::Adapter;
+use embedded_can::{Frame as _, Id, StandardId};
+use fake::{Fake, Outcome, APPLICATION, BOOTLOADER};
+
+struct Done {
+    exit: i32,
+    out: String,
+    err: String,
+}
+
+fn coflash(arguments: &[&str]) -> Done {
+    run(Command::new(env!("CARGO_BIN_EXE_coflash")).args(arguments).env_remove("COFLASH_BUS"))
+}
+
+fn run(command: &mut Command) -> Done {
+    let done = command.output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    Done { exit: done.status.code().expect("no signal"), out: text(done.stdout), err: text(done.stderr) }
+}
+
+fn data(name: &str) -> String {
+    format!("{}/tests/data/{name}", env!("CARGO_MANIFEST_DIR"))
+}
+
+/// A folder of one test, away at the end.
+struct Folder(PathBuf);
+
+impl Folder {
+    fn new(test: &str) -> Self {
+        let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(test);
+        let _ = fs::remove_dir_all(&path);
+        fs::create_dir_all(&path).unwrap();
+        Self(path)
+    }
+
+    fn file(&self, name: &str, bytes: &[u8]) -> String {
+        let path = self.path(name);
+        fs::write(&path, bytes).unwrap();
+        path
+    }
+
+    fn path(&self, name: &str) -> String {
+        self.0.join(name).to_str().unwrap().to_string()
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+#[test]
+fn convert_writes_the_block_file_of_the_manual() {
+    let folder = Folder::new("convert");
+    let out = folder.path("out.blk");
+    let board = ["--board", "stm32f407g-disc1"];
+    let identity = ["--block-size", "0x110", "--vid", "0", "--pid", "1234"];
+    let release = ["--ver", "0x00640A01", "--date", "1420070400"];
+    for (arguments, expected) in [
+        (board.to_vec(), "plain-400.blk"),
+        (vec![], "plain-400.blk"),
+        ([&board[..], &identity].concat(), "identity-110.blk"),
+        ([&board[..], &identity, &release].concat(), "release-110.blk"),
+        // The manual's own spelling.
+        (
+            vec![
+                "-I",
+                "ihex",
+                "--block_size",
+                "0x110",
+                "--start_address",
+                "0x08010000",
+                "--end_address",
+                "0x080FFFFF",
+                "--vid",
+                "0",
+                "--pid",
+                "1234",
+            ],
+            "identity-110.blk",
+        ),
+    ] {
+        let input = data("program.hex");
+        let done = coflash(&[&["convert", &input, &out][..], &arguments].concat());
+        assert_eq!(done.exit, 0, "{}", done.err);
+        assert!(fs::read(&out).unwrap() == fs::read(data(expected)).unwrap(), "{arguments:?}");
+    }
+    let done = coflash(&["convert", &data("program.elf"), &out]);
+    let crc = u32::from_le_bytes(fs::read(data("plain-400.blk")).unwrap()[0x36B..0x36F].try_into().unwrap());
+    let words = format!("{out}: 4 blocks, program 4001 bytes from 0x08010000 on, CRC {crc:08X}h\n");
+    assert_eq!(done.out, words);
+}
+
+#[test]
+fn the_date_comes_from_the_environment() {
+    let folder = Folder::new("date");
+    let out = folder.path("out.blk");
+    let input = data("program.elf");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_coflash"));
+    command.args([
+        "convert",
+        &input,
+        &out,
+        "--block-size",
+        "0x110",
+        "--vid",
+        "0",
+        "--pid",
+        "1234",
+        "--ver",
+        "0x00640A01",
+    ]);
+    let done = run(command.env("SOURCE_DATE_EPOCH", "1420070400"));
+    assert_eq!(done.exit, 0, "{}", done.err);
+    assert!(fs::read(&out).unwrap() == fs::read(data("release-110.blk")).unwrap());
+}
+
+#[test]
+fn a_bad_file_is_named_and_no_device_is_touched() {
+    let folder = Folder::new("bad");
+    let hex = fs::read_to_string(data("program.hex")).unwrap();
+    let blocks = fs::read(data("plain-400.blk")).unwrap();
+    let elf = fs::read(data("program.elf")).unwrap();
+    let damaged = hex.replacen(":08", ":09", 1);
+    let line = 1 + hex.lines().position(|line| line.starts_with(":08")).unwrap();
+    // One byte more at 08010000h, where line 2 has put one.
+    let twice = hex.replacen(":04000005", ":020000040801F1\n:0100000000FF\n:04000005", 1);
+    let twice_line = 1 + twice.lines().position(|line| line == ":0100000000FF").unwrap();
+    let twice_words = format!("twice.hex, line {twice_line}: the data at 0x08010000 overlaps that of line 2");
+    let far = hex.replacen(":020000040801F1", ":020000040800F2", 1);
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    listener.set_nonblocking(true).unwrap();
+    let bus = format!("socketcand://{}/can0", listener.local_addr().unwrap());
+    for (name, bytes, words) in [
+        ("empty.hex", &b""[..], "empty.hex: is empty".to_string()),
+        ("text.txt", b"hello", "text.txt: is no firmware file".to_string()),
+        (
+            "cut.hex",
+            &hex.as_bytes()[..hex.len() - 20],
+            format!(
+                "cut.hex, line {}: the last byte has only one digit; the line is truncated",
+                hex.lines().count() - 1
+            ),
+        ),
+        ("damaged.hex", damaged.as_bytes(), format!("damaged.hex, line {line}: the record is cut off")),
+        ("twice.hex", twice.as_bytes(), twice_words),
+        (
+            "far.hex",
+            far.as_bytes(),
+            "far.hex, line 2: the data at 0x08000000..=0x08000007 lies outside 0x08010000..=0x080fffff"
+                .to_string(),
+        ),
+        ("cut.blk", &blocks[..500], "cut.blk, offset 0x18: a block is cut off".to_string()),
+        ("cut.elf", &elf[..200], "cut.elf: the file is cut off".to_string()),
+    ] {
+        let file = folder.file(name, bytes);
+        let out = folder.path("out.blk");
+        let board = ["--board", "stm32f407g-disc1"];
+        for command in [&["convert", &file, &out][..], &["--bus", &bus, "flash", &file]] {
+            let done = coflash(&[command, &board].concat());
+            assert_eq!(done.exit, 3, "{name}: {}", done.err);
+            assert!(
+                done.err.starts_with("error: ") && done.err.contains(&words),
+                "{}\n not {words}",
+                done.err
+            );
+            assert!(done.err.contains("[0x600000"), "{}", done.err);
+        }
+        assert!(!Path::new(&out).exists());
+    }
+    let missing = coflash(&["--bus", &bus, "flash", &folder.path("missing.hex")]);
+    assert!(missing.exit == 3 && missing.err.contains("missing.hex: cannot be read: "), "{}", missing.err);
+    assert_eq!(listener.accept().unwrap_err().kind(), ErrorKind::WouldBlock, "nobody came to the bus");
+}
+
+#[test]
+fn wrong_usage_is_explained() {
+    let hex = data("program.hex");
+    for (arguments, words) in [
+        (&["flash", &hex][..], "give --bus URL or set COFLASH_BUS"),
+        (&["--bus", "can0", "flash", &hex], "it has no ':' behind the adapter's name"),
+        (&["flash", &hex, "--node", "128"], "node-IDs are 1 to 127"),
+        (&["flash", &hex, "--board", "arduino"], "known boards: stm32f407g-disc1"),
+        (&["flash", &hex, "--board", "stm32f407g-disc1", "--program", "2"], "its programs are 1 to 1"),
+        (&["convert", &hex, "out", "--vid", "1"], "--pid"),
+        (&["convert", &hex, "out", "--block-size", "16"], "must be 24 to 16384"),
+        (&["convert", &hex, "out", "--start-address", "010"], "ambiguous"),
+        (&[], "Usage"),
+    ] {
+        let done = coflash(arguments);
+        assert_eq!(done.exit, 2, "{arguments:?}: {}", done.err);
+        assert!(done.err.contains(words), "{}\n not {words}", done.err);
+    }
+}
+
+#[test]
+fn an_adapter_that_is_not_there_has_its_own_exit_code() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let bus = format!("socketcand://{}/can0", listener.local_addr().unwrap());
+    drop(listener);
+    let done = coflash(&["info", "--bus", &bus]);
+    assert_eq!(done.exit, 4);
+    assert!(done.err.contains("cannot be opened") && done.err.contains("what to do: "), "{}", done.err);
+}
+
+/// Puts a fake device behind a socketcand server; gives the bus URL. The device is handed back when the client goes.
+fn serve(mut fake: Fake) -> (String, thread::JoinHandle<Fake>) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let bus = format!("socketcand://{}/can0", listener.local_addr().unwrap());
+    let server = thread::spawn(move || {
+        let (mut stream, _) = listener.accept().unwrap();
+        stream.set_nodelay(true).unwrap();
+        stream.set_read_timeout(Some(Duration::from_millis(1))).unwrap();
+        stream.write_all(b"< hi >").unwrap();
+        let mut text = String::new();
+        loop {
+            let mut bytes = [0; 1024];
+            match stream.read(&mut bytes) {
+                Ok(0) => return fake,
+                Ok(len) => text.push_str(std::str::from_utf8(&bytes[..len]).unwrap()),
+                Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {}
+                Err(_) => return fake,
+            }
+            while let Some(end) = text.find('>') {
+                let message: String = text.drain(..=end).collect();
+                serve_message(&message, &mut fake, &mut stream);
+            }
+            while let Ok(Some(frame)) = fake.receive(Duration::from_millis(1)) {
+                let Id::Standard(id) = frame.id() else { continue };
+                let data: String = frame.data().iter().map(|byte| format!("{byte:02X}")).collect();
+                let line = format!("< frame {:03X} 1.000000 {data} >", id.as_raw());
+                if stream.write_all(line.as_bytes()).is_err() {
+                    return fake;
+                }
+            }
+        }
+    });
+    (bus, server)
+}
+
+fn serve_message(message: &str, fake: &mut Fake, stream: &mut TcpStream) {
+    let words: Vec<&str> = message.split_ascii_whitespace().collect();
+    if let ["<", "send", id, _, data @ .., ">"] = words.as_slice() {
+        let id = StandardId::new(u16::from_str_radix(id, 16).unwrap()).unwrap();
+        let data: Vec<u8> = data.iter().map(|byte| u8::from_str_radix(byte, 16).unwrap()).collect();
+        fake.send(&Frame::new(id, &data).unwrap()).unwrap();
+    } else {
+        stream.write_all(b"< ok >").unwrap();
+    }
+}
+
+#[test]
+fn flash_and_info_over_a_socket() {
+    let mut fake = Fake::new(APPLICATION);
+    fake.erase_time = Duration::from_millis(50);
+    fake.restart_time = Duration::from_millis(20);
+    let (bus, server) = serve(fake);
+    let done = coflash(&[
+        "--bus",
+        &bus,
+        "flash",
+        "--node",
+        "5",
+        "--board",
+        "stm32f407g-disc1",
+        "--trial-run",
+        &data("program.elf"),
+    ]);
+    assert_eq!(done.exit, 0, "{}", done.err);
+    let fake = server.join().unwrap();
+    assert_eq!(fake.blocks.concat(), fs::read(data("plain-400.blk")).unwrap());
+    assert_eq!(fake.running, Some(APPLICATION));
+    for words in [
+        "calling the application back",
+        "the bootloader is running",
+        "100 %  883 of 883 bytes",
+        "the trial went well",
+        "signed",
+        "running: an application",
+        "done in ",
+    ] {
+        assert!(done.out.contains(words), "{words} is not in\n{}", done.out);
+    }
+
+    let (bus, _server) = serve(fake);
+    let done = run(Command::new(env!("CARGO_BIN_EXE_coflash"))
+        .args(["info", "--node", "5"])
+        .env("COFLASH_BUS", bus));
+    assert_eq!(done.exit, 0, "{}", done.err);
+    assert!(done.out.starts_with("node 5: an application (device type 00020192h)\n"), "{}", done.out);
+}
+
+#[test]
+fn a_device_that_fails_has_the_exit_code_of_its_failure() {
+    let mut refusing = Fake::new(BOOTLOADER);
+    refusing.erase_time = Duration::from_millis(5);
+    refusing.on_block = Box::new(|_| Outcome::Status(0x0C));
+    let mut absent = Fake::new(BOOTLOADER);
+    absent.running = None;
+    let mut dead = Fake::new(BOOTLOADER);
+    dead.erase_time = Duration::from_millis(5);
+    dead.starts = Some(BOOTLOADER);
+    for (fake, exit, words) in [
+        (refusing, 6, "[0x60000006]\n  what to do: check --board and --program"),
+        (absent, 5, "node 5 does not answer (reading 1000h/0) [0x60000013]"),
+        (dead, 7, "the program does not start"),
+    ] {
+        let (bus, server) = serve(fake);
+        let file = data("plain-400.blk");
+        let done = coflash(&["flash", "--bus", &bus, "-N", "5", &file, "--boot-timeout", "300"]);
+        assert_eq!(done.exit, exit, "{}", done.err);
+        assert!(done.err.contains(words), "{}\n not {words}", done.err);
+        server.join().unwrap();
+    }
+}
