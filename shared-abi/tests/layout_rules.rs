@@ -1,0 +1,74 @@
+//! Every rule of the layout: a layout that breaks it is refused, with a message that names it.
+//!
+//! `checked` is a `const fn` that the board files call in a constant, so what panics here does not compile there.
+
+use std::panic::catch_unwind;
+
+use shared_abi::geometry::Region;
+use shared_abi::layout::stm32f407g_disc1::LAYOUT;
+use shared_abi::layout::Layout;
+
+fn broken(change: impl FnOnce(&mut Layout)) -> String {
+    let mut layout = LAYOUT;
+    change(&mut layout);
+    let panic = catch_unwind(|| layout.checked()).expect_err("the layout was accepted");
+    panic
+        .downcast_ref::<&str>()
+        .map_or_else(|| panic.downcast_ref::<String>().cloned().unwrap_or_default(), |s| (*s).to_owned())
+}
+
+/// A layout file lives as long as the program; so do the regions made up here.
+fn programs(regions: &[(u32, u32)]) -> &'static [Region] {
+    regions.iter().map(|&(base, size)| Region::new(base, size)).collect::<Vec<_>>().leak()
+}
+
+#[test]
+fn each_broken_rule_is_named() {
+    const KIB: u32 = 1024;
+    let cases: Vec<(String, &str)> = vec![
+        (broken(|l| l.bootloader.base = 0x0800_4000), "must start at the base of the flash"),
+        (broken(|l| l.bootloader.size = 33 * KIB), "the bootloader must end at a sector border"),
+        (broken(|l| l.callgate_offset = 0x180), "the callgate overlaps the bootloader's vector table"),
+        (broken(|l| l.callgate_offset = 32 * KIB), "the callgate lies outside the bootloader"),
+        (
+            broken(|l| l.parameters[0].size = 8 * KIB),
+            "a parameter region must start and end at sector borders",
+        ),
+        (broken(|l| l.parameters[0].base = 0x0800_4000), "a parameter region overlaps the bootloader"),
+        (broken(|l| l.parameters[1] = l.parameters[0]), "the two parameter regions overlap"),
+        (broken(|l| l.programs = &[]), "there must be 1 to 254 programs"),
+        (
+            broken(|l| l.programs = programs(&[(0x0801_0000, 100 * KIB)])),
+            "a program must start and end at sector borders",
+        ),
+        (
+            broken(|l| l.programs = programs(&[(0x0801_1000, 60 * KIB)])),
+            "a program must start and end at sector borders",
+        ),
+        (broken(|l| l.programs = programs(&[(0x0800_4000, 16 * KIB)])), "a program overlaps the bootloader"),
+        (
+            broken(|l| l.programs = programs(&[(0x0800_C000, 80 * KIB)])),
+            "a program overlaps a parameter region",
+        ),
+        (
+            broken(|l| l.programs = programs(&[(0x0801_0000, 192 * KIB), (0x0802_0000, 128 * KIB)])),
+            "two programs overlap",
+        ),
+        (broken(|l| l.ram.size = 256 * KIB), "the RAM of the images lies outside the chip's SRAM"),
+        (broken(|l| l.ram.size -= 4), "must be a multiple of 8"),
+        (broken(|l| l.ram.size += 8), "lies inside the RAM of the images"),
+        (broken(|l| l.handoff = Region::new(0x2001_FFC8, 48)), "the handoff overlaps the warm-start cell"),
+        (broken(|l| l.handoff.size = 40), "the handoff region has not the size of the handoff"),
+        (broken(|l| l.warm_start = Region::new(0x2001_FFF0, 12)), "has not the size of the warm-start cell"),
+        (
+            broken(|l| {
+                l.warm_start = Region::new(0x2001_FFC0, 16);
+                l.handoff = Region::new(0x2001_FFD0, 48);
+            }),
+            "must be the last RAM cell",
+        ),
+    ];
+    for (message, rule) in cases {
+        assert!(message.contains(rule), "expected {rule:?}, got {message:?}");
+    }
+}
