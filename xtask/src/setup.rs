@@ -16,8 +16,8 @@ pub const HELP: &str = "\
 usage: cargo xtask setup [--yes]
 
 Brings the machine to where every other job runs: the Rust target thumbv7em-none-eabihf, rustfmt and
-clippy (by rustup); cmake, make and libclang to build the emulator's CPU, python3 with venv (by apt-get); and
-a Python environment in target/python with tests/python/requirements.txt.
+clippy (by rustup); cmake, make, pkg-config and libclang to build the emulator's CPU, python3 with venv (by
+apt-get); and a Python environment in target/python with tests/python/requirements.txt.
 
 The other jobs do this themselves, each for what it needs. As root it installs what is missing; for
 anyone else it stops with the line to run, or, with --yes, runs that line.
@@ -140,6 +140,7 @@ enum Tool {
     CCompiler,
     Make,
     Cmake,
+    PkgConfig,
     Libclang,
     Python,
     Venv,
@@ -152,6 +153,7 @@ impl Tool {
             Self::CCompiler => "build-essential",
             Self::Make => "make",
             Self::Cmake => "cmake",
+            Self::PkgConfig => "pkg-config",
             Self::Libclang => "libclang-dev",
             Self::Python => "python3",
             Self::Venv => "python3-venv",
@@ -169,6 +171,8 @@ impl Tool {
                 process::succeeds("make", &["--version"]) || process::succeeds("ninja", &["--version"])
             }
             Self::Cmake => process::succeeds("cmake", &["--version"]),
+            // The configure script inside Unicorn stops without it, and the build then misses a header.
+            Self::PkgConfig => process::succeeds("pkg-config", &["--version"]),
             Self::Libclang => libclang_is_there(),
             Self::Python => process::succeeds("python3", &["--version"]),
             // Debian's python3 comes without ensurepip.
@@ -182,7 +186,7 @@ fn missing_packages(parts: &[Part], is_there: impl Fn(Tool) -> bool) -> Vec<&'st
     let mut tools = Vec::new();
     for part in parts {
         tools.extend_from_slice(match part {
-            Part::Emulator => &[Tool::CCompiler, Tool::Make, Tool::Cmake, Tool::Libclang],
+            Part::Emulator => &[Tool::CCompiler, Tool::Make, Tool::Cmake, Tool::PkgConfig, Tool::Libclang],
             Part::Python if !python_environment_is_there() => &[Tool::Python, Tool::Venv],
             Part::Python | Part::Firmware | Part::Lint => &[],
         });
@@ -315,7 +319,7 @@ mod tests {
         assert_eq!(missing_packages(&[Part::Firmware, Part::Lint], nothing), Vec::<&str>::new());
         assert_eq!(
             missing_packages(&[Part::Emulator, Part::Emulator], nothing),
-            ["build-essential", "cmake", "libclang-dev", "make"]
+            ["build-essential", "cmake", "libclang-dev", "make", "pkg-config"]
         );
         assert_eq!(
             missing_packages(&[Part::Emulator], |tool| !matches!(tool, Tool::Cmake | Tool::Libclang)),
