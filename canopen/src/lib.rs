@@ -13,6 +13,8 @@
 //! | [`nmt`], [`heartbeat`] | network management of a slave, heartbeat producer |
 //! | [`node`] | all of a slave tied together for one node-ID |
 //! | [`device`] | the objects that every device has |
+//! | `emcy` | emergency producer, 1001h, 1003h, 1014h (feature `emcy`) |
+//! | `lss` | layer setting services: node-ID and bit rate over the bus (feature `lss`) |
 //! | [`program`] | program download: the words of CiA 302-3 |
 #![no_std]
 #![forbid(unsafe_code)]
@@ -21,8 +23,12 @@
 extern crate alloc;
 
 pub mod device;
+#[cfg(feature = "emcy")]
+pub mod emcy;
 pub mod frame;
 pub mod heartbeat;
+#[cfg(feature = "lss")]
+pub mod lss;
 pub mod nmt;
 pub mod node;
 pub mod od;

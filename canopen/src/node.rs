@@ -3,7 +3,7 @@
 //! The owner passes every frame received to [`Node::handle`], then fetches frames with [`Node::poll`] until there are
 //! none, and does the latter again at least once every few milliseconds (or at [`Node::next_deadline`]).
 
-use crate::frame::{Frame, NodeId};
+use crate::frame::{CobId, Frame, NodeId};
 use crate::heartbeat::Heartbeat;
 use crate::nmt::{self, NmtCommand, NmtState};
 use crate::od::Objects;
@@ -115,6 +115,11 @@ impl Node {
         }
         if let Some(answer) = self.sdo.poll(now, objects) {
             return Some(answer);
+        }
+        if self.state != NmtState::Stopped {
+            if let Some(emergency) = objects.next_emergency() {
+                return Some(Frame::of(CobId::emcy(self.id), &emergency));
+            }
         }
         self.heartbeat.take_due(now).then(|| nmt::state_message(self.id, self.state))
     }

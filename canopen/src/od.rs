@@ -362,6 +362,11 @@ pub trait Objects {
         let _ = at;
     }
 
+    /// The data of the next emergency to send, until there is none (`emcy::Emcy` makes them).
+    fn next_emergency(&mut self) -> Option<[u8; 8]> {
+        None
+    }
+
     /// A domain is about to be read; gives its size where it is known.
     ///
     /// # Errors

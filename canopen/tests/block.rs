@@ -315,6 +315,13 @@ fn server_repeats_what_the_client_did_not_get() {
     bench.server.handle(&request(START), at(0), &mut bench.device);
     assert_eq!(bench.server.poll(at(0), &mut bench.device), Some(response(FIRST)));
     bench.expect(&[(acked(0, 127), &[FIRST, LAST_OF_14])]);
+    // The acknowledgement of the sub-block before, twice: while the next one has not begun, and when it has.
+    bench.expect(&[(READ_14, &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]), (START, &[FIRST, LAST_OF_14])]);
+    for _ in 0..2 {
+        bench.server.handle(&request(acked(0, 127)), at(0), &mut bench.device);
+    }
+    assert_eq!(bench.server.poll(at(0), &mut bench.device), Some(response(FIRST)));
+    bench.expect(&[(acked(2, 127), &[LAST_OF_14])]);
 }
 
 #[test]
@@ -462,8 +469,21 @@ fn client_repeats_what_the_server_did_not_get() {
     sends(&mut client, 0, &[FIRST, LAST_OF_9]);
     hears(&mut client, 0, &[acked(1, 2)]);
     sends(&mut client, 0, &[[0x81, 8, 9, 0, 0, 0, 0, 0]]);
-    hears(&mut client, 0, &[acked(1, 2), acked(1, 2)]);
+    hears(&mut client, 0, &[acked(1, 2)]);
     sends(&mut client, 0, &[END_OF_9]);
+    // An acknowledgement twice: behind the last, in the middle, and before the first segment.
+    hears(&mut client, 0, &[acked(1, 2), ENDED]);
+    ends(&mut client, 0, &[], Ok(()));
+    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
+    sends(&mut client, 0, &[INITIATE_9]);
+    hears(&mut client, 0, &[granted(1)]);
+    sends(&mut client, 0, &[FIRST]);
+    hears(&mut client, 0, &[acked(1, 1), acked(1, 1)]);
+    sends(&mut client, 0, &[[0x81, 8, 9, 0, 0, 0, 0, 0]]);
+    let mut client = Download::as_blocks(node(), PROGRAM, [0; 0], CONFIG, BLOCK);
+    sends(&mut client, 0, &[[0xC6, 0x50, 0x1F, 1, 0, 0, 0, 0]]);
+    hears(&mut client, 0, &[granted(127), acked(0, 127)]);
+    sends(&mut client, 0, &[[0x81, 0, 0, 0, 0, 0, 0, 0]]);
     // A server that never gets anything is given up.
     let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
     sends(&mut client, 0, &[INITIATE_9]);
@@ -495,6 +515,14 @@ fn client_falls_back_to_segments_where_it_may() {
     sends(&mut client, 0, &[INITIATE_9]);
     hears(&mut client, 0, &[unknown]);
     ends(&mut client, 0, &[], Err(SdoError::Server(AbortCode(0x0504_0001))));
+    let mut client = Upload::as_blocks(node(), PROGRAM, Vec::new(), CONFIG, strict);
+    sends(&mut client, 0, &[[0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0]]);
+    hears(&mut client, 0, &[unknown]);
+    ends(&mut client, 0, &[], Err(SdoError::Server(AbortCode(0x0504_0001))));
+    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
+    sends(&mut client, 0, &[INITIATE_9]);
+    hears(&mut client, 0, &[[0x80, 0x50, 0x1F, 1, 0x22, 0x00, 0x00, 0x08]]);
+    ends(&mut client, 0, &[], Err(SdoError::Server(AbortCode(0x0800_0022))));
     let mut client = Upload::as_blocks(node(), PROGRAM, Vec::new(), CONFIG, BLOCK);
     sends(&mut client, 0, &[[0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0]]);
     hears(&mut client, 0, &[[0x80, 0x50, 0x1F, 1, 0x01, 0x00, 0x01, 0x06]]);

@@ -20,6 +20,7 @@ fn ends(client: &mut impl Transfer, now: u32, result: Result<(), SdoError>) {
     assert_eq!(client.poll(at(now)), Step::Done(result));
     // Nothing brings it back.
     client.handle(&response([0x60, 0, 0x20, 0, 0, 0, 0, 0]), at(now));
+    client.handle(&response([0x80, 0, 0x20, 3, 0, 0, 0, 8]), at(now));
     client.abort(AbortCode::GENERAL);
     assert_eq!(client.poll(at(now)), Step::Done(result));
 }

@@ -395,13 +395,13 @@ fn reserved_bits_are_not_looked_at() {
 /// A device whose values are not what its table says.
 #[test]
 fn a_value_of_the_wrong_length_is_the_devices_fault() {
-    struct Wrong(Device);
+    struct Wrong(Device, usize);
     impl Objects for Wrong {
         fn entries(&self) -> &'static [canopen::od::Entry] {
             self.0.entries()
         }
         fn read(&mut self, _at: canopen::Address, _buf: &mut [u8]) -> Result<usize, AbortCode> {
-            Ok(usize::MAX)
+            Ok(self.1)
         }
         fn upload_start(&mut self, _at: canopen::Address) -> Result<Option<u32>, AbortCode> {
             Ok(Some(8))
@@ -412,18 +412,32 @@ fn a_value_of_the_wrong_length_is_the_devices_fault() {
             _offset: u32,
             _buf: &mut [u8],
         ) -> Result<usize, AbortCode> {
-            Ok(usize::MAX)
+            Ok(self.1)
         }
     }
     let mut server = SdoServer::new(node(), Config::default());
-    let mut device = Wrong(Device::default());
-    let mut ask = |bytes| {
-        server.handle(&request(bytes), at(0), &mut device);
-        *server.poll(at(0), &mut device).unwrap().exactly::<8>().unwrap()
+    let mut device = Wrong(Device::default(), usize::MAX);
+    let mut ask = |device: &mut Wrong, bytes| {
+        server.handle(&request(bytes), at(0), device);
+        *server.poll(at(0), device).unwrap().exactly::<8>().unwrap()
     };
-    assert_eq!(ask([0x40, 0x00, 0x10, 0, 0, 0, 0, 0]), [0x80, 0x00, 0x10, 0, 0x47, 0x00, 0x04, 0x06]);
-    assert_eq!(ask([0x40, 0x01, 0x20, 0, 0, 0, 0, 0]), [0x80, 0x01, 0x20, 0, 0x47, 0x00, 0x04, 0x06]);
-    assert_eq!(ask([0x40, 0x00, 0x20, 0, 0, 0, 0, 0]), [0x41, 0x00, 0x20, 0, 8, 0, 0, 0]);
-    assert_eq!(ask([0x60, 0, 0, 0, 0, 0, 0, 0]), [0x00; 8]);
-    assert_eq!(ask([0x70, 0, 0, 0, 0, 0, 0, 0]), [0x1D, 0, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(
+        ask(&mut device, [0x40, 0x00, 0x10, 0, 0, 0, 0, 0]),
+        [0x80, 0x00, 0x10, 0, 0x47, 0x00, 0x04, 0x06]
+    );
+    assert_eq!(
+        ask(&mut device, [0x40, 0x01, 0x20, 0, 0, 0, 0, 0]),
+        [0x80, 0x01, 0x20, 0, 0x47, 0x00, 0x04, 0x06]
+    );
+    assert_eq!(ask(&mut device, [0x40, 0x00, 0x20, 0, 0, 0, 0, 0]), [0x41, 0x00, 0x20, 0, 8, 0, 0, 0]);
+    assert_eq!(ask(&mut device, [0x60, 0, 0, 0, 0, 0, 0, 0]), [0x00; 8]);
+    assert_eq!(ask(&mut device, [0x70, 0, 0, 0, 0, 0, 0, 0]), [0x1D, 0, 0, 0, 0, 0, 0, 0]);
+    // Three bytes of an Unsigned32; a domain that ends before the size that it told.
+    device.1 = 3;
+    assert_eq!(
+        ask(&mut device, [0x40, 0x00, 0x10, 0, 0, 0, 0, 0]),
+        [0x80, 0x00, 0x10, 0, 0x47, 0x00, 0x04, 0x06]
+    );
+    assert_eq!(ask(&mut device, [0x40, 0x00, 0x20, 0, 0, 0, 0, 0]), [0x41, 0x00, 0x20, 0, 8, 0, 0, 0]);
+    assert_eq!(ask(&mut device, [0x60, 0, 0, 0, 0, 0, 0, 0]), [0x80, 0x00, 0x20, 0, 0x47, 0x00, 0x04, 0x06]);
 }

@@ -114,6 +114,7 @@ impl Objects for Device {
     }
 
     fn download_data(&mut self, _at: Address, data: &[u8]) -> Result<(), AbortCode> {
+        assert!(!data.is_empty(), "data without data");
         if let Some(space) = &mut self.space {
             *space = space.checked_sub(data.len()).expect("data in spite of no space");
         }

@@ -1,0 +1,197 @@
+//! Emergency producer (CiA 301 section 7.2.7) and the objects that go with it.
+//!
+//! A device keeps an [`Emcy`] beside its other values: it asks [`Emcy::read`] and [`Emcy::write`] first, before what else has
+//! 1001h, and passes [`Emcy::next_message`] on as [`Objects::next_emergency`](crate::Objects::next_emergency).
+
+use crate::frame::{CobId, NodeId};
+use crate::od::{put, Access, Address, DataType, Entry};
+use crate::program::{COB_ID_EMCY, ERROR_FIELD, ERROR_REGISTER};
+use crate::sdo::AbortCode;
+
+/// Errors that 1003h remembers.
+pub const HISTORY: usize = 4;
+
+/// Emergencies that may wait to be sent.
+const WAITING: usize = 4;
+
+/// 1003h and 1014h. (1001h, which every device has, is in [`device::ENTRIES`](crate::device::ENTRIES).)
+pub const ENTRIES: [Entry; HISTORY + 2] = [
+    Entry::array(ERROR_FIELD, "Pre-defined error field", HISTORY as u8).access(Access::Rw).default(0),
+    Entry::sub(ERROR_FIELD, 1, "Standard error field 1", DataType::Unsigned32, Access::Ro),
+    Entry::sub(ERROR_FIELD, 2, "Standard error field 2", DataType::Unsigned32, Access::Ro),
+    Entry::sub(ERROR_FIELD, 3, "Standard error field 3", DataType::Unsigned32, Access::Ro),
+    Entry::sub(ERROR_FIELD, 4, "Standard error field 4", DataType::Unsigned32, Access::Ro),
+    Entry::var(COB_ID_EMCY, "COB-ID EMCY", DataType::Unsigned32, Access::Ro).default_text("$NODEID+0x80"),
+];
+
+/// Emergency error codes (CiA 301 table 26).
+pub mod code {
+    /// No error any more.
+    pub const RESET: u16 = 0x0000;
+    /// An error that fits none of the others.
+    pub const GENERIC: u16 = 0x1000;
+    /// A fault of the device's hardware, such as its flash.
+    pub const HARDWARE: u16 = 0x5000;
+    /// A fault of the device's software.
+    pub const SOFTWARE: u16 = 0x6000;
+    /// A data set is wrong, such as a program whose CRC does not match.
+    pub const DATA_SET: u16 = 0x6300;
+    /// Frames were lost.
+    pub const CAN_OVERRUN: u16 = 0x8110;
+    /// The CAN controller became error passive.
+    pub const CAN_PASSIVE: u16 = 0x8120;
+    /// The CAN controller was off the bus and is back.
+    pub const BUS_OFF_RECOVERED: u16 = 0x8140;
+}
+
+/// Bits of the error register, 1001h (CiA 301 table 51).
+pub mod register {
+    /// Any error; set with each of the others.
+    pub const GENERIC: u8 = 1 << 0;
+    /// Communication error.
+    pub const COMMUNICATION: u8 = 1 << 4;
+    /// Of the manufacturer.
+    pub const MANUFACTURER: u8 = 1 << 7;
+}
+
+/// What an emergency says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Emergency {
+    /// What happened.
+    pub code: u16,
+    /// The error register, 1001h.
+    pub register: u8,
+    /// More about it, for the manufacturer.
+    pub detail: [u8; 5],
+}
+
+impl Emergency {
+    /// Takes the data of the frame apart.
+    #[must_use]
+    pub const fn parse(bytes: &[u8; 8]) -> Self {
+        let [low, high, register, a, b, c, d, e] = *bytes;
+        Self { code: u16::from_le_bytes([low, high]), register, detail: [a, b, c, d, e] }
+    }
+
+    /// The data of the frame.
+    #[must_use]
+    pub const fn emit(&self) -> [u8; 8] {
+        let [low, high] = self.code.to_le_bytes();
+        let [a, b, c, d, e] = self.detail;
+        [low, high, self.register, a, b, c, d, e]
+    }
+}
+
+/// The driver's status as CAN overrun carries it: in bytes 5 and 6 of the frame, counted from 0 (SYS TEC manual
+/// L-1112d_10, section 3.4.9).
+#[must_use]
+pub const fn driver_status(status: u16) -> [u8; 5] {
+    let [low, high] = status.to_le_bytes();
+    [0, 0, low, high, 0]
+}
+
+/// Driver status: the CAN controller lost a frame.
+pub const CONTROLLER_OVERRUN: u16 = 0x0020;
+/// Driver status: the receive queue was full.
+pub const QUEUE_OVERRUN: u16 = 0x1000;
+
+/// The errors of a device.
+#[derive(Clone, Debug, Default)]
+pub struct Emcy {
+    register: u8,
+    /// Newest first, as 1003h reads.
+    history: [u32; HISTORY],
+    remembered: u8,
+    /// Oldest first.
+    waiting: [Option<Emergency>; WAITING],
+}
+
+impl Emcy {
+    /// No errors.
+    #[must_use]
+    pub const fn new() -> Self {
+        Self { register: 0, history: [0; HISTORY], remembered: 0, waiting: [None; WAITING] }
+    }
+
+    /// The value of 1001h.
+    #[must_use]
+    pub const fn register(&self) -> u8 {
+        self.register
+    }
+
+    /// An error happened. It is sent and remembered once; its bits stay in the error register until
+    /// [`clear`](Self::clear).
+    pub fn raise(&mut self, code: u16, bits: u8, detail: [u8; 5]) {
+        self.register |= bits | register::GENERIC;
+        self.history.rotate_right(1);
+        let [low, high] = code.to_le_bytes();
+        self.history[0] = u32::from_le_bytes([low, high, detail[0], detail[1]]);
+        self.remembered = (self.remembered + 1).min(HISTORY as u8);
+        self.send(Emergency { code, register: self.register, detail });
+    }
+
+    /// Tells something that is no error: neither the register nor 1003h change.
+    pub fn announce(&mut self, code: u16, detail: [u8; 5]) {
+        self.send(Emergency { code, register: self.register, detail });
+    }
+
+    /// The cause of these bits has gone. The others are told with what is left; nothing is sent if none was set.
+    pub fn clear(&mut self, bits: u8) {
+        let bits = bits & self.register & !register::GENERIC;
+        let only_generic = self.register == register::GENERIC;
+        if bits == 0 && !only_generic {
+            return;
+        }
+        self.register &= !bits;
+        if self.register == register::GENERIC {
+            self.register = 0;
+        }
+        self.send(Emergency { code: code::RESET, register: self.register, detail: [0; 5] });
+    }
+
+    /// The data of the next emergency to send, until there is none.
+    pub fn next_message(&mut self) -> Option<[u8; 8]> {
+        let emergency = self.waiting[0].take()?;
+        self.waiting.rotate_left(1);
+        Some(emergency.emit())
+    }
+
+    /// What finds no room is not sent: the first errors tell most, and 1003h has the latest.
+    fn send(&mut self, emergency: Emergency) {
+        if let Some(free) = self.waiting.iter_mut().find(|place| place.is_none()) {
+            *free = Some(emergency);
+        }
+    }
+
+    /// Reads 1001h, 1003h or 1014h of this node; `None` for every other address.
+    ///
+    /// # Errors
+    /// [`AbortCode::NO_DATA`] for a place of 1003h in which no error is.
+    pub fn read(&self, node: NodeId, at: Address, buf: &mut [u8]) -> Option<Result<usize, AbortCode>> {
+        Some(match (at.index, at.sub) {
+            (ERROR_REGISTER, 0) => put(buf, &[self.register]),
+            (ERROR_FIELD, 0) => put(buf, &[self.remembered]),
+            (ERROR_FIELD, sub) if sub <= self.remembered => {
+                put(buf, &self.history[usize::from(sub) - 1].to_le_bytes())
+            }
+            (ERROR_FIELD, _) => Err(AbortCode::NO_DATA),
+            (COB_ID_EMCY, 0) => put(buf, &u32::from(CobId::emcy(node).get()).to_le_bytes()),
+            _ => return None,
+        })
+    }
+
+    /// Writes 1003h/0, which takes 0 alone and forgets all errors; `None` for every other address.
+    ///
+    /// # Errors
+    /// [`AbortCode::INVALID_VALUE`] for another value.
+    pub fn write(&mut self, at: Address, data: &[u8]) -> Option<Result<(), AbortCode>> {
+        if at != Address::new(ERROR_FIELD, 0) {
+            return None;
+        }
+        if data != [0] {
+            return Some(Err(AbortCode::INVALID_VALUE));
+        }
+        self.remembered = 0;
+        Some(Ok(()))
+    }
+}

@@ -1,0 +1,420 @@
+//! Layer setting services of a slave (CiA 305): node-ID and bit rate over the bus, for a device without switches.
+//!
+//! [`Lss`] decides, its owner acts: [`Lss::handle`] takes frames, [`Lss::poll`] gives answers to send and tells when a
+//! node-ID or a bit rate comes into force. What the device can do and where it stores is behind [`LssDevice`].
+//!
+//! Frames that are no LSS request, requests in a state that does not serve them and requests for other slaves get
+//! silence, as the standard has it.
+
+use crate::frame::{CobId, Frame, NodeId};
+use crate::time::Instant;
+
+/// Who a device is: the identity object 1018h. No two devices in the world share it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LssAddress {
+    /// 1018h/1.
+    pub vendor_id: u32,
+    /// 1018h/2.
+    pub product_code: u32,
+    /// 1018h/3.
+    pub revision: u32,
+    /// 1018h/4.
+    pub serial_number: u32,
+}
+
+impl LssAddress {
+    /// The four numbers in the order of the standard.
+    const fn parts(&self) -> [u32; 4] {
+        [self.vendor_id, self.product_code, self.revision, self.serial_number]
+    }
+}
+
+/// The bit rates of table 0, with their index (CiA 305 table 1).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum BitRate {
+    /// 1 Mbit/s.
+    K1000 = 0,
+    /// 800 kbit/s.
+    K800 = 1,
+    /// 500 kbit/s.
+    K500 = 2,
+    /// 250 kbit/s.
+    K250 = 3,
+    /// 125 kbit/s.
+    K125 = 4,
+    /// 100 kbit/s; later editions of the standard have it reserved.
+    K100 = 5,
+    /// 50 kbit/s.
+    K50 = 6,
+    /// 20 kbit/s.
+    K20 = 7,
+    /// 10 kbit/s.
+    K10 = 8,
+    /// The device finds it out.
+    Auto = 9,
+}
+
+impl BitRate {
+    /// From the index in table 0.
+    #[must_use]
+    pub const fn from_index(index: u8) -> Option<Self> {
+        Some(match index {
+            0 => Self::K1000,
+            1 => Self::K800,
+            2 => Self::K500,
+            3 => Self::K250,
+            4 => Self::K125,
+            5 => Self::K100,
+            6 => Self::K50,
+            7 => Self::K20,
+            8 => Self::K10,
+            9 => Self::Auto,
+            _ => return None,
+        })
+    }
+
+    /// In bit/s; `None` for [`BitRate::Auto`].
+    #[must_use]
+    pub const fn bits_per_second(self) -> Option<u32> {
+        Some(match self {
+            Self::K1000 => 1_000_000,
+            Self::K800 => 800_000,
+            Self::K500 => 500_000,
+            Self::K250 => 250_000,
+            Self::K125 => 125_000,
+            Self::K100 => 100_000,
+            Self::K50 => 50_000,
+            Self::K20 => 20_000,
+            Self::K10 => 10_000,
+            Self::Auto => return None,
+        })
+    }
+}
+
+/// Why a device did not store; the values are the error codes of the answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum StoreError {
+    /// It cannot store at all.
+    Unsupported = 1,
+    /// Its memory failed.
+    Failed = 2,
+}
+
+/// What LSS needs of the device.
+pub trait LssDevice {
+    /// Whether the device can run at this bit rate.
+    fn supports(&mut self, rate: BitRate) -> bool;
+
+    /// Stores what was configured, for the next start. No node-ID makes the device one without (FFh); no bit rate leaves
+    /// the stored one as it is.
+    ///
+    /// # Errors
+    /// The error code that the master gets.
+    fn store(&mut self, node: Option<NodeId>, rate: Option<BitRate>) -> Result<(), StoreError>;
+}
+
+/// What can be chosen about an LSS slave.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Config {
+    /// Start in LSS configuration state. Not of the standard: for a bus with one device to be configured.
+    pub start_in_configuration: bool,
+    /// Without a node-ID, say "non-configured slave" once after the start in place of the boot-up message. Not of the
+    /// standard either.
+    pub announce: bool,
+}
+
+/// What the owner has to do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Output {
+    /// Send this frame.
+    Send(Frame),
+    /// A device that had no node-ID has this one from now on: start the node, say its boot-up.
+    NodeId(NodeId),
+    /// Set the CAN controller to this bit rate now.
+    BitRate(BitRate),
+}
+
+/// An LSS slave.
+#[derive(Debug)]
+pub struct Lss {
+    address: LssAddress,
+    state: State,
+    /// The node-ID in force.
+    active: Option<NodeId>,
+    /// The node-ID that comes into force at the next opportunity.
+    pending: Option<NodeId>,
+    /// The bit rate that was configured.
+    bit_rate: Option<BitRate>,
+    /// Steps of a selective switch, and of an identification, that have matched.
+    selected: u8,
+    identified: u8,
+    /// The part of the address that fastscan is at.
+    position: u8,
+    activation: Activation,
+    answer: Option<[u8; 8]>,
+    /// A node-ID that came into force and has yet to be told.
+    assigned: Option<NodeId>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum State {
+    Waiting,
+    Configuration,
+}
+
+/// Activation of a bit rate: two delays, in which the node is silent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Activation {
+    None,
+    /// All nodes finish what they are sending.
+    Before {
+        rate: BitRate,
+        switch_at: Instant,
+        delay_ms: u16,
+    },
+    /// All nodes change over.
+    After {
+        until: Instant,
+    },
+}
+
+// Command specifiers.
+const SWITCH_GLOBAL: u8 = 0x04;
+const CONFIGURE_NODE_ID: u8 = 0x11;
+const CONFIGURE_BIT_TIMING: u8 = 0x13;
+const ACTIVATE_BIT_TIMING: u8 = 0x15;
+const STORE: u8 = 0x17;
+const SELECT_VENDOR: u8 = 0x40;
+const SELECT_SERIAL: u8 = 0x43;
+const SELECTED: u8 = 0x44;
+const IDENTIFY_VENDOR: u8 = 0x46;
+const IDENTIFY_SERIAL_HIGH: u8 = 0x4B;
+const IDENTIFY_NON_CONFIGURED: u8 = 0x4C;
+const IDENTIFIED: u8 = 0x4F;
+const NON_CONFIGURED: u8 = 0x50;
+const FASTSCAN: u8 = 0x51;
+const INQUIRE_VENDOR: u8 = 0x5A;
+const INQUIRE_SERIAL: u8 = 0x5D;
+const INQUIRE_NODE_ID: u8 = 0x5E;
+
+/// The node-ID of a device without one.
+const UNCONFIGURED: u8 = 0xFF;
+
+/// Fastscan: all that have no node-ID are asked, and start at the first part.
+const CONFIRM: u8 = 0x80;
+
+impl Lss {
+    /// A slave with this node-ID, or without one.
+    #[must_use]
+    pub fn new(address: LssAddress, node: Option<NodeId>, config: Config) -> Self {
+        let state = if config.start_in_configuration { State::Configuration } else { State::Waiting };
+        let announce = config.announce && node.is_none();
+        Self {
+            address,
+            state,
+            active: node,
+            pending: node,
+            bit_rate: None,
+            selected: 0,
+            identified: 0,
+            position: 0,
+            activation: Activation::None,
+            answer: announce.then(|| answer(NON_CONFIGURED, [0; 2])),
+            assigned: None,
+        }
+    }
+
+    /// The node-ID in force.
+    #[must_use]
+    pub const fn node_id(&self) -> Option<NodeId> {
+        self.active
+    }
+
+    /// NMT Reset communication: the node-ID that was configured comes into force. Without one the node is not started, and
+    /// waits for LSS again.
+    pub fn reset_communication(&mut self) -> Option<NodeId> {
+        self.active = self.pending;
+        self.active
+    }
+
+    /// Whether the node must not send anything: a new bit rate is being activated.
+    #[must_use]
+    pub fn is_silent(&self, now: Instant) -> bool {
+        match self.activation {
+            Activation::None => false,
+            Activation::Before { .. } => true,
+            Activation::After { until } => !now.has_reached(until),
+        }
+    }
+
+    /// When [`poll`](Self::poll) will have something to do although no frame came.
+    #[must_use]
+    pub const fn next_deadline(&self) -> Option<Instant> {
+        match self.activation {
+            Activation::None => None,
+            Activation::Before { switch_at, .. } => Some(switch_at),
+            Activation::After { until } => Some(until),
+        }
+    }
+
+    /// Takes a frame, whatever it is.
+    pub fn handle(&mut self, frame: &Frame, now: Instant, device: &mut impl LssDevice) {
+        if frame.cob_id() != Some(CobId::LSS_REQUEST) || self.is_silent(now) {
+            return;
+        }
+        let Some(bytes) = frame.exactly() else { return };
+        if let Some(answer) = self.request(bytes, now, device) {
+            self.answer = Some(answer);
+        }
+    }
+
+    /// What to do next, until there is nothing.
+    pub fn poll(&mut self, now: Instant) -> Option<Output> {
+        match self.activation {
+            Activation::Before { rate, switch_at, delay_ms } if now.has_reached(switch_at) => {
+                self.activation = Activation::After { until: switch_at + u32::from(delay_ms) };
+                return Some(Output::BitRate(rate));
+            }
+            Activation::After { until } if now.has_reached(until) => self.activation = Activation::None,
+            _ => {}
+        }
+        if self.is_silent(now) {
+            return None;
+        }
+        if let Some(answer) = self.answer.take() {
+            return Some(Output::Send(Frame::of(CobId::LSS_RESPONSE, &answer)));
+        }
+        self.assigned.take().map(Output::NodeId)
+    }
+
+    fn request(&mut self, bytes: &[u8; 8], now: Instant, device: &mut impl LssDevice) -> Option<[u8; 8]> {
+        let [command, a, b, c, d, ..] = *bytes;
+        let number = u32::from_le_bytes([a, b, c, d]);
+        match (command, self.state) {
+            (SWITCH_GLOBAL, _) => {
+                self.switch_global(a);
+                None
+            }
+            (SELECT_VENDOR..=SELECT_SERIAL, State::Waiting) => self.select(command - SELECT_VENDOR, number),
+            (IDENTIFY_VENDOR..=IDENTIFY_SERIAL_HIGH, _) => self.identify(command - IDENTIFY_VENDOR, number),
+            (IDENTIFY_NON_CONFIGURED, _) => self.is_unconfigured().then(|| answer(NON_CONFIGURED, [0; 2])),
+            (FASTSCAN, State::Waiting) if self.is_unconfigured() => self.fastscan(bytes),
+            (CONFIGURE_NODE_ID, State::Configuration) => {
+                let known = NodeId::new(a).is_some() || a == UNCONFIGURED;
+                if known {
+                    self.pending = NodeId::new(a);
+                }
+                Some(answer(CONFIGURE_NODE_ID, [u8::from(!known), 0]))
+            }
+            (CONFIGURE_BIT_TIMING, State::Configuration) => {
+                let rate = BitRate::from_index(b).filter(|rate| a == 0 && device.supports(*rate));
+                self.bit_rate = rate.or(self.bit_rate);
+                Some(answer(CONFIGURE_BIT_TIMING, [u8::from(rate.is_none()), 0]))
+            }
+            (ACTIVATE_BIT_TIMING, State::Configuration) => {
+                let delay_ms = u16::from_le_bytes([a, b]);
+                if let Some(rate) = self.bit_rate {
+                    let switch_at = now + u32::from(delay_ms);
+                    self.activation = Activation::Before { rate, switch_at, delay_ms };
+                }
+                None
+            }
+            (STORE, State::Configuration) => {
+                let error = device.store(self.pending, self.bit_rate).err();
+                Some(answer(STORE, [error.map_or(0, |error| error as u8), 0]))
+            }
+            (INQUIRE_VENDOR..=INQUIRE_SERIAL, State::Configuration) => {
+                let part = self.address.parts()[usize::from(command - INQUIRE_VENDOR)];
+                let [a, b, c, d] = part.to_le_bytes();
+                Some([command, a, b, c, d, 0, 0, 0])
+            }
+            (INQUIRE_NODE_ID, State::Configuration) => {
+                Some(answer(INQUIRE_NODE_ID, [self.active.map_or(UNCONFIGURED, NodeId::get), 0]))
+            }
+            _ => None,
+        }
+    }
+
+    /// Whether it has no node-ID and is not about to get one.
+    fn is_unconfigured(&self) -> bool {
+        self.active.is_none() && self.pending.is_none()
+    }
+
+    fn switch_global(&mut self, mode: u8) {
+        match mode {
+            0 => {
+                self.state = State::Waiting;
+                // A device without a node-ID takes the new one here, and boots.
+                if self.active.is_none() && self.pending.is_some() {
+                    self.active = self.pending;
+                    self.assigned = self.active;
+                }
+            }
+            1 => self.state = State::Configuration,
+            _ => {}
+        }
+    }
+
+    /// Four requests in a row name a device.
+    fn select(&mut self, step: u8, number: u32) -> Option<[u8; 8]> {
+        let matches = self.address.parts()[usize::from(step)] == number;
+        if !advance(&mut self.selected, step, 3, matches) {
+            return None;
+        }
+        self.state = State::Configuration;
+        Some(answer(SELECTED, [0; 2]))
+    }
+
+    /// Six requests in a row name vendor, product, and the bounds of revision and serial number.
+    fn identify(&mut self, step: u8, number: u32) -> Option<[u8; 8]> {
+        let LssAddress { vendor_id, product_code, revision, serial_number } = self.address;
+        let matches = match step {
+            0 => number == vendor_id,
+            1 => number == product_code,
+            2 => number <= revision,
+            3 => number >= revision,
+            4 => number <= serial_number,
+            _ => number >= serial_number,
+        };
+        advance(&mut self.identified, step, 5, matches).then(|| answer(IDENTIFIED, [0; 2]))
+    }
+
+    /// One bit of the address after another: who has them as asked answers, all at once.
+    fn fastscan(&mut self, bytes: &[u8; 8]) -> Option<[u8; 8]> {
+        let [_, a, b, c, d, bit, part, next] = *bytes;
+        let number = u32::from_le_bytes([a, b, c, d]);
+        if bit == CONFIRM {
+            self.position = 0;
+            return Some(answer(IDENTIFIED, [0; 2]));
+        }
+        if bit > 31 || part > 3 || next > 3 || part != self.position {
+            return None;
+        }
+        // Bits from 31 down to this one.
+        let asked = u32::MAX << bit;
+        if (self.address.parts()[usize::from(part)] ^ number) & asked != 0 {
+            return None;
+        }
+        self.position = next;
+        // All of the last part was confirmed: found.
+        if bit == 0 && next < part {
+            self.state = State::Configuration;
+        }
+        Some(answer(IDENTIFIED, [0; 2]))
+    }
+}
+
+/// A row of requests, of which each must match: whether this one was the last of them.
+fn advance(done: &mut u8, step: u8, last: u8, matches: bool) -> bool {
+    let in_order = step == 0 || step == *done;
+    let good = in_order && matches;
+    let complete = good && step == last;
+    *done = if good && !complete { step + 1 } else { 0 };
+    complete
+}
+
+fn answer(command: u8, [a, b]: [u8; 2]) -> [u8; 8] {
+    [command, a, b, 0, 0, 0, 0, 0]
+}
