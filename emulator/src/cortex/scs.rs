@@ -53,6 +53,8 @@ const AIRCR_PRIGROUP: u32 = 7 << 8;
 const SCR_SLEEPDEEP: u32 = 1 << 2;
 const SCR_MASK: u32 = 0b1_0110;
 const CCR_MASK: u32 = 0x31B;
+/// UNALIGN_TRP, DIV_0_TRP.
+const CCR_TRAPS: u32 = 0b11 << 3;
 /// STKALIGN is set by reset on the r0p1 core of the STM32F4.
 const CCR_RESET: u32 = 1 << 9;
 const CPACR_MASK: u32 = 0xF << 20;
@@ -224,7 +226,14 @@ impl Scs {
             0xD08 => self.vtor = value & 0xFFFF_FE00,
             0xD0C => return self.write_aircr(value),
             0xD10 => self.scr = value & SCR_MASK,
-            0xD14 => self.ccr = value & CCR_MASK,
+            0xD14 => {
+                self.ccr = value & CCR_MASK;
+                if value & CCR_TRAPS != 0 {
+                    return Err(Unmodelled(
+                        "the traps of CCR (unaligned access, division by zero) are not modelled".into(),
+                    ));
+                }
+            }
             0xD18..=0xD20 => self.set_priorities(4 + line_of(offset - 0xD18), value),
             0xD24 => self.write_shcsr(value),
             0xD28 => self.cfsr &= !value,

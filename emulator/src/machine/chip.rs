@@ -196,6 +196,9 @@ pub struct Chip {
     pub options: HostMemory,
     /// What went wrong.
     pub reports: Reports,
+    /// Reports of accesses to peripherals whose instruction is still to be found; their address is the one that the
+    /// program used.
+    pub unlocated: Vec<Report>,
     /// What was done.
     pub counters: Counters,
 
@@ -262,6 +265,7 @@ impl Chip {
             system,
             options: HostMemory::new(OPTION_PAGE.size, 0xFF),
             reports: Reports::default(),
+            unlocated: Vec::new(),
             counters: Counters {
                 instructions: 0,
                 cycles: 0,
@@ -431,29 +435,49 @@ impl Chip {
 
     /// The CPU loads `size` bytes (1, 2 or 4) from a peripheral address.
     pub fn load(&mut self, address: u32, size: u8) -> u32 {
-        if PERIPHERAL_ALIAS.contains(address, 1) {
+        let result = if PERIPHERAL_ALIAS.contains(address, 1) {
             let (word, bit) = bit_band(PERIPHERALS.base, address - PERIPHERAL_ALIAS.base);
-            return self.load_word(word, 4) >> bit & 1;
-        }
-        let word = self.load_word(address & !3, size);
-        word >> (8 * (address & 3)) & mask(size)
+            self.load_word(word).map(|value| value >> bit & 1)
+        } else {
+            self.load_word(address & !3).map(|word| word >> (8 * (address & 3)) & mask(size))
+        };
+        result.unwrap_or_else(|unmodelled| {
+            self.complain(Access::Read, address, size, 0, unmodelled);
+            0
+        })
     }
 
     /// The CPU stores `size` bytes to a peripheral address.
     pub fn store(&mut self, address: u32, size: u8, value: u32) {
-        if PERIPHERAL_ALIAS.contains(address, 1) {
+        let result = if PERIPHERAL_ALIAS.contains(address, 1) {
             // The bus matrix reads the word, changes the bit, writes the word (PM0214 section 2.2.5).
             let (word, bit) = bit_band(PERIPHERALS.base, address - PERIPHERAL_ALIAS.base);
-            let old = self.load_word(word, 4);
-            self.store_word(word, 4, old & !(1 << bit) | (value & 1) << bit);
+            self.change_word(word, 1 << bit, (value & 1) << bit)
         } else if size == 4 {
-            self.store_word(address, 4, value);
+            self.store_word(address, value)
         } else {
             let shift = 8 * (address & 3);
-            let old = self.load_word(address & !3, size);
-            let mask = mask(size) << shift;
-            self.store_word(address & !3, size, old & !mask | value << shift & mask);
+            self.change_word(address & !3, mask(size) << shift, value << shift)
+        };
+        if let Err(unmodelled) = result {
+            self.complain(Access::Write, address, size, value, unmodelled);
         }
+        self.after_write();
+    }
+
+    fn change_word(&mut self, address: u32, mask: u32, value: u32) -> Result<(), Unmodelled> {
+        let old = self.load_word(address)?;
+        self.store_word(address, old & !mask | value & mask)
+    }
+
+    fn complain(&mut self, access: Access, address: u32, size: u8, value: u32, unmodelled: Unmodelled) {
+        let Unmodelled(mut what) = unmodelled;
+        if PERIPHERAL_ALIAS.contains(address, 1) {
+            let (word, bit) = bit_band(PERIPHERALS.base, address - PERIPHERAL_ALIAS.base);
+            what.push_str(&format!(" (the alias of bit {bit} of the register at {word:08X}h)"));
+        }
+        let time = self.now();
+        self.unlocated.push(Report { time, address, pc: 0, size, access, value, what, count: 1 });
     }
 
     /// Word-sized bit-band access to SRAM: (offset of the byte, bit).
@@ -505,7 +529,7 @@ impl Chip {
         })
     }
 
-    fn load_word(&mut self, address: u32, size: u8) -> u32 {
+    fn load_word(&mut self, address: u32) -> Result<u32, Unmodelled> {
         let now = self.now();
         let result = match Self::place(address) {
             Place::Block { block, offset, enable } if self.has_clock(enable) => {
@@ -529,15 +553,12 @@ impl Chip {
             Place::Nobody => Err(Self::unknown(address)),
         };
         self.settle_flash();
-        result.unwrap_or_else(|Unmodelled(what)| {
-            self.report(Access::Read, address, size, 0, self.block.0, what);
-            0
-        })
+        result
     }
 
-    fn store_word(&mut self, address: u32, size: u8, value: u32) {
+    fn store_word(&mut self, address: u32, value: u32) -> Result<(), Unmodelled> {
         let now = self.now();
-        let result = match Self::place(address) {
+        match Self::place(address) {
             Place::Block { block, offset, enable } if self.has_clock(enable) => {
                 self.store_block(block, offset, value, now)
             }
@@ -553,11 +574,7 @@ impl Chip {
                 Ok(())
             }
             Place::Nobody => Err(Self::unknown(address)),
-        };
-        if let Err(Unmodelled(what)) = result {
-            self.report(Access::Write, address, size, value, self.block.0, what);
         }
-        self.after_write();
     }
 
     fn store_block(&mut self, block: Block, offset: u32, value: u32, now: Time) -> Result<(), Unmodelled> {

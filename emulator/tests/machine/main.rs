@@ -1,0 +1,508 @@
+//! The machine from outside: hand-assembled programs, and what the architecture and the reference manual say of them.
+
+#[rustfmt::skip]
+mod programs;
+
+use emulator::machine::{Access, Cut, FlashCut, FlashTimes, Machine, Options, ResetCause, Stop};
+use emulator::time::Time;
+use programs::Program;
+use shared_abi::geometry::STM32F407VG;
+
+const MS: u64 = 1_000_000_000;
+const STACK: u32 = 0x2001_0000;
+/// The programs log here.
+const OUT: u32 = 0x2000_0000;
+/// What the programs are told.
+const ARGUMENT: u32 = 0x2000_0100;
+
+fn ms(n: u64) -> Time {
+    Time(n * MS)
+}
+
+fn bytes(code: &[u16]) -> Vec<u8> {
+    code.iter().flat_map(|half| half.to_le_bytes()).collect()
+}
+
+fn image(program: &Program) -> Vec<u8> {
+    let mut table = [0_u32; 128];
+    table[0] = STACK;
+    table[1] = program.base | 1;
+    for &(exception, vector) in program.vectors {
+        table[exception] = vector;
+    }
+    table.iter().flat_map(|word| word.to_le_bytes()).chain(bytes(program.code)).collect()
+}
+
+fn with_options(program: &Program, options: Options) -> Machine {
+    let mut machine = Machine::new(&STM32F407VG, options).unwrap();
+    machine.load_bin(0x0800_0000, &image(program)).unwrap();
+    machine.power_on(Time(0));
+    machine
+}
+
+fn machine(program: &Program) -> Machine {
+    with_options(program, Options::default())
+}
+
+/// A machine whose program waits in RAM, told `argument`.
+fn machine_in_ram(program: &Program, argument: u32, options: Options) -> Machine {
+    let mut machine = with_options(&programs::TO_RAM, options);
+    machine.write_ram(program.base, &bytes(program.code)).unwrap();
+    put(&mut machine, ARGUMENT, argument);
+    put(&mut machine, 0x2000_0200, 1);
+    machine
+}
+
+fn word(machine: &Machine, address: u32) -> u32 {
+    let mut buffer = [0; 4];
+    machine.read_memory(address, &mut buffer).unwrap();
+    u32::from_le_bytes(buffer)
+}
+
+fn words(machine: &Machine, count: u32) -> Vec<u32> {
+    (0..count).map(|n| word(machine, OUT + 4 * n)).collect()
+}
+
+fn put(machine: &mut Machine, address: u32, value: u32) {
+    machine.write_ram(address, &value.to_le_bytes()).unwrap();
+}
+
+// --- start and time --------------------------------------------------------------------------------------------------
+
+#[test]
+fn reset_fetches_stack_pointer_and_entry_and_wfi_costs_nothing() {
+    let mut machine = machine(&programs::STORES_AND_SLEEPS);
+    assert_eq!(machine.run_until(ms(1_000)), Stop::Deadline);
+    assert_eq!(words(&machine, 2), [42, STACK]);
+    assert_eq!(machine.counters().instructions, 6, "up to WFI, once");
+    assert_eq!(machine.counters().cycles, 16_000_000, "a second of the HSI");
+    assert_eq!(machine.reports(), []);
+}
+
+#[test]
+fn without_a_program_the_chip_locks_up() {
+    let mut machine = Machine::new(&STM32F407VG, Options::default()).unwrap();
+    assert_eq!(machine.run_until(ms(1)), Stop::Deadline, "no power, no program");
+    machine.power_on(ms(1));
+    assert_eq!(machine.run_until(ms(2)), Stop::Lockup);
+    assert_eq!(machine.run_until(ms(3)), Stop::Deadline);
+    machine.load_bin(0x0800_0000, &image(&programs::STORES_AND_SLEEPS)).unwrap();
+    machine.reset_pin();
+    assert_eq!(machine.run_until(ms(4)), Stop::Deadline);
+    assert_eq!(word(&machine, OUT), 42);
+}
+
+#[test]
+fn systick_comes_once_a_millisecond() {
+    let mut machine = machine(&programs::SYSTICK);
+    machine.run_until(Time(100 * MS + MS / 2));
+    assert_eq!(words(&machine, 2), [100, 100]);
+    assert_eq!(machine.counters().exceptions[15], 100);
+    machine.run_until(Time(1_000 * MS + MS / 2));
+    assert_eq!(words(&machine, 2), [1_000, 1_000]);
+}
+
+#[test]
+fn two_runs_are_the_same_however_they_are_cut_into_slices() {
+    let run = |slice: u64| {
+        let mut machine = machine(&programs::BUSY);
+        let end = 20 * MS + 77;
+        let mut next = 0;
+        while next < end {
+            next = (next + slice).min(end);
+            assert_eq!(machine.run_until(Time(next)), Stop::Deadline);
+        }
+        let mut ram = vec![0; 0x2_0000];
+        machine.read_memory(0x2000_0000, &mut ram).unwrap();
+        (machine.now(), machine.pc(), machine.counters(), ram)
+    };
+    let whole = run(u64::MAX / 2);
+    assert_eq!(whole.2.exceptions[15], 319, "20 ms of 62.5 µs, less the last one or so");
+    assert!(whole == run(u64::MAX / 2), "twice the same");
+    assert!(whole == run(1_234_567), "in slices of 1.2 µs");
+    assert!(whole == run(MS / 3), "in slices of 0.3 ms");
+}
+
+#[test]
+fn ram_is_noise_at_power_on_and_kept_over_a_reset() {
+    let snapshot = |machine: &Machine| {
+        let mut ram = vec![0; 0x1000];
+        machine.read_memory(0x2000_2000, &mut ram).unwrap();
+        ram
+    };
+    let mut machine = machine(&programs::STORES_AND_SLEEPS);
+    let first = snapshot(&machine);
+    machine.run_until(ms(1));
+    machine.reset_pin();
+    assert!(snapshot(&machine) == first, "a reset leaves RAM alone");
+    machine.power_off();
+    assert!(!machine.is_powered());
+    machine.power_on(ms(10));
+    assert_eq!(machine.now(), ms(10));
+    let second = snapshot(&machine);
+    assert!(second != first, "new noise");
+    let ones: u32 = second.iter().map(|byte| byte.count_ones()).sum();
+    assert!((14_000..18_800).contains(&ones), "half of the bits are ones, give or take: {ones}");
+    let again = with_options(&programs::STORES_AND_SLEEPS, Options::default());
+    assert!(snapshot(&again) == first, "the same seed, the same noise");
+    let other = with_options(&programs::STORES_AND_SLEEPS, Options { seed: 2, ..Options::default() });
+    assert!(snapshot(&other) != first);
+}
+
+// --- exceptions ------------------------------------------------------------------------------------------------------
+
+/// DDI 0403E table B1-8: EXC_RETURN FFFF_FFF1 to a handler, FFFF_FFF9 to the thread on the main stack.
+#[test]
+fn a_higher_priority_pre_empts() {
+    let mut machine = machine(&programs::NESTING);
+    put(&mut machine, ARGUMENT, 0x40);
+    machine.run_until(ms(1));
+    let nested_sp = STACK - 2 * 0x20;
+    assert_eq!(words(&machine, 7), [1, 0xFFFF_FFF9, 2, 0xFFFF_FFF1, nested_sp, 3, 4]);
+}
+
+#[test]
+fn an_equal_priority_waits_and_follows() {
+    let mut machine = machine(&programs::NESTING);
+    put(&mut machine, ARGUMENT, 0x80);
+    machine.run_until(ms(1));
+    assert_eq!(words(&machine, 7), [1, 0xFFFF_FFF9, 3, 2, 0xFFFF_FFF9, STACK - 0x20, 4]);
+    assert_eq!(machine.counters().exceptions[16..18], [1, 1]);
+}
+
+#[test]
+fn basepri_and_primask_hold_back_and_primask_lets_wfi_end() {
+    let mut machine = machine(&programs::MASKS);
+    machine.run_until(ms(1));
+    assert_eq!(words(&machine, 6), [1, 9, 2, 3, 9, 4]);
+}
+
+/// DDI 0403E B1.5.6: the frame on the process stack, padded to eight bytes with bit 9 of the stacked xPSR.
+#[test]
+fn svc_from_the_process_stack_and_back() {
+    let mut machine = machine(&programs::PROCESS_STACK);
+    machine.run_until(ms(1));
+    let log = words(&machine, 9);
+    assert_eq!(log[0], 0xFFFF_FFFD);
+    assert_eq!(log[1], STACK, "the handler's own stack is the main one");
+    assert_eq!(log[2], 0x2000_8000 - 0x20);
+    assert_eq!(log[3], 0x0800_0216, "the instruction behind SVC");
+    assert_eq!(log[4] & 0x0100_03FF, 0x0100_0200, "Thumb, padded, thread");
+    assert_eq!(log[5], 0, "CONTROL in the handler");
+    assert_eq!(log[6], 11);
+    assert_eq!(log[7..9], [2, 0x2000_8004], "CONTROL and SP in the thread again");
+}
+
+#[test]
+fn vtor_moves_the_table() {
+    let mut machine = machine(&programs::VECTORS_IN_RAM);
+    machine.run_until(ms(1));
+    assert_eq!(word(&machine, OUT), 77);
+}
+
+#[test]
+fn wfe_ends_by_itself_and_sleep_on_exit_never_comes_back() {
+    let mut waiting = machine(&programs::EVENTS);
+    waiting.run_until(ms(1));
+    assert!((50..=100).contains(&word(&waiting, OUT)), "{}", word(&waiting, OUT));
+    let mut sleeping = machine(&programs::SLEEPS_ON_EXIT);
+    sleeping.run_until(Time(10 * MS + MS / 2));
+    assert_eq!(words(&sleeping, 2), [10, 0]);
+}
+
+// --- FPU -------------------------------------------------------------------------------------------------------------
+
+#[test]
+fn the_fpu_faults_until_it_is_enabled() {
+    let mut machine = machine(&programs::FPU);
+    put(&mut machine, ARGUMENT, 0);
+    machine.run_until(ms(1));
+    assert_eq!(machine.fault_status(), (0x0008_0000, 0x4000_0000), "NOCP, FORCED");
+    assert_eq!(word(&machine, OUT + 20), 3);
+    assert_eq!(word(&machine, OUT + 24), 11, "what came before it was executed");
+    assert_eq!(word(&machine, OUT + 16), 0x0800_0220, "the first FPU instruction");
+}
+
+/// DDI 0403E B1.5.7: the extended frame has 26 words, EXC_RETURN has bit 4 clear.
+#[test]
+fn fpu_registers_survive_an_interrupt() {
+    let mut machine = machine(&programs::FPU);
+    put(&mut machine, ARGUMENT, 1);
+    machine.run_until(ms(1));
+    assert_eq!(word(&machine, OUT), 0xFFFF_FFE9);
+    assert_eq!(word(&machine, OUT + 4), 3.0_f32.to_bits());
+    assert_eq!(word(&machine, OUT + 8), STACK - 4 * 26);
+}
+
+// --- faults ----------------------------------------------------------------------------------------------------------
+
+/// What each bad thing leads to: IPSR, CFSR, HFSR, stacked PC.
+fn fault(kind: u32, enabled: u32, again: u32) -> (Machine, Stop) {
+    let mut machine = machine(&programs::FAULTS);
+    put(&mut machine, ARGUMENT, kind);
+    put(&mut machine, ARGUMENT + 4, enabled);
+    put(&mut machine, ARGUMENT + 8, again);
+    let stop = machine.run_until(ms(1));
+    (machine, stop)
+}
+
+const FORCED: u32 = 0x4000_0000;
+const ALL_FAULTS: u32 = 7 << 16;
+
+#[test]
+fn faults_escalate_to_hard_fault_while_they_are_disabled() {
+    for (kind, cfsr, hfsr) in [
+        (0, 0x0000_8200, FORCED),
+        (1, 0x0001_0000, FORCED),
+        (2, 0x0002_0000, FORCED),
+        (4, 0, 0x8000_0000),
+        (5, 0x0000_0400, FORCED),
+        (6, 0x0000_0100, FORCED),
+        (7, 0x0000_0100, FORCED),
+    ] {
+        let (machine, stop) = fault(kind, 0, 0);
+        assert_eq!(stop, Stop::Deadline);
+        assert_eq!(words(&machine, 3), [3, cfsr, hfsr], "kind {kind}");
+    }
+}
+
+#[test]
+fn faults_are_taken_at_their_own_priority_when_enabled() {
+    for (kind, exception) in [(0, 5), (1, 6), (2, 6), (4, 3), (5, 5), (6, 5)] {
+        let (machine, _) = fault(kind, ALL_FAULTS, 0);
+        assert_eq!(word(&machine, OUT), exception, "kind {kind}");
+        assert_eq!(word(&machine, OUT + 8) & FORCED, 0);
+    }
+}
+
+#[test]
+fn a_bad_load_names_its_address_and_its_instruction() {
+    let (machine, _) = fault(0, 0, 0);
+    let log = words(&machine, 5);
+    assert_eq!(log[3], 0x6000_0010, "BFAR");
+    let [report] = machine.reports() else { panic!("{:?}", machine.reports()) };
+    assert_eq!((report.address, report.access, report.size), (0x6000_0010, Access::Read, 4));
+    assert_eq!(report.pc, log[4], "the stacked PC is the load's");
+    assert_eq!(word(&machine, report.pc & !3) >> (8 * (report.pc & 2)) & 0xFFFF, 0x6800, "ldr r0, [r0]");
+}
+
+#[test]
+fn a_fault_within_hard_fault_locks_up() {
+    let (mut machine, stop) = fault(1, 0, 1);
+    assert_eq!(stop, Stop::Lockup);
+    let before = machine.counters().instructions;
+    assert_eq!(machine.run_until(ms(50)), Stop::Deadline);
+    assert_eq!(machine.counters().instructions, before);
+}
+
+#[test]
+fn code_runs_in_ram_but_not_in_core_coupled_memory() {
+    let (machine, _) = fault(7, 0, 0);
+    assert_eq!(word(&machine, OUT + 16), 0x1000_0000);
+    assert_eq!(machine.reports()[0].access, Access::Fetch);
+}
+
+// --- reset causes ----------------------------------------------------------------------------------------------------
+
+/// RM0090 section 7.3.21: RCC_CSR reset flags.
+#[test]
+fn a_software_reset_keeps_ram_and_says_so() {
+    let mut machine = machine(&programs::RESET);
+    put(&mut machine, OUT, 0);
+    assert_eq!(machine.run_until(ms(1)), Stop::Reset(ResetCause::Software));
+    assert_eq!(word(&machine, OUT + 16), 0x0E00_0000, "power-on: POR, PIN, BOR");
+    assert_eq!(machine.run_until(ms(1)), Stop::Deadline);
+    assert_eq!(word(&machine, OUT), 2, "RAM was kept");
+    assert_eq!(word(&machine, OUT + 16), 0x1400_0000, "SFT, PIN");
+    assert_eq!(machine.counters().resets, 1);
+    machine.reset_pin();
+    machine.run_until(ms(2));
+    assert_eq!(word(&machine, OUT + 16), 0x0400_0000, "PIN alone, as RMVF took the others away");
+}
+
+#[test]
+fn the_watchdog_resets_unless_it_is_fed() {
+    let mut hungry = machine(&programs::WATCHDOG);
+    put(&mut hungry, ARGUMENT, 0);
+    assert_eq!(hungry.run_until(ms(10)), Stop::Reset(ResetCause::IndependentWatchdog));
+    let at = hungry.now().0;
+    assert!((MS..MS + MS / 50).contains(&at), "{}", hungry.now());
+    let mut fed = machine(&programs::WATCHDOG);
+    put(&mut fed, ARGUMENT, 10);
+    assert_eq!(fed.run_until(ms(30)), Stop::Reset(ResetCause::IndependentWatchdog));
+    // Ten rounds of 6 400 × 2 cycles at 16 MHz, 0.8 ms each, then the millisecond that is not fed.
+    assert!((9 * MS..9 * MS + MS / 10).contains(&fed.now().0), "{}", fed.now());
+}
+
+// --- flash -----------------------------------------------------------------------------------------------------------
+
+const SECTOR_1: usize = 0x4000;
+
+/// Datasheet: 250 ms for 16 KiB at x32. Polling from flash sees BSY set never more than once: the CPU stands still.
+#[test]
+fn code_in_flash_stands_still_while_the_flash_is_busy() {
+    let mut machine = with_options(&programs::FLASH_FROM_FLASH, Options::default());
+    machine.load_bin(0x0800_4000, &[0; 64]).unwrap();
+    machine.run_until(ms(260));
+    assert_eq!(machine.flash()[SECTOR_1..SECTOR_1 + 5], [0x78, 0x56, 0x34, 0x12, 0xFF]);
+    let counters = machine.counters();
+    assert_eq!((counters.sectors_erased, counters.units_programmed), (1, 1));
+    assert!((1..=2).contains(&word(&machine, OUT)), "polls: {}", word(&machine, OUT));
+    assert_eq!(word(&machine, OUT + 8), 0, "no error");
+    // One tick is remembered during the stall, not 250.
+    assert!((1..=11).contains(&word(&machine, OUT + 4)), "ticks: {}", word(&machine, OUT + 4));
+    let stalled = counters.flash_stall_time.0;
+    assert!((250 * MS..251 * MS).contains(&stalled), "{stalled}");
+    assert!(counters.flash_stalls >= 2);
+}
+
+#[test]
+fn the_longest_times_can_be_chosen() {
+    let options = Options { flash_times: FlashTimes::Worst, ..Options::default() };
+    let mut machine = with_options(&programs::FLASH_FROM_FLASH, options);
+    machine.run_until(ms(499));
+    assert_eq!(machine.counters().sectors_erased, 0);
+    machine.run_until(ms(501));
+    assert_eq!(machine.counters().sectors_erased, 1);
+}
+
+/// 250 ms at 16 MHz are 4 million cycles; a round of the poll takes four.
+#[test]
+fn code_in_ram_goes_on_and_new_code_in_flash_is_seen() {
+    let mut machine = machine_in_ram(&programs::FLASH_FROM_RAM, 0, Options::default());
+    machine.load_bin(0x0800_4000, &[0x01, 0x20, 0x70, 0x47]).unwrap(); // movs r0, #1; bx lr
+    machine.run_until(ms(300));
+    let log = words(&machine, 3);
+    assert!((990_000..1_010_000).contains(&log[0]), "polls: {}", log[0]);
+    assert_eq!(log[1..], [1, 2], "the old function, then the new one");
+    assert_eq!(machine.counters().flash_stalls, 0);
+}
+
+#[test]
+fn a_load_from_busy_flash_stalls_code_in_ram() {
+    let mut machine = machine_in_ram(&programs::FLASH_FROM_RAM, 1, Options::default());
+    machine.load_bin(0x0800_4000, &[0x01, 0x20, 0x70, 0x47]).unwrap();
+    machine.run_until(ms(300));
+    let log = words(&machine, 3);
+    assert_eq!(log, [1, 1, 2], "BSY was clear at the first poll");
+    assert_eq!(machine.counters().flash_stalls, 1);
+}
+
+#[test]
+fn the_power_can_be_cut_at_a_flash_operation() {
+    for (when, erased) in [(Cut::Before, false), (Cut::After, true)] {
+        let mut machine = machine_in_ram(&programs::FLASH_FROM_RAM, 0, Options::default());
+        machine.load_bin(0x0800_4000, &[0x01, 0x20, 0x70, 0x47]).unwrap();
+        machine.cut_power_at(Some(FlashCut { operation: 0, when }));
+        assert_eq!(machine.run_until(ms(300)), Stop::PowerCut);
+        assert!(!machine.is_powered());
+        assert_eq!(machine.flash()[SECTOR_1] == 0xFF, erased);
+    }
+    let torn = |seed| {
+        let mut machine = machine_in_ram(&programs::FLASH_FROM_RAM, 0, Options::default());
+        machine.load_bin(0x0800_4000, &[0x01, 0x20, 0x70, 0x47].repeat(100)).unwrap();
+        machine.cut_power_at(Some(FlashCut { operation: 1, when: Cut::Torn { seed } }));
+        assert_eq!(machine.run_until(ms(300)), Stop::PowerCut);
+        machine.flash()[SECTOR_1..SECTOR_1 + 8].to_vec()
+    };
+    let first = torn(1);
+    assert_eq!(first, torn(1));
+    assert_ne!(first, torn(2));
+    assert_eq!(first[4..], [0xFF; 4], "the second operation programs one word");
+    let whole = [0x02, 0x20, 0x70, 0x47];
+    assert!(first.iter().zip(whole).all(|(found, wanted)| found & wanted == wanted), "bits only go to 0");
+}
+
+#[test]
+fn losing_the_power_tears_the_operation_that_runs() {
+    let mut machine = machine_in_ram(&programs::FLASH_FROM_RAM, 0, Options::default());
+    machine.load_bin(0x0800_4000, &[0x01, 0x20, 0x70, 0x47].repeat(1000)).unwrap();
+    let before = machine.flash().to_vec();
+    machine.run_until(ms(100));
+    machine.power_off();
+    let sector = &machine.flash()[SECTOR_1..SECTOR_1 + 4000];
+    assert!(sector != &before[SECTOR_1..SECTOR_1 + 4000] && sector.iter().any(|&byte| byte != 0xFF));
+    assert!(machine.flash()[..SECTOR_1] == before[..SECTOR_1], "its neighbour is whole");
+}
+
+// --- memory map ------------------------------------------------------------------------------------------------------
+
+#[test]
+fn bit_band_aliases_reach_their_bits() {
+    let mut machine = machine(&programs::BIT_BAND);
+    machine.run_until(ms(1));
+    assert_eq!(words(&machine, 4), [0x0000_0003, 1, 0x0010_0008, 1]);
+    assert_eq!(machine.reports(), []);
+}
+
+#[test]
+fn unmodelled_and_unclocked_accesses_are_reported_once_with_a_count() {
+    let mut machine = machine(&programs::PERIPHERALS);
+    put(&mut machine, OUT + 4, 5);
+    machine.run_until(ms(1));
+    let [unclocked, unmodelled] = machine.reports() else { panic!("{:?}", machine.reports()) };
+    assert_eq!((unclocked.address, unclocked.access, unclocked.count), (0x4002_0C00, Access::Read, 1));
+    assert!(unclocked.what.contains("GPIOD has no clock"), "{unclocked}");
+    assert_eq!((unmodelled.address, unmodelled.access, unmodelled.value), (0x4000_0000, Access::Write, 1));
+    assert!(unmodelled.what.contains("TIM2"), "{unmodelled}");
+    // The listing: ldr r0, [r1, #0] and str r0, [r2, #0].
+    assert_eq!((unclocked.pc, unmodelled.pc), (0x0800_0206, 0x0800_0210));
+    assert_eq!(machine.reports().iter().map(|r| r.count).sum::<u64>(), 6);
+    assert!(machine.pin('D', 12));
+    assert_eq!(word(&machine, OUT), 1 << 12, "IDR sees the pin");
+}
+
+#[test]
+fn self_written_code_is_seen() {
+    let mut machine = machine(&programs::WRITES_ITS_OWN_CODE);
+    machine.run_until(ms(1));
+    assert_eq!(words(&machine, 2), [1, 2]);
+}
+
+#[test]
+fn the_chip_says_who_it_is() {
+    let options = Options { unique_id: [1, 2, 0xDEAD_BEEF], ..Options::default() };
+    let machine = with_options(&programs::STORES_AND_SLEEPS, options);
+    assert_eq!(word(&machine, 0x1FFF_7A18), 0xDEAD_BEEF);
+    assert_eq!(word(&machine, 0x1FFF_7A20) >> 16, 1024, "flash size in KiB at 1FFF_7A22h");
+    assert_eq!(word(&machine, 0x0000_0000), STACK, "flash is aliased at 0");
+}
+
+// --- hostile input ---------------------------------------------------------------------------------------------------
+
+#[test]
+fn bad_images_are_refused_and_leave_the_flash_alone() {
+    let mut machine = Machine::new(&STM32F407VG, Options::default()).unwrap();
+    for bad in [&b""[..], b"\x7FELF", &[0; 100], b":10010000214601360121470136007EFE09D2190140"] {
+        assert!(machine.load(bad).is_err());
+    }
+    assert!(machine.load_bin(0x080F_FFFF, &[0, 0]).is_err());
+    assert!(machine.load_bin(0x2000_0000, &[0]).is_err());
+    assert!(machine.load_bin(u32::MAX, &[0; 8]).is_err());
+    assert!(machine.write_ram(0x2001_FFFF, &[0, 0]).is_err());
+    assert!(machine.read_memory(0x1FFF_7FFF, &mut [0; 2]).is_err());
+    assert!(machine.flash().iter().all(|&byte| byte == 0xFF));
+    machine.set_pin('Z', 99, Some(true));
+    assert!(!machine.pin('Z', 99));
+}
+
+/// Every program must come to an end of some kind, whatever it is.
+#[test]
+fn noise_as_a_program_does_no_harm() {
+    let mut state = 0x1234_5678_u64;
+    for round in 0..60 {
+        let mut code = Vec::new();
+        for _ in 0..512 {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            code.extend_from_slice(&state.to_be_bytes()[..4]);
+        }
+        let mut machine =
+            with_options(&programs::STORES_AND_SLEEPS, Options { seed: round, ..Options::default() });
+        machine.load_bin(0x0800_0200, &code).unwrap();
+        machine.power_on(Time(0));
+        let mut stops = 0;
+        while machine.run_until(ms(2)) != Stop::Deadline && stops < 50 {
+            stops += 1;
+        }
+    }
+}
