@@ -150,7 +150,7 @@ pub struct Lss {
     /// Steps of a selective switch, and of an identification, that have matched.
     selected: u8,
     identified: u8,
-    /// The part of the address that fastscan is at.
+    /// The part of the address that fastscan is at, 0 to 3.
     position: u8,
     activation: Activation,
     answer: Option<[u8; 8]>,
@@ -389,7 +389,7 @@ impl Lss {
             self.position = 0;
             return Some(answer(IDENTIFIED, [0; 2]));
         }
-        if bit > 31 || part > 3 || next > 3 || part != self.position {
+        if bit > 31 || next > 3 || part != self.position {
             return None;
         }
         // Bits from 31 down to this one.

@@ -238,8 +238,18 @@ fn activates_bit_timing_after_one_delay_and_speaks_after_two() {
     assert!(bench.lss.is_silent(at(599)));
     bench.now = 600;
     assert!(!bench.lss.is_silent(at(600)));
+    assert_eq!(bench.outputs(), []);
     bench.expect(&[([0x5E, 0, 0, 0, 0, 0, 0, 0], [0x5E, 5, 0, 0, 0, 0, 0, 0])]);
     assert_eq!(bench.lss.next_deadline(), None);
+    // An answer that was not fetched before waits, too.
+    for bytes in [[0x5E, 0, 0, 0, 0, 0, 0, 0], [0x15, 10, 0, 0, 0, 0, 0, 0]] {
+        bench.lss.handle(&request(bytes), at(600), &mut bench.device);
+    }
+    assert_eq!(bench.outputs(), []);
+    bench.now = 610;
+    assert_eq!(bench.outputs(), [Output::BitRate(BitRate::K250)]);
+    bench.now = 620;
+    assert_eq!(bench.outputs(), [response([0x5E, 5, 0, 0, 0, 0, 0, 0])]);
 }
 
 #[test]
@@ -348,6 +358,9 @@ fn fastscan_asks_bit_by_bit() {
         (fastscan(0x1122_3344, 0, 1, 2), yes),
         (fastscan(0x0001_0002, 0, 2, 3), yes),
     ]);
+    assert!(!bench.is_in_configuration());
+    // All but the last bit of the last part is not all, whatever comes next.
+    bench.expect(&[(fastscan(0xDEAD_BEEE, 1, 3, 2), yes), (fastscan(0x0001_0002, 0, 2, 3), yes)]);
     assert!(!bench.is_in_configuration());
     bench.expect(&[(fastscan(0xDEAD_BEEF, 0, 3, 0), yes)]);
     assert!(bench.is_in_configuration());
