@@ -10,6 +10,7 @@ use coflash::session::{Session, Timing};
 use emulator::bus::{Outcome, Record};
 use emulator::frame::Frame;
 use emulator::machine::{Machine, Options, Stop};
+use emulator::socketcand::Server;
 use emulator::time::{Span, Time};
 use emulator::world::{MachineId, PortId, World};
 
@@ -148,6 +149,13 @@ impl Bench {
                 return Some(frame.data().to_vec());
             }
         }
+    }
+
+    /// Lets the endpoint's clients take part, and time go on to `until`; gives the number of frames that they got.
+    pub fn serve(&mut self, server: &mut Server, until: Time) -> usize {
+        let before = server.exchange(&mut self.world, self.port);
+        self.world.run_until(until);
+        before + server.exchange(&mut self.world, self.port)
     }
 
     /// A host's session with the board.

@@ -1,4 +1,5 @@
 //! What the tests and the demonstration share: the built firmware, and the bench that it runs on.
 
 pub mod bench;
+pub mod endpoint;
 pub mod firmware;

@@ -19,7 +19,8 @@ run the firmware in the emulator and those that use a third-party CANopen client
   ARGS            go to cargo test: `cargo xtask test -p canopen sdo`, `cargo xtask test -- --nocapture`
 
 The tests find what was built by these variables: COBOOT_BOARD, COBOOT_FIRMWARE_DIR (bootloader.elf,
-app-v1.elf, app-v2.elf) and COBOOT_PYTHON (an interpreter with tests/python/requirements.txt installed).
+app-v1.elf, app-v2.elf), COBOOT_COFLASH (the command line of the host tool) and COBOOT_PYTHON (an
+interpreter with tests/python/requirements.txt installed).
 ";
 
 pub fn run(mut args: Args) -> Outcome {
@@ -27,6 +28,9 @@ pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     setup.prepare(&[Part::Firmware, Part::Emulator, Part::Python])?;
     let images = build::images(board)?;
+    process::run(process::cargo("build").current_dir(workspace::root()).args(["--package", "coflash"]))?;
+    let coflash =
+        workspace::target_dir().join("debug").join("coflash").with_extension(std::env::consts::EXE_EXTENSION);
 
     let started = Instant::now();
     let mut cargo = process::cargo("test");
@@ -36,6 +40,7 @@ pub fn run(mut args: Args) -> Outcome {
         .current_dir(workspace::root())
         .env("COBOOT_BOARD", board.board)
         .env("COBOOT_FIRMWARE_DIR", &images.dir)
+        .env("COBOOT_COFLASH", &coflash)
         .env("COBOOT_PYTHON", setup::python())
         .stdout(Stdio::piped());
     let mut tests = cargo.spawn().map_err(|error| process::not_started(&cargo, &error))?;

@@ -65,6 +65,12 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
         }
         pieces.add(address, data.to_vec(), place);
     }
+    // Linkers write the section headers last: a file that lacks them was cut off, even if all segments are there.
+    let sections = u64::from(header.e_shoff(endian));
+    let sections_end = sections + u64::from(header.e_shentsize(endian)) * u64::from(header.e_shnum(endian));
+    if sections != 0 && sections_end > bytes.len() as u64 {
+        return Err(cut_off("the table of section headers", sections_end)(()));
+    }
     pieces.into_image()
 }
 
@@ -126,6 +132,11 @@ mod tests {
             (
                 "the file: the ELF header is cut off: it must have 52 bytes and has 51",
                 fault(|b| b.truncate(51)),
+            ),
+            (
+                "the file: the table of section headers is cut off: it must have 164 bytes and has 124",
+                // e_shoff 124, one header of 40 bytes.
+                fault(|b| (b[32], b[48]) = (124, 1)),
             ),
             ("the file: holds no data", fault(|b| (b[52], b[84]) = (6, 6))),
             (

@@ -1,0 +1,92 @@
+//! The bench for other programs: they reach its bus through the socketcand endpoint, in real time.
+
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use emulator::pacing::{Pacer, Speed};
+use emulator::socketcand::Server;
+
+use crate::bench::Bench;
+
+/// How long a client may take before it counts as hanging, on the wall clock.
+const PATIENCE: Duration = Duration::from_secs(300);
+
+/// A bench with an endpoint.
+pub struct Endpoint {
+    /// The bench.
+    pub bench: Bench,
+    server: Server,
+}
+
+impl Endpoint {
+    /// Opens an endpoint on a free port of this machine.
+    ///
+    /// # Panics
+    /// If there is none.
+    #[must_use]
+    pub fn new(bench: Bench) -> Self {
+        let server = Server::bind("127.0.0.1:0", "can0").expect("a free port");
+        Self { bench, server }
+    }
+
+    /// `HOST:PORT` of the endpoint.
+    #[must_use]
+    pub fn address(&self) -> String {
+        self.server.address().to_string()
+    }
+
+    /// Its URL for coflash.
+    #[must_use]
+    pub fn url(&self) -> String {
+        format!("socketcand://{}/can0", self.address())
+    }
+
+    /// Runs a program while the board lives on, until it ends.
+    ///
+    /// # Panics
+    /// If it does not start, or does not end.
+    pub fn run(&mut self, command: &mut Command) -> Output {
+        let command = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut child = command.spawn().unwrap_or_else(|error| panic!("{command:?}: {error}"));
+        // What it prints is fetched by other threads, so that it never waits for a full pipe.
+        let [out, err] = readers(&mut child);
+        let began = Instant::now();
+        let mut pacer = Pacer::new(Speed::Times(1.0), began, self.bench.time());
+        let status = loop {
+            if let Some(status) = child.try_wait().expect("the child can be asked") {
+                break status;
+            }
+            if began.elapsed() > PATIENCE {
+                let _ = child.kill();
+                panic!(
+                    "{command:?} hangs; it said: {}",
+                    String::from_utf8_lossy(&out.join().unwrap_or_default())
+                );
+            }
+            let target = pacer.target(Instant::now(), self.bench.time());
+            if target <= self.bench.time() {
+                self.server.wait(Duration::from_micros(500));
+            }
+            let delivered = self.bench.serve(&mut self.server, target);
+            if delivered > 0 {
+                pacer.delivered(Instant::now());
+            }
+        };
+        let [stdout, stderr] = [out, err].map(|reader| reader.join().expect("a reader does not panic"));
+        Output { status, stdout, stderr }
+    }
+}
+
+type Reader = std::thread::JoinHandle<Vec<u8>>;
+
+fn readers(child: &mut Child) -> [Reader; 2] {
+    fn drain(mut from: impl std::io::Read + Send + 'static) -> Reader {
+        std::thread::spawn(move || {
+            let mut bytes = Vec::new();
+            let _ = from.read_to_end(&mut bytes);
+            bytes
+        })
+    }
+    let (out, err) = (child.stdout.take(), child.stderr.take());
+    [drain(out.expect("stdout is a pipe")), drain(err.expect("stderr is a pipe"))]
+}

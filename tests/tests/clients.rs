@@ -1,0 +1,119 @@
+//! Programs that we did not write, unmodified, and our own command line as a person runs it: against the emulated device
+//! through the socketcand endpoint.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::{env, fs};
+
+use canopen::Address;
+use coboot_tests::bench::Bench;
+use coboot_tests::endpoint::Endpoint;
+use coboot_tests::firmware;
+
+const VERSION: Address = Address::new(0x100A, 0);
+
+fn endpoint() -> Endpoint {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    Endpoint::new(bench)
+}
+
+fn text(output: &Output) -> String {
+    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
+}
+
+/// The python of `cargo xtask test`, with the pinned third-party packages.
+fn python() -> Command {
+    let python = env::var_os("COBOOT_PYTHON")
+        .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
+    Command::new(python)
+}
+
+fn script(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("python").join(name)
+}
+
+/// A block file of the application, for clients that take files.
+fn block_file(image: &str) -> PathBuf {
+    let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(image).with_extension("blk");
+    fs::write(&path, firmware::blocks(image).emit()).unwrap();
+    path
+}
+
+#[test]
+fn python_canopen_identifies_flashes_and_starts_the_device() {
+    let mut endpoint = endpoint();
+    let mut python = python();
+    python.arg(script("canopen_client.py")).arg(endpoint.address()).arg(block_file(firmware::APP_V1));
+    let output = endpoint.run(&mut python);
+    let said = text(&output);
+    assert!(output.status.success(), "{said}");
+    for line in [
+        "1000h device type = 10000000h",
+        "1018h vendor 00000000h, product 4007D151h, revision 00010000h",
+        "1F57h flash status = 00000000h",
+        "cleared",
+        "signed",
+        "the application reports 1F51h = 01h and the same 1F56h",
+    ] {
+        assert!(said.contains(line), "no {line:?} in:\n{said}");
+    }
+    assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), "1.0.0");
+    endpoint.bench.assert_nothing_unmodelled();
+}
+
+/// The command line that `cargo xtask test` has built.
+fn coflash() -> Command {
+    let coflash = env::var_os("COBOOT_COFLASH")
+        .unwrap_or_else(|| panic!("COBOOT_COFLASH is not set: run the tests by `cargo xtask test`"));
+    Command::new(coflash)
+}
+
+#[test]
+fn the_coflash_command_does_the_main_job_through_a_socket() {
+    let mut endpoint = endpoint();
+    let url = endpoint.url();
+    let output = endpoint.run(coflash().args(["--bus", &url, "info"]));
+    assert!(output.status.success(), "{}", text(&output));
+    assert!(text(&output).contains("the bootloader"), "{}", text(&output));
+
+    let flash = |endpoint: &mut Endpoint, image: &str| {
+        let output = endpoint.run(coflash().args(["--bus", &url, "flash"]).arg(firmware::dir().join(image)));
+        assert!(output.status.success(), "{}", text(&output));
+    };
+    flash(&mut endpoint, firmware::APP_V1);
+    assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), "1.0.0");
+    // Now an application runs: it is called back.
+    flash(&mut endpoint, firmware::APP_V2);
+    assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), "2.0.0");
+}
+
+/// A file that cannot be flashed is refused before anything of the device is touched.
+#[test]
+fn a_bad_file_touches_no_device() {
+    let mut endpoint = endpoint();
+    let elf = firmware::elf(firmware::APP_V1);
+    let mut damaged = firmware::blocks(firmware::APP_V1).emit();
+    damaged[100] ^= 1;
+    let directory = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
+    for (name, bytes) in [
+        ("truncated.elf", &elf[..elf.len() / 2]),
+        ("empty.hex", &[]),
+        ("bootloader.elf", &firmware::elf(firmware::BOOTLOADER)),
+        ("damaged.blk", &damaged),
+        ("checksum.hex", b":020000040801F1\n:0400000000C0012017\n:00000001FF\n"),
+    ] {
+        let path = directory.join(name);
+        fs::write(&path, bytes).unwrap();
+        let from = endpoint.bench.time();
+        let mut command = coflash();
+        command.args(["--bus", &endpoint.url(), "flash", "--board", firmware::board().board]).arg(&path);
+        let output = endpoint.run(&mut command);
+        assert!(!output.status.success(), "{name}");
+        assert!(text(&output).contains(name), "{name} is not named in: {}", text(&output));
+        let sdo =
+            endpoint.bench.frames_since(from).into_iter().find(|(_, id, _)| (0x580..0x680).contains(id));
+        assert_eq!(sdo, None, "{name}: the device was talked to");
+    }
+}
