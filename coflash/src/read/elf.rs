@@ -29,9 +29,9 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
     }
     let cut_off = |what, needed: u64| {
         let needed = usize::try_from(needed).unwrap_or(usize::MAX);
-        move |_| Place::File.fault(Cause::CutOff { what, needed, found: bytes.len() })
+        Place::File.fault(Cause::CutOff { what, needed, found: bytes.len() })
     };
-    let header = FileHeader32::<Endianness>::parse(bytes).map_err(cut_off("the ELF header", 52))?;
+    let header = FileHeader32::<Endianness>::parse(bytes).map_err(|_| cut_off("the ELF header", 52))?;
     let endian = header.endian().map_err(|_| DATA.fault(Cause::WrongElf("has an unknown byte order")))?;
     let machine = header.e_machine(endian);
     if machine != EM_ARM {
@@ -43,8 +43,9 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
     }
     let table = u64::from(header.e_phoff(endian));
     let table_end = table + u64::from(header.e_phentsize(endian)) * u64::from(header.e_phnum(endian));
-    let program_headers =
-        header.program_headers(endian, bytes).map_err(cut_off("the table of program headers", table_end))?;
+    let program_headers = header
+        .program_headers(endian, bytes)
+        .map_err(|_| cut_off("the table of program headers", table_end))?;
 
     let mut pieces = Pieces::default();
     for segment in program_headers {
@@ -53,11 +54,7 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
             continue;
         }
         let offset = u64::from(segment.p_offset(endian));
-        let data = segment.data(endian, bytes).map_err(|()| {
-            let needed = usize::try_from(offset + size).unwrap_or(usize::MAX);
-            let cause = Cause::CutOff { what: "the file", needed, found: bytes.len() };
-            Place::File.fault(cause)
-        })?;
+        let data = segment.data(endian, bytes).map_err(|()| cut_off("the file", offset + size))?;
         let place = Place::Offset(offset as usize);
         let address = segment.p_paddr(endian);
         if u64::from(address) + size > 1 << 32 {
@@ -69,7 +66,7 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
     let sections = u64::from(header.e_shoff(endian));
     let sections_end = sections + u64::from(header.e_shentsize(endian)) * u64::from(header.e_shnum(endian));
     if sections != 0 && sections_end > bytes.len() as u64 {
-        return Err(cut_off("the table of section headers", sections_end)(()));
+        return Err(cut_off("the table of section headers", sections_end));
     }
     pieces.into_image()
 }
