@@ -81,6 +81,16 @@ const VALUE_MAX: usize = 4096;
 /// The longest wait in one piece: how soon a cancelled session notices.
 const SLICE: Duration = Duration::from_millis(100);
 
+/// What [`Timing::command`] limits in a transfer. The SDO time-out alone does not end one: it counts from answer to
+/// answer, and a device that babbles always has one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Patience {
+    /// The transfer.
+    InAll,
+    /// The time without progress.
+    ForEachStep,
+}
+
 /// A conversation with one node.
 pub struct Session<'a> {
     adapter: &'a mut dyn Adapter,
@@ -150,7 +160,8 @@ impl<'a> Session<'a> {
     pub fn read_once(&mut self, at: Address) -> Result<Vec<u8>, Error> {
         let mut bytes = [0; VALUE_MAX];
         let mut upload = Upload::new(self.node, at, Buffer::new(&mut bytes), self.config());
-        self.run(&mut upload, Doing::Read(at), &mut |_| {})?;
+        // A value is short: all of it has to be here in time.
+        self.run(&mut upload, Doing::Read(at), Patience::InAll, &mut |_| {})?;
         Ok(upload.sink().filled().to_vec())
     }
 
@@ -186,7 +197,7 @@ impl<'a> Session<'a> {
         progress: &mut dyn FnMut(u32),
     ) -> Result<(), Error> {
         let mut download = Download::new(self.node, at, data, self.config());
-        self.run(&mut download, doing, progress)
+        self.run(&mut download, doing, Patience::ForEachStep, progress)
     }
 
     /// Writes a command to 1F51h of a program, once; how it went is in [`status`](Self::status).
@@ -306,6 +317,7 @@ impl<'a> Session<'a> {
         &mut self,
         transfer: &mut impl Transfer,
         doing: Doing,
+        patience: Patience,
         progress: &mut dyn FnMut(u32),
     ) -> Result<(), Error> {
         self.check_cancelled()?;
@@ -314,12 +326,16 @@ impl<'a> Session<'a> {
         while stale < 1000 && self.adapter.receive(Duration::ZERO)?.is_some() {
             stale += 1;
         }
+        let mut deadline = self.now() + self.timing.command;
         let mut cancelled = false;
         let mut told = 0;
         loop {
             if !cancelled && self.check_cancelled().is_err() {
                 cancelled = true;
                 transfer.abort(AbortCode::GENERAL);
+            }
+            if self.now() >= deadline {
+                transfer.abort(AbortCode::TIMEOUT);
             }
             match transfer.poll(self.instant()) {
                 Step::Send(frame) => self.adapter.send(&frame)?,
@@ -333,6 +349,9 @@ impl<'a> Session<'a> {
                         if transfer.progress() != told {
                             told = transfer.progress();
                             progress(told);
+                            if patience == Patience::ForEachStep {
+                                deadline = self.now() + self.timing.command;
+                            }
                         }
                     }
                 }

@@ -471,12 +471,37 @@ impl Adapter for Chaos {
         self.now += Duration::from_millis(10).min(timeout);
         let (id, data) = &self.frames[self.next % self.frames.len()];
         self.next += 1;
+        assert!(self.next < 1_000_000, "a hang");
         Ok(Some(Frame::of(CobId::new(*id).unwrap(), data)))
     }
 
     fn now(&self) -> Duration {
         self.now
     }
+}
+
+/// An upload whose segments are all empty: each is a valid answer, and none is the last.
+#[test]
+fn an_upload_without_end_is_given_up() {
+    let segments = [0x0E, 0x1E].map(|command| (0x585, vec![command, 0, 0, 0, 0, 0, 0, 0]));
+    let frames = [(0x585, vec![0x41, 0x00, 0x10, 0, 0, 1, 0, 0])]
+        .into_iter()
+        .chain(segments.into_iter().cycle().take(20_000))
+        .collect();
+    let mut chaos = Chaos { now: Duration::ZERO, frames, next: 0 };
+    let mut session = Session::new(&mut chaos, node(), Timing::default());
+    let error = session.read_once(canopen::Address::new(0x1000, 0)).unwrap_err();
+    assert!(matches!(error, Error::Protocol { .. }), "{error:?}");
+    assert!(chaos.now >= Duration::from_secs(60) && chaos.now < Duration::from_secs(61), "{:?}", chaos.now);
+}
+
+/// Answers to other questions for ever.
+#[test]
+fn answers_that_never_fit_are_given_up() {
+    let answer = (0x585, vec![0x43, 0x00, 0x10, 0, 0, 0, 0, 0x10]);
+    let mut chaos = Chaos { now: Duration::ZERO, frames: vec![answer], next: 0 };
+    let mut session = Session::new(&mut chaos, node(), Timing::default());
+    assert!(session.command(1, canopen::program::ProgramControl::Clear).is_err());
 }
 
 proptest! {
