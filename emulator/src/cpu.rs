@@ -116,6 +116,8 @@ struct Notes {
     fault: Option<Fault>,
     flash_busy: bool,
     invalid_instruction: bool,
+    /// The masks when the CPU was started, if it was without privilege: they cannot be read then, nor changed.
+    masks: Option<Masks>,
     /// An instruction of the FPU that is switched off lies in the block, at this address.
     fpu_instruction: Option<u32>,
     /// Blocks looked at.
@@ -310,14 +312,17 @@ impl Cpu {
     /// Thread mode without privilege hides the stack pointers and masks from Unicorn's accessors. This runs `act` with
     /// privilege.
     fn privileged<R>(&mut self, act: impl FnOnce(&mut Self) -> R) -> R {
-        let unprivileged = self.ipsr() == 0 && self.register(RegisterARM::CONTROL) & CONTROL_NPRIV != 0;
-        if !unprivileged {
+        if !self.is_unprivileged() {
             return act(self);
         }
         self.set_ipsr(u32::from(HARD_FAULT));
         let result = act(self);
         self.set_ipsr(0);
         result
+    }
+
+    fn is_unprivileged(&self) -> bool {
+        self.register(RegisterARM::CONTROL) & CONTROL_NPRIV != 0 && self.ipsr() == 0
     }
 
     fn set_ipsr(&mut self, number: u32) {
@@ -470,6 +475,8 @@ impl Cpu {
     pub fn run(&mut self) -> Exit {
         self.drop_stale();
         self.chip_mut().leave = false;
+        let masks = self.is_unprivileged().then(|| self.privileged(|cpu| cpu.masks()));
+        self.uc.get_data_mut().notes.masks = masks;
         let exit = self.enter(None);
         let Some(address) = self.uc.get_data_mut().notes.fpu_instruction.take() else { return exit };
         // The FPU is off: run up to its instruction, which faults.
@@ -888,7 +895,7 @@ fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
         return stop(uc);
     }
     if chip.check_exceptions {
-        let masks = masks(uc);
+        let masks = state.notes.masks.unwrap_or_else(|| masks(uc));
         if uc.get_data().chip.scs.exceptions.deliverable(masks).is_some() {
             return stop(uc);
         }

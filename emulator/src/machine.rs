@@ -141,15 +141,27 @@ impl Machine {
     /// [`Error::Image`] or [`Error::Address`]; the flash is as before then.
     pub fn load(&mut self, image: &[u8]) -> Result<LoadedImage, Error> {
         let (segments, entry) = image::parse_elf(image)?;
-        for segment in &segments {
+        Ok(LoadedImage { segments: self.load_segments(&segments)?, entry: Some(entry) })
+    }
+
+    /// Stores an Intel HEX file in flash as a debug probe does.
+    ///
+    /// # Errors
+    /// [`Error::Image`] or [`Error::Address`]; the flash is as before then.
+    pub fn load_hex(&mut self, text: &str) -> Result<LoadedImage, Error> {
+        let segments = image::parse_hex(text)?;
+        Ok(LoadedImage { segments: self.load_segments(&segments)?, entry: None })
+    }
+
+    fn load_segments(&mut self, segments: &[image::Segment]) -> Result<Vec<(u32, u32)>, Error> {
+        for segment in segments {
             self.check_flash(segment.address, segment.bytes.len())?;
         }
-        let mut loaded = LoadedImage { segments: Vec::new(), entry };
         for segment in segments {
             self.load_bin(segment.address, &segment.bytes)?;
-            loaded.segments.push((segment.address, u32::try_from(segment.bytes.len()).unwrap_or(u32::MAX)));
         }
-        Ok(loaded)
+        let len = |segment: &image::Segment| u32::try_from(segment.bytes.len()).unwrap_or(u32::MAX);
+        Ok(segments.iter().map(|segment| (segment.address, len(segment))).collect())
     }
 
     /// Stores bytes in flash as a debug probe does.

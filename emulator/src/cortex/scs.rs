@@ -449,6 +449,20 @@ mod tests {
     }
 
     #[test]
+    fn the_cycle_counter_counts_when_enabled_and_stands_otherwise() {
+        let mut scs = scs();
+        assert_eq!(scs.read_dwt(4, 1_000), Ok(0));
+        scs.write_dwt(4, 5, 1_000).unwrap();
+        scs.write_dwt(0, 1, 2_000).unwrap();
+        assert_eq!(scs.read_dwt(4, 2_100), Ok(105));
+        scs.write_dwt(0, 0, 2_200).unwrap();
+        assert_eq!(scs.read_dwt(4, 9_999), Ok(205));
+        scs.write_dwt(4, u32::MAX, 0).unwrap();
+        scs.write_dwt(0, 1, 0).unwrap();
+        assert_eq!(scs.read_dwt(4, 1), Ok(0), "32 bits wrap");
+    }
+
+    #[test]
     fn fault_status_bits_are_cleared_by_writing_one() {
         let mut scs = scs();
         scs.cfsr = cfsr::UNDEFINSTR | cfsr::NOCP;

@@ -92,6 +92,7 @@ const BLOCKS: [(u32, Block, ClockEnable); 16] = [
 ];
 /// Every block of the F4 occupies this much.
 const BLOCK_SIZE: u32 = 0x400;
+const RCC_CFGR: u32 = 0x4002_3808;
 
 /// Names of blocks that are not modelled, for reports (RM0090 table 1).
 const UNMODELLED: [(u32, &str); 44] = [
@@ -347,6 +348,31 @@ impl Chip {
         self.can1.set_clock(if can_clocked { self.clocks.pclk1 } else { 0 });
     }
 
+    /// Reports a clock tree that the chip cannot follow. The model runs on; silicon would read rubbish or hang.
+    fn check_clocks(&mut self) {
+        let Clocks { hclk, pclk1, pclk2 } = self.clocks;
+        let latency = self.flash.latency();
+        // RM0090 table 10: one wait state for each 30 MHz at 2.7 to 3.6 V.
+        let needed = (hclk - 1) / 30_000_000;
+        let mut wrong = Vec::new();
+        if latency < needed {
+            wrong.push(format!(
+                "HCLK is {hclk} Hz with {latency} flash wait states: it needs {needed}, to be set before (FLASH_ACR)"
+            ));
+        }
+        // Datasheet, general operating conditions.
+        for (name, hz, most) in
+            [("HCLK", hclk, 168_000_000), ("PCLK1", pclk1, 42_000_000), ("PCLK2", pclk2, 84_000_000)]
+        {
+            if hz > most {
+                wrong.push(format!("{name} is {hz} Hz, the chip's limit is {most}"));
+            }
+        }
+        if !wrong.is_empty() {
+            self.report(Access::Write, RCC_CFGR, 4, 0, self.block.0, wrong.join("; "));
+        }
+    }
+
     /// The clock tree as set up.
     #[must_use]
     pub fn clocks(&self) -> Clocks {
@@ -360,6 +386,7 @@ impl Chip {
         self.rcc.advance(now);
         if self.rcc.clocks() != hclk {
             self.apply_clocks();
+            self.check_clocks();
             self.leave = true;
         }
         self.flash.advance(now);
@@ -583,9 +610,13 @@ impl Chip {
         match block {
             Block::Rcc => {
                 self.reset_blocks(resets_before);
-                if offset == rcc::APB1ENR || self.rcc.clocks() != self.clocks {
+                let changed = self.rcc.clocks() != self.clocks;
+                if changed || offset == rcc::APB1ENR {
                     self.apply_clocks();
                     self.leave = true;
+                }
+                if changed {
+                    self.check_clocks();
                 }
             }
             Block::Iwdg if self.iwdg.is_running() => self.rcc.force_lsi(now),

@@ -210,6 +210,21 @@ fn wfe_ends_by_itself_and_sleep_on_exit_never_comes_back() {
     assert_eq!(words(&sleeping, 2), [10, 0]);
 }
 
+#[test]
+fn masks_hold_for_code_without_privilege_which_cannot_change_them() {
+    let mut machine = machine(&programs::UNPRIVILEGED);
+    assert_eq!(machine.run_until(ms(10)), Stop::Deadline);
+    assert_eq!(words(&machine, 3), [1_000, 1_000, 1]);
+}
+
+/// DDI 0403E B1.5.8: an exception return clears FAULTMASK.
+#[test]
+fn faultmask_ends_with_its_handler() {
+    let mut machine = machine(&programs::FAULTMASK);
+    machine.run_until(ms(1));
+    assert_eq!(words(&machine, 2), [0, 1]);
+}
+
 // --- FPU -------------------------------------------------------------------------------------------------------------
 
 #[test]
@@ -425,6 +440,77 @@ fn losing_the_power_tears_the_operation_that_runs() {
     assert!(machine.flash()[..SECTOR_1] == before[..SECTOR_1], "its neighbour is whole");
 }
 
+/// With table and handlers in RAM the ticks go on during the erase; with the table in flash the first one waits for the
+/// vector. 250 ms hold 249 ticks and the end of the erase may come just before or after the next.
+#[test]
+fn interrupts_during_an_erase_need_their_vectors_in_ram() {
+    let run = |table: u32| {
+        let mut machine = machine_in_ram(&programs::ERASE_UNDER_INTERRUPTS, table, Options::default());
+        // Vectors of the listing: tick at 048h, done at 050h.
+        machine.load_bin(0x0800_0000 + 4 * 15, &0x2000_1049_u32.to_le_bytes()).unwrap();
+        machine.load_bin(0x0800_0000 + 4 * 20, &0x2000_1051_u32.to_le_bytes()).unwrap();
+        machine.run_until(ms(255));
+        (words(&machine, 3), machine.counters())
+    };
+    let (log, counters) = run(0x2000_0400);
+    assert!((249..=250).contains(&log[1]), "ticks: {}", log[1]);
+    assert_eq!(log[2], 1, "EOP");
+    assert_eq!(counters.exceptions[16 + 4], 1);
+    assert_eq!(counters.flash_stalls, 0);
+    let (log, counters) = run(0x0800_0000);
+    assert!(log[1] <= 1, "ticks: {}", log[1]);
+    assert_eq!(log[2], 1);
+    assert!(counters.flash_stalls >= 1);
+}
+
+/// RM0090 section 3.5.1: a bus error.
+#[test]
+fn a_wrong_key_is_a_fault() {
+    let mut machine = machine(&programs::WRONG_KEY);
+    machine.run_until(ms(1));
+    assert_eq!(word(&machine, OUT), 3);
+    assert_eq!(machine.fault_status(), (0x0000_0400, FORCED), "IMPRECISERR");
+    assert!(machine.reports()[0].what.contains("FLASH_KEYR"));
+}
+
+// --- clocks ----------------------------------------------------------------------------------------------------------
+
+/// 2 ms for the crystal and 0.2 ms for the PLL pass before; 168 MHz / 16 800 makes a tick each 100 µs.
+#[test]
+fn the_program_sets_the_clock_and_the_cycles_follow() {
+    let mut machine = machine(&programs::SCALES_THE_CLOCK);
+    put(&mut machine, ARGUMENT, 5);
+    machine.run_until(ms(2));
+    assert_eq!(machine.core_clock(), 16_000_000);
+    machine.run_until(ms(3));
+    assert_eq!(machine.core_clock(), 168_000_000);
+    // A million rounds of two cycles are 11.9 ms.
+    machine.run_until(ms(20));
+    let cycles = word(&machine, OUT + 4);
+    assert!((2_000_000..2_000_010).contains(&cycles), "{cycles}");
+    let ticks = word(&machine, OUT);
+    machine.run_until(ms(1_020));
+    assert_eq!(word(&machine, OUT), ticks + 10_000);
+    assert_eq!(machine.reports(), []);
+}
+
+#[test]
+fn too_few_wait_states_are_reported() {
+    let mut machine = machine(&programs::SCALES_THE_CLOCK);
+    put(&mut machine, ARGUMENT, 4);
+    machine.run_until(ms(20));
+    assert!(machine.reports()[0].what.contains("4 flash wait states: it needs 5"), "{:?}", machine.reports());
+}
+
+#[test]
+fn without_its_crystal_the_board_never_gets_there() {
+    let options = Options { hse_hz: 0, ..Options::default() };
+    let mut machine = with_options(&programs::SCALES_THE_CLOCK, options);
+    machine.run_until(ms(50));
+    assert_eq!(machine.core_clock(), 16_000_000);
+    assert!(machine.reports()[0].what.contains("no crystal"));
+}
+
 // --- memory map ------------------------------------------------------------------------------------------------------
 
 #[test]
@@ -476,6 +562,10 @@ fn bad_images_are_refused_and_leave_the_flash_alone() {
     for bad in [&b""[..], b"\x7FELF", &[0; 100], b":10010000214601360121470136007EFE09D2190140"] {
         assert!(machine.load(bad).is_err());
     }
+    assert!(
+        machine.load_hex(":10010000214601360121470136007EFE09D2190140\n:00000001FF\n").is_err(),
+        "not in flash"
+    );
     assert!(machine.load_bin(0x080F_FFFF, &[0, 0]).is_err());
     assert!(machine.load_bin(0x2000_0000, &[0]).is_err());
     assert!(machine.load_bin(u32::MAX, &[0; 8]).is_err());

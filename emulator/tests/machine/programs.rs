@@ -729,3 +729,230 @@ pub const WRITES_ITS_OWN_CODE: Program = Program {
         0x2002, 0x4770,      // 238  .word 0x47702002
     ],
 };
+
+/// Pends line 0 (priority 80h) under BASEPRI 80h and drops its privilege; counts at 2000_0000h, up to 1 000,
+/// then SVC clears BASEPRI. The handlers log at 2000_0004h (line 0: the count) and 2000_0008h (CONTROL as
+/// SVC sees it).
+pub const UNPRIVILEGED: Program = Program {
+    base: 0x0800_0200,
+    vectors: &[(11, 0x0800_0241), (16, 0x0800_023B)],
+    code: &[
+        0xF04F, 0x5600,      // 200  mov.w r6, #536870912
+        0x2400,              // 204  movs r4, #0
+        0x6074,              // 206  str r4, [r6, #4]
+        0x4D11,              // 208  ldr r5, [pc, #68]
+        0x2001,              // 20A  movs r0, #1
+        0x6028,              // 20C  str r0, [r5, #0]
+        0x4911,              // 20E  ldr r1, [pc, #68]
+        0x2080,              // 210  movs r0, #128
+        0x7008,              // 212  strb r0, [r1, #0]
+        0xF380, 0x8811,      // 214  msr BASEPRI, r0
+        0x2201,              // 218  movs r2, #1
+        0x490F,              // 21A  ldr r1, [pc, #60]
+        0x600A,              // 21C  str r2, [r1, #0]
+        0xF382, 0x8814,      // 21E  msr CONTROL, r2
+        0xF3BF, 0x8F6F,      // 222  isb sy
+        0x3401,              // 226  adds r4, #1
+        0x6034,              // 228  str r4, [r6, #0]
+        0x2000,              // 22A  movs r0, #0
+        0xF380, 0x8811,      // 22C  msr BASEPRI, r0
+        0xF5B4, 0x7F7A,      // 230  cmp.w r4, #1000
+        0xD1F7,              // 234  bne.n 8000226
+        0xDF00,              // 236  svc 0
+        0xE7FE,              // 238  b.n 8000238
+        0x6830,              // 23A line0:  ldr r0, [r6, #0]
+        0x6070,              // 23C  str r0, [r6, #4]
+        0x4770,              // 23E  bx lr
+        0x2000,              // 240 call:  movs r0, #0
+        0xF380, 0x8811,      // 242  msr BASEPRI, r0
+        0xF3EF, 0x8014,      // 246  mrs r0, CONTROL
+        0x60B0,              // 24A  str r0, [r6, #8]
+        0x4770,              // 24C  bx lr
+        0x0000,              // 24E  .short 0x0000
+        0xE100, 0xE000,      // 250  .word 0xe000e100
+        0xE400, 0xE000,      // 254  .word 0xe000e400
+        0xE200, 0xE000,      // 258  .word 0xe000e200
+    ],
+};
+
+/// Line 0's handler sets FAULTMASK and returns; the thread logs FAULTMASK.
+pub const FAULTMASK: Program = Program {
+    base: 0x0800_0200,
+    vectors: &[(16, 0x0800_0223)],
+    code: &[
+        0xF04F, 0x5600,      // 200  mov.w r6, #536870912
+        0x4D09,              // 204  ldr r5, [pc, #36]
+        0x2001,              // 206  movs r0, #1
+        0x6028,              // 208  str r0, [r5, #0]
+        0x4909,              // 20A  ldr r1, [pc, #36]
+        0x2000,              // 20C  movs r0, #0
+        0x6008,              // 20E  str r0, [r1, #0]
+        0xF3BF, 0x8F4F,      // 210  dsb sy
+        0xF3BF, 0x8F6F,      // 214  isb sy
+        0xF3EF, 0x8013,      // 218  mrs r0, FAULTMASK
+        0x6030,              // 21C  str r0, [r6, #0]
+        0xBF30,              // 21E  wfi
+        0xE7FD,              // 220  b.n 800021e
+        0xB671,              // 222 line0:  cpsid f
+        0xF3EF, 0x8013,      // 224  mrs r0, FAULTMASK
+        0x6070,              // 228  str r0, [r6, #4]
+        0x4770,              // 22A  bx lr
+        0xE100, 0xE000,      // 22C  .word 0xe000e100
+        0xEF00, 0xE000,      // 230  .word 0xe000ef00
+    ],
+};
+
+/// Writes a wrong key to FLASH_KEYR.
+pub const WRONG_KEY: Program = Program {
+    base: 0x0800_0200,
+    vectors: &[(3, 0x0800_0211)],
+    code: &[
+        0xF04F, 0x5600,      // 200  mov.w r6, #536870912
+        0x2000,              // 204  movs r0, #0
+        0x6030,              // 206  str r0, [r6, #0]
+        0x4903,              // 208  ldr r1, [pc, #12]
+        0x6008,              // 20A  str r0, [r1, #0]
+        0x3001,              // 20C  adds r0, #1
+        0xE7FD,              // 20E  b.n 800020c
+        0xF3EF, 0x8005,      // 210 hard:  mrs r0, IPSR
+        0x6030,              // 214  str r0, [r6, #0]
+        0xE7FE,              // 216  b.n 8000216
+        0x3C04, 0x4002,      // 218  .word 0x40023c04
+    ],
+};
+
+/// Runs at 2000_1000h: SysTick every millisecond with its handler in RAM and the vector table where
+/// 2000_0100h says (its SysTick vector is written there if that is RAM); erases sector 1 with EOPIE; the
+/// flash's handler logs the number of ticks until then at 2000_0004h and SR at 2000_0008h.
+pub const ERASE_UNDER_INTERRUPTS: Program = Program {
+    base: 0x2000_1000,
+    vectors: &[],
+    code: &[
+        0xF04F, 0x5600,      // 000  mov.w r6, #536870912
+        0x2700,              // 004  movs r7, #0
+        0x6037,              // 006  str r7, [r6, #0]
+        0x6077,              // 008  str r7, [r6, #4]
+        0x4815,              // 00A  ldr r0, [pc, #84]
+        0x6800,              // 00C  ldr r0, [r0, #0]
+        0x4915,              // 00E  ldr r1, [pc, #84]
+        0x6008,              // 010  str r0, [r1, #0]
+        0xF04F, 0x5100,      // 012  mov.w r1, #536870912
+        0x4288,              // 016  cmp r0, r1
+        0xD303,              // 018  bcc.n 20001022
+        0x4913,              // 01A  ldr r1, [pc, #76]
+        0x63C1,              // 01C  str r1, [r0, #60]
+        0x4913,              // 01E  ldr r1, [pc, #76]
+        0x6501,              // 020  str r1, [r0, #80]
+        0x4913,              // 022  ldr r1, [pc, #76]
+        0x2010,              // 024  movs r0, #16
+        0x6008,              // 026  str r0, [r1, #0]
+        0x4912,              // 028  ldr r1, [pc, #72]
+        0xF643, 0x627F,      // 02A  movw r2, #15999
+        0x604A,              // 02E  str r2, [r1, #4]
+        0x608F,              // 030  str r7, [r1, #8]
+        0x2207,              // 032  movs r2, #7
+        0x600A,              // 034  str r2, [r1, #0]
+        0x4910,              // 036  ldr r1, [pc, #64]
+        0x4810,              // 038  ldr r0, [pc, #64]
+        0x6048,              // 03A  str r0, [r1, #4]
+        0x4810,              // 03C  ldr r0, [pc, #64]
+        0x6048,              // 03E  str r0, [r1, #4]
+        0x4810,              // 040  ldr r0, [pc, #64]
+        0x6108,              // 042  str r0, [r1, #16]
+        0xBF30,              // 044  wfi
+        0xE7FD,              // 046  b.n 20001044
+        0x6830,              // 048 tick:  ldr r0, [r6, #0]
+        0x3001,              // 04A  adds r0, #1
+        0x6030,              // 04C  str r0, [r6, #0]
+        0x4770,              // 04E  bx lr
+        0x6830,              // 050 done:  ldr r0, [r6, #0]
+        0x6070,              // 052  str r0, [r6, #4]
+        0x68C8,              // 054  ldr r0, [r1, #12]
+        0x60B0,              // 056  str r0, [r6, #8]
+        0x2001,              // 058  movs r0, #1
+        0x60C8,              // 05A  str r0, [r1, #12]
+        0x4770,              // 05C  bx lr
+        0x0000,              // 05E  .short 0x0000
+        0x0100, 0x2000,      // 060  .word 0x20000100
+        0xED08, 0xE000,      // 064  .word 0xe000ed08
+        0x1049, 0x2000,      // 068  .word 0x20001049
+        0x1051, 0x2000,      // 06C  .word 0x20001051
+        0xE100, 0xE000,      // 070  .word 0xe000e100
+        0xE010, 0xE000,      // 074  .word 0xe000e010
+        0x3C00, 0x4002,      // 078  .word 0x40023c00
+        0x0123, 0x4567,      // 07C  .word 0x45670123
+        0x89AB, 0xCDEF,      // 080  .word 0xcdef89ab
+        0x020A, 0x0101,      // 084  .word 0x0101020a
+    ],
+};
+
+/// Switches to 168 MHz (8 MHz crystal, M 8, N 336, P 2, APB1 /4, APB2 /2, 5 wait states if 2000_0100h says
+/// so) by polling, then counts SysTick's 16 800 cycles at 2000_0000h and CYCCNT over 1 000 000 rounds of a
+/// two-cycle loop at 2000_0004h.
+pub const SCALES_THE_CLOCK: Program = Program {
+    base: 0x0800_0200,
+    vectors: &[(15, 0x0800_0269)],
+    code: &[
+        0xF04F, 0x5600,      // 200  mov.w r6, #536870912
+        0x2700,              // 204  movs r7, #0
+        0x6037,              // 206  str r7, [r6, #0]
+        0x4819,              // 208  ldr r0, [pc, #100]
+        0x6802,              // 20A  ldr r2, [r0, #0]
+        0x4919,              // 20C  ldr r1, [pc, #100]
+        0x600A,              // 20E  str r2, [r1, #0]
+        0x4919,              // 210  ldr r1, [pc, #100]
+        0x481A,              // 212  ldr r0, [pc, #104]
+        0x6008,              // 214  str r0, [r1, #0]
+        0x6808,              // 216  ldr r0, [r1, #0]
+        0x0380,              // 218  lsls r0, r0, #14
+        0xD5FC,              // 21A  bpl.n 8000216
+        0x4818,              // 21C  ldr r0, [pc, #96]
+        0x6048,              // 21E  str r0, [r1, #4]
+        0x4818,              // 220  ldr r0, [pc, #96]
+        0x6008,              // 222  str r0, [r1, #0]
+        0x6808,              // 224  ldr r0, [r1, #0]
+        0x0180,              // 226  lsls r0, r0, #6
+        0xD5FC,              // 228  bpl.n 8000224
+        0xF249, 0x4002,      // 22A  movw r0, #37890
+        0x6088,              // 22E  str r0, [r1, #8]
+        0x6888,              // 230  ldr r0, [r1, #8]
+        0xF000, 0x000C,      // 232  and.w r0, r0, #12
+        0x2808,              // 236  cmp r0, #8
+        0xD1FA,              // 238  bne.n 8000230
+        0x4913,              // 23A  ldr r1, [pc, #76]
+        0xF04F, 0x7080,      // 23C  mov.w r0, #16777216
+        0x6008,              // 240  str r0, [r1, #0]
+        0x4912,              // 242  ldr r1, [pc, #72]
+        0x2001,              // 244  movs r0, #1
+        0x6008,              // 246  str r0, [r1, #0]
+        0x684A,              // 248  ldr r2, [r1, #4]
+        0x4B11,              // 24A  ldr r3, [pc, #68]
+        0x3B01,              // 24C  subs r3, #1
+        0xD1FD,              // 24E  bne.n 800024c
+        0x6848,              // 250  ldr r0, [r1, #4]
+        0x1A80,              // 252  subs r0, r0, r2
+        0x6070,              // 254  str r0, [r6, #4]
+        0x490F,              // 256  ldr r1, [pc, #60]
+        0xF244, 0x129F,      // 258  movw r2, #16799
+        0x604A,              // 25C  str r2, [r1, #4]
+        0x608F,              // 25E  str r7, [r1, #8]
+        0x2207,              // 260  movs r2, #7
+        0x600A,              // 262  str r2, [r1, #0]
+        0xBF30,              // 264  wfi
+        0xE7FD,              // 266  b.n 8000264
+        0x6830,              // 268 tick:  ldr r0, [r6, #0]
+        0x3001,              // 26A  adds r0, #1
+        0x6030,              // 26C  str r0, [r6, #0]
+        0x4770,              // 26E  bx lr
+        0x0100, 0x2000,      // 270  .word 0x20000100
+        0x3C00, 0x4002,      // 274  .word 0x40023c00
+        0x3800, 0x4002,      // 278  .word 0x40023800
+        0x0083, 0x0001,      // 27C  .word 0x00010083
+        0x5408, 0x0040,      // 280  .word 0x00405408
+        0x0083, 0x0101,      // 284  .word 0x01010083
+        0xEDFC, 0xE000,      // 288  .word 0xe000edfc
+        0x1000, 0xE000,      // 28C  .word 0xe0001000
+        0x4240, 0x000F,      // 290  .word 0x000f4240
+        0xE010, 0xE000,      // 294  .word 0xe000e010
+    ],
+};
