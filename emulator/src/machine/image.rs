@@ -104,7 +104,7 @@ fn hex_bytes(digits: &str) -> Option<Vec<u8>> {
         .chars()
         .map(|digit| digit.to_digit(16).and_then(|value| u8::try_from(value).ok()))
         .collect::<Option<_>>()?;
-    if nibbles.len() % 2 != 0 {
+    if !nibbles.len().is_multiple_of(2) {
         return None;
     }
     Some(nibbles.chunks_exact(2).map(|pair| pair[0] << 4 | pair[1]).collect())
