@@ -3,12 +3,14 @@
 //! | file | what to do with it |
 //! |---|---|
 //! | `main.rs` | wiring of the tasks: put your own beside them |
-//! | `objects.rs` | the object dictionary: add your objects; keep 1F51h, 1F56h and 1F57h |
+//! | `entries.rs` | the table of the object dictionary: add your objects; keep 1F51h, 1F56h and 1F57h |
+//! | `objects.rs` | the values behind it, with the 1F51h callback |
 //! | `coboot.rs` | everything between application and bootloader: keep it as it is |
 #![no_std]
 #![no_main]
 
 mod coboot;
+mod entries;
 mod objects;
 
 use panic_probe as _;

@@ -1,14 +1,15 @@
 //! The object dictionary of the application, with the 1F51h callback that calls the bootloader back.
 
 use bsp::{IDENTITY, LAYOUT};
-use canopen::device::{self, Device};
-use canopen::od::{concat, put, Access, Address, DataType, Entry, Objects};
+use canopen::device::Device;
+use canopen::od::{put, Address, Entry, Objects};
 use canopen::program::{
     FlashStatus, ProgramControl, ProgramState, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID,
 };
 use canopen::AbortCode;
 
 use crate::coboot::{self, Start};
+use crate::entries::ENTRIES;
 
 /// 1000h: no standardised profile. Anything but the bootloader's 10000000h tells a host that the application runs.
 const DEVICE_TYPE: u32 = 0;
@@ -16,19 +17,6 @@ const DEVICE_TYPE: u32 = 0;
 pub const HEARTBEAT_MS: u16 = 500;
 /// 100Ah.
 const SOFTWARE_VERSION: &str = if cfg!(feature = "version-2") { "2.0.0" } else { "1.0.0" };
-
-/// What coboot needs of an application: keep these when you add your own.
-const PROGRAM_ENTRIES: [Entry; 6] = [
-    Entry::array(PROGRAM_CONTROL, "Program control", 1),
-    Entry::sub(PROGRAM_CONTROL, 1, "Program control 1", DataType::Unsigned8, Access::Rw),
-    Entry::array(PROGRAM_ID, "Program software identification", 1),
-    Entry::sub(PROGRAM_ID, 1, "Program software identification 1", DataType::Unsigned32, Access::Ro),
-    Entry::array(FLASH_STATUS, "Flash status identification", 1),
-    Entry::sub(FLASH_STATUS, 1, "Flash status identification 1", DataType::Unsigned32, Access::Ro),
-];
-
-/// The object dictionary.
-static ENTRIES: [Entry; 17] = concat(device::ENTRIES, PROGRAM_ENTRIES);
 
 /// The application's state, as far as the bus sees it.
 pub struct Application {
