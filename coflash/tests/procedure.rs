@@ -167,6 +167,25 @@ fn a_device_that_is_just_restarting_is_waited_for() {
     assert_eq!((fake.count("command 80"), fake.count("command 01")), (1, 1));
 }
 
+#[test]
+fn a_device_that_answers_on_before_it_restarts_is_not_taken_for_one_that_stays() {
+    let mut fake = Fake::new(APPLICATION);
+    fake.leave_time = Duration::from_millis(1200);
+    let report = run(&mut fake, FlashOptions::default()).0.unwrap();
+    assert_eq!((fake.count("command 80"), fake.count("command 01")), (1, 1));
+    assert_eq!(report.running.map(|running| running.0), Some(APPLICATION));
+}
+
+#[test]
+fn an_answer_left_over_from_before_is_not_taken_for_one_to_this_request() {
+    let mut fake = Fake::new(BOOTLOADER);
+    // The late acknowledge of a segment does not say whose it is.
+    let late = Frame::of(CobId::new(0x585).unwrap(), &[0x20, 0, 0, 0, 0, 0, 0, 0]);
+    fake.inject(late);
+    let mut session = Session::new(&mut fake, node(), Timing::default());
+    session.command(1, canopen::program::ProgramControl::Clear).unwrap();
+}
+
 /// Table 3, and table 10 of the manual for the numbers that it has.
 const STATUS: [(u32, u32, &str); 14] = [
     (0x02, 0x6000_0001, "no valid program"),

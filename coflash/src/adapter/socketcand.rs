@@ -373,6 +373,14 @@ mod tests {
     }
 
     #[test]
+    fn a_message_that_was_cut_off_does_not_spoil_the_next() {
+        let mut messages = Messages::default();
+        messages.add(b"noise > < frame 123 < ok >");
+        assert_eq!(messages.next(), Ok(Some("ok".to_string())));
+        assert_eq!(messages.next(), Ok(None));
+    }
+
+    #[test]
     fn a_message_without_end_is_no_leak() {
         let mut messages = Messages::default();
         messages.add(b"<");

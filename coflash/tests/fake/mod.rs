@@ -49,6 +49,9 @@ pub struct Fake {
     pub deaf_while_busy: bool,
     pub erase_time: Duration,
     pub restart_time: Duration,
+    /// How long it goes on answering before it restarts.
+    pub leave_time: Duration,
+    leaves_at: Option<Duration>,
     /// What START starts.
     pub starts: Option<u32>,
     /// How long an answer takes.
@@ -89,6 +92,8 @@ impl Fake {
             deaf_while_busy: false,
             erase_time: Duration::from_secs(2),
             restart_time: Duration::from_millis(300),
+            leave_time: Duration::ZERO,
+            leaves_at: None,
             starts: Some(APPLICATION),
             latency: Duration::from_micros(500),
             on_block: Box::new(|_| Outcome::Accept),
@@ -129,7 +134,17 @@ impl Fake {
         self.now < self.busy_until
     }
 
+    /// A frame that is on the bus already.
+    pub fn inject(&mut self, frame: Frame) {
+        self.outbox.push_back((self.now, frame));
+    }
+
     fn tick(&mut self) {
+        if self.leaves_at.is_some_and(|at| at <= self.now) {
+            self.leaves_at = None;
+            self.running = None;
+            (self.download, self.upload) = (None, None);
+        }
         if let Some((at, next)) = self.restart.filter(|(at, _)| *at <= self.now) {
             (self.restart, self.running) = (None, next);
             if next.is_some() {
@@ -140,9 +155,8 @@ impl Fake {
     }
 
     fn restart_into(&mut self, next: Option<u32>) {
-        self.running = None;
-        (self.download, self.upload) = (None, None);
-        self.restart = Some((self.now + self.restart_time, next));
+        self.leaves_at = Some(self.now + self.leave_time);
+        self.restart = Some((self.now + self.leave_time + self.restart_time, next));
     }
 
     fn request(&mut self, bytes: [u8; 8]) {
