@@ -2,10 +2,14 @@
 
 pub mod bus;
 pub mod bxcan;
+pub mod candump;
 pub mod cortex;
 pub mod cpu;
 pub mod frame;
 pub mod machine;
+pub mod pacing;
 pub mod periph;
 pub mod peripheral;
+pub mod socketcand;
 pub mod time;
+pub mod world;

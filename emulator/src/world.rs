@@ -12,10 +12,11 @@ use crate::bus::port::{HostPort, Unplugged};
 use crate::bus::{Bus, Record, SHORTEST_CONSEQUENCE_BITS};
 use crate::bxcan::BxCan;
 use crate::frame::Frame;
+use crate::machine::{Machine, Stop};
 use crate::time::{Span, Time};
 
-/// Something with a CPU and a CAN controller that runs in virtual time. [`Machine`](crate::machine::Machine) is the
-/// real one; tests of the world have simpler ones.
+/// Something with a CPU and a CAN controller that runs in virtual time. [`Machine`] is the real
+/// one; tests of the world have simpler ones.
 pub trait Computer {
     /// Why it stopped.
     type Stop;
@@ -93,7 +94,7 @@ const MAX_NEWS: usize = 4096;
 const FASTEST_BIT: Span = Span::from_micros(1);
 
 /// The bench: a bus and all that is plugged into it.
-pub struct World<M: Computer> {
+pub struct World<M: Computer = Machine> {
     bus: Bus,
     slots: Vec<Slot<M>>,
     now: Time,
@@ -124,6 +125,51 @@ impl<M: Computer> Slot<M> {
             Plug::Machine(machine) if machine.is_powered() && self.stuck < STUCK => Some(machine),
             _ => None,
         }
+    }
+}
+
+impl Computer for Machine {
+    type Stop = Stop;
+
+    fn is_powered(&self) -> bool {
+        self.is_powered()
+    }
+
+    fn now(&self) -> Time {
+        self.now()
+    }
+
+    fn run_until(&mut self, deadline: Time) -> Stop {
+        self.run_until(deadline)
+    }
+
+    fn can(&mut self) -> &mut BxCan {
+        self.can_mut(0)
+    }
+
+    fn is_news(stop: &Stop) -> bool {
+        !matches!(stop, Stop::Deadline | Stop::Attention)
+    }
+}
+
+impl World<Machine> {
+    /// A bench with a bus and nothing on it.
+    #[must_use]
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Switches the machine's power on, now. Without effect if it is on.
+    pub fn power_on(&mut self, id: MachineId) {
+        let now = self.now;
+        if !self.machine(id).is_powered() {
+            self.machine_mut(id).power_on(now);
+        }
+    }
+
+    /// Switches the machine's power off, now. A frame that it is sending breaks off.
+    pub fn power_off(&mut self, id: MachineId) {
+        self.machine_mut(id).power_off();
     }
 }
 
@@ -255,6 +301,8 @@ impl<M: Computer> World<M> {
     /// Runs the machines to the next point at which the bus has something to decide, `limit` at the latest, and lets
     /// it decide.
     fn step(&mut self, limit: Time) {
+        // A machine that has just got power is not known to the bus yet; without the bus it would not stop for it.
+        self.bus.advance(self.now, &mut nodes(&mut self.slots));
         let horizon = {
             let nodes = nodes(&mut self.slots);
             self.bus.next_event(&nodes).map_or(limit, |event| event.min(limit))

@@ -1,0 +1,164 @@
+//! How virtual time follows the wall clock for clients that live in real time.
+
+use std::time::{Duration, Instant};
+
+use crate::time::{Span, Time};
+
+/// How fast virtual time goes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Speed {
+    /// So many virtual seconds in a second of the wall clock. Idle or not, the clock goes on, so the time-outs of both
+    /// sides come when they should.
+    Times(f64),
+    /// As fast as the host can, but for a moment behind every frame that a client got: then it goes 1:1, so that the
+    /// client's answer does not come late in the device's eyes. Waits in which nobody has to answer (an erase, a
+    /// heartbeat's period) are skipped through. Time never stands still. Beware: a client that waits for wall-clock
+    /// time between two requests lets much virtual time pass, and time-outs of the device may strike.
+    Max,
+}
+
+impl std::str::FromStr for Speed {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text == "max" {
+            return Ok(Self::Max);
+        }
+        match text.parse::<f64>() {
+            Ok(times) if (MIN_TIMES..=MAX_TIMES).contains(&times) => Ok(Self::Times(times)),
+            _ => Err(format!("`{text}` is neither `max` nor a number from {MIN_TIMES} to {MAX_TIMES}")),
+        }
+    }
+}
+
+const MIN_TIMES: f64 = 0.001;
+const MAX_TIMES: f64 = 1000.0;
+/// The world is never sent further than this in one go, so that clients are heard in time.
+const MOST: Span = Span::from_millis(2);
+/// In one go at [`Speed::Max`].
+const MOST_AT_MAX: Span = Span::from_millis(10);
+/// What a client gets of wall-clock time to react to a frame at [`Speed::Max`].
+const GRACE: Duration = Duration::from_millis(5);
+/// A world that is further behind than this (of wall-clock time) does not catch up: the host is too slow, or slept.
+const PATIENCE: Duration = Duration::from_millis(100);
+
+/// Says how far the world may go. The wall clock is passed in.
+#[derive(Clone, Copy, Debug)]
+pub struct Pacer {
+    speed: Speed,
+    /// A moment at which wall clock and virtual time belonged together.
+    anchor: (Instant, Time),
+    delivered: Option<Instant>,
+}
+
+impl Pacer {
+    /// From this moment on.
+    #[must_use]
+    pub fn new(speed: Speed, wall: Instant, now: Time) -> Self {
+        Self { speed, anchor: (wall, now), delivered: None }
+    }
+
+    /// A client has got a frame.
+    pub fn delivered(&mut self, wall: Instant) {
+        self.delivered = Some(wall);
+    }
+
+    /// How far a world that has come to `now` may go; `now` itself if it has to wait.
+    pub fn target(&mut self, wall: Instant, now: Time) -> Time {
+        let times = match self.speed {
+            Speed::Times(times) => times,
+            Speed::Max => {
+                let waits = self.delivered.is_some_and(|at| wall.saturating_duration_since(at) < GRACE);
+                if !waits {
+                    self.anchor = (wall, now);
+                    return now + MOST_AT_MAX;
+                }
+                1.0
+            }
+        };
+        let due = self.due(wall, times);
+        if due - now > scaled(PATIENCE, times) {
+            self.anchor = (wall, now);
+            return now + MOST;
+        }
+        due.max(now).min(now + MOST)
+    }
+
+    fn due(&self, wall: Instant, times: f64) -> Time {
+        self.anchor.1 + scaled(wall.saturating_duration_since(self.anchor.0), times)
+    }
+}
+
+fn scaled(duration: Duration, times: f64) -> Span {
+    // Rounding and the end of the range are harmless: it is a pace, not a measurement.
+    Span((duration.as_secs_f64() * times * 1e12) as u64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Milliseconds of virtual time gone after so many milliseconds of wall clock, looked at every `tick`.
+    fn run(speed: Speed, wall_ms: u64, tick: u64) -> u64 {
+        let start = Instant::now();
+        let mut pacer = Pacer::new(speed, start, Time(0));
+        let mut now = Time(0);
+        for ms in (0..=wall_ms).step_by(tick as usize) {
+            let wall = start + Duration::from_millis(ms);
+            loop {
+                let target = pacer.target(wall, now);
+                if target <= now || speed == Speed::Max {
+                    now = target;
+                    break;
+                }
+                now = target;
+            }
+        }
+        now.0 / 1_000_000_000
+    }
+
+    #[test]
+    fn follows_the_wall_clock() {
+        assert_eq!(run(Speed::Times(1.0), 5_000, 1), 5_000);
+        assert_eq!(run(Speed::Times(10.0), 500, 1), 5_000);
+        assert_eq!(run(Speed::Times(0.5), 5_000, 10), 2_500);
+    }
+
+    #[test]
+    fn at_max_every_look_takes_it_further() {
+        assert_eq!(run(Speed::Max, 99, 1), 1_000);
+    }
+
+    #[test]
+    fn at_max_a_client_gets_time_to_answer() {
+        let start = Instant::now();
+        let mut pacer = Pacer::new(Speed::Max, start, Time(0));
+        let now = pacer.target(start, Time(0));
+        assert_eq!(now, Time(0) + Span::from_millis(10));
+        pacer.delivered(start);
+        assert!(pacer.target(start, now) - now < Span::from_millis(1));
+        let soon = start + Duration::from_millis(1);
+        assert!(pacer.target(soon, now) - now <= Span::from_millis(1));
+        let late = start + GRACE;
+        assert_eq!(pacer.target(late, now), now + MOST_AT_MAX);
+    }
+
+    #[test]
+    fn a_host_that_slept_does_not_race() {
+        let start = Instant::now();
+        let mut pacer = Pacer::new(Speed::Times(1.0), start, Time(0));
+        let woken = start + Duration::from_secs(3600);
+        let now = pacer.target(woken, Time(0));
+        assert_eq!(now, Time(0) + MOST);
+        assert_eq!(pacer.target(woken, now), now, "and waits for the wall clock again");
+    }
+
+    #[test]
+    fn texts() {
+        assert_eq!("max".parse(), Ok(Speed::Max));
+        assert_eq!("1".parse(), Ok(Speed::Times(1.0)));
+        assert_eq!("0.25".parse(), Ok(Speed::Times(0.25)));
+        for text in ["", "0", "-1", "nan", "inf", "1e9", "fast"] {
+            assert!(text.parse::<Speed>().is_err(), "{text}");
+        }
+    }
+}

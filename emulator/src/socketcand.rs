@@ -1,0 +1,385 @@
+//! The bus for other programs: the socketcand protocol over TCP, as python-can and can-utils' friends speak it.
+//!
+//! All clients share one host port, the "adapter" of the bench: it is on the bus whether clients are connected or not,
+//! so a device always gets its acknowledge. A client sees the frames of the other clients too, but not its own.
+//! Time stamps are virtual time. Remote frames reach clients as `< rtr … >`.
+//!
+//! What clients taught us: python-can expects each answer of the opening alone in one read, so no frame goes out for
+//! [`HOLD`] behind the answer to `rawmode`; and without TCP_NODELAY every exchange waits for delayed acknowledges.
+//!
+//! No client can hold up the world: who does not read is disconnected, and who sends more than the bus takes is read
+//! more slowly.
+
+pub mod protocol;
+#[cfg(test)]
+mod tests;
+
+use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::io::{self, Read, Write};
+use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream, ToSocketAddrs};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::mpsc::{sync_channel, Receiver, RecvTimeoutError, SyncSender, TrySendError};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+use crate::frame::Frame;
+use crate::world::{Computer, PortId, World};
+use protocol::{frame_element, Effect, Session, Splitter, HELLO};
+
+/// How long frames are held back behind the answer to `rawmode`.
+pub const HOLD: Duration = Duration::from_millis(10);
+/// Clients at a time.
+pub const MAX_CLIENTS: usize = 64;
+/// Texts that wait for a client to read them; one more, and it is disconnected.
+const QUEUE: usize = 8192;
+/// Frames of one client that wait for the bus; behind them its connection is not read on.
+const CREDIT: usize = 256;
+/// Events that wait for the world.
+const EVENTS: usize = 1024;
+/// A client that takes nothing for so long while something waits for it is disconnected.
+const PATIENCE: Duration = Duration::from_secs(10);
+/// A write takes up to so many bytes of waiting texts at once.
+const WRITE: usize = 16 * 1024;
+
+type ClientId = u64;
+
+/// What the threads of the connections tell the world's thread.
+enum Event {
+    Connected { id: ClientId, peer: SocketAddr, out: SyncSender<Out>, stream: TcpStream, credit: Arc<Credit> },
+    Frame { id: ClientId, frame: Frame },
+    Frames { id: ClientId, on: bool },
+    Gone { id: ClientId },
+}
+
+/// What a client's writing thread has to do.
+enum Out {
+    Text(String),
+    Hold,
+}
+
+/// How many frames a client may still hand in.
+#[derive(Default)]
+struct Credit {
+    used: Mutex<usize>,
+    changed: Condvar,
+    closed: AtomicBool,
+}
+
+impl Credit {
+    /// Waits until a frame may be handed in; `false` if the connection is over.
+    fn take(&self) -> bool {
+        let mut used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
+        while *used >= CREDIT && !self.closed.load(Ordering::Relaxed) {
+            used = self.changed.wait(used).unwrap_or_else(PoisonError::into_inner);
+        }
+        *used += 1;
+        !self.closed.load(Ordering::Relaxed)
+    }
+
+    fn give_back(&self) {
+        let mut used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
+        *used = used.saturating_sub(1);
+        self.changed.notify_one();
+    }
+
+    fn close(&self) {
+        // Under the lock, so that nobody falls asleep between the look at the flag and the wait.
+        let _used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
+        self.closed.store(true, Ordering::Relaxed);
+        self.changed.notify_all();
+    }
+}
+
+struct Client {
+    out: SyncSender<Out>,
+    stream: TcpStream,
+    credit: Arc<Credit>,
+    frames: bool,
+}
+
+impl Client {
+    fn hang_up(&self) {
+        self.credit.close();
+        // It may have hung up itself.
+        let _ = self.stream.shutdown(Shutdown::Both);
+    }
+}
+
+/// The server. Its threads only carry texts; whoever owns the world calls [`exchange`](Self::exchange).
+pub struct Server {
+    address: SocketAddr,
+    events: Receiver<Event>,
+    early: VecDeque<Event>,
+    clients: BTreeMap<ClientId, Client>,
+    /// Who handed in the frame of which ticket.
+    owners: HashMap<u64, ClientId>,
+    notices: Vec<String>,
+    stop: Arc<AtomicBool>,
+}
+
+impl Server {
+    /// Listens. `bus` is the name that clients have to open, as a rule `can0`.
+    ///
+    /// # Errors
+    /// What the operating system says, for instance that the address is in use.
+    pub fn bind(address: impl ToSocketAddrs, bus: &str) -> io::Result<Self> {
+        let listener = TcpListener::bind(address)?;
+        let address = listener.local_addr()?;
+        let (sender, events) = sync_channel(EVENTS);
+        let stop = Arc::new(AtomicBool::new(false));
+        let (bus, stopped) = (bus.to_owned(), stop.clone());
+        thread::Builder::new()
+            .name("socketcand".into())
+            .spawn(move || accept(&listener, &bus, &sender, &stopped))?;
+        Ok(Self {
+            address,
+            events,
+            early: VecDeque::new(),
+            clients: BTreeMap::new(),
+            owners: HashMap::new(),
+            notices: Vec::new(),
+            stop,
+        })
+    }
+
+    /// Where it listens.
+    #[must_use]
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Clients connected.
+    #[must_use]
+    pub fn clients(&self) -> usize {
+        self.clients.len()
+    }
+
+    /// What happened to clients since the last call, in a person's words.
+    pub fn notices(&mut self) -> Vec<String> {
+        std::mem::take(&mut self.notices)
+    }
+
+    /// Hands the clients' frames to the port, and the port's frames to the clients. Gives the number of frames that
+    /// clients got.
+    pub fn exchange<M: Computer>(&mut self, world: &mut World<M>, port: PortId) -> usize {
+        while let Some(event) = self.early.pop_front().or_else(|| self.events.try_recv().ok()) {
+            self.take_in(event, world, port);
+        }
+        self.give_out(world, port)
+    }
+
+    /// Sleeps until a client wants something, for `longest` at most.
+    pub fn wait(&mut self, longest: Duration) {
+        match self.events.recv_timeout(longest) {
+            Ok(event) => self.early.push_back(event),
+            Err(RecvTimeoutError::Timeout) => {}
+            // The listening thread ends only with the server.
+            Err(RecvTimeoutError::Disconnected) => thread::sleep(longest),
+        }
+    }
+
+    fn take_in<M: Computer>(&mut self, event: Event, world: &mut World<M>, port: PortId) {
+        match event {
+            Event::Connected { id, peer, out, stream, credit } => {
+                self.notices.push(format!("client {id} connected from {peer}"));
+                self.clients.insert(id, Client { out, stream, credit, frames: false });
+            }
+            Event::Frame { id, frame } => {
+                let ticket = world.send(port, frame);
+                self.owners.insert(ticket, id);
+            }
+            Event::Frames { id, on } => {
+                if let Some(client) = self.clients.get_mut(&id) {
+                    client.frames = on;
+                }
+            }
+            Event::Gone { id } => {
+                // What is in its queue still reaches it.
+                if self.clients.remove(&id).is_some() {
+                    self.notices.push(format!("client {id} disconnected"));
+                }
+            }
+        }
+    }
+
+    fn give_out<M: Computer>(&mut self, world: &mut World<M>, port: PortId) -> usize {
+        let port = world.port_mut(port);
+        let mut frames = Vec::new();
+        while let Some((at, frame)) = port.receive() {
+            frames.push((at, None, frame));
+        }
+        while let Some((at, ticket, frame)) = port.sent() {
+            let owner = self.owners.remove(&ticket);
+            if let Some(client) = owner.and_then(|id| self.clients.get(&id)) {
+                client.credit.give_back();
+            }
+            frames.push((at, owner, frame));
+        }
+        frames.sort_by_key(|(at, ..)| *at);
+        let mut given = 0;
+        for (at, owner, frame) in frames {
+            let text = frame_element(at, &frame);
+            let mut full = Vec::new();
+            for (id, client) in &self.clients {
+                if !client.frames || owner == Some(*id) {
+                    continue;
+                }
+                match client.out.try_send(Out::Text(text.clone())) {
+                    Ok(()) => given += 1,
+                    Err(TrySendError::Full(_)) => full.push(*id),
+                    // Its reading thread is about to say so.
+                    Err(TrySendError::Disconnected(_)) => {}
+                }
+            }
+            for id in full {
+                if let Some(client) = self.clients.remove(&id) {
+                    client.hang_up();
+                    self.notices.push(format!("client {id} does not read its frames: disconnected"));
+                }
+            }
+        }
+        given
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        self.clients.values().for_each(Client::hang_up);
+        // Wakes the listening thread, which then sees the flag.
+        let _ = TcpStream::connect_timeout(&self.address, Duration::from_millis(100));
+    }
+}
+
+fn accept(listener: &TcpListener, bus: &str, events: &SyncSender<Event>, stop: &AtomicBool) {
+    let connected = Arc::new(AtomicUsize::new(0));
+    let mut next_id: ClientId = 1;
+    while !stop.load(Ordering::Relaxed) {
+        let Ok((stream, peer)) = listener.accept() else {
+            // Out of file descriptors, perhaps: some client will leave.
+            thread::sleep(Duration::from_millis(50));
+            continue;
+        };
+        if stop.load(Ordering::Relaxed) {
+            return;
+        }
+        if connected.load(Ordering::Relaxed) >= MAX_CLIENTS {
+            // If not even that reaches it, it sees the end of the connection.
+            let _ = (&stream).write_all(b"< error too many clients >");
+            continue;
+        }
+        if serve(stream, peer, next_id, bus, events, &connected).is_ok() {
+            next_id += 1;
+        }
+    }
+}
+
+/// Starts the two threads of a connection.
+fn serve(
+    stream: TcpStream,
+    peer: SocketAddr,
+    id: ClientId,
+    bus: &str,
+    events: &SyncSender<Event>,
+    connected: &Arc<AtomicUsize>,
+) -> io::Result<()> {
+    stream.set_nodelay(true)?;
+    stream.set_write_timeout(Some(PATIENCE))?;
+    let (out, texts) = sync_channel(QUEUE);
+    let credit = Arc::new(Credit::default());
+    let connection =
+        Event::Connected { id, peer, out: out.clone(), stream: stream.try_clone()?, credit: credit.clone() };
+    let writing = stream.try_clone()?;
+    let (session, events, connected) = (Session::new(bus), events.clone(), connected.clone());
+    thread::Builder::new().name(format!("client {id} out")).spawn(move || write(writing, &texts))?;
+    thread::Builder::new().name(format!("client {id} in")).spawn(move || {
+        connected.fetch_add(1, Ordering::Relaxed);
+        if events.send(connection).is_ok() {
+            read(&stream, id, session, &out, &credit, &events);
+        }
+        credit.close();
+        connected.fetch_sub(1, Ordering::Relaxed);
+        // If the world is gone, nobody needs to know.
+        let _ = events.send(Event::Gone { id });
+    })?;
+    Ok(())
+}
+
+/// Takes a client's elements until the connection or the server ends, or the client asks for what ends it.
+fn read(
+    mut stream: &TcpStream,
+    id: ClientId,
+    mut session: Session,
+    out: &SyncSender<Out>,
+    credit: &Credit,
+    events: &SyncSender<Event>,
+) {
+    let mut splitter = Splitter::default();
+    let mut buffer = [0; 4096];
+    if out.try_send(Out::Text(HELLO.into())).is_err() {
+        return;
+    }
+    loop {
+        let len = match stream.read(&mut buffer) {
+            Ok(0) => return,
+            Ok(len) => len,
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+            Err(_) => return,
+        };
+        for element in buffer[..len].iter().filter_map(|byte| splitter.push(*byte)) {
+            let reaction = session.handle(element.as_deref().map_err(|bad| *bad));
+            if let Some(answer) = reaction.answer {
+                // A full queue: it sends and does not read.
+                if out.try_send(Out::Text(answer)).is_err() {
+                    return;
+                }
+            }
+            let event = match reaction.effect {
+                Effect::None => continue,
+                Effect::Send(frame) if credit.take() => Event::Frame { id, frame },
+                Effect::Send(_) => return,
+                Effect::StartFrames => {
+                    if out.try_send(Out::Hold).is_err() {
+                        return;
+                    }
+                    Event::Frames { id, on: true }
+                }
+                Effect::StopFrames => Event::Frames { id, on: false },
+                // The writing thread ends the connection when all is said.
+                Effect::Close => return,
+            };
+            if events.send(event).is_err() {
+                return;
+            }
+        }
+    }
+}
+
+/// Brings texts to a client until there will be no more, then ends the connection.
+fn write(mut stream: TcpStream, texts: &Receiver<Out>) {
+    let mut next = texts.recv().ok();
+    while let Some(out) = next.take() {
+        match out {
+            Out::Text(mut text) => {
+                while text.len() < WRITE {
+                    match texts.try_recv() {
+                        Ok(Out::Text(more)) => text += &more,
+                        Ok(other) => {
+                            next = Some(other);
+                            break;
+                        }
+                        Err(_) => break,
+                    }
+                }
+                if stream.write_all(text.as_bytes()).is_err() {
+                    break;
+                }
+            }
+            Out::Hold => thread::sleep(HOLD),
+        }
+        next = next.or_else(|| texts.recv().ok());
+    }
+    // The client may have hung up itself.
+    let _ = stream.shutdown(Shutdown::Both);
+}
