@@ -23,19 +23,25 @@ fn bytes(code: &[u16]) -> Vec<u8> {
     code.iter().flat_map(|half| half.to_le_bytes()).collect()
 }
 
-fn image(program: &Program) -> Vec<u8> {
+/// The vector table, for whatever program.
+fn table(program: &Program) -> Vec<u8> {
     let mut table = [0_u32; 128];
     table[0] = STACK;
     table[1] = program.base | 1;
     for &(exception, vector) in program.vectors {
         table[exception] = vector;
     }
-    table.iter().flat_map(|word| word.to_le_bytes()).chain(bytes(program.code)).collect()
+    table.iter().flat_map(|word| word.to_le_bytes()).collect()
+}
+
+fn load(machine: &mut Machine, program: &Program) {
+    machine.load_bin(0x0800_0000, &table(program)).unwrap();
+    machine.load_bin(program.base, &bytes(program.code)).unwrap();
 }
 
 fn with_options(program: &Program, options: Options) -> Machine {
     let mut machine = Machine::new(&STM32F407VG, options).unwrap();
-    machine.load_bin(0x0800_0000, &image(program)).unwrap();
+    load(&mut machine, program);
     machine.power_on(Time(0));
     machine
 }
@@ -86,7 +92,7 @@ fn without_a_program_the_chip_locks_up() {
     machine.power_on(ms(1));
     assert_eq!(machine.run_until(ms(2)), Stop::Lockup);
     assert_eq!(machine.run_until(ms(3)), Stop::Deadline);
-    machine.load_bin(0x0800_0000, &image(&programs::STORES_AND_SLEEPS)).unwrap();
+    load(&mut machine, &programs::STORES_AND_SLEEPS);
     machine.reset_pin();
     assert_eq!(machine.run_until(ms(4)), Stop::Deadline);
     assert_eq!(word(&machine, OUT), 42);
@@ -208,6 +214,16 @@ fn wfe_ends_by_itself_and_sleep_on_exit_never_comes_back() {
     let mut sleeping = machine(&programs::SLEEPS_ON_EXIT);
     sleeping.run_until(Time(10 * MS + MS / 2));
     assert_eq!(words(&sleeping, 2), [10, 0]);
+}
+
+/// The IT state is part of the xPSR that is stacked.
+#[test]
+fn an_interrupt_within_a_conditional_block_leaves_it_whole() {
+    let mut machine = machine(&programs::CONDITIONS);
+    put(&mut machine, OUT + 16, 0);
+    machine.run_until(ms(500));
+    assert_eq!(words(&machine, 4), [350_000, 50_000, 150_000, 250_000]);
+    assert!(word(&machine, OUT + 16) > 10_000, "ticks: {}", word(&machine, OUT + 16));
 }
 
 #[test]

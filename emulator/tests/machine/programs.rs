@@ -956,3 +956,48 @@ pub const SCALES_THE_CLOCK: Program = Program {
         0xE010, 0xE000,      // 294  .word 0xe000e010
     ],
 };
+
+/// 100 000 rounds of an IT block that lies across a page border, interrupted every 67 cycles by a handler
+/// that changes the flags. Every second round adds 7, 1, 3 and 5 to the words at 2000_0000h.
+pub const CONDITIONS: Program = Program {
+    base: 0x0800_0FDC,
+    vectors: &[(15, 0x0800_1013)],
+    code: &[
+        0x2000,              // FDC  movs r0, #0
+        0x2400,              // FDE  movs r4, #0
+        0x2500,              // FE0  movs r5, #0
+        0x2600,              // FE2  movs r6, #0
+        0x2700,              // FE4  movs r7, #0
+        0x2300,              // FE6  movs r3, #0
+        0x490D,              // FE8  ldr r1, [pc, #52]
+        0x2242,              // FEA  movs r2, #66
+        0x604A,              // FEC  str r2, [r1, #4]
+        0x6088,              // FEE  str r0, [r1, #8]
+        0x2207,              // FF0  movs r2, #7
+        0x600A,              // FF2  str r2, [r1, #0]
+        0x4A0B,              // FF4  ldr r2, [pc, #44]
+        0x3401,              // FF6 loop:  adds r4, #1
+        0x07E0,              // FF8  lsls r0, r4, #31
+        0xBF1F,              // FFA  itttt ne
+        0x3501,              // FFC  addne r5, #1
+        0x3603,              // FFE  addne r6, #3
+        0x3705,              // 000  addne r7, #5
+        0x3307,              // 002  addne r3, #7
+        0x4294,              // 004  cmp r4, r2
+        0xD1F6,              // 006  bne.n 8000ff6
+        0xF04F, 0x5000,      // 008  mov.w r0, #536870912
+        0xC0E8,              // 00C  stmia r0!, {r3, r5, r6, r7}
+        0xBF30,              // 00E  wfi
+        0xE7FD,              // 010  b.n 800100e
+        0x4805,              // 012 tick:  ldr r0, [pc, #20]
+        0x6801,              // 014  ldr r1, [r0, #0]
+        0x3101,              // 016  adds r1, #1
+        0x6001,              // 018  str r1, [r0, #0]
+        0x4289,              // 01A  cmp r1, r1
+        0x4770,              // 01C  bx lr
+        0x0000,              // 01E  .short 0x0000
+        0xE010, 0xE000,      // 020  .word 0xe000e010
+        0x86A0, 0x0001,      // 024  .word 0x000186a0
+        0x0010, 0x2000,      // 028  .word 0x20000010
+    ],
+};
