@@ -1,0 +1,421 @@
+//! `emulate`: boards on a virtual CAN bus, for other programs to talk to.
+
+mod words;
+
+use std::cell::RefCell;
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::rc::Rc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{bail, Context, Result};
+use clap::Parser;
+use emulator::bus::Outcome;
+use emulator::candump::{Handle, Lines};
+use emulator::machine::{FlashTimes, Machine, Options, ResetCause, Stop};
+use emulator::pacing::{Pacer, Speed};
+use emulator::socketcand::Server;
+use emulator::time::Time;
+use emulator::world::{MachineId, World};
+use shared_abi::geometry::{Geometry, STM32F407VG};
+
+/// Runs boards on a virtual CAN bus and shows in words what happens.
+///
+/// The boards run the very images that go onto real ones. Other programs reach the bus through --socketcand; the
+/// adapter behind it is always on the bus and acknowledges. Times are virtual; see --speed. Ctrl-C ends.
+#[derive(Debug, Parser)]
+#[command(name = "emulate", version)]
+struct Args {
+    /// The board
+    #[arg(long, default_value = "stm32f407g-disc1", value_parser = board)]
+    board: &'static Board,
+
+    /// The bootloader's image (ELF, Intel HEX, or FILE@ADDRESS for a raw binary)
+    #[arg(long, value_name = "FILE")]
+    bootloader: Option<PathBuf>,
+
+    /// An application's image. It is put into flash as a debug probe does it: without a signature of the bootloader's
+    #[arg(long, value_name = "FILE")]
+    app: Option<PathBuf>,
+
+    /// More images
+    #[arg(value_name = "FILE")]
+    images: Vec<PathBuf>,
+
+    /// Serve the bus `can0` to socketcand clients at this address, for example 127.0.0.1:29536
+    #[arg(long, value_name = "HOST:PORT")]
+    socketcand: Option<String>,
+
+    /// Bit rate of the adapter that clients talk through, in bit/s
+    #[arg(long, default_value_t = 125_000, value_parser = clap::value_parser!(u32).range(1_000..=1_000_000))]
+    bit_rate: u32,
+
+    /// Write the bus to this file as a candump log
+    #[arg(long, value_name = "FILE")]
+    trace: Option<PathBuf>,
+
+    /// Error frames go into the log too
+    #[arg(long, requires = "trace")]
+    trace_errors: bool,
+
+    /// Show every frame, not only the notable ones
+    #[arg(short, long)]
+    verbose: bool,
+
+    /// How many boards with these images are on the bus. They differ in their unique IDs and in nothing else, so the
+    /// images must get different node-IDs out of them
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=32))]
+    node_count: u8,
+
+    /// Virtual seconds per second of the wall clock, or `max`: as fast as the host can, but 1:1 for a moment behind every
+    /// frame that a client gets, so that its answer is not late in virtual time
+    #[arg(long, default_value = "1")]
+    speed: Speed,
+
+    /// Chooses what RAM holds at power-on
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+
+    /// Flash takes the datasheet's longest times, not the typical ones
+    #[arg(long)]
+    worst_flash: bool,
+
+    /// End after so many seconds of virtual time
+    #[arg(long = "for", value_name = "SECONDS", value_parser = seconds)]
+    run_for: Option<Time>,
+}
+
+/// What is known of a board here: its chip and its crystal.
+#[derive(Debug)]
+struct Board {
+    name: &'static str,
+    chip: &'static Geometry,
+    hse_hz: u32,
+}
+
+const BOARDS: &[Board] = &[Board { name: "stm32f407g-disc1", chip: &STM32F407VG, hse_hz: 8_000_000 }];
+
+fn board(name: &str) -> Result<&'static Board, String> {
+    let names = || BOARDS.iter().map(|board| board.name).collect::<Vec<_>>().join(", ");
+    BOARDS.iter().find(|board| board.name == name).ok_or_else(|| format!("known boards: {}", names()))
+}
+
+/// The longest `--for`: 200 days.
+const LONGEST: f64 = 200.0 * 86_400.0;
+
+fn seconds(text: &str) -> Result<Time, String> {
+    match text.parse::<f64>() {
+        // Picoseconds; the range fits.
+        Ok(seconds) if (0.0..=LONGEST).contains(&seconds) => Ok(Time((seconds * 1e12) as u64)),
+        _ => Err(format!("not a number of seconds from 0 to {LONGEST}")),
+    }
+}
+
+/// No image of a chip with 1 MiB of flash is larger, ELF with all its debug information included.
+const LARGEST_IMAGE: u64 = 256 << 20;
+/// How often files are brought up to date.
+const FLUSH: Duration = Duration::from_millis(200);
+/// How long the world sleeps when it is ahead of the wall clock.
+const NAP: Duration = Duration::from_micros(500);
+
+fn main() -> ExitCode {
+    match run(&Args::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        // Whoever read the output has enough of it.
+        Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
+        Err(error) => {
+            // If that cannot be written either, the exit code has to do.
+            let _ = writeln!(io::stderr(), "emulate: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn is_broken_pipe(error: &anyhow::Error) -> bool {
+    error.downcast_ref::<Unheard>().is_some()
+}
+
+/// Nobody reads what is said.
+#[derive(Debug, thiserror::Error)]
+#[error("the standard output is closed")]
+struct Unheard;
+
+fn say(text: &str) -> Result<()> {
+    match writeln!(io::stdout(), "{text}") {
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Err(Unheard.into()),
+        other => other.context("writing to the standard output"),
+    }
+}
+
+fn run(args: &Args) -> Result<()> {
+    let end = Arc::new(AtomicBool::new(false));
+    let ended = end.clone();
+    ctrlc::set_handler(move || ended.store(true, Ordering::Relaxed)).context("setting up Ctrl-C")?;
+
+    let mut bench = Bench::new(args)?;
+    bench.listen(args)?;
+    bench.power_on()?;
+    let outcome = bench.live(args, &end);
+    // What has happened is told and written down even if something went wrong.
+    let told = bench.tell();
+    let flushed = bench.flush();
+    outcome.and(told).and(flushed)?;
+    bench.sum_up()
+}
+
+/// Images are loaded in this order; a later one wins where they overlap.
+fn images(args: &Args) -> impl Iterator<Item = &Path> {
+    let named = args.bootloader.iter().chain(&args.app);
+    named.chain(&args.images).map(PathBuf::as_path)
+}
+
+/// Splits FILE@ADDRESS, where FILE@ADDRESS is not itself a file.
+fn raw_address(path: &Path) -> Result<Option<(PathBuf, u32)>> {
+    let Some((file, address)) = path.to_str().and_then(|text| text.rsplit_once('@')) else { return Ok(None) };
+    if path.exists() {
+        return Ok(None);
+    }
+    let digits = address.trim_start_matches("0x").replace('_', "");
+    let address = u32::from_str_radix(&digits, 16)
+        .with_context(|| format!("{}: `{address}` is not a hexadecimal address", path.display()))?;
+    Ok(Some((file.into(), address)))
+}
+
+fn read_image(path: &Path) -> Result<Vec<u8>> {
+    let size = std::fs::metadata(path).with_context(|| format!("{}", path.display()))?.len();
+    if size > LARGEST_IMAGE {
+        bail!("{}: {size} bytes are more than any image for this chip has", path.display());
+    }
+    let bytes = std::fs::read(path).with_context(|| format!("{}", path.display()))?;
+    if bytes.is_empty() {
+        bail!("{}: the file is empty", path.display());
+    }
+    Ok(bytes)
+}
+
+fn load(machine: &mut Machine, path: &Path) -> Result<()> {
+    if let Some((file, address)) = raw_address(path)? {
+        let bytes = read_image(&file)?;
+        return machine.load_bin(address, &bytes).with_context(|| format!("{}", file.display()));
+    }
+    let bytes = read_image(path)?;
+    let loaded = match std::str::from_utf8(&bytes) {
+        _ if bytes.starts_with(b"\x7FELF") => machine.load(&bytes),
+        Ok(text) if text.trim_start().starts_with(':') => machine.load_hex(text),
+        _ => bail!(
+            "{0}: neither ELF nor Intel HEX; for a raw binary say where it goes: {0}@08000000",
+            path.display()
+        ),
+    };
+    loaded.with_context(|| format!("{}", path.display()))?;
+    Ok(())
+}
+
+/// The boards, the bus, and who listens.
+struct Bench {
+    world: World,
+    boards: Vec<Watched>,
+    port: emulator::world::PortId,
+    server: Option<Server>,
+    trace: Option<(PathBuf, Handle<BufWriter<File>>)>,
+    /// What the bus had to say and nobody has printed.
+    said: Rc<RefCell<Vec<String>>>,
+}
+
+/// A board and how many of its reports have been shown.
+struct Watched {
+    id: MachineId,
+    shown: usize,
+}
+
+impl Bench {
+    fn new(args: &Args) -> Result<Self> {
+        if images(args).next().is_none() {
+            bail!("the flash would be empty: name at least one image, for example --bootloader FILE");
+        }
+        let mut world = World::new();
+        let mut boards = Vec::new();
+        for n in 0..args.node_count {
+            let mut unique_id = Options::default().unique_id;
+            unique_id[0] += u32::from(n);
+            let machine = Machine::new(
+                args.board.chip,
+                Options {
+                    seed: args.seed.wrapping_add(u64::from(n)),
+                    hse_hz: args.board.hse_hz,
+                    flash_times: if args.worst_flash { FlashTimes::Worst } else { FlashTimes::Typical },
+                    unique_id,
+                },
+            );
+            let mut machine = machine.context("setting up the board")?;
+            for path in images(args) {
+                load(&mut machine, path)?;
+            }
+            boards.push(Watched { id: world.add_machine(machine), shown: 0 });
+        }
+        let port = world.add_host_port(args.bit_rate);
+        let trace = match &args.trace {
+            None => None,
+            Some(path) => {
+                let file = File::create(path).with_context(|| format!("{}", path.display()))?;
+                let lines = if args.trace_errors { Lines::FramesAndErrors } else { Lines::Frames };
+                let log = Handle::new(BufWriter::new(file), "can0", lines);
+                world.add_sink(log.sink());
+                Some((path.clone(), log))
+            }
+        };
+        let said = Rc::new(RefCell::new(Vec::new()));
+        let (mut words, telling, verbose) = (words::Words::default(), said.clone(), args.verbose);
+        world.add_sink(move |record| {
+            let text = words.of(record);
+            let frame = match record.outcome {
+                Outcome::Good if verbose => Some(format!("{} {}", record.end, record.frame)),
+                Outcome::KeptBack if verbose => Some(format!("{} {} (kept back)", record.end, record.frame)),
+                _ => None,
+            };
+            let mut said = telling.borrow_mut();
+            said.extend(frame);
+            said.extend(text.map(|text| format!("{} {text}", record.end)));
+        });
+        Ok(Self { world, boards, port, server: None, trace, said })
+    }
+
+    fn listen(&mut self, args: &Args) -> Result<()> {
+        if let Some(address) = &args.socketcand {
+            let server = Server::bind(address.as_str(), "can0").with_context(|| {
+                format!("cannot listen at {address}; is another emulator running? choose another port")
+            })?;
+            say(&format!("clients reach the bus at socketcand://{}/can0", server.address()))?;
+            self.server = Some(server);
+        }
+        Ok(())
+    }
+
+    fn power_on(&mut self) -> Result<()> {
+        for n in 0..self.boards.len() {
+            self.world.power_on(self.boards[n].id);
+            let name = self.name(n);
+            say(&format!("{} {name}: power on", self.world.now()))?;
+        }
+        Ok(())
+    }
+
+    fn name(&self, n: usize) -> String {
+        match self.boards.len() {
+            1 => "board".into(),
+            _ => format!("board {}", n + 1),
+        }
+    }
+
+    /// Lets the world go on until the end is asked for or due.
+    fn live(&mut self, args: &Args, end: &AtomicBool) -> Result<()> {
+        let last = args.run_for.unwrap_or(Time(u64::MAX));
+        let mut pacer = Pacer::new(args.speed, Instant::now(), self.world.now());
+        let mut flushed = Instant::now();
+        while !end.load(Ordering::Relaxed) && self.world.now() < last {
+            let target = pacer.target(Instant::now(), self.world.now()).min(last);
+            if target > self.world.now() {
+                self.world.run_until(target);
+                self.exchange(&mut pacer)?;
+            } else {
+                match &mut self.server {
+                    Some(server) => server.wait(NAP),
+                    None => std::thread::sleep(NAP),
+                }
+                self.exchange(&mut pacer)?;
+            }
+            self.tell()?;
+            if flushed.elapsed() > FLUSH {
+                self.flush()?;
+                flushed = Instant::now();
+            }
+        }
+        Ok(())
+    }
+
+    /// Lets the clients take part.
+    fn exchange(&mut self, pacer: &mut Pacer) -> Result<()> {
+        let Some(server) = &mut self.server else {
+            // Nobody wants the frames.
+            while self.world.receive(self.port).is_some() {}
+            return Ok(());
+        };
+        if server.exchange(&mut self.world, self.port) > 0 {
+            pacer.delivered(Instant::now());
+        }
+        server.notices().iter().try_for_each(|notice| say(&format!("{} {notice}", self.world.now())))
+    }
+
+    /// Says what has happened since the last time.
+    fn tell(&mut self) -> Result<()> {
+        let mut lines = std::mem::take(&mut *self.said.borrow_mut());
+        while let Some(news) = self.world.news() {
+            let n = self.boards.iter().position(|board| board.id == news.machine).unwrap_or(0);
+            let (cfsr, hfsr) = self.world.machine(news.machine).fault_status();
+            let text = match news.stop {
+                Stop::Deadline | Stop::Attention => continue,
+                Stop::Reset(ResetCause::PowerOn) => continue,
+                Stop::Reset(ResetCause::Pin) => "reset by the pin NRST".into(),
+                Stop::Reset(ResetCause::Software) => "reset by its software".into(),
+                Stop::Reset(ResetCause::IndependentWatchdog) => "reset by the watchdog".into(),
+                Stop::PowerCut => "the power is cut".into(),
+                Stop::Lockup => format!(
+                    "the CPU has locked up (CFSR {cfsr:08X}h, HFSR {hfsr:08X}h): only a reset helps it"
+                ),
+            };
+            lines.push(format!("{} {}: {text}", news.at, self.name(n)));
+        }
+        for n in 0..self.boards.len() {
+            let board = &self.boards[n];
+            let reports = self.world.machine(board.id).reports();
+            let name = self.name(n);
+            lines.extend(
+                reports[board.shown..]
+                    .iter()
+                    .map(|report| format!("{} {name}: {}", report.time, unmodelled(report))),
+            );
+            self.boards[n].shown = reports.len();
+        }
+        lines.iter().try_for_each(|line| say(line))
+    }
+
+    fn flush(&self) -> Result<()> {
+        match &self.trace {
+            Some((path, log)) => log.flush().with_context(|| format!("writing {}", path.display())),
+            None => Ok(()),
+        }
+    }
+
+    fn sum_up(&self) -> Result<()> {
+        let (frames, errors) = self.world.bus().totals();
+        say(&format!("{} end: {frames} frames, {errors} error frames", self.world.now()))?;
+        for n in 0..self.boards.len() {
+            let reports = self.world.machine(self.boards[n].id).reports();
+            let times: u64 = reports.iter().map(|report| report.count).sum();
+            if times > 0 {
+                let places = reports.len();
+                say(&format!(
+                    "{}: {times} accesses, in {places} places, that the emulator does not model",
+                    self.name(n)
+                ))?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A report in words, without its time and its count.
+fn unmodelled(report: &emulator::machine::Report) -> String {
+    let value = match report.access {
+        emulator::machine::Access::Write => format!(" = {:X}h", report.value),
+        _ => String::new(),
+    };
+    format!(
+        "{} of {} bytes at {:08X}h{value}, pc {:08X}h: {}",
+        report.access, report.size, report.address, report.pc, report.what
+    )
+}
