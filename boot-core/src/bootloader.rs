@@ -17,11 +17,11 @@ const PROGRAM_ENTRIES: [Entry; 8] = [
     Entry::array(PROGRAM_DATA, "Program data", 1),
     Entry::sub(PROGRAM_DATA, 1, "Program data 1", DataType::Domain, Access::Wo),
     Entry::array(PROGRAM_CONTROL, "Program control", 1),
-    Entry::sub(PROGRAM_CONTROL, 1, "Program control 1", DataType::Unsigned8, Access::Rw),
+    Entry::sub(PROGRAM_CONTROL, 1, "Program control 1", DataType::Unsigned8, Access::Rw).default(0),
     Entry::array(PROGRAM_ID, "Program software identification", 1),
     Entry::sub(PROGRAM_ID, 1, "Program software identification 1", DataType::Unsigned32, Access::Ro),
     Entry::array(FLASH_STATUS, "Flash status identification", 1),
-    Entry::sub(FLASH_STATUS, 1, "Flash status identification 1", DataType::Unsigned32, Access::Ro),
+    Entry::sub(FLASH_STATUS, 1, "Flash status identification 1", DataType::Unsigned32, Access::Ro).default(0),
 ];
 
 /// The object dictionary of a bootloader with one program.

@@ -1,5 +1,6 @@
 //! What the tests and the demonstration share: the built firmware, and the bench that it runs on.
 
 pub mod bench;
+pub mod eds;
 pub mod endpoint;
 pub mod firmware;

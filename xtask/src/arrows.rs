@@ -38,7 +38,10 @@ const RULES: &[Rule] = &[
     Rule { name: "app-template", may_use: &["canopen", "bsp", "shared-abi"] },
     Rule { name: "coflash", may_use: &["canopen", "shared-abi"] },
     Rule { name: "emulator", may_use: &["shared-abi"] },
-    Rule { name: "coboot-tests", may_use: &["boot-core", "canopen", "coflash", "emulator", "shared-abi"] },
+    Rule {
+        name: "coboot-tests",
+        may_use: &["boot-core", "bsp", "canopen", "coflash", "emulator", "shared-abi"],
+    },
     Rule { name: "xtask", may_use: &["shared-abi"] },
 ];
 

@@ -11,6 +11,7 @@ mod args;
 mod arrows;
 mod build;
 mod demo;
+mod eds;
 mod elf;
 mod emulate;
 mod json;
@@ -67,6 +68,7 @@ const JOBS: &[Job] = &[
         help: layout::HELP,
         run: layout::run,
     },
+    Job { name: "eds", about: "the EDS files of bootloader and application", help: eds::HELP, run: eds::run },
     Job {
         name: "size",
         about: "the bootloader's flash against its budget",

@@ -1,0 +1,277 @@
+//! The EDS files (CiA 306-1): what a configuration tool knows of a device before it has met one.
+//!
+//! They are made from the tables that the firmware itself serves, so that they cannot say anything else. Values that every
+//! image of a board shares come from its board file. `cargo xtask eds` writes them to `docs/eds/`.
+
+use std::fmt::Write;
+
+use bsp::can::BitTiming;
+use canopen::device::Device;
+use canopen::od::{Access, Address, DataType, DefaultValue, Entry, Kind};
+use canopen::program::{BOOTLOADER_DEVICE_TYPE, IDENTITY};
+
+/// The table of the application template. It needs nothing of the chip.
+#[path = "../../app-template/src/entries.rs"]
+mod application;
+
+/// CiA 306-1 asks for dates. The contents have none: the same table gives the same file.
+const DATE: &str = "11-21-2026";
+const TIME: &str = "12:00AM";
+
+/// Serial number: no two devices have the same.
+const SERIAL_NUMBER: Address = Address::new(IDENTITY, 4);
+
+/// One image, as its EDS file describes it.
+pub struct Image {
+    /// Name of the file in `docs/eds/`.
+    pub file: &'static str,
+    /// What it is, in a line.
+    pub description: &'static str,
+    /// Its object dictionary.
+    pub entries: &'static [Entry],
+    /// What it says of itself. The serial number is not used.
+    pub device: Device,
+    /// Whether node-ID and bit rate are set over the bus.
+    pub lss: bool,
+}
+
+/// The bootloader. What stands here and in its `main.rs` is compared over the bus by the tests.
+#[must_use]
+pub fn bootloader() -> Image {
+    Image {
+        file: "coboot-bootloader.eds",
+        description: "coboot, the CANopen bootloader",
+        entries: &boot_core::bootloader::ENTRIES,
+        device: Device {
+            device_type: BOOTLOADER_DEVICE_TYPE,
+            software_version: concat!("coboot ", env!("CARGO_PKG_VERSION")),
+            heartbeat_ms: 1000,
+            ..BOARD
+        },
+        lss: false,
+    }
+}
+
+/// The application template, version 1. What stands here and in its `objects.rs` is compared over the bus by the tests.
+#[must_use]
+pub fn application() -> Image {
+    Image {
+        file: "coboot-application.eds",
+        description: "The application template of coboot",
+        entries: &application::ENTRIES,
+        device: Device { device_type: 0, software_version: "1.0.0", heartbeat_ms: 500, ..BOARD },
+        lss: false,
+    }
+}
+
+/// What the board file says.
+const BOARD: Device = Device {
+    device_type: 0,
+    name: bsp::IDENTITY.device_name,
+    hardware_version: bsp::IDENTITY.hardware_version,
+    software_version: "",
+    heartbeat_ms: 0,
+    vendor_id: bsp::IDENTITY.vendor_id,
+    product_code: bsp::IDENTITY.product_code,
+    revision: bsp::IDENTITY.revision,
+    serial_number: 0,
+};
+
+impl Image {
+    /// The EDS file.
+    #[must_use]
+    pub fn eds(&self) -> String {
+        let mut eds = Ini(String::new());
+        self.about(&mut eds);
+        let indices = self.indices();
+        let (mandatory, rest): (Vec<u16>, Vec<u16>) =
+            indices.iter().partition(|index| matches!(index, 0x1000 | 0x1001 | 0x1018));
+        let (manufacturer, optional): (Vec<u16>, Vec<u16>) =
+            rest.iter().partition(|index| matches!(index, 0x2000..=0x5FFF));
+        for (list, of) in [
+            ("MandatoryObjects", mandatory),
+            ("OptionalObjects", optional),
+            ("ManufacturerObjects", manufacturer),
+        ] {
+            eds.section(list);
+            eds.line("SupportedObjects", of.len());
+            for (i, index) in of.iter().enumerate() {
+                eds.line(i + 1, format_args!("0x{index:04X}"));
+            }
+            for index in &of {
+                self.object(&mut eds, *index);
+            }
+        }
+        eds.0
+    }
+
+    /// The indices of all objects, ascending.
+    #[must_use]
+    pub fn indices(&self) -> Vec<u16> {
+        let mut indices: Vec<u16> = self.entries.iter().map(|entry| entry.at.index).collect();
+        indices.sort_unstable();
+        indices.dedup();
+        indices
+    }
+
+    /// The sections in front of the objects.
+    fn about(&self, eds: &mut Ini) {
+        eds.section("FileInfo");
+        eds.line("FileName", self.file);
+        eds.line("FileVersion", 1);
+        eds.line("FileRevision", 0);
+        eds.line("EDSVersion", "4.0");
+        eds.line("Description", self.description);
+        for what in ["Creation", "Modification"] {
+            eds.line(format_args!("{what}Time"), TIME);
+            eds.line(format_args!("{what}Date"), DATE);
+        }
+        eds.line("CreatedBy", "cargo xtask eds");
+        eds.line("ModifiedBy", "cargo xtask eds");
+
+        eds.section("DeviceInfo");
+        eds.line("VendorName", "coboot");
+        eds.line("VendorNumber", format_args!("0x{:08X}", self.device.vendor_id));
+        eds.line("ProductName", self.device.name);
+        eds.line("ProductNumber", format_args!("0x{:08X}", self.device.product_code));
+        eds.line("RevisionNumber", format_args!("0x{:08X}", self.device.revision));
+        eds.line("OrderCode", "");
+        for kbit in [10, 20, 50, 125, 250, 500, 800, 1000] {
+            eds.line(format_args!("BaudRate_{kbit}"), u8::from(self.supports(kbit * 1000)));
+        }
+        eds.line("SimpleBootUpMaster", 0);
+        eds.line("SimpleBootUpSlave", 1);
+        // No PDO, so none is put together bit by bit or byte by byte.
+        eds.line("Granularity", 0);
+        eds.line("DynamicChannelsSupported", 0);
+        eds.line("GroupMessaging", 0);
+        eds.line("NrOfRxPDO", 0);
+        eds.line("NrOfTxPDO", 0);
+        eds.line("LSS_Supported", u8::from(self.lss));
+        eds.line("CompactPDO", 0);
+
+        eds.section("DummyUsage");
+        for data_type in 1..=7 {
+            eds.line(format_args!("Dummy{data_type:04X}"), 0);
+        }
+
+        eds.section("Comments");
+        eds.line("Lines", 2);
+        eds.line("Line1", format_args!("{}, on the board {}.", self.description, bsp::LAYOUT.board));
+        eds.line("Line2", "Made from the table that the firmware serves; change that, not this.");
+    }
+
+    /// The board's own bit rate; with LSS every one that its clock makes.
+    fn supports(&self, bit_rate: u32) -> bool {
+        bit_rate == bsp::BIT_RATE || self.lss && BitTiming::new(bsp::CAN_CLOCK, bit_rate).is_some()
+    }
+
+    /// An object and its parts.
+    fn object(&self, eds: &mut Ini, index: u16) {
+        for entry in self.entries.iter().filter(|entry| entry.at.index == index) {
+            let (object_type, parts) = match entry.kind {
+                Kind::Var => {
+                    eds.section(format_args!("{index:04X}"));
+                    self.value(eds, entry, entry.name);
+                    continue;
+                }
+                Kind::Sub => {
+                    eds.section(format_args!("{index:04X}sub{:X}", entry.at.sub));
+                    self.value(eds, entry, entry.name);
+                    continue;
+                }
+                Kind::Array(_) => (ARRAY, self.parts(index)),
+                Kind::Record(_) => (RECORD, self.parts(index)),
+            };
+            eds.section(format_args!("{index:04X}"));
+            eds.line("ParameterName", entry.name);
+            eds.line("ObjectType", format_args!("0x{object_type:X}"));
+            eds.line("SubNumber", parts);
+            eds.section(format_args!("{index:04X}sub0"));
+            // With a head that can be written it is the number of those in use (1003h).
+            let name = match entry.access {
+                Access::Const => "Highest sub-index supported",
+                _ => "Number of entries",
+            };
+            self.value(eds, entry, name);
+        }
+    }
+
+    /// Sub-indices of an object, 0 among them.
+    fn parts(&self, index: u16) -> usize {
+        self.entries.iter().filter(|entry| entry.at.index == index).count()
+    }
+
+    fn value(&self, eds: &mut Ini, entry: &Entry, name: &str) {
+        let object_type = if entry.data_type == DataType::Domain { DOMAIN } else { VAR };
+        eds.line("ParameterName", name);
+        eds.line("ObjectType", format_args!("0x{object_type:X}"));
+        eds.line("DataType", format_args!("0x{:04X}", entry.data_type as u8));
+        eds.line("AccessType", access(entry.access));
+        if let Some(value) = self.default(entry) {
+            eds.line("DefaultValue", value);
+        }
+        eds.line("PDOMapping", 0);
+    }
+
+    /// What a device reads there as long as nobody wrote it: from the table, from the head itself, or from what the device
+    /// says of itself.
+    fn default(&self, entry: &Entry) -> Option<String> {
+        match (entry.default, entry.kind) {
+            (DefaultValue::Number(value), _) => return Some(number(entry.data_type, value)),
+            (DefaultValue::Text(text), _) => return Some(text.to_owned()),
+            (DefaultValue::None, Kind::Array(highest) | Kind::Record(highest)) => {
+                return Some(number(entry.data_type, highest.into()));
+            }
+            (DefaultValue::None, _) if entry.at == SERIAL_NUMBER => return None,
+            _ => {}
+        }
+        let mut buf = [0; canopen::sdo::server::VALUE_MAX];
+        let len = self.device.read(entry.at, &mut buf)?.expect("what a device says of itself can be read");
+        Some(match entry.data_type {
+            DataType::VisibleString => String::from_utf8_lossy(&buf[..len]).into_owned(),
+            data_type => {
+                number(data_type, buf[..len].iter().rfold(0, |value, byte| value << 8 | u64::from(*byte)))
+            }
+        })
+    }
+}
+
+// Object codes of CiA 301 table 42.
+const DOMAIN: u8 = 2;
+const VAR: u8 = 7;
+const ARRAY: u8 = 8;
+const RECORD: u8 = 9;
+
+fn access(access: Access) -> &'static str {
+    match access {
+        Access::Const => "const",
+        Access::Ro => "ro",
+        Access::Wo => "wo",
+        Access::Rw => "rw",
+    }
+}
+
+/// Hexadecimal for what is read bit by bit or digit by digit, with all digits of its type.
+fn number(data_type: DataType, value: u64) -> String {
+    match data_type {
+        DataType::Unsigned32 => format!("0x{value:08X}"),
+        _ => value.to_string(),
+    }
+}
+
+/// The file as it grows.
+struct Ini(String);
+
+impl Ini {
+    fn section(&mut self, name: impl std::fmt::Display) {
+        if !self.0.is_empty() {
+            self.0.push('\n');
+        }
+        writeln!(self.0, "[{name}]").expect("a string takes everything");
+    }
+
+    fn line(&mut self, key: impl std::fmt::Display, value: impl std::fmt::Display) {
+        writeln!(self.0, "{key}={value}").expect("a string takes everything");
+    }
+}
