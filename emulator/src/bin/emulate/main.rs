@@ -85,7 +85,7 @@ struct Args {
     worst_flash: bool,
 
     /// End after so many seconds of virtual time
-    #[arg(long = "for", value_name = "SECONDS", value_parser = seconds)]
+    #[arg(long = "for", value_name = "SECONDS", value_parser = seconds, allow_negative_numbers = true)]
     run_for: Option<Time>,
 }
 
@@ -222,8 +222,8 @@ struct Bench {
     port: emulator::world::PortId,
     server: Option<Server>,
     trace: Option<(PathBuf, Handle<BufWriter<File>>)>,
-    /// What the bus had to say and nobody has printed.
-    said: Rc<RefCell<Vec<String>>>,
+    /// What was to be said and when, not printed yet.
+    said: Rc<RefCell<Vec<(Time, String)>>>,
 }
 
 /// A board and how many of its reports have been shown.
@@ -273,13 +273,12 @@ impl Bench {
         world.add_sink(move |record| {
             let text = words.of(record);
             let frame = match record.outcome {
-                Outcome::Good if verbose => Some(format!("{} {}", record.end, record.frame)),
-                Outcome::KeptBack if verbose => Some(format!("{} {} (kept back)", record.end, record.frame)),
+                Outcome::Good if verbose => Some(record.frame.to_string()),
+                Outcome::KeptBack if verbose => Some(format!("{} (kept back)", record.frame)),
                 _ => None,
             };
             let mut said = telling.borrow_mut();
-            said.extend(frame);
-            said.extend(text.map(|text| format!("{} {text}", record.end)));
+            said.extend(frame.into_iter().chain(text).map(|text| (record.end, text)));
         });
         Ok(Self { world, boards, port, server: None, trace, said })
     }
@@ -320,14 +319,13 @@ impl Bench {
             let target = pacer.target(Instant::now(), self.world.now()).min(last);
             if target > self.world.now() {
                 self.world.run_until(target);
-                self.exchange(&mut pacer)?;
             } else {
                 match &mut self.server {
                     Some(server) => server.wait(NAP),
                     None => std::thread::sleep(NAP),
                 }
-                self.exchange(&mut pacer)?;
             }
+            self.exchange(&mut pacer);
             self.tell()?;
             if flushed.elapsed() > FLUSH {
                 self.flush()?;
@@ -338,49 +336,37 @@ impl Bench {
     }
 
     /// Lets the clients take part.
-    fn exchange(&mut self, pacer: &mut Pacer) -> Result<()> {
+    fn exchange(&mut self, pacer: &mut Pacer) {
         let Some(server) = &mut self.server else {
             // Nobody wants the frames.
             while self.world.receive(self.port).is_some() {}
-            return Ok(());
+            return;
         };
         if server.exchange(&mut self.world, self.port) > 0 {
             pacer.delivered(Instant::now());
         }
-        server.notices().iter().try_for_each(|notice| say(&format!("{} {notice}", self.world.now())))
+        let now = self.world.now();
+        self.said.borrow_mut().extend(server.notices().into_iter().map(|notice| (now, notice)));
     }
 
-    /// Says what has happened since the last time.
+    /// Says what has happened since the last time, in the order in which it did.
     fn tell(&mut self) -> Result<()> {
         let mut lines = std::mem::take(&mut *self.said.borrow_mut());
         while let Some(news) = self.world.news() {
             let n = self.boards.iter().position(|board| board.id == news.machine).unwrap_or(0);
-            let (cfsr, hfsr) = self.world.machine(news.machine).fault_status();
-            let text = match news.stop {
-                Stop::Deadline | Stop::Attention => continue,
-                Stop::Reset(ResetCause::PowerOn) => continue,
-                Stop::Reset(ResetCause::Pin) => "reset by the pin NRST".into(),
-                Stop::Reset(ResetCause::Software) => "reset by its software".into(),
-                Stop::Reset(ResetCause::IndependentWatchdog) => "reset by the watchdog".into(),
-                Stop::PowerCut => "the power is cut".into(),
-                Stop::Lockup => format!(
-                    "the CPU has locked up (CFSR {cfsr:08X}h, HFSR {hfsr:08X}h): only a reset helps it"
-                ),
-            };
-            lines.push(format!("{} {}: {text}", news.at, self.name(n)));
+            if let Some(text) = happened(news.stop, self.world.machine(news.machine).fault_status()) {
+                lines.push((news.at, format!("{}: {text}", self.name(n))));
+            }
         }
         for n in 0..self.boards.len() {
-            let board = &self.boards[n];
+            let (name, board) = (self.name(n), &mut self.boards[n]);
             let reports = self.world.machine(board.id).reports();
-            let name = self.name(n);
-            lines.extend(
-                reports[board.shown..]
-                    .iter()
-                    .map(|report| format!("{} {name}: {}", report.time, unmodelled(report))),
-            );
-            self.boards[n].shown = reports.len();
+            let new = reports.get(board.shown..).unwrap_or_default();
+            lines.extend(new.iter().map(|report| (report.time, format!("{name}: {}", unmodelled(report)))));
+            board.shown = reports.len();
         }
-        lines.iter().try_for_each(|line| say(line))
+        lines.sort_by_key(|(at, _)| *at);
+        lines.iter().try_for_each(|(at, line)| say(&format!("{at} {line}")))
     }
 
     fn flush(&self) -> Result<()> {
@@ -406,6 +392,20 @@ impl Bench {
         }
         Ok(())
     }
+}
+
+/// What happened to a board, in words; nothing where it did not happen to it but was asked for.
+fn happened(stop: Stop, (cfsr, hfsr): (u32, u32)) -> Option<String> {
+    Some(match stop {
+        Stop::Deadline | Stop::Attention | Stop::Reset(ResetCause::PowerOn) => return None,
+        Stop::Reset(ResetCause::Pin) => "reset by the pin NRST".into(),
+        Stop::Reset(ResetCause::Software) => "reset by its software".into(),
+        Stop::Reset(ResetCause::IndependentWatchdog) => "reset by the watchdog".into(),
+        Stop::PowerCut => "the power is cut".into(),
+        Stop::Lockup => {
+            format!("the CPU has locked up (CFSR {cfsr:08X}h, HFSR {hfsr:08X}h): only a reset helps it")
+        }
+    })
 }
 
 /// A report in words, without its time and its count.
