@@ -1,0 +1,149 @@
+//! The EDS files against a checker, an importer and a client that we did not write, and against the device.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::{env, fs};
+
+use coboot_tests::bench::Bench;
+use coboot_tests::eds::{self, Image};
+use coboot_tests::endpoint::Endpoint;
+use coboot_tests::firmware;
+use coflash::flash::{flash, FlashOptions};
+
+fn images() -> [Image; 2] {
+    [eds::bootloader(), eds::application()]
+}
+
+fn committed(image: &Image) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/eds").join(image.file)
+}
+
+/// The python of `cargo xtask test`, with the pinned third-party packages.
+fn python() -> PathBuf {
+    env::var_os("COBOOT_PYTHON")
+        .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"))
+        .into()
+}
+
+fn text(output: &Output) -> String {
+    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
+}
+
+/// dcfchk of dcf-tools: whether it finds no fault, and what it says.
+fn dcfchk(eds: &Path) -> (bool, String) {
+    // Installed beside the interpreter, whose name may be a link: it is not resolved.
+    let output = Command::new(python().with_file_name("dcfchk")).arg(eds).output().expect("dcfchk starts");
+    (output.status.success(), text(&output))
+}
+
+#[test]
+fn the_committed_files_are_what_the_tables_give() {
+    for image in images() {
+        let file = fs::read_to_string(committed(&image)).expect("docs/eds is committed");
+        assert_eq!(file, image.eds(), "{} is out of date: run `cargo xtask eds`", image.file);
+    }
+}
+
+#[test]
+fn dcfchk_finds_no_fault_in_the_files_and_one_in_each_damaged_copy() {
+    for image in images() {
+        let (good, said) = dcfchk(&committed(&image));
+        assert!(good && said.is_empty(), "{}: {said}", image.file);
+    }
+
+    let image = eds::bootloader();
+    let whole = image.eds();
+    let faults = [
+        (
+            "type",
+            "[1001]\nParameterName=Error register\nObjectType=0x7\nDataType=0x0005\n",
+            "DataType=0x0005\n",
+            "",
+        ),
+        ("range", "[1018sub0]", "DefaultValue=4", "DefaultValue=256"),
+        ("access", "[1000]", "AccessType=const", "AccessType=none"),
+        ("number", "[1F50]", "SubNumber=2", "SubNumber=3"),
+        ("list", "[MandatoryObjects]", "1=0x1000", "1=0x1002"),
+        ("name", "[1008]", "ParameterName=", "ParameterNumber="),
+    ];
+    for (fault, section, good, bad) in faults {
+        let at = whole.find(section).unwrap_or_else(|| panic!("{fault}: no {section}"));
+        let (before, behind) = whole.split_at(at);
+        assert!(behind.contains(good), "{fault}: no {good}");
+        let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("fault-{fault}.eds"));
+        fs::write(&path, format!("{before}{}", behind.replacen(good, bad, 1))).unwrap();
+        let (good, said) = dcfchk(&path);
+        assert!(!good, "the fault \"{fault}\" was not found: {said}");
+    }
+}
+
+fn board() -> Bench {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    bench
+}
+
+/// The board with version 1 of the application running.
+fn board_with_application() -> Bench {
+    let mut bench = board();
+    let file = firmware::blocks(firmware::APP_V1);
+    flash(&mut bench.session(), &file, &FlashOptions::default(), &mut |_| {}).expect("it takes the program");
+    assert_eq!(bench.session().device_type().unwrap().map(|running| running.is_bootloader()), Some(false));
+    bench
+}
+
+/// python-canopen imports the file, reads every value of the device and compares.
+fn compare(image: &Image, bench: Bench) {
+    let mut endpoint = Endpoint::new(bench);
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/eds_client.py");
+    let mut client = Command::new(python());
+    client.arg(script).arg(endpoint.address()).arg(committed(image));
+    let output = endpoint.run(&mut client);
+    let said = text(&output);
+    assert!(output.status.success(), "{said}");
+    let summary = format!("{} values compared, 0 differ", image.entries.len());
+    assert!(said.contains(&summary), "no {summary:?} in:\n{said}");
+    endpoint.bench.assert_nothing_unmodelled();
+}
+
+#[test]
+fn python_canopen_finds_the_bootloader_as_its_file_says() {
+    compare(&eds::bootloader(), board());
+}
+
+#[test]
+fn python_canopen_finds_the_application_as_its_file_says() {
+    compare(&eds::application(), board_with_application());
+}
+
+/// The other direction: the device has nothing that the file does not name.
+fn survey(image: &Image, mut bench: Bench) {
+    let there: Vec<u16> = (0x1000_u16..0x2000)
+        .filter(|index| {
+            let [low, high] = index.to_le_bytes();
+            let answer = bench.ask(0x601, &[0x40, low, high, 0, 0, 0, 0, 0], 0x581);
+            let answer = answer.unwrap_or_else(|| panic!("no answer about {index:04X}h"));
+            // 06020000h, "object does not exist", little-endian.
+            answer[0] != 0x80 || answer[4..] != [0x00, 0x00, 0x02, 0x06]
+        })
+        .collect();
+    let named: Vec<u16> =
+        image.indices().into_iter().filter(|index| (0x1000..0x2000).contains(index)).collect();
+    assert_eq!(there, named, "{}", image.file);
+
+    // LSS: "switch state global, configuration", then "inquire node-ID".
+    bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+    let answer = bench.ask(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0], 0x7E4);
+    assert_eq!(answer.is_some(), image.lss, "{}: LSS_Supported", image.file);
+}
+
+#[test]
+fn the_bootloader_has_no_object_that_its_file_does_not_name() {
+    survey(&eds::bootloader(), board());
+}
+
+#[test]
+fn the_application_has_no_object_that_its_file_does_not_name() {
+    survey(&eds::application(), board_with_application());
+}
