@@ -13,6 +13,9 @@ Sets the machine up, builds the firmware and runs the emulated board with the bo
   --yes           installs what is missing with sudo
   OPTIONS         go to the emulator; `cargo xtask emulate -- --help` lists them. Among them:
                   --socketcand 127.0.0.1:29536    where other programs reach the bus
+                  --app FILE                      an application in flash, as a debug probe puts it there
+                  --trace FILE                    the bus as a candump log
+                  --bootloader FILE               another bootloader than the one built here
 ";
 
 pub fn run(mut args: Args) -> Outcome {
@@ -21,9 +24,12 @@ pub fn run(mut args: Args) -> Outcome {
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
     let images = build::images(board)?;
 
+    let options = args.rest();
     let mut emulator = process::cargo("run");
-    emulator.args(["--package", "emulator", "--bin", "emulate", "--"]);
-    emulator.args(args.rest().iter().filter(|word| *word != "--"));
-    emulator.arg(&images.bootloader);
+    emulator.args(["--package", "emulator", "--bin", "emulate", "--", "--board", board.board]);
+    if !options.iter().any(|word| word == "--bootloader" || word.starts_with("--bootloader=")) {
+        emulator.arg("--bootloader").arg(&images.bootloader);
+    }
+    emulator.args(options.iter().filter(|word| *word != "--"));
     process::run(&mut emulator)
 }

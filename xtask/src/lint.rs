@@ -24,20 +24,23 @@ pub fn run(mut args: Args) -> Outcome {
     args.none_left()?;
     setup.prepare(&[Part::Lint, Part::Firmware, Part::Emulator])?;
 
-    process::run(process::cargo("fmt").args(["--all", "--check"]))
-        .map_err(|_| "some files are not formatted; `cargo fmt --all` does it.".to_owned())?;
-    process::run(process::cargo("clippy").current_dir(workspace::root()).args([
-        "--all-targets",
-        "--",
-        "--deny",
-        "warnings",
-    ]))?;
-    for (package, features) in FIRMWARE {
-        process::run(
-            process::cargo("clippy")
-                .args(build::firmware_args(package, board, features))
-                .args(["--", "--deny", "warnings"]),
-        )?;
+    // All of them, so that one run shows all there is to mend.
+    let mut problems = Vec::new();
+    if process::run(process::cargo("fmt").args(["--all", "--check"])).is_err() {
+        problems.push("some files are not formatted; `cargo fmt --all` does it.".to_owned());
     }
-    Ok(())
+    let mut clippy = |args: &[String]| {
+        let mut clippy = process::cargo("clippy");
+        clippy.current_dir(workspace::root()).args(args).args(["--", "--deny", "warnings"]);
+        problems.extend(process::run(&mut clippy).err());
+    };
+    clippy(&["--all-targets".to_owned()]);
+    for (package, features) in FIRMWARE {
+        clippy(&build::firmware_args(package, board, features));
+    }
+    if problems.is_empty() {
+        Ok(())
+    } else {
+        Err(problems.join("\n       "))
+    }
 }

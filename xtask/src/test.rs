@@ -58,17 +58,23 @@ pub fn run(mut args: Args) -> Outcome {
     }
     let status = tests.wait().map_err(|error| process::not_started(&cargo, &error))?;
 
+    if !status.success() && summary.failed == 0 {
+        // It counts as a failure, so that the last line never looks better than the run was.
+        summary.failed = 1;
+        summary.names_of_failed.push("something that did not build, or a test program that broke off".into());
+    }
+
     println!();
     for name in &summary.names_of_failed {
         println!("FAILED: {name}");
     }
     println!("{} test programs in {} s", summary.programs, started.elapsed().as_secs());
     println!("{}", summary.line());
-    match (status.success(), summary.failed, summary.programs) {
-        (true, 0, 1..) => Ok(()),
-        (true, 0, 0) => Err("no test ran.".into()),
-        (_, 0, _) => Err("something did not build, or a test program broke off; see above.".into()),
-        (_, failed, _) => Err(format!("{failed} tests failed; their output stands above.")),
+    match summary.failed {
+        0 if summary.programs == 0 => Err("no test ran.".into()),
+        0 => Ok(()),
+        1 => Err("1 test failed; its output stands above.".into()),
+        failed => Err(format!("{failed} tests failed; their output stands above.")),
     }
 }
 
