@@ -428,7 +428,9 @@ mod tests {
             self.now
         }
         fn run_until(&mut self, deadline: Time) {
-            while !self.stuck && self.now < deadline && !self.can.wants_attention() {
+            assert!(!self.can.wants_attention(), "it must wait for the bus first");
+            let mut attention = false;
+            while !self.stuck && self.now < deadline && !attention {
                 self.now = self.now + self.step;
                 if self.can.read(0x0C, self.now).unwrap() & 3 > 0 {
                     let id = self.can.read(0x1B0, self.now).unwrap() >> 21;
@@ -441,6 +443,7 @@ mod tests {
                     self.next_send = self.next_send + self.period;
                     self.transmit(self.id);
                 }
+                attention = self.can.wants_attention();
             }
         }
         fn can(&mut self) -> &mut BxCan {
