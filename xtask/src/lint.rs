@@ -34,7 +34,7 @@ pub fn run(mut args: Args) -> Outcome {
         clippy.current_dir(workspace::root()).args(args).args(["--", "--deny", "warnings"]);
         problems.extend(process::run(&mut clippy).err());
     };
-    clippy(&["--all-targets".to_owned()]);
+    clippy(&["--all-targets", "--keep-going"].map(str::to_owned));
     for (package, features) in FIRMWARE {
         clippy(&build::firmware_args(package, board, features));
     }

@@ -14,6 +14,7 @@ mod demo;
 mod eds;
 mod elf;
 mod emulate;
+mod fuzz;
 mod json;
 mod layout;
 mod lint;
@@ -69,6 +70,12 @@ const JOBS: &[Job] = &[
         run: layout::run,
     },
     Job { name: "eds", about: "the EDS files of bootloader and application", help: eds::HELP, run: eds::run },
+    Job {
+        name: "fuzz",
+        about: "the fuzz targets, each for a while (nightly toolchain)",
+        help: fuzz::HELP,
+        run: fuzz::run,
+    },
     Job {
         name: "size",
         about: "the bootloader's flash against its budget",

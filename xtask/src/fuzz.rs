@@ -1,0 +1,213 @@
+//! `cargo xtask fuzz`: all fuzz targets, one after the other.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::{env, fs};
+
+use crate::args::Args;
+use crate::{process, workspace, Outcome};
+
+pub const HELP: &str = "\
+usage: cargo xtask fuzz [--seconds N] [--target NAME]
+
+Runs the fuzz targets of fuzz/: SDO server, SDO client, the wire between them, LSS, program download,
+parameter journal, firmware files. What they find in this run is built upon in the next one.
+
+  --seconds N     how long each target runs (default: 30)
+  --target NAME   this one alone
+
+It needs a nightly toolchain of Rust and a C++ compiler. cargo-fuzz is installed into target/tools
+where it is missing.
+";
+
+/// The version that is installed where there is none.
+const CARGO_FUZZ: &str = "0.13.2";
+/// How long a target may take for one input, in seconds. They take microseconds.
+const TOO_LONG: u32 = 10;
+
+pub fn run(mut args: Args) -> Outcome {
+    let seconds = seconds(args.value("--seconds")?)?;
+    let only = args.value("--target")?;
+    args.none_left()?;
+    let folder = workspace::root().join("fuzz");
+    let mut targets = targets(&folder)?;
+    if let Some(name) = only {
+        if !targets.contains(&name) {
+            return Err(format!("there is no target \"{name}\"; there is: {}.", targets.join(", ")));
+        }
+        targets = vec![name];
+    }
+    toolchain()?;
+    let path = cargo_fuzz()?;
+
+    let fuzz = |words: &[&str]| {
+        let mut command = Command::new("rustup");
+        command.args(["run", "nightly", "cargo", "fuzz"]).args(words).current_dir(workspace::root());
+        command.env("PATH", &path).env("CARGO_TARGET_DIR", target_dir()).env_remove("CARGO");
+        command
+    };
+    println!("Building the fuzz targets ...");
+    process::run(&mut fuzz(&["build"]))?;
+    let mut failed = Vec::new();
+    for target in &targets {
+        let corpus = folder.join("corpus").join(target);
+        fs::create_dir_all(&corpus).map_err(|error| unwritable(&corpus, &error))?;
+        let log = target_dir().join(target).with_extension("log");
+        let file = fs::File::create(&log).map_err(|error| unwritable(&log, &error))?;
+        let mut command = fuzz(&["run", target]);
+        command.arg(&corpus);
+        let seeds = folder.join("seeds").join(target);
+        if seeds.is_dir() {
+            command.arg(&seeds);
+        }
+        command.args(["--", "-print_final_stats=1"]);
+        command.args([format!("-max_total_time={seconds}"), format!("-timeout={TOO_LONG}")]);
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(file);
+        let status = command.status().map_err(|error| process::not_started(&command, &error))?;
+        let said = fs::read(&log).unwrap_or_default();
+        let said = String::from_utf8_lossy(&said);
+        match (status.success(), runs(&said)) {
+            (true, Some(runs @ 1..)) => println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault"),
+            (good, _) => {
+                let words = if good { "ran no input" } else { "FAILED" };
+                println!("  {target:<16} {words}; all of it is in {}", workspace::shown(&log));
+                print!("{}", excerpt(&said));
+                failed.push(target.as_str());
+            }
+        }
+    }
+    if failed.is_empty() {
+        Ok(())
+    } else {
+        Err(format!(
+            "{} failed. `cargo +nightly fuzz run TARGET FILE` repeats one with the file named above; make a test of \
+             it before you mend it.",
+            failed.join(", ")
+        ))
+    }
+}
+
+fn seconds(value: Option<String>) -> Outcome<u32> {
+    let Some(value) = value else { return Ok(30) };
+    // 0 would mean "for ever" to the fuzzer.
+    match value.parse() {
+        Ok(seconds @ 1..) => Ok(seconds),
+        _ => Err(format!("--seconds takes a number from 1 on, not \"{value}\".")),
+    }
+}
+
+/// The targets, by the names of their files.
+fn targets(folder: &Path) -> Outcome<Vec<String>> {
+    let folder = folder.join("fuzz_targets");
+    let files = fs::read_dir(&folder)
+        .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&folder)))?;
+    let mut names: Vec<String> = files
+        .flatten()
+        .map(|file| file.path())
+        .filter(|path| path.extension().is_some_and(|extension| extension == "rs"))
+        .filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned()))
+        .collect();
+    names.sort();
+    Ok(names)
+}
+
+fn target_dir() -> PathBuf {
+    workspace::target_dir().join("fuzz")
+}
+
+fn unwritable(path: &Path, error: &std::io::Error) -> String {
+    format!("{} cannot be written: {error}.", workspace::shown(path))
+}
+
+/// The sanitizer and the coverage counters are features of the nightly compiler.
+fn toolchain() -> Outcome {
+    if !process::succeeds("rustup", &["run", "nightly", "rustc", "--version"]) {
+        return Err("fuzzing needs a nightly toolchain. Run this line and try again:\n\n    \
+                    rustup toolchain install nightly"
+            .into());
+    }
+    let compiler = env::var_os("CXX").unwrap_or_else(|| "c++".into());
+    if !process::succeeds(compiler, &["--version"]) {
+        return Err("the fuzzer's library is C++, and there is no compiler for it. Run this line and try again:\n\n    \
+                    sudo apt-get install -y build-essential"
+            .into());
+    }
+    Ok(())
+}
+
+/// Sees to it that there is a cargo-fuzz; gives the PATH with it.
+fn cargo_fuzz() -> Outcome<std::ffi::OsString> {
+    let tools = workspace::target_dir().join("tools");
+    let mut folders = vec![tools.join("bin")];
+    folders.extend(env::split_paths(&env::var_os("PATH").unwrap_or_default()));
+    let there =
+        |folder: &PathBuf| folder.join("cargo-fuzz").with_extension(env::consts::EXE_EXTENSION).is_file();
+    if !folders.iter().any(there) {
+        println!("Installing cargo-fuzz into {} ...", workspace::shown(&tools));
+        let mut install = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+        install.args(["install", "--quiet", "--locked", "cargo-fuzz", "--version", CARGO_FUZZ, "--root"]);
+        install.arg(&tools).env("CARGO_TARGET_DIR", tools.join("build"));
+        process::run(&mut install)
+            .map_err(|problem| format!("{problem} It needs a connection to crates.io, once."))?;
+    }
+    env::join_paths(folders).map_err(|error| format!("the PATH cannot be extended: {error}."))
+}
+
+/// How many inputs the fuzzer says it has run.
+fn runs(said: &str) -> Option<u64> {
+    said.lines().find_map(|line| line.strip_prefix("stat::number_of_executed_units:")?.trim().parse().ok())
+}
+
+/// What of a failed run tells why: the panic with its message, and where the input is.
+fn excerpt(said: &str) -> String {
+    let mut text = String::new();
+    let mut more = 0;
+    for line in said.lines() {
+        if line.contains("panicked at") || line.contains("ERROR: libFuzzer") {
+            more = 4;
+        }
+        let input = line.contains("Test unit written to");
+        if more > 0 || input {
+            text += &format!("    {line}\n");
+        }
+        more -= i32::from(more > 0);
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_target_is_declared_and_named_in_the_help() {
+        let folder = workspace::root().join("fuzz");
+        let manifest = fs::read_to_string(folder.join("Cargo.toml")).unwrap();
+        let targets = targets(&folder).unwrap();
+        assert!(targets.iter().any(|target| target == "lss"), "{targets:?}");
+        for target in targets {
+            assert!(manifest.contains(&format!("path = \"fuzz_targets/{target}.rs\"")), "{target}");
+        }
+    }
+
+    #[test]
+    fn a_time_is_a_number_from_one_on() {
+        assert_eq!(seconds(None), Ok(30));
+        assert_eq!(seconds(Some("5".into())), Ok(5));
+        for wrong in ["0", "-1", "x", "", "1.5"] {
+            assert!(seconds(Some(wrong.into())).is_err(), "{wrong}");
+        }
+    }
+
+    /// Lines as libFuzzer prints them.
+    #[test]
+    fn the_fuzzers_words_are_understood() {
+        let said = "#918484\tDONE   cov: 741 ft: 3053\nstat::number_of_executed_units: 918484\nstat::average_exec_per_sec:     57405\n";
+        assert_eq!((runs(said), excerpt(said)), (Some(918_484), String::new()));
+        let said = "INFO: seed\nthread '<unnamed>' panicked at src/x.rs:1:2:\nno room\n==1== ERROR: libFuzzer: deadly signal\n\
+                    Test unit written to crash-1\n";
+        assert_eq!(runs(said), None);
+        let excerpt = excerpt(said);
+        assert!(excerpt.contains("no room") && excerpt.contains("crash-1") && !excerpt.contains("seed"));
+    }
+}
