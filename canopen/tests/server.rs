@@ -360,6 +360,24 @@ fn a_full_consumer_holds_the_answer_back() {
     still_serves(&mut bench);
 }
 
+/// Found by fuzzing: such a client was not held back by the answer that it did not wait for.
+#[test]
+fn a_client_that_sends_regardless_of_room_is_refused() {
+    let out_of_memory = [0x80, 0x50, 0x1F, 1, 0x05, 0x00, 0x04, 0x05];
+    let mut bench = Bench::new();
+    bench.device.space = Some(8);
+    bench.expect(&[START_9]);
+    assert_eq!(bench.ask(FIRST.0), None);
+    bench.expect(&[([0x1B, 8, 9, 0, 0, 0, 0, 0], out_of_memory)]);
+    assert_eq!(bench.device.events.last(), Some(&Event::Cancel));
+    bench.device.space = Some(3);
+    bench.expect(&[([0x23, 0x50, 0x1F, 1, 1, 2, 3, 4], out_of_memory)]);
+    assert_eq!(bench.device.events.last(), Some(&Event::Cancel));
+    assert_eq!(bench.device.space, Some(3));
+    bench.device.space = None;
+    still_serves(&mut bench);
+}
+
 #[test]
 fn what_is_no_sdo_gets_silence() {
     let mut bench = Bench::new();

@@ -590,6 +590,10 @@ impl Incoming {
         }
         if self.is_domain() {
             if !data.is_empty() {
+                // Held back are the answers; a client that sends without having got one, or expedited, is refused.
+                if objects.download_space(at) < data.len() {
+                    return Err(AbortCode::OUT_OF_MEMORY);
+                }
                 objects.download_data(at, data)?;
             }
         } else {
