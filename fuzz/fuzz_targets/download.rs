@@ -1,0 +1,174 @@
+//! The program download against any blocks and commands in any order, with the flash's work done or not in between.
+//!
+//! Must hold: nothing outside the program's region and the parameters is ever written (the flash refuses more than the chip
+//! would); and afterwards CLEAR and a correct sequence of blocks install a program.
+#![no_main]
+
+use boot_core::download::{Downloader, Step};
+use canopen::program::{FlashError, FlashStatus, ProgramControl};
+use coboot_fuzz::model::ModelFlash;
+use coboot_fuzz::Input;
+use coflash::block_file::{Block, CRC};
+use libfuzzer_sys::fuzz_target;
+use shared_abi::geometry::{Geometry, Region, SectorRun, STM32F407VG};
+use shared_abi::layout::Layout;
+
+/// The F407 with sectors a 64th of their size: the same shape, and cheap to erase in a model.
+static CHIP: Geometry = Geometry {
+    chip: "small-f407",
+    flash: Region::new(0x0800_0000, 0x4400),
+    sectors: &[
+        SectorRun { count: 4, size: 0x200 },
+        SectorRun { count: 1, size: 0x400 },
+        SectorRun { count: 7, size: 0x800 },
+    ],
+    interrupts: 4,
+    ..STM32F407VG
+};
+static LAYOUT: Layout = Layout {
+    board: "model",
+    chip: &CHIP,
+    bootloader: Region::new(0x0800_0000, 0x400),
+    callgate_offset: 0x200,
+    parameters: [Region::new(0x0800_0400, 0x200), Region::new(0x0800_0600, 0x200)],
+    programs: &[Region::new(0x0800_0800, 0x3C00)],
+    ram: Region::new(0x2000_0000, 0x1_FFC0),
+    handoff: Region::new(0x2001_FFC0, 48),
+    warm_start: Region::new(0x2001_FFF0, 16),
+}
+.checked();
+
+/// The largest block that the device takes.
+const BUFFER: usize = 256;
+const LAST: u32 = u32::MAX;
+
+fuzz_target!(|bytes: &[u8]| {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut buffer = [0; BUFFER];
+    let mut device = Downloader::<1>::new(&LAYOUT, &flash, &mut buffer);
+    let mut input = Input::new(bytes);
+    let mut next = 0_u32;
+    // Whether the SDO server has a transfer open: it calls nothing else then.
+    let mut open = false;
+    while let Some(action) = input.byte() {
+        match action {
+            // A block that may be good: number, place and size as they should be, or not.
+            0..=89 => {
+                let Some([how, number, place, len]) = input.array() else { break };
+                let number = match how & 3 {
+                    0 => LAST,
+                    1 => number.into(),
+                    _ => next,
+                };
+                let address = match how >> 2 & 3 {
+                    0 => 0x0800_0000 + u32::from(place) * 0x80,
+                    1 => u32::MAX - u32::from(place),
+                    _ => 0x0800_0800 + u32::from(place) * 4,
+                };
+                let data = input.take(usize::from(len)).to_vec();
+                let mut block = Block { number, flash_address: address, data }.emit();
+                if how & 0x10 != 0 {
+                    let middle = block.len() / 2;
+                    block[middle] ^= 1 << (how >> 5);
+                }
+                if send(&mut device, &flash, &block).is_ok() {
+                    next = number.wrapping_add(1);
+                }
+                open = false;
+            }
+            90..=119 => {
+                let Some([value]) = input.array() else { break };
+                if let (Ok(command), false) = (ProgramControl::try_from(value), open) {
+                    let _ = device.command(1, command);
+                    if command == ProgramControl::Clear {
+                        next = 0;
+                    }
+                }
+            }
+            // Any bytes, in pieces as the bus brings them.
+            120..=139 => {
+                if open {
+                    device.block_cancel();
+                }
+                let size = (action & 1 != 0).then_some(u32::from(action) * 3);
+                open = device.block_start(1, size).is_ok();
+            }
+            140..=159 => {
+                let data = input.take(usize::from(action % 8));
+                if open && !data.is_empty() && device.block_data(data).is_err() {
+                    device.block_cancel();
+                    open = false;
+                }
+            }
+            160..=169 => {
+                if std::mem::take(&mut open) {
+                    let _ = device.block_end(&flash);
+                }
+            }
+            170..=179 => {
+                if std::mem::take(&mut open) {
+                    device.block_cancel();
+                }
+            }
+            180..=219 => drop(device.step(&mut flash)),
+            _ => settle(&mut device, &mut flash),
+        }
+        if device.take_leave().is_some() {
+            // The device resets.
+            break;
+        }
+    }
+    flash.power_on();
+    for region in &flash.touched {
+        let program = LAYOUT.programs[0];
+        let parameters = LAYOUT.parameters;
+        let inside = [program, parameters[0], parameters[1]];
+        assert!(inside.iter().any(|own| own.contains(region.base, region.size)), "{region:?} was written");
+    }
+
+    let mut buffer = [0; BUFFER];
+    let mut device = Downloader::<1>::new(&LAYOUT, &flash, &mut buffer);
+    device.command(1, ProgramControl::Clear).expect("CLEAR");
+    settle(&mut device, &mut flash);
+    assert_eq!(device.status(1), FlashStatus::OK);
+    // Initial stack pointer, reset vector, and something to count.
+    let mut program = vec![0; 100];
+    program[..8].copy_from_slice(&[0x00, 0xF0, 0x01, 0x20, 0x51, 0x08, 0x00, 0x08]);
+    let crc = CRC.checksum(&program);
+    let mut last = (program.len() as u32).to_le_bytes().to_vec();
+    last.extend(crc.to_le_bytes());
+    let good = [(0, 0, vec![0; 8]), (1, 0x0800_0800, program), (LAST, 0, last)];
+    for (number, flash_address, data) in good {
+        let block = Block { number, flash_address, data }.emit();
+        assert_eq!(send(&mut device, &flash, &block), Ok(()), "block {number}");
+        settle(&mut device, &mut flash);
+        assert_eq!(device.status(1), FlashStatus::OK, "block {number}");
+    }
+    assert_eq!(device.identification(1), crc);
+    device.command(1, ProgramControl::Start).expect("START");
+    assert_ne!(device.status(1).error, Some(FlashError::NoValidProgram));
+    assert!(device.take_leave().is_some(), "the program does not start");
+});
+
+/// What the SDO server does with a block.
+fn send(device: &mut Downloader<'_, 1>, flash: &ModelFlash, block: &[u8]) -> Result<(), canopen::AbortCode> {
+    device.block_cancel();
+    device.block_start(1, Some(block.len() as u32))?;
+    for piece in block.chunks(7) {
+        if let Err(code) = device.block_data(piece) {
+            device.block_cancel();
+            return Err(code);
+        }
+    }
+    device.block_end(flash)
+}
+
+/// Lets the flash's work come to its end.
+fn settle(device: &mut Downloader<'_, 1>, flash: &mut ModelFlash) {
+    for _ in 0..200_000 {
+        if device.step(flash) == Step::Idle && !device.busy() {
+            return;
+        }
+    }
+    panic!("the work never ends");
+}

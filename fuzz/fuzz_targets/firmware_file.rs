@@ -1,0 +1,56 @@
+//! The readers of firmware files (Intel HEX, S-record, ELF, block file, raw) and the conversion behind them.
+//!
+//! Must hold: any bytes give an image or an error that can be shown; an image that can be converted gives a block file that reads
+//! back as the same, with every byte of the image in it; a block file is written as it was read.
+#![no_main]
+
+use coflash::block_file::BlockFile;
+use coflash::convert::{blocks_of, Options};
+use coflash::read::{read, Firmware, Format};
+use libfuzzer_sys::fuzz_target;
+
+const FORMATS: [Option<Format>; 6] = [
+    None,
+    Some(Format::IntelHex),
+    Some(Format::SRecord),
+    Some(Format::Elf),
+    Some(Format::BlockFile),
+    Some(Format::Raw),
+];
+
+fuzz_target!(|bytes: &[u8]| {
+    let Some((first, bytes)) = bytes.split_first() else { return };
+    let format = FORMATS[usize::from(*first) % FORMATS.len()];
+    match read(bytes, format, Some(0x0801_0000)) {
+        Err(error) => assert!(!error.of("file").to_string().is_empty()),
+        Ok(Firmware::Blocks(file)) => assert_eq!(file.emit(), bytes),
+        Ok(Firmware::Image(image)) => {
+            let segments: Vec<(u32, Vec<u8>)> = image.segments().collect();
+            assert!(!segments.is_empty());
+            for pair in segments.windows(2) {
+                let end = u64::from(pair[0].0) + pair[0].1.len() as u64;
+                assert!(end < u64::from(pair[1].0), "segments touch or overlap");
+            }
+            let span = image.span();
+            // A few bytes at both ends of the address space: no program, and not worth the memory.
+            if span.last - span.first > 1 << 20 {
+                return;
+            }
+            let Ok(converted) = blocks_of(Firmware::Image(image), &Options::default()) else { return };
+            let file = converted.file;
+            assert_eq!(BlockFile::parse(&file.emit()).expect("what was written reads back"), file);
+            for (address, data) in segments {
+                for (address, byte) in (address..=u32::MAX).zip(data) {
+                    assert_eq!(byte_at(&file, address), Some(byte), "at {address:08X}h");
+                }
+            }
+        }
+    }
+});
+
+fn byte_at(file: &BlockFile, address: u32) -> Option<u8> {
+    file.program_blocks().iter().find_map(|block| {
+        let offset = address.checked_sub(block.flash_address)?;
+        block.data.get(offset as usize).copied()
+    })
+}

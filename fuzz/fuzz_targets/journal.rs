@@ -1,0 +1,59 @@
+//! The journal of parameters on two sectors of any contents.
+//!
+//! Must hold: opening and reading survive anything; a value that was stored well reads back, now and after the next start, and
+//! the other one stays as it was.
+#![no_main]
+
+use std::task::Poll;
+
+use boot_core::parameters::{Journal, Key};
+use coboot_fuzz::model::ModelFlash;
+use coboot_fuzz::Input;
+use libfuzzer_sys::fuzz_target;
+use shared_abi::geometry::{Geometry, Region, SectorRun, STM32F407VG};
+
+static CHIP: Geometry = Geometry {
+    chip: "two-sectors",
+    flash: Region::new(0x0800_0000, 0x400),
+    sectors: &[SectorRun { count: 2, size: 0x200 }],
+    ..STM32F407VG
+};
+const REGIONS: [Region; 2] = [Region::new(0x0800_0000, 0x200), Region::new(0x0800_0200, 0x200)];
+const KEYS: [Key; 3] = [Key::Program(1), Key::Program(2), Key::CrashCount];
+
+fuzz_target!(|bytes: &[u8]| {
+    let mut input = Input::new(bytes);
+    let mut flash = ModelFlash::new(&CHIP);
+    let Some([fills, stores]) = input.array() else { return };
+    for _ in 0..fills % 8 {
+        let Some([low, high, len]) = input.array() else { break };
+        let at = u32::from(u16::from_le_bytes([low, high]) % 0x400);
+        let most = (0x400 - at).min(len.into()) as usize;
+        flash.poke(0x0800_0000 + at, input.take(most));
+    }
+    let mut journal = Journal::open(&flash, REGIONS);
+    for i in 0..stores {
+        let Some([which, byte]) = input.array() else { break };
+        let key = KEYS[usize::from(which) % KEYS.len()];
+        let value = [u32::from(byte), u32::from(i), u32::MAX, 0];
+        let before = KEYS.map(|key| journal.get(&flash, key));
+        let mut store = journal.store(key, value);
+        let outcome = (0..100_000).find_map(|_| match store.poll(&mut journal, &mut flash, &CHIP) {
+            Poll::Pending => None,
+            Poll::Ready(outcome) => Some(outcome),
+        });
+        let outcome = outcome.expect("a store that never ends");
+        if which & 0x80 != 0 {
+            flash.power_on();
+            journal = Journal::open(&flash, REGIONS);
+        }
+        for (other, before) in KEYS.into_iter().zip(before) {
+            let now = journal.get(&flash, other);
+            if other != key {
+                assert_eq!(now, before, "{other:?} changed while {key:?} was stored");
+            } else if outcome.is_ok() {
+                assert_eq!(now, Some(value), "{key:?} does not read back");
+            }
+        }
+    }
+});
