@@ -147,3 +147,18 @@ fn the_bootloader_has_no_object_that_its_file_does_not_name() {
 fn the_application_has_no_object_that_its_file_does_not_name() {
     survey(&eds::application(), board_with_application());
 }
+
+/// A new object is explained where people look for it.
+#[test]
+fn the_protocol_page_names_every_object() {
+    let page = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/protocol.md");
+    let page = fs::read_to_string(page).expect("docs/protocol.md is committed");
+    for image in images() {
+        for index in image.indices() {
+            assert!(
+                page.contains(&format!("\n| {index:04X}h")),
+                "docs/protocol.md has no row for {index:04X}h"
+            );
+        }
+    }
+}
