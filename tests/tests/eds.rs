@@ -9,6 +9,7 @@ use coboot_tests::eds::{self, Image};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coflash::flash::{flash, FlashOptions};
+use coflash::read::Firmware;
 
 fn images() -> [Image; 2] {
     [eds::bootloader(), eds::application()]
@@ -159,6 +160,23 @@ fn the_protocol_page_names_every_object() {
                 page.contains(&format!("\n| {index:04X}h")),
                 "docs/protocol.md has no row for {index:04X}h"
             );
+        }
+    }
+}
+
+/// Names and defaults are for the files; on the chip they would be paid for in flash.
+#[test]
+fn the_firmware_does_not_carry_the_names() {
+    for elf in [firmware::BOOTLOADER, firmware::APP_V1] {
+        let Ok(Firmware::Image(image)) = coflash::read::read(&firmware::elf(elf), None, None) else {
+            panic!("{elf} is no ELF of ours")
+        };
+        let has = |text: &str| {
+            image.segments().any(|(_, data)| data.windows(text.len()).any(|bytes| bytes == text.as_bytes()))
+        };
+        assert!(has(eds::bootloader().device.name), "{elf}: what 1008h reads should be there");
+        for entry in eds::bootloader().entries {
+            assert!(!has(entry.name), "{elf} carries {:?}: is canopen's feature `names` on?", entry.name);
         }
     }
 }
