@@ -132,7 +132,7 @@ mod app {
         let mut ticks = 0_u32;
         loop {
             rtic::pend(pac::Interrupt::CAN1_TX);
-            if ticks % (500 / TICK_MS) == 0 {
+            if ticks.is_multiple_of(500 / TICK_MS) {
                 cx.local.led.toggle();
             }
             ticks = ticks.wrapping_add(1);

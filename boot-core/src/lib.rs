@@ -18,4 +18,6 @@ pub mod flash;
 pub mod parameters;
 pub mod program;
 
+/// Frames, node and transfers, in which the core speaks: a firmware that uses this crate needs no other for them.
+pub use canopen;
 pub use program::crc32;

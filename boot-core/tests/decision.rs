@@ -60,7 +60,10 @@ fn what_asks_for_the_bootloader_wins() {
     let request = |request| Circumstances { request: Some(request), ..QUIET };
     assert_eq!(stay(request(BootRequest::Stay), policy()), StayReason::Requested);
     assert_eq!(stay(Circumstances { strap: true, ..QUIET }, policy()), StayReason::Strap);
-    assert_eq!(stay(Circumstances { strap: true, ..request(BootRequest::Start(1)) }, policy()), StayReason::Strap);
+    assert_eq!(
+        stay(Circumstances { strap: true, ..request(BootRequest::Start(1)) }, policy()),
+        StayReason::Strap
+    );
     assert_eq!(stay(Circumstances { crash_resets: 3, ..QUIET }, policy()), StayReason::CrashLoop);
     assert_eq!(stay(QUIET, Policy { autostart: None, ..policy() }), StayReason::NoAutostart);
     for node_id in [0, 101, 127, 255] {
@@ -102,5 +105,8 @@ fn any_damage_to_a_program_keeps_it_from_starting() {
     }
     let erased = check(true, |flash| flash.poke(0x0801_0000, &[0xFF; 64]));
     assert_eq!(erased, Err(Invalid::Vectors(VectorFault::StackPointer)));
-    assert!(check(true, |flash| flash.poke(0x0801_0040, &[0])).is_ok(), "what lies behind its size is not its own");
+    assert!(
+        check(true, |flash| flash.poke(0x0801_0040, &[0])).is_ok(),
+        "what lies behind its size is not its own"
+    );
 }

@@ -37,15 +37,15 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1, SPI2])]
 mod app {
     use boot_core::bootloader::Bootloader;
+    use boot_core::canopen::device::Device;
+    use boot_core::canopen::nmt::NmtCommand;
+    use boot_core::canopen::node::{Config, NmtPolicy, Node};
+    use boot_core::canopen::program::BOOTLOADER_DEVICE_TYPE;
+    use boot_core::canopen::{CobId, Frame, Instant, NodeId};
     use boot_core::download::Step;
     use bsp::can::{BitTiming, Transmitter};
     use bsp::{pac, CanController, BIT_RATE, IDENTITY, LAYOUT, NODE_ID};
     use bxcan::Rx0;
-    use canopen::device::Device;
-    use canopen::nmt::NmtCommand;
-    use canopen::node::{Config, NmtPolicy, Node};
-    use canopen::program::BOOTLOADER_DEVICE_TYPE;
-    use canopen::{CobId, Frame, Instant, NodeId};
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
     use shared_abi::block_file::MAX_BLOCK_SIZE;
@@ -207,7 +207,7 @@ mod app {
         let mut ticks = 0_u32;
         loop {
             rtic::pend(pac::Interrupt::CAN1_TX);
-            if ticks % (100 / TICK_MS) == 0 {
+            if ticks.is_multiple_of(100 / TICK_MS) {
                 cx.local.led.toggle();
             }
             ticks = ticks.wrapping_add(1);

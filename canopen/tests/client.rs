@@ -253,6 +253,17 @@ fn frames_of_others_and_late_answers_change_nothing() {
 }
 
 #[test]
+fn late_answers_do_not_put_off_the_time_out() {
+    let mut client = upload();
+    sends(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
+    for now in [300, 600, 900] {
+        client.handle(&response([0x43, 0x00, 0x10, 0, 9, 9, 9, 9]), at(now));
+        assert_eq!(client.poll(at(now)), Step::Wait(at(1000)));
+    }
+    aborts(&mut client, 1000, [0x80, 0x00, 0x20, 3, 0, 0, 4, 5], SdoError::NoAnswer);
+}
+
+#[test]
 fn a_caller_can_give_up() {
     let mut client = download(&[1, 2, 3, 4, 5]);
     sends(&mut client, 0, [0x21, 0x00, 0x20, 3, 5, 0, 0, 0]);

@@ -50,7 +50,7 @@ impl Bench {
         let mut world = World::empty();
         let heard = Rc::new(RefCell::new(Vec::new()));
         let ears = Rc::clone(&heard);
-        world.add_sink(move |record| ears.borrow_mut().push(record.clone()));
+        world.add_sink(move |record| ears.borrow_mut().push(*record));
         let device = world.add_machine(machine);
         let port = world.add_host_port(BIT_RATE);
         Self { world, device, port, heard, clock: Rc::default() }

@@ -15,7 +15,7 @@ use shared_abi::warm_start::{BootRequest, WarmStart};
 
 /// The bytes that a structure has in RAM. (The host is little-endian, as the chip is.)
 fn bytes<T: Copy>(value: &T) -> Vec<u8> {
-    assert!(cfg!(target_endian = "little"));
+    const { assert!(cfg!(target_endian = "little")) };
     // SAFETY: `T` is one of the ABI's `repr(C)` structures without padding (the sizes are checked in these tests).
     unsafe { std::slice::from_raw_parts(std::ptr::from_ref(value).cast(), size_of::<T>()) }.to_vec()
 }

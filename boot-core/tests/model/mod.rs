@@ -145,7 +145,7 @@ impl Flash for ModelFlash {
     }
 
     fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashFault> {
-        assert!(self.chip.flash.contains(address, 4) && address % 4 == 0, "{address:#x}");
+        assert!(self.chip.flash.contains(address, 4) && address.is_multiple_of(4), "{address:#x}");
         self.begin(Operation::Program { address, word })
     }
 

@@ -116,7 +116,7 @@ impl<D: AsRef<[u8]>> Download<D> {
                 Ok(Next::Send(Request::EndBlockDownload(BlockEnd { unused: unused as u8, crc })))
             }
             // The server's acknowledgement once more.
-            (Some(Response::AckBlockDownload(_)), State::EndingBlock) => Ok(Next::Wait),
+            (Some(Response::AckBlockDownload(_)), State::EndingBlock) => Ok(Next::Ignore),
             (Some(Response::EndBlockDownload), State::EndingBlock) => Ok(Next::Done(None)),
             (response, _) => self.link.unexpected(response),
         }

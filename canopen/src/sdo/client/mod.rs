@@ -149,6 +149,8 @@ struct Link {
 enum Next {
     Send(Request),
     Wait,
+    /// It was nothing: it does not count as life, or a stranger's answers would keep a transfer from its time-out.
+    Ignore,
     /// Well done; with a last word to the server, where it wants one.
     Done(Option<Request>),
 }
@@ -200,10 +202,12 @@ impl Link {
 
     /// Takes what follows from an answer.
     fn advance(&mut self, next: Result<Next, SdoError>, now: Instant) {
-        self.moved = now;
+        if !matches!(next, Ok(Next::Ignore)) {
+            self.moved = now;
+        }
         match next {
             Ok(Next::Send(request)) => self.request = Some(request),
-            Ok(Next::Wait) => {}
+            Ok(Next::Wait | Next::Ignore) => {}
             Ok(Next::Done(farewell)) => {
                 self.request = farewell;
                 self.result = Some(Ok(()));
@@ -229,7 +233,7 @@ impl Link {
                 | Response::InitiateUpload(at, _)
                 | Response::InitiateBlockDownload { at, .. }
                 | Response::InitiateBlockUpload { at, .. },
-            ) if at != self.at => Ok(Next::Wait),
+            ) if at != self.at => Ok(Next::Ignore),
             _ => Err(SdoError::Client(AbortCode::COMMAND)),
         }
     }

@@ -185,7 +185,7 @@ impl<S: Sink> Upload<S> {
 
     /// A frame within a sub-block.
     fn block_segment(&mut self, bytes: &[u8; 8]) -> Result<Next, SdoError> {
-        let State::Blocks(receiver) = &mut self.state else { return Ok(Next::Wait) };
+        let State::Blocks(receiver) = &mut self.state else { return Ok(Next::Ignore) };
         let Some(segment) = BlockSegment::parse(bytes) else {
             // No segment has sequence number 0, and an abort is the one answer that looks like this.
             return match Response::parse(bytes) {
@@ -206,9 +206,9 @@ impl<S: Sink> Upload<S> {
 
     /// A frame behind the last segment.
     fn end_of_blocks(&mut self, bytes: &[u8; 8], response: Option<Response>) -> Result<Next, SdoError> {
-        let State::Blocks(receiver) = &mut self.state else { return Ok(Next::Wait) };
+        let State::Blocks(receiver) = &mut self.state else { return Ok(Next::Ignore) };
         if receiver.is_duplicate_of_tail(bytes) {
-            return Ok(Next::Wait);
+            return Ok(Next::Ignore);
         }
         let Some(Response::EndBlockUpload(end)) = response else { return self.link.unexpected(response) };
         let tail = receiver.finish(&end).map_err(SdoError::Client)?;
