@@ -2,7 +2,7 @@
 
 use bsp::can::BitTiming;
 use bsp::{BIT_RATE, CAN_CLOCK, LAYOUT, NODE_ID};
-use canopen::{Instant, NodeId};
+use canopen::{BitRate, Instant, NodeId};
 use cortex_m::peripheral::SCB;
 use shared_abi::callgate::Callgate;
 use shared_abi::handoff::Handoff;
@@ -12,24 +12,27 @@ use shared_abi::warm_start::{BootRequest, Cell};
 /// How long the device stays after the answer to 80h is on the bus, in ms (SYS TEC manual L-1112d_10, 4.5).
 const FAREWELL_MS: u32 = 10;
 
-/// The bit timing without a bootloader.
-pub const DEFAULT_TIMING: BitTiming = match BitTiming::new(CAN_CLOCK, BIT_RATE) {
-    Some(timing) => timing,
-    None => panic!("board: the clock of the CAN controller cannot make the bit rate"),
+/// The bit rate without a bootloader.
+const DEFAULT_BIT_RATE: BitRate = match BitRate::from_bits_per_second(BIT_RATE) {
+    Some(rate) => rate,
+    None => panic!("board: the bit rate must be one of CANopen's, or 0 to find it out"),
 };
-/// The node-ID without a bootloader.
-const DEFAULT_NODE: NodeId = match NodeId::new(NODE_ID) {
-    Some(node) => node,
-    None => panic!("board: the node-ID must be 1 to 127"),
-};
+
+/// Whether the board's CAN controller can run at this bit rate.
+pub const fn supports(rate: BitRate) -> bool {
+    match rate.bits_per_second() {
+        Some(rate) => BitTiming::new(CAN_CLOCK, rate).is_some(),
+        None => true,
+    }
+}
 
 /// What the application takes from the bootloader's handoff.
 #[derive(Clone, Copy, Debug)]
 pub struct Start {
-    /// Node-ID to use.
-    pub node_id: NodeId,
-    /// Bit rate to use, in bit/s.
-    pub bit_rate: u32,
+    /// Node-ID to use, unless there is none.
+    pub node_id: Option<NodeId>,
+    /// Bit rate to use.
+    pub bit_rate: BitRate,
     /// 1018h/4.
     pub serial_number: u32,
 }
@@ -38,11 +41,17 @@ pub struct Start {
 pub fn how_we_came_up(layout: &Layout) -> Start {
     // SAFETY: the layout's handoff region, checked to be RAM of that size in no image.
     let handoff = unsafe { Handoff::read(layout.handoff.base as *const Handoff) };
-    match handoff.and_then(|info| NodeId::new(info.node_id).map(|node_id| (info, node_id))) {
-        Some((info, node_id)) => {
-            Start { node_id, bit_rate: info.bit_rate, serial_number: info.serial_number }
-        }
-        None => Start { node_id: DEFAULT_NODE, bit_rate: BIT_RATE, serial_number: bsp::serial_number() },
+    match handoff {
+        Some(info) => Start {
+            node_id: NodeId::new(info.node_id),
+            bit_rate: BitRate::from_bits_per_second(info.bit_rate).unwrap_or(DEFAULT_BIT_RATE),
+            serial_number: info.serial_number,
+        },
+        None => Start {
+            node_id: NodeId::new(NODE_ID),
+            bit_rate: DEFAULT_BIT_RATE,
+            serial_number: bsp::serial_number(),
+        },
     }
 }
 

@@ -2,6 +2,7 @@
 //! on the host.
 
 use canopen::device;
+use canopen::emcy;
 use canopen::od::{concat, Access, DataType, Entry};
 use canopen::program::{FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID};
 
@@ -16,4 +17,5 @@ const PROGRAM_ENTRIES: [Entry; 6] = [
 ];
 
 /// The object dictionary.
-pub static ENTRIES: [Entry; 17] = concat(device::ENTRIES, PROGRAM_ENTRIES);
+pub static ENTRIES: [Entry; 23] =
+    concat(concat::<11, 6, 17>(device::ENTRIES, emcy::ENTRIES), PROGRAM_ENTRIES);

@@ -26,13 +26,16 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
 
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]
 mod app {
-    use bsp::can::{BitTiming, Transmitter};
-    use bsp::{pac, CanController, LAYOUT};
-    use bxcan::Rx0;
-    use canopen::nmt::NmtCommand;
-    use canopen::node::{Config, NmtPolicy, Node};
-    use canopen::{CobId, Frame, Instant};
+    use bsp::can::{BitTiming, Errors, Mode, Port};
+    use bsp::{pac, CanController, CAN_CLOCK, LAYOUT};
+    use canopen::bit_rate::Heard;
+    use canopen::line::{Confinement, Status, CONTROLLER_OVERRUN, QUEUE_OVERRUN};
+    use canopen::node::{self, NmtPolicy};
+    use canopen::slave::{self, Output, Slave, SlaveDevice};
+    use canopen::{BitRate, CobId, Frame, Instant};
+    use core::mem::take;
     use heapless::spsc::{Consumer, Producer, Queue};
+    use rtic::Mutex;
     use rtic_monotonics::fugit::ExtU32;
     use rtic_monotonics::Monotonic;
 
@@ -46,15 +49,17 @@ mod app {
     const TICK_MS: u32 = 5;
 
     #[shared]
-    struct Shared {}
+    struct Shared {
+        can: Port<CanController>,
+        /// Frames were lost because the protocol task came too late.
+        queue_overrun: bool,
+    }
 
     #[local]
     struct Local {
-        receiver: Rx0<CanController>,
         received: Producer<'static, Frame>,
         to_handle: Consumer<'static, Frame>,
-        transmitter: Transmitter<CanController>,
-        node: Node,
+        slave: Slave,
         application: Application,
         departure: Departure,
         led: bsp::Led,
@@ -67,23 +72,24 @@ mod app {
 
         // Same node-ID and bit rate as the bootloader: whoever talked to it goes on talking to this.
         let start = coboot::how_we_came_up(LAYOUT);
-        let timing = BitTiming::new(bsp::CAN_CLOCK, start.bit_rate).unwrap_or(coboot::DEFAULT_TIMING);
-        let identifiers = [CobId::NMT, CobId::sdo_request(start.node_id)];
-        let can = bsp::can::start(board.can, timing, &identifiers.map(|id| bsp::can::standard_id(id.get())));
-        let (transmitter, receiver, _) = can.split();
-
-        let config = Config { heartbeat_ms: HEARTBEAT_MS, nmt: NmtPolicy::Follow, ..Config::default() };
+        let application = Application::new(&start);
+        let config = slave::Config {
+            node: node::Config {
+                heartbeat_ms: HEARTBEAT_MS,
+                nmt: NmtPolicy::Follow,
+                ..node::Config::default()
+            },
+            ..slave::Config::default()
+        };
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();
         (
-            Shared {},
+            Shared { can: Port::new(board.can), queue_overrun: false },
             Local {
-                receiver,
                 received,
                 to_handle,
-                transmitter: Transmitter::new(transmitter),
-                node: Node::new(start.node_id, config),
-                application: Application::new(&start),
+                slave: Slave::new(application.lss_address(), start.node_id, start.bit_rate, config),
+                application,
                 departure: Departure::Staying,
                 led: board.led,
             },
@@ -97,32 +103,87 @@ mod app {
         }
     }
 
-    #[task(binds = CAN1_RX0, local = [receiver, received], priority = 3)]
+    /// Empties the controller's FIFO: three frames deep, so nothing may hold this task up.
+    #[task(binds = CAN1_RX0, shared = [can, queue_overrun], local = [received], priority = 3)]
     fn can_rx(cx: can_rx::Context) {
-        while let Some(frame) = bsp::can::receive(cx.local.receiver) {
-            cx.local.received.enqueue(frame).ok();
-        }
+        (cx.shared.can, cx.shared.queue_overrun).lock(|can, queue_overrun| {
+            while let Some(frame) = can.receive() {
+                // A full queue drops the frame; the client's time-out repeats it, and an emergency tells.
+                *queue_overrun |= cx.local.received.enqueue(frame).is_err();
+            }
+        });
         rtic::pend(pac::Interrupt::CAN1_TX);
     }
 
     /// Speaks CANopen: whenever a frame came in, a mailbox became free or time has passed.
-    #[task(binds = CAN1_TX, local = [to_handle, transmitter, node, application, departure], priority = 2)]
+    #[task(
+        binds = CAN1_TX,
+        shared = [can, queue_overrun],
+        local = [to_handle, slave, application, departure],
+        priority = 2
+    )]
     fn protocol(cx: protocol::Context) {
         let now = Instant::from_millis(Mono::now().ticks());
-        let protocol::LocalResources { to_handle, transmitter, node, application, departure, .. } = cx.local;
-        while let Some(frame) = to_handle.dequeue() {
-            match node.handle(&frame, now, application) {
-                Some(NmtCommand::ResetNode) => coboot::restart(),
-                Some(NmtCommand::ResetCommunication) => node.restart(node.id(), application),
-                _ => {}
+        let protocol::SharedResources { mut can, mut queue_overrun, .. } = cx.shared;
+        let protocol::LocalResources { to_handle, slave, application, departure, .. } = cx.local;
+        let status = (&mut can, &mut queue_overrun).lock(status);
+        slave.observe(status, now, application);
+        // The next frame is handled when the answers to those before are on their way.
+        while carry_out(slave, &mut can, now, application) {
+            let Some(frame) = to_handle.dequeue() else { break };
+            if slave.handle(&frame, now, application) {
+                coboot::restart();
             }
-            transmitter.pump(|| node.poll(now, application));
         }
-        transmitter.pump(|| node.poll(now, application));
-
         if application.is_called_back() {
-            let answered = node.is_sdo_idle() && transmitter.is_idle();
+            let answered = slave.is_idle() && can.lock(|can| can.is_idle());
             departure.proceed(answered, now);
+        }
+    }
+
+    /// Does what the slave says, until it says nothing; whether there is room for a frame then.
+    fn carry_out(
+        slave: &mut Slave,
+        can: &mut impl Mutex<T = Port<CanController>>,
+        now: Instant,
+        device: &mut impl SlaveDevice,
+    ) -> bool {
+        loop {
+            let room = can.lock(|can| can.has_room());
+            match slave.poll(now, room, device) {
+                None => return room,
+                Some(Output::Send(frame)) => can.lock(|can| can.send(&frame)),
+                Some(Output::Join(rate)) => configure(can, rate, Mode::Normal),
+                Some(Output::Listen(rate)) => configure(can, rate, Mode::Silent),
+                Some(Output::ComeBack) => can.lock(|can| can.come_back()),
+                Some(Output::Accept(ids)) => can.lock(|can| can.accept(ids.into_iter().map(CobId::get))),
+            }
+        }
+    }
+
+    fn configure(can: &mut impl Mutex<T = Port<CanController>>, rate: BitRate, mode: Mode) {
+        // Another rate is asked for by nobody: `coboot::supports` says so.
+        if let Some(timing) = BitTiming::new(CAN_CLOCK, rate.or_zero()) {
+            can.lock(|can| can.configure(timing, mode));
+        }
+    }
+
+    /// What the slave wants to know of its line.
+    fn status(can: &mut Port<CanController>, queue_overrun: &mut bool) -> Status {
+        let errors = can.errors();
+        let lost = [(can.take_overrun(), CONTROLLER_OVERRUN), (take(queue_overrun), QUEUE_OVERRUN)];
+        Status {
+            confinement: match errors {
+                Errors { off: true, .. } => Confinement::BusOff,
+                Errors { passive: true, .. } => Confinement::Passive,
+                _ => Confinement::Active,
+            },
+            heard: match errors.last {
+                None => Heard::Nothing,
+                Some(Ok(())) => Heard::Frame,
+                Some(Err(())) => Heard::Error,
+            },
+            lost: lost.iter().map(|(lost, bit)| u16::from(*lost) * bit).sum(),
         }
     }
 

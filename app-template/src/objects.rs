@@ -1,12 +1,18 @@
 //! The object dictionary of the application, with the 1F51h callback that calls the bootloader back.
 
+use core::task::Poll;
+
 use bsp::{IDENTITY, LAYOUT};
 use canopen::device::Device;
+use canopen::emcy::Emcy;
+use canopen::line::LineEvent;
+use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Address, Entry, Objects};
 use canopen::program::{
     FlashStatus, ProgramControl, ProgramState, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID,
 };
-use canopen::AbortCode;
+use canopen::slave::SlaveDevice;
+use canopen::{AbortCode, BitRate, NodeId};
 
 use crate::coboot::{self, Start};
 use crate::entries::ENTRIES;
@@ -23,6 +29,9 @@ pub struct Application {
     device: Device,
     program_crc: u32,
     called_back: bool,
+    emcy: Emcy,
+    /// Node-ID in force.
+    id: Option<NodeId>,
 }
 
 impl Application {
@@ -39,7 +48,18 @@ impl Application {
             revision: IDENTITY.revision,
             serial_number: start.serial_number,
         };
-        Self { device, program_crc: coboot::own_crc(LAYOUT).unwrap_or(0), called_back: false }
+        Self {
+            device,
+            program_crc: coboot::own_crc(LAYOUT).unwrap_or(0),
+            called_back: false,
+            emcy: Emcy::new(),
+            id: start.node_id,
+        }
+    }
+
+    /// Who the device is, for layer setting services.
+    pub fn lss_address(&self) -> LssAddress {
+        self.device.lss_address()
     }
 
     /// Whether the device shall go back to the bootloader.
@@ -69,6 +89,9 @@ impl Objects for Application {
     }
 
     fn read(&mut self, at: Address, buf: &mut [u8]) -> Result<usize, AbortCode> {
+        if let Some(read) = self.id.and_then(|id| self.emcy.read(id, at, buf)) {
+            return read;
+        }
         if let Some(read) = self.device.read(at, buf) {
             return read;
         }
@@ -81,9 +104,37 @@ impl Objects for Application {
     }
 
     fn write(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
+        if let Some(written) = self.emcy.write(at, data) {
+            return written;
+        }
         match (at.index, data) {
             (PROGRAM_CONTROL, &[value]) => self.program_control(ProgramControl::try_from(value)?),
             _ => Err(AbortCode::UNSUPPORTED_ACCESS),
         }
+    }
+
+    fn next_emergency(&mut self) -> Option<[u8; 8]> {
+        self.emcy.next_message()
+    }
+}
+
+impl LssDevice for Application {
+    fn supports(&mut self, rate: BitRate) -> bool {
+        coboot::supports(rate)
+    }
+
+    /// Storing is the bootloader's: its journal lies in flash that this program does not own.
+    fn store(&mut self, _: Option<NodeId>, _: Option<BitRate>) -> Poll<Result<(), StoreError>> {
+        Poll::Ready(Err(StoreError::Unsupported))
+    }
+}
+
+impl SlaveDevice for Application {
+    fn line_event(&mut self, event: LineEvent) {
+        self.emcy.line_event(event);
+    }
+
+    fn node_id_changed(&mut self, id: Option<NodeId>) {
+        self.id = id;
     }
 }

@@ -18,7 +18,8 @@ use shared_abi::warm_start::BootRequest;
 
 use crate::crc32;
 use crate::flash::{Flash, FlashFault, SectorEraser, WordWriter, ERASED};
-use crate::parameters::{Journal, Key, Store, Value};
+use crate::node::NodeParameters;
+use crate::parameters::{Journal, Key, Store, StoreError, Value};
 use crate::program::{check_vectors, FlashCrc, ProgramRecord};
 
 /// Bytes of flash that one step of a CRC covers: at 10 cycles a byte and 168 MHz, some 60 µs.
@@ -101,6 +102,8 @@ enum Work {
     Verify { program: u8, last: Last, crc: FlashCrc },
     /// The record of a program: after verification, and when the signature changes.
     Record { program: u8, record: ProgramRecord, store: Store },
+    /// Node-ID and bit rate; of no program.
+    Node { store: Store },
 }
 
 /// The download of programs into flash. `PROGRAMS` is the number of programs in the layout.
@@ -114,6 +117,10 @@ pub struct Downloader<'b, const PROGRAMS: usize> {
     work: Option<Work>,
     /// A request that waits for the device to leave the bootloader.
     leave: Option<BootRequest>,
+    /// How a piece of work on a program ended, or a block that was damaged; to be told.
+    outcome: Option<(u8, Result<(), FlashError>)>,
+    /// How the last storing of node-ID and bit rate ended.
+    node_stored: Result<(), StoreError>,
 }
 
 impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
@@ -132,7 +139,17 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
                 session: Session::Idle,
             }
         });
-        Self { layout, journal, programs, buffer, reception: Reception::Idle, work: None, leave: None }
+        Self {
+            layout,
+            journal,
+            programs,
+            buffer,
+            reception: Reception::Idle,
+            work: None,
+            leave: None,
+            outcome: None,
+            node_stored: Ok(()),
+        }
     }
 
     /// Whether sub-index `program` of 1F50h, 1F51h, 1F56h and 1F57h exists.
@@ -163,6 +180,32 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
     /// The request to leave the bootloader, once: the answer to the command may still be on its way.
     pub fn take_leave(&mut self) -> Option<BootRequest> {
         self.leave.take()
+    }
+
+    /// How a piece of work on a program ended, or a block that was damaged, once.
+    pub fn take_outcome(&mut self) -> Option<(u8, Result<(), FlashError>)> {
+        self.outcome.take()
+    }
+
+    /// Stores node-ID and bit rate in the background.
+    ///
+    /// # Errors
+    /// If other work goes on.
+    pub fn store_node(&mut self, node: NodeParameters) -> Result<(), FlashError> {
+        if self.busy() || self.leave.is_some() {
+            return Err(FlashError::Busy);
+        }
+        self.work = Some(Work::Node { store: self.journal.store(Key::Node, node.value()) });
+        Ok(())
+    }
+
+    /// How the last [`store_node`](Self::store_node) ended.
+    pub fn node_stored(&self) -> Poll<Result<(), StoreError>> {
+        if matches!(self.work, Some(Work::Node { .. })) {
+            Poll::Pending
+        } else {
+            Poll::Ready(self.node_stored)
+        }
     }
 
     /// 1F51h: a command. It is judged and acknowledged now and carried out by [`Downloader::step`].
@@ -299,6 +342,18 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
         let Some(mut work) = self.work.take() else { return Step::Idle };
         let chip = self.layout.chip;
         let (program, outcome) = match &mut work {
+            Work::Node { store } => {
+                return match store.poll(&mut self.journal, flash, chip) {
+                    Poll::Pending => {
+                        self.work = Some(work);
+                        Step::Programming
+                    }
+                    Poll::Ready(outcome) => {
+                        self.node_stored = outcome;
+                        Step::Idle
+                    }
+                };
+            }
             Work::Invalidate { program, store } => {
                 let program = *program;
                 match store.poll(&mut self.journal, flash, chip) {
@@ -366,6 +421,7 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
                         state.session = Session::Idle;
                     }
                 }
+                self.outcome = Some((program, outcome));
                 Step::Idle
             }
         }
@@ -383,6 +439,7 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
             | Work::Write { program, .. }
             | Work::Verify { program, .. }
             | Work::Record { program, .. } => Some(*program),
+            Work::Node { .. } => None,
         }
     }
 
@@ -391,6 +448,9 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
         self.reception = Reception::Idle;
         if let Some(index) = self.index(program) {
             self.programs[index].error = Some(error);
+        }
+        if error == FlashError::Crc {
+            self.outcome = Some((program, Err(error)));
         }
         abort
     }

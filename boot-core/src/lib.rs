@@ -6,6 +6,7 @@
 //! | [`decision`] | bootloader or program, after every reset |
 //! | [`program`] | what is known of a program, and the proof that it may be started |
 //! | [`parameters`] | the power-fail-safe journal of the non-volatile parameters |
+//! | [`node`] | node-ID and bit rate of the device |
 //! | [`download`] | 1F50h, 1F51h, 1F56h, 1F57h: block files into flash |
 //! | [`flash`] | the seam to the flash |
 #![no_std]
@@ -15,6 +16,7 @@ pub mod bootloader;
 pub mod decision;
 pub mod download;
 pub mod flash;
+pub mod node;
 pub mod parameters;
 pub mod program;
 

@@ -31,6 +31,8 @@ pub enum Key {
     Program(u8),
     /// How often in a row the watchdog had to reset a running application.
     CrashCount,
+    /// Node-ID and bit rate.
+    Node,
 }
 
 impl Key {
@@ -39,6 +41,7 @@ impl Key {
         match self {
             Self::Program(number) => 0x0001_0000 | number as u32,
             Self::CrashCount => 0x0002_0000,
+            Self::Node => 0x0003_0000,
         }
     }
 }

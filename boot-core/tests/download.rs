@@ -2,14 +2,15 @@
 
 mod model;
 
-use boot_core::bootloader::Bootloader;
+use boot_core::bootloader::{Bootloader, Config};
 use boot_core::download::Step;
 use boot_core::flash::FlashFault;
+use boot_core::node::NodeParameters;
 use boot_core::parameters::Journal;
 use boot_core::program::{verify, Invalid};
 use canopen::device::Device;
 use canopen::od::{Address, Objects};
-use canopen::AbortCode;
+use canopen::{AbortCode, BitRate, NodeId};
 use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash};
 use shared_abi::geometry::{Geometry, Region, SectorRun, STM32F407VG};
 use shared_abi::layout::Layout;
@@ -52,6 +53,16 @@ const START: u8 = 0x01;
 const SET_SIGNATURE: u8 = 0x83;
 const CLR_SIGNATURE: u8 = 0x84;
 
+fn config() -> Config {
+    Config {
+        device: DEVICE,
+        layout: LAYOUT_REF,
+        node: NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 },
+        supports: |rate| rate != BitRate::K800,
+        boot_up_emergency: None,
+    }
+}
+
 const DEVICE: Device = Device {
     device_type: 0x1000_0000,
     name: "model",
@@ -71,7 +82,7 @@ struct Bench<'f> {
 impl<'f> Bench<'f> {
     fn new(flash: &'f mut ModelFlash) -> Self {
         let buffer = Box::leak(vec![0; 256].into_boxed_slice());
-        Self { node: Bootloader::new(DEVICE, LAYOUT_REF, flash, buffer) }
+        Self { node: Bootloader::new(config(), flash, buffer) }
     }
 
     fn settle(&mut self) {

@@ -6,10 +6,13 @@
 use core::arch::global_asm;
 use core::ops::RangeInclusive;
 
+use boot_core::canopen::{BitRate, NodeId};
 use boot_core::decision::{decide, BootDecision, Circumstances, Policy};
+use boot_core::node::NodeParameters;
 use boot_core::parameters::{Journal, Key};
 use boot_core::program::verify;
-use bsp::{pac, BIT_RATE, LAYOUT, NODE_ID};
+use bsp::can::BitTiming;
+use bsp::{pac, BIT_RATE, CAN_CLOCK, LAYOUT, NODE_ID};
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
 use shared_abi::warm_start::{BootRequest, Cell};
 
@@ -70,13 +73,15 @@ extern "C" fn stage() {
     let mut journal = Journal::open(&flash, LAYOUT.parameters);
     let crash_resets = count_crash_resets(&mut journal, &mut flash, reset_cause, request);
 
-    let circumstances = Circumstances { request, strap, crash_resets, node_id: NODE_ID };
+    let node = node_parameters(&journal, &flash);
+    let node_id = node.id.map_or(NO_NODE_ID, NodeId::get);
+    let circumstances = Circumstances { request, strap, crash_resets, node_id };
     match decide(&circumstances, &POLICY, |number| verify(&flash, &journal, LAYOUT, number)) {
         BootDecision::Stay(_) => {}
         BootDecision::Start { program, trial } => {
             let handoff = Handoff::new(&BootInfo {
-                node_id: NODE_ID,
-                bit_rate: BIT_RATE,
+                node_id,
+                bit_rate: node.bit_rate.or_zero(),
                 program: program.number(),
                 reset_cause,
                 trial,
@@ -90,6 +95,42 @@ extern "C" fn stage() {
                 program.vectors().jump()
             }
         }
+    }
+}
+
+/// Node-ID and bit rate of a device that was never told others.
+const BOARD_NODE: NodeParameters = NodeParameters {
+    id: match NODE_ID {
+        NO_NODE_ID => None,
+        id => match NodeId::new(id) {
+            Some(id) => Some(id),
+            None => panic!("board: the node-ID must be 1 to 127, or 255 for none"),
+        },
+    },
+    bit_rate: match BitRate::from_bits_per_second(BIT_RATE) {
+        Some(rate) => {
+            assert!(
+                supports(rate),
+                "board: the clock of the CAN controller cannot make the bit rate, or nothing can find it out"
+            );
+            rate
+        }
+        None => panic!("board: the bit rate must be one of CANopen's, or 0 to find it out"),
+    },
+};
+/// Stands for no node-ID (CiA 305).
+const NO_NODE_ID: u8 = 255;
+
+/// Node-ID and bit rate in force from this reset on.
+pub fn node_parameters(journal: &Journal, flash: &FlashController) -> NodeParameters {
+    NodeParameters::load(journal, flash, BOARD_NODE, supports)
+}
+
+/// Whether the board's CAN controller can run at this bit rate.
+pub const fn supports(rate: BitRate) -> bool {
+    match rate.bits_per_second() {
+        Some(rate) => BitTiming::new(CAN_CLOCK, rate).is_some(),
+        None => cfg!(feature = "auto-bit-rate"),
     }
 }
 

@@ -36,18 +36,22 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
 
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1, SPI2])]
 mod app {
-    use boot_core::bootloader::Bootloader;
+    use boot_core::bootloader::{self, Bootloader};
+    use boot_core::canopen::bit_rate::Heard;
     use boot_core::canopen::device::Device;
-    use boot_core::canopen::nmt::NmtCommand;
-    use boot_core::canopen::node::{Config, NmtPolicy, Node};
+    use boot_core::canopen::line::{Confinement, Status, CONTROLLER_OVERRUN, QUEUE_OVERRUN};
+    use boot_core::canopen::node::{self, NmtPolicy};
     use boot_core::canopen::program::BOOTLOADER_DEVICE_TYPE;
-    use boot_core::canopen::{CobId, Frame, Instant, NodeId};
+    use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
+    use boot_core::canopen::{BitRate, CobId, Frame, Instant};
     use boot_core::download::Step;
-    use bsp::can::{BitTiming, Transmitter};
-    use bsp::{pac, CanController, BIT_RATE, IDENTITY, LAYOUT, NODE_ID};
-    use bxcan::Rx0;
+    use boot_core::parameters::Journal;
+    use bsp::can::{BitTiming, Errors, Mode, Port};
+    use bsp::{pac, CanController, CAN_CLOCK, IDENTITY, LAYOUT};
+    use core::mem::take;
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
+    use rtic::Mutex;
     use shared_abi::block_file::MAX_BLOCK_SIZE;
     use shared_abi::warm_start::BootRequest;
 
@@ -69,27 +73,22 @@ mod app {
     /// anything else happens.
     const FAREWELL_MS: u32 = 20;
 
-    const TIMING: BitTiming = match BitTiming::new(bsp::CAN_CLOCK, BIT_RATE) {
-        Some(timing) => timing,
-        None => panic!("board: the clock of the CAN controller cannot make the bit rate"),
-    };
-    const NODE: NodeId = match NodeId::new(NODE_ID) {
-        Some(node) => node,
-        None => panic!("board: the node-ID must be 1 to 127"),
-    };
+    /// Behind each boot-up, so that a master knows the bootloader from the application.
+    const BOOT_UP_EMERGENCY: Option<[u8; 5]> = Some(*b"BOOT\0");
 
     #[shared]
     struct Shared {
+        can: Port<CanController>,
+        /// Frames were lost because the protocol task came too late.
+        queue_overrun: bool,
         bootloader: Bootloader<'static, FlashController>,
     }
 
     #[local]
     struct Local {
-        receiver: Rx0<CanController>,
         received: Producer<'static, Frame>,
         to_handle: Consumer<'static, Frame>,
-        transmitter: Transmitter<CanController>,
-        node: Node,
+        slave: Slave,
         leaving: Option<Leaving>,
         led: bsp::Led,
     }
@@ -107,11 +106,8 @@ mod app {
         let board = bsp::init(cx.device.RCC, cx.device.CAN1, cx.device.GPIOD);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
-        let identifiers = [CobId::NMT, CobId::sdo_request(NODE)].map(|id| bsp::can::standard_id(id.get()));
-        let can = bsp::can::start(board.can, TIMING, &identifiers);
-        let (transmitter, receiver, _) = can.split();
-
         let flash = FlashController::new(cx.device.FLASH, LAYOUT.chip.flash);
+        let node = boot::node_parameters(&Journal::open(&flash, LAYOUT.parameters), &flash);
         let device = Device {
             device_type: BOOTLOADER_DEVICE_TYPE,
             name: IDENTITY.device_name,
@@ -123,18 +119,33 @@ mod app {
             revision: IDENTITY.revision,
             serial_number: bsp::serial_number(),
         };
-        let config =
-            Config { heartbeat_ms: HEARTBEAT_MS, nmt: NmtPolicy::StayPreOperational, ..Config::default() };
+        let config = bootloader::Config {
+            device,
+            layout: LAYOUT,
+            node,
+            supports: boot::supports,
+            boot_up_emergency: BOOT_UP_EMERGENCY,
+        };
+        let slave_config = slave::Config {
+            node: node::Config {
+                heartbeat_ms: HEARTBEAT_MS,
+                nmt: NmtPolicy::StayPreOperational,
+                ..node::Config::default()
+            },
+            ..slave::Config::default()
+        };
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();
         (
-            Shared { bootloader: Bootloader::new(device, LAYOUT, flash, cx.local.block) },
+            Shared {
+                can: Port::new(board.can),
+                queue_overrun: false,
+                bootloader: Bootloader::new(config, flash, cx.local.block),
+            },
             Local {
-                receiver,
                 received,
                 to_handle,
-                transmitter: Transmitter::new(transmitter),
-                node: Node::new(NODE, config),
+                slave: Slave::new(device.lss_address(), node.id, node.bit_rate, slave_config),
                 leaving: None,
                 led: board.led,
             },
@@ -149,30 +160,38 @@ mod app {
     }
 
     /// Empties the controller's FIFO: three frames deep, so nothing may hold this task up.
-    #[task(binds = CAN1_RX0, local = [receiver, received], priority = 3)]
+    #[task(binds = CAN1_RX0, shared = [can, queue_overrun], local = [received], priority = 3)]
     fn can_rx(cx: can_rx::Context) {
-        while let Some(frame) = bsp::can::receive(cx.local.receiver) {
-            // A full queue drops the frame; the client's time-out repeats it.
-            cx.local.received.enqueue(frame).ok();
-        }
+        (cx.shared.can, cx.shared.queue_overrun).lock(|can, queue_overrun| {
+            while let Some(frame) = can.receive() {
+                // A full queue drops the frame; the client's time-out repeats it, and an emergency tells.
+                *queue_overrun |= cx.local.received.enqueue(frame).is_err();
+            }
+        });
         rtic::pend(pac::Interrupt::CAN1_TX);
     }
 
     /// Speaks CANopen: whenever a frame came in, a mailbox became free or time has passed.
-    #[task(binds = CAN1_TX, shared = [bootloader], local = [to_handle, transmitter, node, leaving], priority = 2)]
-    fn protocol(mut cx: protocol::Context) {
+    #[task(
+        binds = CAN1_TX,
+        shared = [can, queue_overrun, bootloader],
+        local = [to_handle, slave, leaving],
+        priority = 2
+    )]
+    fn protocol(cx: protocol::Context) {
         let now = Instant::from_millis(Mono::now().ticks());
-        let (node, transmitter, leaving) = (cx.local.node, cx.local.transmitter, cx.local.leaving);
-        cx.shared.bootloader.lock(|bootloader| {
-            while let Some(frame) = cx.local.to_handle.dequeue() {
-                match node.handle(&frame, now, bootloader) {
-                    Some(NmtCommand::ResetNode) => *leaving = Some(Leaving { request: None, at: None }),
-                    Some(NmtCommand::ResetCommunication) => node.restart(NODE, bootloader),
-                    _ => {}
+        let protocol::SharedResources { mut can, mut queue_overrun, mut bootloader, .. } = cx.shared;
+        let protocol::LocalResources { to_handle, slave, leaving, .. } = cx.local;
+        let status = (&mut can, &mut queue_overrun).lock(status);
+        bootloader.lock(|bootloader| {
+            slave.observe(status, now, bootloader);
+            // The next frame is handled when the answers to those before are on their way.
+            while carry_out(slave, &mut can, now, bootloader) {
+                let Some(frame) = to_handle.dequeue() else { break };
+                if slave.handle(&frame, now, bootloader) {
+                    *leaving = Some(Leaving { request: None, at: None });
                 }
-                transmitter.pump(|| node.poll(now, bootloader));
             }
-            transmitter.pump(|| node.poll(now, bootloader));
             if let Some(request) = bootloader.take_leave() {
                 *leaving = Some(Leaving { request: Some(request), at: None });
             }
@@ -182,10 +201,58 @@ mod app {
         });
         if let Some(leaving) = leaving {
             match leaving.at {
-                None if node.is_sdo_idle() && transmitter.is_idle() => leaving.at = Some(now + FAREWELL_MS),
+                None if slave.is_idle() && can.lock(|can| can.is_idle()) => {
+                    leaving.at = Some(now + FAREWELL_MS)
+                }
                 Some(at) if now.has_reached(at) => leave(leaving.request),
                 _ => {}
             }
+        }
+    }
+
+    /// Does what the slave says, until it says nothing; whether there is room for a frame then.
+    fn carry_out(
+        slave: &mut Slave,
+        can: &mut impl Mutex<T = Port<CanController>>,
+        now: Instant,
+        device: &mut impl SlaveDevice,
+    ) -> bool {
+        loop {
+            let room = can.lock(|can| can.has_room());
+            match slave.poll(now, room, device) {
+                None => return room,
+                Some(Output::Send(frame)) => can.lock(|can| can.send(&frame)),
+                Some(Output::Join(rate)) => configure(can, rate, Mode::Normal),
+                Some(Output::Listen(rate)) => configure(can, rate, Mode::Silent),
+                Some(Output::ComeBack) => can.lock(|can| can.come_back()),
+                Some(Output::Accept(ids)) => can.lock(|can| can.accept(ids.into_iter().map(CobId::get))),
+            }
+        }
+    }
+
+    fn configure(can: &mut impl Mutex<T = Port<CanController>>, rate: BitRate, mode: Mode) {
+        // Another rate is asked for by nobody: `boot::supports` says so.
+        if let Some(timing) = BitTiming::new(CAN_CLOCK, rate.or_zero()) {
+            can.lock(|can| can.configure(timing, mode));
+        }
+    }
+
+    /// What the slave wants to know of its line.
+    fn status(can: &mut Port<CanController>, queue_overrun: &mut bool) -> Status {
+        let errors = can.errors();
+        let lost = [(can.take_overrun(), CONTROLLER_OVERRUN), (take(queue_overrun), QUEUE_OVERRUN)];
+        Status {
+            confinement: match errors {
+                Errors { off: true, .. } => Confinement::BusOff,
+                Errors { passive: true, .. } => Confinement::Passive,
+                _ => Confinement::Active,
+            },
+            heard: match errors.last {
+                None => Heard::Nothing,
+                Some(Ok(())) => Heard::Frame,
+                Some(Err(())) => Heard::Error,
+            },
+            lost: lost.iter().map(|(lost, bit)| u16::from(*lost) * bit).sum(),
         }
     }
 

@@ -1,7 +1,8 @@
-//! What every board does with its bxCAN: bit timing, filters, frames.
+//! What every board does with its bxCAN: bit timing, filters, frames, and the state of the controller (RM0090 section 32).
 
 use bxcan::filter::ListEntry16;
-use bxcan::{Can, Fifo, Instance, Interrupts, MasterInstance, StandardId};
+use bxcan::{Can, Fifo, Interrupts, Mailbox, MasterInstance, OverrunError, StandardId};
+use embedded_can::Frame;
 
 /// A bit timing that bxCAN can be set to (RM0090 section 32.7.7).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -49,92 +50,182 @@ impl BitTiming {
     }
 }
 
-/// Configures the controller for one bit timing and the data frames of a few identifiers, and lets it join the bus.
-///
-/// Joining takes 11 recessive bits on the bus; the controller waits for them by itself and this function does not.
-/// Interrupts of receive FIFO 0 and of the mailboxes are on.
-pub fn start<I>(controller: I, timing: BitTiming, identifiers: &[StandardId]) -> Can<I>
-where
-    I: Instance + MasterInstance + bxcan::FilterOwner,
-{
-    let mut can = Can::builder(controller).set_bit_timing(timing.register()).leave_disabled();
-    set_filters(&mut can, identifiers);
-    can.enable_interrupts(Interrupts::FIFO0_MESSAGE_PENDING | Interrupts::TRANSMIT_MAILBOX_EMPTY);
-    // WouldBlock says that the bus was not idle yet; it is the controller's to wait.
-    let _: nb::Result<(), _> = can.enable_non_blocking();
-    can
+/// How the controller takes part in the bus.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mode {
+    /// Like any other.
+    Normal,
+    /// It listens, and neither acknowledges nor disturbs.
+    Silent,
 }
 
-/// Sets the acceptance filters to exactly these identifiers (data frames, 11 bits), all into FIFO 0.
-fn set_filters<I: MasterInstance + bxcan::FilterOwner>(can: &mut Can<I>, identifiers: &[StandardId]) {
-    let mut filters = can.modify_filters();
-    filters.clear();
-    for (bank, four) in identifiers.chunks(4).enumerate() {
-        // A bank lists four identifiers; a shorter row repeats its first one.
-        let entry = |i| ListEntry16::data_frames_with_id(four.get(i).copied().unwrap_or(four[0]));
-        filters.enable_bank(bank as u8, Fifo::Fifo0, [entry(0), entry(1), entry(2), entry(3)]);
+/// What a controller that was asked for its errors tells (`CAN_ESR`, RM0090 section 32.9.2).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Errors {
+    /// Bus-off.
+    pub off: bool,
+    /// Error passive.
+    pub passive: bool,
+    /// What became of the last frame since the question before: nothing came, a good one, a bad one.
+    pub last: Option<Result<(), ()>>,
+}
+
+/// Offsets of registers that `bxcan` keeps to itself, in bytes (RM0090 section 32.9.5).
+const MCR: usize = 0x00;
+const RF0R: usize = 0x0C;
+const ESR: usize = 0x18;
+/// `CAN_MCR`: bus-off is left without being told to.
+const ABOM: u32 = 1 << 6;
+/// `CAN_RF0R`: a frame was lost because the FIFO was full; written with 1, it is cleared.
+const FOVR0: u32 = 1 << 4;
+const EPVF: u32 = 1 << 1;
+const BOFF: u32 = 1 << 2;
+/// The last error code; 7 is written by software alone, 0 is a good frame.
+const LEC: u32 = 7 << 4;
+
+/// A bxCAN controller and the one frame that may wait for its mailboxes.
+pub struct Port<I: MasterInstance> {
+    can: Can<I>,
+    waiting: Option<bxcan::Frame>,
+    overrun: bool,
+}
+
+impl<I: MasterInstance> Port<I> {
+    /// Takes the controller. It hears and says nothing before [`configure`](Self::configure) and
+    /// [`accept`](Self::accept). Interrupts of receive FIFO 0 and of the mailboxes are on.
+    pub fn new(controller: I) -> Self {
+        let mut can = Can::builder(controller).leave_disabled();
+        can.enable_interrupts(Interrupts::FIFO0_MESSAGE_PENDING | Interrupts::TRANSMIT_MAILBOX_EMPTY);
+        Self { can, waiting: None, overrun: false }
     }
-}
 
-/// The identifier of this value; only its 11 bits count.
-#[must_use]
-pub fn standard_id(raw: u16) -> StandardId {
-    StandardId::new(raw & 0x7FF).unwrap_or(StandardId::MAX)
-}
+    /// Sets bit timing and mode, and joins the bus with empty mailboxes.
+    ///
+    /// Joining takes 11 recessive bits on the bus; the controller waits for them by itself and this function does not.
+    pub fn configure(&mut self, timing: BitTiming, mode: Mode) {
+        let config = self.can.modify_config();
+        config.set_bit_timing(timing.register()).set_silent(mode == Mode::Silent).leave_disabled();
+        // Only now: while a frame is under way that nobody acknowledges, an abort would wait for it.
+        self.waiting = None;
+        for mailbox in [Mailbox::Mailbox0, Mailbox::Mailbox1, Mailbox::Mailbox2] {
+            self.can.abort(mailbox);
+        }
+        self.join();
+    }
 
-/// The next frame from the FIFO, `None` when it is empty. An overrun is left for the caller's next round: the frames that
-/// are there are still good.
-pub fn receive<I: Instance, F: embedded_can::Frame>(fifo: &mut bxcan::Rx0<I>) -> Option<F> {
-    loop {
-        match fifo.receive() {
-            Ok(frame) => return convert(&frame),
-            Err(nb::Error::WouldBlock) => return None,
-            Err(nb::Error::Other(bxcan::OverrunError { .. })) => {}
+    /// Comes back from bus-off: by itself, once the bus was idle for 128 × 11 bits.
+    pub fn come_back(&mut self) {
+        self.can.modify_config().leave_disabled();
+        self.join();
+    }
+
+    fn join(&mut self) {
+        // WouldBlock says that the bus was not idle yet; it is the controller's to wait.
+        let _: nb::Result<(), _> = self.can.enable_non_blocking();
+        // When to leave bus-off is decided above.
+        self.write(MCR, self.read(MCR) & !ABOM);
+    }
+
+    /// Sets the acceptance filters to exactly these identifiers (data frames, 11 bits), all into FIFO 0.
+    pub fn accept(&mut self, identifiers: impl Iterator<Item = u16>) {
+        let mut identifiers = identifiers.map(standard_id).peekable();
+        let mut filters = self.can.modify_filters();
+        filters.clear();
+        let mut bank = 0;
+        while let Some(&first) = identifiers.peek() {
+            // A bank lists four identifiers; a shorter row repeats its first one.
+            let row = [(); 4].map(|()| ListEntry16::data_frames_with_id(identifiers.next().unwrap_or(first)));
+            filters.enable_bank(bank, Fifo::Fifo0, row);
+            bank += 1;
         }
     }
-}
 
-/// The same frame in another crate's type. Both ends are checked types, so the conversion cannot fail.
-#[must_use]
-pub fn convert<F: embedded_can::Frame, G: embedded_can::Frame>(frame: &F) -> Option<G> {
-    if frame.is_remote_frame() {
-        G::new_remote(frame.id(), frame.dlc())
-    } else {
-        G::new(frame.id(), frame.data())
-    }
-}
-
-/// The transmit side: mailboxes, and the one frame that may wait for them.
-pub struct Transmitter<I: Instance> {
-    mailboxes: bxcan::Tx<I>,
-    waiting: Option<bxcan::Frame>,
-}
-
-impl<I: Instance> Transmitter<I> {
-    /// Takes the mailboxes.
-    pub const fn new(mailboxes: bxcan::Tx<I>) -> Self {
-        Self { mailboxes, waiting: None }
-    }
-
-    /// Acknowledges the mailbox interrupt, then sends what `next` gives for as long as the mailboxes take it.
-    ///
-    /// Frames of one identifier leave in order: the mailboxes take the second only when the first is on its way.
-    pub fn pump<F: embedded_can::Frame>(&mut self, mut next: impl FnMut() -> Option<F>) {
-        self.mailboxes.clear_interrupt_flags();
-        while let Some(frame) = self.waiting.take().or_else(|| next().as_ref().and_then(convert)) {
-            match self.mailboxes.transmit(&frame) {
-                // A frame of lower priority may have had to leave its mailbox: it goes next.
-                Ok(status) => self.waiting = status.dequeued_frame().cloned(),
-                Err(_) => {
-                    self.waiting = Some(frame);
-                    break;
-                }
+    /// The next frame from the FIFO, `None` when it is empty.
+    pub fn receive<F: Frame>(&mut self) -> Option<F> {
+        loop {
+            match self.can.rx0().receive() {
+                Ok(frame) => return convert(&frame),
+                Err(nb::Error::WouldBlock) => return None,
+                // The frames that are there are still good.
+                Err(nb::Error::Other(OverrunError { .. })) => self.overrun = true,
             }
         }
     }
 
+    /// Acknowledges the mailbox interrupt and moves a frame that waits into a mailbox. Whether there is room for one now.
+    pub fn has_room(&mut self) -> bool {
+        self.can.clear_tx_interrupt();
+        if let Some(frame) = self.waiting.take() {
+            self.put(frame);
+        }
+        self.waiting.is_none()
+    }
+
+    /// Sends a frame. To be called only when there is room; a frame that still waits would be lost.
+    ///
+    /// Frames of one identifier leave in order: the mailboxes take the second only when the first is on its way.
+    pub fn send<F: Frame>(&mut self, frame: &F) {
+        if let Some(frame) = convert(frame) {
+            self.put(frame);
+        }
+    }
+
+    fn put(&mut self, frame: bxcan::Frame) {
+        self.waiting = match self.can.transmit(&frame) {
+            // A frame of lower priority may have had to leave its mailbox: it goes next.
+            Ok(status) => status.dequeued_frame().cloned(),
+            Err(_) => Some(frame),
+        };
+    }
+
     /// Whether everything given to it is on the bus and acknowledged.
     pub fn is_idle(&self) -> bool {
-        self.waiting.is_none() && self.mailboxes.is_idle()
+        self.waiting.is_none() && self.can.is_transmitter_idle()
+    }
+
+    /// What the controller tells of its errors.
+    pub fn errors(&mut self) -> Errors {
+        let status = self.read(ESR);
+        self.write(ESR, LEC);
+        let last = match status & LEC {
+            LEC => None,
+            0 => Some(Ok(())),
+            _ => Some(Err(())),
+        };
+        Errors { off: status & BOFF != 0, passive: status & EPVF != 0, last }
+    }
+
+    /// Whether the FIFO was full and lost frames since the question before.
+    pub fn take_overrun(&mut self) -> bool {
+        if self.read(RF0R) & FOVR0 != 0 {
+            self.write(RF0R, FOVR0);
+            self.overrun = true;
+        }
+        core::mem::take(&mut self.overrun)
+    }
+
+    fn read(&self, offset: usize) -> u32 {
+        // SAFETY: `REGISTERS` is the base of the controller that this port owns, the offset one of the registers above;
+        // reading them has no effect.
+        unsafe { I::REGISTERS.cast::<u32>().byte_add(offset).read_volatile() }
+    }
+
+    fn write(&mut self, offset: usize, value: u32) {
+        // SAFETY: as above; the values written are those that section 32.9.2 allows at any time.
+        unsafe { I::REGISTERS.cast::<u32>().byte_add(offset).write_volatile(value) }
+    }
+}
+
+/// The identifier of this value; only its 11 bits count.
+fn standard_id(raw: u16) -> StandardId {
+    StandardId::new(raw & 0x7FF).unwrap_or(StandardId::MAX)
+}
+
+/// The same frame in another crate's type. Both ends are checked types, so the conversion cannot fail.
+fn convert<F: Frame, G: Frame>(frame: &F) -> Option<G> {
+    if frame.is_remote_frame() {
+        G::new_remote(frame.id(), frame.dlc())
+    } else {
+        G::new(frame.id(), frame.data())
     }
 }

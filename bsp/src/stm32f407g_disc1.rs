@@ -21,10 +21,10 @@ pub const IDENTITY: Identity = Identity {
     hardware_version: "MB997",
 };
 
-/// Node-ID of a device that was never told another one.
+/// Node-ID of a device that was never told another one, 1 to 127; 255 for one that waits for layer setting services.
 pub const NODE_ID: u8 = 1;
 
-/// Bit rate of a device that was never told another one, in bit/s.
+/// Bit rate of a device that was never told another one, in bit/s; 0 for one that finds it out by listening.
 pub const BIT_RATE: u32 = 125_000;
 
 /// Crystal on OSC_IN and OSC_OUT, in Hz.

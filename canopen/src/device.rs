@@ -2,6 +2,7 @@
 //!
 //! A device puts [`ENTRIES`] into its table with [`concat`](crate::od::concat) and asks [`Device::read`] first.
 
+use crate::lss::LssAddress;
 use crate::od::{put, Access, Address, DataType, Entry};
 use crate::program::{
     DEVICE_NAME, DEVICE_TYPE, ERROR_REGISTER, HARDWARE_VERSION, HEARTBEAT_TIME, IDENTITY, SOFTWARE_VERSION,
@@ -47,6 +48,17 @@ pub struct Device {
 }
 
 impl Device {
+    /// Who it is, for layer setting services.
+    #[must_use]
+    pub const fn lss_address(&self) -> LssAddress {
+        LssAddress {
+            vendor_id: self.vendor_id,
+            product_code: self.product_code,
+            revision: self.revision,
+            serial_number: self.serial_number,
+        }
+    }
+
     /// Reads one of [`ENTRIES`]; `None` for every other address.
     ///
     /// # Errors

@@ -4,6 +4,7 @@
 //! 1001h, and passes [`Emcy::next_message`] on as [`Objects::next_emergency`](crate::Objects::next_emergency).
 
 use crate::frame::{CobId, NodeId};
+use crate::line::LineEvent;
 use crate::od::{put, Access, Address, DataType, Entry};
 use crate::program::{COB_ID_EMCY, ERROR_FIELD, ERROR_REGISTER};
 use crate::sdo::AbortCode;
@@ -42,6 +43,8 @@ pub mod code {
     pub const CAN_PASSIVE: u16 = 0x8120;
     /// The CAN controller was off the bus and is back.
     pub const BUS_OFF_RECOVERED: u16 = 0x8140;
+    /// What the manufacturer likes to tell.
+    pub const DEVICE_SPECIFIC: u16 = 0xFF00;
 }
 
 /// Bits of the error register, 1001h (CiA 301 table 51).
@@ -89,11 +92,6 @@ pub const fn driver_status(status: u16) -> [u8; 5] {
     let [low, high] = status.to_le_bytes();
     [0, 0, low, high, 0]
 }
-
-/// Driver status: the CAN controller lost a frame.
-pub const CONTROLLER_OVERRUN: u16 = 0x0020;
-/// Driver status: the receive queue was full.
-pub const QUEUE_OVERRUN: u16 = 0x1000;
 
 /// The errors of a device.
 #[derive(Clone, Debug, Default)]
@@ -147,6 +145,23 @@ impl Emcy {
             self.register = 0;
         }
         self.send(Emergency { code: code::RESET, register: self.register, detail: [0; 5] });
+    }
+
+    /// Tells what happened on the line.
+    pub fn line_event(&mut self, event: LineEvent) {
+        match event {
+            LineEvent::Passive => self.raise(code::CAN_PASSIVE, register::COMMUNICATION, [0; 5]),
+            LineEvent::Active => self.clear(register::COMMUNICATION),
+            // Both are over when they are told.
+            LineEvent::Lost(status) => {
+                self.raise(code::CAN_OVERRUN, register::COMMUNICATION, driver_status(status));
+                self.clear(register::COMMUNICATION);
+            }
+            LineEvent::Recovered => {
+                self.raise(code::BUS_OFF_RECOVERED, register::COMMUNICATION, [0; 5]);
+                self.clear(register::COMMUNICATION);
+            }
+        }
     }
 
     /// The data of the next emergency to send, until there is none.

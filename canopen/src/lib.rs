@@ -11,10 +11,13 @@
 //! | [`od`] | the object dictionary: a table of entries and a trait for their values |
 //! | [`sdo`] | wire codec, abort codes, server, client |
 //! | [`nmt`], [`heartbeat`] | network management of a slave, heartbeat producer |
-//! | [`node`] | all of a slave tied together for one node-ID |
+//! | [`node`] | NMT, heartbeat, emergencies and SDO server of one node-ID |
 //! | [`device`] | the objects that every device has |
 //! | `emcy` | emergency producer, 1001h, 1003h, 1014h (feature `emcy`) |
-//! | `lss` | layer setting services: node-ID and bit rate over the bus (feature `lss`) |
+//! | [`lss`] | layer setting services: node-ID and bit rate over the bus |
+//! | [`bit_rate`] | the bit rates of CANopen, and how to find out one |
+//! | [`line`] | what the CAN controller tells: error passive, bus-off, frames lost |
+//! | [`slave`] | a device on the bus: node, LSS and line tied together |
 //! | [`program`] | program download: the words of CiA 302-3 |
 #![no_std]
 #![forbid(unsafe_code)]
@@ -22,20 +25,23 @@
 #[cfg(feature = "alloc")]
 extern crate alloc;
 
+pub mod bit_rate;
 pub mod device;
 #[cfg(feature = "emcy")]
 pub mod emcy;
 pub mod frame;
 pub mod heartbeat;
-#[cfg(feature = "lss")]
+pub mod line;
 pub mod lss;
 pub mod nmt;
 pub mod node;
 pub mod od;
 pub mod program;
 pub mod sdo;
+pub mod slave;
 pub mod time;
 
+pub use bit_rate::BitRate;
 pub use frame::{CobId, Frame, NodeId};
 pub use od::{Address, Objects};
 pub use sdo::AbortCode;

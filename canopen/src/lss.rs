@@ -6,6 +6,9 @@
 //! Frames that are no LSS request, requests in a state that does not serve them and requests for other slaves get
 //! silence, as the standard has it.
 
+use core::task::Poll;
+
+pub use crate::bit_rate::BitRate;
 use crate::frame::{CobId, Frame, NodeId};
 use crate::time::Instant;
 
@@ -29,69 +32,6 @@ impl LssAddress {
     }
 }
 
-/// The bit rates of table 0, with their index (CiA 305 table 1).
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u8)]
-pub enum BitRate {
-    /// 1 Mbit/s.
-    K1000 = 0,
-    /// 800 kbit/s.
-    K800 = 1,
-    /// 500 kbit/s.
-    K500 = 2,
-    /// 250 kbit/s.
-    K250 = 3,
-    /// 125 kbit/s.
-    K125 = 4,
-    /// 100 kbit/s; later editions of the standard have it reserved.
-    K100 = 5,
-    /// 50 kbit/s.
-    K50 = 6,
-    /// 20 kbit/s.
-    K20 = 7,
-    /// 10 kbit/s.
-    K10 = 8,
-    /// The device finds it out.
-    Auto = 9,
-}
-
-impl BitRate {
-    /// From the index in table 0.
-    #[must_use]
-    pub const fn from_index(index: u8) -> Option<Self> {
-        Some(match index {
-            0 => Self::K1000,
-            1 => Self::K800,
-            2 => Self::K500,
-            3 => Self::K250,
-            4 => Self::K125,
-            5 => Self::K100,
-            6 => Self::K50,
-            7 => Self::K20,
-            8 => Self::K10,
-            9 => Self::Auto,
-            _ => return None,
-        })
-    }
-
-    /// In bit/s; `None` for [`BitRate::Auto`].
-    #[must_use]
-    pub const fn bits_per_second(self) -> Option<u32> {
-        Some(match self {
-            Self::K1000 => 1_000_000,
-            Self::K800 => 800_000,
-            Self::K500 => 500_000,
-            Self::K250 => 250_000,
-            Self::K125 => 125_000,
-            Self::K100 => 100_000,
-            Self::K50 => 50_000,
-            Self::K20 => 20_000,
-            Self::K10 => 10_000,
-            Self::Auto => return None,
-        })
-    }
-}
-
 /// Why a device did not store; the values are the error codes of the answer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
@@ -108,11 +48,19 @@ pub trait LssDevice {
     fn supports(&mut self, rate: BitRate) -> bool;
 
     /// Stores what was configured, for the next start. No node-ID makes the device one without (FFh); no bit rate leaves
-    /// the stored one as it is.
+    /// the stored one as it is. A device that needs time for it (`Pending`) is asked by [`stored`](Self::stored).
     ///
     /// # Errors
     /// The error code that the master gets.
-    fn store(&mut self, node: Option<NodeId>, rate: Option<BitRate>) -> Result<(), StoreError>;
+    fn store(&mut self, node: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>>;
+
+    /// How the last [`store`](Self::store) came out.
+    ///
+    /// # Errors
+    /// The error code that the master gets.
+    fn stored(&mut self) -> Poll<Result<(), StoreError>> {
+        Poll::Ready(Ok(()))
+    }
 }
 
 /// What can be chosen about an LSS slave.
@@ -153,6 +101,8 @@ pub struct Lss {
     /// The part of the address that fastscan is at, 0 to 3.
     position: u8,
     activation: Activation,
+    /// The device is storing; its master waits for the answer and gets no other.
+    storing: bool,
     answer: Option<[u8; 8]>,
     /// A node-ID that came into force and has yet to be told.
     assigned: Option<NodeId>,
@@ -221,6 +171,7 @@ impl Lss {
             identified: 0,
             position: 0,
             activation: Activation::None,
+            storing: false,
             answer: announce.then(|| answer(NON_CONFIGURED, [0; 2])),
             assigned: None,
         }
@@ -261,12 +212,23 @@ impl Lss {
 
     /// Takes a frame, whatever it is.
     pub fn handle(&mut self, frame: &Frame, now: Instant, device: &mut impl LssDevice) {
-        if frame.cob_id() != Some(CobId::LSS_REQUEST) || self.is_silent(now) {
+        if frame.cob_id() != Some(CobId::LSS_REQUEST) || self.is_silent(now) || self.storing {
             return;
         }
         let Some(bytes) = frame.exactly() else { return };
         if let Some(answer) = self.request(bytes, now, device) {
             self.answer = Some(answer);
+        }
+    }
+
+    /// Asks a device that is storing whether it is done, so that the master gets its answer. To be called before
+    /// [`poll`](Self::poll) where the device needs time to store.
+    pub fn follow_store(&mut self, device: &mut impl LssDevice) {
+        if self.storing {
+            if let Poll::Ready(outcome) = device.stored() {
+                self.storing = false;
+                self.answer = Some(store_answer(outcome));
+            }
         }
     }
 
@@ -321,10 +283,13 @@ impl Lss {
                 }
                 None
             }
-            (STORE, State::Configuration) => {
-                let error = device.store(self.pending, self.bit_rate).err();
-                Some(answer(STORE, [error.map_or(0, |error| error as u8), 0]))
-            }
+            (STORE, State::Configuration) => match device.store(self.pending, self.bit_rate) {
+                Poll::Ready(outcome) => Some(store_answer(outcome)),
+                Poll::Pending => {
+                    self.storing = true;
+                    None
+                }
+            },
             (INQUIRE_VENDOR..=INQUIRE_SERIAL, State::Configuration) => {
                 let part = self.address.parts()[usize::from(command - INQUIRE_VENDOR)];
                 let [a, b, c, d] = part.to_le_bytes();
@@ -413,6 +378,10 @@ fn advance(done: &mut u8, step: u8, last: u8, matches: bool) -> bool {
     let complete = good && step == last;
     *done = if good && !complete { step + 1 } else { 0 };
     complete
+}
+
+fn store_answer(outcome: Result<(), StoreError>) -> [u8; 8] {
+    answer(STORE, [outcome.err().map_or(0, |error| error as u8), 0])
 }
 
 fn answer(command: u8, [a, b]: [u8; 2]) -> [u8; 8] {

@@ -78,6 +78,11 @@ impl Node {
         self.sdo.is_idle()
     }
 
+    /// Ends a transfer that is going on, without a word to the client.
+    pub fn end_transfer(&mut self, objects: &mut impl Objects) {
+        self.sdo.reset(objects);
+    }
+
     /// Starts anew under this node-ID, as after Reset communication: a transfer ends, the boot-up is said again.
     pub fn restart(&mut self, id: NodeId, objects: &mut impl Objects) {
         self.sdo.reset(objects);

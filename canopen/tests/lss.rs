@@ -2,6 +2,8 @@
 
 mod common;
 
+use core::task::Poll;
+
 use canopen::lss::{BitRate, Config, Lss, LssAddress, LssDevice, Output, StoreError};
 use canopen::{CobId, Frame, NodeId};
 use common::at;
@@ -27,9 +29,9 @@ impl LssDevice for Device {
         rate != BitRate::K800
     }
 
-    fn store(&mut self, node: Option<NodeId>, rate: Option<BitRate>) -> Result<(), StoreError> {
+    fn store(&mut self, node: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {
         self.stored.push((node, rate));
-        self.fails.map_or(Ok(()), Err)
+        Poll::Ready(self.fails.map_or(Ok(()), Err))
     }
 }
 

@@ -4,6 +4,8 @@
 //! stores is what was configured; and afterwards a correct master finds, configures and stores it.
 #![no_main]
 
+use core::task::Poll;
+
 use canopen::lss::{BitRate, Config, Lss, LssAddress, LssDevice, Output, StoreError};
 use canopen::{CobId, Frame, Instant, NodeId};
 use coboot_fuzz::{Input, ENDLESS};
@@ -28,13 +30,13 @@ impl LssDevice for Device {
         rate != BitRate::K800
     }
 
-    fn store(&mut self, node: Option<NodeId>, rate: Option<BitRate>) -> Result<(), StoreError> {
+    fn store(&mut self, node: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {
         assert_ne!(rate, Some(BitRate::K800), "a bit rate that the device does not support");
         if self.fails {
-            return Err(StoreError::Failed);
+            return Poll::Ready(Err(StoreError::Failed));
         }
         self.stored = Some((node, rate));
-        Ok(())
+        Poll::Ready(Ok(()))
     }
 }
 

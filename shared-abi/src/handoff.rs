@@ -88,7 +88,7 @@ impl ResetCause {
 pub struct BootInfo {
     /// Node-ID in use, 1 to 127.
     pub node_id: u8,
-    /// Bit rate of the CAN bus in bit/s.
+    /// Bit rate of the CAN bus in bit/s; 0 for a device that finds it out by listening.
     pub bit_rate: u32,
     /// The program that was started, 1 to 254.
     pub program: u8,
@@ -120,7 +120,7 @@ pub struct Handoff {
     pub reset_cause: u8,
     /// 1 for a trial, 0 otherwise.
     pub trial: u8,
-    /// Bit rate in bit/s.
+    /// Bit rate in bit/s, 0 for one to be found out.
     pub bit_rate: u32,
     /// Version of the bootloader.
     pub bootloader_version: u32,

@@ -48,7 +48,7 @@ pub fn bootloader() -> Image {
             heartbeat_ms: 1000,
             ..BOARD
         },
-        lss: false,
+        lss: true,
     }
 }
 
@@ -60,7 +60,7 @@ pub fn application() -> Image {
         description: "The application template of coboot",
         entries: &application::ENTRIES,
         device: Device { device_type: 0, software_version: "1.0.0", heartbeat_ms: 500, ..BOARD },
-        lss: false,
+        lss: true,
     }
 }
 

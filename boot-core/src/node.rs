@@ -1,0 +1,49 @@
+//! Node-ID and bit rate as the layer setting services store them, for bootloader and application alike.
+
+use canopen::bit_rate::BitRate;
+use canopen::NodeId;
+
+use crate::flash::Flash;
+use crate::parameters::{Journal, Key, Value};
+
+/// What a device is called on its bus, and how fast that is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct NodeParameters {
+    /// `None` for a device that waits for layer setting services to give it one.
+    pub id: Option<NodeId>,
+    /// May be [`BitRate::Auto`].
+    pub bit_rate: BitRate,
+}
+
+/// The stored form of "no node-ID" (CiA 305).
+const NO_NODE_ID: u32 = 0xFF;
+
+impl NodeParameters {
+    /// What was stored, or the board's own values where nothing was, or nothing that this firmware can run with.
+    pub fn load<F: Flash>(
+        journal: &Journal,
+        flash: &F,
+        board: Self,
+        supports: impl FnOnce(BitRate) -> bool,
+    ) -> Self {
+        journal
+            .get(flash, Key::Node)
+            .and_then(Self::from_value)
+            .filter(|stored| supports(stored.bit_rate))
+            .unwrap_or(board)
+    }
+
+    fn from_value([id, rate, ..]: Value) -> Option<Self> {
+        let id = match id {
+            NO_NODE_ID => None,
+            id => Some(NodeId::new(u8::try_from(id).ok()?)?),
+        };
+        Some(Self { id, bit_rate: BitRate::from_index(u8::try_from(rate).ok()?)? })
+    }
+
+    /// The stored form.
+    #[must_use]
+    pub fn value(&self) -> Value {
+        [self.id.map_or(NO_NODE_ID, |id| id.get().into()), self.bit_rate as u32, 0, 0]
+    }
+}

@@ -1,0 +1,172 @@
+//! The bit rates of CANopen, and how a device finds out which one a bus runs at.
+
+use crate::time::Instant;
+
+/// The bit rates of table 0, with their index (CiA 305 table 1).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum BitRate {
+    /// 1 Mbit/s.
+    K1000 = 0,
+    /// 800 kbit/s.
+    K800 = 1,
+    /// 500 kbit/s.
+    K500 = 2,
+    /// 250 kbit/s.
+    K250 = 3,
+    /// 125 kbit/s.
+    K125 = 4,
+    /// 100 kbit/s; later editions of the standard have it reserved.
+    K100 = 5,
+    /// 50 kbit/s.
+    K50 = 6,
+    /// 20 kbit/s.
+    K20 = 7,
+    /// 10 kbit/s.
+    K10 = 8,
+    /// The device finds it out.
+    Auto = 9,
+}
+
+impl BitRate {
+    /// From the index in table 0.
+    #[must_use]
+    pub const fn from_index(index: u8) -> Option<Self> {
+        Some(match index {
+            0 => Self::K1000,
+            1 => Self::K800,
+            2 => Self::K500,
+            3 => Self::K250,
+            4 => Self::K125,
+            5 => Self::K100,
+            6 => Self::K50,
+            7 => Self::K20,
+            8 => Self::K10,
+            9 => Self::Auto,
+            _ => return None,
+        })
+    }
+
+    /// From bit/s, as boards and handoff have it: 0 is [`BitRate::Auto`].
+    #[must_use]
+    pub const fn from_bits_per_second(rate: u32) -> Option<Self> {
+        if rate == 0 {
+            return Some(Self::Auto);
+        }
+        let mut i = 0;
+        while i < Self::FIXED.len() {
+            if Self::FIXED[i].or_zero() == rate {
+                return Some(Self::FIXED[i]);
+            }
+            i += 1;
+        }
+        None
+    }
+
+    /// In bit/s, 0 for [`BitRate::Auto`].
+    #[must_use]
+    pub const fn or_zero(self) -> u32 {
+        match self.bits_per_second() {
+            Some(rate) => rate,
+            None => 0,
+        }
+    }
+
+    /// All that can be set, from fast to slow.
+    pub const FIXED: [Self; 9] = [
+        Self::K1000,
+        Self::K800,
+        Self::K500,
+        Self::K250,
+        Self::K125,
+        Self::K100,
+        Self::K50,
+        Self::K20,
+        Self::K10,
+    ];
+
+    /// In bit/s; `None` for [`BitRate::Auto`].
+    #[must_use]
+    pub const fn bits_per_second(self) -> Option<u32> {
+        Some(match self {
+            Self::K1000 => 1_000_000,
+            Self::K800 => 800_000,
+            Self::K500 => 500_000,
+            Self::K250 => 250_000,
+            Self::K125 => 125_000,
+            Self::K100 => 100_000,
+            Self::K50 => 50_000,
+            Self::K20 => 20_000,
+            Self::K10 => 10_000,
+            Self::Auto => return None,
+        })
+    }
+}
+
+/// What a controller that only listens made of the bus since it was last asked.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Heard {
+    /// Nothing.
+    #[default]
+    Nothing,
+    /// A good frame was the last thing.
+    Frame,
+    /// An error was the last thing.
+    Error,
+}
+
+/// Finds the bit rate of a bus by listening (in the manner of CiA 801): a good frame proves a rate, an error disproves it.
+///
+/// On a bus where nobody else acknowledges, the lone sender's frames come out bad even at the right rate, until it is error
+/// passive and its error flags no longer show (ISO 11898-1): the search comes round to the right rate again and finds it
+/// then.
+#[derive(Clone, Copy, Debug)]
+pub struct Detector {
+    at: usize,
+    since: Instant,
+}
+
+/// How long silence is listened to before the next rate gets its turn, in milliseconds: more than a usual heartbeat.
+/// Slow sampling of a fast bus may hear nothing at all.
+const DWELL_MS: u32 = 1500;
+
+impl Detector {
+    /// Starts with this rate, or with the first there is; `supports` tells which of them the device can run at.
+    pub fn new(first: BitRate, now: Instant, supports: impl FnMut(BitRate) -> bool) -> Self {
+        let at = BitRate::FIXED.iter().position(|rate| *rate == first).unwrap_or(0);
+        let mut detector = Self { at, since: now };
+        detector.settle(supports);
+        detector
+    }
+
+    /// The rate to listen at.
+    #[must_use]
+    pub const fn rate(&self) -> BitRate {
+        BitRate::FIXED[self.at]
+    }
+
+    /// Takes what was heard. `true` proves the rate; otherwise [`rate`](Self::rate) may have become another one.
+    pub fn heard(&mut self, heard: Heard, now: Instant, supports: impl FnMut(BitRate) -> bool) -> bool {
+        let go_on = match heard {
+            Heard::Frame => return true,
+            Heard::Error => true,
+            Heard::Nothing => now.since(self.since) >= DWELL_MS,
+        };
+        if go_on {
+            self.at = (self.at + 1) % BitRate::FIXED.len();
+            self.since = now;
+            self.settle(supports);
+        }
+        false
+    }
+
+    /// Passes over the rates that the device cannot run at. If there is none at all, it stays where it is.
+    fn settle(&mut self, mut supports: impl FnMut(BitRate) -> bool) {
+        for _ in BitRate::FIXED {
+            if supports(self.rate()) {
+                return;
+            }
+            self.at = (self.at + 1) % BitRate::FIXED.len();
+        }
+    }
+}

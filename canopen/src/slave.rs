@@ -1,0 +1,248 @@
+//! A device on the bus: its [`Node`], layer setting services, bit rate detection and the state of its line tied together.
+//!
+//! The owner of the CAN controller
+//!
+//! 1. passes every frame received to [`Slave::handle`],
+//! 2. tells the controller's state by [`Slave::observe`], every few milliseconds,
+//! 3. then does what [`Slave::poll`] says until it says nothing.
+//!
+//! A new slave first says how to set the controller up, so there is one place that does.
+
+use crate::bit_rate::BitRate;
+#[cfg(feature = "auto-bit-rate")]
+use crate::bit_rate::Detector;
+use crate::frame::{CobId, Frame, NodeId};
+use crate::line::{Consequence, LineEvent, Losses, Monitor, Status};
+#[cfg(feature = "lss")]
+use crate::lss::Lss;
+use crate::lss::{self, LssAddress, LssDevice};
+use crate::nmt::NmtCommand;
+use crate::node::{self, Node};
+use crate::od::Objects;
+use crate::time::Instant;
+
+/// What a slave needs of its device.
+pub trait SlaveDevice: Objects + LssDevice {
+    /// Something happened on the line that an emergency may tell of.
+    fn line_event(&mut self, event: LineEvent) {
+        let _ = event;
+    }
+
+    /// The device has this node-ID from now on, or none; its node starts anew.
+    fn node_id_changed(&mut self, id: Option<NodeId>) {
+        let _ = id;
+    }
+}
+
+/// What can be chosen about a slave.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Config {
+    /// The node's part.
+    pub node: node::Config,
+    /// The part of the layer setting services.
+    pub lss: lss::Config,
+}
+
+/// What the owner has to do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Output {
+    /// Send this frame.
+    Send(Frame),
+    /// Set the controller to this bit rate, never [`BitRate::Auto`], and take part in the bus. What waits in the mailboxes is
+    /// not sent any more.
+    Join(BitRate),
+    /// Set the controller to this bit rate and listen only.
+    Listen(BitRate),
+    /// Bring the controller back from bus-off.
+    ComeBack,
+    /// Let in the frames of exactly these identifiers; one may be named twice.
+    Accept([CobId; 3]),
+}
+
+/// A device on the bus.
+#[derive(Debug)]
+pub struct Slave {
+    config: Config,
+    node: Option<Node>,
+    #[cfg(feature = "lss")]
+    lss: Lss,
+    line: Line,
+    losses: Losses,
+    /// The node-ID changed: the filters have yet to follow.
+    accept: bool,
+}
+
+#[derive(Debug)]
+enum Line {
+    /// To be set to this rate.
+    Down(BitRate),
+    #[cfg(feature = "auto-bit-rate")]
+    Listening {
+        detector: Detector,
+        set: BitRate,
+    },
+    Up {
+        monitor: Monitor,
+        come_back: bool,
+    },
+}
+
+impl Slave {
+    /// A device with this node-ID, or without one, on a bus of this bit rate. One without node-ID is silent, but for layer
+    /// setting services.
+    #[must_use]
+    pub fn new(address: LssAddress, id: Option<NodeId>, rate: BitRate, config: Config) -> Self {
+        #[cfg(not(feature = "lss"))]
+        let _ = address;
+        Self {
+            config,
+            node: id.map(|id| Node::new(id, config.node)),
+            #[cfg(feature = "lss")]
+            lss: Lss::new(address, id, config.lss),
+            line: Line::Down(rate),
+            losses: Losses::default(),
+            accept: true,
+        }
+    }
+
+    /// Its node, unless it has no node-ID.
+    #[must_use]
+    pub const fn node(&self) -> Option<&Node> {
+        self.node.as_ref()
+    }
+
+    /// Takes the value of 1017h: the heartbeat's period in milliseconds, 0 for none.
+    pub fn set_heartbeat_ms(&mut self, period_ms: u16, now: Instant) {
+        self.config.node.heartbeat_ms = period_ms;
+        if let Some(node) = &mut self.node {
+            node.set_heartbeat_ms(period_ms, now);
+        }
+    }
+
+    /// Whether nothing is on its way to a client: no transfer, no answer.
+    #[must_use]
+    pub fn is_idle(&self) -> bool {
+        self.node.as_ref().is_none_or(Node::is_sdo_idle)
+    }
+
+    /// Takes a frame, whatever it is, and tells whether the NMT master asked to restart the device.
+    pub fn handle(&mut self, frame: &Frame, now: Instant, device: &mut impl SlaveDevice) -> bool {
+        // Who only listens is not on the bus yet, and could not answer.
+        if !matches!(self.line, Line::Up { .. }) {
+            return false;
+        }
+        #[cfg(feature = "lss")]
+        self.lss.handle(frame, now, device);
+        let Some(node) = &mut self.node else { return false };
+        match node.handle(frame, now, device) {
+            Some(NmtCommand::ResetNode) => return true,
+            Some(NmtCommand::ResetCommunication) => {
+                #[cfg(feature = "lss")]
+                let id = self.lss.reset_communication();
+                #[cfg(not(feature = "lss"))]
+                let id = Some(node.id());
+                self.restart(id, device);
+            }
+            _ => {}
+        }
+        false
+    }
+
+    /// Takes what the controller tells of itself.
+    pub fn observe(&mut self, status: Status, now: Instant, device: &mut impl SlaveDevice) {
+        if let Some(lost) = self.losses.observe(status.lost, now) {
+            device.line_event(LineEvent::Lost(lost));
+        }
+        match &mut self.line {
+            Line::Down(_) => {}
+            #[cfg(feature = "auto-bit-rate")]
+            Line::Listening { detector, .. } => {
+                if detector.heard(status.heard, now, |rate| device.supports(rate)) {
+                    self.line = Line::Down(detector.rate());
+                }
+            }
+            Line::Up { monitor, come_back } => match monitor.observe(status.confinement, now) {
+                Some(Consequence::Tell(event)) => device.line_event(event),
+                Some(Consequence::ComeBack) => *come_back = true,
+                None => {}
+            },
+        }
+    }
+
+    /// What to do next, until there is nothing. Frames are given only while there is `room` for one in the mailboxes.
+    pub fn poll(&mut self, now: Instant, room: bool, device: &mut impl SlaveDevice) -> Option<Output> {
+        if core::mem::take(&mut self.accept) {
+            return Some(Output::Accept(self.identifiers()));
+        }
+        match &mut self.line {
+            Line::Down(rate) => {
+                let rate = *rate;
+                return Some(self.bring_up(rate, now, device));
+            }
+            #[cfg(feature = "auto-bit-rate")]
+            Line::Listening { detector, set } => {
+                if *set == detector.rate() {
+                    return None;
+                }
+                *set = detector.rate();
+                return Some(Output::Listen(*set));
+            }
+            Line::Up { come_back, .. } => {
+                if core::mem::take(come_back) {
+                    return Some(Output::ComeBack);
+                }
+            }
+        }
+        #[cfg(feature = "lss")]
+        {
+            self.lss.follow_store(device);
+            match room.then(|| self.lss.poll(now)).flatten() {
+                Some(lss::Output::Send(frame)) => return Some(Output::Send(frame)),
+                Some(lss::Output::BitRate(rate)) => return Some(self.bring_up(rate, now, device)),
+                Some(lss::Output::NodeId(id)) => {
+                    self.restart(Some(id), device);
+                    self.accept = false;
+                    return Some(Output::Accept(self.identifiers()));
+                }
+                None if self.lss.is_silent(now) => return None,
+                None => {}
+            }
+        }
+        if !room {
+            return None;
+        }
+        self.node.as_mut()?.poll(now, device).map(Output::Send)
+    }
+
+    /// The identifiers that it serves.
+    fn identifiers(&self) -> [CobId; 3] {
+        let lss = if cfg!(feature = "lss") { CobId::LSS_REQUEST } else { CobId::NMT };
+        match &self.node {
+            Some(node) => [CobId::NMT, lss, CobId::sdo_request(node.id())],
+            None => [lss; 3],
+        }
+    }
+
+    fn bring_up(&mut self, rate: BitRate, now: Instant, device: &mut impl SlaveDevice) -> Output {
+        #[cfg(feature = "auto-bit-rate")]
+        if rate == BitRate::Auto {
+            let detector = Detector::new(BitRate::K125, now, |rate| device.supports(rate));
+            let set = detector.rate();
+            self.line = Line::Listening { detector, set };
+            return Output::Listen(set);
+        }
+        let _ = device;
+        self.line = Line::Up { monitor: Monitor::new(now), come_back: false };
+        Output::Join(rate)
+    }
+
+    /// The node starts anew under this node-ID: a transfer ends, the boot-up is said (again).
+    fn restart(&mut self, id: Option<NodeId>, device: &mut impl SlaveDevice) {
+        if let Some(node) = &mut self.node {
+            node.end_transfer(device);
+        }
+        self.node = id.map(|id| Node::new(id, self.config.node));
+        self.accept = true;
+        device.node_id_changed(id);
+    }
+}
