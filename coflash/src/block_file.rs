@@ -1,14 +1,57 @@
 //! Block files: read, verified and written. The format itself is in [`shared_abi::block_file`].
 
-use crc::{Crc, Table, CRC_32_ISO_HDLC};
+use std::fmt;
+
+use crc::{Crc, Table, CRC_16_XMODEM, CRC_32_ISO_HDLC};
 use shared_abi::block_file::{Control, Header, Last, CRC_SIZE, HEADER_SIZE, NUMBER_CONTROL, NUMBER_LAST};
 pub use shared_abi::block_file::{Identity, FRAMING, MAX_BLOCK_SIZE};
 
-use crate::image::AddressRange;
+use crate::image::{AddressRange, Image, Pieces};
 use crate::read::{Cause, Place, ReadError};
 
 /// The CRC of blocks and programs: polynomial EDB88320h reflected (manual L-1112d_10, chapter 3.1).
 pub const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISO_HDLC);
+
+/// The CRC that a bootloader built for it takes instead: polynomial 1021h, start value 0, as SDO block transfer has it
+/// (manual L-1112d_10, table 8, `--crc16`).
+const CRC16: Crc<u16, Table<16>> = Crc::<u16, Table<16>>::new(&CRC_16_XMODEM);
+
+/// With what the blocks and the program are checked. The file does not say it: host and bootloader have to agree.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Checksum {
+    /// [`CRC`].
+    #[default]
+    Crc32,
+    /// The 16-bit CRC with polynomial 1021h, stored in 32 bits.
+    Crc16,
+}
+
+impl Checksum {
+    /// Over all of the parts, one behind the other.
+    fn of<'a>(self, parts: impl Iterator<Item = &'a [u8]>) -> u32 {
+        match self {
+            Self::Crc32 => {
+                let mut digest = CRC.digest();
+                parts.for_each(|part| digest.update(part));
+                digest.finalize()
+            }
+            Self::Crc16 => {
+                let mut digest = CRC16.digest();
+                parts.for_each(|part| digest.update(part));
+                digest.finalize().into()
+            }
+        }
+    }
+}
+
+impl fmt::Display for Checksum {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Crc32 => "CRC-32",
+            Self::Crc16 => "CRC-16",
+        })
+    }
+}
 
 /// The most data bytes that a block can have.
 pub const MAX_DATA: usize = MAX_BLOCK_SIZE - FRAMING;
@@ -29,9 +72,15 @@ pub struct Block {
 }
 
 impl Block {
-    /// The bytes of the block with header and CRC.
+    /// The bytes of the block with header and CRC-32.
     #[must_use]
     pub fn emit(&self) -> Vec<u8> {
+        self.emit_with(Checksum::Crc32)
+    }
+
+    /// The bytes of the block with header and CRC.
+    #[must_use]
+    pub fn emit_with(&self, checksum: Checksum) -> Vec<u8> {
         let header = Header {
             number: self.number,
             flash_address: self.flash_address,
@@ -41,7 +90,8 @@ impl Block {
         let mut bytes = Vec::with_capacity(FRAMING + self.data.len());
         bytes.extend_from_slice(&header.emit());
         bytes.extend_from_slice(&self.data);
-        bytes.extend_from_slice(&CRC.checksum(&bytes).to_le_bytes());
+        let crc = checksum.of([bytes.as_slice()].into_iter());
+        bytes.extend_from_slice(&crc.to_le_bytes());
         bytes
     }
 }
@@ -52,6 +102,7 @@ pub struct BlockFile {
     blocks: Vec<Block>,
     control: Control,
     last: Last,
+    checksum: Checksum,
 }
 
 impl BlockFile {
@@ -59,9 +110,15 @@ impl BlockFile {
     ///
     /// `blocks` are (address, data) in address order and not before `start`; each has at most [`MAX_DATA`] bytes.
     /// `control` makes block 0 when the program's size is known.
-    pub(crate) fn new(start: u32, blocks: Vec<(u32, Vec<u8>)>, control: impl FnOnce(u32) -> Control) -> Self {
+    pub(crate) fn new(
+        start: u32,
+        blocks: Vec<(u32, Vec<u8>)>,
+        control: impl FnOnce(u32) -> Control,
+        checksum: Checksum,
+    ) -> Self {
         let program_size = blocks.last().map_or(0, |(address, data)| address - start + data.len() as u32);
-        let program_crc = program_crc(start, program_size, blocks.iter().map(|(a, d)| (*a, d.as_slice())));
+        let program_crc =
+            program_crc(checksum, start, program_size, blocks.iter().map(|(a, d)| (*a, d.as_slice())));
         let control = control(program_size);
         // Flash address 0: the older manual (L-1112e_5) asks for it, the newer one allows anything.
         let last = Last { program_size, program_crc };
@@ -70,7 +127,7 @@ impl BlockFile {
         let mut all = vec![block(NUMBER_CONTROL, 0, bytes[..len].to_vec())];
         all.extend((1..).zip(blocks).map(|(number, (address, data))| block(number, address, data)));
         all.push(block(NUMBER_LAST, 0, last.emit().to_vec()));
-        Self { blocks: all, control, last }
+        Self { blocks: all, control, last, checksum }
     }
 
     /// Whether bytes begin like a block file: block 0 at address 0 with one of the known lengths.
@@ -82,16 +139,20 @@ impl BlockFile {
         })
     }
 
-    /// Reads a file and checks every number, size and CRC in it.
+    /// Reads a file and checks every number, size and CRC in it. Which CRC it is, the first block tells.
     ///
     /// # Errors
     /// The first fault, with its offset.
     pub fn parse(bytes: &[u8]) -> Result<Self, ReadError> {
         let mut blocks: Vec<Block> = Vec::new();
         let mut offset = 0;
+        let mut checksum = Checksum::Crc32;
+        if parse_block(bytes, Checksum::Crc16, Place::Offset(0)).is_ok() {
+            checksum = Checksum::Crc16;
+        }
         let last = loop {
             let place = Place::Offset(offset);
-            let (block, len) = parse_block(&bytes[offset..], place)?;
+            let (block, len) = parse_block(&bytes[offset..], checksum, place)?;
             let expected = blocks.len() as u32;
             let is_last = block.number == NUMBER_LAST && expected > 0;
             if block.number != expected && !is_last {
@@ -118,7 +179,7 @@ impl BlockFile {
         let control = &blocks[0].data;
         let control =
             Control::parse(control).ok_or(Place::Offset(0).fault(Cause::ControlSize(control.len())))?;
-        let file = Self { blocks, control, last };
+        let file = Self { blocks, control, last, checksum };
         if file.program_blocks().is_empty() {
             return Err(Place::File.fault(Cause::NoData));
         }
@@ -163,7 +224,7 @@ impl BlockFile {
             && program_size <= MAX_PROGRAM_SIZE
             && u64::from(start) + u64::from(program_size) > u64::from(span.last);
         let blocks = self.program_blocks().iter().map(|block| (block.flash_address, block.data.as_slice()));
-        covered && program_crc(start, program_size, blocks) == crc
+        covered && program_crc(self.checksum, start, program_size, blocks) == crc
     }
 
     fn program_fault(&self) -> Cause {
@@ -199,6 +260,51 @@ impl BlockFile {
         &self.control
     }
 
+    /// With what it is checked.
+    #[must_use]
+    pub fn checksum(&self) -> Checksum {
+        self.checksum
+    }
+
+    /// The memory contents that the blocks carry.
+    #[must_use]
+    pub fn image(&self) -> Image {
+        let mut pieces = Pieces::default();
+        let mut offset = 0;
+        for block in &self.blocks {
+            if !matches!(block.number, NUMBER_CONTROL | NUMBER_LAST) {
+                pieces.add(block.flash_address, block.data.clone(), Place::Offset(offset));
+            }
+            offset += FRAMING + block.data.len();
+        }
+        pieces.in_order()
+    }
+
+    /// Where the program starts: its region's first address, as far as the file tells it.
+    #[must_use]
+    pub fn program_start(&self) -> u32 {
+        let span = self.span();
+        if self.starts_at(span.first) {
+            return span.first;
+        }
+        span.last.wrapping_add(1).wrapping_sub(self.last.program_size)
+    }
+
+    /// The flash from the program's start to its last byte, as the device will have it.
+    #[must_use]
+    pub fn flash_image(&self) -> Vec<u8> {
+        let start = self.program_start();
+        // `parse` and `convert` bound the size by `MAX_PROGRAM_SIZE`.
+        let mut flash = vec![0xFF; self.last.program_size as usize];
+        for block in self.program_blocks() {
+            let at = block.flash_address.wrapping_sub(start) as usize;
+            if let Some(place) = flash.get_mut(at..at + block.data.len()) {
+                place.copy_from_slice(&block.data);
+            }
+        }
+        flash
+    }
+
     /// Bytes of the program, from its region's start on.
     #[must_use]
     pub fn program_size(&self) -> u32 {
@@ -214,7 +320,7 @@ impl BlockFile {
     /// The bytes of the file.
     #[must_use]
     pub fn emit(&self) -> Vec<u8> {
-        self.blocks.iter().flat_map(Block::emit).collect()
+        self.blocks.iter().flat_map(|block| block.emit_with(self.checksum)).collect()
     }
 }
 
@@ -223,7 +329,7 @@ fn last_address(block: &Block) -> u32 {
 }
 
 /// One block from the front of `bytes`, and how long it is.
-fn parse_block(bytes: &[u8], place: Place) -> Result<(Block, usize), ReadError> {
+fn parse_block(bytes: &[u8], checksum: Checksum, place: Place) -> Result<(Block, usize), ReadError> {
     let cut_off = |what, needed| place.fault(Cause::CutOff { what, needed, found: bytes.len() });
     let header = bytes.first_chunk().ok_or_else(|| cut_off("the header of a block", HEADER_SIZE))?;
     let Header { number, flash_address, size } = Header::parse(header);
@@ -233,7 +339,7 @@ fn parse_block(bytes: &[u8], place: Place) -> Result<(Block, usize), ReadError> 
     let crc_at = HEADER_SIZE + size as usize;
     let crc = bytes.get(crc_at..).and_then(|rest| rest.first_chunk::<CRC_SIZE>());
     let crc = crc.ok_or_else(|| cut_off("a block", crc_at + CRC_SIZE))?;
-    let (found, needed) = (u32::from_le_bytes(*crc), CRC.checksum(&bytes[..crc_at]));
+    let (found, needed) = (u32::from_le_bytes(*crc), checksum.of([&bytes[..crc_at]].into_iter()));
     if found != needed {
         return Err(place.fault(Cause::BlockCrc { number, found, needed }));
     }
@@ -264,20 +370,20 @@ fn check_order(before: Option<&Block>, block: &Block, place: Place) -> Result<()
 /// CRC of the first `size` bytes from `start`, as they are to lie in flash: erased bytes read FFh.
 ///
 /// The blocks lie between `start` and `start + size`, in address order.
-fn program_crc<'a>(start: u32, size: u32, blocks: impl Iterator<Item = (u32, &'a [u8])>) -> u32 {
+fn program_crc<'a>(
+    checksum: Checksum,
+    start: u32,
+    size: u32,
+    blocks: impl Iterator<Item = (u32, &'a [u8])>,
+) -> u32 {
     const ERASED: [u8; 4096] = [0xFF; 4096];
-    let blocks = blocks.map(|(address, data)| (u64::from(address), data));
     let end = u64::from(start) + u64::from(size);
-    let mut digest = CRC.digest();
+    let blocks = blocks.map(|(address, data)| (u64::from(address), data)).chain([(end, [].as_slice())]);
     let mut at = u64::from(start);
-    for (address, data) in blocks.chain([(end, [].as_slice())]) {
-        while at < address {
-            let gap = (address - at).min(ERASED.len() as u64);
-            digest.update(&ERASED[..gap as usize]);
-            at += gap;
-        }
-        digest.update(data);
-        at += data.len() as u64;
-    }
-    digest.finalize()
+    checksum.of(blocks.flat_map(move |(address, data)| {
+        let gap = address.saturating_sub(at) as usize;
+        at = at.max(address) + data.len() as u64;
+        let full = std::iter::repeat_n(ERASED.as_slice(), gap / ERASED.len());
+        full.chain([&ERASED[..gap % ERASED.len()], data])
+    }))
 }

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 
 use shared_abi::block_file::{Control, Identity};
 
-use crate::block_file::{BlockFile, FRAMING, MAX_BLOCK_SIZE, MAX_PROGRAM_SIZE};
+use crate::block_file::{BlockFile, Checksum, FRAMING, MAX_BLOCK_SIZE, MAX_PROGRAM_SIZE};
 use crate::image::{AddressRange, Image};
 use crate::read::{Cause, Firmware, Place, ReadError};
 
@@ -24,6 +24,8 @@ pub enum Region {
     Strict(AddressRange),
     /// What `--start-address` and `--end-address` cut out (manual, table 8): data outside is left out.
     Cut(AddressRange),
+    /// The same with `--end-address` alone: the program starts at the first byte.
+    CutBehind(u32),
 }
 
 /// What gaps inside a block are filled with: a 32-bit pattern, as the flash's words would show it.
@@ -111,6 +113,10 @@ pub struct Options {
     pub gap_fill: GapFill,
     /// What goes into block 0.
     pub label: Label,
+    /// What is added to every address, after [`Region::Cut`] and before [`Region::Strict`]; 2³² − n takes n away.
+    pub adjust_start: u32,
+    /// With what the blocks and the program are checked: what the bootloader was built for.
+    pub checksum: Checksum,
 }
 
 impl Default for Options {
@@ -120,6 +126,8 @@ impl Default for Options {
             block_size: DEFAULT_BLOCK_SIZE,
             gap_fill: GapFill::default(),
             label: Label::default(),
+            adjust_start: 0,
+            checksum: Checksum::default(),
         }
     }
 }
@@ -148,6 +156,12 @@ pub enum ConvertError {
     /// A region that ends before it starts.
     #[error("the address range {0} ends before it starts")]
     Range(AddressRange),
+    /// Addresses that leave the address space when they are adjusted.
+    #[error("adding {0:#010x} to the addresses moves the program over the end of the address space")]
+    Adjust(u32),
+    /// Blocks cannot be changed any more.
+    #[error("a block file is taken as it is: {0} needs the firmware that it was made of")]
+    Blocks(&'static str),
 }
 
 /// A conversion's result.
@@ -168,7 +182,7 @@ pub struct Converted {
 /// See [`ConvertError`].
 pub fn convert(image: &Image, options: &Options) -> Result<Converted, ConvertError> {
     let payload = payload(options)?;
-    let (image, start, left_out) = place(image, options.region)?;
+    let (image, start, left_out) = place(image, options)?;
     if !start.is_multiple_of(WORD) {
         return Err(ConvertError::Start(start));
     }
@@ -177,7 +191,8 @@ pub fn convert(image: &Image, options: &Options) -> Result<Converted, ConvertErr
         return Err(Place::File.fault(Cause::TooSparse { first: start, last }).into());
     }
     let blocks = blocks(&image, payload, options.gap_fill);
-    let file = BlockFile::new(start, blocks, |app_size| options.label.control(app_size));
+    let label = |app_size| options.label.control(app_size);
+    let file = BlockFile::new(start, blocks, label, options.checksum);
     Ok(Converted { file, left_out })
 }
 
@@ -189,9 +204,16 @@ pub fn convert(image: &Image, options: &Options) -> Result<Converted, ConvertErr
 pub fn blocks_of(firmware: Firmware, options: &Options) -> Result<Converted, ConvertError> {
     match firmware {
         Firmware::Image(image) => convert(&image, options),
+        Firmware::Blocks(_) if options.adjust_start != 0 => {
+            Err(ConvertError::Blocks("another start address"))
+        }
         Firmware::Blocks(file) => {
-            if let Region::Strict(region) | Region::Cut(region) = options.region {
-                file.check_region(region)?;
+            match options.region {
+                Region::Unknown => {}
+                Region::Strict(region) | Region::Cut(region) => file.check_region(region)?,
+                Region::CutBehind(last) => {
+                    file.check_region(AddressRange { first: file.program_start(), last })?;
+                }
             }
             Ok(Converted { file, left_out: 0 })
         }
@@ -211,19 +233,44 @@ fn payload(options: &Options) -> Result<usize, ConvertError> {
 }
 
 /// What of the image belongs to the program, where the program starts, and how many bytes do not belong to it.
-fn place(image: &Image, region: Region) -> Result<(Cow<'_, Image>, u32, u64), ConvertError> {
-    match region {
-        Region::Unknown => Ok((Cow::Borrowed(image), image.span().first & !(WORD - 1), 0)),
+fn place<'i>(image: &'i Image, options: &Options) -> Result<(Cow<'i, Image>, u32, u64), ConvertError> {
+    let offset = options.adjust_start;
+    let adjusted = |image: Cow<'i, Image>| match offset {
+        0 => Ok(image),
+        _ => image.moved(offset).map(Cow::Owned).ok_or(ConvertError::Adjust(offset)),
+    };
+    let inside = |range| image.part(range).ok_or(Place::File.fault(Cause::NothingInside(range)));
+    let left_out = |part: &Image| image.byte_count() - part.byte_count();
+    let start = |image: &Image| image.span().first & !(WORD - 1);
+    match options.region {
+        Region::Unknown => {
+            let image = adjusted(Cow::Borrowed(image))?;
+            let start = start(&image);
+            Ok((image, start, 0))
+        }
+        Region::CutBehind(last) => {
+            let part = inside(AddressRange { first: 0, last })?;
+            let left_out = left_out(&part);
+            let part = adjusted(Cow::Owned(part))?;
+            let start = start(&part);
+            Ok((part, start, left_out))
+        }
         Region::Strict(range) => {
             check_range(range)?;
+            let image = adjusted(Cow::Borrowed(image))?;
             image.check_inside(range)?;
-            Ok((Cow::Borrowed(image), range.first, 0))
+            Ok((image, range.first, 0))
         }
         Region::Cut(range) => {
             check_range(range)?;
-            let part = image.part(range).ok_or(Place::File.fault(Cause::NothingInside(range)))?;
-            let left_out = image.byte_count() - part.byte_count();
-            Ok((Cow::Owned(part), range.first, left_out))
+            let part = inside(range)?;
+            let left_out = left_out(&part);
+            let start = range.first.wrapping_add(offset);
+            let part = adjusted(Cow::Owned(part))?;
+            if part.span().first < start {
+                return Err(ConvertError::Adjust(offset));
+            }
+            Ok((part, start, left_out))
         }
     }
 }

@@ -331,7 +331,8 @@ fn send_blocks(
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
 ) -> Result<u32, Error> {
-    let blocks: Vec<(&Block, Vec<u8>)> = file.blocks().iter().map(|block| (block, block.emit())).collect();
+    let blocks: Vec<(&Block, Vec<u8>)> =
+        file.blocks().iter().map(|block| (block, block.emit_with(file.checksum()))).collect();
     let total = blocks.iter().map(|(_, bytes)| bytes.len()).sum();
     let mut done = 0;
     let mut repeats = 0;

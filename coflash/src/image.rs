@@ -19,6 +19,18 @@ impl AddressRange {
     /// Every address.
     pub const ALL: Self = Self { first: 0, last: u32::MAX };
 
+    /// How many addresses.
+    #[must_use]
+    pub const fn len(&self) -> u64 {
+        (self.last as u64 + 1).saturating_sub(self.first as u64)
+    }
+
+    /// Whether it ends before it starts.
+    #[must_use]
+    pub const fn is_empty(&self) -> bool {
+        self.last < self.first
+    }
+
     /// Whether both ends of `other` lie inside.
     #[must_use]
     pub const fn contains(&self, other: &Self) -> bool {
@@ -83,7 +95,17 @@ impl Pieces {
         }
         Ok(Image { pieces })
     }
+
+    /// Pieces that are in address order and without overlap already.
+    pub(crate) fn in_order(self) -> Image {
+        Image { pieces: self.0 }
+    }
 }
+
+/// What stands in front of the software version in a program (CiA 814-1, section 6.5), its final zero included.
+const VERSION_MARK: &[u8] = b"$CANopenSoftwareVersion\0";
+/// The longest software version that is looked at.
+const VERSION_MAX: usize = 255;
 
 /// The memory contents of a firmware file: at least one byte, no two of them at one address.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -120,6 +142,36 @@ impl Image {
                 last = next.range().last;
             }
             Some((address, data))
+        })
+    }
+
+    /// The same, so many bytes further up in memory, or `None` where the address space ends before it does. An offset of
+    /// 2³² − n is one of −n.
+    #[must_use]
+    pub fn moved(&self, offset: u32) -> Option<Self> {
+        let mut pieces = self.pieces.clone();
+        for piece in &mut pieces {
+            piece.address = piece.address.wrapping_add(offset);
+            piece.address.checked_add((piece.data.len() - 1) as u32)?;
+        }
+        // Where some pieces went over the border and some did not, the order is lost.
+        let in_order = pieces.windows(2).all(|pair| pair[0].address < pair[1].address);
+        in_order.then_some(Self { pieces })
+    }
+
+    /// The software version that the program has behind `$CANopenSoftwareVersion` (CiA 814-1, section 6.5): the text of
+    /// object 100Ah, encoded as ISO 8859-1. What would move a cursor is replaced.
+    #[must_use]
+    pub fn software_version(&self) -> Option<String> {
+        self.segments().find_map(|(_, data)| {
+            let at = data.windows(VERSION_MARK.len()).position(|window| window == VERSION_MARK)?;
+            let text =
+                data[at + VERSION_MARK.len()..].iter().take(VERSION_MAX).take_while(|byte| **byte != 0);
+            let visible = |byte: &u8| match char::from(*byte) {
+                letter if letter.is_control() => '?',
+                letter => letter,
+            };
+            Some(text.map(visible).collect())
         })
     }
 

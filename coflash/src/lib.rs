@@ -5,6 +5,7 @@
 //! | [`read`] | Intel HEX, S-record, ELF, raw and block files into memory, with the place of every fault |
 //! | [`image`] | memory contents with holes |
 //! | [`convert`] | an image into blocks |
+//! | [`inspect`] | what a firmware file holds, in words |
 //! | [`block_file`] | the container that 1F50h takes: read, verified, written |
 //! | [`adapter`] | ways to a CAN bus, chosen by URL |
 //! | [`session`] | SDO with one node: values, commands, status |
@@ -41,6 +42,7 @@ pub mod error;
 pub mod flash;
 pub mod image;
 pub mod info;
+pub mod inspect;
 pub mod read;
 pub mod session;
 

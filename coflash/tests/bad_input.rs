@@ -1,7 +1,7 @@
 //! No input may make a reader panic, and nothing damaged may pass for firmware.
 
-use coflash::block_file::BlockFile;
-use coflash::convert::{blocks_of, Options};
+use coflash::block_file::{BlockFile, Checksum};
+use coflash::convert::{blocks_of, GapFill, Options};
 use coflash::read::{self, Firmware, Format};
 use proptest::prelude::*;
 
@@ -11,7 +11,7 @@ macro_rules! data {
     };
 }
 
-const FILES: [(&str, &[u8]); 8] = [
+const FILES: [(&str, &[u8]); 9] = [
     data!("program.elf"),
     data!("program.hex"),
     data!("program-srec_cat.hex"),
@@ -20,6 +20,7 @@ const FILES: [(&str, &[u8]); 8] = [
     data!("plain-400.blk"),
     data!("identity-110.blk"),
     data!("release-110.blk"),
+    data!("crc16-400.blk"),
 ];
 
 /// The file's meaning, or why it has none.
@@ -149,6 +150,9 @@ proptest! {
     fn blocks_hold_exactly_the_image(
         pieces in prop::collection::btree_map(0u32..4000, any::<u8>(), 1..300),
         block_size in 24usize..300,
+        checksum in prop::sample::select(vec![Checksum::Crc32, Checksum::Crc16]),
+        gap_fill in prop::sample::select(vec![0xFFu32, 0, 0x4433_2211]),
+        adjust_start in prop::sample::select(vec![0u32, 0x0801_0000]),
     ) {
         let hex: String = pieces
             .iter()
@@ -160,21 +164,30 @@ proptest! {
             .chain([":00000001FF\n".to_string()])
             .collect();
         let Firmware::Image(image) = read::read(hex.as_bytes(), None, None).unwrap() else { panic!() };
-        let options = Options { block_size, ..Options::default() };
+        let gap_fill = GapFill::new(gap_fill);
+        let options = Options { block_size, checksum, gap_fill, adjust_start, ..Options::default() };
         let file = blocks_of(Firmware::Image(image), &options).unwrap().file;
         let mut memory = [0xFFu8; 4096];
         let mut covered = [false; 4096];
         for block in file.program_blocks() {
             prop_assert!(block.data.len() + 16 <= block_size);
             prop_assert!(block.flash_address % 4 == 0);
-            for (address, byte) in (block.flash_address as usize..).zip(&block.data) {
+            for (address, byte) in ((block.flash_address - adjust_start) as usize..).zip(&block.data) {
                 prop_assert!(!covered[address]);
                 (memory[address], covered[address]) = (*byte, true);
             }
         }
-        for (address, byte) in (0..).zip(memory) {
-            prop_assert_eq!(byte, pieces.get(&address).copied().unwrap_or(0xFF));
+        for (address, byte) in (0u32..).zip(memory) {
+            // A hole inside a block has the fill's byte, as the flash's words show it; one between blocks is erased.
+            let hole = match covered[address as usize] {
+                true if gap_fill == GapFill::new(0) => 0,
+                true if gap_fill == GapFill::new(0x4433_2211) => [0x11, 0x22, 0x33, 0x44][address as usize % 4],
+                _ => 0xFF,
+            };
+            prop_assert_eq!(byte, pieces.get(&address).copied().unwrap_or(hole));
         }
+        let start = (file.program_start() - adjust_start) as usize;
+        prop_assert_eq!(file.flash_image(), &memory[start..start + file.program_size() as usize]);
         prop_assert_eq!(BlockFile::parse(&file.emit()).unwrap(), file);
     }
 }

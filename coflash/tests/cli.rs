@@ -35,6 +35,18 @@ fn data(name: &str) -> String {
     format!("{}/tests/data/{name}", env!("CARGO_MANIFEST_DIR"))
 }
 
+/// Compares with `tests/snapshots/NAME.txt`, where a person has read and approved what another person will read. With
+/// `COFLASH_BLESS` in the environment the file is written instead.
+#[track_caller]
+fn snapshot(name: &str, found: &str) {
+    let path = format!("{}/tests/snapshots/{name}.txt", env!("CARGO_MANIFEST_DIR"));
+    if std::env::var_os("COFLASH_BLESS").is_some() {
+        fs::write(&path, found).unwrap();
+    }
+    let expected = fs::read_to_string(&path).unwrap_or_default();
+    assert!(found == expected, "{path} says\n{expected}\nand now it is\n{found}");
+}
+
 /// A folder of one test, away at the end.
 struct Folder(PathBuf);
 
@@ -103,6 +115,93 @@ fn convert_writes_the_block_file_of_the_manual() {
     let crc = u32::from_le_bytes(fs::read(data("plain-400.blk")).unwrap()[0x36B..0x36F].try_into().unwrap());
     let words = format!("{out}: 4 blocks, program 4001 bytes from 0x08010000 on, CRC {crc:08X}h\n");
     assert_eq!(done.out, words);
+}
+
+/// The manual's calls word by word (chapter 5.1), apart from the addresses, which are those of another chip.
+#[test]
+fn a_build_script_for_the_manuals_converter_works() {
+    let folder = Folder::new("legacy");
+    let input = folder.file("blcop_app.hex", &fs::read(data("program.hex")).unwrap());
+    let call = |options: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_coflash"));
+        command.current_dir(&folder.0).arg("convert").args(options);
+        run(command.env_remove("COFLASH_BUS").env("SOURCE_DATE_EPOCH", "1420070400"))
+    };
+    let region = ["--start_address", "0x08010000", "--end_address", "0x080FFFFF"];
+    let label = ["--vid", "0", "--pid", "1234", "--ver", "0x00640A01"];
+    let files = ["blcop_app.hex", "blcop_app.bin"];
+    let first = ["-I", "ihex", "-O", "Binary", "--block_size", "0x110"];
+    let done = call(&[&first[..], &region, &label, &files, &["--temp"]].concat());
+    assert_eq!(done.exit, 0, "{}", done.err);
+    assert!(fs::read(folder.path("blcop_app.bin")).unwrap() == fs::read(data("release-110.blk")).unwrap());
+    assert!(fs::read(folder.path("blcop_app.tmp")).unwrap() == fs::read(data("program.bin")).unwrap());
+    // Octal and suffixed numbers, the byte-wide fill of 2008, the CRC-16, and no name for the output.
+    let done =
+        call(&["--block_size", "02000", "--gap_fill", "0xFFul", "--crc16", "--adjust_start", "0", &input]);
+    assert_eq!(done.exit, 0, "{}", done.err);
+    assert!(fs::read(folder.path("blcop_app.blk")).unwrap() == fs::read(data("crc16-400.blk")).unwrap());
+    for format in ["S3", "S5", "S9", "srec"] {
+        let done = call(&["-I", format, &data("program.s3"), "s.blk", "--start_address", "0x08010000"]);
+        assert_eq!(done.exit, 0, "{}", done.err);
+        assert!(fs::read(folder.path("s.blk")).unwrap() == fs::read(data("plain-400.blk")).unwrap());
+    }
+}
+
+#[test]
+fn inspect_tells_what_a_file_holds() {
+    let shown = |file: &str, options: &[&str]| {
+        let done = run(Command::new(env!("CARGO_BIN_EXE_coflash"))
+            .current_dir(data(""))
+            .args(["inspect", file])
+            .args(options));
+        assert_eq!(done.exit, 0, "{}", done.err);
+        done.out
+    };
+    snapshot("inspect-release", &shown("release-110.blk", &[]));
+    snapshot("inspect-crc16", &shown("crc16-400.blk", &["--board", "stm32f407g-disc1"]));
+    snapshot("inspect-hex", &shown("program.hex", &[]));
+    let json: serde_json::Value = serde_json::from_str(&shown("release-110.blk", &["--json"])).unwrap();
+    assert_eq!(json["format"], "block file");
+    assert_eq!(json["blocks"]["identity"]["product_code"], 1234);
+    assert_eq!(json["blocks"]["release"]["version_text"], "V1.10r100");
+    assert_eq!(json["blocks"]["program"]["size"], 4001);
+    assert_eq!(json["blocks"]["program"]["start"], 0x0801_0000);
+    assert_eq!(json["blocks"]["all"].as_array().unwrap().len(), 6);
+
+    let folder = Folder::new("inspect");
+    let mut damaged = fs::read(data("release-110.blk")).unwrap();
+    damaged[0x50] ^= 1;
+    let done = coflash(&["inspect", "--json", &folder.file("damaged.blk", &damaged)]);
+    assert_eq!((done.exit, done.err.as_str()), (3, ""));
+    let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
+    assert_eq!(json["error"]["number"], "0x60000020");
+    assert!(json["error"]["what"].as_str().unwrap().contains("CRC of block 1"), "{}", done.out);
+    let far =
+        fs::read_to_string(data("program.hex")).unwrap().replacen(":020000040801F1", ":020000040800F2", 1);
+    let far = folder.file("far.hex", far.as_bytes());
+    assert_eq!(coflash(&["inspect", &far]).exit, 0);
+    let done = coflash(&["inspect", &far, "--board", "stm32f407g-disc1"]);
+    assert!(done.exit == 3 && done.err.contains("lies outside"), "{}", done.err);
+}
+
+#[test]
+fn quiet_says_nothing_and_json_says_one_document() {
+    let folder = Folder::new("quiet");
+    let out = folder.path("out.blk");
+    let done = coflash(&["convert", "-q", &data("program.elf"), &out]);
+    assert_eq!((done.exit, done.out.as_str(), done.err.as_str()), (0, "", ""));
+    let done = coflash(&["--json", "convert", &data("program.elf"), &out]);
+    let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
+    let crc = u32::from_le_bytes(fs::read(data("plain-400.blk")).unwrap()[0x36B..0x36F].try_into().unwrap());
+    assert_eq!((&json["program"]["size"], &json["program"]["crc"]), (&4001.into(), &crc.into()));
+    assert_eq!((&json["blocks"], &json["left_out"]), (&4.into(), &0.into()));
+    // What is left out is warned about beside the document.
+    let done = coflash(&["--json", "convert", &data("program.elf"), &out, "--end-address", "0x080102C5"]);
+    assert!(
+        done.exit == 0 && done.err.contains("25 bytes outside the address range were left out [0x60002001]")
+    );
+    let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
+    assert_eq!(json["left_out"], 25);
 }
 
 #[test]
@@ -198,7 +297,15 @@ fn wrong_usage_is_explained() {
         (&["flash", &hex, "--board", "stm32f407g-disc1", "--program", "2"], "its programs are 1 to 1"),
         (&["convert", &hex, "out", "--vid", "1"], "--pid"),
         (&["convert", &hex, "out", "--block-size", "16"], "must be 24 to 16384"),
-        (&["convert", &hex, "out", "--start-address", "010"], "ambiguous"),
+        (&["convert", &hex, "out", "--start-address", "08"], "no number in C notation"),
+        (&["convert", &hex, &hex], "overwritten by its own conversion"),
+        (&["convert", &hex, "out", "-O", "elf"], "binary"),
+        (
+            &["convert", &hex, "out", "--key", "cf7a7fe196f64c6b8f19e58361d2397e", "--add", "0xA5"],
+            "encrypted",
+        ),
+        (&["convert", &hex, "out", "--adjust-start", "0xF7FEFFF0"], "over the end of the address space"),
+        (&["-q", "-v", "convert", &hex, "out"], "cannot be used with"),
         (&[], "Usage"),
     ] {
         let done = coflash(arguments);

@@ -1,6 +1,6 @@
 //! Conversion against block files made by other tools (`data/make.sh`) and against literals from the manual's tables.
 
-use coflash::block_file::BlockFile;
+use coflash::block_file::{BlockFile, Checksum};
 use coflash::convert::{blocks_of, convert, ConvertError, Converted, GapFill, Label, Options, Region};
 use coflash::image::{AddressRange, Image};
 use coflash::read::{self, Firmware, Format};
@@ -48,6 +48,79 @@ fn every_format_of_one_program_gives_the_same_block_file() {
             assert_eq!(left_out, 0);
         }
     }
+}
+
+/// Polynomial 1021h in blocks and program, stored in 32 bits (manual, table 8); made with Python's `binascii.crc_hqx`.
+#[test]
+fn the_16_bit_crc_is_that_of_the_manual() {
+    let elf = image(data!("program.elf"));
+    let options = Options { region: board(), checksum: Checksum::Crc16, ..Options::default() };
+    let file = convert(&elf, &options).unwrap().file;
+    assert!(file.emit() == data!("crc16-400.blk"));
+    // Read back, it is known for what it is.
+    let read = BlockFile::parse(data!("crc16-400.blk")).unwrap();
+    assert_eq!(read, file);
+    assert_eq!((read.checksum(), read.program_crc() >> 16), (Checksum::Crc16, 0));
+    let mut damaged = data!("crc16-400.blk").to_vec();
+    damaged[0x30] ^= 1;
+    assert!(BlockFile::parse(&damaged).unwrap_err().to_string().contains("CRC of block 1"));
+}
+
+#[test]
+fn addresses_are_adjusted_behind_the_cut_and_before_the_board() {
+    let elf = image(data!("program.elf"));
+    let with = |region, adjust_start| convert(&elf, &Options { region, adjust_start, ..Options::default() });
+    let range = |first, last| Region::Cut(AddressRange { first, last });
+    for region in [Region::Unknown, range(0x0801_0000, 0x080F_FFFF)] {
+        assert!(with(region, 0xF800_0000).unwrap().file.emit() == data!("adjusted-400.blk"), "{region:?}");
+    }
+    // Away from the board and back to it.
+    let moved = Firmware::Image(elf.moved(0x1000_0000).unwrap());
+    let back = Options { region: board(), adjust_start: 0xF000_0000, ..Options::default() };
+    assert!(blocks_of(moved.clone(), &back).unwrap().file.emit() == data!("plain-400.blk"));
+    assert!(blocks_of(moved, &Options { region: board(), ..Options::default() }).is_err());
+    // Over the end of the address space: the border within a piece, between two, and before the first.
+    for (region, offset) in [
+        (Region::Unknown, 0xF7FE_FFF0),
+        (Region::Unknown, 0xF7FE_F200),
+        (range(0x0800_0000, 0x0801_FFFF), 0xF7FF_FFF0),
+    ] {
+        let error = with(region, offset).unwrap_err();
+        assert!(matches!(error, ConvertError::Adjust(_)), "{offset:#x}: {error}");
+    }
+    assert!(with(Region::Unknown, 2).is_ok(), "a start inside a word is rounded down");
+    let blocks = read::read(data!("plain-400.blk"), None, None).unwrap();
+    let error = blocks_of(blocks, &Options { adjust_start: 4, ..Options::default() }).unwrap_err();
+    assert!(matches!(error, ConvertError::Blocks(_)), "{error}");
+}
+
+/// objcopy's binary is the flash image, gaps filled with FFh.
+#[test]
+fn the_flash_image_is_that_of_objcopy() {
+    for bytes in [data!("plain-400.blk"), data!("identity-110.blk"), data!("crc16-400.blk")] {
+        let file = BlockFile::parse(bytes).unwrap();
+        assert!(file.flash_image() == data!("program.bin"));
+        assert_eq!(file.program_start(), 0x0801_0000);
+    }
+}
+
+/// The example of CiA 814-1, section 6.5: the text begins 24 bytes behind the mark.
+#[test]
+fn the_software_version_is_found_in_every_format() {
+    let text = b"junk$CANopenSoftwareVersion\x001.2.0 (\xE9)\x1B\0more";
+    let raw = |bytes: &[u8]| match read::read(bytes, Some(Format::Raw), Some(0x0801_0000)).unwrap() {
+        Firmware::Image(image) => image,
+        Firmware::Blocks(_) => panic!("a block file"),
+    };
+    let found = Some("1.2.0 (\u{e9})?".to_string());
+    assert_eq!(raw(text).software_version(), found);
+    // It may lie across two blocks.
+    let options = Options { block_size: 24, ..Options::default() };
+    let file = convert(&raw(text), &options).unwrap().file;
+    assert_eq!(file.image().software_version(), found);
+    assert_eq!(raw(&text[..4]).software_version(), None);
+    assert_eq!(raw(&text[..27]).software_version(), None, "the mark's final zero is missing");
+    assert_eq!(raw(&text[..29]).software_version(), Some("1".to_string()), "no end");
 }
 
 #[test]
@@ -115,6 +188,7 @@ fn the_region_decides_about_data_outside() {
     // The manual's --start_address/--end_address leave it out.
     let cut = with(Region::Cut(range(0x0801_0000, 0x0801_02C5))).unwrap();
     assert_eq!((cut.file.program_size(), cut.left_out), (0x2C6, 8 + 17));
+    assert_eq!(with(Region::CutBehind(0x0801_02C5)).unwrap(), cut);
     let error = with(Region::Cut(range(0, 0xFFFF))).unwrap_err().to_string();
     assert_eq!(error, "the file: holds no data inside 0x00000000..=0x0000ffff");
     // The size counts from the region's start.

@@ -1,25 +1,32 @@
 //! `coflash convert`: a firmware file into a block file.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use clap::Args;
-use coflash::convert::Label;
+use coflash::block_file::FRAMING;
+use coflash::convert::{Converted, Label};
+use serde_json::json;
 
 use super::file::{warn_left_out, Input, Source};
-use super::{number, program_number, Failure};
+use super::output::Failure;
+use super::values::{number, program_number};
+use super::Context;
 
 /// Converts a firmware file into a block file, ready for 1F50h.
 ///
 /// The same input gives the same output, byte for byte; with --ver, if --date or SOURCE_DATE_EPOCH is given.
+///
+/// Numbers are in C notation: 4096, 0x1000 or octal 010000. The options of BinaryBlockConv are accepted in its own
+/// spelling, too (--start_address and so on).
 #[derive(Debug, Args)]
 pub(super) struct Convert {
     #[command(flatten)]
     input: Input,
 
-    /// The block file to write.
+    /// The block file to write; otherwise the firmware's name with .blk.
     #[arg(value_name = "OUT")]
-    output: PathBuf,
+    output: Option<PathBuf>,
 
     /// The program number on the board.
     #[arg(long, short = 'P', alias = "prog_no", value_name = "1..254", value_parser = program_number, default_value = "1")]
@@ -28,6 +35,24 @@ pub(super) struct Convert {
     #[command(flatten)]
     source: Source,
 
+    #[command(flatten)]
+    labels: Labels,
+
+    /// Also write the program as it will lie in flash, gaps filled, to OUT's name with .tmp in the current folder.
+    #[arg(long)]
+    temp: bool,
+
+    /// The output's format. There is one.
+    #[arg(short = 'O', value_name = "FORMAT", value_parser = ["binary"], ignore_case = true, hide = true)]
+    output_format: Option<String>,
+
+    #[command(flatten)]
+    encryption: Encryption,
+}
+
+/// For whom the program is: what goes into block 0.
+#[derive(Debug, Args)]
+pub(super) struct Labels {
     /// Vendor-ID of the devices that may take this program (1018h/1).
     #[arg(long, value_name = "NUMBER", value_parser = number, requires = "pid")]
     vid: Option<u32>,
@@ -36,7 +61,7 @@ pub(super) struct Convert {
     #[arg(long, value_name = "NUMBER", value_parser = number, requires = "vid")]
     pid: Option<u32>,
 
-    /// The program's version: major in bits 0-7, minor in bits 8-15, release in bits 16-31.
+    /// The program's version: major in bits 0-7, minor in bits 8-15, release in bits 16-31 (0x00640A01 is V1.10r100).
     #[arg(long, value_name = "NUMBER", value_parser = number, requires = "vid")]
     ver: Option<u32>,
 
@@ -45,27 +70,70 @@ pub(super) struct Convert {
     date: Option<u64>,
 }
 
+/// What the manual's converter could do and no bootloader of this house undoes: better no file than a wrong one.
+#[derive(Debug, Args)]
+struct Encryption {
+    #[arg(long, value_name = "KEY", hide = true)]
+    key: Option<String>,
+
+    #[arg(long, value_name = "VALUE", hide = true)]
+    add: Option<String>,
+}
+
 impl Convert {
-    pub(super) fn run(&self) -> Result<(), Failure> {
-        let input = &self.input.file;
-        let done = self.source.blocks(input, self.program, self.label()?)?;
-        warn_left_out(input, &done);
-        let bytes = done.file.emit();
-        std::fs::write(&self.output, &bytes).map_err(|error| {
-            Failure::system(format!("{}: cannot be written: {error}", self.output.display()))
-        })?;
-        say!(
-            "{}: {} blocks, program {} bytes from {:#010x} on, CRC {:08X}h",
-            self.output.display(),
-            done.file.blocks().len(),
-            done.file.program_size(),
-            done.file.span().last.wrapping_sub(done.file.program_size().wrapping_sub(1)),
-            done.file.program_crc()
-        );
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        if self.encryption.key.is_some() || self.encryption.add.is_some() {
+            let advice = "leave --key and --add out: this bootloader takes programs that are not encrypted";
+            return Err(Failure::usage("encrypted block files cannot be made", advice));
+        }
+        let input = self.input.path();
+        let output = self.output.clone().unwrap_or_else(|| input.with_extension("blk"));
+        if same_file(input, &output) {
+            let what = format!("{} would be overwritten by its own conversion", input.display());
+            return Err(Failure::usage(what, "name another file for the result"));
+        }
+        let done = self.source.blocks(input, self.program, self.labels.label()?)?;
+        warn_left_out(context, input, &done);
+        write(&output, &done.file.emit())?;
+        if self.temp {
+            let name = output.with_extension("tmp");
+            let flash = PathBuf::from(name.file_name().unwrap_or_default());
+            write(&flash, &done.file.flash_image())?;
+            context.out.say(format_args!("{}: the program as it lies in flash", flash.display()));
+        }
+        self.tell(context, &output, &done);
         Ok(())
     }
 
-    fn label(&self) -> Result<Label, Failure> {
+    fn tell(&self, context: &Context, output: &Path, done: &Converted) {
+        let Converted { file, left_out } = done;
+        let (start, size, crc) = (file.program_start(), file.program_size(), file.program_crc());
+        let count = file.blocks().len();
+        let largest = file.blocks().iter().map(|block| block.data.len() + FRAMING).max();
+        context.out.detail(format_args!(
+            "{}, the largest block has {} bytes",
+            file.checksum(),
+            largest.unwrap_or_default()
+        ));
+        let words = format!(
+            "{}: {count} blocks, program {size} bytes from {start:#010x} on, CRC {crc:08X}h",
+            output.display()
+        );
+        context.out.result(words, || {
+            json!({
+                "command": "convert",
+                "output": output.display().to_string(),
+                "blocks": count,
+                "checksum": file.checksum().to_string(),
+                "program": { "start": start, "size": size, "crc": crc },
+                "left_out": left_out,
+            })
+        });
+    }
+}
+
+impl Labels {
+    pub(super) fn label(&self) -> Result<Label, Failure> {
         let (Some(vendor_id), Some(product_code)) = (self.vid, self.pid) else { return Ok(Label::None) };
         let Some(version) = self.ver else { return Ok(Label::Device { vendor_id, product_code }) };
         let date = match self.date {
@@ -77,4 +145,15 @@ impl Convert {
         };
         Ok(Label::Release { vendor_id, product_code, version, date })
     }
+}
+
+/// Whether two names lead to one file, as far as that can be told.
+fn same_file(one: &Path, other: &Path) -> bool {
+    let canonical = |path: &Path| path.canonicalize().ok();
+    one == other || canonical(one).is_some_and(|one| canonical(other) == Some(one))
+}
+
+fn write(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
+    std::fs::write(path, bytes)
+        .map_err(|error| Failure::system(format!("{}: cannot be written: {error}", path.display())))
 }

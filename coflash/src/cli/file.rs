@@ -1,15 +1,17 @@
 //! The firmware file and how to read it: what `convert` and `flash` share.
 
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
+use coflash::block_file::Checksum;
 use coflash::convert::{blocks_of, Converted, GapFill, Label, Options, Region, DEFAULT_BLOCK_SIZE};
 use coflash::image::AddressRange;
-use coflash::read::{self, Format};
+use coflash::read::{self, Firmware, Format};
 use shared_abi::layout;
 
-use super::{number, Failure};
+use super::output::Failure;
+use super::values::number;
+use super::Context;
 
 /// How to read a firmware file and cut it into blocks.
 #[derive(Debug, Args)]
@@ -33,6 +35,14 @@ pub(super) struct Source {
     /// What fills gaps inside a block: a byte, or a 32-bit pattern.
     #[arg(long, alias = "gap_fill", value_name = "VALUE", value_parser = number, default_value = "0xFFFFFFFF")]
     gap_fill: u32,
+
+    /// What is added to every address of the file (0xF8000000 takes 0x08000000 away).
+    #[arg(long, alias = "adjust_start", value_name = "OFFSET", value_parser = number, default_value = "0")]
+    adjust_start: u32,
+
+    /// Check blocks and program with the 16-bit CRC (polynomial 1021h): for a bootloader that was built for it.
+    #[arg(long)]
+    crc16: bool,
 
     /// The file's format, if the first bytes do not tell it.
     #[arg(short = 'I', long = "input-format", value_name = "FORMAT", ignore_case = true)]
@@ -80,19 +90,43 @@ fn board(name: &str) -> Result<&'static layout::Layout, String> {
 impl Source {
     /// Reads `file` for program `number` and makes its blocks. No device is needed, and none is touched.
     pub(super) fn blocks(&self, file: &Path, program: u8, label: Label) -> Result<Converted, Failure> {
-        let region = self.region(program)?;
+        let (firmware, _) = self.load(file, program)?;
+        self.convert(firmware, file, program, label)
+    }
+
+    /// Reads `file`; tells its format, too.
+    pub(super) fn load(&self, file: &Path, program: u8) -> Result<(Firmware, Format), Failure> {
+        // A raw file starts where the region does; conversion will adjust that like any other address.
+        let raw_address = match self.region(program)? {
+            Region::Unknown | Region::CutBehind(_) => None,
+            Region::Strict(range) => Some(range.first.wrapping_sub(self.adjust_start)),
+            Region::Cut(range) => Some(range.first),
+        };
+        Ok(read::load_telling(file, self.format.map(Format::from), raw_address)?)
+    }
+
+    /// Makes the blocks of a file that was read.
+    pub(super) fn convert(
+        &self,
+        firmware: Firmware,
+        file: &Path,
+        program: u8,
+        label: Label,
+    ) -> Result<Converted, Failure> {
         let options = Options {
-            region,
+            region: self.region(program)?,
             block_size: self.block_size as usize,
             gap_fill: GapFill::new(self.gap_fill),
             label,
+            adjust_start: self.adjust_start,
+            checksum: if self.crc16 { Checksum::Crc16 } else { Checksum::Crc32 },
         };
-        let raw_address = match region {
-            Region::Unknown => None,
-            Region::Strict(range) | Region::Cut(range) => Some(range.first),
-        };
-        let firmware = read::load(file, self.format.map(Format::from), raw_address)?;
         blocks_of(firmware, &options).map_err(|error| Failure::convert(error, file))
+    }
+
+    /// Whether it was said where the program may lie.
+    pub(super) fn has_region(&self) -> bool {
+        self.board.is_some() || self.start_address.is_some() || self.end_address.is_some()
     }
 
     fn region(&self, program: u8) -> Result<Region, Failure> {
@@ -102,13 +136,13 @@ impl Source {
                 None => {
                     let what = format!("{} has no program {program}", layout.board);
                     let advice = format!("its programs are 1 to {}", layout.programs.len());
-                    Err(Failure::usage(&what, advice))
+                    Err(Failure::usage(what, advice))
                 }
             },
             (None, None, None) => Ok(Region::Unknown),
-            (None, first, last) => {
-                let AddressRange { first: least, last: most } = AddressRange::ALL;
-                let (first, last) = (first.unwrap_or(least), last.unwrap_or(most));
+            (None, None, Some(last)) => Ok(Region::CutBehind(last)),
+            (None, Some(first), last) => {
+                let last = last.unwrap_or(AddressRange::ALL.last);
                 Ok(Region::Cut(AddressRange { first, last }))
             }
         }
@@ -119,18 +153,28 @@ impl Source {
 #[derive(Debug, Args)]
 pub(super) struct Input {
     /// The firmware: Intel HEX, Motorola S-record, ELF, raw binary or block file.
-    #[arg(value_name = "FILE")]
-    pub(super) file: PathBuf,
+    #[arg(value_name = "FILE", required_unless_present = "legacy_file")]
+    file: Option<PathBuf>,
+
+    /// The same in DotNetFlashtool's spelling.
+    #[arg(short = 'F', value_name = "FILE", conflicts_with = "file", hide = true)]
+    legacy_file: Option<PathBuf>,
+}
+
+impl Input {
+    /// The file. One of the two is always given.
+    pub(super) fn path(&self) -> &Path {
+        self.file.as_deref().or(self.legacy_file.as_deref()).unwrap_or(Path::new(""))
+    }
 }
 
 /// Says what was left out, if something was.
-pub(super) fn warn_left_out(file: &Path, converted: &Converted) {
+pub(super) fn warn_left_out(context: &Context, file: &Path, converted: &Converted) {
     if converted.left_out > 0 {
-        let _ = writeln!(
-            std::io::stderr(),
-            "warning: {}: {} bytes outside the address range were left out [0x60002001]",
+        context.out.warn(format_args!(
+            "{}: {} bytes outside the address range were left out [0x60002001]",
             file.display(),
             converted.left_out
-        );
+        ));
     }
 }

@@ -1,12 +1,16 @@
 //! `coflash flash`: a program into a device.
 
 use clap::Args;
-use coflash::convert::Label;
 use coflash::flash::{flash, FlashOptions};
+use serde_json::json;
+
+use super::convert::Labels;
 
 use super::file::{warn_left_out, Input, Source};
+use super::output::Failure;
 use super::progress::Progress;
-use super::{number, program_number, Bus, Device, Failure};
+use super::values::{number, program_number};
+use super::{Context, Device};
 
 /// Puts a program into a device and starts it.
 ///
@@ -27,6 +31,9 @@ pub(super) struct Flash {
     #[command(flatten)]
     source: Source,
 
+    #[command(flatten)]
+    labels: Labels,
+
     /// Start the program once, and call it back, before it is signed.
     #[arg(long, alias = "chk_run")]
     trial_run: bool,
@@ -41,25 +48,21 @@ pub(super) struct Flash {
 }
 
 impl Flash {
-    pub(super) fn run(&self, bus: &Bus) -> Result<(), Failure> {
-        let file = &self.input.file;
-        let done = self.source.blocks(file, self.program, Label::None)?;
-        warn_left_out(file, &done);
-        say!(
-            "{}: program of {} bytes, CRC {:08X}h",
-            file.display(),
-            done.file.program_size(),
-            done.file.program_crc()
-        );
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        let file = self.input.path();
+        let done = self.source.blocks(file, self.program, self.labels.label()?)?;
+        warn_left_out(context, file, &done);
+        let (size, crc) = (done.file.program_size(), done.file.program_crc());
+        context.out.say(format_args!("{}: program of {size} bytes, CRC {crc:08X}h", file.display()));
         let options = FlashOptions {
             program: self.program,
             repeats: self.repeats,
             trial_run: self.trial_run,
             start: !self.no_start,
         };
-        let mut adapter = bus.open()?;
+        let mut adapter = context.open()?;
         let mut session = self.device.session(&mut *adapter)?;
-        let mut progress = Progress::new();
+        let mut progress = Progress::new(context.out);
         let result = flash(&mut session, &done.file, &options, &mut |event| progress.show(event));
         progress.finish();
         let report = result?;
@@ -69,7 +72,7 @@ impl Flash {
             1 => ", 1 block sent again".to_string(),
             blocks => format!(", {blocks} blocks sent again"),
         };
-        say!("done in {seconds:.1} s{repeats}");
+        context.out.result(format_args!("done in {seconds:.1} s{repeats}"), || json!({ "command": "flash" }));
         Ok(())
     }
 }

@@ -1,9 +1,12 @@
 //! `coflash info`: what a device says about itself.
 
+use canopen::program::FlashStatus;
 use clap::Args;
-use coflash::info::info;
+use coflash::info::{info, DeviceInfo};
+use serde_json::{json, Value};
 
-use super::{Bus, Device, Failure};
+use super::output::Failure;
+use super::{Context, Device};
 
 /// Shows what runs on a device, its identity, and the state of its programs.
 #[derive(Debug, Args)]
@@ -13,10 +16,54 @@ pub(super) struct Info {
 }
 
 impl Info {
-    pub(super) fn run(&self, bus: &Bus) -> Result<(), Failure> {
-        let mut adapter = bus.open()?;
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        let mut adapter = context.open()?;
         let mut session = self.device.session(&mut *adapter)?;
-        say!("{}", info(&mut session)?.to_string().trim_end());
+        let info = info(&mut session)?;
+        context.out.result(&info, || value(&info));
         Ok(())
     }
+}
+
+/// For programs.
+pub(super) fn value(info: &DeviceInfo) -> Value {
+    let [vendor_id, product_code, revision, serial_number] = info.identity;
+    let programs: Vec<Value> = info
+        .programs
+        .iter()
+        .map(|program| {
+            json!({
+                "number": program.number,
+                "control": program.control,
+                "crc": program.crc,
+                "status": program.status.map(status),
+            })
+        })
+        .collect();
+    json!({
+        "command": "info",
+        "node": info.node.get(),
+        "device_type": info.device_type.0,
+        "bootloader": info.device_type.is_bootloader(),
+        "error_register": info.error_register,
+        "name": info.name,
+        "hardware_version": info.hardware_version,
+        "software_version": info.software_version,
+        "vendor_id": vendor_id,
+        "product_code": product_code,
+        "revision": revision,
+        "serial_number": serial_number,
+        "programs": programs,
+    })
+}
+
+/// 1F57h for programs.
+pub(super) fn status(status: FlashStatus) -> Value {
+    json!({
+        "word": status.to_word(),
+        "busy": status.busy,
+        "error": status.error.map(|error| error.code()),
+        "error_text": status.error.map(|error| error.to_string()),
+        "detail": status.detail,
+    })
 }

@@ -1,6 +1,5 @@
 //! What a person sees of an update: a bar on a terminal, plain lines elsewhere.
 
-use std::io::{stdout, IsTerminal};
 use std::time::{Duration, Instant};
 
 use coflash::flash::Event;
@@ -8,8 +7,15 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 const STYLE: &str = "{bar:40} {percent:>3} %  {bytes} of {total_bytes}, {bytes_per_sec}, {eta} left";
 
+use super::output::Output;
+
 /// Shows the events of an update.
-pub(super) enum Progress {
+pub(super) struct Progress {
+    out: Output,
+    form: Form,
+}
+
+enum Form {
     /// On a terminal.
     Terminal(Option<ProgressBar>),
     /// In a file or a pipe: a line for each tenth.
@@ -21,40 +27,38 @@ pub(super) enum Progress {
 }
 
 impl Progress {
-    pub(super) fn new() -> Self {
-        if stdout().is_terminal() {
-            Self::Terminal(None)
-        } else {
-            Self::Plain { began: None, tenths: 0 }
-        }
+    pub(super) fn new(out: Output) -> Self {
+        let form =
+            if out.on_terminal() { Form::Terminal(None) } else { Form::Plain { began: None, tenths: 0 } };
+        Self { out, form }
     }
 
     pub(super) fn show(&mut self, event: Event) {
-        match (self, event) {
-            (Self::Terminal(shown), Event::Progress { done, total }) => {
+        match (&mut self.form, event) {
+            (Form::Terminal(shown), Event::Progress { done, total }) => {
                 let bar = shown.get_or_insert_with(|| bar(total));
                 bar.set_position(done as u64);
                 if done == total {
                     bar.finish();
                 }
             }
-            (Self::Terminal(Some(bar)), event) if !bar.is_finished() => bar.println(format!("  {event}")),
-            (Self::Plain { began, tenths }, Event::Progress { done, total }) => {
+            (Form::Terminal(Some(bar)), event) if !bar.is_finished() => bar.println(format!("  {event}")),
+            (Form::Plain { began, tenths }, Event::Progress { done, total }) => {
                 let began = *began.get_or_insert_with(Instant::now);
                 let now = (done * 10).checked_div(total).unwrap_or(10);
                 if now > *tenths {
                     *tenths = now;
-                    say!("  {}", line(done, total, began.elapsed()));
+                    self.out.say(format_args!("  {}", line(done, total, began.elapsed())));
                 }
             }
-            (_, event) => say!("  {event}"),
+            (_, event) => self.out.say(format_args!("  {event}")),
         }
     }
 
     /// Leaves the bar where it stands.
     pub(super) fn finish(&mut self) {
-        match self {
-            Self::Terminal(Some(bar)) if !bar.is_finished() => bar.abandon(),
+        match &self.form {
+            Form::Terminal(Some(bar)) if !bar.is_finished() => bar.abandon(),
             _ => {}
         }
     }

@@ -73,17 +73,7 @@ pub enum Firmware {
 /// # Errors
 /// The first fault, with its place.
 pub fn read(bytes: &[u8], format: Option<Format>, raw_address: Option<u32>) -> Result<Firmware, ReadError> {
-    if bytes.is_empty() {
-        return Err(Place::File.fault(Cause::Empty));
-    }
-    let format = format.or_else(|| Format::detect(bytes)).ok_or(Place::File.fault(Cause::NotFirmware))?;
-    match format {
-        Format::IntelHex => ihex::read(bytes).map(Firmware::Image),
-        Format::SRecord => srec::read(bytes).map(Firmware::Image),
-        Format::Elf => elf::read(bytes).map(Firmware::Image),
-        Format::Raw => raw::read(bytes, raw_address).map(Firmware::Image),
-        Format::BlockFile => BlockFile::parse(bytes).map(Firmware::Blocks),
-    }
+    read_telling(bytes, format, raw_address).map(|(firmware, _)| firmware)
 }
 
 /// Reads a firmware file from disk; otherwise as [`read`].
@@ -91,10 +81,41 @@ pub fn read(bytes: &[u8], format: Option<Format>, raw_address: Option<u32>) -> R
 /// # Errors
 /// The first fault, with file and place.
 pub fn load(path: &Path, format: Option<Format>, raw_address: Option<u32>) -> Result<Firmware, FileError> {
+    load_telling(path, format, raw_address).map(|(firmware, _)| firmware)
+}
+
+/// The same, and which format it turned out to be.
+///
+/// # Errors
+/// The first fault, with file and place.
+pub fn load_telling(
+    path: &Path,
+    format: Option<Format>,
+    raw_address: Option<u32>,
+) -> Result<(Firmware, Format), FileError> {
     std::fs::read(path)
         .map_err(|error| Place::File.fault(Cause::Io(error)))
-        .and_then(|bytes| read(&bytes, format, raw_address))
+        .and_then(|bytes| read_telling(&bytes, format, raw_address))
         .map_err(|error| error.of(path.display()))
+}
+
+fn read_telling(
+    bytes: &[u8],
+    format: Option<Format>,
+    raw_address: Option<u32>,
+) -> Result<(Firmware, Format), ReadError> {
+    if bytes.is_empty() {
+        return Err(Place::File.fault(Cause::Empty));
+    }
+    let format = format.or_else(|| Format::detect(bytes)).ok_or(Place::File.fault(Cause::NotFirmware))?;
+    let firmware = match format {
+        Format::IntelHex => ihex::read(bytes).map(Firmware::Image),
+        Format::SRecord => srec::read(bytes).map(Firmware::Image),
+        Format::Elf => elf::read(bytes).map(Firmware::Image),
+        Format::Raw => raw::read(bytes, raw_address).map(Firmware::Image),
+        Format::BlockFile => BlockFile::parse(bytes).map(Firmware::Blocks),
+    };
+    Ok((firmware?, format))
 }
 
 /// Where in a file something is.

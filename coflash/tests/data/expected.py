@@ -1,5 +1,6 @@
 """Writes the block files that conversion of program.* must give, from the manual's tables alone (L-1112d_10,
 chapter 5.1): blocks of 0x110 bytes as in the manual's example call, and the default of 0x400 bytes."""
+import binascii
 import re
 import struct
 import subprocess
@@ -8,9 +9,14 @@ import zlib
 START = 0x08010000
 
 
-def block(number, address, data):
+def crc16(data):
+    """Polynomial 1021h, start value 0, as the manual's --crc16 has it."""
+    return binascii.crc_hqx(data, 0)
+
+
+def block(number, address, data, crc):
     body = struct.pack("<III", number, address, len(data)) + data
-    return body + struct.pack("<I", zlib.crc32(body))
+    return body + struct.pack("<I", crc(body))
 
 
 def memory():
@@ -26,21 +32,23 @@ def memory():
     return found
 
 
-def block_file(control, block_size):
+def block_file(control, block_size, crc=zlib.crc32, offset=0):
     found = memory()
     flash = bytes(found.get(a, 0xFF) for a in range(START, max(found) + 1))
     assert flash == open("program.bin", "rb").read()
-    out, number, address = block(0, 0, control(len(flash))), 1, START
+    out, number, address = block(0, 0, control(len(flash)), crc), 1, START
     while any(a >= address for a in found):
         # A block starts at the word of the first byte that is not in a block yet, and ends with its last byte.
         address = min(a for a in found if a >= address) & ~3
         last = max(a for a in found if a < address + block_size - 16)
-        out += block(number, address, flash[address - START:last + 1 - START])
+        out += block(number, address + offset, flash[address - START:last + 1 - START], crc)
         number, address = number + 1, address + block_size - 16
-    return out + block(0xFFFFFFFF, 0, struct.pack("<II", len(flash), zlib.crc32(flash)))
+    return out + block(0xFFFFFFFF, 0, struct.pack("<II", len(flash), crc(flash)), crc)
 
 
 open("plain-400.blk", "wb").write(block_file(lambda size: bytes(8), 0x400))
 open("identity-110.blk", "wb").write(block_file(lambda size: struct.pack("<III", size, 0, 1234), 0x110))
 open("release-110.blk", "wb").write(
     block_file(lambda size: struct.pack("<IIIIq", size, 0, 1234, 0x00640A01, 1420070400), 0x110))
+open("crc16-400.blk", "wb").write(block_file(lambda size: bytes(8), 0x400, crc16))
+open("adjusted-400.blk", "wb").write(block_file(lambda size: bytes(8), 0x400, offset=-0x08000000))

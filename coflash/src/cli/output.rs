@@ -1,0 +1,220 @@
+//! What a command says: words for people, one JSON document for programs, and how it ends.
+
+use std::fmt;
+use std::io::{self, IsTerminal, Write as _};
+use std::path::Path;
+use std::process::ExitCode;
+
+use clap::Args;
+use coflash::adapter::AdapterError;
+use coflash::convert::ConvertError;
+use coflash::read::FileError;
+use coflash::Error;
+use serde_json::{json, Value};
+
+/// How much is said, and in which form. For all commands.
+#[derive(Clone, Copy, Debug, Default, Args)]
+pub(super) struct Output {
+    /// Write one JSON document to standard output in place of words for people.
+    #[arg(long, global = true)]
+    json: bool,
+
+    /// Say nothing unless something goes wrong.
+    #[arg(long, short, global = true, conflicts_with = "verbose")]
+    quiet: bool,
+
+    /// Say more: what is waited for, and what was chosen where the command line did not say it.
+    #[arg(long, short, global = true)]
+    verbose: bool,
+}
+
+impl Output {
+    /// Whether people read along.
+    pub(super) fn for_people(self) -> bool {
+        !self.json && !self.quiet
+    }
+
+    /// Whether a bar that moves makes sense.
+    pub(super) fn on_terminal(self) -> bool {
+        self.for_people() && io::stdout().is_terminal()
+    }
+
+    /// Says something to people. A reader that has gone away (`| head`) is no reason to stop an update.
+    pub(super) fn say(self, words: impl fmt::Display) {
+        if self.for_people() {
+            let _ = writeln!(io::stdout(), "{words}");
+        }
+    }
+
+    /// Says something to people who asked for more.
+    pub(super) fn detail(self, words: impl fmt::Display) {
+        if self.verbose {
+            let _ = writeln!(io::stderr(), "{words}");
+        }
+    }
+
+    /// The result of a command: words for people, the value for programs.
+    pub(super) fn result(self, words: impl fmt::Display, value: impl FnOnce() -> Value) {
+        if self.json {
+            self.value(&value());
+        } else if !self.quiet {
+            let text = words.to_string();
+            let _ = writeln!(io::stdout(), "{}", text.trim_end());
+        }
+    }
+
+    /// One JSON document in one line.
+    pub(super) fn value(self, value: &Value) {
+        if self.json {
+            let _ = writeln!(io::stdout(), "{value}");
+        }
+    }
+
+    /// Something that people should know although the command goes on. Never on standard output.
+    pub(super) fn warn(self, words: impl fmt::Display) {
+        let _ = writeln!(io::stderr(), "{} {words}", paint("warning:", "33"));
+    }
+
+    /// A failure, as the last thing that a command says.
+    pub(super) fn failure(self, failure: &Failure) {
+        if self.json {
+            self.value(&failure.value());
+        } else {
+            let _ = write!(io::stderr(), "{failure}");
+        }
+    }
+}
+
+/// Colours a word on standard error, if that is a terminal and nobody objects (<https://no-color.org>).
+fn paint(word: &str, colour: &str) -> String {
+    let objected = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
+    if io::stderr().is_terminal() && !objected {
+        format!("\x1B[1;{colour}m{word}\x1B[0m")
+    } else {
+        word.to_string()
+    }
+}
+
+/// The exit codes, as every `--help` tells them.
+pub(super) const EXIT_CODES: &str = "\
+Exit codes:
+  0    done
+  1    the result cannot be written, or the system refuses something else
+  2    wrong usage
+  3    the firmware file is bad, or does not fit the board; no device was touched
+  4    the CAN adapter cannot be opened, or is gone
+  5    the device does not answer
+  6    the device refuses, or reports an error
+  7    the program does not start, or the application does not go back to the bootloader
+  130  cancelled";
+
+/// The exit codes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub(super) enum Exit {
+    System = 1,
+    Usage = 2,
+    File = 3,
+    Adapter = 4,
+    NoAnswer = 5,
+    Device = 6,
+    NoStart = 7,
+    Cancelled = 130,
+}
+
+impl From<Exit> for ExitCode {
+    fn from(exit: Exit) -> Self {
+        Self::from(exit as u8)
+    }
+}
+
+/// Why a command failed: what happened, what to do, and how it ends.
+#[derive(Debug)]
+pub(super) struct Failure {
+    pub(super) exit: Exit,
+    /// The stable number, where there is one.
+    number: Option<u32>,
+    what: String,
+    advice: Option<String>,
+}
+
+impl Failure {
+    pub(super) fn usage(what: impl Into<String>, advice: impl Into<String>) -> Self {
+        Self { exit: Exit::Usage, number: None, what: what.into(), advice: Some(advice.into()) }
+    }
+
+    pub(super) fn system(what: String) -> Self {
+        Self { exit: Exit::System, number: None, what, advice: None }
+    }
+
+    /// A conversion of `file` that failed.
+    pub(super) fn convert(error: ConvertError, file: &Path) -> Self {
+        match error {
+            ConvertError::File(error) => error.of(file.display()).into(),
+            ConvertError::BlockSize { .. }
+            | ConvertError::Start(_)
+            | ConvertError::Range(_)
+            | ConvertError::Adjust(_)
+            | ConvertError::Blocks(_) => {
+                Self { exit: Exit::Usage, number: Some(0x6000_0018), what: error.to_string(), advice: None }
+            }
+        }
+    }
+
+    /// For programs.
+    pub(super) fn value(&self) -> Value {
+        json!({
+            "error": {
+                "number": self.number.map(|number| format!("{number:#010x}")),
+                "exit": self.exit as u8,
+                "what": self.what,
+                "advice": self.advice,
+            }
+        })
+    }
+}
+
+impl From<FileError> for Failure {
+    fn from(error: FileError) -> Self {
+        let number = Some(error.error.cause.number());
+        Self { exit: Exit::File, number, what: error.to_string(), advice: None }
+    }
+}
+
+impl From<AdapterError> for Failure {
+    fn from(error: AdapterError) -> Self {
+        Error::from(error).into()
+    }
+}
+
+impl From<Error> for Failure {
+    fn from(error: Error) -> Self {
+        let exit = match &error {
+            Error::Adapter(AdapterError::Url { .. }) => Exit::Usage,
+            Error::Adapter(_) => Exit::Adapter,
+            Error::Cancelled => Exit::Cancelled,
+            Error::NoAnswer { .. } => Exit::NoAnswer,
+            Error::Refused { .. }
+            | Error::Protocol { .. }
+            | Error::Failed { .. }
+            | Error::Busy { .. }
+            | Error::WrongCrc { .. } => Exit::Device,
+            Error::NoBootloader { .. } | Error::StartFailed { .. } => Exit::NoStart,
+        };
+        Self { exit, number: Some(error.number()), what: error.to_string(), advice: Some(error.advice()) }
+    }
+}
+
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} {}", paint("error:", "31"), self.what)?;
+        if let Some(number) = self.number {
+            write!(f, " [{number:#010x}]")?;
+        }
+        writeln!(f)?;
+        match &self.advice {
+            Some(advice) => writeln!(f, "  what to do: {advice}"),
+            None => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,90 @@
+//! Values on the command line, in the notations that the manual's tools take.
+
+use std::time::Duration;
+
+use canopen::NodeId;
+
+/// A number of up to 32 bits in C notation: `4096`, `0x1000`, `010000` (octal), with an `u` or `l` behind it if need be.
+pub(super) fn number(text: &str) -> Result<u32, String> {
+    let bare = text.trim_end_matches(['u', 'U', 'l', 'L']);
+    let (digits, radix) = match bare.strip_prefix("0x").or_else(|| bare.strip_prefix("0X")) {
+        Some(digits) => (digits, 16),
+        None if bare.len() > 1 && bare.starts_with('0') => (&bare[1..], 8),
+        None => (bare, 10),
+    };
+    // `from_str_radix` would take a sign.
+    if digits.is_empty() || !digits.chars().all(|digit| digit.is_digit(radix)) {
+        return Err("it is no number in C notation (4096, 0x1000 or octal 010000)".to_string());
+    }
+    u32::from_str_radix(digits, radix).map_err(|_| "it is no number of up to 32 bits".to_string())
+}
+
+pub(super) fn node_id(text: &str) -> Result<NodeId, String> {
+    let number = number(text)?;
+    u8::try_from(number).ok().and_then(NodeId::new).ok_or_else(|| "node-IDs are 1 to 127".to_string())
+}
+
+/// A program number: 1 to 254, the sub-indices of 1F50h.
+pub(super) fn program_number(text: &str) -> Result<u8, String> {
+    match u8::try_from(number(text)?) {
+        Ok(program @ 1..=254) => Ok(program),
+        _ => Err("programs are 1 to 254".to_string()),
+    }
+}
+
+pub(super) fn milliseconds(text: &str) -> Result<Duration, String> {
+    match number(text)? {
+        0 => Err("it must be at least 1 millisecond".to_string()),
+        millis => Ok(Duration::from_millis(millis.into())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_those_of_c() {
+        for (text, value) in [
+            ("0", 0),
+            ("00", 0),
+            ("0x400", 1024),
+            ("0XfF", 255),
+            ("4294967295", u32::MAX),
+            ("0xFFFFFFFFUL", u32::MAX),
+            ("010", 8),
+            ("1000u", 1000),
+        ] {
+            assert_eq!(number(text), Ok(value), "{text}");
+        }
+        for text in [
+            "",
+            "0x",
+            "-1",
+            "+1",
+            "0x+1",
+            "4294967296",
+            "0x100000000",
+            "08",
+            "1k",
+            " 1",
+            "12h",
+            "ff",
+            "UL",
+            "0xUL",
+        ] {
+            assert!(number(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn node_ids_and_programs_have_their_ranges() {
+        assert_eq!(node_id("0x7F").map(NodeId::get), Ok(127));
+        assert_eq!((program_number("1"), program_number("254")), (Ok(1), Ok(254)));
+        for (node, program) in [("0", "0"), ("128", "255"), ("257", "257")] {
+            assert!(node_id(node).is_err() && program_number(program).is_err());
+        }
+        assert_eq!(milliseconds("500"), Ok(Duration::from_millis(500)));
+        assert!(milliseconds("0").is_err());
+    }
+}
