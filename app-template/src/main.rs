@@ -178,10 +178,11 @@ mod app {
                 Errors { passive: true, .. } => Confinement::Passive,
                 _ => Confinement::Active,
             },
-            heard: match errors.last {
-                None => Heard::Nothing,
-                Some(Ok(())) => Heard::Frame,
-                Some(Err(())) => Heard::Error,
+            heard: match errors {
+                Errors { joined: false, .. } => Heard::NeverIdle,
+                Errors { last: None, .. } => Heard::Nothing,
+                Errors { last: Some(Ok(())), .. } => Heard::Frame,
+                Errors { last: Some(Err(())), .. } => Heard::Error,
             },
             lost: lost.iter().map(|(lost, bit)| u16::from(*lost) * bit).sum(),
         }

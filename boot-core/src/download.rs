@@ -17,7 +17,7 @@ use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
 use crate::crc32;
-use crate::flash::{Flash, FlashFault, SectorEraser, WordWriter, ERASED};
+use crate::flash::{is_blank, Flash, FlashFault, SectorEraser, WordWriter, ERASED};
 use crate::node::NodeParameters;
 use crate::parameters::{Journal, Key, Store, StoreError, Value};
 use crate::program::{check_vectors, FlashCrc, ProgramRecord};
@@ -572,19 +572,4 @@ fn write_error(fault: FlashFault) -> FlashError {
 /// The `i`-th little-endian word.
 fn word_at(bytes: &[u8], i: usize) -> u32 {
     bytes.get(4 * i..).and_then(|rest| rest.first_chunk()).map_or(ERASED, |word| u32::from_le_bytes(*word))
-}
-
-fn is_blank<F: Flash>(flash: &F, region: Region) -> bool {
-    let mut chunk = [0; 64];
-    let mut next = region.base;
-    while next < region.end() {
-        let len = (region.end() - next).min(chunk.len() as u32);
-        let bytes = &mut chunk[..len as usize];
-        flash.read(next, bytes);
-        if bytes.iter().any(|byte| *byte != u8::MAX) {
-            return false;
-        }
-        next += len;
-    }
-    true
 }

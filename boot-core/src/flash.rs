@@ -2,7 +2,7 @@
 
 use core::task::Poll;
 
-use shared_abi::geometry::Sector;
+use shared_abi::geometry::{Region, Sector};
 
 /// Why a flash operation failed, as the controller tells it (RM0090 section 3.8.4, `FLASH_SR`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -153,4 +153,20 @@ impl SectorEraser {
             }
         }
     }
+}
+
+/// Whether all bytes read as erased.
+pub fn is_blank<F: Flash>(flash: &F, region: Region) -> bool {
+    let mut chunk = [0; 64];
+    let mut next = region.base;
+    while next < region.end() {
+        let len = (region.end() - next).min(chunk.len() as u32);
+        let bytes = &mut chunk[..len as usize];
+        flash.read(next, bytes);
+        if bytes.iter().any(|byte| *byte != u8::MAX) {
+            return false;
+        }
+        next += len;
+    }
+    true
 }

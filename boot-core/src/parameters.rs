@@ -10,7 +10,7 @@ use core::task::Poll;
 use shared_abi::geometry::{Geometry, Region};
 
 use crate::crc32;
-use crate::flash::{Flash, FlashFault, SectorEraser, WordWriter, ERASED};
+use crate::flash::{is_blank, Flash, FlashFault, SectorEraser, WordWriter, ERASED};
 
 const SLOT_WORDS: usize = 6;
 const SLOT_SIZE: u32 = SLOT_WORDS as u32 * 4;
@@ -115,10 +115,8 @@ impl Journal {
                 let address = slot_address(&self.regions[active.region], active.free);
                 State::Append { writer: WordWriter::new(address) }
             }
-            active => {
-                let target = active.map_or(0, |active| 1 - active.region);
-                State::Erase { eraser: SectorEraser::new(self.regions[target]) }
-            }
+            None => State::Begin,
+            Some(active) => State::Erase { eraser: SectorEraser::new(self.regions[1 - active.region]) },
         };
         Store { record, attempts: 0, state }
     }
@@ -136,6 +134,8 @@ pub struct Store {
 enum State {
     /// Into the first free slot of the active region.
     Append { writer: WordWriter },
+    /// No region is valid yet.
+    Begin,
     /// Make the other region blank.
     Erase { eraser: SectorEraser },
     /// Look for the next living record of the old region, from slot `from` on; `to` is the next slot of the new one.
@@ -185,6 +185,9 @@ impl Store {
                         Err(error) => return Poll::Ready(Err(StoreError::Flash(error))),
                     }
                 }
+                // A new device: its master shall not wait for an erase that changes nothing.
+                State::Begin if is_blank(flash, new) => State::Collect { from: 1, to: 1 },
+                State::Begin => State::Erase { eraser: SectorEraser::new(new) },
                 State::Erase { eraser } => match eraser.poll(flash, chip) {
                     Poll::Pending => return Poll::Pending,
                     Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),

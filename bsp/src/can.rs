@@ -59,23 +59,28 @@ pub enum Mode {
     Silent,
 }
 
-/// What a controller that was asked for its errors tells (`CAN_ESR`, RM0090 section 32.9.2).
+/// What a controller that was asked for its errors tells (`CAN_ESR` and `CAN_MSR`, RM0090 section 32.9.2).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Errors {
     /// Bus-off.
     pub off: bool,
     /// Error passive.
     pub passive: bool,
+    /// It has seen the bus idle since it was configured, and takes part.
+    pub joined: bool,
     /// What became of the last frame since the question before: nothing came, a good one, a bad one.
     pub last: Option<Result<(), ()>>,
 }
 
 /// Offsets of registers that `bxcan` keeps to itself, in bytes (RM0090 section 32.9.5).
 const MCR: usize = 0x00;
+const MSR: usize = 0x04;
 const RF0R: usize = 0x0C;
 const ESR: usize = 0x18;
 /// `CAN_MCR`: bus-off is left without being told to.
 const ABOM: u32 = 1 << 6;
+/// `CAN_MSR`: initialisation and sleep mode are left with the first 11 recessive bits.
+const INAK_SLAK: u32 = 0b11;
 /// `CAN_RF0R`: a frame was lost because the FIFO was full; written with 1, it is cleared.
 const FOVR0: u32 = 1 << 4;
 const EPVF: u32 = 1 << 1;
@@ -192,7 +197,8 @@ impl<I: MasterInstance> Port<I> {
             0 => Some(Ok(())),
             _ => Some(Err(())),
         };
-        Errors { off: status & BOFF != 0, passive: status & EPVF != 0, last }
+        let joined = self.read(MSR) & INAK_SLAK == 0;
+        Errors { off: status & BOFF != 0, passive: status & EPVF != 0, joined, last }
     }
 
     /// Whether the FIFO was full and lost frames since the question before.

@@ -109,6 +109,8 @@ pub enum Heard {
     /// Nothing.
     #[default]
     Nothing,
+    /// It found no beginning: the bus was never idle for 11 bits (ISO 11898-1).
+    NeverIdle,
     /// A good frame was the last thing.
     Frame,
     /// An error was the last thing.
@@ -126,6 +128,9 @@ pub struct Detector {
     since: Instant,
 }
 
+/// How long the bus may not be idle before the next rate gets its turn, in milliseconds. At the right rate it is idle behind
+/// each frame, and no frame takes longer than 14 ms at 10 kbit/s.
+const NEVER_IDLE_MS: u32 = 50;
 /// How long silence is listened to before the next rate gets its turn, in milliseconds: more than a usual heartbeat.
 /// Slow sampling of a fast bus may hear nothing at all.
 const DWELL_MS: u32 = 1500;
@@ -151,6 +156,7 @@ impl Detector {
             Heard::Frame => return true,
             Heard::Error => true,
             Heard::Nothing => now.since(self.since) >= DWELL_MS,
+            Heard::NeverIdle => now.since(self.since) >= NEVER_IDLE_MS,
         };
         if go_on {
             self.at = (self.at + 1) % BitRate::FIXED.len();

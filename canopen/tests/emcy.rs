@@ -90,7 +90,7 @@ fn an_error_is_sent_behind_the_boot_up_and_remembered() {
     bench.application.0.raise(
         code::CAN_OVERRUN,
         register::COMMUNICATION,
-        emcy::driver_status(emcy::CONTROLLER_OVERRUN | emcy::QUEUE_OVERRUN),
+        emcy::driver_status(canopen::line::CONTROLLER_OVERRUN | canopen::line::QUEUE_OVERRUN),
     );
     assert_eq!(bench.sent(), [emergency([0x10, 0x81, 0x91, 0, 0, 0x20, 0x10, 0])]);
     bench.expect(&[

@@ -73,6 +73,11 @@ impl Bench {
         Rc::clone(&self.clock)
     }
 
+    /// Changes the host over to another bit rate.
+    pub fn set_host_bit_rate(&mut self, bit_rate: u32) {
+        self.world.port_mut(self.port).set_bit_rate(bit_rate);
+    }
+
     /// Switches the power on.
     pub fn power_on(&mut self) {
         let now = self.world.now();

@@ -60,6 +60,11 @@ impl HostPort {
         self.silent = silent;
     }
 
+    /// Changes over to another bit rate (in bit/s, 1 at least), between two frames.
+    pub fn set_bit_rate(&mut self, bit_rate: u32) {
+        self.bit = Span(PICOS / u64::from(bit_rate.max(1)));
+    }
+
     /// Puts a frame into the queue; it may go out from `at` on. Gives the ticket under which [`sent`](Self::sent)
     /// reports it.
     pub fn send(&mut self, frame: Frame, at: Time) -> u64 {

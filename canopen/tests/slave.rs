@@ -1,0 +1,211 @@
+//! A device on the bus: node, layer setting services and line together.
+
+mod common;
+
+use core::task::Poll;
+
+use canopen::bit_rate::Heard;
+use canopen::line::{Confinement, LineEvent, Status};
+use canopen::lss::{LssAddress, LssDevice, StoreError};
+use canopen::od::{Access, DataType, Entry, Objects};
+use canopen::slave::{Config, Output, Slave, SlaveDevice};
+use canopen::{AbortCode, Address, BitRate, CobId, Frame, NodeId};
+use common::at;
+
+const ADDRESS: LssAddress = LssAddress { vendor_id: 1, product_code: 2, revision: 3, serial_number: 4 };
+static ENTRIES: [Entry; 1] = [Entry::var(0x1000, "Device type", DataType::Unsigned32, Access::Const)];
+
+/// A device whose memory takes its time.
+#[derive(Default)]
+struct Device {
+    events: Vec<LineEvent>,
+    ids: Vec<Option<u8>>,
+    stored: Option<(Option<NodeId>, Option<BitRate>)>,
+    outcome: Option<Result<(), StoreError>>,
+}
+
+impl Objects for Device {
+    fn entries(&self) -> &'static [Entry] {
+        &ENTRIES
+    }
+
+    fn read(&mut self, _: Address, buf: &mut [u8]) -> Result<usize, AbortCode> {
+        buf[..4].copy_from_slice(&[1, 2, 3, 4]);
+        Ok(4)
+    }
+}
+
+impl LssDevice for Device {
+    fn supports(&mut self, rate: BitRate) -> bool {
+        rate != BitRate::K800
+    }
+
+    fn store(&mut self, id: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {
+        self.stored = Some((id, rate));
+        Poll::Pending
+    }
+
+    fn stored(&mut self) -> Poll<Result<(), StoreError>> {
+        self.outcome.map_or(Poll::Pending, Poll::Ready)
+    }
+}
+
+impl SlaveDevice for Device {
+    fn line_event(&mut self, event: LineEvent) {
+        self.events.push(event);
+    }
+
+    fn node_id_changed(&mut self, id: Option<NodeId>) {
+        self.ids.push(id.map(NodeId::get));
+    }
+}
+
+struct Bench {
+    slave: Slave,
+    device: Device,
+    now: u32,
+}
+
+impl Bench {
+    fn new(id: u8, rate: BitRate) -> Self {
+        let slave = Slave::new(ADDRESS, NodeId::new(id), rate, Config::default());
+        Self { slave, device: Device::default(), now: 0 }
+    }
+
+    fn outputs(&mut self) -> Vec<Output> {
+        core::iter::from_fn(|| self.slave.poll(at(self.now), true, &mut self.device)).take(20).collect()
+    }
+
+    fn put(&mut self, id: u16, data: &[u8]) -> bool {
+        self.slave.handle(&frame(id, data), at(self.now), &mut self.device)
+    }
+
+    fn ask(&mut self, id: u16, data: &[u8]) -> Vec<Output> {
+        self.put(id, data);
+        self.outputs()
+    }
+
+    fn hear(&mut self, heard: Heard) {
+        self.slave.observe(Status { heard, ..Status::default() }, at(self.now), &mut self.device);
+    }
+}
+
+fn frame(id: u16, data: &[u8]) -> Frame {
+    Frame::of(CobId::new(id).unwrap(), data)
+}
+
+fn accept(ids: [u16; 3]) -> Output {
+    Output::Accept(ids.map(|id| CobId::new(id).unwrap()))
+}
+
+fn send(id: u16, data: &[u8]) -> Output {
+    Output::Send(frame(id, data))
+}
+
+#[test]
+fn sets_filters_and_bit_rate_before_it_says_its_boot_up() {
+    let mut bench = Bench::new(5, BitRate::K250);
+    assert!(!bench.put(0x605, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]), "not on the bus yet");
+    assert_eq!(
+        bench.outputs(),
+        [accept([0x000, 0x7E5, 0x605]), Output::Join(BitRate::K250), send(0x705, &[0])]
+    );
+    let answer = bench.ask(0x605, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]);
+    assert_eq!(answer, [send(0x585, &[0x43, 0, 0x10, 0, 1, 2, 3, 4])]);
+}
+
+#[test]
+fn without_room_for_frames_the_controller_is_still_looked_after() {
+    let mut bench = Bench::new(5, BitRate::K250);
+    let mut poll = |slave: &mut Slave| slave.poll(at(0), false, &mut bench.device);
+    assert_eq!(poll(&mut bench.slave), Some(accept([0x000, 0x7E5, 0x605])));
+    assert_eq!(poll(&mut bench.slave), Some(Output::Join(BitRate::K250)));
+    assert_eq!(poll(&mut bench.slave), None);
+    let off = Status { confinement: Confinement::BusOff, ..Status::default() };
+    bench.slave.observe(off, at(10), &mut bench.device);
+    bench.slave.observe(off, at(210), &mut bench.device);
+    assert_eq!(bench.slave.poll(at(210), false, &mut bench.device), Some(Output::ComeBack));
+    bench.slave.observe(Status::default(), at(220), &mut bench.device);
+    assert_eq!(bench.device.events, [LineEvent::Recovered]);
+}
+
+#[test]
+fn a_device_without_node_id_lets_lss_in_alone_and_boots_when_it_gets_one() {
+    let mut bench = Bench::new(0xFF, BitRate::K125);
+    assert_eq!(bench.outputs(), [accept([0x7E5; 3]), Output::Join(BitRate::K125)]);
+    assert!(!bench.put(0x000, &[0x81, 0]), "NMT is for nodes");
+    assert_eq!(bench.ask(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]), []);
+    assert_eq!(bench.ask(0x7E5, &[0x11, 9, 0, 0, 0, 0, 0, 0]), [send(0x7E4, &[0x11, 0, 0, 0, 0, 0, 0, 0])]);
+    let outputs = bench.ask(0x7E5, &[0x04, 0, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(outputs, [accept([0x000, 0x7E5, 0x609]), send(0x709, &[0])]);
+    assert_eq!(bench.device.ids, [Some(9)]);
+}
+
+#[test]
+fn reset_communication_takes_over_what_lss_configured() {
+    let mut bench = Bench::new(5, BitRate::K125);
+    bench.outputs();
+    bench.ask(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+    bench.ask(0x7E5, &[0x11, 9, 0, 0, 0, 0, 0, 0]);
+    let outputs = bench.ask(0x000, &[0x82, 5]);
+    assert_eq!(outputs, [accept([0x000, 0x7E5, 0x609]), send(0x709, &[0])]);
+    bench.ask(0x7E5, &[0x11, 0xFF, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(bench.ask(0x000, &[0x82, 0]), [accept([0x7E5; 3])], "and falls silent without one");
+    assert_eq!(bench.device.ids, [Some(9), None]);
+}
+
+#[test]
+fn reset_node_is_the_owners() {
+    let mut bench = Bench::new(5, BitRate::K125);
+    bench.outputs();
+    assert!(!bench.put(0x000, &[0x81, 6]), "of another node");
+    assert!(bench.put(0x000, &[0x81, 5]));
+    assert!(bench.put(0x000, &[0x81, 0]));
+}
+
+#[test]
+fn the_answer_to_store_waits_for_the_memory() {
+    for (outcome, code) in [(Ok(()), 0), (Err(StoreError::Failed), 2)] {
+        let mut bench = Bench::new(5, BitRate::K125);
+        bench.outputs();
+        bench.ask(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+        assert_eq!(bench.ask(0x7E5, &[0x17, 0, 0, 0, 0, 0, 0, 0]), []);
+        assert_eq!(bench.device.stored, Some((NodeId::new(5), None)));
+        // Nothing else is answered meanwhile.
+        assert_eq!(bench.ask(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0]), []);
+        bench.device.outcome = Some(outcome);
+        assert_eq!(bench.outputs(), [send(0x7E4, &[0x17, code, 0, 0, 0, 0, 0, 0])]);
+        let inquired = bench.ask(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0]);
+        assert_eq!(inquired, [send(0x7E4, &[0x5E, 5, 0, 0, 0, 0, 0, 0])]);
+    }
+}
+
+#[test]
+fn listens_until_a_frame_proves_the_bit_rate() {
+    let mut bench = Bench::new(5, BitRate::Auto);
+    assert_eq!(bench.outputs(), [accept([0x000, 0x7E5, 0x605]), Output::Listen(BitRate::K125)]);
+    bench.hear(Heard::Error);
+    assert_eq!(bench.outputs(), [Output::Listen(BitRate::K100)]);
+    bench.hear(Heard::Nothing);
+    assert_eq!(bench.outputs(), []);
+    assert_eq!(bench.ask(0x605, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]), [], "who listens cannot answer");
+    bench.hear(Heard::Frame);
+    assert_eq!(bench.outputs(), [Output::Join(BitRate::K100), send(0x705, &[0])]);
+}
+
+#[test]
+fn activates_a_bit_rate_and_keeps_silent_meanwhile() {
+    let mut bench = Bench::new(5, BitRate::K125);
+    bench.outputs();
+    bench.ask(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+    bench.ask(0x7E5, &[0x13, 0, 2, 0, 0, 0, 0, 0]);
+    bench.ask(0x7E5, &[0x15, 100, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(bench.ask(0x605, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]), []);
+    bench.now = 100;
+    assert_eq!(bench.outputs(), [Output::Join(BitRate::K500)]);
+    bench.now = 199;
+    assert_eq!(bench.outputs(), []);
+    bench.now = 200;
+    // The answer that waited.
+    assert_eq!(bench.outputs(), [send(0x585, &[0x43, 0, 0x10, 0, 1, 2, 3, 4])]);
+}

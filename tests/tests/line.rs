@@ -1,0 +1,365 @@
+//! The device on its line: node-ID and bit rate by layer setting services, bit rates found by listening, errors of the bus
+//! and how the device comes back from them. Frames are written by hand from CiA 301 and CiA 305.
+
+use canopen::{BitRate, NodeId};
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::firmware;
+use coflash::flash::{flash, FlashOptions};
+use coflash::session::{Session, Timing};
+use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
+use emulator::bus::Outcome;
+use emulator::frame::Frame;
+use emulator::time::{Span, Time};
+
+const LSS_REQUEST: u16 = 0x7E5;
+const LSS_RESPONSE: u32 = 0x7E4;
+
+/// A board in its bootloader, with nothing installed.
+fn empty_board() -> Bench {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    bench
+}
+
+fn restart(bench: &mut Bench) {
+    bench.power_off();
+    bench.run_ms(10);
+    bench.power_on();
+}
+
+/// An LSS request that has an answer.
+#[track_caller]
+fn lss(bench: &mut Bench, request: [u8; 8]) -> [u8; 8] {
+    let answer = bench.ask(LSS_REQUEST, &request, LSS_RESPONSE).expect("an answer");
+    answer.try_into().expect("8 bytes")
+}
+
+fn configuration_state(bench: &mut Bench) {
+    bench.post(LSS_REQUEST, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+}
+
+/// Configures, stores, and says nothing else.
+fn store(bench: &mut Bench, node: u8, rate: BitRate) {
+    configuration_state(bench);
+    assert_eq!(lss(bench, [0x11, node, 0, 0, 0, 0, 0, 0]), [0x11, 0, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(lss(bench, [0x13, 0, rate as u8, 0, 0, 0, 0, 0]), [0x13, 0, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(lss(bench, [0x17, 0, 0, 0, 0, 0, 0, 0]), [0x17, 0, 0, 0, 0, 0, 0, 0]);
+}
+
+/// Whether a node said its boot-up since then, and when.
+fn boot_up(bench: &Bench, node: u8, since: Time) -> Option<Time> {
+    let id = 0x700 + u32::from(node);
+    let said = |frame: &&(Time, u32, Vec<u8>)| frame.1 == id && frame.2 == [0];
+    bench.frames_since(since).iter().find(said).map(|frame| frame.0)
+}
+
+fn emergencies(bench: &Bench, since: Time) -> Vec<Vec<u8>> {
+    let id = 0x80 + u32::from(NODE);
+    bench.frames_since(since).into_iter().filter(|frame| frame.1 == id).map(|frame| frame.2).collect()
+}
+
+fn session(bench: &mut Bench, node: u8) -> Session<'_> {
+    Session::new(bench, NodeId::new(node).expect("1 to 127"), Timing::default())
+}
+
+fn is_bootloader(session: &mut Session<'_>) -> bool {
+    session.device_type().unwrap().expect("a device type").is_bootloader()
+}
+
+#[test]
+fn stored_node_id_and_bit_rate_serve_bootloader_and_application_after_a_reset() {
+    let mut bench = empty_board();
+    store(&mut bench, 42, BitRate::K500);
+    restart(&mut bench);
+    bench.set_host_bit_rate(500_000);
+    let from = bench.time();
+    bench.run_ms(50);
+    assert!(boot_up(&bench, 42, from).is_some(), "{:?}", bench.frames_since(from));
+
+    let file = firmware::blocks(firmware::APP_V1);
+    let from = bench.time();
+    flash(&mut session(&mut bench, 42), &file, &FlashOptions::default(), &mut |_| {}).unwrap();
+    assert!(boot_up(&bench, 42, from).is_some());
+    // And the application tells the same by LSS.
+    configuration_state(&mut bench);
+    assert_eq!(lss(&mut bench, [0x5E, 0, 0, 0, 0, 0, 0, 0]), [0x5E, 42, 0, 0, 0, 0, 0, 0]);
+    bench.assert_nothing_unmodelled();
+}
+
+#[test]
+fn every_bit_rate_of_the_table_is_served_and_the_others_are_refused() {
+    for (index, rate) in [
+        (0, 1_000_000),
+        (2, 500_000),
+        (3, 250_000),
+        (4, 125_000),
+        (5, 100_000),
+        (6, 50_000),
+        (7, 20_000),
+        (8, 10_000),
+    ] {
+        let mut bench = empty_board();
+        store(&mut bench, 3, BitRate::from_index(index).unwrap());
+        restart(&mut bench);
+        bench.set_host_bit_rate(rate);
+        let from = bench.time();
+        bench.run_ms(100);
+        assert!(boot_up(&bench, 3, from).is_some(), "{rate} bit/s: {:?}", bench.records());
+        assert!(bench.records().iter().all(|record| record.outcome == Outcome::Good), "{rate} bit/s");
+    }
+    let mut bench = empty_board();
+    configuration_state(&mut bench);
+    // 800 kbit/s: 42 MHz is no multiple of it. Index 10 and table 1 are nobody's.
+    for (table, index) in [(0, 1), (0, 10), (0, 255), (1, 4)] {
+        let request = [0x13, table, index, 0, 0, 0, 0, 0];
+        assert_eq!(lss(&mut bench, request), [0x13, 1, 0, 0, 0, 0, 0, 0], "table {table} index {index}");
+    }
+}
+
+#[test]
+fn a_device_without_node_id_is_silent_until_it_gets_one() {
+    let mut bench = empty_board();
+    store(&mut bench, 0xFF, BitRate::K125);
+    restart(&mut bench);
+    let from = bench.time();
+    bench.run_ms(3000);
+    // NMT and SDO are for nodes.
+    bench.post(0x000, &[0x81, 0]);
+    bench.post(0x000, &[0x01, 0]);
+    bench.post(0x600 + u16::from(NODE), &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]);
+    bench.run_ms(100);
+    let spoken: Vec<_> =
+        bench.frames_since(from).into_iter().filter(|(_, id, _)| *id > 0 && *id != 0x601).collect();
+    assert_eq!(spoken, [], "a word without being asked");
+
+    assert_eq!(lss(&mut bench, [0x4C, 0, 0, 0, 0, 0, 0, 0]), [0x50, 0, 0, 0, 0, 0, 0, 0]);
+    configuration_state(&mut bench);
+    assert_eq!(lss(&mut bench, [0x5E, 0, 0, 0, 0, 0, 0, 0]), [0x5E, 0xFF, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(lss(&mut bench, [0x11, 7, 0, 0, 0, 0, 0, 0]), [0x11, 0, 0, 0, 0, 0, 0, 0]);
+    let from = bench.time();
+    bench.post(LSS_REQUEST, &[0x04, 0, 0, 0, 0, 0, 0, 0]);
+    bench.run_ms(20);
+    assert!(boot_up(&bench, 7, from).is_some(), "{:?}", bench.frames_since(from));
+    assert!(is_bootloader(&mut session(&mut bench, 7)));
+}
+
+#[test]
+fn a_bit_rate_is_activated_after_the_delay() {
+    let mut bench = empty_board();
+    configuration_state(&mut bench);
+    assert_eq!(lss(&mut bench, [0x13, 0, 0, 0, 0, 0, 0, 0]), [0x13, 0, 0, 0, 0, 0, 0, 0]);
+    // 200 ms.
+    bench.post(LSS_REQUEST, &[0x15, 200, 0, 0, 0, 0, 0, 0]);
+    bench.run_ms(100);
+    let asked = bench.time();
+    assert_eq!(bench.ask(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0], 0x581), None, "before the delay is over");
+    bench.set_host_bit_rate(1_000_000);
+    assert!(bench.time() - asked >= Span::from_millis(100));
+    bench.run_ms(250);
+    // Stored it was not, and the device did not start anew.
+    assert!(is_bootloader(&mut bench.session()));
+    assert_eq!(boot_up(&bench, NODE, asked), None);
+}
+
+/// What a device does that is to find out its bit rate: how long until it says its boot-up.
+fn found_after(bench: &mut Bench, within_ms: u64) -> Option<Span> {
+    let from = bench.time();
+    for _ in 0..within_ms / 10 {
+        bench.run_ms(10);
+        if let Some(at) = boot_up(bench, NODE, from) {
+            return Some(at - from);
+        }
+    }
+    None
+}
+
+#[test]
+fn finds_the_bit_rate_of_a_bus_with_traffic_and_disturbs_nobody() {
+    for rate in [1_000_000, 250_000, 50_000] {
+        let mut bench = empty_board();
+        store(&mut bench, NODE, BitRate::Auto);
+        restart(&mut bench);
+        bench.set_host_bit_rate(rate);
+        // Another node of that bus acknowledges; the host talks every 20 ms.
+        bench.world.add_host_port(rate);
+        let from = bench.time();
+        for i in 0..250 {
+            bench.post(0x300, &[i as u8; 5]);
+            bench.run_ms(20);
+        }
+        let at = boot_up(&bench, NODE, from).unwrap_or_else(|| panic!("{rate} bit/s not found"));
+        assert!(at - from < Span::from_millis(2000), "{rate} bit/s found after {:?}", at - from);
+        let records = bench.records();
+        let bad = records.iter().filter(|record| record.start >= from && record.outcome != Outcome::Good);
+        assert_eq!(bad.count(), 0, "{rate} bit/s: a listener destroyed frames");
+        assert!(is_bootloader(&mut bench.session()));
+    }
+}
+
+#[test]
+fn finds_the_bit_rate_of_a_bus_where_it_is_alone_with_the_master() {
+    for rate in [1_000_000, 250_000, 20_000] {
+        let mut bench = empty_board();
+        store(&mut bench, NODE, BitRate::Auto);
+        restart(&mut bench);
+        bench.set_host_bit_rate(rate);
+        let from = bench.time();
+        bench.run_ms(2000);
+        assert!(bench.frames_since(from).is_empty(), "a word before it knows the bit rate");
+        // One request, which nobody acknowledges at first.
+        bench.post(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]);
+        assert!(found_after(&mut bench, 5000).is_some(), "{rate} bit/s not found");
+        assert!(is_bootloader(&mut bench.session()));
+    }
+}
+
+#[test]
+fn an_application_finds_the_bit_rate_too() {
+    let mut bench = empty_board();
+    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
+        .unwrap();
+    bench.session().command(1, canopen::program::ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up(1000);
+    store(&mut bench, NODE, BitRate::Auto);
+    restart(&mut bench);
+    bench.set_host_bit_rate(500_000);
+    bench.post(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]);
+    let found = found_after(&mut bench, 5000);
+    assert!(found.is_some());
+    assert!(!is_bootloader(&mut bench.session()));
+}
+
+#[test]
+fn the_boot_up_of_the_bootloader_is_followed_by_an_emergency() {
+    let bench = {
+        let mut bench = empty_board();
+        bench.run_ms(20);
+        bench
+    };
+    // Device specific, no error in the register, "BOOT".
+    assert_eq!(emergencies(&bench, Time::default()), [[0x00, 0xFF, 0, b'B', b'O', b'O', b'T', 0]]);
+}
+
+#[test]
+fn comes_back_from_bus_off_with_growing_patience_and_tells() {
+    let mut bench = empty_board();
+    let device = bench.device.node();
+    // Whatever the device sends is destroyed: 32 attempts make it bus-off.
+    let mine = FrameMatch { from: Some(device), ..FrameMatch::default() };
+    bench.world.inject(Fault { frames: mine, when: When::Always, action: FaultAction::Disturb });
+    let from = bench.time();
+    bench.post(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]);
+    bench.run_ms(4000);
+    let bursts = bursts(&bench, from, device);
+    // Each return ends in bus-off again, and each pause is longer than the one before.
+    assert!((3..=6).contains(&bursts.len()), "{bursts:?}");
+    let pauses: Vec<Span> = bursts.windows(2).map(|pair| pair[1].0 - pair[0].1).collect();
+    assert!(pauses.windows(2).all(|pair| pair[1] > pair[0]), "{pauses:?}");
+    // An error passive node waits a little longer between attempts; 32 make it bus-off in any case.
+    assert!(bursts.iter().all(|burst| burst.2 == 32), "{bursts:?}");
+
+    bench.world.clear_faults();
+    let from = bench.time();
+    bench.run_ms(5500);
+    let told = emergencies(&bench, from);
+    assert!(told.iter().any(|bytes| bytes[..3] == [0x40, 0x81, 0x11]), "{told:02X?}");
+    assert_eq!(told.last().unwrap()[..3], [0x00, 0x00, 0x00], "and it is over: {told:02X?}");
+    assert!(is_bootloader(&mut bench.session()));
+    // 1003h remembers: newest first.
+    let history = bench.ask(0x601, &[0x40, 0x03, 0x10, 1, 0, 0, 0, 0], 0x581).unwrap();
+    assert_eq!(history[..6], [0x43, 0x03, 0x10, 1, 0x40, 0x81]);
+}
+
+/// Attempts of a node, as bursts: first start, last end, how many.
+fn bursts(bench: &Bench, from: Time, node: usize) -> Vec<(Time, Time, u32)> {
+    let mut bursts: Vec<(Time, Time, u32)> = Vec::new();
+    for record in bench.records() {
+        if record.from != Some(node) || record.start < from {
+            continue;
+        }
+        match bursts.last_mut() {
+            Some((_, end, count)) if record.start - *end < Span::from_millis(50) => {
+                *end = record.end;
+                *count += 1;
+            }
+            _ => bursts.push((record.start, record.end, 1)),
+        }
+    }
+    bursts
+}
+
+#[test]
+fn error_passive_is_told_and_its_end_too() {
+    let mut bench = empty_board();
+    let device = bench.device.node();
+    let mine = FrameMatch { from: Some(device), ..FrameMatch::default() };
+    // 16 errors and a few: passive, not off.
+    let rule = bench.world.inject(Fault { frames: mine, when: When::Always, action: FaultAction::Disturb });
+    let from = bench.time();
+    bench.post(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]);
+    while bench.world.bus().fault_hits(rule) < 20 {
+        bench.run_ms(1);
+    }
+    bench.world.clear_faults();
+    bench.run_ms(50);
+    assert_eq!(emergencies(&bench, from)[0][..3], [0x20, 0x81, 0x11]);
+    // Each frame that gets through takes one off the counter; heartbeats do in time.
+    for _ in 0..64 {
+        bench.ask(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0], 0x581).unwrap();
+    }
+    bench.run_ms(50);
+    assert_eq!(emergencies(&bench, from).last().unwrap()[..3], [0x00, 0x00, 0x00]);
+}
+
+#[test]
+fn a_damaged_block_is_told_by_an_emergency_and_the_next_good_one_ends_it() {
+    let mut bench = empty_board();
+    let from = bench.time();
+    // A control block of 8 zero bytes, with a CRC that does not belong to it.
+    let mut block = [0; 24];
+    block[8] = 8;
+    let address = canopen::Address::new(0x1F50, 1);
+    let doing = coflash::session::Doing::Block(0);
+    bench.session().write(address, &block, doing, &mut |_| {}).unwrap_err();
+    bench.run_ms(20);
+    assert_eq!(emergencies(&bench, from), [[0x00, 0x63, 0x81, 0x06, 1, 0, 0, 0]]);
+    let register = bench.ask(0x601, &[0x40, 0x01, 0x10, 0, 0, 0, 0, 0], 0x581).unwrap();
+    assert_eq!(register[4], 0x81);
+    bench.session().command(1, canopen::program::ProgramControl::Clear).unwrap();
+    bench.session().await_idle(1, doing).unwrap();
+    bench.run_ms(20);
+    assert_eq!(emergencies(&bench, from).last().unwrap()[..3], [0x00, 0x00, 0x00]);
+}
+
+#[test]
+fn frames_lost_in_a_flood_are_told_once() {
+    let mut bench = empty_board();
+    store(&mut bench, NODE, BitRate::K1000);
+    restart(&mut bench);
+    bench.set_host_bit_rate(1_000_000);
+    bench.run_ms(50);
+    bench.session().command(1, canopen::program::ProgramControl::Clear).unwrap();
+    bench.session().await_idle(1, coflash::session::Doing::Block(0)).unwrap();
+    let address = canopen::Address::new(0x1F50, 1);
+    let from = bench.time();
+    // While a large block is being sent, a second host floods with the shortest frames that the device lets in: NMT
+    // commands without data, which are nobody's.
+    let flood = bench.world.add_host_port(1_000_000);
+    for _ in 0..30_000 {
+        bench.world.send(flood, Frame::standard(0x000, &[]).unwrap());
+    }
+    let block = vec![0; 16_384];
+    // The flood wins every arbitration; the transfer may well fail. The device has to live.
+    let _ = bench.session().write(address, &block, coflash::session::Doing::Block(0), &mut |_| {});
+    bench.run_ms(3000);
+    let told = emergencies(&bench, from);
+    let lost: Vec<_> = told.iter().filter(|bytes| bytes[..2] == [0x10, 0x81]).collect();
+    assert!((1..=3).contains(&lost.len()), "more than one a second, or none: {lost:02X?}");
+    // Bytes 5 and 6: the driver's status, 0020h and 1000h.
+    assert!(
+        lost.iter().all(|bytes| matches!((bytes[5], bytes[6]), (0x20, 0) | (0, 0x10) | (0x20, 0x10))),
+        "{lost:02X?}"
+    );
+    assert!(is_bootloader(&mut bench.session()));
+}
