@@ -62,6 +62,17 @@ pub enum Error {
         /// How long it was waited for.
         waited: Duration,
     },
+    /// The file is for another device.
+    WrongTarget {
+        /// Which device was looked at.
+        node: NodeId,
+        /// What differs.
+        what: Mismatch,
+        /// What the device says.
+        device: u32,
+        /// What the file says.
+        file: u32,
+    },
     /// The application does not go back to the bootloader.
     NoBootloader {
         /// Which device.
@@ -89,6 +100,25 @@ pub enum Error {
     },
 }
 
+/// In what a device is another one than the file's.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mismatch {
+    /// 1018h/1.
+    VendorId,
+    /// 1018h/2.
+    ProductCode,
+}
+
+impl Mismatch {
+    /// The error that the bootloader would have for it.
+    const fn error(self) -> FlashError {
+        match self {
+            Self::VendorId => FlashError::WrongVendorId,
+            Self::ProductCode => FlashError::WrongProductId,
+        }
+    }
+}
+
 impl From<AdapterError> for Error {
     fn from(error: AdapterError) -> Self {
         Self::Adapter(error)
@@ -104,6 +134,7 @@ impl Error {
             Self::Adapter(error) => error.number(),
             Self::WrongCrc { .. } => 0x6000_0001,
             Self::Failed { error, .. } => flash_error_number(*error),
+            Self::WrongTarget { what, .. } => flash_error_number(what.error()),
             Self::NoBootloader { .. } => 0x6000_0010,
             Self::Cancelled => 0x6000_0011,
             Self::NoAnswer { .. } => 0x6000_0013,
@@ -128,7 +159,8 @@ impl Error {
                                       --sdo-timeout helps against answers that come late"
                 .to_string(),
             Self::Failed { error, .. } => failure_advice(*error).to_string(),
-            Self::Busy { .. } => "give it more time with --timeout, or switch the device off and on".to_string(),
+            Self::WrongTarget { what, .. } => failure_advice(what.error()).to_string(),
+            Self::Busy { .. } => "give it more time with --command-timeout, or switch the device off and on".to_string(),
             Self::NoBootloader { code: Some(_), .. } => {
                 "this application cannot be called back: bring the device into the bootloader by its entry strap, or \
                  within its rescue window after power-on"
@@ -239,6 +271,13 @@ impl fmt::Display for Error {
             }
             Self::Busy { node, doing, waited } => {
                 write!(f, "node {node} is still busy {doing} after {:.1} s", waited.as_secs_f64())
+            }
+            Self::WrongTarget { node, what, device, file } => {
+                let what = match what {
+                    Mismatch::VendorId => "vendor-ID",
+                    Mismatch::ProductCode => "product code",
+                };
+                write!(f, "the program is for {what} {file:08X}h, and node {node} has {device:08X}h")
             }
             Self::NoBootloader { node, running, code } => {
                 match running {

@@ -8,10 +8,11 @@ use std::time::Duration;
 
 use canopen::program::{self, FlashError, ProgramControl};
 use canopen::{AbortCode, Address};
+use shared_abi::block_file::Control;
 
 use crate::block_file::{Block, BlockFile};
-use crate::error::Error;
-use crate::session::{DeviceType, Doing, Session};
+use crate::error::{Error, Mismatch};
+use crate::session::{DeviceType, Doing, Session, Transfers};
 
 /// What to do beyond the download itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -20,15 +21,41 @@ pub struct FlashOptions {
     pub program: u8,
     /// How often one block is sent again after a CRC error or a broken transfer.
     pub repeats: u32,
+    /// Compare the device's identity with this before anything is erased, and once more with that of the program on trial.
+    pub check_target: Option<Target>,
     /// Start the program once and call it back before it is signed (steps 10 to 13).
     pub trial_run: bool,
     /// Start the program at the end (step 15).
     pub start: bool,
+    /// Compare the CRC once more at the very end: the one that the program itself tells when it runs.
+    pub verify: bool,
+}
+
+/// The device that a program is for: what 1018h/1 and 1018h/2 have to read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Target {
+    /// Vendor-ID.
+    pub vendor_id: u32,
+    /// Product code.
+    pub product_code: u32,
+}
+
+impl Target {
+    /// The device that a block file names in its block 0, if it names one.
+    #[must_use]
+    pub fn of(file: &BlockFile) -> Option<Self> {
+        match *file.control() {
+            Control::Plain => None,
+            Control::Identity(identity) | Control::Dated { identity, .. } => {
+                Some(Self { vendor_id: identity.vendor_id, product_code: identity.product_code })
+            }
+        }
+    }
 }
 
 impl Default for FlashOptions {
     fn default() -> Self {
-        Self { program: 1, repeats: 3, trial_run: false, start: true }
+        Self { program: 1, repeats: 3, check_target: None, trial_run: false, start: true, verify: false }
     }
 }
 
@@ -37,6 +64,8 @@ impl Default for FlashOptions {
 pub enum Event {
     /// Step 2: this is running on the device.
     Found(DeviceType),
+    /// It is the device that the file is for.
+    TargetRight(Target),
     /// Step 3: the application is asked to go back to the bootloader.
     CallingBack,
     /// Step 3 has worked.
@@ -81,12 +110,58 @@ pub enum Event {
     Starting,
     /// It runs.
     Started(DeviceType),
+    /// After its end, the procedure's last look: the CRC is still the file's.
+    VerifiedAgain {
+        /// The CRC.
+        crc: u32,
+    },
+    /// The procedure failed, and leaves the device like this.
+    Left(DeviceState),
+}
+
+/// In what state a procedure that failed leaves the device, as far as it got.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DeviceState {
+    /// Nothing was changed.
+    Untouched,
+    /// The bootloader was called; the old program is whole.
+    Called,
+    /// The erasure was begun: there is no program, or an incomplete one.
+    Erased,
+    /// The new program is in and right, but not signed.
+    Unsigned,
+    /// The new program is in and signed.
+    Signed,
+}
+
+impl fmt::Display for DeviceState {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Untouched => "nothing was changed in it",
+            Self::Called => {
+                "it may be in the bootloader; its old program is whole and starts again after a reset"
+            }
+            Self::Erased => {
+                "it has no complete program and stays in the bootloader, ready for the next attempt"
+            }
+            Self::Unsigned => {
+                "the new program is in it but not signed: after a reset the bootloader waits for the next attempt"
+            }
+            Self::Signed => "the new program is in it and signed: it starts after a reset",
+        })
+    }
 }
 
 impl fmt::Display for Event {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Found(running) => write!(f, "found {running}"),
+            Self::TargetRight(Target { vendor_id, product_code }) => {
+                write!(
+                    f,
+                    "it is the right device: vendor-ID {vendor_id:08X}h, product code {product_code:08X}h"
+                )
+            }
             Self::CallingBack => f.write_str("calling the application back to the bootloader"),
             Self::InBootloader => f.write_str("the bootloader is running"),
             Self::Erasing => f.write_str("erasing the old program"),
@@ -101,6 +176,8 @@ impl fmt::Display for Event {
             Self::Signed => f.write_str("signed: the program starts by itself from now on"),
             Self::Starting => f.write_str("starting the program"),
             Self::Started(running) => write!(f, "running: {running}"),
+            Self::VerifiedAgain { crc } => write!(f, "verified once more: CRC {crc:08X}h"),
+            Self::Left(state) => write!(f, "the device: {state}"),
         }
     }
 }
@@ -140,6 +217,10 @@ pub struct Report {
     pub repeats: u32,
     /// How long all of it took, on the bus's clock.
     pub took: Duration,
+    /// How long the blocks took.
+    pub transfer: Duration,
+    /// How the blocks were written at the end.
+    pub transfers: Transfers,
     /// What runs now, if the program was started.
     pub running: Option<DeviceType>,
 }
@@ -160,19 +241,54 @@ pub fn flash(
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Report, Error> {
+    let mut state = DeviceState::Untouched;
+    let result = procedure(session, file, options, &mut state, tell);
+    if result.is_err() {
+        tell(Event::Left(state));
+    }
+    result
+}
+
+/// [`flash`], which keeps `state` up to date.
+fn procedure(
+    session: &mut Session<'_>,
+    file: &BlockFile,
+    options: &FlashOptions,
+    state: &mut DeviceState,
+    tell: &mut dyn FnMut(Event),
+) -> Result<Report, Error> {
     let began = session.now();
     let number = options.program;
-    enter_bootloader(session, number, tell)?;
+    let running = find(session)?;
+    tell(Event::Found(running));
+    if let Some(target) = options.check_target {
+        check_target(session, target)?;
+        tell(Event::TargetRight(target));
+    }
+    if !running.is_bootloader() {
+        *state = DeviceState::Called;
+        tell(Event::CallingBack);
+        call_back(session, number)?;
+        tell(Event::InBootloader);
+    }
+    *state = DeviceState::Erased;
     erase(session, number, tell)?;
+    let transfer_began = session.now();
     let repeats = send_blocks(session, file, options, tell)?;
+    let transfer = session.now().saturating_sub(transfer_began);
     verify(session, number, file.program_crc(), tell)?;
+    *state = DeviceState::Unsigned;
     if options.trial_run {
         tell(Event::TrialStarting);
         let running = start(session, number)?;
+        if let Some(target) = options.check_target {
+            check_target(session, target)?;
+        }
         call_back(session, number)?;
         tell(Event::TrialPassed(running));
     }
     sign(session, number, tell)?;
+    *state = DeviceState::Signed;
     let running = if options.start {
         tell(Event::Starting);
         let running = start(session, number)?;
@@ -181,8 +297,30 @@ pub fn flash(
     } else {
         None
     };
+    if options.verify {
+        let crc = file.program_crc();
+        compare_crc(session, number, crc)?;
+        tell(Event::VerifiedAgain { crc });
+    }
     let took = session.now().saturating_sub(began);
-    Ok(Report { program_size: file.program_size(), program_crc: file.program_crc(), repeats, took, running })
+    let (program_size, program_crc) = (file.program_size(), file.program_crc());
+    Ok(Report { program_size, program_crc, repeats, took, transfer, transfers: session.transfers(), running })
+}
+
+/// Compares the device's identity with that of the file's target. Bootloader and application have the same one.
+///
+/// # Errors
+/// [`Error::WrongTarget`], and what a [read](Session::read) has.
+pub fn check_target(session: &mut Session<'_>, target: Target) -> Result<(), Error> {
+    let wanted = [(1, target.vendor_id), (2, target.product_code)];
+    for (sub, file) in wanted {
+        let device = session.read_number(Address::new(program::IDENTITY, sub))?;
+        if device != file {
+            let what = if sub == 1 { Mismatch::VendorId } else { Mismatch::ProductCode };
+            return Err(Error::WrongTarget { node: session.node(), what, device, file });
+        }
+    }
+    Ok(())
 }
 
 /// Steps 2 and 3: afterwards the bootloader is running.
@@ -391,6 +529,10 @@ fn send_block(
         match why {
             Some(why) if repeat < options.repeats => {
                 repeat += 1;
+                // A device, or an adapter, that cannot cope with block transfers may cope with segments.
+                if repeat > 1 && matches!(why, RepeatReason::Broken(_) | RepeatReason::NoAnswer) {
+                    session.transfer_by(Transfers::Segments);
+                }
                 tell(Event::Repeating { block, repeat, of: options.repeats, why });
             }
             _ => return otherwise,
@@ -417,11 +559,16 @@ pub fn verify(
     crc: u32,
     tell: &mut dyn FnMut(Event),
 ) -> Result<(), Error> {
+    compare_crc(session, number, crc)?;
+    tell(Event::Verified { crc });
+    Ok(())
+}
+
+fn compare_crc(session: &mut Session<'_>, number: u8, crc: u32) -> Result<(), Error> {
     let device = session.read_number(Address::new(program::PROGRAM_ID, number))?;
     if device != crc {
         return Err(Error::WrongCrc { device, file: crc });
     }
-    tell(Event::Verified { crc });
     Ok(())
 }
 

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::program::{self, FlashStatus, ProgramControl, BOOTLOADER_DEVICE_TYPE};
-use canopen::sdo::client::{Buffer, Config};
+use canopen::sdo::client::{Block, Buffer, Config};
 use canopen::sdo::{Download, SdoError, Step, Transfer, Upload};
 use canopen::{AbortCode, Address, CobId, Frame, Instant, NodeId};
 
@@ -81,6 +81,19 @@ const VALUE_MAX: usize = 4096;
 /// The longest wait in one piece: how soon a cancelled session notices.
 const SLICE: Duration = Duration::from_millis(100);
 
+/// How values of more than four bytes are written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Transfers {
+    /// As blocks, the fast way, until the device says that it does not know them; from then on in segments.
+    #[default]
+    Blocks,
+    /// In segments, which every device knows: one answer for seven bytes.
+    Segments,
+}
+
+/// Less is not worth the frames around a block transfer.
+const WORTH_BLOCKS: usize = 4 * 7;
+
 /// What [`Timing::command`] limits in a transfer. The SDO time-out alone does not end one: it counts from answer to
 /// answer, and a device that babbles always has one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -96,6 +109,7 @@ pub struct Session<'a> {
     adapter: &'a mut dyn Adapter,
     node: NodeId,
     timing: Timing,
+    transfers: Transfers,
     cancelled: Option<Arc<AtomicBool>>,
 }
 
@@ -111,12 +125,23 @@ impl fmt::Debug for Session<'_> {
 impl<'a> Session<'a> {
     /// A conversation with `node`. Nothing is sent yet.
     pub fn new(adapter: &'a mut dyn Adapter, node: NodeId, timing: Timing) -> Self {
-        Self { adapter, node, timing, cancelled: None }
+        Self { adapter, node, timing, transfers: Transfers::default(), cancelled: None }
     }
 
     /// Ends with [`Error::Cancelled`] as soon as `flag` is set: a transfer under way is aborted.
     pub fn cancel_by(&mut self, flag: Arc<AtomicBool>) {
         self.cancelled = Some(flag);
+    }
+
+    /// Writes this way from now on.
+    pub fn transfer_by(&mut self, transfers: Transfers) {
+        self.transfers = transfers;
+    }
+
+    /// How long values are written at present.
+    #[must_use]
+    pub fn transfers(&self) -> Transfers {
+        self.transfers
     }
 
     /// The node.
@@ -196,6 +221,17 @@ impl<'a> Session<'a> {
         doing: Doing,
         progress: &mut dyn FnMut(u32),
     ) -> Result<(), Error> {
+        if self.transfers == Transfers::Blocks && data.len() > WORTH_BLOCKS {
+            let block = Block { fallback: false, ..Block::default() };
+            let mut download = Download::as_blocks(self.node, at, data, self.config(), block);
+            match self.run(&mut download, doing, Patience::ForEachStep, progress) {
+                // It is no use asking again for each value.
+                Err(Error::Refused { code, .. }) if download.progress() == 0 && means_no_blocks(code) => {
+                    self.transfers = Transfers::Segments;
+                }
+                result => return result,
+            }
+        }
         let mut download = Download::new(self.node, at, data, self.config());
         self.run(&mut download, doing, Patience::ForEachStep, progress)
     }
@@ -391,6 +427,11 @@ impl fmt::Display for DeviceType {
         let who = if self.is_bootloader() { "the bootloader" } else { "an application" };
         write!(f, "{who} (device type {:08X}h)", self.0)
     }
+}
+
+/// Whether this is how a server says that it does not know block transfer. Some use the general error for it.
+fn means_no_blocks(code: AbortCode) -> bool {
+    matches!(code, AbortCode::COMMAND | AbortCode::UNSUPPORTED_ACCESS | AbortCode::GENERAL)
 }
 
 /// A little-endian number of one to four bytes.

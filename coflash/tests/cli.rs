@@ -411,6 +411,98 @@ fn flash_and_info_over_a_socket() {
     assert!(done.out.starts_with("node 5: an application (device type 00020192h)\n"), "{}", done.out);
 }
 
+/// The manual's calls (chapters 5.2 and 5.3) with the names of its options.
+#[test]
+fn a_script_for_the_manuals_download_tools_works() {
+    let file = data("identity-110.blk");
+    let download =
+        ["-P", "1", "-B", "4", "-N", "5", "--delay", "20", "--repeats", "0x000400", "--timeout", "500"];
+    let dot_net = ["--node_id", "0x05", "--br_idx", "4", "--device_no", "255", "--prog_no", "1", "--chk_run"];
+    let dot_net_2 = ["--sdo_timeout", "500", "--chk_tgt", "0", "--vxd_type", "4", "--baudrate", "500"];
+    for (options, trial) in [
+        ([&download[..], &[&file]].concat(), false),
+        ([&["-F", &file][..], &dot_net, &dot_net_2].concat(), true),
+    ] {
+        let mut fake = Fake::new(BOOTLOADER);
+        fake.erase_time = Duration::from_millis(30);
+        fake.restart_time = Duration::from_millis(10);
+        let (bus, server) = serve(fake);
+        let done = coflash(&[&["--bus", &bus, "flash"][..], &options].concat());
+        assert_eq!(done.exit, 0, "{}", done.err);
+        assert_eq!(done.err.contains("--vxd_type is passed over"), trial, "{}", done.err);
+        let fake = server.join().unwrap();
+        assert_eq!(fake.blocks.concat(), fs::read(&file).unwrap());
+        assert_eq!(fake.count("command 80"), usize::from(trial));
+    }
+    for (option, value, words) in [("--gateway_id", "3", "SDO gateway"), ("-B", "9", "0 (1 Mbit/s) to 8")] {
+        let done = coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", &file, option, value]);
+        assert_eq!(done.exit, 2, "{}", done.err);
+        assert!(done.err.contains(words), "{}", done.err);
+    }
+}
+
+#[test]
+fn the_target_is_checked_before_anything_is_erased() {
+    let file = data("identity-110.blk");
+    for option in [&["--check-target"][..], &["--chk_tgt", "1"]] {
+        let (bus, server) = serve(Fake::new(APPLICATION));
+        let done = coflash(&[&["--bus", &bus, "flash", "--node", "5", &file][..], option].concat());
+        assert_eq!(done.exit, 6, "{}", done.err);
+        assert_eq!(
+            done.err,
+            "error: the program is for vendor-ID 00000000h, and node 5 has 0000003Fh [0x60000180]\n  \
+             the device: nothing was changed in it\n  what to do: check that file and device belong together \
+             (coflash info shows the device's identity)\n"
+        );
+        assert_eq!(server.join().unwrap().writes().len(), 0);
+    }
+    // A file that names no device cannot be checked, unless the command line names one.
+    let plain = data("program.elf");
+    let done = coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--check-target", &plain]);
+    assert!(done.exit == 2 && done.err.contains("--vid and --pid"), "{}", done.err);
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.erase_time = Duration::from_millis(30);
+    let (bus, server) = serve(fake);
+    let done = coflash(&[
+        "--json",
+        "--bus",
+        &bus,
+        "flash",
+        "-N",
+        "5",
+        "--check-target",
+        "--vid",
+        "0x3F",
+        "--pid",
+        "1234",
+        "--no-start",
+        &plain,
+    ]);
+    assert_eq!(done.exit, 0, "{}", done.err);
+    let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
+    assert_eq!((&json["command"], &json["node"], &json["program"]), (&"flash".into(), &5.into(), &1.into()));
+    assert_eq!((&json["size"], &json["running"]), (&4001.into(), &serde_json::Value::Null));
+    assert_eq!((&json["transfer"], &json["blocks_repeated"]), (&"segments".into(), &0.into()));
+    let fake = server.join().unwrap();
+    // Block 0: vendor-ID and product code behind the size.
+    assert_eq!(fake.blocks[0][16..24], [0x3F, 0, 0, 0, 0xD2, 4, 0, 0]);
+    assert_eq!(fake.count("command 01"), 0);
+}
+
+#[test]
+fn a_failure_in_json_has_the_manuals_number_and_the_devices_state() {
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.erase_time = Duration::from_millis(5);
+    fake.on_block = Box::new(|_| Outcome::Status(0x0E));
+    let (bus, server) = serve(fake);
+    let done = coflash(&["flash", "--json", "--bus", &bus, "-N", "5", &data("plain-400.blk")]);
+    assert_eq!((done.exit, done.err.as_str()), (6, ""));
+    let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
+    assert_eq!(json["error"]["number"], "0x60000007");
+    assert_eq!((&json["error"]["exit"], &json["error"]["device"]), (&6.into(), &"erased".into()));
+    server.join().unwrap();
+}
+
 #[test]
 fn a_device_that_fails_has_the_exit_code_of_its_failure() {
     let mut refusing = Fake::new(BOOTLOADER);
@@ -422,7 +514,7 @@ fn a_device_that_fails_has_the_exit_code_of_its_failure() {
     dead.erase_time = Duration::from_millis(5);
     dead.starts = Some(BOOTLOADER);
     for (fake, exit, words) in [
-        (refusing, 6, "[0x60000006]\n  what to do: check --board and --program"),
+        (refusing, 6, "[0x60000006]\n  the device: it has no complete program and stays in the bootloader"),
         (absent, 5, "node 5 does not answer (reading 1000h/0) [0x60000013]"),
         (dead, 7, "the program does not start"),
     ] {

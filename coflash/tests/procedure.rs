@@ -9,12 +9,12 @@ use std::time::Duration;
 use canopen::{CobId, Frame, NodeId};
 use coflash::block_file::BlockFile;
 use coflash::error::Error;
-use coflash::flash::{flash, Event, FlashOptions, RepeatReason, Report};
+use coflash::flash::{flash, DeviceState, Event, FlashOptions, RepeatReason, Report, Target};
 use coflash::info::info;
-use coflash::session::{Session, Timing};
+use coflash::session::{Session, Timing, Transfers};
 use coflash::Adapter;
 use embedded_can::{Frame as _, StandardId};
-use fake::{Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
+use fake::{Blocks, Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use proptest::prelude::*;
 
 fn file() -> BlockFile {
@@ -121,6 +121,135 @@ fn progress_never_goes_back_and_ends_complete() {
     }
     assert_eq!(last, total_bytes);
     assert!(seen > 100, "about one for each segment of seven bytes: {seen}");
+}
+
+#[test]
+fn blocks_are_used_where_the_device_knows_them() {
+    for blksize in [1, 2, 5, 127] {
+        let mut fake = Fake::new(APPLICATION);
+        fake.knows_blocks = Blocks::Known(blksize);
+        let report = run(&mut fake, FlashOptions::default()).0.unwrap();
+        assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"));
+        assert_eq!((report.transfers, report.repeats), (Transfers::Blocks, 0));
+        // Block 0 and the last one have 28 and 24 bytes: four segments cost no more than the frames around a block.
+        assert_eq!(fake.block_downloads, BLOCKS - 2);
+    }
+}
+
+#[test]
+fn a_device_without_blocks_is_asked_once_for_them() {
+    for code in [0x0504_0001, 0x0601_0000, 0x0800_0000] {
+        let mut fake = Fake::new(APPLICATION);
+        fake.knows_blocks = Blocks::Refused(code);
+        let report = run(&mut fake, FlashOptions::default()).0.unwrap();
+        assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"));
+        assert_eq!((report.transfers, report.repeats), (Transfers::Segments, 0));
+        assert_eq!(fake.block_downloads, 1);
+    }
+    // Any other abort is about the value, and no reason to write it another way.
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.knows_blocks = Blocks::Refused(0x0607_0012);
+    let error = fails(&mut fake);
+    assert_eq!((error.number(), fake.block_downloads), (0x6000_0025, 1));
+}
+
+#[test]
+fn a_device_that_does_not_answer_to_blocks_gets_segments() {
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.knows_blocks = Blocks::Ignored;
+    let report = run(&mut fake, FlashOptions::default()).0.unwrap();
+    assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"));
+    assert_eq!((report.transfers, report.repeats, fake.block_downloads), (Transfers::Segments, 2, 2));
+}
+
+#[test]
+fn no_block_is_tried_where_segments_are_asked_for() {
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.knows_blocks = Blocks::Known(127);
+    let mut session = Session::new(&mut fake, node(), Timing::default());
+    session.transfer_by(Transfers::Segments);
+    flash(&mut session, &file(), &FlashOptions::default(), &mut |_| {}).unwrap();
+    assert_eq!(fake.block_downloads, 0);
+}
+
+#[test]
+fn lost_segments_of_a_block_are_sent_again_within_the_transfer() {
+    for lost in [vec![1], vec![3], vec![10, 11], (1..60).step_by(7).collect()] {
+        let mut fake = Fake::new(BOOTLOADER);
+        fake.knows_blocks = Blocks::Known(10);
+        fake.lost_segments = lost.clone();
+        let report = run(&mut fake, FlashOptions::default()).0.unwrap();
+        assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"), "{lost:?}");
+        assert_eq!((report.repeats, report.transfers), (0, Transfers::Blocks));
+    }
+}
+
+#[test]
+fn a_file_for_another_device_erases_nothing() {
+    let target = Target::of(&file()).unwrap();
+    assert_eq!((target.vendor_id, target.product_code), (0, 1234));
+    let check = |check_target| FlashOptions { check_target: Some(check_target), ..FlashOptions::default() };
+    for running in [APPLICATION, BOOTLOADER] {
+        // The fake has vendor-ID 3Fh and product code 1234.
+        let mut fake = Fake::new(running);
+        let (result, events) = run(&mut fake, check(target));
+        let error = result.unwrap_err();
+        assert_eq!(error.number(), 0x6000_0180);
+        assert_eq!(error.to_string(), "the program is for vendor-ID 00000000h, and node 5 has 0000003Fh");
+        assert_eq!((fake.writes().len(), events.last()), (0, Some(&Event::Left(DeviceState::Untouched))));
+
+        let mut fake = Fake::new(running);
+        let error = run(&mut fake, check(Target { vendor_id: 0x3F, product_code: 1235 })).0.unwrap_err();
+        assert_eq!((error.number(), fake.writes().len()), (0x6000_0182, 0));
+
+        let mut fake = Fake::new(running);
+        let right = check(Target { vendor_id: 0x3F, product_code: 1234 });
+        run(&mut fake, FlashOptions { trial_run: true, ..right }).0.unwrap();
+        // At first, and the program on trial.
+        assert_eq!((fake.count("read 1018/1"), fake.count("read 1018/2")), (2, 2));
+    }
+}
+
+#[test]
+fn verify_looks_once_more_at_the_running_program() {
+    let options = FlashOptions { verify: true, ..FlashOptions::default() };
+    let mut fake = Fake::new(BOOTLOADER);
+    let (report, events) = run(&mut fake, options);
+    report.unwrap();
+    assert_eq!(fake.count("read 1F56/1"), 2);
+    assert_eq!(fake.log.last().unwrap(), "read 1F56/1");
+    assert_eq!(events.last(), Some(&Event::VerifiedAgain { crc: file().program_crc() }));
+    // A program that tells another CRC once it runs.
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.crc_of_application = Some(0x1234_5678);
+    let (result, events) = run(&mut fake, options);
+    assert_eq!(result.unwrap_err().number(), 0x6000_0001);
+    assert_eq!(events.last(), Some(&Event::Left(DeviceState::Signed)));
+}
+
+#[test]
+fn a_failure_tells_how_it_leaves_the_device() {
+    let left = |running, change: &dyn Fn(&mut Fake), options| {
+        let mut fake = Fake::new(running);
+        change(&mut fake);
+        let (result, events) = run(&mut fake, options);
+        assert!(result.is_err());
+        *events.last().unwrap()
+    };
+    let (plain, trial) =
+        (FlashOptions::default(), FlashOptions { trial_run: true, ..FlashOptions::default() });
+    let at = |state| Event::Left(state);
+    assert_eq!(left(BOOTLOADER, &|fake| fake.running = None, plain), at(DeviceState::Untouched));
+    let stays = |fake: &mut Fake| fake.on_command = script(0x80, usize::MAX, Outcome::Ignore);
+    assert_eq!(left(APPLICATION, &stays, plain), at(DeviceState::Called));
+    let refuses = |fake: &mut Fake| fake.on_block = script(2, 1, Outcome::Status(0x0C));
+    assert_eq!(left(BOOTLOADER, &refuses, plain), at(DeviceState::Erased));
+    assert_eq!(left(BOOTLOADER, &|fake| fake.crc = Some(1), plain), at(DeviceState::Erased));
+    assert_eq!(left(BOOTLOADER, &|fake| fake.starts = None, trial), at(DeviceState::Unsigned));
+    assert_eq!(left(BOOTLOADER, &|fake| fake.starts = None, plain), at(DeviceState::Signed));
+    // A run that goes well leaves nothing to tell.
+    let (_, events) = run(&mut Fake::new(BOOTLOADER), plain);
+    assert!(!events.iter().any(|event| matches!(event, Event::Left(_))));
 }
 
 #[test]
@@ -280,9 +409,13 @@ fn a_refusal_without_status_gives_the_abort_code() {
 
 #[test]
 fn a_lost_answer_or_request_costs_a_repeat_and_nothing_else() {
-    for block in [0, 1, 3, u32::MAX] {
+    for (block, knows_blocks) in [0, 1, 3, u32::MAX]
+        .into_iter()
+        .flat_map(|block| [Blocks::Refused(0x0504_0001), Blocks::Known(127)].map(|knows| (block, knows)))
+    {
         for outcome in [Outcome::LoseAnswer, Outcome::LoseRequest] {
             let mut fake = Fake::new(BOOTLOADER);
+            fake.knows_blocks = knows_blocks;
             fake.on_block = script(block, 1, outcome);
             let report = run(&mut fake, FlashOptions::default()).0.unwrap();
             // The last block may be sent twice; its second copy is the same.
@@ -411,19 +544,22 @@ fn answers_that_come_late_do_not_stand_for_others() {
 
 #[test]
 fn cancelling_aborts_the_transfer() {
-    let mut fake = Fake::new(BOOTLOADER);
-    let flag = Arc::new(AtomicBool::new(false));
-    let mut session = Session::new(&mut fake, node(), Timing::default());
-    session.cancel_by(flag.clone());
-    let result = flash(&mut session, &file(), &FlashOptions::default(), &mut |event| {
-        if matches!(event, Event::Progress { done, .. } if done > 300) {
-            flag.store(true, Ordering::Relaxed);
-        }
-    });
-    assert_eq!(result.unwrap_err().number(), 0x6000_0011);
-    assert_eq!(*fake.log.last().unwrap(), "abort 08000000");
-    // The next run needs nothing but to be started.
-    run(&mut fake, FlashOptions::default()).0.unwrap();
+    for knows_blocks in [Blocks::Refused(0x0504_0001), Blocks::Known(5)] {
+        let mut fake = Fake::new(BOOTLOADER);
+        fake.knows_blocks = knows_blocks;
+        let flag = Arc::new(AtomicBool::new(false));
+        let mut session = Session::new(&mut fake, node(), Timing::default());
+        session.cancel_by(flag.clone());
+        let result = flash(&mut session, &file(), &FlashOptions::default(), &mut |event| {
+            if matches!(event, Event::Progress { done, .. } if done > 300) {
+                flag.store(true, Ordering::Relaxed);
+            }
+        });
+        assert_eq!(result.unwrap_err().number(), 0x6000_0011);
+        assert_eq!(*fake.log.last().unwrap(), "abort 08000000");
+        // The next run needs nothing but to be started.
+        run(&mut fake, FlashOptions::default()).0.unwrap();
+    }
 }
 
 #[test]
@@ -532,10 +668,12 @@ proptest! {
                 prop::sample::select(vec![0x585u16, 0x585, 0x585, 0x705, 0x085]),
                 prop_oneof![
                     prop::collection::vec(any::<u8>(), 0..9),
-                    (prop::sample::select(vec![0x60u8, 0x20, 0x30, 0x43, 0x41, 0x80, 0x00]), any::<[u8; 7]>())
+                    (prop::sample::select(vec![0x60u8, 0x20, 0x30, 0x43, 0x41, 0x80, 0x00, 0xA4, 0xA2, 0xA1]), any::<[u8; 7]>())
                         .prop_map(|(command, rest)| [&[command][..], &rest].concat()),
                     Just(vec![0x43, 0x00, 0x10, 0, 0, 0, 0, 0x10]),
                     Just(vec![0x60, 0x51, 0x1F, 1, 0, 0, 0, 0]),
+                    Just(vec![0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0]),
+                    (any::<u8>(), any::<u8>()).prop_map(|(ackseq, blksize)| vec![0xA2, ackseq, blksize, 0, 0, 0, 0, 0]),
                     Just(vec![0x43, 0x57, 0x1F, 1, 0, 0, 0, 0]),
                 ],
             ),

@@ -5,8 +5,9 @@ use clap::Args;
 use coflash::info::{info, DeviceInfo};
 use serde_json::{json, Value};
 
+use super::device::Device;
 use super::output::Failure;
-use super::{Context, Device};
+use super::Context;
 
 /// Shows what runs on a device, its identity, and the state of its programs.
 #[derive(Debug, Args)]

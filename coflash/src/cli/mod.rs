@@ -1,23 +1,19 @@
 //! The commands, one file each, and what they share.
 
 use std::process::ExitCode;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::Arc;
-use std::time::Duration;
 
-use canopen::NodeId;
-use clap::{Args, Parser, Subcommand};
+use clap::{Parser, Subcommand};
 use coflash::adapter::{self, Adapter};
-use coflash::session::{Session, Timing};
 
-use self::output::{Exit, Failure, Output, EXIT_CODES};
-use self::values::{milliseconds, node_id};
+use self::output::{Failure, Output, EXIT_CODES};
 
 mod convert;
+mod device;
 mod file;
 mod flash;
 mod info;
 mod inspect;
+mod legacy;
 mod output;
 mod progress;
 mod values;
@@ -78,49 +74,6 @@ impl Context {
             return Err(Failure::usage("it is not said on which CAN bus the device is", advice));
         };
         Ok(adapter::open(url)?)
-    }
-}
-
-/// Which device, and how patient to be with it.
-#[derive(Debug, Args)]
-struct Device {
-    /// The device's node-ID.
-    #[arg(long, short = 'N', alias = "node_id", default_value = "1", value_parser = node_id, value_name = "1..127")]
-    node: NodeId,
-
-    /// How long the answer to one request may take, in milliseconds.
-    #[arg(long, alias = "sdo_timeout", default_value = "500", value_parser = milliseconds, value_name = "MS")]
-    sdo_timeout: Duration,
-
-    /// How long a command (erasing, checking) may take, in milliseconds.
-    #[arg(long, default_value = "60000", value_parser = milliseconds, value_name = "MS")]
-    timeout: Duration,
-
-    /// How long a restart may take, in milliseconds.
-    #[arg(long, default_value = "5000", value_parser = milliseconds, value_name = "MS")]
-    boot_timeout: Duration,
-}
-
-impl Device {
-    /// A session which Ctrl-C ends.
-    fn session<'a>(&self, adapter: &'a mut dyn Adapter) -> Result<Session<'a>, Failure> {
-        let timing = Timing {
-            sdo: self.sdo_timeout,
-            command: self.timeout,
-            boot: self.boot_timeout,
-            ..Timing::default()
-        };
-        let mut session = Session::new(adapter, self.node, timing);
-        let cancelled = Arc::new(AtomicBool::new(false));
-        session.cancel_by(cancelled.clone());
-        // The first time ends the transfer in order, the second time at once.
-        ctrlc::set_handler(move || {
-            if cancelled.swap(true, Ordering::Relaxed) {
-                std::process::exit(i32::from(Exit::Cancelled as u8));
-            }
-        })
-        .map_err(|error| Failure::system(format!("Ctrl-C cannot be caught: {error}")))?;
-        Ok(session)
     }
 }
 

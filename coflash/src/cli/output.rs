@@ -8,9 +8,12 @@ use std::process::ExitCode;
 use clap::Args;
 use coflash::adapter::AdapterError;
 use coflash::convert::ConvertError;
+use coflash::flash::DeviceState;
 use coflash::read::FileError;
 use coflash::Error;
 use serde_json::{json, Value};
+
+use super::flash::state_word;
 
 /// How much is said, and in which form. For all commands.
 #[derive(Clone, Copy, Debug, Default, Args)]
@@ -135,16 +138,23 @@ pub(super) struct Failure {
     /// The stable number, where there is one.
     number: Option<u32>,
     what: String,
+    /// In what state the device is left, where that is known.
+    left: Option<DeviceState>,
     advice: Option<String>,
 }
 
 impl Failure {
+    /// The same, with the state in which the device is left.
+    pub(super) fn leaving(self, left: Option<DeviceState>) -> Self {
+        Self { left, ..self }
+    }
+
     pub(super) fn usage(what: impl Into<String>, advice: impl Into<String>) -> Self {
-        Self { exit: Exit::Usage, number: None, what: what.into(), advice: Some(advice.into()) }
+        Self { exit: Exit::Usage, number: None, what: what.into(), left: None, advice: Some(advice.into()) }
     }
 
     pub(super) fn system(what: String) -> Self {
-        Self { exit: Exit::System, number: None, what, advice: None }
+        Self { exit: Exit::System, number: None, what, left: None, advice: None }
     }
 
     /// A conversion of `file` that failed.
@@ -155,9 +165,13 @@ impl Failure {
             | ConvertError::Start(_)
             | ConvertError::Range(_)
             | ConvertError::Adjust(_)
-            | ConvertError::Blocks(_) => {
-                Self { exit: Exit::Usage, number: Some(0x6000_0018), what: error.to_string(), advice: None }
-            }
+            | ConvertError::Blocks(_) => Self {
+                exit: Exit::Usage,
+                number: Some(0x6000_0018),
+                what: error.to_string(),
+                left: None,
+                advice: None,
+            },
         }
     }
 
@@ -168,6 +182,7 @@ impl Failure {
                 "number": self.number.map(|number| format!("{number:#010x}")),
                 "exit": self.exit as u8,
                 "what": self.what,
+                "device": self.left.map(state_word),
                 "advice": self.advice,
             }
         })
@@ -177,7 +192,7 @@ impl Failure {
 impl From<FileError> for Failure {
     fn from(error: FileError) -> Self {
         let number = Some(error.error.cause.number());
-        Self { exit: Exit::File, number, what: error.to_string(), advice: None }
+        Self { exit: Exit::File, number, what: error.to_string(), left: None, advice: None }
     }
 }
 
@@ -198,10 +213,17 @@ impl From<Error> for Failure {
             | Error::Protocol { .. }
             | Error::Failed { .. }
             | Error::Busy { .. }
-            | Error::WrongCrc { .. } => Exit::Device,
+            | Error::WrongCrc { .. }
+            | Error::WrongTarget { .. } => Exit::Device,
             Error::NoBootloader { .. } | Error::StartFailed { .. } => Exit::NoStart,
         };
-        Self { exit, number: Some(error.number()), what: error.to_string(), advice: Some(error.advice()) }
+        Self {
+            exit,
+            number: Some(error.number()),
+            what: error.to_string(),
+            left: None,
+            advice: Some(error.advice()),
+        }
     }
 }
 
@@ -212,6 +234,9 @@ impl fmt::Display for Failure {
             write!(f, " [{number:#010x}]")?;
         }
         writeln!(f)?;
+        if let Some(left) = self.left {
+            writeln!(f, "  the device: {left}")?;
+        }
         match &self.advice {
             Some(advice) => writeln!(f, "  what to do: {advice}"),
             None => Ok(()),

@@ -34,6 +34,17 @@ pub enum Outcome {
     Ignore,
 }
 
+/// What the device makes of a block download.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Blocks {
+    /// It knows them, with so many segments in a sub-block.
+    Known(u8),
+    /// It aborts them with this code.
+    Refused(u32),
+    /// It has never heard of them and says nothing.
+    Ignored,
+}
+
 type Script<T> = Box<dyn FnMut(T) -> Outcome + Send>;
 
 pub struct Fake {
@@ -45,6 +56,8 @@ pub struct Fake {
     status: u32,
     /// What 1F56h reads instead of the last block's CRC.
     pub crc: Option<u32>,
+    /// The same while the application runs.
+    pub crc_of_application: Option<u32>,
     /// Whether the device answers nothing while it is busy.
     pub deaf_while_busy: bool,
     pub erase_time: Duration,
@@ -58,6 +71,12 @@ pub struct Fake {
     pub latency: Duration,
     pub on_block: Script<u32>,
     pub on_command: Script<u8>,
+    pub knows_blocks: Blocks,
+    /// Segments of block downloads that are lost, as they are counted from the start.
+    pub lost_segments: Vec<usize>,
+    segments: usize,
+    /// Block downloads that were begun.
+    pub block_downloads: usize,
     /// Frames that come before each answer.
     pub noise: Vec<Frame>,
     /// After so many frames the adapter is gone.
@@ -78,6 +97,8 @@ struct Download {
     size: usize,
     data: Vec<u8>,
     toggle: u8,
+    /// Of a block download: the last segment in order of this sub-block, and whether it was the last of all.
+    sub_block: Option<(u8, bool)>,
 }
 
 impl Fake {
@@ -89,6 +110,7 @@ impl Fake {
             busy_until: Duration::ZERO,
             status: 0,
             crc: None,
+            crc_of_application: None,
             deaf_while_busy: false,
             erase_time: Duration::from_secs(2),
             restart_time: Duration::from_millis(300),
@@ -98,6 +120,10 @@ impl Fake {
             latency: Duration::from_micros(500),
             on_block: Box::new(|_| Outcome::Accept),
             on_command: Box::new(|_| Outcome::Accept),
+            knows_blocks: Blocks::Refused(0x0504_0001),
+            lost_segments: Vec::new(),
+            segments: 0,
+            block_downloads: 0,
             noise: Vec::new(),
             frames_left: usize::MAX,
             log: Vec::new(),
@@ -159,7 +185,46 @@ impl Fake {
         self.restart = Some((self.now + self.leave_time + self.restart_time, next));
     }
 
+    /// A frame of a block download (CiA 301, 7.2.4.3.9 to 11), if one is under way; tells whether it was one.
+    fn block_frame(&mut self, bytes: [u8; 8]) -> bool {
+        let Blocks::Known(blksize) = self.knows_blocks else { return false };
+        let Some(Download { data, size, sub_block: Some((seqno, ended)), .. }) = &mut self.download else {
+            return false;
+        };
+        if !*ended {
+            // An abort looks like a segment number 0, which there is none of.
+            if bytes[0] == 0x80 {
+                return false;
+            }
+            self.segments += 1;
+            let (number, last) = (bytes[0] & 0x7F, bytes[0] & 0x80 != 0);
+            if !self.lost_segments.contains(&self.segments) && number == *seqno + 1 {
+                *seqno = number;
+                *ended = last;
+                data.extend_from_slice(&bytes[1..]);
+            }
+            // A sub-block is over with its last segment, whether all of it arrived or not.
+            if number == blksize || last {
+                let ackseq = std::mem::take(seqno);
+                self.answer([0xA2, ackseq, blksize, 0, 0, 0, 0, 0]);
+            }
+            return true;
+        }
+        if bytes[0] & 0xE3 != 0xC1 {
+            return false;
+        }
+        data.truncate(data.len() - usize::from(bytes[0] >> 2 & 7));
+        assert_eq!(data.len(), *size);
+        assert_eq!(u16::from_le_bytes([bytes[1], bytes[2]]), crc16(data));
+        let Some(download) = self.download.take() else { return true };
+        self.write(download.at, download.data, [0xA1, 0, 0, 0, 0, 0, 0, 0]);
+        true
+    }
+
     fn request(&mut self, bytes: [u8; 8]) {
+        if self.block_frame(bytes) {
+            return;
+        }
         let at = (u16::from_le_bytes([bytes[1], bytes[2]]), bytes[3]);
         let word = u32::from_le_bytes(bytes[4..].try_into().unwrap());
         match bytes[0] {
@@ -194,7 +259,8 @@ impl Fake {
             }
             // Initiate download, segmented with size.
             0x21 => {
-                self.download = Some(Download { at, size: word as usize, data: Vec::new(), toggle: 0 });
+                self.download =
+                    Some(Download { at, size: word as usize, data: Vec::new(), toggle: 0, sub_block: None });
                 if at.0 == 0x1F50 && self.busy() {
                     self.status = 0x86;
                     return self.abort(at, 0x0800_0022);
@@ -221,6 +287,25 @@ impl Fake {
                 assert_eq!(download.data.len(), download.size);
                 self.write(download.at, download.data, answer);
             }
+            // Initiate block download with size and CRC.
+            0xC6 => {
+                self.block_downloads += 1;
+                match self.knows_blocks {
+                    Blocks::Known(_) if at.0 == 0x1F50 && self.busy() => {
+                        self.status = 0x86;
+                        self.abort(at, 0x0800_0022);
+                    }
+                    Blocks::Known(blksize) => {
+                        let data = Vec::new();
+                        let sub_block = Some((0, false));
+                        self.download =
+                            Some(Download { at, size: word as usize, data, toggle: 0, sub_block });
+                        self.answer(initiate(0xA4, at, blksize.into()));
+                    }
+                    Blocks::Refused(code) => self.abort(at, code),
+                    Blocks::Ignored => {}
+                }
+            }
             0x80 => {
                 self.log.push(format!("abort {word:08X}"));
                 (self.download, self.upload) = (None, None);
@@ -243,7 +328,8 @@ impl Fake {
             (0x1F56, 1) => {
                 let last = self.blocks.last().filter(|block| block[0] == 0xFF);
                 let crc = last.map_or(0, |block| u32::from_le_bytes(block[16..20].try_into().unwrap()));
-                number(self.crc.unwrap_or(crc))
+                let application = self.crc_of_application.filter(|_| self.running == Some(APPLICATION));
+                number(application.or(self.crc).unwrap_or(crc))
             }
             (0x1F57, 1) => number(if self.busy() { 1 } else { self.status }),
             (0x1018 | 0x1F51 | 0x1F56 | 0x1F57, _) => Err(0x0609_0011),
@@ -314,6 +400,22 @@ impl Fake {
             other => panic!("unexpected write {other:X?}"),
         }
     }
+}
+
+/// CRC of a block transfer: polynomial 1021h, start value 0 (CiA 301, 7.2.4.3.16), bit by bit.
+fn crc16(data: &[u8]) -> u16 {
+    data.iter().fold(0, |crc, byte| {
+        (0..8).fold(
+            crc ^ u16::from(*byte) << 8,
+            |crc, _| {
+                if crc & 0x8000 != 0 {
+                    crc << 1 ^ 0x1021
+                } else {
+                    crc << 1
+                }
+            },
+        )
+    })
 }
 
 /// An initiate frame or an abort: command, index, sub-index, 32 bits.

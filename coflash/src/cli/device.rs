@@ -1,0 +1,123 @@
+//! Which device, and how patient to be with it: for every command that talks to one.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+
+use canopen::NodeId;
+use clap::Args;
+use coflash::adapter::Adapter;
+use coflash::session::{Session, Timing, Transfers};
+
+use super::output::{Exit, Failure};
+use super::values::{milliseconds, node_id, number, program_number};
+
+/// One device.
+#[derive(Debug, Args)]
+pub(super) struct Device {
+    /// The device's node-ID.
+    #[arg(long, short = 'N', alias = "node_id", default_value = "1", value_parser = node_id, value_name = "1..127")]
+    node: NodeId,
+
+    #[command(flatten)]
+    patience: Patience,
+}
+
+/// One program of one device.
+#[derive(Debug, Args)]
+pub(super) struct Program {
+    #[command(flatten)]
+    pub(super) device: Device,
+
+    /// The program number: sub-index of 1F51h, 1F56h and 1F57h.
+    #[arg(long, short = 'P', alias = "prog_no", value_name = "1..254", value_parser = program_number, default_value = "1")]
+    pub(super) program: u8,
+}
+
+impl Device {
+    /// A session which Ctrl-C ends.
+    pub(super) fn session<'a>(&self, adapter: &'a mut dyn Adapter) -> Result<Session<'a>, Failure> {
+        self.patience.session(adapter, self.node)
+    }
+}
+
+/// How long to wait for what.
+#[derive(Debug, Args)]
+pub(super) struct Patience {
+    /// How long the answer to one request may take, in milliseconds.
+    #[arg(long, aliases = ["sdo_timeout", "timeout"], default_value = "500", value_parser = milliseconds, value_name = "MS")]
+    sdo_timeout: Duration,
+
+    /// How long a command (erasing, checking) may take, in milliseconds.
+    #[arg(long, default_value = "60000", value_parser = milliseconds, value_name = "MS")]
+    command_timeout: Duration,
+
+    /// How long a restart may take, in milliseconds.
+    #[arg(long, default_value = "5000", value_parser = milliseconds, value_name = "MS")]
+    boot_timeout: Duration,
+
+    /// The pause between two looks at a device that is at work, in milliseconds; otherwise 10 at first and 250 at most.
+    #[arg(long, value_parser = milliseconds, value_name = "MS", conflicts_with = "command_timeout")]
+    delay: Option<Duration>,
+
+    /// How often a device that is at work is looked at before it is given up, --delay (or a second) apart; in place of
+    /// --command-timeout.
+    #[arg(long, value_parser = number, value_name = "TIMES", conflicts_with = "command_timeout")]
+    repeats: Option<u32>,
+
+    /// Write in segments, and not as blocks where the device knows them.
+    #[arg(long)]
+    segmented: bool,
+}
+
+/// The manual's defaults (table 9) for `--delay` and `--repeats` where only one of them is given.
+const DELAY: Duration = Duration::from_secs(1);
+const REPEATS: u32 = 0x400;
+
+impl Patience {
+    /// A session which Ctrl-C ends.
+    pub(super) fn session<'a>(
+        &self,
+        adapter: &'a mut dyn Adapter,
+        node: NodeId,
+    ) -> Result<Session<'a>, Failure> {
+        let mut session = Session::new(adapter, node, self.timing());
+        session.cancel_by(cancelled()?);
+        if self.segmented {
+            session.transfer_by(Transfers::Segments);
+        }
+        Ok(session)
+    }
+
+    pub(super) fn timing(&self) -> Timing {
+        let timing = Timing {
+            sdo: self.sdo_timeout,
+            command: self.command_timeout,
+            boot: self.boot_timeout,
+            ..Timing::default()
+        };
+        if self.delay.is_none() && self.repeats.is_none() {
+            return timing;
+        }
+        let delay = self.delay.unwrap_or(DELAY);
+        let command = delay.saturating_mul(self.repeats.unwrap_or(REPEATS).max(1));
+        Timing { command, poll_first: delay, poll_most: delay, ..timing }
+    }
+}
+
+/// The flag that Ctrl-C sets. The first time ends a transfer in order, the second time the program at once.
+pub(super) fn cancelled() -> Result<Arc<AtomicBool>, Failure> {
+    static FLAG: OnceLock<Arc<AtomicBool>> = OnceLock::new();
+    if let Some(flag) = FLAG.get() {
+        return Ok(flag.clone());
+    }
+    let flag = FLAG.get_or_init(Arc::default).clone();
+    let cancelled = flag.clone();
+    ctrlc::set_handler(move || {
+        if cancelled.swap(true, Ordering::Relaxed) {
+            std::process::exit(i32::from(Exit::Cancelled as u8));
+        }
+    })
+    .map_err(|error| Failure::system(format!("Ctrl-C cannot be caught: {error}")))?;
+    Ok(flag)
+}
