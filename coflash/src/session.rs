@@ -78,6 +78,11 @@ impl fmt::Display for Doing {
 
 /// The largest value that is read as a whole. No object of a bootloader comes near it.
 const VALUE_MAX: usize = 4096;
+/// After so long without an abort, no more come for the segments of a transfer that was refused. A frame on the slowest
+/// bus takes 13 ms.
+const QUIET: Duration = Duration::from_millis(30);
+/// After so many frames in a row, a look whether the node has something against them.
+const BURST: u32 = 8;
 /// The longest wait in one piece: how soon a cancelled session notices.
 const SLICE: Duration = Duration::from_millis(100);
 
@@ -229,6 +234,10 @@ impl<'a> Session<'a> {
                 Err(Error::Refused { code, .. }) if download.progress() == 0 && means_no_blocks(code) => {
                     self.transfers = Transfers::Segments;
                 }
+                Err(error @ Error::Refused { .. }) => {
+                    self.settle_after_burst()?;
+                    return Err(error);
+                }
                 result => return result,
             }
         }
@@ -303,6 +312,15 @@ impl<'a> Session<'a> {
         }
     }
 
+    /// Waits until the node has said nothing for a while: segments that were on their way when it refused a block
+    /// transfer draw an abort each, and none of these is the answer to what is asked next.
+    fn settle_after_burst(&mut self) -> Result<(), Error> {
+        let deadline = self.now() + self.timing.sdo;
+        let response = CobId::sdo_response(self.node);
+        while self.now() < deadline && self.listen(QUIET, |frame| frame.cob_id() == Some(response))? {}
+        Ok(())
+    }
+
     /// Lets time pass on the bus. Frames that come are not for anyone.
     ///
     /// # Errors
@@ -365,6 +383,7 @@ impl<'a> Session<'a> {
         let mut deadline = self.now() + self.timing.command;
         let mut cancelled = false;
         let mut told = 0;
+        let mut burst = 0;
         loop {
             if !cancelled && self.check_cancelled().is_err() {
                 cancelled = true;
@@ -374,8 +393,18 @@ impl<'a> Session<'a> {
                 transfer.abort(AbortCode::TIMEOUT);
             }
             match transfer.poll(self.instant()) {
-                Step::Send(frame) => self.adapter.send(&frame)?,
+                Step::Send(frame) => {
+                    self.adapter.send(&frame)?;
+                    burst += 1;
+                    if burst % BURST == 0 {
+                        if let Some(frame) = self.adapter.receive(Duration::ZERO)? {
+                            let now = self.instant();
+                            transfer.handle(&frame, now);
+                        }
+                    }
+                }
                 Step::Wait(until) => {
+                    burst = 0;
                     let now = self.instant();
                     let left = if now.has_reached(until) { 0 } else { until.since(now) };
                     let left = Duration::from_millis(left.into());

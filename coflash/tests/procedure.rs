@@ -184,6 +184,21 @@ fn lost_segments_of_a_block_are_sent_again_within_the_transfer() {
     }
 }
 
+/// What was on its way then draws an abort for each segment: none of them is taken for an answer to the next request.
+#[test]
+fn a_block_transfer_that_is_refused_in_the_middle_is_told_by_its_status() {
+    for segment in [1, 2, 9, 30] {
+        let mut fake = Fake::new(BOOTLOADER);
+        fake.knows_blocks = Blocks::Known(127);
+        fake.refuses_segment = Some((segment, 0x0C));
+        let error = fails(&mut fake);
+        assert_eq!(error.number(), 0x6000_0006, "{segment}: {error}");
+        // It is noticed long before the 39 segments are sent.
+        let sent = fake.sent.iter().filter(|frame| matches!(frame.data()[0], 1..=0x1F | 0x81..=0x9F)).count();
+        assert!(sent <= segment + 16, "{segment}: {sent}");
+    }
+}
+
 #[test]
 fn a_file_for_another_device_erases_nothing() {
     let target = Target::of(&file()).unwrap();

@@ -74,6 +74,8 @@ pub struct Fake {
     pub knows_blocks: Blocks,
     /// Segments of block downloads that are lost, as they are counted from the start.
     pub lost_segments: Vec<usize>,
+    /// The segment of a block download at which the device has seen enough: it aborts, and from then on 1F57h reads this.
+    pub refuses_segment: Option<(usize, u32)>,
     segments: usize,
     /// Block downloads that were begun.
     pub block_downloads: usize,
@@ -122,6 +124,7 @@ impl Fake {
             on_command: Box::new(|_| Outcome::Accept),
             knows_blocks: Blocks::Refused(0x0504_0001),
             lost_segments: Vec::new(),
+            refuses_segment: None,
             segments: 0,
             block_downloads: 0,
             noise: Vec::new(),
@@ -197,6 +200,11 @@ impl Fake {
                 return false;
             }
             self.segments += 1;
+            if let Some((_, status)) = self.refuses_segment.filter(|(segment, _)| *segment == self.segments) {
+                self.status = status;
+                self.abort((0x1F50, 1), 0x0800_0020);
+                return true;
+            }
             let (number, last) = (bytes[0] & 0x7F, bytes[0] & 0x80 != 0);
             if !self.lost_segments.contains(&self.segments) && number == *seqno + 1 {
                 *seqno = number;
@@ -310,6 +318,8 @@ impl Fake {
                 self.log.push(format!("abort {word:08X}"));
                 (self.download, self.upload) = (None, None);
             }
+            // Segments of a transfer that is no more.
+            _ if self.refuses_segment.is_some() => self.abort((0, 0), 0x0504_0001),
             other => panic!("unexpected command {other:02X}"),
         }
     }
