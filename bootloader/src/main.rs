@@ -7,6 +7,7 @@
 //! | `flash.rs` | the flash controller | registers |
 //! | `ram_vectors.rs` | the vector table in RAM | one copy |
 //! | `callgate.rs` | services for the application | its ABI |
+//! | `memory.rs` | `memcpy` and its kin, small | assembly |
 //!
 //! What the bootloader *is* stands in `boot-core` and `canopen`.
 #![no_std]
@@ -15,6 +16,7 @@
 mod boot;
 mod callgate;
 mod flash;
+mod memory;
 mod ram_vectors;
 
 use cortex_m::peripheral::SCB;

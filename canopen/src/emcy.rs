@@ -121,7 +121,9 @@ impl Emcy {
     /// [`clear`](Self::clear).
     pub fn raise(&mut self, code: u16, bits: u8, detail: [u8; 5]) {
         self.register |= bits | register::GENERIC;
-        self.history.rotate_right(1);
+        for i in (1..HISTORY).rev() {
+            self.history[i] = self.history[i - 1];
+        }
         let [low, high] = code.to_le_bytes();
         self.history[0] = u32::from_le_bytes([low, high, detail[0], detail[1]]);
         self.remembered = (self.remembered + 1).min(HISTORY as u8);
@@ -167,7 +169,9 @@ impl Emcy {
     /// The data of the next emergency to send, until there is none.
     pub fn next_message(&mut self) -> Option<[u8; 8]> {
         let emergency = self.waiting[0].take()?;
-        self.waiting.rotate_left(1);
+        for i in 1..WAITING {
+            self.waiting[i - 1] = self.waiting[i].take();
+        }
         Some(emergency.emit())
     }
 

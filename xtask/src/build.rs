@@ -56,7 +56,23 @@ pub fn images(board: &Layout) -> Outcome<Images> {
 /// # Errors
 /// When it does not build, or is no image of this board.
 pub fn bootloader(board: &Layout) -> Outcome<PathBuf> {
-    image(&Build { board, package: "bootloader", features: "" }, "bootloader.elf", board.bootloader)
+    image(&Build { board, package: "bootloader", features: COMPLETE }, "bootloader.elf", board.bootloader)
+}
+
+/// The bootloader's features that a product may go without, and all of them.
+pub const OPTIONAL: [&str; 4] = ["auto-bit-rate", "block-upload", "emcy", "lss"];
+/// See [`OPTIONAL`].
+pub const COMPLETE: &str = "complete";
+
+/// Builds the bootloader of a board with some of [`OPTIONAL`], to look at.
+///
+/// # Errors
+/// When it does not build.
+pub fn bootloader_with(board: &Layout, features: &[&str]) -> Outcome<PathBuf> {
+    let features = features.join(",");
+    let mut cargo = process::cargo("build");
+    process::run(cargo.arg("--quiet").args(firmware_args("bootloader", board, &features)))?;
+    Ok(workspace::target_dir().join("fw").join(TARGET).join(PROFILE).join("bootloader"))
 }
 
 /// One call of cargo: the package is also the name of its program.

@@ -15,8 +15,13 @@ over the firmware of a board, with warnings denied.
 ";
 
 /// The firmware packages and the features that each is looked at with, besides the board's.
-const FIRMWARE: &[(&str, &str)] =
-    &[("bsp", ""), ("bootloader", ""), ("app-template", ""), ("app-template", "version-2")];
+const FIRMWARE: &[(&str, &str)] = &[
+    ("bsp", ""),
+    ("bootloader", ""),
+    ("bootloader", build::COMPLETE),
+    ("app-template", ""),
+    ("app-template", "version-2"),
+];
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;

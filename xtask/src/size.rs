@@ -6,6 +6,7 @@ use std::path::Path;
 use std::{cmp, fs};
 
 use shared_abi::geometry::Region;
+use shared_abi::layout::Layout;
 
 use crate::args::Args;
 use crate::elf::Elf;
@@ -15,7 +16,8 @@ use crate::{build, symbols, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask size [--board BOARD] [--yes]
 
-Builds the bootloader, prints its flash by section and by crate, and fails when it is over the budget.
+Builds the bootloader, prints its flash by section, by crate and by optional feature, and fails when
+it is over the budget.
 
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -33,6 +35,7 @@ pub fn run(mut args: Args) -> Outcome {
     let flash = Flash::of(&elf, board.bootloader)?;
     print!("\n{}", flash.table());
     print!("\n{}", by_crate(&elf));
+    print!("\n{}", by_feature(board, flash.used)?);
     println!(
         "\nbootloader: {} of {} bytes ({} of flash kept for it)",
         flash.used,
@@ -115,6 +118,20 @@ impl Flash {
         }
         text
     }
+}
+
+/// What each optional feature costs: the flash of the complete bootloader less that of one without it.
+fn by_feature(board: &Layout, complete: u32) -> Outcome<String> {
+    let used = |features: &[&str]| -> Outcome<u32> {
+        Ok(Flash::of(&read(&build::bootloader_with(board, features)?)?, board.bootloader)?.used)
+    };
+    let mut text = String::from("feature                          bytes\n");
+    for feature in build::OPTIONAL {
+        let others: Vec<_> = build::OPTIONAL.into_iter().filter(|other| *other != feature).collect();
+        let _ = writeln!(text, "{feature:<31} {:>6}", complete.saturating_sub(used(&others)?));
+    }
+    let _ = writeln!(text, "{:<31} {:>6}", "(without all of them)", used(&[])?);
+    Ok(text)
 }
 
 /// Flash by crate, as the symbols tell. Code that was inlined counts for the crate it ended up in.
