@@ -67,7 +67,8 @@ mod app {
 
     #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new()])]
     fn init(cx: init::Context) -> (Shared, Local) {
-        let board = bsp::init(cx.device.RCC, cx.device.CAN1, cx.device.GPIOD);
+        let mut rcc = bsp::clocks(cx.device.RCC);
+        let board = bsp::init(&mut rcc, cx.device.CAN1, cx.device.GPIOD);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
         // Same node-ID and bit rate as the bootloader: whoever talked to it goes on talking to this.
@@ -128,12 +129,14 @@ mod app {
         let protocol::LocalResources { to_handle, slave, application, departure, .. } = cx.local;
         let status = (&mut can, &mut queue_overrun).lock(status);
         slave.observe(status, now, application);
-        // The next frame is handled when the answers to those before are on their way.
-        while carry_out(slave, &mut can, now, application) {
-            let Some(frame) = to_handle.dequeue() else { break };
+        // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
+        carry_out(slave, &mut can, now, application);
+        while let Some(frame) = to_handle.dequeue() {
             if slave.handle(&frame, now, application) {
                 coboot::restart();
             }
+            carry_out(slave, &mut can, now, application);
+        }
         }
         if application.is_called_back() {
             let answered = slave.is_idle() && can.lock(|can| can.is_idle());
@@ -141,22 +144,20 @@ mod app {
         }
     }
 
-    /// Does what the slave says, until it says nothing; whether there is room for a frame then.
+    /// Does what the slave says, until it says nothing.
     fn carry_out(
         slave: &mut Slave,
         can: &mut impl Mutex<T = Port<CanController>>,
         now: Instant,
         device: &mut impl SlaveDevice,
-    ) -> bool {
-        loop {
-            let room = can.lock(|can| can.has_room());
-            match slave.poll(now, room, device) {
-                None => return room,
-                Some(Output::Send(frame)) => can.lock(|can| can.send(&frame)),
-                Some(Output::Join(rate)) => configure(can, rate, Mode::Normal),
-                Some(Output::Listen(rate)) => configure(can, rate, Mode::Silent),
-                Some(Output::ComeBack) => can.lock(|can| can.come_back()),
-                Some(Output::Accept(ids)) => can.lock(|can| can.accept(ids.into_iter().map(CobId::get))),
+    ) {
+        while let Some(output) = slave.poll(now, can.lock(|can| can.has_room()), device) {
+            match output {
+                Output::Send(frame) => can.lock(|can| can.send(&frame)),
+                Output::Join(rate) => configure(can, rate, Mode::Normal),
+                Output::Listen(rate) => configure(can, rate, Mode::Silent),
+                Output::ComeBack => can.lock(|can| can.come_back()),
+                Output::Accept(ids) => can.lock(|can| can.accept(ids.into_iter().map(CobId::get))),
             }
         }
     }

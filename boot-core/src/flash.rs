@@ -4,6 +4,8 @@ use core::task::Poll;
 
 use shared_abi::geometry::{Region, Sector};
 
+use crate::crc;
+
 /// Why a flash operation failed, as the controller tells it (RM0090 section 3.8.4, `FLASH_SR`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FlashFault {
@@ -38,12 +40,28 @@ pub trait Flash {
     /// The outcome of the running operation, `Ready(Ok(()))` when none runs.
     fn poll(&mut self) -> Poll<Result<(), FlashFault>>;
 
+    /// The CRC-32 of a region behind data whose CRC is `crc` (0 for none). A chip that has a unit for it overrides this.
+    fn crc32(&self, crc: u32, region: Region) -> u32 {
+        crc32_by_software(self, crc, region)
+    }
+
     /// The word at a word-aligned address.
     fn read_word(&self, address: u32) -> u32 {
         let mut bytes = [0; 4];
         self.read(address, &mut bytes);
         u32::from_le_bytes(bytes)
     }
+}
+
+/// [`Flash::crc32`] for a chip without a unit, and for what its unit does not take.
+pub fn crc32_by_software<F: Flash + ?Sized>(flash: &F, mut crc: u32, region: Region) -> u32 {
+    let mut chunk = [0; 64];
+    for offset in (0..region.size).step_by(chunk.len()) {
+        let bytes = &mut chunk[..(region.size - offset).min(64) as usize];
+        flash.read(region.base + offset, bytes);
+        crc = crc::resume(crc, bytes);
+    }
+    crc
 }
 
 impl<F: Flash> Flash for &mut F {
@@ -61,6 +79,10 @@ impl<F: Flash> Flash for &mut F {
 
     fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
         (**self).poll()
+    }
+
+    fn crc32(&self, crc: u32, region: Region) -> u32 {
+        (**self).crc32(crc, region)
     }
 
     fn read_word(&self, address: u32) -> u32 {

@@ -8,11 +8,13 @@
 //! | [`parameters`] | the power-fail-safe journal of the non-volatile parameters |
 //! | [`node`] | node-ID and bit rate of the device |
 //! | [`download`] | 1F50h, 1F51h, 1F56h, 1F57h: block files into flash |
+//! | [`crc`] | CRC-32 |
 //! | [`flash`] | the seam to the flash |
 #![no_std]
 #![forbid(unsafe_code)]
 
 pub mod bootloader;
+pub mod crc;
 pub mod decision;
 pub mod download;
 pub mod flash;
@@ -22,4 +24,4 @@ pub mod program;
 
 /// Frames, node and transfers, in which the core speaks: a firmware that uses this crate needs no other for them.
 pub use canopen;
-pub use program::crc32;
+pub use crc::crc32;

@@ -1,21 +1,11 @@
 //! Programs: what is known of one, and the proof that one may be started.
 
-use crc::{Crc, Digest, Table, CRC_32_ISO_HDLC};
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 use shared_abi::vectors::{VectorFault, VectorTable};
 
 use crate::flash::Flash;
 use crate::parameters::{Journal, Key, Value};
-
-/// One table of 256 words: about ten cycles a byte. It lies in RAM with the rest of the code.
-static CRC32: Crc<u32, Table<1>> = Crc::<u32, Table<1>>::new(&CRC_32_ISO_HDLC);
-
-/// CRC-32/ISO-HDLC, the function of block file, 1F56h and journal.
-#[must_use]
-pub fn crc32(bytes: &[u8]) -> u32 {
-    CRC32.checksum(bytes)
-}
 
 /// The word that stands for "signed" in a program's record.
 pub const SIGNATURE: u32 = u32::from_le_bytes(*b"APP1");
@@ -49,32 +39,25 @@ impl ProgramRecord {
 }
 
 /// A CRC over flash, computed in steps that the caller bounds.
-#[derive(Clone)]
+#[derive(Clone, Copy, Debug)]
 pub struct FlashCrc {
-    digest: Digest<'static, u32, Table<1>>,
-    next: u32,
-    end: u32,
+    crc: u32,
+    rest: Region,
 }
 
 impl FlashCrc {
     /// Over this region, which must be inside the flash.
     #[must_use]
-    pub fn new(region: Region) -> Self {
-        Self { digest: CRC32.digest(), next: region.base, end: region.end() }
+    pub const fn new(region: Region) -> Self {
+        Self { crc: 0, rest: region }
     }
 
     /// Goes on over at most `budget` bytes; the CRC once the end is reached.
     pub fn step<F: Flash>(&mut self, flash: &F, budget: u32) -> Option<u32> {
-        let mut chunk = [0; 64];
-        let stop = self.end.min(self.next.saturating_add(budget));
-        while self.next < stop {
-            let len = (stop - self.next).min(chunk.len() as u32);
-            let bytes = &mut chunk[..len as usize];
-            flash.read(self.next, bytes);
-            self.digest.update(bytes);
-            self.next += len;
-        }
-        (self.next == self.end).then(|| self.digest.clone().finalize())
+        let len = self.rest.size.min(budget);
+        self.crc = flash.crc32(self.crc, Region::new(self.rest.base, len));
+        self.rest = Region::new(self.rest.base + len, self.rest.size - len);
+        (self.rest.size == 0).then_some(self.crc)
     }
 }
 

@@ -12,7 +12,8 @@ use boot_core::node::NodeParameters;
 use boot_core::parameters::{Journal, Key};
 use boot_core::program::verify;
 use bsp::can::BitTiming;
-use bsp::{pac, BIT_RATE, CAN_CLOCK, LAYOUT, NODE_ID};
+use bsp::clock::Source;
+use bsp::{pac, BIT_RATE, CAN_CLOCK, CLOCK_TREE, LAYOUT, NODE_ID};
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
 use shared_abi::warm_start::{BootRequest, Cell};
 
@@ -69,14 +70,20 @@ extern "C" fn stage() {
     let request = warm_start_cell().take();
     let strap = bsp::entry_strap(&rcc, &peripherals.GPIOA);
 
-    let mut flash = FlashController::new(peripherals.FLASH, LAYOUT.chip.flash);
+    // A CRC over a whole program wants speed. Exact it need not be, and the crystal would take its time.
+    CLOCK_TREE.speed_up(&rcc, Source::Internal);
+    let mut flash = FlashController::new(peripherals.FLASH, peripherals.CRC, &rcc, LAYOUT.chip.flash);
     let mut journal = Journal::open(&flash, LAYOUT.parameters);
     let crash_resets = count_crash_resets(&mut journal, &mut flash, reset_cause, request);
 
     let node = node_parameters(&journal, &flash);
     let node_id = node.id.map_or(NO_NODE_ID, NodeId::get);
     let circumstances = Circumstances { request, strap, crash_resets, node_id };
-    match decide(&circumstances, &POLICY, |number| verify(&flash, &journal, LAYOUT, number)) {
+    let decision = decide(&circumstances, &POLICY, |number| verify(&flash, &journal, LAYOUT, number));
+    // Whoever runs next finds the chip as after a reset.
+    CLOCK_TREE.slow_down(&rcc);
+    flash.release(&rcc);
+    match decision {
         BootDecision::Stay(_) => {}
         BootDecision::Start { program, trial } => {
             let handoff = Handoff::new(&BootInfo {

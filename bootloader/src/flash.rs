@@ -1,10 +1,11 @@
-//! The flash controller (RM0090 section 3), at the level of its registers.
+//! The flash controller (RM0090 section 3) and the CRC unit (section 4), at the level of their registers.
 //!
 //! The HAL's driver does not fit: it erases in units of 128 KiB, programs by bytes and leaves error flags standing.
 
 use core::task::Poll;
 
-use boot_core::flash::{Flash, FlashFault};
+use boot_core::crc;
+use boot_core::flash::{crc32_by_software, Flash, FlashFault};
 use bsp::pac;
 use shared_abi::geometry::{Region, Sector};
 
@@ -16,6 +17,7 @@ const WORDS: u8 = 0b10;
 /// The controller and the flash that it guards. The control register is locked whenever no operation runs.
 pub struct FlashController {
     registers: pac::FLASH,
+    crc: pac::CRC,
     flash: Region,
     running: bool,
 }
@@ -25,11 +27,21 @@ impl FlashController {
     ///
     /// Its caches go off: they would show words as they were before they were programmed (section 3.5.4), and a
     /// bootloader that runs from RAM gains nothing by them.
-    pub fn new(registers: pac::FLASH, flash: Region) -> Self {
+    pub fn new(registers: pac::FLASH, crc: pac::CRC, rcc: &pac::RCC, flash: Region) -> Self {
+        rcc.ahb1enr().modify(|_, w| w.crcen().enabled());
         registers.acr().modify(|_, w| w.dcen().clear_bit().icen().clear_bit().prften().clear_bit());
         registers.acr().modify(|_, w| w.dcrst().set_bit().icrst().set_bit());
         registers.acr().modify(|_, w| w.dcrst().clear_bit().icrst().clear_bit());
-        Self { registers, flash, running: false }
+        Self { registers, crc, flash, running: false }
+    }
+
+    /// Leaves both as after a reset.
+    pub fn release(self, rcc: &pac::RCC) {
+        rcc.ahb1rstr().modify(|_, w| w.crcrst().set_bit());
+        rcc.ahb1rstr().modify(|_, w| w.crcrst().clear_bit());
+        rcc.ahb1enr().modify(|_, w| w.crcen().disabled());
+        self.clear_flags();
+        self.registers.acr().reset();
     }
 
     /// Opens the control register for one operation. (A `write` starts from the register's reset value, in which LOCK is
@@ -45,7 +57,7 @@ impl FlashController {
         }
     }
 
-    fn clear_flags(&mut self) {
+    fn clear_flags(&self) {
         let flags = self.registers.sr().read().bits();
         // SAFETY: the flags of SR are cleared by writing them back.
         self.registers.sr().write(|w| unsafe { w.bits(flags) });
@@ -76,6 +88,31 @@ impl Flash for FlashController {
         } else {
             u32::MAX
         }
+    }
+
+    /// By the unit. It has the polynomial, but takes words with the most significant bit first, and starts anew: what went
+    /// before comes back as one word that leaves it in the same state.
+    fn crc32(&self, crc: u32, region: Region) -> u32 {
+        if !region.base.is_multiple_of(4) || !self.flash.contains(region.base, region.size) {
+            return crc32_by_software(self, crc, region);
+        }
+        let words = region.size / 4;
+        let unit = self.crc.dr();
+        // SAFETY: every word may be written to DR.
+        let feed = |word: u32| unit.write(|w| unsafe { w.bits(word) });
+        self.crc.cr().write(|w| w.reset().set_bit());
+        if crc != 0 {
+            feed(u32::MAX ^ word_before((!crc).reverse_bits()));
+        }
+        for address in (region.base..).step_by(4).take(words as usize) {
+            // SAFETY: the region was checked to be inside the memory-mapped flash, which is always readable.
+            feed(unsafe { (address as *const u32).read_volatile() }.reverse_bits());
+        }
+        let crc = !unit.read().bits().reverse_bits();
+        let mut tail = [0; 3];
+        let tail = &mut tail[..region.size as usize % 4];
+        self.read(region.base + words * 4, tail);
+        crc::resume(crc, tail)
     }
 
     fn start_erase(&mut self, sector: Sector) -> Result<(), FlashFault> {
@@ -121,4 +158,14 @@ impl Flash for FlashController {
             Ok(())
         })
     }
+}
+
+/// The word that takes the CRC unit from 0 to this state: its 32 steps backwards.
+fn word_before(mut state: u32) -> u32 {
+    /// The polynomial of the unit.
+    const POLYNOMIAL: u32 = 0x04C1_1DB7;
+    for _ in 0..32 {
+        state = if state & 1 != 0 { (state ^ POLYNOMIAL) >> 1 | 1 << 31 } else { state >> 1 };
+    }
+    state
 }

@@ -49,7 +49,9 @@ mod app {
     use boot_core::download::Step;
     use boot_core::parameters::Journal;
     use bsp::can::{BitTiming, Errors, Mode, Port};
-    use bsp::{pac, CanController, CAN_CLOCK, IDENTITY, LAYOUT};
+    use bsp::clock::Source;
+    use bsp::hal::rcc::RccExt;
+    use bsp::{pac, CanController, CAN_CLOCK, CLOCK_TREE, IDENTITY, LAYOUT};
     use core::mem::take;
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
@@ -105,10 +107,11 @@ mod app {
     #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), block: [u8; MAX_BLOCK_SIZE] = [0; MAX_BLOCK_SIZE]])]
     fn init(mut cx: init::Context) -> (Shared, Local) {
         ram_vectors::relocate(&mut cx.core.SCB);
-        let board = bsp::init(cx.device.RCC, cx.device.CAN1, cx.device.GPIOD);
+        CLOCK_TREE.speed_up(&cx.device.RCC, Source::Crystal);
+        let flash = FlashController::new(cx.device.FLASH, cx.device.CRC, &cx.device.RCC, LAYOUT.chip.flash);
+        let board = bsp::init(&mut cx.device.RCC.constrain(), cx.device.CAN1, cx.device.GPIOD);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
-        let flash = FlashController::new(cx.device.FLASH, LAYOUT.chip.flash);
         let node = boot::node_parameters(&Journal::open(&flash, LAYOUT.parameters), &flash);
         let device = Device {
             device_type: BOOTLOADER_DEVICE_TYPE,
@@ -187,12 +190,14 @@ mod app {
         let status = (&mut can, &mut queue_overrun).lock(status);
         bootloader.lock(|bootloader| {
             slave.observe(status, now, bootloader);
-            // The next frame is handled when the answers to those before are on their way.
-            while carry_out(slave, &mut can, now, bootloader) {
-                let Some(frame) = to_handle.dequeue() else { break };
+            // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
+            carry_out(slave, &mut can, now, bootloader);
+            while let Some(frame) = to_handle.dequeue() {
                 if slave.handle(&frame, now, bootloader) {
                     *leaving = Some(Leaving { request: None, at: None });
                 }
+                carry_out(slave, &mut can, now, bootloader);
+            }
             }
             if let Some(request) = bootloader.take_leave() {
                 *leaving = Some(Leaving { request: Some(request), at: None });
@@ -212,22 +217,20 @@ mod app {
         }
     }
 
-    /// Does what the slave says, until it says nothing; whether there is room for a frame then.
+    /// Does what the slave says, until it says nothing.
     fn carry_out(
         slave: &mut Slave,
         can: &mut impl Mutex<T = Port<CanController>>,
         now: Instant,
         device: &mut impl SlaveDevice,
-    ) -> bool {
-        loop {
-            let room = can.lock(|can| can.has_room());
-            match slave.poll(now, room, device) {
-                None => return room,
-                Some(Output::Send(frame)) => can.lock(|can| can.send(&frame)),
-                Some(Output::Join(rate)) => configure(can, rate, Mode::Normal),
-                Some(Output::Listen(rate)) => configure(can, rate, Mode::Silent),
-                Some(Output::ComeBack) => can.lock(|can| can.come_back()),
-                Some(Output::Accept(ids)) => can.lock(|can| can.accept(ids.into_iter().map(CobId::get))),
+    ) {
+        while let Some(output) = slave.poll(now, can.lock(|can| can.has_room()), device) {
+            match output {
+                Output::Send(frame) => can.lock(|can| can.send(&frame)),
+                Output::Join(rate) => configure(can, rate, Mode::Normal),
+                Output::Listen(rate) => configure(can, rate, Mode::Silent),
+                Output::ComeBack => can.lock(|can| can.come_back()),
+                Output::Accept(ids) => can.lock(|can| can.accept(ids.into_iter().map(CobId::get))),
             }
         }
     }

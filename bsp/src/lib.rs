@@ -6,6 +6,7 @@
 #![no_std]
 
 pub mod can;
+pub mod clock;
 
 #[cfg(feature = "board-stm32f407g-disc1")]
 #[path = "stm32f407g_disc1.rs"]

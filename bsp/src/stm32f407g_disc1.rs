@@ -5,8 +5,9 @@ use stm32f4xx_hal::can::{Can, CanExt};
 use stm32f4xx_hal::gpio::{GpioExt, Output, Pin};
 use stm32f4xx_hal::pac;
 use stm32f4xx_hal::prelude::*;
-use stm32f4xx_hal::rcc::{Config, RccExt};
+use stm32f4xx_hal::rcc::{Config, Rcc, RccExt};
 
+use crate::clock::ClockTree;
 use crate::Identity;
 
 /// Who owns which address on this board.
@@ -27,12 +28,21 @@ pub const NODE_ID: u8 = 1;
 /// Bit rate of a device that was never told another one, in bit/s; 0 for one that finds it out by listening.
 pub const BIT_RATE: u32 = 125_000;
 
-/// Crystal on OSC_IN and OSC_OUT, in Hz.
-const HSE: u32 = 8_000_000;
-/// The core's clock, in Hz: the fastest that the chip allows at 3.3 V (datasheet DS8626, table 14).
-pub const SYSCLK: u32 = 168_000_000;
-/// Clock of the CAN controller, in Hz: that of APB1, whose limit is 42 MHz.
-pub const CAN_CLOCK: u32 = 42_000_000;
+/// A crystal of 8 MHz on OSC_IN and OSC_OUT; the fastest clocks that the chip allows at 3.3 V (datasheet DS8626, table 14).
+pub const CLOCK_TREE: ClockTree = ClockTree {
+    hse: 8_000_000,
+    pll_input: 2_000_000,
+    pll_n: 168,
+    pll_p: 2,
+    apb1: 4,
+    apb2: 2,
+    wait_states: 5,
+}
+.checked();
+/// The core's clock, in Hz.
+pub const SYSCLK: u32 = CLOCK_TREE.sysclk();
+/// Clock of the CAN controller, in Hz: that of APB1.
+pub const CAN_CLOCK: u32 = CLOCK_TREE.apb1_clock();
 
 /// The CAN controller that coboot talks through.
 pub type CanController = Can<pac::CAN1>;
@@ -47,14 +57,18 @@ pub struct Board {
     pub led: Led,
 }
 
-/// Sets the clocks and pins up, from the state after a reset.
+/// The clocks as the HAL knows them, for the HAL's drivers. From the state after a reset.
 #[must_use]
-pub fn init(rcc: pac::RCC, can1: pac::CAN1, gpiod: pac::GPIOD) -> Board {
-    let clocks = Config::hse(HSE.Hz()).sysclk(SYSCLK.Hz()).pclk1(CAN_CLOCK.Hz());
-    let mut rcc = rcc.freeze(clocks);
-    let gpiod = gpiod.split(&mut rcc);
+pub fn clocks(rcc: pac::RCC) -> Rcc {
+    rcc.freeze(Config::hse(CLOCK_TREE.hse.Hz()).sysclk(SYSCLK.Hz()).pclk1(CAN_CLOCK.Hz()))
+}
+
+/// Sets the pins up.
+#[must_use]
+pub fn init(rcc: &mut Rcc, can1: pac::CAN1, gpiod: pac::GPIOD) -> Board {
+    let gpiod = gpiod.split(rcc);
     let led = gpiod.pd12.into_push_pull_output();
-    let can = can1.can((gpiod.pd1, gpiod.pd0), &mut rcc);
+    let can = can1.can((gpiod.pd1, gpiod.pd0), rcc);
     Board { can, led }
 }
 
