@@ -137,7 +137,6 @@ mod app {
             }
             carry_out(slave, &mut can, now, application);
         }
-        }
         if application.is_called_back() {
             let answered = slave.is_idle() && can.lock(|can| can.is_idle());
             departure.proceed(answered, now);

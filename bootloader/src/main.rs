@@ -198,7 +198,6 @@ mod app {
                 }
                 carry_out(slave, &mut can, now, bootloader);
             }
-            }
             if let Some(request) = bootloader.take_leave() {
                 *leaving = Some(Leaving { request: Some(request), at: None });
             }
