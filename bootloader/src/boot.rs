@@ -135,11 +135,14 @@ pub fn node_parameters(journal: &Journal, flash: &FlashController) -> NodeParame
 
 /// Whether the board's CAN controller can run at this bit rate.
 pub const fn supports(rate: BitRate) -> bool {
-    match rate.bits_per_second() {
-        Some(rate) => BitTiming::new(CAN_CLOCK, rate).is_some(),
-        None => cfg!(feature = "auto-bit-rate"),
+    match rate {
+        BitRate::Auto => cfg!(feature = "auto-bit-rate"),
+        rate => TIMINGS[rate as usize].is_some(),
     }
 }
+
+/// How the board's CAN controller makes each bit rate.
+pub const TIMINGS: [Option<BitTiming>; 9] = BitTiming::table(CAN_CLOCK, BitRate::TABLE);
 
 /// The warm-start cell of this board.
 pub fn warm_start_cell() -> Cell {

@@ -48,10 +48,10 @@ mod app {
     use boot_core::canopen::{BitRate, CobId, Frame, Instant};
     use boot_core::download::Step;
     use boot_core::parameters::Journal;
-    use bsp::can::{BitTiming, Errors, Mode, Port};
+    use bsp::can::{Errors, Mode, Port};
     use bsp::clock::Source;
     use bsp::hal::rcc::RccExt;
-    use bsp::{pac, CanController, CAN_CLOCK, CLOCK_TREE, IDENTITY, LAYOUT};
+    use bsp::{pac, CanController, CLOCK_TREE, IDENTITY, LAYOUT};
     use core::mem::take;
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
@@ -236,8 +236,8 @@ mod app {
 
     fn configure(can: &mut impl Mutex<T = Port<CanController>>, rate: BitRate, mode: Mode) {
         // Another rate is asked for by nobody: `boot::supports` says so.
-        if let Some(timing) = BitTiming::new(CAN_CLOCK, rate.or_zero()) {
-            can.lock(|can| can.configure(timing, mode));
+        if let Some(Some(timing)) = boot::TIMINGS.get(rate as usize) {
+            can.lock(|can| can.configure(*timing, mode));
         }
     }
 

@@ -43,6 +43,18 @@ impl BitTiming {
         None
     }
 
+    /// The timings of several bit rates, worked out at compile time.
+    #[must_use]
+    pub const fn table<const N: usize>(clock: u32, bit_rates: [u32; N]) -> [Option<Self>; N] {
+        let mut table = [None; N];
+        let mut i = 0;
+        while i < N {
+            table[i] = Self::new(clock, bit_rates[i]);
+            i += 1;
+        }
+        table
+    }
+
     /// The value of `CAN_BTR`; resynchronisation by up to 1 quantum.
     #[must_use]
     pub const fn register(&self) -> u32 {

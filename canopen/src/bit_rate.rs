@@ -63,6 +63,17 @@ impl BitRate {
         None
     }
 
+    /// The rates of [`FIXED`](Self::FIXED) in bit/s; the index of each is that of CiA 305.
+    pub const TABLE: [u32; 9] = {
+        let mut table = [0; 9];
+        let mut i = 0;
+        while i < 9 {
+            table[i] = Self::FIXED[i].or_zero();
+            i += 1;
+        }
+        table
+    };
+
     /// In bit/s, 0 for [`BitRate::Auto`].
     #[must_use]
     pub const fn or_zero(self) -> u32 {
