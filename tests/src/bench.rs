@@ -1,10 +1,11 @@
-//! The bench: one emulated board with the built firmware on a bus, and a port for the host, all in virtual time.
+//! The bench: emulated boards with the built firmware on a bus, one as a rule, and a port for the host, all in virtual
+//! time.
 
 use std::cell::{Cell, RefCell};
 use std::rc::Rc;
 use std::time::Duration;
 
-use canopen::NodeId;
+use canopen::{Address, NodeId};
 use coflash::adapter::{Adapter, AdapterError};
 use coflash::session::{Session, Timing};
 use emulator::bus::{Outcome, Record};
@@ -21,12 +22,13 @@ pub const NODE: u8 = 1;
 /// See [`NODE`].
 pub const BIT_RATE: u32 = 125_000;
 
-/// One board on a bus.
+/// Boards on a bus.
 pub struct Bench {
     /// All of it.
     pub world: World<Machine>,
-    /// The board.
+    /// The board, or the first of several.
     pub device: MachineId,
+    boards: Vec<MachineId>,
     port: PortId,
     heard: Rc<RefCell<Vec<Record>>>,
     clock: Rc<Cell<Time>>,
@@ -45,20 +47,53 @@ impl Bench {
     /// If the emulator cannot be set up, or the firmware was not built.
     #[must_use]
     pub fn with(options: Options) -> Self {
-        let mut machine = Machine::new(firmware::board().chip, options).expect("the emulator starts");
-        machine.load(&firmware::elf(firmware::BOOTLOADER)).expect("the bootloader's ELF fits the flash");
+        Self::of(vec![options])
+    }
+
+    /// So many boards, each with a unique ID and noise of its own. They share bus and node-ID until they are told others.
+    ///
+    /// # Panics
+    /// As [`with`](Self::with), and for no board at all.
+    #[must_use]
+    pub fn of_boards(count: u32) -> Self {
+        let options = |n| {
+            let Options { unique_id: [position, lot, more], .. } = Options::default();
+            Options {
+                seed: u64::from(n) + 1,
+                unique_id: [position + n * 0x0001_0001, lot, more],
+                ..Options::default()
+            }
+        };
+        Self::of((0..count).map(options).collect())
+    }
+
+    fn of(chips: Vec<Options>) -> Self {
         let mut world = World::empty();
         let heard = Rc::new(RefCell::new(Vec::new()));
         let ears = Rc::clone(&heard);
         world.add_sink(move |record| ears.borrow_mut().push(*record));
-        let device = world.add_machine(machine);
+        let bootloader = firmware::elf(firmware::BOOTLOADER);
+        let boards: Vec<MachineId> = chips
+            .into_iter()
+            .map(|options| {
+                let mut machine = Machine::new(firmware::board().chip, options).expect("the emulator starts");
+                machine.load(&bootloader).expect("the bootloader's ELF fits the flash");
+                world.add_machine(machine)
+            })
+            .collect();
         let port = world.add_host_port(BIT_RATE);
-        Self { world, device, port, heard, clock: Rc::default() }
+        Self { world, device: boards[0], boards, port, heard, clock: Rc::default() }
     }
 
-    /// The board.
+    /// The board, or the first of several.
     pub fn machine(&mut self) -> &mut Machine {
         self.world.machine_mut(self.device)
+    }
+
+    /// All boards, as [`World::machine_mut`] names them.
+    #[must_use]
+    pub fn boards(&self) -> Vec<MachineId> {
+        self.boards.clone()
     }
 
     /// Virtual time.
@@ -78,15 +113,18 @@ impl Bench {
         self.world.port_mut(self.port).set_bit_rate(bit_rate);
     }
 
-    /// Switches the power on.
+    /// Switches the power of all boards on.
     pub fn power_on(&mut self) {
-        let now = self.world.now();
-        self.machine().power_on(now);
+        for board in self.boards() {
+            self.world.power_on(board);
+        }
     }
 
-    /// Cuts the power.
+    /// Cuts the power of all boards.
     pub fn power_off(&mut self) {
-        self.machine().power_off();
+        for board in self.boards() {
+            self.world.power_off(board);
+        }
     }
 
     /// Lets time pass.
@@ -99,16 +137,25 @@ impl Bench {
     /// # Panics
     /// If that takes more than `within_ms`.
     pub fn await_boot_up(&mut self, within_ms: u64) -> Time {
+        self.await_boot_up_of(NODE, within_ms)
+    }
+
+    /// Runs until a node says its boot-up; gives the time of it.
+    ///
+    /// # Panics
+    /// If that takes more than `within_ms`.
+    pub fn await_boot_up_of(&mut self, node: u8, within_ms: u64) -> Time {
         let from = self.time();
         let deadline = from + Span::from_millis(within_ms);
         loop {
             match self.world.run_until_frame_or(self.port, deadline) {
-                Some((at, frame)) if frame.raw_id() == 0x700 + u32::from(NODE) && frame.data() == [0] => {
+                Some((at, frame)) if frame.raw_id() == 0x700 + u32::from(node) && frame.data() == [0] => {
                     return at
                 }
                 Some(_) => {}
                 None => {
-                    panic!("no boot-up within {within_ms} ms; the bus said {:?}", self.frames_since(from))
+                    let said = self.frames_since(from);
+                    panic!("no boot-up of node {node} within {within_ms} ms; the bus said {said:?}")
                 }
             }
         }
@@ -156,6 +203,26 @@ impl Bench {
         }
     }
 
+    /// As in the factory: gives a board alone on the bus (the others have no power) a node-ID by layer setting services, 255
+    /// for none, and stores it. Gives the board's serial number, and leaves it without power.
+    ///
+    /// # Panics
+    /// If the board refuses, or does not answer as [`NODE`] at [`BIT_RATE`] as a new one does.
+    pub fn commission(&mut self, board: MachineId, node: u8) -> u32 {
+        self.world.power_on(board);
+        self.await_boot_up(100);
+        let serial = self.session().read_number(Address::new(0x1018, 4)).expect("a serial number");
+        // Switch state global: configuration. Configure node-ID. Store (CiA 305).
+        self.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+        for request in [[0x11, node], [0x17, 0]] {
+            let [command, value] = request;
+            let answer = self.ask(0x7E5, &[command, value, 0, 0, 0, 0, 0, 0], 0x7E4);
+            assert_eq!(answer.as_deref(), Some(&[command, 0, 0, 0, 0, 0, 0, 0][..]), "node-ID {node}");
+        }
+        self.world.power_off(board);
+        serial
+    }
+
     /// Lets the endpoint's clients take part, and time go on to `until`; gives the number of frames that they got.
     pub fn serve(&mut self, server: &mut Server, until: Time) -> usize {
         let before = server.exchange(&mut self.world, self.port);
@@ -168,17 +235,27 @@ impl Bench {
     /// # Panics
     /// Never: the node-ID is a good one.
     pub fn session(&mut self) -> Session<'_> {
-        let node = NodeId::new(NODE).expect("1 to 127");
+        self.session_with(NODE)
+    }
+
+    /// A host's session with a node.
+    ///
+    /// # Panics
+    /// If the node-ID is none.
+    pub fn session_with(&mut self, node: u8) -> Session<'_> {
+        let node = NodeId::new(node).expect("1 to 127");
         Session::new(self, node, Timing::default())
     }
 
-    /// Fails if the firmware touched anything that the emulator does not model.
+    /// Fails if the firmware of any board touched anything that the emulator does not model.
     ///
     /// # Panics
     /// With the list of what it touched.
     pub fn assert_nothing_unmodelled(&mut self) {
-        let reports = self.machine().reports();
-        assert!(reports.is_empty(), "the firmware touched what the emulator does not model: {reports:#?}");
+        for board in self.boards() {
+            let reports = self.world.machine_mut(board).reports();
+            assert!(reports.is_empty(), "the firmware touched what the emulator does not model: {reports:#?}");
+        }
     }
 }
 
