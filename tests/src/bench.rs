@@ -5,7 +5,7 @@ use std::cell::{Cell, RefCell};
 use std::rc::Rc;
 use std::time::Duration;
 
-use canopen::{Address, NodeId};
+use canopen::{Address, BitRate, NodeId};
 use coflash::adapter::{Adapter, AdapterError};
 use coflash::session::{Session, Timing};
 use emulator::bus::{Outcome, Record};
@@ -203,21 +203,20 @@ impl Bench {
         }
     }
 
-    /// As in the factory: gives a board alone on the bus (the others have no power) a node-ID by layer setting services, 255
-    /// for none, and stores it. Gives the board's serial number, and leaves it without power.
+    /// As in the factory: gives a board alone on the bus (the others have no power) node-ID, 255 for none, and bit rate by
+    /// layer setting services, and stores them. Gives the board's serial number, and leaves it without power.
     ///
     /// # Panics
     /// If the board refuses, or does not answer as [`NODE`] at [`BIT_RATE`] as a new one does.
-    pub fn commission(&mut self, board: MachineId, node: u8) -> u32 {
+    pub fn commission(&mut self, board: MachineId, node: u8, rate: BitRate) -> u32 {
         self.world.power_on(board);
         self.await_boot_up(100);
         let serial = self.session().read_number(Address::new(0x1018, 4)).expect("a serial number");
-        // Switch state global: configuration. Configure node-ID. Store (CiA 305).
+        // Switch state global: configuration. Configure node-ID, bit timing (of table 0). Store (CiA 305).
         self.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
-        for request in [[0x11, node], [0x17, 0]] {
-            let [command, value] = request;
-            let answer = self.ask(0x7E5, &[command, value, 0, 0, 0, 0, 0, 0], 0x7E4);
-            assert_eq!(answer.as_deref(), Some(&[command, 0, 0, 0, 0, 0, 0, 0][..]), "node-ID {node}");
+        for [command, a, b] in [[0x11, node, 0], [0x13, 0, rate as u8], [0x17, 0, 0]] {
+            let answer = self.ask(0x7E5, &[command, a, b, 0, 0, 0, 0, 0], 0x7E4);
+            assert_eq!(answer.as_deref(), Some(&[command, 0, 0, 0, 0, 0, 0, 0][..]), "{node} at {rate:?}");
         }
         self.world.power_off(board);
         serial
@@ -254,7 +253,10 @@ impl Bench {
     pub fn assert_nothing_unmodelled(&mut self) {
         for board in self.boards() {
             let reports = self.world.machine_mut(board).reports();
-            assert!(reports.is_empty(), "the firmware touched what the emulator does not model: {reports:#?}");
+            assert!(
+                reports.is_empty(),
+                "the firmware touched what the emulator does not model: {reports:#?}"
+            );
         }
     }
 }

@@ -3,21 +3,38 @@
 
 use std::collections::BTreeSet;
 
-use canopen::Address;
-use coboot_tests::bench::{Bench, BIT_RATE, NODE};
+use canopen::program::ProgramControl;
+use canopen::{Address, BitRate};
+use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::error::Error;
 use coflash::flash::{flash, Event, FlashOptions};
 use coflash::session::{Doing, Session};
-use emulator::bus::Outcome;
+use emulator::bus::{Outcome, Record};
 use emulator::frame::Frame;
-use emulator::time::Span;
+use emulator::time::{Span, Time};
 
 const DATA: Address = Address::new(0x1F50, 1);
 const STATUS: Address = Address::new(0x1F57, 1);
 const VERSION: Address = Address::new(0x100A, 0);
 const LSS_REQUEST: u16 = 0x7E5;
 const LSS_RESPONSE: u32 = 0x7E4;
+
+const REQUEST: u16 = 0x600 + NODE as u16;
+const RESPONSE: u32 = 0x580 + NODE as u32;
+/// One bit, and the shortest pause between two frames (ISO 11898-1: 3 bits), at 1 Mbit/s.
+const BIT: Span = Span::from_micros(1);
+const INTERMISSION: Span = Span(3 * BIT.0);
+
+/// A board in its bootloader, with nothing installed, at 1 Mbit/s.
+fn fast_board() -> Bench {
+    let mut bench = Bench::new();
+    bench.commission(bench.device, NODE, BitRate::K1000);
+    bench.set_host_bit_rate(1_000_000);
+    bench.power_on();
+    bench.await_boot_up(100);
+    bench.run_ms(10);
+    bench
+}
 
 /// Whether a node is there, and what runs on it.
 fn running(bench: &mut Bench, node: u8) -> Option<&'static str> {
@@ -38,8 +55,13 @@ fn three_devices_are_updated_one_after_the_other_and_one_of_them_had_no_node_id(
     let mut bench = Bench::of_boards(3);
     let boards = bench.boards();
     let nodes = [2, 3, 0xFF];
-    let serials: Vec<u32> = boards.iter().zip(nodes).map(|(board, node)| bench.commission(*board, node)).collect();
-    assert_eq!(serials.iter().collect::<BTreeSet<_>>().len(), 3, "no two devices share a serial number: {serials:X?}");
+    let serials: Vec<u32> =
+        boards.iter().zip(nodes).map(|(board, node)| bench.commission(*board, node, BitRate::K125)).collect();
+    assert_eq!(
+        serials.iter().collect::<BTreeSet<_>>().len(),
+        3,
+        "no two devices share a serial number: {serials:X?}"
+    );
 
     bench.power_on();
     let from = bench.time();
@@ -94,4 +116,179 @@ fn three_devices_are_updated_one_after_the_other_and_one_of_them_had_no_node_id(
     assert_eq!(running(&mut bench, NODE), None, "nobody has the board file's node-ID any more");
     assert!(bench.records().iter().all(|record| record.outcome == Outcome::Good), "nobody disturbed anybody");
     bench.assert_nothing_unmodelled();
+}
+
+/// Frames of others, as they occur: none is for the device, some come close.
+fn foreign(n: usize) -> Frame {
+    let byte = n as u8;
+    let data = [byte, !byte, 0x55, byte ^ 0x0F, 0x33, byte, 0, byte];
+    let frame = match n % 8 {
+        0 => Frame::standard(0x181, &data),
+        // SYNC.
+        1 => Frame::standard(0x080, &[]),
+        // The SDO channel of the next node.
+        2 => Frame::standard(0x602, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]),
+        // 29 bits that begin as, or are, the number of the device's SDO request.
+        3 => Frame::extended(0x601 << 18, &data),
+        4 => Frame::extended(0x601, &data),
+        // Heartbeats of nodes that are far away.
+        5 => Frame::standard(0x77F, &[0x05]),
+        // What LSS slaves say.
+        6 => Frame::standard(0x7E4, &data),
+        _ => Frame::standard(0x6FF, &data),
+    };
+    frame.expect("an identifier and its data")
+}
+
+/// What went over the device's SDO channel, apart from the looks at 1F57h, of which there are as many as there is time.
+fn sdo_trace(records: &[Record], from: Time) -> Vec<(u32, Vec<u8>)> {
+    let of_channel = |record: &&Record| {
+        let id = record.frame.raw_id();
+        record.start >= from && !record.frame.is_extended() && (id == REQUEST.into() || id == RESPONSE)
+    };
+    let frames =
+        records.iter().filter(of_channel).inspect(|record| assert_eq!(record.outcome, Outcome::Good));
+    frames
+        .map(|record| (record.frame.raw_id(), record.frame.data().to_vec()))
+        .filter(|(_, data)| data[1..4] != [0x57, 0x1F, 0x01])
+        .collect()
+}
+
+/// A whole update at 1 Mbit/s, while others leave no gap between two frames: exactly the same frames go over the SDO
+/// channel as on a quiet bus.
+#[test]
+fn a_bus_full_of_foreign_frames_costs_no_sdo_frame() {
+    let mut quiet = fast_board();
+    let from = quiet.time();
+    install(&mut quiet.session(), firmware::APP_V1);
+    let expected = sdo_trace(&quiet.records(), from);
+    assert!(expected.len() > 2000, "{}", expected.len());
+
+    let mut bench = fast_board();
+    let others = bench.world.add_host_port(1_000_000);
+    for n in 0..200_000 {
+        bench.world.send(others, foreign(n));
+    }
+    let from = bench.time();
+    let interrupts = receive_interrupts(&mut bench);
+    install(&mut bench.session(), firmware::APP_V1);
+    let interrupts = receive_interrupts(&mut bench) - interrupts;
+    assert!(bench.world.port_mut(others).waiting() > 0, "the load lasted to the end");
+
+    let records = bench.records();
+    let loaded: Vec<&Record> = records.iter().filter(|record| record.start >= from).collect();
+    for pair in loaded.windows(2) {
+        assert!(pair[1].start - pair[0].end <= INTERMISSION, "a gap on the bus behind {:?}", pair[0]);
+    }
+    assert_eq!(sdo_trace(&records, from), expected);
+    let requests =
+        loaded.iter().filter(|record| !record.frame.is_extended() && record.frame.raw_id() == REQUEST.into());
+    let requests = requests.count() as u64;
+    assert!(
+        interrupts <= requests,
+        "{interrupts} interrupts for {requests} requests among {} frames",
+        loaded.len()
+    );
+    assert_eq!(lost_frames(&bench, from), 0);
+    assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0");
+    bench.assert_nothing_unmodelled();
+}
+
+/// How often the device was interrupted for a frame received: CAN1_RX0 is interrupt 20 (RM0090 table 62), and thus
+/// exception 36.
+fn receive_interrupts(bench: &mut Bench) -> u64 {
+    bench.machine().counters().exceptions[16 + 20]
+}
+
+/// Emergencies that tell of lost frames: 8110h.
+fn lost_frames(bench: &Bench, from: Time) -> usize {
+    let emergencies = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == 0x80 + u32::from(NODE));
+    emergencies.filter(|(.., data)| data[..2] == [0x10, 0x81]).count()
+}
+
+/// The most that a client may send without waiting, as fast as the wire carries it.
+#[test]
+fn a_burst_of_127_segments_back_to_back_at_1_mbit_is_taken_without_loss() {
+    let mut bench = fast_board();
+    bench.session().command(1, ProgramControl::Clear).unwrap();
+    bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
+    bench.session().write(DATA, &block(0, 0, &[0; 8]), Doing::Block(0), &mut |_| {}).unwrap();
+    bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
+
+    // Two sub-blocks of 127 segments; the bits of the data change so often that no stuff bit makes the frames longer.
+    let data: Vec<u8> =
+        (0..2 * 127 * 7 - 16).map(|n| if n % 64 == 0 { (n / 64) as u8 } else { 0x55 }).collect();
+    let block = block(1, 0x0801_0000, &data);
+    assert_eq!(block.len(), 1778);
+    let from = bench.time();
+    let granted = bench.ask(REQUEST, &[0xC6, 0x50, 0x1F, 0x01, 0xF2, 0x06, 0, 0], RESPONSE);
+    assert_eq!(granted.as_deref(), Some(&[0xA4, 0x50, 0x1F, 0x01, 127, 0, 0, 0][..]));
+    let segments: Vec<&[u8]> = block.chunks(7).collect();
+    for sub_block in segments.chunks(127) {
+        let sent = bench.time();
+        let mut frames: Vec<Vec<u8>> = Vec::new();
+        for (n, segment) in sub_block.iter().enumerate() {
+            let last = segment.as_ptr_range().end == block.as_ptr_range().end;
+            let sequence = n as u8 + 1 | if last { 0x80 } else { 0 };
+            frames.push([&[sequence], *segment].concat());
+        }
+        let (last, before) = frames.split_last().expect("127 segments");
+        before.iter().for_each(|frame| bench.post(REQUEST, frame));
+        let answer = bench.ask(REQUEST, last, RESPONSE);
+        // All were taken, and as many may follow.
+        assert_eq!(answer.as_deref(), Some(&[0xA2, 127, 127, 0, 0, 0, 0, 0][..]));
+        let records = bench.records();
+        let burst: Vec<&Record> = records
+            .iter()
+            .filter(|record| record.start >= sent && record.frame.raw_id() == REQUEST.into())
+            .collect();
+        assert_eq!(burst.len(), 127);
+        for pair in burst.windows(2) {
+            assert!(
+                pair[1].start - pair[0].end <= INTERMISSION,
+                "back to back, apart from the device's heartbeat"
+            );
+        }
+    }
+    let [low, high] = crc16(&block).to_le_bytes();
+    let ended = bench.ask(REQUEST, &[0xC1, low, high, 0, 0, 0, 0, 0], RESPONSE);
+    assert_eq!(ended.as_deref(), Some(&[0xA1, 0, 0, 0, 0, 0, 0, 0][..]));
+    assert_eq!(bench.session().await_idle(1, Doing::Read(STATUS)).unwrap().to_word(), 0);
+    assert_eq!(bench.machine().flash()[0x1_0000..][..data.len()], data);
+    assert_eq!(lost_frames(&bench, from), 0);
+}
+
+/// CRC of a block transfer: polynomial 1021h, start 0 (CiA 301 section 7.2.4.3.16). "123456789" gives 31C3h there.
+fn crc16(bytes: &[u8]) -> u16 {
+    bytes.iter().fold(0, |crc, byte| {
+        (0..8).fold(
+            crc ^ u16::from(*byte) << 8,
+            |crc, _| if crc >> 15 == 1 { crc << 1 ^ 0x1021 } else { crc << 1 },
+        )
+    })
+}
+
+/// CRC of a block: CRC-32/ISO-HDLC. "123456789" gives CBF43926h there.
+fn crc32(bytes: &[u8]) -> u32 {
+    !bytes.iter().fold(u32::MAX, |crc, byte| {
+        (0..8).fold(
+            crc ^ u32::from(*byte),
+            |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xEDB8_8320 } else { crc >> 1 },
+        )
+    })
+}
+
+/// A block of the block file.
+fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
+    let header = [number, address, data.len() as u32];
+    let mut bytes: Vec<u8> = header.iter().flat_map(|word| word.to_le_bytes()).collect();
+    bytes.extend(data);
+    bytes.extend(crc32(&bytes).to_le_bytes());
+    bytes
+}
+
+#[test]
+fn the_checks_of_this_file_know_the_published_values() {
+    assert_eq!(crc16(b"123456789"), 0x31C3);
+    assert_eq!(crc32(b"123456789"), 0xCBF4_3926);
 }
