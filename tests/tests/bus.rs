@@ -229,7 +229,7 @@ fn a_burst_of_127_segments_back_to_back_at_1_mbit_is_taken_without_loss() {
         let mut frames: Vec<Vec<u8>> = Vec::new();
         for (n, segment) in sub_block.iter().enumerate() {
             let last = segment.as_ptr_range().end == block.as_ptr_range().end;
-            let sequence = n as u8 + 1 | if last { 0x80 } else { 0 };
+            let sequence = (n as u8 + 1) | if last { 0x80 } else { 0 };
             frames.push([&[sequence], *segment].concat());
         }
         let (last, before) = frames.split_last().expect("127 segments");
