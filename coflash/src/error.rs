@@ -8,6 +8,7 @@ use canopen::sdo::AbortCode;
 use canopen::NodeId;
 
 use crate::adapter::AdapterError;
+use crate::lss::LssDoing;
 use crate::session::{DeviceType, Doing};
 
 /// Why a conversation with a device ended early.
@@ -89,6 +90,13 @@ pub enum Error {
         /// What the file says.
         file: u32,
     },
+    /// A layer setting service failed.
+    Lss {
+        /// What the master was about.
+        doing: LssDoing,
+        /// How it failed.
+        failure: LssFailure,
+    },
     /// The program does not come up.
     StartFailed {
         /// Which device.
@@ -97,6 +105,20 @@ pub enum Error {
         running: Option<DeviceType>,
         /// What 1F57h says, if something.
         status: Option<FlashStatus>,
+    },
+}
+
+/// How a layer setting service failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LssFailure {
+    /// Nobody answers.
+    NoAnswer,
+    /// The device refuses.
+    Refused {
+        /// The standard's error code; FFh for one of the maker's own.
+        code: u8,
+        /// The maker's own error code.
+        detail: u8,
     },
 }
 
@@ -127,7 +149,7 @@ impl From<AdapterError> for Error {
 
 impl Error {
     /// The stable number: the manual's (L-1112e_5, table 5, which holds all of the newer manual's) where it has one,
-    /// otherwise 60000100h plus the word of 1F57h, and 6000030xh for adapters.
+    /// otherwise 60000100h plus the word of 1F57h, 60000200h plus the error code of LSS, and 6000030xh for adapters.
     #[must_use]
     pub const fn number(&self) -> u32 {
         match self {
@@ -138,6 +160,8 @@ impl Error {
             Self::NoBootloader { .. } => 0x6000_0010,
             Self::Cancelled => 0x6000_0011,
             Self::NoAnswer { .. } => 0x6000_0013,
+            Self::Lss { failure: LssFailure::NoAnswer, .. } => 0x6000_0013,
+            Self::Lss { failure: LssFailure::Refused { code, .. }, .. } => 0x6000_0200 + *code as u32,
             Self::StartFailed { .. } => 0x6000_0014,
             Self::Busy { .. } => 0x6000_0016,
             Self::Refused { .. } | Self::Protocol { .. } => 0x6000_0025,
@@ -169,6 +193,22 @@ impl Error {
             Self::NoBootloader { .. } => "switch the device off and on and run the command again; if its application \
                                           ignores the call, use the entry strap"
                 .to_string(),
+            Self::Lss { doing, failure: LssFailure::NoAnswer } => match doing {
+                LssDoing::Fastscan => "run it again; if it happens again, two devices may have one LSS address",
+                LssDoing::Select => {
+                    "check the four numbers of the address (coflash info shows them as identity), and that the device \
+                     has power"
+                }
+                _ => "check that the device supports LSS, that it has power, and that both sides use the same bit rate",
+            }
+            .to_string(),
+            Self::Lss { doing, failure: LssFailure::Refused { code, .. } } => match (doing, code) {
+                (LssDoing::Store, 1) => "this device cannot store: switches or its application set node-ID and bit rate",
+                (LssDoing::Store, _) => "run it again; if it happens again, the device's memory is broken",
+                (LssDoing::BitRate, _) => "choose a bit rate that the device supports",
+                _ => "choose a node-ID from 1 to 127",
+            }
+            .to_string(),
             Self::WrongCrc { .. } => {
                 "check that the file was made for this board and this program number, and run the command again"
                     .to_string()
@@ -291,6 +331,16 @@ impl fmt::Display for Error {
             }
             Self::WrongCrc { device, file } => {
                 write!(f, "the program in the device has CRC {device:08X}h, that of the file {file:08X}h")
+            }
+            Self::Lss { doing, failure: LssFailure::NoAnswer } => {
+                write!(f, "no device answers ({})", doing.words())
+            }
+            Self::Lss { doing, failure: LssFailure::Refused { code, detail } } => {
+                write!(f, "the device refuses {}: error {code}", doing.words())?;
+                match detail {
+                    0 => Ok(()),
+                    detail => write!(f, ", {detail} of its maker"),
+                }
             }
             Self::StartFailed { node, running, status } => {
                 match running {

@@ -428,6 +428,22 @@ pub fn sign(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event)) 
     Ok(())
 }
 
+/// Takes the signature away: the program does not start by itself any more.
+///
+/// # Errors
+/// As [`erase`].
+pub fn unsign(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
+    execute(session, number, ProgramControl::ClrSignature)
+}
+
+/// Sets 1F57h back to "no error".
+///
+/// # Errors
+/// As [`erase`].
+pub fn reset_status(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
+    execute(session, number, ProgramControl::ResetStat)
+}
+
 /// Gives a command that may be repeated, and waits until it is carried out.
 fn execute(session: &mut Session<'_>, number: u8, command: ProgramControl) -> Result<(), Error> {
     let doing = Doing::Command(command);

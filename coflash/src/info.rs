@@ -62,11 +62,8 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
     // The highest sub-index is the number of programs; a device without the object has none.
     let count = number(program::PROGRAM_CONTROL, 0)?.map_or(0, |count| count.min(254) as u8);
     let mut programs = Vec::new();
-    for sub in 1..=count {
-        let control = number(program::PROGRAM_CONTROL, sub)?;
-        let crc = number(program::PROGRAM_ID, sub)?;
-        let status = number(program::FLASH_STATUS, sub)?.map(FlashStatus::from_word);
-        programs.push(ProgramInfo { number: sub, control, crc, status });
+    for number in 1..=count {
+        programs.push(program_info(session, number)?);
     }
     Ok(DeviceInfo {
         node: session.node(),
@@ -78,6 +75,18 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
         identity,
         programs,
     })
+}
+
+/// Asks a device about one of its programs.
+///
+/// # Errors
+/// As [`info`].
+pub fn program_info(session: &mut Session<'_>, program: u8) -> Result<ProgramInfo, Error> {
+    let mut number = |index| optional(session.read_number(Address::new(index, program)));
+    let control = number(program::PROGRAM_CONTROL)?;
+    let crc = number(program::PROGRAM_ID)?;
+    let status = number(program::FLASH_STATUS)?.map(FlashStatus::from_word);
+    Ok(ProgramInfo { number: program, control, crc, status })
 }
 
 /// Makes the absence of an object a value.

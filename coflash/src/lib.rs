@@ -11,6 +11,10 @@
 //! | [`session`] | SDO with one node: values, commands, status |
 //! | [`flash`] | the update procedure, with its steps as events |
 //! | [`info`] | what a device says about itself |
+//! | [`scan`] | who is on the bus |
+//! | [`lss`] | node-ID and bit rate over the bus |
+//! | [`decode`] | frames in words |
+//! | [`candump`] | logs of frames |
 //! | [`error`] | what can go wrong with a device, with numbers and advice |
 //!
 //! Flashing a file takes these lines:
@@ -37,13 +41,17 @@
 
 pub mod adapter;
 pub mod block_file;
+pub mod candump;
 pub mod convert;
+pub mod decode;
 pub mod error;
 pub mod flash;
 pub mod image;
 pub mod info;
 pub mod inspect;
+pub mod lss;
 pub mod read;
+pub mod scan;
 pub mod session;
 
 pub use adapter::Adapter;

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::program::{self, FlashStatus, ProgramControl, BOOTLOADER_DEVICE_TYPE};
-use canopen::sdo::client::{Block, Buffer, Config};
+use canopen::sdo::client::{Block, Buffer, Config, Sink};
 use canopen::sdo::{Download, SdoError, Step, Transfer, Upload};
 use canopen::{AbortCode, Address, CobId, Frame, Instant, NodeId};
 
@@ -78,6 +78,22 @@ impl fmt::Display for Doing {
 
 /// The largest value that is read as a whole. No object of a bootloader comes near it.
 const VALUE_MAX: usize = 4096;
+/// The most bytes that are read at all: more than any microcontroller's flash has.
+pub const UPLOAD_MAX: usize = 64 * 1024 * 1024;
+
+/// Grows with what really arrives; what a device merely announces takes no memory.
+struct Grown(Vec<u8>);
+
+impl Sink for Grown {
+    fn write(&mut self, data: &[u8]) -> Result<(), AbortCode> {
+        if self.0.len() + data.len() > UPLOAD_MAX {
+            return Err(AbortCode::OUT_OF_MEMORY);
+        }
+        self.0.extend_from_slice(data);
+        Ok(())
+    }
+}
+
 /// After so long without an abort, no more come for the segments of a transfer that was refused. A frame on the slowest
 /// bus takes 13 ms.
 const QUIET: Duration = Duration::from_millis(30);
@@ -193,6 +209,20 @@ impl<'a> Session<'a> {
         // A value is short: all of it has to be here in time.
         self.run(&mut upload, Doing::Read(at), Patience::InAll, &mut |_| {})?;
         Ok(upload.sink().filled().to_vec())
+    }
+
+    /// Reads a value of any length, as blocks where the device knows them. `progress` is told how many bytes are here.
+    ///
+    /// # Errors
+    /// As [`read`](Self::read); [`Error::Protocol`] for more than [`UPLOAD_MAX`] bytes.
+    pub fn upload(&mut self, at: Address, progress: &mut dyn FnMut(u32)) -> Result<Vec<u8>, Error> {
+        let (sink, config) = (Grown(Vec::new()), self.config());
+        let mut upload = match self.transfers {
+            Transfers::Blocks => Upload::as_blocks(self.node, at, sink, config, Block::default()),
+            Transfers::Segments => Upload::new(self.node, at, sink, config),
+        };
+        self.run(&mut upload, Doing::Read(at), Patience::ForEachStep, progress)?;
+        Ok(upload.into_sink().0)
     }
 
     /// Reads an unsigned number of up to 32 bits.

@@ -2,15 +2,20 @@
 
 use std::fmt;
 use std::io;
+use std::net::{TcpStream, ToSocketAddrs};
 use std::time::Duration;
 
 use canopen::Frame;
 
+mod slcan;
 #[cfg(target_os = "linux")]
 mod socketcan;
 mod socketcand;
+mod trace;
 
+pub use self::slcan::{Line, Slcan};
 pub use self::socketcand::Socketcand;
+pub use self::trace::Trace;
 
 /// A CAN bus, and the time on it.
 ///
@@ -65,24 +70,54 @@ impl<A: Adapter + ?Sized> Adapter for Box<A> {
 }
 
 /// What [`open`] understands, for messages and help texts.
-pub const URLS: &str = "socketcand://HOST:PORT/BUS, socketcan:INTERFACE (Linux)";
+pub const URLS: &str = "socketcand://HOST:PORT/BUS, slcan:PORT@BITRATE, slcan:tcp://HOST:PORT@BITRATE, \
+                        socketcan:INTERFACE (Linux)";
 
-/// Opens the adapter that a URL names (see [`URLS`]). This is the place to add others.
+/// How long a server may take to let us in, and to take what we send.
+const PATIENCE: Duration = Duration::from_secs(3);
+
+/// Opens the adapter that a URL names (see [`URLS`]).
 ///
 /// # Errors
 /// The URL is no good, or the adapter does not open.
 pub fn open(url: &str) -> Result<Box<dyn Adapter>, AdapterError> {
+    open_at(url, None)
+}
+
+/// Opens the adapter that a URL names, at this bit rate (in bit/s) if the URL names none and the adapter sets it. This is
+/// the place to add other adapters.
+///
+/// # Errors
+/// The URL is no good, or the adapter does not open.
+pub fn open_at(url: &str, bit_rate: Option<u32>) -> Result<Box<dyn Adapter>, AdapterError> {
     let bad = |why| AdapterError::Url { url: url.to_string(), why };
     let (scheme, rest) = url.split_once(':').ok_or_else(|| bad("it has no ':' behind the adapter's name"))?;
+    let word = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_ascii_graphic());
     match scheme {
         "socketcand" => {
             let rest = rest.strip_prefix("//").ok_or_else(|| bad("it must be socketcand://HOST:PORT/BUS"))?;
             let (server, bus) = rest.split_once('/').ok_or_else(|| bad("it names no bus: append /can0"))?;
-            let word = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_ascii_graphic());
             if !word(server) || !word(bus) || bus.contains(['<', '>', '/']) {
                 return Err(bad("it must be socketcand://HOST:PORT/BUS"));
             }
             Ok(Box::new(Socketcand::connect(server, bus)?))
+        }
+        "slcan" => {
+            let (line, rate) = match rest.rsplit_once('@') {
+                None => (rest, bit_rate),
+                Some((line, rate)) => {
+                    let why = "its bit rate must be like 125k, 500k or 1M";
+                    (line, Some(parse_bit_rate(rate).ok_or_else(|| bad(why))?))
+                }
+            };
+            match line.strip_prefix("tcp://") {
+                Some(server) if word(server) && server.contains(':') => {
+                    Ok(Box::new(Slcan::connect(server, rate)?))
+                }
+                Some(_) => Err(bad("it must be slcan:tcp://HOST:PORT@BITRATE")),
+                None if line.is_empty() => Err(bad("it names no serial port: slcan:/dev/ttyACM0@500k")),
+                None => Ok(Box::new(Slcan::serial(line, rate)?)),
+            }
         }
         #[cfg(target_os = "linux")]
         "socketcan" if !rest.is_empty() => Ok(Box::new(socketcan::SocketCan::open(rest)?)),
@@ -92,6 +127,54 @@ pub fn open(url: &str) -> Result<Box<dyn Adapter>, AdapterError> {
         "socketcan" => Err(bad("only Linux has SocketCAN")),
         _ => Err(bad("there is no such adapter")),
     }
+}
+
+/// A number in hexadecimal digits and nothing else: no sign, no blank.
+pub(crate) fn hex_number(text: &str) -> Option<u32> {
+    let digits = !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_hexdigit());
+    digits.then(|| u32::from_str_radix(text, 16).ok()).flatten()
+}
+
+/// Bytes in pairs of hexadecimal digits and nothing else.
+pub(crate) fn hex_bytes(text: &str) -> Option<Vec<u8>> {
+    if !text.is_ascii() || !text.len().is_multiple_of(2) {
+        return None;
+    }
+    (0..text.len()).step_by(2).map(|at| hex_number(&text[at..at + 2]).map(|byte| byte as u8)).collect()
+}
+
+/// `500k`, `1M`, `125000`, in bit/s.
+fn parse_bit_rate(text: &str) -> Option<u32> {
+    let (digits, unit) = match text.strip_suffix(['k', 'K']) {
+        Some(digits) => (digits, 1000),
+        None => match text.strip_suffix('M') {
+            Some(digits) => (digits, 1_000_000),
+            None => (text, 1),
+        },
+    };
+    let digits = Some(digits).filter(|digits| digits.bytes().all(|byte| byte.is_ascii_digit()))?;
+    digits.parse::<u32>().ok()?.checked_mul(unit).filter(|rate| (1..=1_000_000).contains(rate))
+}
+
+/// Connects to the first of the server's addresses that answers.
+fn connect(server: &str, default_port: Option<u16>) -> io::Result<TcpStream> {
+    let has_port = server.rsplit_once(':').is_some_and(|(host, port)| {
+        !port.is_empty()
+            && port.bytes().all(|b| b.is_ascii_digit())
+            && (!host.contains(':') || host.ends_with(']'))
+    });
+    let server = match default_port {
+        Some(port) if !has_port => format!("{server}:{port}"),
+        _ => server.to_string(),
+    };
+    let mut result = Err(io::Error::new(io::ErrorKind::NotFound, "the host has no address"));
+    for address in server.to_socket_addrs()? {
+        result = TcpStream::connect_timeout(&address, PATIENCE);
+        if result.is_ok() {
+            break;
+        }
+    }
+    result
 }
 
 /// What an adapter can be out of.

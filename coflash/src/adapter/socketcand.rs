@@ -2,16 +2,14 @@
 
 use std::collections::VecDeque;
 use std::io::{self, ErrorKind, Read, Write};
-use std::net::{TcpStream, ToSocketAddrs};
+use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
 use canopen::Frame;
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 
-use super::{Adapter, AdapterError};
+use super::{connect, hex_bytes, hex_number, Adapter, AdapterError, PATIENCE};
 
-/// How long the server may take to let us in, and to take what we send.
-const PATIENCE: Duration = Duration::from_secs(3);
 /// No message of the protocol comes near this length.
 const LONGEST_MESSAGE: usize = 4096;
 /// The port that socketcand listens on unless told otherwise.
@@ -34,7 +32,7 @@ impl Socketcand {
     pub fn connect(server: &str, bus: &str) -> Result<Self, AdapterError> {
         let name = format!("socketcand {server}, bus {bus}");
         let open = |source| AdapterError::Open { adapter: name.clone(), source };
-        let stream = connect(server).map_err(open)?;
+        let stream = connect(server, Some(DEFAULT_PORT)).map_err(open)?;
         // Frames are small and each waits for its answer: Nagle's algorithm would hold them back.
         stream.set_nodelay(true).map_err(open)?;
         stream.set_write_timeout(Some(PATIENCE)).map_err(open)?;
@@ -145,24 +143,6 @@ impl Adapter for Socketcand {
     }
 }
 
-/// Connects to the first of the server's addresses that answers.
-fn connect(server: &str) -> io::Result<TcpStream> {
-    let has_port = server.rsplit_once(':').is_some_and(|(host, port)| {
-        !port.is_empty()
-            && port.bytes().all(|b| b.is_ascii_digit())
-            && (!host.contains(':') || host.ends_with(']'))
-    });
-    let server = if has_port { server.to_string() } else { format!("{server}:{DEFAULT_PORT}") };
-    let mut result = Err(io::Error::new(ErrorKind::NotFound, "the host has no address"));
-    for address in server.to_socket_addrs()? {
-        result = TcpStream::connect_timeout(&address, PATIENCE);
-        if result.is_ok() {
-            break;
-        }
-    }
-    result
-}
-
 /// `< send 605 8 40 0 10 0 0 0 0 0 >`; a 29-bit identifier has eight digits.
 fn send_message(frame: &Frame) -> String {
     let id = match frame.id() {
@@ -177,18 +157,14 @@ fn send_message(frame: &Frame) -> String {
 fn parse_frame(message: &str) -> Option<Frame> {
     let mut words = message.split_ascii_whitespace();
     let ("frame", Some(id), Some(_time)) = (words.next()?, words.next(), words.next()) else { return None };
-    let number = u32::from_str_radix(id, 16).ok()?;
+    let number = hex_number(id)?;
     let id: Id = if id.len() > 3 {
         ExtendedId::new(number)?.into()
     } else {
         StandardId::new(u16::try_from(number).ok()?)?.into()
     };
     let digits: String = words.collect();
-    if !digits.is_ascii() || !digits.len().is_multiple_of(2) || digits.len() > 16 {
-        return None;
-    }
-    let data = (0..digits.len()).step_by(2).map(|at| u8::from_str_radix(&digits[at..at + 2], 16));
-    Frame::new(id, &data.collect::<Result<Vec<u8>, _>>().ok()?)
+    Frame::new(id, &hex_bytes(&digits)?)
 }
 
 /// Cuts the byte stream into messages, however TCP has split and joined them.
@@ -263,6 +239,8 @@ mod tests {
             "frame 123 1.0 1",
             "frame 123 1.0 001122334455667788",
             "frame 123 1.0 0\u{e9}1",
+            "frame 123 1.0 +1",
+            "frame +12 1.0 01",
         ] {
             assert_eq!(parse_frame(bad), None, "{bad}");
         }

@@ -71,12 +71,7 @@ impl Flash {
         let options = self.options(&done)?;
         let (size, crc) = (done.file.program_size(), done.file.program_crc());
         context.out.say(format_args!("{}: program of {size} bytes, CRC {crc:08X}h", file.display()));
-        if let Some(rate) = self.legacy.bit_rate() {
-            context.out.detail(format_args!(
-                "{rate} bit/s is asked for; this adapter was given its bit rate elsewhere"
-            ));
-        }
-        let mut adapter = context.open()?;
+        let mut adapter = context.open_at(self.legacy.bit_rate())?;
         let mut session = self.program.device.session(&mut *adapter)?;
         let mut progress = Progress::new(context.out);
         let mut left = None;

@@ -5,33 +5,42 @@ use std::io::{self, IsTerminal, Write as _};
 use std::path::Path;
 use std::process::ExitCode;
 
+use canopen::NodeId;
 use clap::Args;
 use coflash::adapter::AdapterError;
 use coflash::convert::ConvertError;
+use coflash::error::LssFailure;
 use coflash::flash::DeviceState;
 use coflash::read::FileError;
 use coflash::Error;
 use serde_json::{json, Value};
 
 use super::flash::state_word;
+use super::GLOBAL;
 
 /// How much is said, and in which form. For all commands.
 #[derive(Clone, Copy, Debug, Default, Args)]
 pub(super) struct Output {
     /// Write one JSON document to standard output in place of words for people.
-    #[arg(long, global = true)]
+    #[arg(long, global = true, help_heading = GLOBAL)]
     json: bool,
 
     /// Say nothing unless something goes wrong.
-    #[arg(long, short, global = true, conflicts_with = "verbose")]
+    #[arg(long, short, global = true, help_heading = GLOBAL, conflicts_with = "verbose")]
     quiet: bool,
 
     /// Say more: what is waited for, and what was chosen where the command line did not say it.
-    #[arg(long, short, global = true)]
+    #[arg(long, short, global = true, help_heading = GLOBAL)]
     verbose: bool,
 }
 
 impl Output {
+    /// What either of two says.
+    pub(super) fn or(self, other: Self) -> Self {
+        let Self { json, quiet, verbose } = other;
+        Self { json: self.json || json, quiet: self.quiet || quiet, verbose: self.verbose || verbose }
+    }
+
     /// Whether people read along.
     pub(super) fn for_people(self) -> bool {
         !self.json && !self.quiet
@@ -153,8 +162,35 @@ impl Failure {
         Self { exit: Exit::Usage, number: None, what: what.into(), left: None, advice: Some(advice.into()) }
     }
 
+    /// Words of the command line's reader, which have their advice in them.
+    pub(super) fn bare_usage(words: String) -> Self {
+        let what = words.strip_prefix("error: ").unwrap_or(&words).trim_end().to_string();
+        Self { exit: Exit::Usage, number: None, what, left: None, advice: None }
+    }
+
+    /// A file, other than firmware, that cannot be read.
+    pub(super) fn unreadable(path: &Path, error: &io::Error) -> Self {
+        let number = error.raw_os_error().and_then(|code| u32::try_from(code).ok());
+        let what = format!("{}: cannot be read: {error}", path.display());
+        Self { exit: Exit::File, number, what, left: None, advice: None }
+    }
+
+    /// A fault in a line of a file, other than firmware.
+    pub(super) fn line(path: &Path, line: usize, why: &str) -> Self {
+        let what = format!("{}, line {line}: {why}", path.display());
+        Self { exit: Exit::File, number: None, what, left: None, advice: None }
+    }
+
     pub(super) fn system(what: String) -> Self {
         Self { exit: Exit::System, number: None, what, left: None, advice: None }
+    }
+
+    /// A device that was reset and has not come back.
+    pub(super) fn no_boot_up(node: NodeId) -> Self {
+        let advice = "check that node-ID and bit rate are right; a device with a new node-ID comes back under that one";
+        let what = format!("node {node} has sent no boot-up message");
+        let advice = Some(advice.to_string());
+        Self { exit: Exit::NoAnswer, number: Some(0x6000_0013), what, left: None, advice }
     }
 
     /// A conversion of `file` that failed.
@@ -208,13 +244,14 @@ impl From<Error> for Failure {
             Error::Adapter(AdapterError::Url { .. }) => Exit::Usage,
             Error::Adapter(_) => Exit::Adapter,
             Error::Cancelled => Exit::Cancelled,
-            Error::NoAnswer { .. } => Exit::NoAnswer,
+            Error::NoAnswer { .. } | Error::Lss { failure: LssFailure::NoAnswer, .. } => Exit::NoAnswer,
             Error::Refused { .. }
             | Error::Protocol { .. }
             | Error::Failed { .. }
             | Error::Busy { .. }
             | Error::WrongCrc { .. }
-            | Error::WrongTarget { .. } => Exit::Device,
+            | Error::WrongTarget { .. }
+            | Error::Lss { .. } => Exit::Device,
             Error::NoBootloader { .. } | Error::StartFailed { .. } => Exit::NoStart,
         };
         Self {

@@ -24,6 +24,22 @@ pub(super) fn node_id(text: &str) -> Result<NodeId, String> {
     u8::try_from(number).ok().and_then(NodeId::new).ok_or_else(|| "node-IDs are 1 to 127".to_string())
 }
 
+/// Node-IDs and ranges of them: `1,5,9-12`. Each appears once, in the order given.
+pub(super) fn nodes(text: &str) -> Result<Vec<NodeId>, String> {
+    let mut nodes = Vec::new();
+    for part in text.split(',') {
+        let (first, last) = part.split_once('-').unwrap_or((part, part));
+        let (first, last) = (node_id(first.trim())?, node_id(last.trim())?);
+        if first > last {
+            return Err(format!("the range {part} ends before it starts"));
+        }
+        let range = (first.get()..=last.get()).filter_map(NodeId::new);
+        let new: Vec<NodeId> = range.filter(|node| !nodes.contains(node)).collect();
+        nodes.extend(new);
+    }
+    Ok(nodes)
+}
+
 /// A program number: 1 to 254, the sub-indices of 1F50h.
 pub(super) fn program_number(text: &str) -> Result<u8, String> {
     match u8::try_from(number(text)?) {
@@ -74,6 +90,17 @@ mod tests {
             "0xUL",
         ] {
             assert!(number(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn nodes_are_a_list_with_ranges() {
+        let numbers = |text| nodes(text).map(|nodes| nodes.into_iter().map(NodeId::get).collect::<Vec<_>>());
+        assert_eq!(numbers("1,5,9-12").unwrap(), [1, 5, 9, 10, 11, 12]);
+        assert_eq!(numbers("5, 0x7F,4-6").unwrap(), [5, 127, 4, 6]);
+        assert_eq!(numbers("1-127").unwrap().len(), 127);
+        for text in ["", ",", "1,", "0", "128", "5-4", "1-", "-1", "1-128", "1-2-3", "a"] {
+            assert!(numbers(text).is_err(), "{text}");
         }
     }
 

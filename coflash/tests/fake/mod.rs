@@ -48,6 +48,7 @@ pub enum Blocks {
 type Script<T> = Box<dyn FnMut(T) -> Outcome + Send>;
 
 pub struct Fake {
+    pub node: u8,
     pub now: Duration,
     /// What runs: device type; `None` while it restarts or is absent.
     pub running: Option<u32>,
@@ -106,6 +107,7 @@ struct Download {
 impl Fake {
     pub fn new(running: u32) -> Self {
         Self {
+            node: NODE,
             now: Duration::from_secs(1000),
             running: Some(running),
             restart: None,
@@ -150,7 +152,7 @@ impl Fake {
 
     fn answer(&mut self, data: [u8; 8]) {
         self.outbox.extend(self.noise.iter().map(|frame| (self.now, *frame)));
-        let id = CobId::new(0x580 + u16::from(NODE)).unwrap();
+        let id = CobId::new(0x580 + u16::from(self.node)).unwrap();
         self.outbox.push_back((self.now + self.latency, Frame::of(id, &data)));
     }
 
@@ -161,6 +163,11 @@ impl Fake {
 
     fn busy(&self) -> bool {
         self.now < self.busy_until
+    }
+
+    /// What 1F57h reads from now on.
+    pub fn status(&mut self, word: u32) {
+        self.status = word;
     }
 
     /// A frame that is on the bus already.
@@ -177,10 +184,17 @@ impl Fake {
         if let Some((at, next)) = self.restart.filter(|(at, _)| *at <= self.now) {
             (self.restart, self.running) = (None, next);
             if next.is_some() {
-                let id = CobId::new(0x700 + u16::from(NODE)).unwrap();
+                let id = CobId::new(0x700 + u16::from(self.node)).unwrap();
                 self.outbox.push_back((at, Frame::of(id, &[0])));
             }
         }
+    }
+
+    /// When it has something to say, `until` at the latest.
+    fn next_at(&self, until: Duration) -> Option<Duration> {
+        let frame = self.outbox.front().map(|(at, _)| (*at).max(self.now));
+        let boot_up = self.restart.filter(|(_, next)| next.is_some()).map(|(at, _)| at.max(self.now));
+        [frame, boot_up].into_iter().flatten().min().filter(|at| *at <= until)
     }
 
     fn restart_into(&mut self, next: Option<u32>) {
@@ -314,6 +328,11 @@ impl Fake {
                     Blocks::Ignored => {}
                 }
             }
+            // Initiate block upload: a server may answer it without blocks (CiA 301, 7.2.4.3.15).
+            0xA4 if matches!(self.knows_blocks, Blocks::Known(_)) => {
+                self.request([0x40, bytes[1], bytes[2], bytes[3], 0, 0, 0, 0]);
+            }
+            0xA4 => self.abort(at, 0x0504_0001),
             0x80 => {
                 self.log.push(format!("abort {word:08X}"));
                 (self.download, self.upload) = (None, None);
@@ -406,7 +425,7 @@ impl Fake {
                 next => self.restart_into(next),
             },
             (0x1F51, 0x80) if !in_bootloader => self.restart_into(Some(BOOTLOADER)),
-            (0x1F51, 0x80) => {}
+            (0x1F51, 0x80 | 0x84 | 0x02) => {}
             other => panic!("unexpected write {other:X?}"),
         }
     }
@@ -446,7 +465,16 @@ impl Adapter for Fake {
         }
         self.frames_left -= 1;
         self.sent.push(*frame);
-        let request = frame.cob_id() == CobId::new(0x600 + u16::from(NODE));
+        if frame.cob_id() == CobId::new(0) && self.running.is_some() {
+            match frame.exactly().copied() {
+                Some([command @ (0x81 | 0x82), node]) if node == 0 || node == self.node => {
+                    self.log.push(format!("nmt {command:02X}"));
+                    self.restart_into(self.running);
+                }
+                _ => {}
+            }
+        }
+        let request = frame.cob_id() == CobId::new(0x600 + u16::from(self.node));
         let hears = self.running.is_some() && !(self.deaf_while_busy && self.busy());
         match frame.exactly() {
             Some(bytes) if request && hears => self.request(*bytes),
@@ -479,5 +507,37 @@ impl Adapter for Fake {
 
     fn now(&self) -> Duration {
         self.now
+    }
+}
+
+/// Several devices on one bus.
+pub struct Bus(pub Vec<Fake>);
+
+impl Adapter for Bus {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        // The frame takes its time once; then all hear it at the same time.
+        self.0.iter_mut().try_for_each(|fake| fake.send(frame))
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        let until = self.now() + timeout;
+        // The device with the earliest news speaks first; the others' clocks follow.
+        let next = (0..self.0.len()).filter_map(|at| self.0[at].next_at(until).map(|when| (when, at))).min();
+        let (when, frame) = match next {
+            Some((when, at)) => {
+                let fake = &mut self.0[at];
+                (when, fake.receive(when.saturating_sub(fake.now))?)
+            }
+            None => (until, None),
+        };
+        for fake in &mut self.0 {
+            fake.now = fake.now.max(when);
+            fake.tick();
+        }
+        Ok(frame)
+    }
+
+    fn now(&self) -> Duration {
+        self.0.iter().map(|fake| fake.now).max().unwrap_or_default()
     }
 }

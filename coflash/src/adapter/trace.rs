@@ -1,0 +1,71 @@
+//! Writes down what goes over a bus, as `candump -L` does.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::Path;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use canopen::Frame;
+
+use super::{Adapter, AdapterError};
+use crate::candump::Line;
+
+/// An adapter whose frames, sent and received, are written to a file.
+pub struct Trace<A> {
+    adapter: A,
+    file: BufWriter<File>,
+    /// The wall clock at the adapter's origin of time.
+    origin: Duration,
+    /// Why writing failed, once it has: the bus goes on without it.
+    pub failed: Option<std::io::Error>,
+}
+
+impl<A> std::fmt::Debug for Trace<A> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Trace").field("origin", &self.origin).finish_non_exhaustive()
+    }
+}
+
+impl<A: Adapter> Trace<A> {
+    /// Writes what goes over `adapter` to `path`, which is overwritten.
+    ///
+    /// # Errors
+    /// [`AdapterError::Open`] where the file cannot be made.
+    pub fn new(adapter: A, path: &Path) -> Result<Self, AdapterError> {
+        let file = File::create(path).map_err(|source| AdapterError::Open {
+            adapter: format!("trace file {}", path.display()),
+            source,
+        })?;
+        let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let origin = wall.saturating_sub(adapter.now());
+        Ok(Self { adapter, file: BufWriter::new(file), origin, failed: None })
+    }
+
+    fn note(&mut self, frame: &Frame) {
+        let time = self.origin + self.adapter.now();
+        let line = Line { time, interface: "can0".to_string(), frame: *frame };
+        if let Err(error) = writeln!(self.file, "{line}") {
+            self.failed.get_or_insert(error);
+        }
+    }
+}
+
+impl<A: Adapter> Adapter for Trace<A> {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        self.adapter.send(frame)?;
+        self.note(frame);
+        Ok(())
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        let frame = self.adapter.receive(timeout)?;
+        if let Some(frame) = &frame {
+            self.note(frame);
+        }
+        Ok(frame)
+    }
+
+    fn now(&self) -> Duration {
+        self.adapter.now()
+    }
+}

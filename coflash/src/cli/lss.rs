@@ -1,0 +1,320 @@
+//! `coflash lss`: node-ID and bit rate over the bus.
+
+use std::time::Duration;
+
+use canopen::nmt::NmtCommand;
+use canopen::NodeId;
+use clap::{Args, Subcommand};
+use coflash::adapter::Adapter;
+use coflash::lss::{BitRate, LssAddress, Master};
+use coflash::Error;
+use serde_json::{json, Value};
+
+use super::device::cancelled;
+use super::output::Failure;
+use super::values::{milliseconds, node_id, number};
+use super::Context;
+
+/// Layer setting services: node-ID and bit rate over the bus.
+///
+/// There must be no other LSS master on the bus.
+#[derive(Debug, Args)]
+pub(super) struct Lss {
+    #[command(subcommand)]
+    service: Service,
+
+    /// How long a device may take for its answer, in milliseconds. Fastscan takes up to 128 times as long.
+    #[arg(long, global = true, default_value = "100", value_parser = milliseconds, value_name = "MS")]
+    lss_timeout: Duration,
+}
+
+#[derive(Debug, Subcommand)]
+enum Service {
+    /// Find devices without node-ID, and give them one if asked to.
+    Fastscan(Fastscan),
+    /// Give a device a node-ID.
+    Assign(Assign),
+    /// Give a device a bit rate.
+    BitRate(SetBitRate),
+    /// Have a device store its node-ID and bit rate.
+    Store(Store),
+    /// Ask a device for its LSS address and node-ID.
+    Inquire(Inquire),
+}
+
+/// Which device. Without any of these: the only one on the bus.
+#[derive(Clone, Copy, Debug, Args)]
+struct Which {
+    /// Its vendor-ID (1018h/1).
+    #[arg(long, value_parser = number, value_name = "NUMBER", requires_all = ["product", "revision", "serial"])]
+    vendor: Option<u32>,
+    /// Its product code (1018h/2).
+    #[arg(long, alias = "pcode", value_parser = number, value_name = "NUMBER", requires = "vendor")]
+    product: Option<u32>,
+    /// Its revision (1018h/3).
+    #[arg(long, alias = "rev", value_parser = number, value_name = "NUMBER", requires = "vendor")]
+    revision: Option<u32>,
+    /// Its serial number (1018h/4).
+    #[arg(long, alias = "ser_num", value_parser = number, value_name = "NUMBER", requires = "vendor")]
+    serial: Option<u32>,
+}
+
+#[derive(Debug, Args)]
+struct Fastscan {
+    /// Give the devices node-IDs, from this one on upwards, in the order in which they are found.
+    #[arg(long, value_parser = node_id, value_name = "1..127")]
+    assign: Option<NodeId>,
+
+    /// Have them store it.
+    #[arg(long, requires = "assign")]
+    store: bool,
+}
+
+#[derive(Debug, Args)]
+struct Assign {
+    /// The node-ID to give.
+    #[arg(long, short = 'N', alias = "node_id", value_parser = node_id, value_name = "1..127", required_unless_present = "none")]
+    node: Option<NodeId>,
+
+    /// Take the node-ID away.
+    #[arg(long, conflicts_with = "node")]
+    none: bool,
+
+    /// Have it stored.
+    #[arg(long)]
+    store: bool,
+
+    /// Reset the communication of a device that had another node-ID, so that the new one comes into force at once.
+    #[arg(long)]
+    reset: bool,
+
+    #[command(flatten)]
+    which: Which,
+}
+
+#[derive(Debug, Args)]
+struct SetBitRate {
+    /// The bit rate in kbit/s: 1000, 800, 500, 250, 125, 100, 50, 20 or 10.
+    #[arg(value_name = "KBITS", value_parser = bit_rate)]
+    rate: BitRate,
+
+    /// Change over now, after so many milliseconds of silence; the adapter's own bit rate has to follow.
+    #[arg(long, value_name = "MS", value_parser = milliseconds, num_args = 0..=1, default_missing_value = "500")]
+    activate: Option<Duration>,
+
+    /// Have it stored.
+    #[arg(long)]
+    store: bool,
+
+    #[command(flatten)]
+    which: Which,
+}
+
+#[derive(Debug, Args)]
+struct Store {
+    #[command(flatten)]
+    which: Which,
+}
+
+#[derive(Debug, Args)]
+struct Inquire {
+    #[command(flatten)]
+    which: Which,
+}
+
+impl Which {
+    /// The address, where all of it was given (clap has seen to "all or nothing").
+    fn address(self) -> Option<LssAddress> {
+        Some(LssAddress {
+            vendor_id: self.vendor?,
+            product_code: self.product?,
+            revision: self.revision?,
+            serial_number: self.serial?,
+        })
+    }
+
+    /// Switches the device into configuration state.
+    fn select(self, master: &mut Master<'_>) -> Result<(), Error> {
+        master.switch_all(false)?;
+        match self.address() {
+            Some(address) => master.select(&address),
+            None => master.switch_all(true),
+        }
+    }
+}
+
+impl Lss {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        let mut adapter = context.open()?;
+        let done = {
+            let mut master = self.master(&mut *adapter)?;
+            let done = match &self.service {
+                Service::Fastscan(fastscan) => fastscan.run(&mut master, context),
+                Service::Assign(assign) => assign.run(&mut master),
+                Service::BitRate(rate) => rate.run(&mut master),
+                Service::Store(store) => {
+                    store.which.select(&mut master).and_then(|()| master.store()).map(|()| Done {
+                        words: "node-ID and bit rate are stored".to_string(),
+                        ..Done::default()
+                    })
+                }
+                Service::Inquire(inquire) => inquire.run(&mut master),
+            };
+            // A device that was activated has fallen silent and is waiting already.
+            let back = master.switch_all(false);
+            let done = done?;
+            back?;
+            done
+        };
+        if let Some(node) = done.reset {
+            adapter.send(&NmtCommand::ResetCommunication.emit(Some(node)))?;
+        }
+        context.out.result(done.words, || {
+            let mut value = done.value;
+            value["command"] = "lss".into();
+            value
+        });
+        Ok(())
+    }
+
+    fn master<'a>(&self, adapter: &'a mut dyn Adapter) -> Result<Master<'a>, Failure> {
+        let mut master = Master::new(adapter, self.lss_timeout);
+        master.cancel_by(cancelled()?);
+        Ok(master)
+    }
+}
+
+/// What a service has to tell.
+struct Done {
+    words: String,
+    value: Value,
+    /// Whose communication is to be reset.
+    reset: Option<NodeId>,
+}
+
+impl Default for Done {
+    fn default() -> Self {
+        Self { words: String::new(), value: json!({}), reset: None }
+    }
+}
+
+impl Fastscan {
+    fn run(&self, master: &mut Master<'_>, context: &Context) -> Result<Done, Error> {
+        let mut words = Vec::new();
+        let mut devices = Vec::new();
+        let mut next = self.assign;
+        master.switch_all(false)?;
+        while let Some(address) = master.fastscan(&mut |_| {})? {
+            let mut line = shown(&address);
+            let mut device = value(&address);
+            let node = next;
+            if let Some(node) = node {
+                master.set_node_id(Some(node))?;
+                if self.store {
+                    master.store()?;
+                }
+                line = format!("{line}: node {node} from now on");
+                device["node"] = node.get().into();
+                next = NodeId::new(node.get() + 1);
+            }
+            context.out.detail(&line);
+            words.push(line);
+            devices.push(device);
+            // It takes its node-ID, and boots. One that gets none would be found again.
+            master.switch_all(false)?;
+            if next.is_none() {
+                break;
+            }
+        }
+        if words.is_empty() {
+            words.push("no device without node-ID".to_string());
+        }
+        Ok(Done { words: words.join("\n"), value: json!({ "devices": devices }), reset: None })
+    }
+}
+
+impl Assign {
+    fn run(&self, master: &mut Master<'_>) -> Result<Done, Error> {
+        self.which.select(master)?;
+        let old = master.inquire_node_id()?;
+        master.set_node_id(self.node)?;
+        if self.store {
+            master.store()?;
+        }
+        let given = match self.node {
+            Some(node) => format!("the device has node-ID {node}"),
+            None => "the device has no node-ID".to_string(),
+        };
+        let reset = old.filter(|old| self.reset && Some(*old) != self.node);
+        let when = match old {
+            Some(old) if self.node == Some(old) => ", as before".to_string(),
+            None => " from now on".to_string(),
+            Some(_) if reset.is_some() => " from now on".to_string(),
+            Some(old) => format!(", in force after coflash reset --communication --node {old}"),
+        };
+        let value = json!({ "node": self.node.map(NodeId::get), "old": old.map(NodeId::get) });
+        Ok(Done { words: format!("{given}{when}"), value, reset })
+    }
+}
+
+impl SetBitRate {
+    fn run(&self, master: &mut Master<'_>) -> Result<Done, Error> {
+        self.which.select(master)?;
+        master.set_bit_rate(self.rate)?;
+        if self.store {
+            master.store()?;
+        }
+        let rate = self.rate.bits_per_second().unwrap_or_default();
+        let when = match self.activate {
+            Some(delay) => {
+                master.activate(delay)?;
+                format!("changes over after {} ms", delay.as_millis())
+            }
+            None if self.store => "changes over with its next start".to_string(),
+            None => "was not told to change over".to_string(),
+        };
+        let words = format!("the device is given {} kbit/s and {when}", rate / 1000);
+        Ok(Done {
+            words,
+            value: json!({ "bit_rate": rate, "activated": self.activate.is_some() }),
+            reset: None,
+        })
+    }
+}
+
+impl Inquire {
+    fn run(&self, master: &mut Master<'_>) -> Result<Done, Error> {
+        self.which.select(master)?;
+        let address = master.inquire_address()?;
+        let node = master.inquire_node_id()?;
+        let words = match node {
+            Some(node) => format!("{}: node {node}", shown(&address)),
+            None => format!("{}: no node-ID", shown(&address)),
+        };
+        let mut value = value(&address);
+        value["node"] = node.map(NodeId::get).into();
+        Ok(Done { words, value, reset: None })
+    }
+}
+
+fn shown(address: &LssAddress) -> String {
+    let LssAddress { vendor_id, product_code, revision, serial_number } = address;
+    format!("vendor {vendor_id:08X}h, product {product_code:08X}h, revision {revision:08X}h, serial {serial_number:08X}h")
+}
+
+fn value(address: &LssAddress) -> Value {
+    json!({
+        "vendor_id": address.vendor_id,
+        "product_code": address.product_code,
+        "revision": address.revision,
+        "serial_number": address.serial_number,
+    })
+}
+
+fn bit_rate(text: &str) -> Result<BitRate, String> {
+    let rate = number(text)?.checked_mul(1000);
+    (0..=8)
+        .filter_map(BitRate::from_index)
+        .find(|known| known.bits_per_second() == rate)
+        .ok_or_else(|| "LSS knows 1000, 800, 500, 250, 125, 100, 50, 20 and 10 kbit/s".to_string())
+}

@@ -1,0 +1,167 @@
+//! `coflash start`, `enter`, `erase`, `sign`, `unsign` and `status`: the single steps of an update.
+
+use clap::Args;
+use coflash::flash::{call_back, enter_bootloader, erase, find, reset_status, sign, start, unsign, Event};
+use coflash::info::{program_info, ProgramInfo};
+use coflash::session::Session;
+use coflash::Error;
+use serde_json::{json, Value};
+
+use super::device::Program;
+use super::info::status;
+use super::output::Failure;
+use super::Context;
+
+/// Starts the program, and waits until it answers.
+#[derive(Debug, Args)]
+pub(super) struct Start {
+    #[command(flatten)]
+    program: Program,
+}
+
+/// Calls the application back to the bootloader, and waits until that answers.
+#[derive(Debug, Args)]
+pub(super) struct Enter {
+    #[command(flatten)]
+    program: Program,
+}
+
+/// Erases the program. A running application is called back to the bootloader first.
+#[derive(Debug, Args)]
+pub(super) struct Erase {
+    #[command(flatten)]
+    program: Program,
+}
+
+/// Signs the program, so that it starts by itself.
+#[derive(Debug, Args)]
+pub(super) struct Sign {
+    #[command(flatten)]
+    program: Program,
+}
+
+/// Takes the program's signature away, so that the device stays in the bootloader after a reset.
+#[derive(Debug, Args)]
+pub(super) struct Unsign {
+    #[command(flatten)]
+    program: Program,
+}
+
+/// Shows a program's state, CRC and flash status (1F51h, 1F56h, 1F57h).
+#[derive(Debug, Args)]
+pub(super) struct Status {
+    #[command(flatten)]
+    program: Program,
+
+    /// Set the flash status back to "no error" first.
+    #[arg(long)]
+    clear: bool,
+}
+
+/// Does something with one program of one device, and tells the outcome.
+fn with(
+    context: &Context,
+    command: &str,
+    program: &Program,
+    act: impl FnOnce(&mut Session<'_>, u8, &mut dyn FnMut(Event)) -> Result<(String, Value), Error>,
+) -> Result<(), Failure> {
+    let mut adapter = context.open()?;
+    let mut session = program.device.session(&mut *adapter)?;
+    let (words, more) = act(&mut session, program.program, &mut |event| context.out.detail(event))?;
+    let node = session.node();
+    context.out.result(format_args!("node {node}: {words}"), || {
+        let mut value = json!({ "command": command, "node": node.get(), "program": program.program });
+        if let (Some(value), Value::Object(more)) = (value.as_object_mut(), more) {
+            value.extend(more);
+        }
+        value
+    });
+    Ok(())
+}
+
+impl Start {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        with(context, "start", &self.program, |session, number, tell| {
+            let running = find(session)?;
+            tell(Event::Found(running));
+            if !running.is_bootloader() {
+                return Ok((format!("{running} is running already"), json!({ "running": running.0 })));
+            }
+            let running = start(session, number)?;
+            Ok((format!("{running} is running"), json!({ "running": running.0 })))
+        })
+    }
+}
+
+impl Enter {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        with(context, "enter", &self.program, |session, number, tell| {
+            let running = find(session)?;
+            tell(Event::Found(running));
+            let words = if running.is_bootloader() {
+                "the bootloader is running already"
+            } else {
+                call_back(session, number)?;
+                "the bootloader is running"
+            };
+            Ok((words.to_string(), json!({})))
+        })
+    }
+}
+
+impl Erase {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        with(context, "erase", &self.program, |session, number, tell| {
+            enter_bootloader(session, number, tell)?;
+            let began = session.now();
+            erase(session, number, tell)?;
+            let seconds = session.now().saturating_sub(began).as_secs_f64();
+            Ok((format!("program {number} is erased, in {seconds:.1} s"), json!({ "seconds": seconds })))
+        })
+    }
+}
+
+impl Sign {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        with(context, "sign", &self.program, |session, number, tell| {
+            sign(session, number, tell)?;
+            Ok((format!("program {number} is signed: it starts by itself from now on"), json!({})))
+        })
+    }
+}
+
+impl Unsign {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        with(context, "unsign", &self.program, |session, number, _| {
+            unsign(session, number)?;
+            let words =
+                format!("program {number} is not signed any more: the device stays in the bootloader");
+            Ok((words, json!({})))
+        })
+    }
+}
+
+impl Status {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        with(context, "status", &self.program, |session, number, tell| {
+            let running = find(session)?;
+            tell(Event::Found(running));
+            if self.clear {
+                reset_status(session, number)?;
+            }
+            let info = program_info(session, number)?;
+            let value = json!({
+                "device_type": running.0,
+                "bootloader": running.is_bootloader(),
+                "control": info.control,
+                "crc": info.crc,
+                "status": info.status.map(status),
+            });
+            Ok((format!("{running}\n{}", info_words(&info)), value))
+        })
+    }
+}
+
+fn info_words(info: &ProgramInfo) -> String {
+    info.to_string().trim_end().to_string()
+}

@@ -1,0 +1,69 @@
+//! `coflash reset`: NMT reset node or reset communication.
+
+use std::time::Duration;
+
+use canopen::nmt::{parse_state_message, NmtCommand, NmtState};
+use canopen::NodeId;
+use clap::Args;
+use coflash::scan::hear;
+use serde_json::json;
+
+use super::device::cancelled;
+use super::output::Failure;
+use super::values::{milliseconds, node_id};
+use super::Context;
+
+/// Resets a device, or all of them, and shows who comes back.
+///
+/// After a reset a device starts its program if that is signed and its autostart is on.
+#[derive(Debug, Args)]
+pub(super) struct Reset {
+    /// The device's node-ID.
+    #[arg(long, short = 'N', alias = "node_id", value_parser = node_id, value_name = "1..127", required_unless_present = "all")]
+    node: Option<NodeId>,
+
+    /// All devices of the bus.
+    #[arg(long, conflicts_with = "node")]
+    all: bool,
+
+    /// Reset the communication alone: a new node-ID comes into force.
+    #[arg(long)]
+    communication: bool,
+
+    /// How long to wait for boot-up messages, in milliseconds.
+    #[arg(long, default_value = "2000", value_parser = milliseconds, value_name = "MS")]
+    boot_timeout: Duration,
+}
+
+impl Reset {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        let command = if self.communication { NmtCommand::ResetCommunication } else { NmtCommand::ResetNode };
+        let mut adapter = context.open()?;
+        adapter.send(&command.emit(self.node))?;
+        let mut back: Vec<NodeId> = Vec::new();
+        hear(&mut *adapter, self.boot_timeout, &cancelled()?, &mut |frame| {
+            if let Some((node, NmtState::Initialisation)) = parse_state_message(frame) {
+                if !back.contains(&node) {
+                    back.push(node);
+                }
+            }
+            // With a new node-ID it comes back as another one: only the one that was reset ends the waiting.
+            self.node.is_some_and(|node| back.contains(&node))
+        })?;
+        let words = match back.as_slice() {
+            [] => "nobody has sent a boot-up message".to_string(),
+            nodes => {
+                let nodes: Vec<String> = nodes.iter().map(NodeId::to_string).collect();
+                format!("back on the bus: node {}", nodes.join(", "))
+            }
+        };
+        context.out.result(words, || {
+            let back: Vec<u8> = back.iter().map(|node| node.get()).collect();
+            json!({ "command": "reset", "node": self.node.map(NodeId::get), "booted": back })
+        });
+        match self.node {
+            Some(node) if back.is_empty() => Err(Failure::no_boot_up(node)),
+            _ => Ok(()),
+        }
+    }
+}

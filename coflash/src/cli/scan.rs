@@ -1,0 +1,108 @@
+//! `coflash scan`: who is on the bus.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use canopen::NodeId;
+use clap::Args;
+use coflash::decode::state_words;
+use coflash::scan::{scan, Found, ScanOptions};
+use coflash::session::Timing;
+use serde_json::{json, Value};
+
+use super::device::cancelled;
+use super::output::Failure;
+use super::values::{milliseconds, nodes};
+use super::{info, Context};
+
+/// Shows who is on the bus: asks all node-IDs by SDO, and listens for heartbeats.
+///
+/// A question disturbs an SDO transfer that another tool has under way with the same node; --listen-only asks nothing.
+#[derive(Debug, Args)]
+pub(super) struct Scan {
+    /// Whom to ask: node-IDs and ranges, like 1,5,9-12.
+    #[arg(long, short = 'N', alias = "node", value_parser = nodes, value_name = "NODES", default_value = "1-127")]
+    nodes: Vec<Vec<NodeId>>,
+
+    /// How long to listen, in milliseconds.
+    #[arg(long, value_parser = milliseconds, value_name = "MS", default_value = "1100")]
+    listen: Duration,
+
+    /// Ask nothing.
+    #[arg(long)]
+    listen_only: bool,
+
+    /// How long the answer to one request may take, in milliseconds.
+    #[arg(long, alias = "sdo_timeout", default_value = "500", value_parser = milliseconds, value_name = "MS")]
+    sdo_timeout: Duration,
+}
+
+impl Scan {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        let options = ScanOptions {
+            nodes: self.nodes.concat(),
+            listen: self.listen,
+            timing: Timing { sdo: self.sdo_timeout, ..Timing::default() },
+            ask: !self.listen_only,
+        };
+        let mut adapter = context.open()?;
+        context.out.detail("asking and listening");
+        let found = scan(&mut *adapter, &options, &cancelled()?)?;
+        context.out.result(Table(&found), || json!({ "command": "scan", "nodes": values(&found) }));
+        Ok(())
+    }
+}
+
+/// A line for each node.
+struct Table<'f>(&'f BTreeMap<NodeId, Found>);
+
+impl std::fmt::Display for Table<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        if self.0.is_empty() {
+            return f.write_str(
+                "nobody answers, and nobody is heard (coflash lss fastscan finds devices without node-ID)",
+            );
+        }
+        writeln!(
+            f,
+            "node  runs         name                 software      serial     program 1       heartbeat"
+        )?;
+        for (node, found) in self.0 {
+            let state = found.state.map_or("-", state_words);
+            let Some(info) = &found.info else {
+                writeln!(f, "{:>4}  no answer by SDO{:63}{state}", node.get(), "")?;
+                continue;
+            };
+            let text = |text: &Option<String>| text.clone().unwrap_or_else(|| "-".to_string());
+            let runs = if info.device_type.is_bootloader() { "bootloader" } else { "application" };
+            let serial = info.identity[3].map_or("-".to_string(), |serial| format!("{serial:08X}h"));
+            let program = match info.programs.first().and_then(|program| program.status) {
+                None => "-".to_string(),
+                Some(status) if status.busy => "busy".to_string(),
+                Some(status) => {
+                    status.error.map_or("ok".to_string(), |error| format!("error {:02X}h", error.code()))
+                }
+            };
+            writeln!(
+                f,
+                "{:>4}  {runs:<11}  {:<19}  {:<12}  {serial:<9}  {program:<14}  {state}",
+                node.get(),
+                text(&info.name),
+                text(&info.software_version),
+            )?;
+        }
+        Ok(())
+    }
+}
+
+fn values(found: &BTreeMap<NodeId, Found>) -> Vec<Value> {
+    let value = |(node, found): (&NodeId, &Found)| {
+        json!({
+            "node": node.get(),
+            "state": found.state.map(state_words),
+            "answers": found.info.is_some(),
+            "info": found.info.as_ref().map(info::value),
+        })
+    };
+    found.iter().map(value).collect()
+}

@@ -1,0 +1,134 @@
+//! `coflash shell`: one command after the other.
+
+use std::io::IsTerminal;
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+
+use clap::{Args, Parser};
+use rustyline::error::ReadlineError;
+use rustyline::DefaultEditor;
+
+use super::device::cancelled;
+use super::output::Failure;
+use super::{Cli, Command, Context};
+
+/// Reads commands from the keyboard, with history; or from standard input, one a line.
+///
+/// What was said on the command line (--bus, --json and so on) holds for all of them. `exit` or Ctrl-D ends it. From
+/// standard input the first command that fails ends it.
+#[derive(Debug, Args)]
+pub(super) struct Shell {}
+
+impl Shell {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        let interactive = std::io::stdin().is_terminal();
+        let history = interactive.then(history_file).flatten();
+        let mut editor =
+            DefaultEditor::new().map_err(|error| Failure::system(format!("no line editor: {error}")))?;
+        if let Some(history) = &history {
+            // The first time there is none.
+            let _ = editor.load_history(history);
+        }
+        loop {
+            let line = match editor.readline(if interactive { "coflash> " } else { "" }) {
+                Ok(line) => line,
+                Err(ReadlineError::Interrupted) => continue,
+                Err(ReadlineError::Eof) => break,
+                Err(error) => return Err(Failure::system(format!("standard input cannot be read: {error}"))),
+            };
+            let words = split(&line)?;
+            match words.first().map(String::as_str) {
+                None => continue,
+                Some("exit" | "quit") => break,
+                Some(word) if word.starts_with('#') => continue,
+                Some(_) => {}
+            }
+            if interactive {
+                let _ = editor.add_history_entry(&line);
+            }
+            cancelled()?.store(false, Ordering::Relaxed);
+            match (command(context, words), interactive) {
+                (Ok(()), _) => {}
+                (Err(failure), true) => context.out.failure(&failure),
+                (Err(failure), false) => return Err(failure),
+            }
+        }
+        if let Some(history) = history {
+            if let Err(error) = editor.save_history(&history) {
+                context.out.detail(format_args!("{}: cannot be written: {error}", history.display()));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Runs one line.
+fn command(context: &Context, words: Vec<String>) -> Result<(), Failure> {
+    let words = std::iter::once("coflash".to_string()).chain(words);
+    let cli = match Cli::try_parse_from(words) {
+        Ok(cli) => cli,
+        Err(error) if !error.use_stderr() => {
+            // Help that was asked for.
+            context.out.say(error.to_string().trim_end());
+            return Ok(());
+        }
+        Err(error) => return Err(Failure::bare_usage(error.to_string())),
+    };
+    if matches!(cli.command, Command::Shell(_)) {
+        return Err(Failure::usage("this is the shell already", "leave the word shell out"));
+    }
+    let line = cli.context();
+    // What the line does not say, the shell's own command line does.
+    let line = Context {
+        bus: line.bus.or_else(|| context.bus.clone()),
+        trace: line.trace.or_else(|| context.trace.clone()),
+        out: line.out.or(context.out),
+    };
+    cli.command.run(&line)
+}
+
+/// Words between blanks; quotes hold blanks together.
+fn split(line: &str) -> Result<Vec<String>, Failure> {
+    let mut words = Vec::new();
+    let mut word: Option<String> = None;
+    let mut quote = None;
+    for letter in line.chars() {
+        match (quote, letter) {
+            (Some(open), letter) if letter == open => quote = None,
+            (Some(_), letter) => word.get_or_insert_default().push(letter),
+            (None, '"' | '\'') => {
+                quote = Some(letter);
+                word.get_or_insert_default();
+            }
+            (None, letter) if letter.is_whitespace() => words.extend(word.take()),
+            (None, letter) => word.get_or_insert_default().push(letter),
+        }
+    }
+    if quote.is_some() {
+        return Err(Failure::usage("a quotation mark is not closed", "close it, or leave it out"));
+    }
+    words.extend(word);
+    Ok(words)
+}
+
+fn history_file() -> Option<PathBuf> {
+    let state = std::env::var_os("XDG_STATE_HOME").map(PathBuf::from);
+    let home = || std::env::home_dir().map(|home| home.join(".local").join("state"));
+    let folder = state.filter(|path| path.is_absolute()).or_else(home)?.join("coflash");
+    std::fs::create_dir_all(&folder).ok()?;
+    Some(folder.join("history"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_is_cut_at_blanks_outside_quotes() {
+        let words = |line| split(line).map_err(|failure| failure.to_string());
+        assert_eq!(words("  flash  'my app.elf' -N 5 ").unwrap(), ["flash", "my app.elf", "-N", "5"]);
+        assert_eq!(words(r#"a"b c"d '' "#).unwrap(), ["ab cd", ""]);
+        assert_eq!(words("").unwrap().len(), 0);
+        assert!(words("flash 'x").unwrap_err().contains("not closed"));
+    }
+}

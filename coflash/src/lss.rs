@@ -1,0 +1,276 @@
+//! Layer setting services, the master's side (CiA 305): node-ID and bit rate over the bus, for devices without switches.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::Arc;
+use std::time::Duration;
+
+pub use canopen::lss::{BitRate, LssAddress};
+use canopen::{CobId, Frame, NodeId};
+
+use crate::adapter::Adapter;
+use crate::error::{Error, LssFailure};
+
+// Command specifiers (CiA 305).
+const SWITCH_GLOBAL: u8 = 0x04;
+const CONFIGURE_NODE_ID: u8 = 0x11;
+const CONFIGURE_BIT_TIMING: u8 = 0x13;
+const ACTIVATE_BIT_TIMING: u8 = 0x15;
+const STORE: u8 = 0x17;
+const SELECT: [u8; 4] = [0x40, 0x41, 0x42, 0x43];
+const SELECTED: u8 = 0x44;
+const IDENTIFIED: u8 = 0x4F;
+const FASTSCAN: u8 = 0x51;
+const INQUIRE: [u8; 4] = [0x5A, 0x5B, 0x5C, 0x5D];
+const INQUIRE_NODE_ID: u8 = 0x5E;
+
+/// Fastscan: "who has no node-ID?".
+const ANYBODY: u8 = 0x80;
+/// The node-ID of a device without one.
+const NO_NODE_ID: u8 = 0xFF;
+
+/// How long a slave may take for its answer, unless told otherwise. Fastscan waits so long for each bit that is set in an
+/// address, so that patience costs time there.
+pub const ANSWER: Duration = Duration::from_millis(100);
+
+/// What the master was about when something went wrong.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LssDoing {
+    /// Addressing a device by its LSS address.
+    Select,
+    /// Asking for the address or the node-ID.
+    Inquire,
+    /// Giving a node-ID.
+    NodeId,
+    /// Giving a bit rate.
+    BitRate,
+    /// Having it stored.
+    Store,
+    /// Searching.
+    Fastscan,
+}
+
+impl LssDoing {
+    /// For people.
+    #[must_use]
+    pub const fn words(self) -> &'static str {
+        match self {
+            Self::Select => "selecting the device by its LSS address",
+            Self::Inquire => "asking for LSS address or node-ID",
+            Self::NodeId => "giving the node-ID",
+            Self::BitRate => "giving the bit rate",
+            Self::Store => "storing node-ID and bit rate",
+            Self::Fastscan => "fastscan",
+        }
+    }
+}
+
+/// The master of the bus. There must not be two.
+pub struct Master<'a> {
+    adapter: &'a mut dyn Adapter,
+    answer: Duration,
+    cancelled: Option<Arc<AtomicBool>>,
+}
+
+impl std::fmt::Debug for Master<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Master").field("answer", &self.answer).finish_non_exhaustive()
+    }
+}
+
+impl<'a> Master<'a> {
+    /// A master that waits so long for an answer ([`ANSWER`]). Nothing is sent yet.
+    pub fn new(adapter: &'a mut dyn Adapter, answer: Duration) -> Self {
+        Self { adapter, answer, cancelled: None }
+    }
+
+    /// Ends with [`Error::Cancelled`] as soon as `flag` is set.
+    pub fn cancel_by(&mut self, flag: Arc<AtomicBool>) {
+        self.cancelled = Some(flag);
+    }
+
+    /// Switches every device that listens into configuration state, or back to waiting. Nobody answers.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn switch_all(&mut self, to_configuration: bool) -> Result<(), Error> {
+        self.send([SWITCH_GLOBAL, u8::from(to_configuration), 0, 0, 0, 0, 0, 0])
+    }
+
+    /// Switches the one device with this address into configuration state.
+    ///
+    /// # Errors
+    /// [`Error::Lss`] where no device answers to the address.
+    pub fn select(&mut self, address: &LssAddress) -> Result<(), Error> {
+        let LssAddress { vendor_id, product_code, revision, serial_number } = *address;
+        let numbers = [vendor_id, product_code, revision, serial_number];
+        self.drain()?;
+        for (command, number) in SELECT.into_iter().zip(numbers) {
+            self.send(with_number(command, number))?;
+        }
+        self.await_answer(SELECTED)?.map(|_| ()).ok_or(no_answer(LssDoing::Select))
+    }
+
+    /// Asks the device in configuration state for its address.
+    ///
+    /// # Errors
+    /// [`Error::Lss`].
+    pub fn inquire_address(&mut self) -> Result<LssAddress, Error> {
+        let mut numbers = [0; 4];
+        for (command, number) in INQUIRE.into_iter().zip(&mut numbers) {
+            let [_, a, b, c, d, ..] =
+                self.ask(with_number(command, 0))?.ok_or(no_answer(LssDoing::Inquire))?;
+            *number = u32::from_le_bytes([a, b, c, d]);
+        }
+        let [vendor_id, product_code, revision, serial_number] = numbers;
+        Ok(LssAddress { vendor_id, product_code, revision, serial_number })
+    }
+
+    /// Asks the device in configuration state for the node-ID that it has in force; `None` where it has none.
+    ///
+    /// # Errors
+    /// [`Error::Lss`].
+    pub fn inquire_node_id(&mut self) -> Result<Option<NodeId>, Error> {
+        let answer = self.ask(with_number(INQUIRE_NODE_ID, 0))?.ok_or(no_answer(LssDoing::Inquire))?;
+        Ok(NodeId::new(answer[1]))
+    }
+
+    /// Gives the device in configuration state a node-ID, or takes it away. A device without one takes it when it is
+    /// switched back to waiting; one that has another needs a reset of its communication.
+    ///
+    /// # Errors
+    /// [`Error::Lss`].
+    pub fn set_node_id(&mut self, node: Option<NodeId>) -> Result<(), Error> {
+        let number = node.map_or(NO_NODE_ID, NodeId::get);
+        self.order([CONFIGURE_NODE_ID, number, 0, 0, 0, 0, 0, 0], LssDoing::NodeId)
+    }
+
+    /// Gives the device in configuration state a bit rate; it comes into force by [`activate`](Self::activate), or with the
+    /// next start when it was stored.
+    ///
+    /// # Errors
+    /// [`Error::Lss`].
+    pub fn set_bit_rate(&mut self, rate: BitRate) -> Result<(), Error> {
+        self.order([CONFIGURE_BIT_TIMING, 0, rate as u8, 0, 0, 0, 0, 0], LssDoing::BitRate)
+    }
+
+    /// Has all devices in configuration state change over to the bit rate that they were given: they fall silent for
+    /// `delay`, change over, and stay silent for as long again. Nobody answers.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn activate(&mut self, delay: Duration) -> Result<(), Error> {
+        let [low, high] = u16::try_from(delay.as_millis()).unwrap_or(u16::MAX).to_le_bytes();
+        self.send([ACTIVATE_BIT_TIMING, low, high, 0, 0, 0, 0, 0])
+    }
+
+    /// Has the device in configuration state store node-ID and bit rate.
+    ///
+    /// # Errors
+    /// [`Error::Lss`].
+    pub fn store(&mut self) -> Result<(), Error> {
+        self.order([STORE, 0, 0, 0, 0, 0, 0, 0], LssDoing::Store)
+    }
+
+    /// Finds one of the devices without a node-ID, bit by bit of its address, and switches it into configuration state;
+    /// `None` where there is no such device. `progress` is told how many of the 128 bits are known.
+    ///
+    /// # Errors
+    /// [`Error::Lss`] where the device has gone in the middle.
+    pub fn fastscan(&mut self, progress: &mut dyn FnMut(u32)) -> Result<Option<LssAddress>, Error> {
+        self.drain()?;
+        if !self.is_there(0, ANYBODY, 0, 0)? {
+            return Ok(None);
+        }
+        let mut numbers = [0; 4];
+        for (part, number) in (0..).zip(&mut numbers) {
+            for bit in (0..32).rev() {
+                // "Do your bits from 31 down to this one read as these?": silence means that this one is set.
+                if !self.is_there(*number, bit, part, part)? {
+                    *number |= 1 << bit;
+                }
+                progress(u32::from(part) * 32 + 32 - u32::from(bit));
+            }
+            // The whole number once more: who has it goes on to the next part, or is found.
+            if !self.is_there(*number, 0, part, (part + 1) % 4)? {
+                return Err(no_answer(LssDoing::Fastscan));
+            }
+        }
+        let [vendor_id, product_code, revision, serial_number] = numbers;
+        Ok(Some(LssAddress { vendor_id, product_code, revision, serial_number }))
+    }
+
+    /// One question of fastscan.
+    fn is_there(&mut self, number: u32, bit: u8, part: u8, next: u8) -> Result<bool, Error> {
+        let [a, b, c, d] = number.to_le_bytes();
+        self.send([FASTSCAN, a, b, c, d, bit, part, next])?;
+        // Several devices may answer, all with the same frame: on the bus that is one. A late one would spoil the next
+        // question, but then the confirmation fails.
+        Ok(self.await_answer(IDENTIFIED)?.is_some())
+    }
+
+    /// Gives an order that is answered with an error code.
+    fn order(&mut self, request: [u8; 8], doing: LssDoing) -> Result<(), Error> {
+        let [_, code, detail, ..] = self.ask(request)?.ok_or(no_answer(doing))?;
+        match code {
+            0 => Ok(()),
+            code => Err(Error::Lss { doing, failure: LssFailure::Refused { code, detail } }),
+        }
+    }
+
+    /// Sends a request and waits for the answer with the same command specifier.
+    fn ask(&mut self, request: [u8; 8]) -> Result<Option<[u8; 8]>, Error> {
+        self.drain()?;
+        self.send(request)?;
+        self.await_answer(request[0])
+    }
+
+    fn send(&mut self, request: [u8; 8]) -> Result<(), Error> {
+        self.check_cancelled()?;
+        Ok(self.adapter.send(&Frame::of(CobId::LSS_REQUEST, &request))?)
+    }
+
+    /// Forgets what came before the question.
+    fn drain(&mut self) -> Result<(), Error> {
+        let mut stale = 0;
+        while stale < 1000 && self.adapter.receive(Duration::ZERO)?.is_some() {
+            stale += 1;
+        }
+        Ok(())
+    }
+
+    fn await_answer(&mut self, command: u8) -> Result<Option<[u8; 8]>, Error> {
+        let deadline = self.adapter.now() + self.answer;
+        loop {
+            self.check_cancelled()?;
+            let left = deadline.saturating_sub(self.adapter.now());
+            if let Some(frame) = self.adapter.receive(left)? {
+                let bytes: Option<&[u8; 8]> = frame.exactly();
+                match bytes {
+                    Some(bytes) if frame.cob_id() == Some(CobId::LSS_RESPONSE) && bytes[0] == command => {
+                        return Ok(Some(*bytes))
+                    }
+                    _ => {}
+                }
+            }
+            if self.adapter.now() >= deadline {
+                return Ok(None);
+            }
+        }
+    }
+
+    fn check_cancelled(&self) -> Result<(), Error> {
+        match &self.cancelled {
+            Some(flag) if flag.load(Ordering::Relaxed) => Err(Error::Cancelled),
+            _ => Ok(()),
+        }
+    }
+}
+
+fn with_number(command: u8, number: u32) -> [u8; 8] {
+    let [a, b, c, d] = number.to_le_bytes();
+    [command, a, b, c, d, 0, 0, 0]
+}
+
+fn no_answer(doing: LssDoing) -> Error {
+    Error::Lss { doing, failure: LssFailure::NoAnswer }
+}

@@ -1,0 +1,136 @@
+//! Who is on the bus.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::Arc;
+use std::time::Duration;
+
+use canopen::nmt::{parse_state_message, NmtState};
+use canopen::program::DEVICE_TYPE;
+use canopen::sdo::wire::Request;
+use canopen::{Address, CobId, Frame, NodeId};
+use embedded_can::Frame as _;
+
+use crate::adapter::Adapter;
+use crate::error::Error;
+use crate::info::{info, DeviceInfo};
+use crate::session::{Session, Timing};
+
+/// A node that was seen or heard.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Found {
+    /// The last boot-up or heartbeat message heard.
+    pub state: Option<NmtState>,
+    /// What it told by SDO, if it answers.
+    pub info: Option<DeviceInfo>,
+}
+
+/// How to search.
+#[derive(Clone, Debug)]
+pub struct ScanOptions {
+    /// Whom to ask.
+    pub nodes: Vec<NodeId>,
+    /// How long to listen to what the bus says by itself; heartbeats come once a second in most networks.
+    pub listen: Duration,
+    /// How long to wait for what.
+    pub timing: Timing,
+    /// Whether to ask at all.
+    pub ask: bool,
+}
+
+impl Default for ScanOptions {
+    fn default() -> Self {
+        Self {
+            nodes: (1..=127).filter_map(NodeId::new).collect(),
+            listen: Duration::from_millis(1100),
+            timing: Timing::default(),
+            ask: true,
+        }
+    }
+}
+
+/// How many nodes are asked at once: each that is there answers, and an adapter must not lose answers.
+const AT_ONCE: usize = 16;
+
+/// Asks all nodes what they are, and listens to what the bus says by itself.
+///
+/// # Errors
+/// [`Error::Adapter`] or [`Error::Cancelled`]; nobody there is no error.
+pub fn scan(
+    adapter: &mut dyn Adapter,
+    options: &ScanOptions,
+    cancelled: &Arc<AtomicBool>,
+) -> Result<BTreeMap<NodeId, Found>, Error> {
+    let mut found: BTreeMap<NodeId, Found> = BTreeMap::new();
+    let mut answered: Vec<NodeId> = Vec::new();
+    if options.ask {
+        let question = Request::InitiateUpload(Address::new(DEVICE_TYPE, 0)).emit();
+        for nodes in options.nodes.chunks(AT_ONCE) {
+            for node in nodes {
+                adapter.send(&Frame::of(CobId::sdo_request(*node), &question))?;
+            }
+            let mut silent: Vec<NodeId> = nodes.to_vec();
+            hear(adapter, options.timing.sdo.min(AT_ONCE_LIMIT), cancelled, &mut |frame| {
+                note_state(&mut found, frame);
+                let answering = silent.iter().position(|node| is_answer(frame, *node));
+                answered.extend(answering.map(|at| silent.remove(at)));
+                silent.is_empty()
+            })?;
+        }
+    }
+    hear(adapter, options.listen, cancelled, &mut |frame| {
+        note_state(&mut found, frame);
+        false
+    })?;
+    for node in answered {
+        let mut session = Session::new(adapter, node, options.timing);
+        session.cancel_by(cancelled.clone());
+        let told = match info(&mut session) {
+            Ok(told) => Some(told),
+            Err(error @ (Error::Adapter(_) | Error::Cancelled)) => return Err(error),
+            // It answered once, so that it is there; what it does not tell is left out.
+            Err(_) => None,
+        };
+        found.entry(node).or_default().info = told;
+    }
+    Ok(found)
+}
+
+/// Nobody on a bus that works takes longer for the first answer.
+const AT_ONCE_LIMIT: Duration = Duration::from_millis(200);
+
+/// Whether the node answers something by SDO, be it an abort.
+fn is_answer(frame: &Frame, node: NodeId) -> bool {
+    frame.cob_id() == Some(CobId::sdo_response(node)) && frame.dlc() == 8
+}
+
+fn note_state(found: &mut BTreeMap<NodeId, Found>, frame: &Frame) {
+    if let Some((node, state)) = parse_state_message(frame) {
+        found.entry(node).or_default().state = Some(state);
+    }
+}
+
+/// Receives for a time, or until it is enough.
+///
+/// # Errors
+/// [`Error::Adapter`] or [`Error::Cancelled`].
+pub fn hear(
+    adapter: &mut dyn Adapter,
+    time: Duration,
+    cancelled: &Arc<AtomicBool>,
+    enough: &mut dyn FnMut(&Frame) -> bool,
+) -> Result<(), Error> {
+    let deadline = adapter.now() + time;
+    while adapter.now() < deadline {
+        if cancelled.load(Ordering::Relaxed) {
+            return Err(Error::Cancelled);
+        }
+        let left = deadline.saturating_sub(adapter.now());
+        if let Some(frame) = adapter.receive(left.min(Duration::from_millis(100)))? {
+            if enough(&frame) {
+                return Ok(());
+            }
+        }
+    }
+    Ok(())
+}
