@@ -1,0 +1,66 @@
+//! python-canopen, unmodified, as the master of a bus with three emulated devices, through the socketcand endpoint.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::{env, fs};
+
+use canopen::{Address, BitRate};
+use coboot_tests::bench::Bench;
+use coboot_tests::endpoint::Endpoint;
+use coboot_tests::firmware;
+use emulator::bus::Outcome;
+
+const NODES: [u8; 3] = [10, 11, 12];
+
+/// The script at work on the endpoint; gives what it said.
+fn master(endpoint: &mut Endpoint, arguments: &[&str]) -> String {
+    let python = env::var_os("COBOOT_PYTHON")
+        .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/master_client.py");
+    let mut command = Command::new(python);
+    command.arg(script).arg(endpoint.address()).args(arguments).args(NODES.map(|node| node.to_string()));
+    let output = endpoint.run(&mut command);
+    let said =
+        format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{said}");
+    said
+}
+
+/// Three devices come without node-ID, are found by fastscan and get node-ID and bit rate; after the power was off they are
+/// a bus at that bit rate, on which one is updated.
+#[test]
+fn python_canopen_commissions_three_devices_and_works_with_them() {
+    let mut bench = Bench::of_boards(3);
+    let boards = bench.boards();
+    let mut serials: Vec<u32> =
+        boards.into_iter().map(|board| bench.commission(board, 0xFF, BitRate::K125)).collect();
+    bench.power_on();
+    let mut endpoint = Endpoint::new(bench);
+    let said = master(&mut endpoint, &["commission"]);
+    // Fastscan finds the lowest number first.
+    serials.sort_unstable();
+    for (node, serial) in NODES.iter().zip(&serials) {
+        let line = format!("found 00000000 4007D151 00010000 {serial:08X}: node-ID {node}");
+        assert!(said.contains(&line), "no {line:?} in:\n{said}");
+    }
+
+    let bench = &mut endpoint.bench;
+    bench.power_off();
+    bench.run_ms(100);
+    bench.set_host_bit_rate(250_000);
+    bench.power_on();
+    bench.run_ms(100);
+    let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("master.blk");
+    fs::write(&path, firmware::blocks(firmware::APP_V1).emit()).unwrap();
+    master(&mut endpoint, &["use", path.to_str().expect("a path of this repository")]);
+
+    let bench = &mut endpoint.bench;
+    for (node, serial) in NODES.iter().zip(&serials) {
+        let mut session = bench.session_with(*node);
+        assert_eq!(session.read_number(Address::new(0x1018, 4)).unwrap(), *serial, "node {node}");
+        let running = session.device_type().unwrap().expect("an answer");
+        assert_eq!(running.is_bootloader(), *node != 12, "node {node}");
+    }
+    assert!(bench.records().iter().all(|record| record.outcome == Outcome::Good), "nobody disturbed anybody");
+    bench.assert_nothing_unmodelled();
+}
