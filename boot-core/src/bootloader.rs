@@ -9,63 +9,114 @@ use canopen::emcy::{self, Emcy};
 #[cfg(feature = "emcy")]
 use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
-use canopen::od::{concat, put, Access, Address, DataType, Entry, Objects};
 #[cfg(feature = "emcy")]
-use canopen::program::{FlashError, FlashStatus};
+use canopen::od::concat;
+use canopen::od::{put, Access, Address, DataType, Entry, Objects};
+#[cfg(feature = "emcy")]
+use canopen::program::FlashError;
 use canopen::program::{
-    ProgramControl, ProgramState, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID,
+    ProgramControl, ProgramState, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID,
 };
 use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, NodeId};
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
-use crate::download::{Downloader, Step};
+use crate::download::{Downloader, Policy, Step};
 use crate::flash::Flash;
 use crate::node::NodeParameters;
 
-/// The program objects of a device with one program (SYS TEC manual L-1112d_10, table 1).
-const PROGRAM_ENTRIES: [Entry; 8] = [
-    Entry::array(PROGRAM_DATA, "Program data", 1),
-    Entry::sub(PROGRAM_DATA, 1, "Program data 1", DataType::Domain, Access::Wo),
-    Entry::array(PROGRAM_CONTROL, "Program control", 1),
-    Entry::sub(PROGRAM_CONTROL, 1, "Program control 1", DataType::Unsigned8, Access::Rw).default(0),
-    Entry::array(PROGRAM_ID, "Program software identification", 1),
-    Entry::sub(PROGRAM_ID, 1, "Program software identification 1", DataType::Unsigned32, Access::Ro),
-    Entry::array(FLASH_STATUS, "Flash status identification", 1),
-    Entry::sub(FLASH_STATUS, 1, "Flash status identification 1", DataType::Unsigned32, Access::Ro).default(0),
+/// The objects of a device with `programs` programs (1 to 254), of which there are [`entry_count`] (SYS TEC manual
+/// L-1112d_10, table 1).
+#[must_use]
+pub const fn entries<const LEN: usize>(programs: u8) -> [Entry; LEN] {
+    let mut entries = [COMMON[0]; LEN];
+    let mut len = 0;
+    while len < COMMON.len() {
+        entries[len] = COMMON[len];
+        len += 1;
+    }
+    let mut object = 0;
+    while object < PROGRAM_OBJECTS.len() {
+        let (array, name, each) = PROGRAM_OBJECTS[object];
+        entries[len] = Entry::array(array, name, programs);
+        len += 1;
+        let mut number = 1;
+        while number <= programs {
+            entries[len] = Entry { at: Address::new(array, number), ..each };
+            len += 1;
+            number += 1;
+        }
+        object += 1;
+    }
+    assert!(len == LEN, "bootloader::entries: the length is not that of entry_count");
+    entries
+}
+
+/// How many entries the object dictionary has.
+#[must_use]
+pub const fn entry_count(programs: u8) -> usize {
+    COMMON.len() + PROGRAM_OBJECTS.len() * (1 + programs as usize)
+}
+
+/// 1F50h, 1F51h, 1F56h, 1F57h: the array, and what each of its elements is.
+const PROGRAM_OBJECTS: [(u16, &str, Entry); 4] = [
+    (
+        PROGRAM_DATA,
+        "Program data",
+        Entry::sub(PROGRAM_DATA, 1, "Program data of a program", DataType::Domain, Access::Wo),
+    ),
+    (
+        PROGRAM_CONTROL,
+        "Program control",
+        Entry::sub(PROGRAM_CONTROL, 1, "Program control of a program", DataType::Unsigned8, Access::Rw)
+            .default(0),
+    ),
+    (
+        PROGRAM_ID,
+        "Program software identification",
+        Entry::sub(PROGRAM_ID, 1, "Identification of a program", DataType::Unsigned32, Access::Ro),
+    ),
+    (
+        FLASH_STATUS,
+        "Flash status identification",
+        Entry::sub(FLASH_STATUS, 1, "Flash status of a program", DataType::Unsigned32, Access::Ro).default(0),
+    ),
 ];
 
-/// The object dictionary of a bootloader with one program.
+/// What does not depend on the programs.
 #[cfg(feature = "emcy")]
-pub static ENTRIES: [Entry; 25] =
-    concat(concat::<11, 6, 17>(device::ENTRIES, emcy::ENTRIES), PROGRAM_ENTRIES);
-/// The object dictionary of a bootloader with one program.
+const COMMON: [Entry; 17] = concat(device::ENTRIES, emcy::ENTRIES);
 #[cfg(not(feature = "emcy"))]
-pub static ENTRIES: [Entry; 19] = concat(device::ENTRIES, PROGRAM_ENTRIES);
+const COMMON: [Entry; 11] = device::ENTRIES;
 
-/// Programs in the object dictionary.
-const PROGRAMS: usize = 1;
+/// 1018h/4.
+const SERIAL_NUMBER: Address = Address::new(IDENTITY, 4);
 
 /// What can be chosen about a bootloader.
 #[derive(Clone, Copy, Debug)]
 pub struct Config {
-    /// What it says of itself.
+    /// The object dictionary: [`entries`] of the layout's programs.
+    pub entries: &'static [Entry],
+    /// What it says of itself; but for the serial number, which every device has its own of.
     pub device: Device,
     /// Who owns which address.
     pub layout: &'static Layout,
-    /// Node-ID and bit rate that it came up with.
-    pub node: NodeParameters,
     /// The bit rates that its controller can be set to.
     pub supports: fn(BitRate) -> bool,
     /// An emergency behind each boot-up, which tells a master that this is the bootloader and not the application: its
     /// code FF00h (device specific, CiA 301 table 26) and these bytes.
     pub boot_up_emergency: Option<[u8; 5]>,
+    /// How programs are downloaded.
+    pub download: Policy,
 }
 
 /// The objects of the bootloader and what is behind them.
-pub struct Bootloader<'b, F: Flash> {
-    config: Config,
+pub struct Bootloader<'b, F: Flash, const PROGRAMS: usize> {
+    config: &'static Config,
+    serial_number: u32,
+    /// Node-ID and bit rate as they are stored.
+    node: NodeParameters,
     /// Node-ID in force.
     id: Option<NodeId>,
     flash: F,
@@ -74,26 +125,34 @@ pub struct Bootloader<'b, F: Flash> {
     emcy: Emcy,
 }
 
-impl<'b, F: Flash> Bootloader<'b, F> {
-    /// Starts from what the flash holds. The size of `buffer` is the largest block that 1F50h takes, framing included.
-    pub fn new(config: Config, flash: F, buffer: &'b mut [u8]) -> Self {
-        let download = Downloader::new(config.layout, &flash, buffer);
+impl<'b, F: Flash, const PROGRAMS: usize> Bootloader<'b, F, PROGRAMS> {
+    /// Starts from what the flash holds. The larger `buffer`, the further the flash may lag behind the bus.
+    pub fn new(
+        config: &'static Config,
+        serial_number: u32,
+        node: NodeParameters,
+        flash: F,
+        buffer: &'b mut [u8],
+    ) -> Self {
+        let download = Downloader::new(config.layout, &config.download, &flash, buffer);
         let mut bootloader = Self {
             config,
+            serial_number,
+            node,
             id: None,
             flash,
             download,
             #[cfg(feature = "emcy")]
             emcy: Emcy::new(),
         };
-        bootloader.node_id_changed(config.node.id);
+        bootloader.node_id_changed(node.id);
         bootloader
     }
 
     /// Who the device is, for layer setting services.
     #[must_use]
     pub fn lss_address(&self) -> LssAddress {
-        self.config.device.lss_address()
+        LssAddress { serial_number: self.serial_number, ..self.config.device.lss_address() }
     }
 
     /// Carries the work on the flash on: a bounded piece of it.
@@ -114,8 +173,7 @@ impl<'b, F: Flash> Bootloader<'b, F> {
                     FlashError::NoValidProgram | FlashError::Crc => emcy::code::DATA_SET,
                     _ => emcy::code::HARDWARE,
                 };
-                let status = FlashStatus { busy: false, error: Some(error), detail: 0 }.to_word();
-                self.emcy.raise(code, emcy::register::MANUFACTURER, [status as u8, program, 0, 0, 0]);
+                self.emcy.raise(code, emcy::register::MANUFACTURER, [error.code(), program, 0, 0, 0]);
             }
         }
     }
@@ -137,15 +195,18 @@ impl<'b, F: Flash> Bootloader<'b, F> {
     }
 }
 
-impl<F: Flash> Objects for Bootloader<'_, F> {
+impl<F: Flash, const PROGRAMS: usize> Objects for Bootloader<'_, F, PROGRAMS> {
     fn entries(&self) -> &'static [Entry] {
-        &ENTRIES
+        self.config.entries
     }
 
     fn read(&mut self, at: Address, buf: &mut [u8]) -> Result<usize, AbortCode> {
         #[cfg(feature = "emcy")]
         if let Some(read) = self.id.and_then(|id| self.emcy.read(id, at, buf)) {
             return read;
+        }
+        if at == SERIAL_NUMBER {
+            return put(buf, &self.serial_number.to_le_bytes());
         }
         if let Some(read) = self.config.device.read(at, buf) {
             return read;
@@ -178,7 +239,7 @@ impl<F: Flash> Objects for Bootloader<'_, F> {
     }
 
     fn download_end(&mut self, _at: Address) -> Result<(), AbortCode> {
-        let ended = self.download.block_end(&self.flash);
+        let ended = self.download.block_end();
         self.tell_outcome();
         ended
     }
@@ -193,16 +254,16 @@ impl<F: Flash> Objects for Bootloader<'_, F> {
     }
 }
 
-impl<F: Flash> LssDevice for Bootloader<'_, F> {
+impl<F: Flash, const PROGRAMS: usize> LssDevice for Bootloader<'_, F, PROGRAMS> {
     fn supports(&mut self, rate: BitRate) -> bool {
         (self.config.supports)(rate)
     }
 
     fn store(&mut self, id: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {
-        let node = NodeParameters { id, bit_rate: rate.unwrap_or(self.config.node.bit_rate) };
+        let node = NodeParameters { id, bit_rate: rate.unwrap_or(self.node.bit_rate) };
         match self.download.store_node(node) {
             Ok(()) => {
-                self.config.node = node;
+                self.node = node;
                 Poll::Pending
             }
             Err(_) => Poll::Ready(Err(StoreError::Failed)),
@@ -214,7 +275,7 @@ impl<F: Flash> LssDevice for Bootloader<'_, F> {
     }
 }
 
-impl<F: Flash> SlaveDevice for Bootloader<'_, F> {
+impl<F: Flash, const PROGRAMS: usize> SlaveDevice for Bootloader<'_, F, PROGRAMS> {
     #[cfg(feature = "emcy")]
     fn line_event(&mut self, event: LineEvent) {
         self.emcy.line_event(event);

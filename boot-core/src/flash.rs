@@ -54,14 +54,25 @@ pub trait Flash {
 }
 
 /// [`Flash::crc32`] for a chip without a unit, and for what its unit does not take.
-pub fn crc32_by_software<F: Flash + ?Sized>(flash: &F, mut crc: u32, region: Region) -> u32 {
+pub fn crc32_by_software<F: Flash + ?Sized>(flash: &F, crc: u32, region: Region) -> u32 {
+    fold(flash, crc, region, crc::resume)
+}
+
+/// A function over the bytes of a region, 64 at a time.
+pub(crate) fn fold<F: Flash + ?Sized, T>(
+    flash: &F,
+    start: T,
+    region: Region,
+    f: impl Fn(T, &[u8]) -> T,
+) -> T {
+    let mut result = start;
     let mut chunk = [0; 64];
     for offset in (0..region.size).step_by(chunk.len()) {
         let bytes = &mut chunk[..(region.size - offset).min(64) as usize];
         flash.read(region.base + offset, bytes);
-        crc = crc::resume(crc, bytes);
+        result = f(result, bytes);
     }
-    crc
+    result
 }
 
 impl<F: Flash> Flash for &mut F {
@@ -179,16 +190,5 @@ impl SectorEraser {
 
 /// Whether all bytes read as erased.
 pub fn is_blank<F: Flash>(flash: &F, region: Region) -> bool {
-    let mut chunk = [0; 64];
-    let mut next = region.base;
-    while next < region.end() {
-        let len = (region.end() - next).min(chunk.len() as u32);
-        let bytes = &mut chunk[..len as usize];
-        flash.read(next, bytes);
-        if bytes.iter().any(|byte| *byte != u8::MAX) {
-            return false;
-        }
-        next += len;
-    }
-    true
+    fold(flash, true, region, |blank, bytes| blank && bytes.iter().all(|byte| *byte == u8::MAX))
 }

@@ -4,7 +4,8 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 use shared_abi::vectors::{VectorFault, VectorTable};
 
-use crate::flash::Flash;
+use crate::crc;
+use crate::flash::{fold, Flash};
 use crate::parameters::{Journal, Key, Value};
 
 /// The word that stands for "signed" in a program's record.
@@ -55,7 +56,12 @@ impl FlashCrc {
     /// Goes on over at most `budget` bytes; the CRC once the end is reached.
     pub fn step<F: Flash>(&mut self, flash: &F, budget: u32) -> Option<u32> {
         let len = self.rest.size.min(budget);
-        self.crc = flash.crc32(self.crc, Region::new(self.rest.base, len));
+        let next = Region::new(self.rest.base, len);
+        self.crc = if cfg!(feature = "crc-16") {
+            fold(flash, self.crc, next, crc::block)
+        } else {
+            flash.crc32(self.crc, next)
+        };
         self.rest = Region::new(self.rest.base + len, self.rest.size - len);
         (self.rest.size == 0).then_some(self.crc)
     }

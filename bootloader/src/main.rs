@@ -36,17 +36,18 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
     SCB::sys_reset()
 }
 
-#[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1, SPI2])]
+#[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]
 mod app {
-    use boot_core::bootloader::{self, Bootloader};
+    use boot_core::bootloader::{self, entries, entry_count, Bootloader};
     use boot_core::canopen::bit_rate::Heard;
     use boot_core::canopen::device::Device;
     use boot_core::canopen::line::{Confinement, Status, CONTROLLER_OVERRUN, QUEUE_OVERRUN};
     use boot_core::canopen::node::{self, NmtPolicy};
+    use boot_core::canopen::od::Entry;
     use boot_core::canopen::program::BOOTLOADER_DEVICE_TYPE;
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant};
-    use boot_core::download::Step;
+    use boot_core::download::{Policy, Step};
     use boot_core::parameters::Journal;
     use bsp::can::{Errors, Mode, Port};
     use bsp::clock::Source;
@@ -56,7 +57,6 @@ mod app {
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
     use rtic::Mutex;
-    use shared_abi::block_file::MAX_BLOCK_SIZE;
     use shared_abi::warm_start::BootRequest;
 
     use super::{boot, Mono};
@@ -67,12 +67,13 @@ mod app {
 
     /// Frames that may wait for the protocol task. It has a higher priority than all that takes long, so few do.
     const RX_QUEUE: usize = 32;
+    /// Bytes of blocks that may wait for the flash: what RAM is free. While a sector of 128 KiB is erased, a bus at 1 Mbit/s
+    /// brings some 55 KiB.
+    const BLOCK_QUEUE: usize = 80 * 1024;
     /// Period of the heartbeat in ms.
     const HEARTBEAT_MS: u16 = 1000;
     /// How often the protocol looks at its deadlines, in ms.
     const TICK_MS: u32 = 2;
-    /// How often a sector being erased is looked at, in ms. It takes hundreds of them.
-    const ERASE_POLL_MS: u32 = 1;
     /// How long the device stays after the answer to its leaving is on the bus, in ms: clients want to see the answer before
     /// anything else happens.
     const FAREWELL_MS: u32 = 20;
@@ -80,12 +81,35 @@ mod app {
     /// Behind each boot-up, so that a master knows the bootloader from the application.
     const BOOT_UP_EMERGENCY: Option<[u8; 5]> = Some(*b"BOOT\0");
 
+    /// Programs of the layout, each a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
+    const PROGRAMS: usize = LAYOUT.programs.len();
+    static ENTRIES: [Entry; entry_count(PROGRAMS as u8)] = entries(PROGRAMS as u8);
+
+    static CONFIG: bootloader::Config = bootloader::Config {
+        entries: &ENTRIES,
+        device: Device {
+            device_type: BOOTLOADER_DEVICE_TYPE,
+            name: IDENTITY.device_name,
+            hardware_version: IDENTITY.hardware_version,
+            software_version: concat!("coboot ", env!("CARGO_PKG_VERSION")),
+            heartbeat_ms: HEARTBEAT_MS,
+            vendor_id: IDENTITY.vendor_id,
+            product_code: IDENTITY.product_code,
+            revision: IDENTITY.revision,
+            serial_number: 0,
+        },
+        layout: LAYOUT,
+        supports: boot::supports,
+        boot_up_emergency: BOOT_UP_EMERGENCY,
+        download: Policy { identity: Some((IDENTITY.vendor_id, IDENTITY.product_code)), ..Policy::DEFAULT },
+    };
+
     #[shared]
     struct Shared {
         can: Port<CanController>,
         /// Frames were lost because the protocol task came too late.
         queue_overrun: bool,
-        bootloader: Bootloader<'static, FlashController>,
+        bootloader: Bootloader<'static, FlashController, PROGRAMS>,
     }
 
     #[local]
@@ -104,7 +128,7 @@ mod app {
         at: Option<Instant>,
     }
 
-    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), block: [u8; MAX_BLOCK_SIZE] = [0; MAX_BLOCK_SIZE]])]
+    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; BLOCK_QUEUE] = [0; BLOCK_QUEUE]])]
     fn init(mut cx: init::Context) -> (Shared, Local) {
         ram_vectors::relocate(&mut cx.core.SCB);
         CLOCK_TREE.speed_up(&cx.device.RCC, Source::Crystal);
@@ -113,24 +137,6 @@ mod app {
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
         let node = boot::node_parameters(&Journal::open(&flash, LAYOUT.parameters), &flash);
-        let device = Device {
-            device_type: BOOTLOADER_DEVICE_TYPE,
-            name: IDENTITY.device_name,
-            hardware_version: IDENTITY.hardware_version,
-            software_version: concat!("coboot ", env!("CARGO_PKG_VERSION")),
-            heartbeat_ms: HEARTBEAT_MS,
-            vendor_id: IDENTITY.vendor_id,
-            product_code: IDENTITY.product_code,
-            revision: IDENTITY.revision,
-            serial_number: bsp::serial_number(),
-        };
-        let config = bootloader::Config {
-            device,
-            layout: LAYOUT,
-            node,
-            supports: boot::supports,
-            boot_up_emergency: BOOT_UP_EMERGENCY,
-        };
         let slave_config = slave::Config {
             node: node::Config {
                 heartbeat_ms: HEARTBEAT_MS,
@@ -139,28 +145,25 @@ mod app {
             },
             ..slave::Config::default()
         };
+        let bootloader = Bootloader::new(&CONFIG, bsp::serial_number(), node, flash, cx.local.blocks);
+        let slave = Slave::new(bootloader.lss_address(), node.id, node.bit_rate, slave_config);
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();
         (
-            Shared {
-                can: Port::new(board.can),
-                queue_overrun: false,
-                bootloader: Bootloader::new(config, flash, cx.local.block),
-            },
-            Local {
-                received,
-                to_handle,
-                slave: Slave::new(device.lss_address(), node.id, node.bit_rate, slave_config),
-                leaving: None,
-                led: board.led,
-            },
+            Shared { can: Port::new(board.can), queue_overrun: false, bootloader },
+            Local { received, to_handle, slave, leaving: None, led: board.led },
         )
     }
 
-    #[idle]
-    fn idle(_: idle::Context) -> ! {
+    /// Works on the flash for as long as there is work, and sleeps otherwise; every task comes first.
+    #[idle(shared = [bootloader])]
+    fn idle(mut cx: idle::Context) -> ! {
         loop {
-            cortex_m::asm::wfi();
+            match cx.shared.bootloader.lock(|bootloader| bootloader.step()) {
+                Step::Programming | Step::Again => {}
+                // The monotonic wakes it every millisecond; a sector takes hundreds of them.
+                Step::Idle | Step::Erasing => cortex_m::asm::wfi(),
+            }
         }
     }
 
@@ -200,9 +203,6 @@ mod app {
             }
             if let Some(request) = bootloader.take_leave() {
                 *leaving = Some(Leaving { request: Some(request), at: None });
-            }
-            if bootloader.busy() {
-                flash_work::spawn().ok();
             }
         });
         if let Some(leaving) = leaving {
@@ -258,18 +258,6 @@ mod app {
                 Errors { last: Some(Err(())), .. } => Heard::Error,
             },
             lost: lost.iter().map(|(lost, bit)| u16::from(*lost) * bit).sum(),
-        }
-    }
-
-    /// Works on the flash for as long as there is work; every other task comes first.
-    #[task(shared = [bootloader], priority = 1)]
-    async fn flash_work(mut cx: flash_work::Context) {
-        loop {
-            match cx.shared.bootloader.lock(|bootloader| bootloader.step()) {
-                Step::Idle => break,
-                Step::Again | Step::Programming => {}
-                Step::Erasing => Mono::delay(ERASE_POLL_MS.millis()).await,
-            }
         }
     }
 

@@ -4,7 +4,7 @@
 //! would); and afterwards CLEAR and a correct sequence of blocks install a program.
 #![no_main]
 
-use boot_core::download::{Downloader, Step};
+use boot_core::download::{Downloader, Policy, Step};
 use canopen::program::{FlashError, FlashStatus, ProgramControl};
 use coboot_fuzz::model::ModelFlash;
 use coboot_fuzz::Input;
@@ -45,7 +45,7 @@ const LAST: u32 = u32::MAX;
 fuzz_target!(|bytes: &[u8]| {
     let mut flash = ModelFlash::new(&CHIP);
     let mut buffer = [0; BUFFER];
-    let mut device = Downloader::<1>::new(&LAYOUT, &flash, &mut buffer);
+    let mut device = Downloader::<1>::new(&LAYOUT, &Policy::DEFAULT, &flash, &mut buffer);
     let mut input = Input::new(bytes);
     let mut next = 0_u32;
     // Whether the SDO server has a transfer open: it calls nothing else then.
@@ -71,7 +71,7 @@ fuzz_target!(|bytes: &[u8]| {
                     let middle = block.len() / 2;
                     block[middle] ^= 1 << (how >> 5);
                 }
-                if send(&mut device, &flash, &block).is_ok() {
+                if send(&mut device, &block).is_ok() {
                     next = number.wrapping_add(1);
                 }
                 open = false;
@@ -102,7 +102,7 @@ fuzz_target!(|bytes: &[u8]| {
             }
             160..=169 => {
                 if std::mem::take(&mut open) {
-                    let _ = device.block_end(&flash);
+                    let _ = device.block_end();
                 }
             }
             170..=179 => {
@@ -127,7 +127,7 @@ fuzz_target!(|bytes: &[u8]| {
     }
 
     let mut buffer = [0; BUFFER];
-    let mut device = Downloader::<1>::new(&LAYOUT, &flash, &mut buffer);
+    let mut device = Downloader::<1>::new(&LAYOUT, &Policy::DEFAULT, &flash, &mut buffer);
     device.command(1, ProgramControl::Clear).expect("CLEAR");
     settle(&mut device, &mut flash);
     assert_eq!(device.status(1), FlashStatus::OK);
@@ -140,7 +140,7 @@ fuzz_target!(|bytes: &[u8]| {
     let good = [(0, 0, vec![0; 8]), (1, 0x0800_0800, program), (LAST, 0, last)];
     for (number, flash_address, data) in good {
         let block = Block { number, flash_address, data }.emit();
-        assert_eq!(send(&mut device, &flash, &block), Ok(()), "block {number}");
+        assert_eq!(send(&mut device, &block), Ok(()), "block {number}");
         settle(&mut device, &mut flash);
         assert_eq!(device.status(1), FlashStatus::OK, "block {number}");
     }
@@ -151,7 +151,7 @@ fuzz_target!(|bytes: &[u8]| {
 });
 
 /// What the SDO server does with a block.
-fn send(device: &mut Downloader<'_, 1>, flash: &ModelFlash, block: &[u8]) -> Result<(), canopen::AbortCode> {
+fn send(device: &mut Downloader<'_, 1>, block: &[u8]) -> Result<(), canopen::AbortCode> {
     device.block_cancel();
     device.block_start(1, Some(block.len() as u32))?;
     for piece in block.chunks(7) {
@@ -160,7 +160,7 @@ fn send(device: &mut Downloader<'_, 1>, flash: &ModelFlash, block: &[u8]) -> Res
             return Err(code);
         }
     }
-    device.block_end(flash)
+    device.block_end()
 }
 
 /// Lets the flash's work come to its end.

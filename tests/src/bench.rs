@@ -47,10 +47,16 @@ impl Bench {
     /// If the emulator cannot be set up, or the firmware was not built.
     #[must_use]
     pub fn with(options: Options) -> Self {
-        Self::of(vec![options])
+        Self::of(firmware::BOOTLOADER, vec![options])
     }
 
-    /// So many boards, each with a unique ID and noise of its own. They share bus and node-ID until they are told others.
+    /// A board whose bootloader has every option.
+    #[must_use]
+    pub fn complete() -> Self {
+        Self::of(firmware::BOOTLOADER_COMPLETE, vec![Options::default()])
+    }
+
+    /// So many boards whose bootloaders have every option, each with a unique ID and noise of its own. They share bus and node-ID until they are told others.
     ///
     /// # Panics
     /// As [`with`](Self::with), and for no board at all.
@@ -64,15 +70,15 @@ impl Bench {
                 ..Options::default()
             }
         };
-        Self::of((0..count).map(options).collect())
+        Self::of(firmware::BOOTLOADER_COMPLETE, (0..count).map(options).collect())
     }
 
-    fn of(chips: Vec<Options>) -> Self {
+    fn of(bootloader: &str, chips: Vec<Options>) -> Self {
         let mut world = World::empty();
         let heard = Rc::new(RefCell::new(Vec::new()));
         let ears = Rc::clone(&heard);
         world.add_sink(move |record| ears.borrow_mut().push(*record));
-        let bootloader = firmware::elf(firmware::BOOTLOADER);
+        let bootloader = firmware::elf(bootloader);
         let boards: Vec<MachineId> = chips
             .into_iter()
             .map(|options| {

@@ -5,6 +5,7 @@
 
 use std::fmt::Write;
 
+use boot_core::bootloader::{entries, entry_count};
 use bsp::can::BitTiming;
 use canopen::device::Device;
 use canopen::od::{Access, Address, DataType, DefaultValue, Entry, Kind};
@@ -20,6 +21,10 @@ const TIME: &str = "12:00AM";
 
 /// Serial number: no two devices have the same.
 const SERIAL_NUMBER: Address = Address::new(IDENTITY, 4);
+
+/// The table of the bootloader.
+static BOOTLOADER: [Entry; entry_count(PROGRAMS)] = entries(PROGRAMS);
+const PROGRAMS: u8 = bsp::LAYOUT.programs.len() as u8;
 
 /// One image, as its EDS file describes it.
 pub struct Image {
@@ -41,7 +46,7 @@ pub fn bootloader() -> Image {
     Image {
         file: "coboot-bootloader.eds",
         description: "coboot, the CANopen bootloader",
-        entries: &boot_core::bootloader::ENTRIES,
+        entries: &BOOTLOADER,
         device: Device {
             device_type: BOOTLOADER_DEVICE_TYPE,
             software_version: concat!("coboot ", env!("CARGO_PKG_VERSION")),

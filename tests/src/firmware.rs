@@ -9,6 +9,8 @@ use shared_abi::layout::{self, Layout};
 
 /// The images by the names that `cargo xtask build` gives them.
 pub const BOOTLOADER: &str = "bootloader.elf";
+/// The bootloader with every option.
+pub const BOOTLOADER_COMPLETE: &str = "bootloader-complete.elf";
 /// Version 1 of the application.
 pub const APP_V1: &str = "app-v1.elf";
 /// Version 2 of the application.

@@ -19,7 +19,7 @@ const LSS_RESPONSE: u32 = 0x7E4;
 
 /// A board in its bootloader, with nothing installed.
 fn empty_board() -> Bench {
-    let mut bench = Bench::new();
+    let mut bench = Bench::complete();
     bench.power_on();
     bench.await_boot_up(100);
     bench

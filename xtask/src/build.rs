@@ -15,8 +15,8 @@ use crate::{process, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask build [--board BOARD] [--yes]
 
-Builds the bootloader and both versions of the application, and puts them into
-target/firmware/BOARD/ as bootloader.elf, app-v1.elf and app-v2.elf.
+Builds the bootloader, standard and with every option, and both versions of the application, and puts
+them into target/firmware/BOARD/ as bootloader.elf, bootloader-complete.elf, app-v1.elf and app-v2.elf.
 
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -44,6 +44,8 @@ pub fn run(mut args: Args) -> Outcome {
 /// When one does not build, or is no image of this board.
 pub fn images(board: &Layout) -> Outcome<Images> {
     let bootloader = bootloader(board)?;
+    let complete = Build { board, package: "bootloader", features: COMPLETE };
+    image(&complete, "bootloader-complete.elf", board.bootloader)?;
     let program = board.programs[0];
     // Version 1 is the template as it stands.
     image(&Build { board, package: "app-template", features: "" }, "app-v1.elf", program)?;
@@ -56,12 +58,14 @@ pub fn images(board: &Layout) -> Outcome<Images> {
 /// # Errors
 /// When it does not build, or is no image of this board.
 pub fn bootloader(board: &Layout) -> Outcome<PathBuf> {
-    image(&Build { board, package: "bootloader", features: COMPLETE }, "bootloader.elf", board.bootloader)
+    image(&Build { board, package: "bootloader", features: STANDARD }, "bootloader.elf", board.bootloader)
 }
 
-/// The bootloader's features that a product may go without, and all of them.
+/// The bootloader's features that a product may go without.
 pub const OPTIONAL: [&str; 4] = ["auto-bit-rate", "block-upload", "emcy", "lss"];
-/// See [`OPTIONAL`].
+/// Those of them that a product usually has: this bootloader is the one that is measured against the budget.
+pub const STANDARD: &str = "standard";
+/// All of them.
 pub const COMPLETE: &str = "complete";
 
 /// Builds the bootloader of a board with some of [`OPTIONAL`], to look at.

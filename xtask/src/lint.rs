@@ -18,6 +18,7 @@ over the firmware of a board, with warnings denied.
 const FIRMWARE: &[(&str, &str)] = &[
     ("bsp", ""),
     ("bootloader", ""),
+    ("bootloader", build::STANDARD),
     ("bootloader", build::COMPLETE),
     ("app-template", ""),
     ("app-template", "version-2"),

@@ -35,7 +35,7 @@ pub fn run(mut args: Args) -> Outcome {
     let flash = Flash::of(&elf, board.bootloader)?;
     print!("\n{}", flash.table());
     print!("\n{}", by_crate(&elf));
-    print!("\n{}", by_feature(board, flash.used)?);
+    print!("\n{}", by_feature(board)?);
     println!(
         "\nbootloader: {} of {} bytes ({} of flash kept for it)",
         flash.used,
@@ -121,15 +121,17 @@ impl Flash {
 }
 
 /// What each optional feature costs: the flash of the complete bootloader less that of one without it.
-fn by_feature(board: &Layout, complete: u32) -> Outcome<String> {
+fn by_feature(board: &Layout) -> Outcome<String> {
     let used = |features: &[&str]| -> Outcome<u32> {
         Ok(Flash::of(&read(&build::bootloader_with(board, features)?)?, board.bootloader)?.used)
     };
+    let complete = used(&build::OPTIONAL)?;
     let mut text = String::from("feature                          bytes\n");
     for feature in build::OPTIONAL {
         let others: Vec<_> = build::OPTIONAL.into_iter().filter(|other| *other != feature).collect();
         let _ = writeln!(text, "{feature:<31} {:>6}", complete.saturating_sub(used(&others)?));
     }
+    let _ = writeln!(text, "{:<31} {complete:>6}", "(with all of them)");
     let _ = writeln!(text, "{:<31} {:>6}", "(without all of them)", used(&[])?);
     Ok(text)
 }

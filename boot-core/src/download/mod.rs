@@ -1,0 +1,814 @@
+//! Program download by block file: 1F50h takes the blocks, 1F51h the commands, 1F57h tells what became of them.
+//!
+//! Two halves that never wait for each other. The **SDO half** (`block_…`, [`Downloader::command`]) judges what comes in: it
+//! refuses at once, with an abort and a status, or accepts and leaves work behind. The **flash half**
+//! ([`Downloader::step`]) carries the work through, an operation or a bounded computation at a time.
+//!
+//! Between them lies a queue of blocks. While it has room for another block the status is not busy, although the flash
+//! works: a host that looks at the status between blocks sends the next one while those before are being programmed,
+//! and sectors are erased ahead of the data.
+//!
+//! Nothing of an installed program is lost before the first block of another one was judged good: CLEAR is carried out
+//! with it (SYS TEC manual L-1112d_10, figure 12), see [`Erase`].
+
+mod queue;
+
+use core::task::Poll;
+
+use canopen::program::{FlashError, FlashStatus, ProgramControl};
+use canopen::sdo::AbortCode;
+use shared_abi::block_file::{
+    Control, Header, Last, CONTROL_MAX, CRC_SIZE, FRAMING, HEADER_SIZE, LAST_SIZE, MAX_BLOCK_SIZE,
+    NUMBER_CONTROL, NUMBER_LAST,
+};
+use shared_abi::geometry::Region;
+use shared_abi::layout::Layout;
+use shared_abi::warm_start::BootRequest;
+
+use crate::crc;
+use crate::flash::{is_blank, Flash, FlashFault, SectorEraser, WordWriter};
+use crate::node::NodeParameters;
+use crate::parameters::{Journal, Key, Store, StoreError, Value};
+use crate::program::{check_vectors, FlashCrc, ProgramRecord};
+use queue::Queue;
+
+/// What came of a step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Step {
+    /// There is no work.
+    Idle,
+    /// The flash programs a word, which takes it tens of microseconds.
+    Programming,
+    /// The flash erases a sector, which takes it hundreds of milliseconds.
+    Erasing,
+    /// There is more to compute; step again soon.
+    Again,
+}
+
+/// When CLEAR erases.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Erase {
+    /// With the first block that is for this device: until then the old program stays, and can be started. Sectors are erased as the
+    /// data need them. A second CLEAR in a row erases all at once.
+    #[default]
+    WithFirstBlock,
+    /// All sectors of the program, before anything else.
+    AtOnce,
+}
+
+/// What the integrator's own check says of a program that is about to be downloaded.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    /// Nothing: vendor-ID and product code decide.
+    Standard,
+    /// It is for this device.
+    Accept,
+    /// It is not.
+    Refuse(FlashError),
+}
+
+/// What can be chosen about the download.
+#[derive(Clone, Copy, Debug)]
+pub struct Policy {
+    /// Vendor-ID and product code of the device. A control block that tells others is refused; 0 in it stands for any.
+    pub identity: Option<(u32, u32)>,
+    /// The integrator's own check, with all that the control block tells (`TgtProcessAppInfoData` of the manual).
+    pub check: fn(program: u8, control: &Control) -> Verdict,
+    /// Whether programs may be changed now; where not, the status is `NO_ACCESS`.
+    pub allowed: fn() -> bool,
+    /// When CLEAR erases.
+    pub erase: Erase,
+    /// Bytes of flash that one step of a CRC covers: the longest that other work of the same priority is kept waiting.
+    pub crc_step: u32,
+}
+
+impl Policy {
+    /// Anybody's programs at any time; steps of 1 KiB.
+    pub const DEFAULT: Self = Self {
+        identity: None,
+        check: |_, _| Verdict::Standard,
+        allowed: || true,
+        erase: Erase::WithFirstBlock,
+        crc_step: 1024,
+    };
+}
+
+/// Why a block or a command is refused: the status that 1F57h shows, and the abort that the client gets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Refusal(FlashError, AbortCode);
+
+/// Cannot be stored: the block itself is wrong.
+const fn unfit(error: FlashError) -> Refusal {
+    Refusal(error, AbortCode::STORE)
+}
+
+/// Cannot be stored now: right block or command, wrong moment.
+const fn untimely(error: FlashError) -> Refusal {
+    Refusal(error, AbortCode::DEVICE_STATE)
+}
+
+/// One program as the objects 1F50h–1F57h show it.
+#[derive(Clone, Copy, Debug)]
+struct Program {
+    /// What the journal holds; kept here because the flash cannot be read while it is busy.
+    record: Option<ProgramRecord>,
+    /// 1F56h: the CRC that was computed last, or the stored one.
+    identification: u32,
+    /// How the last block or command ended.
+    error: Option<FlashError>,
+    session: Session,
+}
+
+/// How far the download of a program is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Session {
+    /// No block was taken yet.
+    Idle,
+    /// CLEAR was acknowledged; nothing is lost yet.
+    Cleared,
+    /// Blocks are being taken.
+    Open {
+        /// Number of the next one.
+        next: u32,
+        /// Up to here the flash is erased.
+        erased: u32,
+        /// Up to here it may be erased before there are data.
+        ahead: u32,
+    },
+    /// Half a program is in flash: only CLEAR makes a new beginning.
+    Failed,
+}
+
+/// The block that is being received; its bytes are the open ones of the queue.
+#[derive(Clone, Copy, Debug)]
+enum Reception {
+    Idle,
+    /// The header is not complete.
+    Header {
+        program: u8,
+    },
+    /// The header was judged good.
+    Data {
+        program: u8,
+        header: Header,
+    },
+}
+
+/// What is being done to the flash.
+enum Work {
+    /// The record goes first, so that a program that is partly erased is no program. `all`: then every sector.
+    Invalidate { program: u8, store: Store, all: bool },
+    /// All sectors.
+    Erase { program: u8, eraser: SectorEraser },
+    /// One sector ahead of the data.
+    EraseNext { program: u8, until: u32, eraser: SectorEraser },
+    /// The block at the front of the queue. `edges` are its first and last word, filled up with what is there.
+    Write { program: u8, header: Header, edges: [u32; 2], writer: WordWriter },
+    /// What was being done does not matter any more, but the flash has yet to finish it.
+    Settle,
+    /// The last block: is the flash what the host meant?
+    Verify { program: u8, last: Last, crc: FlashCrc },
+    /// The record of a program: after verification, and when the signature changes.
+    Record { program: u8, record: ProgramRecord, store: Store },
+    /// Node-ID and bit rate; of no program.
+    Node { store: Store },
+}
+
+/// The download of programs into flash. `PROGRAMS` is the number of programs in the layout.
+pub struct Downloader<'b, const PROGRAMS: usize> {
+    layout: &'static Layout,
+    policy: &'static Policy,
+    journal: Journal,
+    programs: [Program; PROGRAMS],
+    queue: Queue<'b>,
+    /// Whose blocks are in the queue.
+    owner: u8,
+    reception: Reception,
+    work: Option<Work>,
+    /// To be verified when the queue is empty.
+    last: Option<Last>,
+    /// A request that waits for the device to leave the bootloader.
+    leave: Option<BootRequest>,
+    /// How a piece of work on a program ended, or a block that was damaged; to be told.
+    outcome: Option<(u8, Result<(), FlashError>)>,
+    /// How the last storing of node-ID and bit rate ended.
+    node_stored: Result<(), StoreError>,
+}
+
+impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
+    /// Starts from what the parameters tell. The larger `buffer`, the further the flash may lag behind the bus; blocks larger
+    /// than it, or than [`MAX_BLOCK_SIZE`], are refused.
+    pub fn new<F: Flash>(
+        layout: &'static Layout,
+        policy: &'static Policy,
+        flash: &F,
+        buffer: &'b mut [u8],
+    ) -> Self {
+        let journal = Journal::open(flash, layout.parameters);
+        let mut number = 0;
+        let programs = [(); PROGRAMS].map(|()| {
+            number += 1;
+            let record = ProgramRecord::load(&journal, flash, number);
+            Program {
+                record,
+                identification: record.map_or(0, |record| record.crc),
+                error: None,
+                session: Session::Idle,
+            }
+        });
+        Self {
+            layout,
+            policy,
+            journal,
+            programs,
+            queue: Queue::new(buffer),
+            owner: 0,
+            reception: Reception::Idle,
+            work: None,
+            last: None,
+            leave: None,
+            outcome: None,
+            node_stored: Ok(()),
+        }
+    }
+
+    /// Whether sub-index `program` of 1F50h, 1F51h, 1F56h and 1F57h exists.
+    #[must_use]
+    pub fn has(&self, program: u8) -> bool {
+        self.index(program).is_some()
+    }
+
+    /// 1F57h. Busy while a command of this program is carried out, or while no further block can be taken.
+    #[must_use]
+    pub fn status(&self, program: u8) -> FlashStatus {
+        let error = self.index(program).and_then(|i| self.programs[i].error);
+        let busy = match self.work {
+            Some(
+                Work::Invalidate { program: of, all: true, .. }
+                | Work::Erase { program: of, .. }
+                | Work::Verify { program: of, .. }
+                | Work::Record { program: of, .. },
+            ) => of == program,
+            _ => false,
+        };
+        let full = self.owner == program && (self.last.is_some() || !self.has_room());
+        FlashStatus { busy: busy || full, error, detail: 0 }
+    }
+
+    /// Whether the queue takes a block of the largest size. (One that is not even as large takes one at a time.)
+    fn has_room(&self) -> bool {
+        self.queue.is_empty() || self.queue.free() >= MAX_BLOCK_SIZE
+    }
+
+    /// 1F56h: the CRC over the program, 0 where there is none.
+    #[must_use]
+    pub fn identification(&self, program: u8) -> u32 {
+        self.index(program).map_or(0, |i| self.programs[i].identification)
+    }
+
+    /// Whether there is work for [`Downloader::step`].
+    #[must_use]
+    pub fn busy(&self) -> bool {
+        self.work.is_some() || self.last.is_some() || !self.queue.is_empty() || self.sector_ahead().is_some()
+    }
+
+    /// The request to leave the bootloader, once: the answer to the command may still be on its way.
+    pub fn take_leave(&mut self) -> Option<BootRequest> {
+        self.leave.take()
+    }
+
+    /// How a piece of work on a program ended, or a block that was damaged, once.
+    pub fn take_outcome(&mut self) -> Option<(u8, Result<(), FlashError>)> {
+        self.outcome.take()
+    }
+
+    /// Stores node-ID and bit rate in the background.
+    ///
+    /// # Errors
+    /// If other work goes on.
+    pub fn store_node(&mut self, node: NodeParameters) -> Result<(), FlashError> {
+        if self.busy() || self.leave.is_some() {
+            return Err(FlashError::Busy);
+        }
+        self.work = Some(Work::Node { store: self.journal.store(Key::Node, node.value()) });
+        Ok(())
+    }
+
+    /// How the last [`store_node`](Self::store_node) ended.
+    pub fn node_stored(&self) -> Poll<Result<(), StoreError>> {
+        if matches!(self.work, Some(Work::Node { .. })) {
+            Poll::Pending
+        } else {
+            Poll::Ready(self.node_stored)
+        }
+    }
+
+    /// 1F51h: a command. It is judged and acknowledged now and carried out by [`Downloader::step`].
+    ///
+    /// # Errors
+    /// The abort that answers it.
+    pub fn command(&mut self, program: u8, command: ProgramControl) -> Result<(), AbortCode> {
+        use ProgramControl::{Clear, ClrSignature, ResetStat, SetSignature, Start, StartBootloader, Stop};
+
+        let index = self.index(program).ok_or(AbortCode::NO_SUB_INDEX)?;
+        if matches!(command, Stop | StartBootloader) {
+            // No program runs, and the bootloader does: both are so already.
+            return Ok(());
+        }
+        // A new beginning does not wait for the end of the old one.
+        let broken_off =
+            command == Clear && self.owner == program && self.last.is_none() && self.is_downloading();
+        if self.leave.is_some() || (self.busy() && !broken_off) {
+            return Err(self.refuse(program, untimely(FlashError::Busy)));
+        }
+        if matches!(command, Clear | SetSignature | ClrSignature) && !(self.policy.allowed)() {
+            return Err(self.refuse(program, untimely(FlashError::NoAccess)));
+        }
+        let state = &mut self.programs[index];
+        state.error = None;
+        match (command, state.record) {
+            (Clear, record) => {
+                let again = state.session == Session::Cleared;
+                state.session = Session::Cleared;
+                self.reception = Reception::Idle;
+                self.queue.clear();
+                self.work = match self.work.take() {
+                    // The record is gone only when this is through.
+                    Some(work @ Work::Invalidate { .. }) => Some(work),
+                    None if again || self.policy.erase == Erase::AtOnce => {
+                        Some(self.erase_all(program, record))
+                    }
+                    None => None,
+                    Some(_) => Some(Work::Settle),
+                };
+            }
+            (Start, Some(record)) => {
+                let request = if record.signed { BootRequest::Start } else { BootRequest::Trial };
+                self.leave = Some(request(program));
+            }
+            (SetSignature | ClrSignature, Some(record)) => {
+                let signed = command == SetSignature;
+                if record.signed != signed {
+                    self.work = Some(self.store_record(program, ProgramRecord { signed, ..record }));
+                }
+            }
+            (Start | SetSignature, None) => state.error = Some(FlashError::NoValidProgram),
+            (Stop | StartBootloader | ResetStat | ClrSignature, _) => {}
+        }
+        Ok(())
+    }
+
+    /// Whether the flash works on blocks and nothing else.
+    fn is_downloading(&self) -> bool {
+        matches!(
+            self.work,
+            None | Some(
+                Work::Invalidate { all: false, .. }
+                    | Work::EraseNext { .. }
+                    | Work::Write { .. }
+                    | Work::Settle
+            )
+        )
+    }
+
+    /// 1F50h: the client announces a block, and its size if it knows it.
+    ///
+    /// # Errors
+    /// The abort that answers it.
+    pub fn block_start(&mut self, program: u8, size: Option<u32>) -> Result<(), AbortCode> {
+        self.index(program).ok_or(AbortCode::NO_SUB_INDEX)?;
+        let others = self.owner != program && self.busy();
+        if self.leave.is_some() || self.last.is_some() || others || !self.is_downloading() || !self.has_room()
+        {
+            return Err(self.refuse(program, untimely(FlashError::Busy)));
+        }
+        if let Some(size) = size {
+            if size as usize > self.largest() {
+                return Err(self.refuse(program, Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH)));
+            }
+            if (size as usize) < FRAMING {
+                return Err(self.refuse(program, Refusal(FlashError::Format, AbortCode::LENGTH_TOO_LOW)));
+            }
+        }
+        self.owner = program;
+        self.queue.forget();
+        self.reception = Reception::Header { program };
+        Ok(())
+    }
+
+    /// 1F50h: the next bytes of the block.
+    ///
+    /// # Errors
+    /// The abort that ends the transfer.
+    pub fn block_data(&mut self, data: &[u8]) -> Result<(), AbortCode> {
+        let (Reception::Header { program } | Reception::Data { program, .. }) = self.reception else {
+            return Err(AbortCode::DEVICE_STATE);
+        };
+        if self.queue.open() + data.len() > self.largest() || !self.queue.push(data) {
+            return Err(self.refuse(program, Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH)));
+        }
+        if matches!(self.reception, Reception::Header { .. }) && self.queue.open() >= HEADER_SIZE {
+            let header = Header::parse(&self.queue.of_open(0));
+            if let Err(refusal) = self.judge_header(program, header) {
+                return Err(self.refuse(program, refusal));
+            }
+            self.reception = Reception::Data { program, header };
+        }
+        Ok(())
+    }
+
+    /// 1F50h: the block is complete. Judges it in full and leaves the work behind.
+    ///
+    /// # Errors
+    /// The abort that answers instead of the last acknowledgement.
+    pub fn block_end(&mut self) -> Result<(), AbortCode> {
+        let reception = core::mem::replace(&mut self.reception, Reception::Idle);
+        let (program, outcome) = match reception {
+            Reception::Idle => return Err(AbortCode::DEVICE_STATE),
+            Reception::Header { program } => {
+                (program, Err(Refusal(FlashError::Format, AbortCode::LENGTH_TOO_LOW)))
+            }
+            Reception::Data { program, header } => (program, self.accept(program, header)),
+        };
+        match outcome {
+            Ok(()) => {
+                if let Some(index) = self.index(program) {
+                    self.programs[index].error = None;
+                }
+                Ok(())
+            }
+            Err(refusal) => Err(self.refuse(program, refusal)),
+        }
+    }
+
+    /// 1F50h: the transfer ended before the block did. The block may be sent again.
+    pub fn block_cancel(&mut self) {
+        self.reception = Reception::Idle;
+        self.queue.forget();
+    }
+
+    /// Carries the work on.
+    pub fn step<F: Flash>(&mut self, flash: &mut F) -> Step {
+        let Some(mut work) = self.work.take() else {
+            return self.next_work(flash);
+        };
+        let chip = self.layout.chip;
+        let (program, outcome) = match &mut work {
+            Work::Node { store } => match store.poll(&mut self.journal, flash, chip) {
+                Poll::Pending => (0, Poll::Pending),
+                Poll::Ready(outcome) => {
+                    self.node_stored = outcome;
+                    return Step::Again;
+                }
+            },
+            Work::Settle => match flash.poll() {
+                Poll::Pending => (0, Poll::Pending),
+                Poll::Ready(_) => return Step::Again,
+            },
+            Work::Invalidate { program, store, all } => {
+                let (program, all) = (*program, *all);
+                let outcome = store.poll(&mut self.journal, flash, chip);
+                if let Poll::Ready(Ok(())) = outcome {
+                    if let Some(index) = self.index(program) {
+                        self.programs[index].record = None;
+                        self.programs[index].identification = 0;
+                    }
+                    if all {
+                        self.work = Some(self.erase_all(program, None));
+                    }
+                    return Step::Again;
+                }
+                (program, outcome.map_err(|_| FlashError::NvData))
+            }
+            Work::Erase { program, eraser } => (*program, eraser.poll(flash, chip).map_err(write_error)),
+            Work::EraseNext { program, until, eraser } => {
+                let (program, until) = (*program, *until);
+                let outcome = eraser.poll(flash, chip);
+                if let Poll::Ready(Ok(())) = outcome {
+                    if let Some(Session::Open { erased, .. }) = self.session(program) {
+                        *erased = until;
+                    }
+                    return Step::Again;
+                }
+                (program, outcome.map_err(write_error))
+            }
+            Work::Write { program, header, edges, writer } => {
+                let (program, header) = (*program, *header);
+                let (queue, edges, words) = (&self.queue, &*edges, words_of(&header));
+                let outcome = writer.poll(flash, words, |i| word(queue, &header, edges, i, words));
+                if let Poll::Ready(Ok(())) = outcome {
+                    self.queue.pop(header.size as usize + FRAMING);
+                    return Step::Again;
+                }
+                (program, outcome.map_err(write_error))
+            }
+            Work::Verify { program, last, crc } => {
+                let (program, last) = (*program, *last);
+                let Some(crc) = crc.step(flash, self.policy.crc_step) else {
+                    self.work = Some(work);
+                    return Step::Again;
+                };
+                if let Some(index) = self.index(program) {
+                    self.programs[index].identification = crc;
+                    self.programs[index].session = Session::Idle;
+                }
+                let plausible = check_vectors(flash, self.region(program), self.layout).is_ok();
+                if crc == last.program_crc && plausible {
+                    let record = ProgramRecord { size: last.program_size, crc, signed: false };
+                    self.work = Some(self.store_record(program, record));
+                    return Step::Again;
+                }
+                (program, Poll::Ready(Err(FlashError::NoValidProgram)))
+            }
+            Work::Record { program, record, store } => {
+                let outcome = store.poll(&mut self.journal, flash, chip).map_err(|_| FlashError::NvData);
+                if outcome == Poll::Ready(Ok(())) {
+                    if let Some(index) = self.index(*program) {
+                        self.programs[index].record = Some(*record);
+                    }
+                }
+                (*program, outcome)
+            }
+        };
+        let Poll::Ready(outcome) = outcome else {
+            let erasing = matches!(work, Work::Erase { .. } | Work::EraseNext { .. } | Work::Settle);
+            self.work = Some(work);
+            return if erasing { Step::Erasing } else { Step::Programming };
+        };
+        self.end(program, outcome);
+        Step::Again
+    }
+
+    /// A piece of work is over.
+    fn end(&mut self, program: u8, outcome: Result<(), FlashError>) {
+        if let Some(index) = self.index(program) {
+            let state = &mut self.programs[index];
+            state.error = outcome.err();
+            if outcome.is_err() {
+                if state.session != Session::Idle {
+                    state.session = Session::Failed;
+                }
+                self.queue.clear();
+                self.reception = Reception::Idle;
+                self.last = None;
+            }
+        }
+        self.outcome = Some((program, outcome));
+    }
+
+    /// Chooses what to do to an idle flash.
+    fn next_work<F: Flash>(&mut self, flash: &F) -> Step {
+        let program = self.owner;
+        let sector = |address: u32| self.layout.chip.sector_at(address).map(|sector| sector.region);
+        let erase_next = |region: Region| Work::EraseNext {
+            program,
+            until: region.end(),
+            eraser: SectorEraser::new(region),
+        };
+        let work = if self.queue.is_empty() {
+            match (self.last, self.sector_ahead()) {
+                (Some(last), None) => {
+                    self.last = None;
+                    let crc = FlashCrc::new(Region::new(self.region(program).base, last.program_size));
+                    Work::Verify { program, last, crc }
+                }
+                (_, Some(ahead)) => match sector(ahead) {
+                    Some(region) => erase_next(region),
+                    None => return Step::Idle,
+                },
+                (None, None) => return Step::Idle,
+            }
+        } else {
+            let header = Header::parse(&self.queue.first());
+            let target = Region::new(header.flash_address, header.size);
+            match self.session_of(program) {
+                Some(Session::Open { erased, .. }) if erased < target.end() => match sector(erased) {
+                    Some(region) => erase_next(region),
+                    None => return self.fail(program, FlashError::Address),
+                },
+                _ if !is_blank(flash, target) => return self.fail(program, FlashError::NotCleared),
+                _ => {
+                    let (first, last) = (target.base & !3, (target.end() - 1) & !3);
+                    let edges = [flash.read_word(first), flash.read_word(last)];
+                    Work::Write { program, header, edges, writer: WordWriter::new(first) }
+                }
+            }
+        };
+        self.work = Some(work);
+        Step::Again
+    }
+
+    fn fail(&mut self, program: u8, error: FlashError) -> Step {
+        self.end(program, Err(error));
+        Step::Again
+    }
+
+    /// Where the next sector begins that can be erased before there are data for it.
+    fn sector_ahead(&self) -> Option<u32> {
+        match self.session_of(self.owner)? {
+            Session::Open { erased, ahead, .. } if erased < ahead => Some(erased),
+            _ => None,
+        }
+    }
+
+    fn index(&self, program: u8) -> Option<usize> {
+        let index = usize::from(program).checked_sub(1)?;
+        (index < PROGRAMS).then_some(index)
+    }
+
+    fn session_of(&self, program: u8) -> Option<Session> {
+        self.index(program).map(|index| self.programs[index].session)
+    }
+
+    fn session(&mut self, program: u8) -> Option<&mut Session> {
+        self.index(program).map(|index| &mut self.programs[index].session)
+    }
+
+    /// Ends a reception and shows why. The error that ended a session stays to be seen.
+    fn refuse(&mut self, program: u8, Refusal(error, abort): Refusal) -> AbortCode {
+        self.reception = Reception::Idle;
+        self.queue.forget();
+        if let Some(index) = self.index(program) {
+            let state = &mut self.programs[index];
+            if state.session != Session::Failed || state.error.is_none() {
+                state.error = Some(error);
+            }
+        }
+        if error == FlashError::Crc {
+            self.outcome = Some((program, Err(error)));
+        }
+        abort
+    }
+
+    fn region(&self, program: u8) -> Region {
+        self.layout.program(program).unwrap_or(Region::new(0, 0))
+    }
+
+    /// The largest block that can be taken.
+    fn largest(&self) -> usize {
+        self.queue.capacity().min(MAX_BLOCK_SIZE)
+    }
+
+    fn invalidate(&self, program: u8, all: bool) -> Work {
+        Work::Invalidate {
+            program,
+            store: self.journal.store(Key::Program(program), ProgramRecord::NONE),
+            all,
+        }
+    }
+
+    fn erase_all(&self, program: u8, record: Option<ProgramRecord>) -> Work {
+        match record {
+            Some(_) => self.invalidate(program, true),
+            None => Work::Erase { program, eraser: SectorEraser::new(self.region(program)) },
+        }
+    }
+
+    fn store_record(&self, program: u8, record: ProgramRecord) -> Work {
+        let value: Value = record.value();
+        Work::Record { program, record, store: self.journal.store(Key::Program(program), value) }
+    }
+
+    /// What the first twelve bytes tell: refuses before the rest is sent.
+    fn judge_header(&self, program: u8, header: Header) -> Result<(), Refusal> {
+        let Some(index) = self.index(program) else { return Err(unfit(FlashError::Unspecified)) };
+        let state = &self.programs[index];
+        if header.size as usize > self.largest() - FRAMING {
+            return Err(Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH));
+        }
+        match (header.number, state.session) {
+            (NUMBER_CONTROL, Session::Idle) if state.record.is_some() => {
+                return Err(untimely(FlashError::NotCleared));
+            }
+            (NUMBER_CONTROL, Session::Idle | Session::Cleared) => {
+                return if (self.policy.allowed)() { Ok(()) } else { Err(untimely(FlashError::NoAccess)) };
+            }
+            // The sequence begins anew, over what is there.
+            (NUMBER_CONTROL, Session::Open { .. }) => return Ok(()),
+            (NUMBER_LAST, Session::Open { next, .. }) if next > 1 => return Ok(()),
+            (number, Session::Open { next, .. }) if number == next => {}
+            _ => return Err(untimely(FlashError::Sequence)),
+        }
+        let target = (header.flash_address, header.size);
+        if header.size == 0 {
+            return Err(unfit(FlashError::Format));
+        }
+        if !self.region(program).contains(target.0, target.1) {
+            let secured = [self.layout.bootloader, self.layout.parameters[0], self.layout.parameters[1]];
+            let touches = |region: &Region| {
+                // `u64`: an address near the end of the address space must not wrap.
+                u64::from(region.base) < u64::from(target.0) + u64::from(target.1) && target.0 < region.end()
+            };
+            let secured = secured.iter().any(touches);
+            return Err(unfit(if secured { FlashError::Secured } else { FlashError::Address }));
+        }
+        Ok(())
+    }
+
+    /// Judges the open block as a whole, and takes it.
+    fn accept(&mut self, program: u8, header: Header) -> Result<(), Refusal> {
+        let data_end = HEADER_SIZE + header.size as usize;
+        if self.queue.open() != data_end + CRC_SIZE {
+            return Err(Refusal(FlashError::Format, AbortCode::LENGTH));
+        }
+        let computed = self.queue.open_slices(data_end).iter().fold(0, |crc, bytes| crc::block(crc, bytes));
+        if computed != u32::from_le_bytes(self.queue.of_open(data_end)) {
+            return Err(unfit(FlashError::Crc));
+        }
+        let Some(index) = self.index(program) else { return Err(unfit(FlashError::Unspecified)) };
+        let region = self.region(program);
+        match header.number {
+            NUMBER_CONTROL => {
+                let data: [u8; CONTROL_MAX] = self.queue.of_open(HEADER_SIZE);
+                let control = data.get(..header.size as usize).and_then(Control::parse);
+                let control = control.ok_or(unfit(FlashError::Format))?;
+                let app_size = self.check_identity(program, &control)?;
+                self.queue.forget();
+                let (erased, ahead) = match self.programs[index].session {
+                    // Known to be erased is nothing; what there are to be data for is erased ahead of them.
+                    Session::Cleared => (region.base, region.base + app_size.min(region.size)),
+                    Session::Open { erased, ahead, .. } => (erased, ahead),
+                    // No CLEAR: each block finds out whether its place is blank.
+                    _ => (region.end(), region.end()),
+                };
+                self.programs[index].session = Session::Open { next: 1, erased, ahead };
+                if self.programs[index].record.is_some() && self.work.is_none() {
+                    self.work = Some(self.invalidate(program, false));
+                }
+            }
+            NUMBER_LAST => {
+                let data: [u8; LAST_SIZE] = self.queue.of_open(HEADER_SIZE);
+                let last = data.get(..header.size as usize).and_then(Last::parse);
+                let last = last.ok_or(unfit(FlashError::Format))?;
+                // The first two vectors at least: without them under the CRC nothing can be started.
+                if last.program_size < 8 {
+                    return Err(unfit(FlashError::Format));
+                }
+                if last.program_size > region.size {
+                    return Err(unfit(FlashError::Address));
+                }
+                self.queue.forget();
+                self.last = Some(last);
+                // What no block has written belongs to the program all the same, and reads FFh.
+                if let Session::Open { ahead, .. } = &mut self.programs[index].session {
+                    *ahead = (*ahead).max(region.base + last.program_size);
+                }
+            }
+            number => {
+                self.queue.commit();
+                if let Session::Open { next, .. } = &mut self.programs[index].session {
+                    *next = number.wrapping_add(1);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether a program is for this device; gives the size that it is said to have, 0 where it is not said.
+    fn check_identity(&self, program: u8, control: &Control) -> Result<u32, Refusal> {
+        let identity = match control {
+            Control::Plain => None,
+            Control::Identity(identity) | Control::Dated { identity, .. } => Some(identity),
+        };
+        match ((self.policy.check)(program, control), identity, self.policy.identity) {
+            (Verdict::Refuse(error), ..) => return Err(unfit(error)),
+            (Verdict::Standard, Some(told), Some((vendor_id, product_code))) => {
+                if told.vendor_id != 0 && told.vendor_id != vendor_id {
+                    return Err(unfit(FlashError::WrongVendorId));
+                }
+                if told.product_code != 0 && told.product_code != product_code {
+                    return Err(unfit(FlashError::WrongProductId));
+                }
+            }
+            _ => {}
+        }
+        Ok(identity.map_or(0, |identity| identity.app_size))
+    }
+}
+
+fn write_error(fault: FlashFault) -> FlashError {
+    match fault {
+        FlashFault::Protected => FlashError::Secured,
+        FlashFault::Failed | FlashFault::Verify => FlashError::Write,
+    }
+}
+
+/// Words of flash that a block touches.
+fn words_of(header: &Header) -> usize {
+    let before = header.flash_address % 4;
+    (before + header.size).div_ceil(4) as usize
+}
+
+/// The `i`-th of them. Flash is programmed by words: the edges are filled up with what is there already.
+fn word(queue: &Queue<'_>, header: &Header, edges: &[u32; 2], i: usize, words: usize) -> u32 {
+    let there = edges[usize::from(i + 1 == words)].to_le_bytes();
+    let before = (header.flash_address % 4) as usize;
+    let mut bytes = if i == 0 || i + 1 == words { there } else { [0; 4] };
+    for (j, byte) in bytes.iter_mut().enumerate() {
+        let at = (4 * i + j).wrapping_sub(before);
+        if at < header.size as usize {
+            *byte = queue.byte(HEADER_SIZE + at);
+        }
+    }
+    u32::from_le_bytes(bytes)
+}
