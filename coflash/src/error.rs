@@ -113,6 +113,8 @@ pub enum Error {
 pub enum LssFailure {
     /// Nobody answers.
     NoAnswer,
+    /// The device has no node-ID, and it is not said which one to give.
+    None,
     /// The device refuses.
     Refused {
         /// The standard's error code; FFh for one of the maker's own.
@@ -161,6 +163,7 @@ impl Error {
             Self::Cancelled => 0x6000_0011,
             Self::NoAnswer { .. } => 0x6000_0013,
             Self::Lss { failure: LssFailure::NoAnswer, .. } => 0x6000_0013,
+            Self::Lss { failure: LssFailure::None, .. } => 0x6000_0017,
             Self::Lss { failure: LssFailure::Refused { code, .. }, .. } => 0x6000_0200 + *code as u32,
             Self::StartFailed { .. } => 0x6000_0014,
             Self::Busy { .. } => 0x6000_0016,
@@ -202,6 +205,9 @@ impl Error {
                 _ => "check that the device supports LSS, that it has power, and that both sides use the same bit rate",
             }
             .to_string(),
+            Self::Lss { failure: LssFailure::None, .. } => {
+                "say which node-ID it is to get, or give it one by coflash lss assign".to_string()
+            }
             Self::Lss { doing, failure: LssFailure::Refused { code, .. } } => match (doing, code) {
                 (LssDoing::Store, 1) => "this device cannot store: switches or its application set node-ID and bit rate",
                 (LssDoing::Store, _) => "run it again; if it happens again, the device's memory is broken",
@@ -335,6 +341,7 @@ impl fmt::Display for Error {
             Self::Lss { doing, failure: LssFailure::NoAnswer } => {
                 write!(f, "no device answers ({})", doing.words())
             }
+            Self::Lss { failure: LssFailure::None, .. } => f.write_str("the device has no node-ID"),
             Self::Lss { doing, failure: LssFailure::Refused { code, detail } } => {
                 write!(f, "the device refuses {}: error {code}", doing.words())?;
                 match detail {

@@ -10,11 +10,14 @@
 //! | [`adapter`] | ways to a CAN bus, chosen by URL |
 //! | [`session`] | SDO with one node: values, commands, status |
 //! | [`flash`] | the update procedure, with its steps as events |
+//! | [`many`] | the same for many devices at once |
+//! | [`hub`] | several conversations over one adapter |
 //! | [`info`] | what a device says about itself |
 //! | [`scan`] | who is on the bus |
 //! | [`lss`] | node-ID and bit rate over the bus |
 //! | [`decode`] | frames in words |
 //! | [`candump`] | logs of frames |
+//! | [`diagnose`] | why a device may be silent |
 //! | [`error`] | what can go wrong with a device, with numbers and advice |
 //!
 //! Flashing a file takes these lines:
@@ -44,12 +47,15 @@ pub mod block_file;
 pub mod candump;
 pub mod convert;
 pub mod decode;
+pub mod diagnose;
 pub mod error;
 pub mod flash;
+pub mod hub;
 pub mod image;
 pub mod info;
 pub mod inspect;
 pub mod lss;
+pub mod many;
 pub mod read;
 pub mod scan;
 pub mod session;

@@ -5,10 +5,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 pub use canopen::lss::{BitRate, LssAddress};
-use canopen::{CobId, Frame, NodeId};
+use canopen::nmt::{self, NmtCommand};
+use canopen::program::DEVICE_TYPE;
+use canopen::{Address, CobId, Frame, NodeId};
 
 use crate::adapter::Adapter;
 use crate::error::{Error, LssFailure};
+use crate::scan::hear;
+use crate::session::Doing;
 
 // Command specifiers (CiA 305).
 const SWITCH_GLOBAL: u8 = 0x04;
@@ -264,6 +268,55 @@ impl<'a> Master<'a> {
             _ => Ok(()),
         }
     }
+}
+
+/// Sees to it that the device with this address has a node-ID: its own, or the one that is asked for, which it is given if
+/// need be. Afterwards it is on the bus with it.
+///
+/// # Errors
+/// [`Error::Lss`] where the device does not answer, has no node-ID and none is asked for, or refuses; [`Error::NoAnswer`]
+/// where it does not come up with its new node-ID within `boot`.
+pub fn ensure_node_id(
+    adapter: &mut dyn Adapter,
+    address: &LssAddress,
+    node: Option<NodeId>,
+    boot: Duration,
+    cancelled: &Arc<AtomicBool>,
+) -> Result<NodeId, Error> {
+    let mut master = Master::new(adapter, ANSWER);
+    master.cancel_by(cancelled.clone());
+    master.switch_all(false)?;
+    master.select(address)?;
+    let old = master.inquire_node_id()?;
+    let (new, reset) = match (old, node) {
+        (None, None) => {
+            master.switch_all(false)?;
+            return Err(Error::Lss { doing: LssDoing::NodeId, failure: LssFailure::None });
+        }
+        (Some(own), None) => (own, None),
+        (Some(own), Some(node)) if own == node => (own, None),
+        (old, Some(node)) => {
+            master.set_node_id(Some(node))?;
+            (node, old)
+        }
+    };
+    master.switch_all(false)?;
+    if old == Some(new) {
+        return Ok(new);
+    }
+    if let Some(old) = reset {
+        adapter.send(&NmtCommand::ResetCommunication.emit(Some(old)))?;
+    }
+    let mut up = false;
+    let boot_up = nmt::boot_up(new);
+    hear(adapter, boot, cancelled, &mut |frame| {
+        up = *frame == boot_up;
+        up
+    })?;
+    if up {
+        return Ok(new);
+    }
+    Err(Error::NoAnswer { node: new, doing: Doing::Read(Address::new(DEVICE_TYPE, 0)) })
 }
 
 fn with_number(command: u8, number: u32) -> [u8; 8] {

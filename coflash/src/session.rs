@@ -359,6 +359,18 @@ impl<'a> Session<'a> {
         self.listen(time, |_| false).map(|_| ())
     }
 
+    /// Listens to everything on the bus for a time.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn hear(&mut self, time: Duration, heard: &mut dyn FnMut(&Frame)) -> Result<(), Error> {
+        self.listen(time, |frame| {
+            heard(frame);
+            false
+        })
+        .map(|_| ())
+    }
+
     /// Waits for the node's boot-up message, `time` at most; tells whether it came.
     ///
     /// # Errors
@@ -369,7 +381,7 @@ impl<'a> Session<'a> {
     }
 
     /// Receives until `enough` says so, `time` at most; tells whether it did.
-    fn listen(&mut self, time: Duration, enough: impl Fn(&Frame) -> bool) -> Result<bool, Error> {
+    fn listen(&mut self, time: Duration, mut enough: impl FnMut(&Frame) -> bool) -> Result<bool, Error> {
         let deadline = self.now() + time;
         loop {
             self.check_cancelled()?;

@@ -83,10 +83,16 @@ impl Patience {
     ) -> Result<Session<'a>, Failure> {
         let mut session = Session::new(adapter, node, self.timing());
         session.cancel_by(cancelled()?);
-        if self.segmented {
-            session.transfer_by(Transfers::Segments);
-        }
+        session.transfer_by(self.transfers());
         Ok(session)
+    }
+
+    pub(super) fn transfers(&self) -> Transfers {
+        if self.segmented {
+            Transfers::Segments
+        } else {
+            Transfers::Blocks
+        }
     }
 
     pub(super) fn timing(&self) -> Timing {

@@ -14,7 +14,7 @@ use super::values::number;
 use super::Context;
 
 /// How to read a firmware file and cut it into blocks.
-#[derive(Debug, Args)]
+#[derive(Clone, Debug, Args)]
 pub(super) struct Source {
     /// The board: takes the program's region from its memory map, and refuses data outside.
     #[arg(long, value_name = "BOARD", value_parser = board)]
@@ -124,6 +124,13 @@ impl Source {
         blocks_of(firmware, &options).map_err(|error| Failure::convert(error, file))
     }
 
+    /// The same for another board.
+    pub(super) fn for_board(&self, name: &str) -> Result<Self, Failure> {
+        let layout =
+            board(name).map_err(|known| Failure::usage(format!("there is no board '{name}'"), known))?;
+        Ok(Self { board: Some(layout), ..self.clone() })
+    }
+
     /// Whether it was said where the program may lie.
     pub(super) fn has_region(&self) -> bool {
         self.board.is_some() || self.start_address.is_some() || self.end_address.is_some()
@@ -153,18 +160,13 @@ impl Source {
 #[derive(Debug, Args)]
 pub(super) struct Input {
     /// The firmware: Intel HEX, Motorola S-record, ELF, raw binary or block file.
-    #[arg(value_name = "FILE", required_unless_present = "legacy_file")]
-    file: Option<PathBuf>,
-
-    /// The same in DotNetFlashtool's spelling.
-    #[arg(short = 'F', value_name = "FILE", conflicts_with = "file", hide = true)]
-    legacy_file: Option<PathBuf>,
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
 }
 
 impl Input {
-    /// The file. One of the two is always given.
     pub(super) fn path(&self) -> &Path {
-        self.file.as_deref().or(self.legacy_file.as_deref()).unwrap_or(Path::new(""))
+        &self.file
     }
 }
 

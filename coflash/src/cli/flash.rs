@@ -1,36 +1,72 @@
 //! `coflash flash`: a program into a device.
 
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
+use canopen::NodeId;
 use clap::Args;
-use coflash::convert::Converted;
+use coflash::adapter::Adapter;
+use coflash::block_file::BlockFile;
+use coflash::convert::Label;
 use coflash::flash::{flash, DeviceState, Event, FlashOptions, Report, Target};
+use coflash::lss::{ensure_node_id, LssAddress};
+use coflash::many::{flash_many, Job, ManyOptions};
 use coflash::session::Transfers;
 use serde_json::{json, Value};
 
 use super::convert::Labels;
-use super::device::Program;
-use super::file::{warn_left_out, Input, Source};
+use super::device::{cancelled, Patience};
+use super::file::{warn_left_out, Source};
+use super::job::{self, Entry, Settings};
 use super::legacy::Legacy;
+use super::many::{document, summary, write_report, Board, Outcome};
 use super::output::Failure;
 use super::progress::Progress;
-use super::values::number;
+use super::values::{nodes, number, program_number};
 use super::Context;
 
-/// Puts a program into a device and starts it.
+/// Puts a program into a device, or into many, and starts it.
 ///
 /// Takes a block file, or any other firmware file and converts it on the fly. The file is read and checked completely
-/// before the device is touched. An update that was interrupted can be started again at once.
+/// before a device is touched. An update that was interrupted can be started again at once.
+///
+/// With several nodes, or a job file, the devices are updated at the same time; a failure of one does not stop the others.
 ///
 /// The options of BinaryBlockDownload and DotNetFlashtool are accepted in their own spelling, too (-F, --node_id,
 /// --prog_no, --chk_tgt, --chk_run, --sdo_timeout, --timeout and so on).
 #[derive(Debug, Args)]
 pub(super) struct Flash {
-    #[command(flatten)]
-    input: Input,
+    /// The firmware: Intel HEX, Motorola S-record, ELF, raw binary or block file.
+    #[arg(value_name = "FILE", required_unless_present_any = ["legacy_file", "job"])]
+    file: Option<PathBuf>,
+
+    /// The same in DotNetFlashtool's spelling.
+    #[arg(short = 'F', value_name = "FILE", conflicts_with = "file", hide = true)]
+    legacy_file: Option<PathBuf>,
+
+    /// The devices' node-IDs: 5, or a list with ranges like 1,5,9-12.
+    #[arg(long, short = 'N', alias = "node_id", default_value = "1", value_parser = nodes, value_name = "NODES")]
+    node: Vec<Vec<NodeId>>,
+
+    /// A file that says which devices get what (see the manual), in place of FILE and --node.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["file", "legacy_file", "node", "vid"])]
+    job: Option<PathBuf>,
+
+    /// How many devices are at work at the same time.
+    #[arg(long, value_name = "DEVICES", value_parser = number, default_value = "8")]
+    at_once: u32,
+
+    /// Write what came of it to this file, as JSON.
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
+
+    /// The program number: sub-index of 1F50h.
+    #[arg(long, short = 'P', alias = "prog_no", value_name = "1..254", value_parser = program_number, default_value = "1")]
+    program: u8,
 
     #[command(flatten)]
-    program: Program,
+    patience: Patience,
 
     #[command(flatten)]
     source: Source,
@@ -62,51 +98,209 @@ pub(super) struct Flash {
     legacy: Legacy,
 }
 
+/// What one device is to get.
+struct Assignment {
+    node: Option<NodeId>,
+    address: Option<LssAddress>,
+    image: PathBuf,
+    file: Arc<BlockFile>,
+    options: FlashOptions,
+}
+
 impl Flash {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         self.legacy.check(context)?;
-        let file = self.input.path();
-        let done = self.source.blocks(file, self.program.program, self.labels.label()?)?;
-        warn_left_out(context, file, &done);
-        let options = self.options(&done)?;
-        let (size, crc) = (done.file.program_size(), done.file.program_crc());
-        context.out.say(format_args!("{}: program of {size} bytes, CRC {crc:08X}h", file.display()));
+        let devices = match &self.job {
+            Some(job) => self.devices_of_job(context, job)?,
+            None => self.devices(context)?,
+        };
         let mut adapter = context.open_at(self.legacy.bit_rate())?;
-        let mut session = self.program.device.session(&mut *adapter)?;
+        match devices.as_slice() {
+            [device] if self.job.is_none() => self.one(context, &mut *adapter, device),
+            devices => self.many(context, &mut *adapter, devices),
+        }
+    }
+
+    /// The devices of the command line, which all get the same.
+    fn devices(&self, context: &Context) -> Result<Vec<Assignment>, Failure> {
+        let image = self.file.as_deref().or(self.legacy_file.as_deref()).unwrap_or(Path::new(""));
+        let done = self.source.blocks(image, self.program, self.labels.label()?)?;
+        warn_left_out(context, image, &done);
+        let options = self.options(&done.file, &Settings::default())?;
+        let (size, crc) = (done.file.program_size(), done.file.program_crc());
+        context.out.say(format_args!("{}: program of {size} bytes, CRC {crc:08X}h", image.display()));
+        let file = Arc::new(done.file);
+        let address = self.legacy.address();
+        let mut nodes: Vec<NodeId> = Vec::new();
+        for node in self.node.iter().flatten() {
+            if !nodes.contains(node) {
+                nodes.push(*node);
+            }
+        }
+        if address.is_some() && nodes.len() > 1 {
+            let advice = "give one --node, or a job file with an lss address for each device";
+            return Err(Failure::usage("one LSS address cannot get several node-IDs", advice));
+        }
+        let assign = |node| Assignment {
+            node: Some(node),
+            address,
+            image: image.to_path_buf(),
+            file: file.clone(),
+            options,
+        };
+        Ok(nodes.into_iter().map(assign).collect())
+    }
+
+    /// The devices of a job file. Every image is read and checked before any device is touched.
+    fn devices_of_job(&self, context: &Context, job: &Path) -> Result<Vec<Assignment>, Failure> {
+        // Devices that get the same share it.
+        let mut known: Vec<(PathBuf, Option<String>, u8, Arc<BlockFile>)> = Vec::new();
+        let mut devices = Vec::new();
+        for entry in job::read(job)? {
+            let Entry { node, address, settings } = entry;
+            let image = settings.image.clone().unwrap_or_default();
+            let program = settings.program.unwrap_or(self.program);
+            let same = known.iter().find(|(path, board, number, _)| {
+                (path, board, *number) == (&image, &settings.board, program)
+            });
+            let file = match same {
+                Some((.., file)) => file.clone(),
+                None => {
+                    let source = match &settings.board {
+                        Some(board) => self.source.for_board(board)?,
+                        None => self.source.clone(),
+                    };
+                    let done = source.blocks(&image, program, Label::None)?;
+                    warn_left_out(context, &image, &done);
+                    let file = Arc::new(done.file);
+                    known.push((image.clone(), settings.board.clone(), program, file.clone()));
+                    file
+                }
+            };
+            let options = FlashOptions { program, ..self.options(&file, &settings)? };
+            devices.push(Assignment { node, address, image, file, options });
+        }
+        Ok(devices)
+    }
+
+    /// What the command line says, unless a device's own settings say otherwise.
+    fn options(&self, file: &BlockFile, settings: &Settings) -> Result<FlashOptions, Failure> {
+        let check = settings.check_target.unwrap_or(self.check_target || self.legacy.check_target());
+        let advice = "convert it with --vid and --pid, or give them here";
+        let unnamed = || Failure::usage("the file does not say for which device it is", advice);
+        let check_target = if check { Some(Target::of(file).ok_or_else(unnamed)?) } else { None };
+        Ok(FlashOptions {
+            program: self.program,
+            repeats: self.block_repeats,
+            check_target,
+            trial_run: settings.trial_run.unwrap_or(self.trial_run),
+            start: settings.start.unwrap_or(!self.no_start),
+            verify: settings.verify.unwrap_or(self.verify),
+        })
+    }
+
+    /// The node-ID of a device, which is given it first if it is named by its LSS address.
+    fn node_of(&self, adapter: &mut dyn Adapter, device: &Assignment) -> Result<NodeId, Failure> {
+        match (device.address, device.node) {
+            (Some(address), node) => {
+                let boot = self.patience.timing().boot;
+                Ok(ensure_node_id(adapter, &address, node, boot, &cancelled()?)?)
+            }
+            (None, Some(node)) => Ok(node),
+            // A job without either was refused.
+            (None, None) => Err(Failure::usage("a device has no node-ID", "give it one")),
+        }
+    }
+
+    fn one(&self, context: &Context, adapter: &mut dyn Adapter, device: &Assignment) -> Result<(), Failure> {
+        let node = self.node_of(adapter, device)?;
+        let mut session = self.patience.session(adapter, node)?;
         let mut progress = Progress::new(context.out);
         let mut left = None;
-        let result = flash(&mut session, &done.file, &options, &mut |event| match event {
+        let result = flash(&mut session, &device.file, &device.options, &mut |event| match event {
             Event::Left(state) => left = Some(state),
             event => progress.show(event),
         });
         progress.finish();
-        let report = result.map_err(|error| Failure::from(error).leaving(left))?;
+        let result = result.map_err(|error| Failure::diagnosed(error, &mut session).leaving(left));
+        let report = match (&self.report, result) {
+            (None, result) => result?,
+            (Some(path), result) => {
+                let outcome = Outcome {
+                    node: Some(node),
+                    name: format!("node {node}"),
+                    image: device.image.display().to_string(),
+                    result,
+                };
+                write_report(path, &document(std::slice::from_ref(&outcome)))?;
+                outcome.result?
+            }
+        };
         context.out.result(Done(&report), || {
             let mut value = value(&report);
             value["command"] = "flash".into();
-            value["node"] = session.node().get().into();
-            value["program"] = self.program.program.into();
+            value["node"] = node.get().into();
+            value["program"] = device.options.program.into();
             value
         });
         Ok(())
     }
 
-    fn options(&self, done: &Converted) -> Result<FlashOptions, Failure> {
-        let check_target = if self.check_target || self.legacy.check_target() {
-            let advice = "convert it with --vid and --pid, or give them here";
-            let unnamed = || Failure::usage("the file does not say for which device it is", advice);
-            Some(Target::of(&done.file).ok_or_else(unnamed)?)
-        } else {
-            None
+    fn many(
+        &self,
+        context: &Context,
+        adapter: &mut dyn Adapter,
+        devices: &[Assignment],
+    ) -> Result<(), Failure> {
+        let mut outcomes: Vec<Option<Outcome>> = Vec::new();
+        let mut jobs: Vec<(usize, Job)> = Vec::new();
+        for (number, device) in devices.iter().enumerate() {
+            let image = device.image.display().to_string();
+            let twice = |node| jobs.iter().any(|(_, job): &(usize, Job)| job.node == node);
+            let outcome = match self.node_of(adapter, device) {
+                Ok(node) if twice(node) => {
+                    let advice = "name each device once, and give each its own node-ID";
+                    let failure = Failure::usage(format!("node {node} is in the job twice"), advice);
+                    Some(Outcome { node: Some(node), name: device.name(), image, result: Err(failure) })
+                }
+                Ok(node) => {
+                    jobs.push((number, Job { node, file: device.file.clone(), options: device.options }));
+                    None
+                }
+                Err(failure) => {
+                    Some(Outcome { node: device.node, name: device.name(), image, result: Err(failure) })
+                }
+            };
+            outcomes.push(outcome);
+        }
+        let options = ManyOptions {
+            timing: self.patience.timing(),
+            transfers: self.patience.transfers(),
+            at_once: self.at_once as usize,
+            cancelled: cancelled()?,
         };
-        Ok(FlashOptions {
-            program: self.program.program,
-            repeats: self.block_repeats,
-            check_target,
-            trial_run: self.trial_run,
-            start: !self.no_start,
-            verify: self.verify,
-        })
+        let (numbers, jobs): (Vec<usize>, Vec<Job>) = jobs.into_iter().unzip();
+        let nodes: Vec<NodeId> = jobs.iter().map(|job| job.node).collect();
+        let board = Board::new(context.out, &nodes);
+        let results = flash_many(adapter, &jobs, &options, &|job, event| board.show(job, event));
+        board.finish();
+        for ((number, node), result) in numbers.into_iter().zip(nodes).zip(results) {
+            let image = devices[number].image.display().to_string();
+            outcomes[number] = Some(Outcome::new(node, image, result));
+        }
+        let outcomes: Vec<Outcome> = outcomes.into_iter().flatten().collect();
+        summary(context.out, &outcomes, self.report.as_deref())
+    }
+}
+
+impl Assignment {
+    /// For people.
+    fn name(&self) -> String {
+        match (self.node, self.address) {
+            (Some(node), _) => format!("node {node}"),
+            (None, Some(address)) => format!("device with serial number {:08X}h", address.serial_number),
+            (None, None) => "device".to_string(),
+        }
     }
 }
 
@@ -125,7 +319,7 @@ impl std::fmt::Display for Done<'_> {
 }
 
 /// For programs.
-fn value(report: &Report) -> Value {
+pub(super) fn value(report: &Report) -> Value {
     let seconds = |time: Duration| (time.as_secs_f64() * 1000.0).round() / 1000.0;
     json!({
         "size": report.program_size,

@@ -20,7 +20,7 @@ impl Info {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let mut adapter = context.open()?;
         let mut session = self.device.session(&mut *adapter)?;
-        let info = info(&mut session)?;
+        let info = info(&mut session).map_err(|error| Failure::diagnosed(error, &mut session))?;
         context.out.result(&info, || value(&info));
         Ok(())
     }

@@ -2,6 +2,7 @@
 //! by changing the program's name.
 
 use clap::Args;
+use coflash::lss::LssAddress;
 
 use super::output::Failure;
 use super::values::number;
@@ -22,6 +23,22 @@ pub(super) struct Legacy {
     /// A value above 0 is --check-target.
     #[arg(long = "chk_tgt", value_name = "VALUE", value_parser = number, hide = true)]
     chk_tgt: Option<u32>,
+
+    /// Give the device with this LSS address the node-ID of --node first: its serial number.
+    #[arg(long = "ser_num", value_name = "NUMBER", value_parser = number)]
+    serial: Option<u32>,
+
+    /// The same: its revision.
+    #[arg(long = "rev", value_name = "NUMBER", value_parser = number)]
+    revision: Option<u32>,
+
+    /// The same: its product code.
+    #[arg(long = "pcode", value_name = "NUMBER", value_parser = number)]
+    product: Option<u32>,
+
+    /// The same: its vendor-ID; 0x3F unless told otherwise.
+    #[arg(long = "vendor", value_name = "NUMBER", value_parser = number)]
+    vendor: Option<u32>,
 
     #[arg(long = "vxd_type", value_name = "VALUE", hide = true)]
     vxd_type: Option<String>,
@@ -60,6 +77,17 @@ impl Legacy {
             }
         }
         Ok(())
+    }
+
+    /// The LSS address, if any part of it was given; the other parts have the manual's defaults (table 9).
+    pub(super) fn address(&self) -> Option<LssAddress> {
+        let parts = [self.vendor, self.product, self.revision, self.serial];
+        parts.iter().any(Option::is_some).then(|| LssAddress {
+            vendor_id: self.vendor.unwrap_or(0x3F),
+            product_code: self.product.unwrap_or(0),
+            revision: self.revision.unwrap_or(0),
+            serial_number: self.serial.unwrap_or(0),
+        })
     }
 
     /// Whether the old spelling of `--check-target` was given.

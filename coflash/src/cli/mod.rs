@@ -16,8 +16,10 @@ mod flash;
 mod generate;
 mod info;
 mod inspect;
+mod job;
 mod legacy;
 mod lss;
+mod many;
 mod monitor;
 mod output;
 mod program;
@@ -59,7 +61,7 @@ struct Cli {
 enum Command {
     Convert(convert::Convert),
     Inspect(inspect::Inspect),
-    Flash(flash::Flash),
+    Flash(Box<flash::Flash>),
     Scan(scan::Scan),
     Info(info::Info),
     Status(program::Status),

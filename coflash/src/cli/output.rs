@@ -9,9 +9,11 @@ use canopen::NodeId;
 use clap::Args;
 use coflash::adapter::AdapterError;
 use coflash::convert::ConvertError;
+use coflash::diagnose::diagnose;
 use coflash::error::LssFailure;
 use coflash::flash::DeviceState;
 use coflash::read::FileError;
+use coflash::session::Session;
 use coflash::Error;
 use serde_json::{json, Value};
 
@@ -90,7 +92,9 @@ impl Output {
     /// A failure, as the last thing that a command says.
     pub(super) fn failure(self, failure: &Failure) {
         if self.json {
-            self.value(&failure.value());
+            if !failure.told {
+                self.value(&failure.value());
+            }
         } else {
             let _ = write!(io::stderr(), "{failure}");
         }
@@ -118,6 +122,7 @@ Exit codes:
   5    the device does not answer
   6    the device refuses, or reports an error
   7    the program does not start, or the application does not go back to the bootloader
+  8    some of several devices failed; the summary tells which
   130  cancelled";
 
 /// The exit codes.
@@ -131,6 +136,7 @@ pub(super) enum Exit {
     NoAnswer = 5,
     Device = 6,
     NoStart = 7,
+    Some = 8,
     Cancelled = 130,
 }
 
@@ -150,39 +156,67 @@ pub(super) struct Failure {
     /// In what state the device is left, where that is known.
     left: Option<DeviceState>,
     advice: Option<String>,
+    /// Whether the document on standard output has it already.
+    told: bool,
 }
 
 impl Failure {
+    /// A conversation that failed. Where the device is silent, the bus is listened to for the reason.
+    pub(super) fn diagnosed(error: Error, session: &mut Session<'_>) -> Self {
+        let silent = matches!(error, Error::NoAnswer { .. });
+        let failure = Self::from(error);
+        match silent.then(|| diagnose(session)) {
+            Some(Ok(diagnosis)) => Self { advice: Some(diagnosis.to_string()), ..failure },
+            // The first reason stands.
+            Some(Err(_)) | None => failure,
+        }
+    }
+
+    /// Devices of several have failed, and the summary has told why.
+    pub(super) fn told(exit: Exit, failed: usize, of: usize) -> Self {
+        let what = format!("{failed} of {of} devices failed");
+        Self { told: true, ..Self::new(exit, None, what, None) }
+    }
+
+    fn new(exit: Exit, number: Option<u32>, what: String, advice: Option<String>) -> Self {
+        Self { exit, number, what, left: None, advice, told: false }
+    }
+
+    /// A fault in one device of a job file.
+    pub(super) fn job(path: &Path, device: usize, why: &str) -> Self {
+        Self::new(Exit::File, None, format!("{}, device {device}: {why}", path.display()), None)
+    }
+
     /// The same, with the state in which the device is left.
     pub(super) fn leaving(self, left: Option<DeviceState>) -> Self {
         Self { left, ..self }
     }
 
     pub(super) fn usage(what: impl Into<String>, advice: impl Into<String>) -> Self {
-        Self { exit: Exit::Usage, number: None, what: what.into(), left: None, advice: Some(advice.into()) }
+        Self::new(Exit::Usage, None, what.into(), Some(advice.into()))
     }
 
     /// Words of the command line's reader, which have their advice in them.
     pub(super) fn bare_usage(words: String) -> Self {
         let what = words.strip_prefix("error: ").unwrap_or(&words).trim_end().to_string();
-        Self { exit: Exit::Usage, number: None, what, left: None, advice: None }
+        Self::new(Exit::Usage, None, what, None)
     }
 
     /// A file, other than firmware, that cannot be read.
     pub(super) fn unreadable(path: &Path, error: &io::Error) -> Self {
         let number = error.raw_os_error().and_then(|code| u32::try_from(code).ok());
         let what = format!("{}: cannot be read: {error}", path.display());
-        Self { exit: Exit::File, number, what, left: None, advice: None }
+        Self::new(Exit::File, number, what, None)
     }
 
     /// A fault in a line of a file, other than firmware.
     pub(super) fn line(path: &Path, line: usize, why: &str) -> Self {
         let what = format!("{}, line {line}: {why}", path.display());
-        Self { exit: Exit::File, number: None, what, left: None, advice: None }
+        Self::new(Exit::File, None, what, None)
     }
 
     pub(super) fn system(what: String) -> Self {
-        Self { exit: Exit::System, number: None, what, left: None, advice: None }
+        Self::new(Exit::System, None, what, None)
     }
 
     /// A device that was reset and has not come back.
@@ -190,7 +224,7 @@ impl Failure {
         let advice = "check that node-ID and bit rate are right; a device with a new node-ID comes back under that one";
         let what = format!("node {node} has sent no boot-up message");
         let advice = Some(advice.to_string());
-        Self { exit: Exit::NoAnswer, number: Some(0x6000_0013), what, left: None, advice }
+        Self::new(Exit::NoAnswer, Some(0x6000_0013), what, advice)
     }
 
     /// A conversion of `file` that failed.
@@ -201,13 +235,7 @@ impl Failure {
             | ConvertError::Start(_)
             | ConvertError::Range(_)
             | ConvertError::Adjust(_)
-            | ConvertError::Blocks(_) => Self {
-                exit: Exit::Usage,
-                number: Some(0x6000_0018),
-                what: error.to_string(),
-                left: None,
-                advice: None,
-            },
+            | ConvertError::Blocks(_) => Self::new(Exit::Usage, Some(0x6000_0018), error.to_string(), None),
         }
     }
 
@@ -228,7 +256,7 @@ impl Failure {
 impl From<FileError> for Failure {
     fn from(error: FileError) -> Self {
         let number = Some(error.error.cause.number());
-        Self { exit: Exit::File, number, what: error.to_string(), left: None, advice: None }
+        Self::new(Exit::File, number, error.to_string(), None)
     }
 }
 
@@ -254,13 +282,7 @@ impl From<Error> for Failure {
             | Error::Lss { .. } => Exit::Device,
             Error::NoBootloader { .. } | Error::StartFailed { .. } => Exit::NoStart,
         };
-        Self {
-            exit,
-            number: Some(error.number()),
-            what: error.to_string(),
-            left: None,
-            advice: Some(error.advice()),
-        }
+        Self::new(exit, Some(error.number()), error.to_string(), Some(error.advice()))
     }
 }
 

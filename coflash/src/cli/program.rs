@@ -67,7 +67,8 @@ fn with(
 ) -> Result<(), Failure> {
     let mut adapter = context.open()?;
     let mut session = program.device.session(&mut *adapter)?;
-    let (words, more) = act(&mut session, program.program, &mut |event| context.out.detail(event))?;
+    let (words, more) = act(&mut session, program.program, &mut |event| context.out.detail(event))
+        .map_err(|error| Failure::diagnosed(error, &mut session))?;
     let node = session.node();
     context.out.result(format_args!("node {node}: {words}"), || {
         let mut value = json!({ "command": command, "node": node.get(), "program": program.program });

@@ -45,7 +45,9 @@ impl Read {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let mut adapter = context.open()?;
         let mut session = self.device.session(&mut *adapter)?;
-        let bytes = session.upload(self.object, &mut |_| {})?;
+        let bytes = session
+            .upload(self.object, &mut |_| {})
+            .map_err(|error| Failure::diagnosed(error, &mut session))?;
         let (node, object) = (session.node(), self.object);
         if let Some(path) = &self.output {
             std::fs::write(path, &bytes).map_err(|error| {

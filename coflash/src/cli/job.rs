@@ -1,0 +1,176 @@
+//! The job file of `coflash flash --job`: which devices get what.
+
+use std::path::{Path, PathBuf};
+
+use canopen::NodeId;
+use coflash::lss::LssAddress;
+use serde::Deserialize;
+
+use super::output::Failure;
+
+/// A job file. What is said at its top holds for every device that does not say otherwise.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+struct File {
+    #[serde(flatten)]
+    defaults: Settings,
+    #[serde(default, rename = "device")]
+    devices: Vec<Device>,
+}
+
+/// What can be said for all devices and for each of them.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(super) struct Settings {
+    /// The firmware, from the job file's folder.
+    pub(super) image: Option<PathBuf>,
+    pub(super) board: Option<String>,
+    pub(super) program: Option<u8>,
+    pub(super) check_target: Option<bool>,
+    pub(super) trial_run: Option<bool>,
+    pub(super) start: Option<bool>,
+    pub(super) verify: Option<bool>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Device {
+    node: Option<u8>,
+    lss: Option<Lss>,
+    #[serde(flatten)]
+    settings: Settings,
+    /// What nobody knows: flattened structures cannot refuse it by themselves.
+    #[serde(flatten)]
+    unknown: toml::Table,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Lss {
+    vendor: u32,
+    product: u32,
+    revision: u32,
+    serial: u32,
+}
+
+/// One device of a job file, with the file's defaults.
+#[derive(Debug)]
+pub(super) struct Entry {
+    pub(super) node: Option<NodeId>,
+    pub(super) address: Option<LssAddress>,
+    pub(super) settings: Settings,
+}
+
+/// Reads a job file.
+pub(super) fn read(path: &Path) -> Result<Vec<Entry>, Failure> {
+    let text = std::fs::read_to_string(path).map_err(|error| Failure::unreadable(path, &error))?;
+    parse(&text, path)
+}
+
+fn parse(text: &str, path: &Path) -> Result<Vec<Entry>, Failure> {
+    let file: File = toml::from_str(text).map_err(|error| {
+        let line =
+            error.span().map_or(1, |span| 1 + text[..span.start.min(text.len())].matches('\n').count());
+        Failure::line(path, line, error.message())
+    })?;
+    let File { defaults, devices } = file;
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let mut entries: Vec<Entry> = Vec::new();
+    for (number, device) in (1..).zip(devices) {
+        let wrong = |what: String| Failure::job(path, number, &what);
+        if let Some(key) = device.unknown.keys().find(|key| !SETTINGS.contains(&key.as_str())) {
+            return Err(wrong(format!("there is no setting '{key}'")));
+        }
+        let node = match device.node {
+            None => None,
+            Some(number) => {
+                Some(NodeId::new(number).ok_or_else(|| wrong("node-IDs are 1 to 127".to_string()))?)
+            }
+        };
+        let address = device.lss.map(|lss| LssAddress {
+            vendor_id: lss.vendor,
+            product_code: lss.product,
+            revision: lss.revision,
+            serial_number: lss.serial,
+        });
+        if node.is_none() && address.is_none() {
+            return Err(wrong("it has neither node nor lss".to_string()));
+        }
+        let same = |entry: &Entry| {
+            (node.is_some() && entry.node == node) || (address.is_some() && entry.address == address)
+        };
+        if entries.iter().any(same) {
+            return Err(wrong("it is in the list already".to_string()));
+        }
+        let own = device.settings;
+        let image = own.image.or_else(|| defaults.image.clone());
+        let settings = Settings {
+            image: Some(folder.join(image.ok_or_else(|| wrong("it has no image".to_string()))?)),
+            board: own.board.or_else(|| defaults.board.clone()),
+            program: own.program.or(defaults.program),
+            check_target: own.check_target.or(defaults.check_target),
+            trial_run: own.trial_run.or(defaults.trial_run),
+            start: own.start.or(defaults.start),
+            verify: own.verify.or(defaults.verify),
+        };
+        if settings.program.is_some_and(|program| !(1..=254).contains(&program)) {
+            return Err(wrong("programs are 1 to 254".to_string()));
+        }
+        entries.push(Entry { node, address, settings });
+    }
+    if entries.is_empty() {
+        return Err(Failure::line(path, 1, "it names no device: write a [[device]] for each"));
+    }
+    Ok(entries)
+}
+
+/// The names of [`Settings`]: serde hands these to the table of the unknown, too.
+const SETTINGS: [&str; 7] = ["image", "board", "program", "check-target", "trial-run", "start", "verify"];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn job(text: &str) -> Result<Vec<Entry>, String> {
+        parse(text, Path::new("folder/job.toml")).map_err(|failure| failure.to_string())
+    }
+
+    #[test]
+    fn devices_have_their_own_settings_or_the_files() {
+        let entries = job("image = 'a.elf'\ntrial-run = true\nprogram = 2\n[[device]]\nnode = 5\n\
+                           [[device]]\nlss = { vendor = 0x3F, product = 1, revision = 2, serial = 3 }\n\
+                           node = 6\nimage = '/b.elf'\ntrial-run = false\n")
+        .unwrap();
+        let [first, second] = entries.as_slice() else { panic!("{entries:?}") };
+        assert_eq!((first.node, first.address), (NodeId::new(5), None));
+        assert_eq!(first.settings.image.as_deref(), Some(Path::new("folder/a.elf")));
+        assert_eq!((first.settings.trial_run, first.settings.program), (Some(true), Some(2)));
+        assert_eq!(second.settings.image.as_deref(), Some(Path::new("/b.elf")));
+        assert_eq!((second.settings.trial_run, second.settings.program), (Some(false), Some(2)));
+        let address = LssAddress { vendor_id: 0x3F, product_code: 1, revision: 2, serial_number: 3 };
+        assert_eq!((second.node, second.address), (NodeId::new(6), Some(address)));
+    }
+
+    #[test]
+    fn a_fault_is_named_with_its_place() {
+        for (text, words) in [
+            ("", "job.toml, line 1: it names no device"),
+            ("image = 'a'\n\nimage = 'b'\n", "job.toml, line 3: "),
+            ("image = 5\n", "job.toml, line 1: "),
+            ("[[device]]\nnode = 5\n", "job.toml, device 1: it has no image"),
+            ("image = 'a'\n[[device]]\n", "device 1: it has neither node nor lss"),
+            ("image = 'a'\n[[device]]\nnode = 128\n", "device 1: node-IDs are 1 to 127"),
+            ("image = 'a'\n[[device]]\nnode = 300\n", "job.toml, line "),
+            ("image = 'a'\nprogram = 255\n[[device]]\nnode = 1\n", "device 1: programs are 1 to 254"),
+            (
+                "image = 'a'\n[[device]]\nnode = 1\n[[device]]\nnode = 1\n",
+                "device 2: it is in the list already",
+            ),
+            ("image = 'a'\n[[device]]\nnode = 1\nspeed = 2\n", "device 1: there is no setting 'speed'"),
+            ("speed = 2\nimage = 'a'\n[[device]]\nnode = 1\n", "speed"),
+            ("image = 'a'\n[[device]]\nlss = { vendor = 1 }\n", "product"),
+        ] {
+            let error = job(text).unwrap_err();
+            assert!(error.contains(words), "{text:?}: {error}");
+        }
+    }
+}

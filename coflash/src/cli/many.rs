@@ -1,0 +1,162 @@
+//! What a person and a program see of the update of many devices.
+
+use std::path::Path;
+use std::sync::{Mutex, PoisonError};
+
+use canopen::NodeId;
+use coflash::flash::{Event, Report};
+use coflash::many::Failed;
+use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use serde_json::{json, Value};
+
+use super::flash::value;
+use super::output::{Exit, Failure, Output};
+
+const STYLE: &str = "{prefix:<9} {bar:30} {percent:>3} %  {bytes_per_sec:>12}  {msg}";
+
+/// A line of progress for each device: a bar on a terminal, and elsewhere lines with the node in front.
+pub(super) struct Board {
+    out: Output,
+    names: Vec<String>,
+    form: Form,
+}
+
+enum Form {
+    Terminal(Vec<ProgressBar>),
+    /// Tenths that were shown, for each device.
+    Plain(Mutex<Vec<usize>>),
+}
+
+impl Board {
+    pub(super) fn new(out: Output, nodes: &[NodeId]) -> Self {
+        let names: Vec<String> = nodes.iter().map(|node| format!("node {node}")).collect();
+        let form = if out.on_terminal() {
+            let all = MultiProgress::with_draw_target(ProgressDrawTarget::stdout());
+            let bar = |name: &String| {
+                let bar = all.add(ProgressBar::new(1)).with_prefix(name.clone());
+                // The template is a constant; should it ever be wrong, a bar in another style does.
+                if let Ok(style) = ProgressStyle::with_template(STYLE) {
+                    bar.set_style(style.progress_chars("=> "));
+                }
+                bar.set_message("waiting");
+                bar
+            };
+            Form::Terminal(names.iter().map(bar).collect())
+        } else {
+            Form::Plain(Mutex::new(vec![0; names.len()]))
+        };
+        Self { out, names, form }
+    }
+
+    /// Shows what happens to a device.
+    pub(super) fn show(&self, device: usize, event: Event) {
+        let Some(name) = self.names.get(device) else { return };
+        match (&self.form, event) {
+            // The summary tells it.
+            (_, Event::Left(_)) => {}
+            (Form::Terminal(bars), Event::Progress { done, total }) => {
+                bars[device].set_length(total as u64);
+                bars[device].set_position(done as u64);
+                bars[device].set_message("");
+            }
+            (Form::Terminal(bars), event) => bars[device].set_message(event.to_string()),
+            (Form::Plain(tenths), Event::Progress { done, total }) => {
+                let now = (done * 10).checked_div(total).unwrap_or(10);
+                // Nobody panics while it is held; and if so, the number is still one.
+                let mut tenths = tenths.lock().unwrap_or_else(PoisonError::into_inner);
+                // Many devices have many lines: every half does.
+                if now / 5 > tenths[device] / 5 {
+                    self.out.say(format_args!("{name}: {:>3} %", now * 10));
+                }
+                tenths[device] = now;
+            }
+            (Form::Plain(_), event) => self.out.say(format_args!("{name}: {event}")),
+        }
+    }
+
+    /// Leaves the bars as they stand.
+    pub(super) fn finish(&self) {
+        if let Form::Terminal(bars) = &self.form {
+            bars.iter().filter(|bar| !bar.is_finished()).for_each(ProgressBar::abandon);
+        }
+    }
+}
+
+/// How it went with one device.
+pub(super) struct Outcome {
+    pub(super) node: Option<NodeId>,
+    /// The device as the job names it.
+    pub(super) name: String,
+    pub(super) image: String,
+    pub(super) result: Result<Report, Failure>,
+}
+
+impl Outcome {
+    pub(super) fn new(node: NodeId, image: String, result: Result<Report, Failed>) -> Self {
+        let result = result.map_err(|failed| Failure::from(failed.error).leaving(Some(failed.left)));
+        Self { node: Some(node), name: format!("node {node}"), image, result }
+    }
+}
+
+/// Tells the summary, and gives what the command comes to.
+pub(super) fn summary(out: Output, outcomes: &[Outcome], report: Option<&Path>) -> Result<(), Failure> {
+    let failed = outcomes.iter().filter(|outcome| outcome.result.is_err()).count();
+    let document = document(outcomes);
+    out.say("");
+    for Outcome { name, result, .. } in outcomes {
+        match result {
+            Ok(report) => out.say(format_args!("{name}: done in {:.1} s", report.took.as_secs_f64())),
+            Err(failure) => out.say(format_args!("{name}: {}", failure.to_string().trim_end())),
+        }
+    }
+    let (all, good) = (outcomes.len(), outcomes.len() - failed);
+    out.say(format_args!("{good} of {all} devices are done"));
+    out.value(&document);
+    if let Some(path) = report {
+        write_report(path, &document)?;
+    }
+    let cancelled =
+        |outcome: &Outcome| matches!(&outcome.result, Err(failure) if failure.exit == Exit::Cancelled);
+    match failed {
+        0 => Ok(()),
+        _ if outcomes.iter().any(cancelled) => Err(Failure::told(Exit::Cancelled, failed, all)),
+        _ => Err(Failure::told(Exit::Some, failed, all)),
+    }
+}
+
+/// What came of all devices, for programs.
+pub(super) fn document(outcomes: &[Outcome]) -> Value {
+    let failed = outcomes.iter().filter(|outcome| outcome.result.is_err()).count();
+    let devices: Vec<Value> = outcomes.iter().map(outcome_value).collect();
+    json!({ "command": "flash", "devices": devices, "failed": failed })
+}
+
+/// Writes it to a file.
+pub(super) fn write_report(path: &Path, document: &Value) -> Result<(), Failure> {
+    std::fs::write(path, format!("{document:#}\n"))
+        .map_err(|error| Failure::system(format!("{}: cannot be written: {error}", path.display())))
+}
+
+fn outcome_value(outcome: &Outcome) -> Value {
+    let mut all = json!({
+        "node": outcome.node.map(NodeId::get),
+        "name": outcome.name,
+        "image": outcome.image,
+        "ok": outcome.result.is_ok(),
+    });
+    match &outcome.result {
+        Ok(report) => all["report"] = value(report),
+        Err(failure) => all["error"] = failure.value()["error"].clone(),
+    }
+    all
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_bars_have_their_style() {
+        assert!(ProgressStyle::with_template(STYLE).is_ok());
+    }
+}

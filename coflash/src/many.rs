@@ -1,0 +1,79 @@
+//! The update of many devices over one bus: while one erases, another receives.
+
+use std::sync::atomic::AtomicBool;
+use std::sync::Arc;
+
+use canopen::NodeId;
+
+use crate::adapter::Adapter;
+use crate::block_file::BlockFile;
+use crate::error::Error;
+use crate::flash::{flash, DeviceState, Event, FlashOptions, Report};
+use crate::hub;
+use crate::session::{Session, Timing, Transfers};
+
+/// What one device is to get.
+#[derive(Clone, Debug)]
+pub struct Job {
+    /// Which device.
+    pub node: NodeId,
+    /// The program.
+    pub file: Arc<BlockFile>,
+    /// How.
+    pub options: FlashOptions,
+}
+
+/// How to treat all of them.
+#[derive(Clone, Debug)]
+pub struct ManyOptions {
+    /// How long to wait for what. Answers wait behind those of other devices: the SDO time-out is taken as many times as
+    /// there are devices at once.
+    pub timing: Timing,
+    /// How to write.
+    pub transfers: Transfers,
+    /// How many devices are at work at the same time.
+    pub at_once: usize,
+    /// Ends all of them as soon as it is set.
+    pub cancelled: Arc<AtomicBool>,
+}
+
+/// A device that failed, and how it was left.
+#[derive(Debug)]
+pub struct Failed {
+    /// What went wrong.
+    pub error: Error,
+    /// How far it had come.
+    pub left: DeviceState,
+}
+
+/// Updates all devices; a failure of one does not stop the others. `tell` hears what happens to which job, in threads of
+/// their own. The results are in the order of the jobs.
+pub fn flash_many(
+    adapter: &mut dyn Adapter,
+    jobs: &[Job],
+    options: &ManyOptions,
+    tell: &(dyn Fn(usize, Event) + Sync),
+) -> Vec<Result<Report, Failed>> {
+    let at_once = options.at_once.clamp(1, jobs.len().max(1));
+    let sdo = options.timing.sdo.saturating_mul(at_once as u32);
+    let timing = Timing { sdo, ..options.timing };
+    let conversation = |(number, job): (usize, &Job)| -> (NodeId, hub::Conversation<'_, _>) {
+        let (job, cancelled, transfers) = (job.clone(), options.cancelled.clone(), options.transfers);
+        let act = move |port: &mut hub::Port| {
+            let mut session = Session::new(port, job.node, timing);
+            session.cancel_by(cancelled);
+            session.transfer_by(transfers);
+            let mut left = DeviceState::Untouched;
+            let result = flash(&mut session, &job.file, &job.options, &mut |event| {
+                if let Event::Left(state) = event {
+                    left = state;
+                }
+                tell(number, event);
+            });
+            result.map_err(|error| Failed { error, left })
+        };
+        (jobs[number].node, Box::new(act))
+    };
+    let conversations = jobs.iter().enumerate().map(conversation).collect();
+    hub::run(adapter, conversations, at_once)
+}
