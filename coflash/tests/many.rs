@@ -15,6 +15,8 @@ use fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 
 const FILE: &[u8] = include_bytes!("data/identity-110.blk");
 
+type Results = Vec<Result<Report, Failed>>;
+
 fn devices(nodes: impl IntoIterator<Item = u8>) -> Bus {
     let device = |node| {
         let mut fake = Fake::new(if node % 2 == 0 { APPLICATION } else { BOOTLOADER });
@@ -41,7 +43,7 @@ fn options(at_once: usize) -> ManyOptions {
     }
 }
 
-fn run(bus: &mut Bus, jobs: &[Job], at_once: usize) -> (Vec<Result<Report, Failed>>, Vec<(usize, Event)>) {
+fn run(bus: &mut Bus, jobs: &[Job], at_once: usize) -> (Results, Vec<(usize, Event)>) {
     let events = Mutex::new(Vec::new());
     let results =
         flash_many(bus, jobs, &options(at_once), &|job, event| events.lock().unwrap().push((job, event)));
