@@ -86,11 +86,13 @@ impl Journal {
             (a, b) => a.or(b),
         };
         let active = newest.map(|(region, sequence)| {
-            let mut free = slots(&regions[region]);
-            while free > 1 && read_slot(flash, &regions[region], free - 1) == BLANK {
-                free -= 1;
+            // Behind the slot of the last word that is not blank; a word at a time, because this is on the way of every start.
+            let Region { base, .. } = regions[region];
+            let mut words = slots(&regions[region]) * SLOT_WORDS as u32;
+            while words > SLOT_WORDS as u32 && flash.read_word(base + 4 * (words - 1)) == ERASED {
+                words -= 1;
             }
-            Active { region, sequence, free }
+            Active { region, sequence, free: words.div_ceil(SLOT_WORDS as u32) }
         });
         Self { regions, active }
     }

@@ -1,0 +1,61 @@
+//! How long a device takes from its reset to the first instruction of its application.
+
+use coboot_tests::bench::Bench;
+use coboot_tests::firmware;
+use coflash::block_file::BlockFile;
+use coflash::convert::{blocks_of, Options, Region};
+use coflash::flash::{flash, FlashOptions};
+use coflash::read::{read, Firmware, Format};
+use emulator::time::{Span, Time};
+
+/// The application, followed by other data up to 400 KiB.
+fn large_program() -> BlockFile {
+    const SIZE: u32 = 400 * 1024;
+    let base = firmware::board().programs[0].base;
+    let Firmware::Image(image) = read(&firmware::elf(firmware::APP_V1), None, None).expect("an ELF of ours")
+    else {
+        panic!("an ELF is no block file");
+    };
+    let mut bytes: Vec<u8> = (0..SIZE).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
+    for (address, data) in image.segments() {
+        let at = (address - base) as usize;
+        bytes[at..at + data.len()].copy_from_slice(&data);
+    }
+    let large = read(&bytes, Some(Format::Raw), Some(base)).expect("a raw image");
+    let options = Options {
+        region: Region::Strict(firmware::board().programs[0].into()),
+        block_size: 16_384,
+        ..Options::default()
+    };
+    blocks_of(large, &options).expect("it fits").file
+}
+
+/// From power-on to the program counter in the program, in steps of 10 us.
+fn first_instruction(bench: &mut Bench) -> Span {
+    let base = firmware::board().programs[0].base;
+    let from: Time = bench.time();
+    bench.power_on();
+    loop {
+        bench.world.run_for(Span::from_micros(10));
+        if bench.machine().pc() >= base && bench.machine().pc() < 0x1000_0000 {
+            return bench.time() - from;
+        }
+        assert!(bench.time() - from < Span::from_millis(1000), "the program does not start");
+    }
+}
+
+/// The budget of the design: 10 ms, with a CRC over all of a program of 400 KiB.
+#[test]
+fn a_program_of_400_kib_is_checked_and_started_within_10_ms() {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    flash(&mut bench.session(), &large_program(), &FlashOptions::default(), &mut |_| {}).unwrap();
+    bench.power_off();
+    bench.run_ms(10);
+    let took = first_instruction(&mut bench);
+    println!("reset to the first instruction of a program of 400 KiB: {} us", took.0 / 1_000_000);
+    assert!(took <= Span::from_millis(10), "{} us", took.0 / 1_000_000);
+    // The CRC takes its part of it: without one it would be there in no time.
+    assert!(took >= Span::from_millis(1), "{} us", took.0 / 1_000_000);
+}
