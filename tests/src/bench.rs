@@ -56,7 +56,8 @@ impl Bench {
         Self::of(firmware::BOOTLOADER_COMPLETE, vec![Options::default()])
     }
 
-    /// So many boards whose bootloaders have every option, each with a unique ID and noise of its own. They share bus and node-ID until they are told others.
+    /// So many boards whose bootloaders have every option, each with a unique ID and noise of its own. They share bus and
+    /// node-ID until they are told others.
     ///
     /// # Panics
     /// As [`with`](Self::with), and for no board at all.
