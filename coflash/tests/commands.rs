@@ -246,6 +246,43 @@ fn monitor_shows_the_bus() {
     server.join().unwrap();
 }
 
+/// `coflash monitor | head`: it ends when nobody reads any more.
+#[test]
+fn monitor_ends_with_its_reader() {
+    let (bus, server) = serve(Heartbeats(Duration::ZERO));
+    let mut child = Command::new(env!("CARGO_BIN_EXE_coflash"))
+        .args(["monitor", "--bus", &bus])
+        .env_remove("COFLASH_CONFIG")
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    drop(child.stdout.take());
+    assert_eq!(child.wait().unwrap().code(), Some(0));
+    server.join().unwrap();
+}
+
+/// A bus with a heartbeat every ten milliseconds.
+struct Heartbeats(Duration);
+
+impl coflash::Adapter for Heartbeats {
+    fn send(&mut self, _: &Frame) -> Result<(), coflash::adapter::AdapterError> {
+        Ok(())
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::adapter::AdapterError> {
+        let beat = Duration::from_millis(10);
+        if timeout < beat {
+            return Ok(None);
+        }
+        self.0 += beat;
+        Ok(Some(Frame::of(CobId::new(0x705).unwrap(), &[5])))
+    }
+
+    fn now(&self) -> Duration {
+        self.0
+    }
+}
+
 #[test]
 fn lss_says_what_it_does() {
     let (bus, server) = serve(LssDevice::default());

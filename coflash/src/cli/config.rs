@@ -69,3 +69,32 @@ fn with_default(command: Command, id: &str, value: &str) -> Command {
         command.mut_subcommand(name, |subcommand| with_default(subcommand, id, value))
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn the_documentations_example_is_all_that_a_file_may_have() {
+        let page = include_str!("../../../docs/coflash.md");
+        let example = page.split("```toml\n").nth(1).and_then(|block| block.split("```").next()).unwrap();
+        let table: toml::Table = example.parse().unwrap();
+        let mut keys: Vec<&str> = table.keys().map(String::as_str).collect();
+        let mut known = KEYS.to_vec();
+        (keys.sort_unstable(), known.sort_unstable());
+        assert_eq!(keys, known);
+    }
+
+    #[test]
+    fn every_setting_is_an_option_of_some_command() {
+        for key in KEYS {
+            let id = key.replace('-', "_");
+            let is_option =
+                |command: &Command| command.get_arguments().any(|argument| argument.get_id() == id.as_str());
+            let command = super::super::Cli::command();
+            assert!(is_option(&command) || command.get_subcommands().any(is_option), "{key}");
+        }
+    }
+}

@@ -178,4 +178,21 @@ mod tests {
     fn the_arguments_are_well_formed() {
         Cli::command().debug_assert();
     }
+
+    /// The commands that the manual page of this tool shows are commands of this tool.
+    #[test]
+    fn what_the_documentation_shows_is_understood() {
+        let page = include_str!("../../../docs/coflash.md");
+        let lines: Vec<&str> = page.lines().filter_map(|line| line.strip_prefix("$ ")).collect();
+        assert!(lines.len() > 5, "{lines:?}");
+        for line in lines {
+            // What stands behind it is for a shell: a variable in front, a pipe behind.
+            let words = line.split(" | ").next().unwrap_or_default().split(" > ").next().unwrap_or_default();
+            let words =
+                words.split_whitespace().skip_while(|word| word.contains('=') && !word.starts_with('-'));
+            if let Err(error) = Cli::try_parse_from(words) {
+                panic!("{line}: {error}");
+            }
+        }
+    }
 }

@@ -100,9 +100,10 @@ impl Show<'_> {
                 return;
             }
         }
-        self.left = self.left.saturating_sub(1);
-        let out = self.context.out;
-        out.say(format_args!("{:>11.6}  {:<20}  {words}", time.as_secs_f64(), frame.to_string()));
-        out.value(&json!({ "time": time.as_secs_f64(), "frame": frame.to_string(), "words": words }));
+        let (seconds, frame) = (time.as_secs_f64(), frame.to_string());
+        let line = format!("{seconds:>11.6}  {frame:<20}  {words}");
+        let read =
+            self.context.out.listed(line, || json!({ "time": seconds, "frame": frame, "words": words }));
+        self.left = if read { self.left.saturating_sub(1) } else { 0 };
     }
 }

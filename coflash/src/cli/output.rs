@@ -84,6 +84,15 @@ impl Output {
         }
     }
 
+    /// A line of an endless list: words for people, a value for programs. Tells whether anybody still reads.
+    pub(super) fn listed(self, words: impl fmt::Display, value: impl FnOnce() -> Value) -> bool {
+        if self.json {
+            writeln!(io::stdout(), "{}", value()).is_ok()
+        } else {
+            self.quiet || writeln!(io::stdout(), "{words}").is_ok()
+        }
+    }
+
     /// Something that people should know although the command goes on. Never on standard output.
     pub(super) fn warn(self, words: impl fmt::Display) {
         let _ = writeln!(io::stderr(), "{} {words}", paint("warning:", "33"));
