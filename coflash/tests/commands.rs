@@ -177,9 +177,9 @@ fn scan_finds_who_answers_and_who_is_heard() {
         (&true.into(), &false.into())
     );
     let (out, bus) = scan(&["--listen-only"]);
-    assert!(out.contains("no answer by SDO") && bus.0.iter().all(|fake| fake.sent.is_empty()), "{out}");
+    assert!(out.contains("no answer") && bus.0.iter().all(|fake| fake.sent.is_empty()), "{out}");
     let (out, _) = scan(&["-N", "9,11-12"]);
-    assert!(out.contains("\n   9  bootloader"), "{out}");
+    assert!(out.contains("\n9     bootloader"), "{out}");
     let (bus, server) = serve(Bus(vec![]));
     let done = coflash(&["scan", "--bus", &bus, "--listen", "10", "--sdo-timeout", "10"]);
     assert!(done.exit == 0 && done.out.starts_with("nobody answers, and nobody is heard"), "{}", done.out);

@@ -83,7 +83,8 @@ mod tests {
         let table: toml::Table = example.parse().unwrap();
         let mut keys: Vec<&str> = table.keys().map(String::as_str).collect();
         let mut known = KEYS.to_vec();
-        (keys.sort_unstable(), known.sort_unstable());
+        keys.sort_unstable();
+        known.sort_unstable();
         assert_eq!(keys, known);
     }
 

@@ -63,36 +63,34 @@ impl std::fmt::Display for Table<'_> {
                 "nobody answers, and nobody is heard (coflash lss fastscan finds devices without node-ID)",
             );
         }
-        writeln!(
-            f,
-            "node  runs         name                 software      serial     program 1       heartbeat"
-        )?;
-        for (node, found) in self.0 {
-            let state = found.state.map_or("-", state_words);
-            let Some(info) = &found.info else {
-                writeln!(f, "{:>4}  no answer by SDO{:63}{state}", node.get(), "")?;
-                continue;
-            };
-            let text = |text: &Option<String>| text.clone().unwrap_or_else(|| "-".to_string());
-            let runs = if info.device_type.is_bootloader() { "bootloader" } else { "application" };
-            let serial = info.identity[3].map_or("-".to_string(), |serial| format!("{serial:08X}h"));
-            let program = match info.programs.first().and_then(|program| program.status) {
-                None => "-".to_string(),
-                Some(status) if status.busy => "busy".to_string(),
-                Some(status) => {
-                    status.error.map_or("ok".to_string(), |error| format!("error {:02X}h", error.code()))
-                }
-            };
-            writeln!(
-                f,
-                "{:>4}  {runs:<11}  {:<19}  {:<12}  {serial:<9}  {program:<14}  {state}",
-                node.get(),
-                text(&info.name),
-                text(&info.software_version),
-            )?;
+        let heads = ["node", "runs", "name", "software", "serial", "program 1", "heartbeat"];
+        let rows = std::iter::once(heads.map(String::from)).chain(self.0.iter().map(row)).collect::<Vec<_>>();
+        let width = |column: usize| rows.iter().map(|row| row[column].len()).max().unwrap_or_default();
+        let widths: Vec<usize> = (0..heads.len()).map(width).collect();
+        for row in &rows {
+            let cells = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:<width$}"));
+            writeln!(f, "{}", cells.collect::<Vec<_>>().join("  ").trim_end())?;
         }
         Ok(())
     }
+}
+
+fn row((node, found): (&NodeId, &Found)) -> [String; 7] {
+    let none = || "-".to_string();
+    let state = found.state.map_or_else(none, |state| state_words(state).to_string());
+    let node = node.to_string();
+    let Some(info) = &found.info else {
+        return [node, "no answer".to_string(), none(), none(), none(), none(), state];
+    };
+    let runs = if info.device_type.is_bootloader() { "bootloader" } else { "application" };
+    let text = |text: &Option<String>| text.clone().unwrap_or_else(none);
+    let serial = info.identity[3].map_or_else(none, |serial| format!("{serial:08X}h"));
+    let program = match info.programs.first().and_then(|program| program.status) {
+        None => none(),
+        Some(status) if status.busy => "busy".to_string(),
+        Some(status) => status.error.map_or("ok".to_string(), |error| format!("error {:02X}h", error.code())),
+    };
+    [node, runs.to_string(), text(&info.name), text(&info.software_version), serial, program, state]
 }
 
 fn values(found: &BTreeMap<NodeId, Found>) -> Vec<Value> {
