@@ -4,13 +4,16 @@ mod fake;
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
-use canopen::NodeId;
+use canopen::{CobId, Frame, NodeId};
 use coflash::block_file::BlockFile;
 use coflash::error::Error;
 use coflash::flash::{DeviceState, Event, FlashOptions, Report};
+use coflash::hub::{self, Conversation};
 use coflash::many::{flash_many, Failed, Job, ManyOptions};
 use coflash::session::{Timing, Transfers};
+use coflash::Adapter;
 use fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 
 const FILE: &[u8] = include_bytes!("data/identity-110.blk");
@@ -85,6 +88,34 @@ fn the_same_devices_give_the_same_course_of_events() {
     for _ in 0..5 {
         assert!(course() == first);
     }
+}
+
+/// What an adapter promises: nothing means that the time has passed. And each port hears its own node alone.
+#[test]
+fn a_port_waits_as_long_as_it_says_and_hears_its_own_node() {
+    let mut bus = Bus(vec![Fake::new(BOOTLOADER)]);
+    let frame = |id: u16| Frame::of(CobId::new(id).unwrap(), &[0; 8]);
+    for id in [0x583, 0x603, 0x703, 0x584, 0x7E4, 0x083] {
+        bus.0[0].inject(frame(id));
+    }
+    let conversation = |wait: u64| -> Conversation<'static, (Duration, Vec<Frame>)> {
+        Box::new(move |port| {
+            let began = port.now();
+            let mut heard = Vec::new();
+            while let Some(frame) = port.receive(Duration::from_millis(wait)).unwrap() {
+                heard.push(frame);
+            }
+            (port.now() - began, heard)
+        })
+    };
+    let node = |number| NodeId::new(number).unwrap();
+    let conversations =
+        vec![(node(3), conversation(100)), (node(4), conversation(7)), (node(5), conversation(30))];
+    let ended = hub::run(&mut bus, conversations, 3);
+    let ms = Duration::from_millis;
+    assert_eq!(ended[0], (ms(100), vec![frame(0x583), frame(0x703), frame(0x083)]));
+    assert_eq!(ended[1], (ms(7), vec![frame(0x584)]));
+    assert_eq!(ended[2], (ms(30), vec![]));
 }
 
 #[test]

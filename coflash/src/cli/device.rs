@@ -127,3 +127,42 @@ pub(super) fn cancelled() -> Result<Arc<AtomicBool>, Failure> {
     .map_err(|error| Failure::system(format!("Ctrl-C cannot be caught: {error}")))?;
     Ok(flag)
 }
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        patience: Patience,
+    }
+
+    fn timing(words: &[&str]) -> Timing {
+        Line::try_parse_from([&["coflash"], words].concat())
+            .unwrap_or_else(|error| panic!("{error}"))
+            .patience
+            .timing()
+    }
+
+    #[test]
+    fn delay_and_repeats_are_those_of_the_manuals_tool() {
+        let ms = Duration::from_millis;
+        assert_eq!(timing(&[]), Timing::default());
+        // Table 9: 400h looks, a second apart, and an SDO time-out of 500 ms.
+        let legacy = timing(&["--delay", "1000", "--repeats", "0x000400", "--timeout", "500"]);
+        assert_eq!(
+            (legacy.command, legacy.poll_first, legacy.poll_most),
+            (ms(1_024_000), ms(1000), ms(1000))
+        );
+        assert_eq!(legacy.sdo, ms(500));
+        assert_eq!(timing(&["--delay", "20"]).command, ms(20 * 1024));
+        assert_eq!(timing(&["--repeats", "3"]).command, ms(3000));
+        let own = timing(&["--sdo-timeout", "7", "--command-timeout", "8", "--boot-timeout", "9"]);
+        assert_eq!((own.sdo, own.command, own.boot), (ms(7), ms(8), ms(9)));
+        assert_eq!(own.poll_first, Timing::default().poll_first);
+        assert!(Line::try_parse_from(["coflash", "--delay", "1", "--command-timeout", "1"]).is_err());
+    }
+}
