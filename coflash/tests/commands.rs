@@ -206,6 +206,22 @@ fn a_trace_is_shown_again_in_words() {
     );
 }
 
+/// A disk that is full does not stop an update, and is not kept secret.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_trace_that_cannot_be_written_is_a_warning() {
+    let (bus, server) = serve(quick(BOOTLOADER));
+    let done = coflash(&["read", "1018/2", "-N", "5", "--bus", &bus, "--trace", "/dev/full"]);
+    assert_eq!((done.exit, done.out.as_str()), (0, "node 5, 1018h/2: 1234 (000004D2h)\n"));
+    assert!(done.err.starts_with("warning: /dev/full: cannot be written any more: "), "{}", done.err);
+    server.join().unwrap();
+    let (bus, server) = serve(quick(BOOTLOADER));
+    let done = coflash(&["read", "1018/2", "-N", "5", "--bus", &bus, "--trace", "/there/is/none"]);
+    assert_eq!(done.exit, 4);
+    assert!(done.err.contains("trace file /there/is/none cannot be opened"), "{}", done.err);
+    assert!(server.join().unwrap().sent.is_empty());
+}
+
 #[test]
 fn monitor_shows_a_log() {
     let folder = Folder::new("monitor");
@@ -472,6 +488,19 @@ fn the_configuration_gives_defaults_and_the_command_line_wins() {
         .env_remove("COFLASH_CONFIG"));
     assert!(done.exit == 0 && done.out.starts_with("node 5: "), "{}{}", done.out, done.err);
     server.join().unwrap();
+    // In the shell, too; but not for those who are meant by --all, and nobody is given it as a node-ID.
+    let (bus, server) = serve(quick(BOOTLOADER));
+    let config = folder.file("node.toml", b"node = 5\n");
+    let done = shell(&["--bus", &bus, "--config", &config], "read 1018/2\n");
+    assert!(done.out.starts_with("node 5, 1018h/2: 1234"), "{}{}", done.out, done.err);
+    server.join().unwrap();
+    let (bus, server) = serve(quick(BOOTLOADER));
+    let done = coflash(&["reset", "--all", "--bus", &bus, "--config", &config, "--boot-timeout", "300"]);
+    assert_eq!(done.exit, 0, "{}", done.err);
+    let fake = server.join().unwrap();
+    assert_eq!(fake.sent[0].to_string(), "000#8100");
+    let done = coflash(&["lss", "assign", "--bus", "socketcand://127.0.0.1:1/x", "--config", &config]);
+    assert!(done.exit == 2 && done.err.contains("--node"), "{}", done.err);
     for (text, exit, words) in [
         ("bus = 'x\n", 3, "line 1: "),
         ("\n\n=\n", 3, "line 3: "),

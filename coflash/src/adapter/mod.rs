@@ -15,7 +15,7 @@ mod trace;
 
 pub use self::slcan::{Line, Slcan};
 pub use self::socketcand::Socketcand;
-pub use self::trace::Trace;
+pub use self::trace::{OnFailure, Trace};
 
 /// A CAN bus, and the time on it.
 ///

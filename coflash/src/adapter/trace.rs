@@ -16,9 +16,12 @@ pub struct Trace<A> {
     file: BufWriter<File>,
     /// The wall clock at the adapter's origin of time.
     origin: Duration,
-    /// Why writing failed, once it has: the bus goes on without it.
-    pub failed: Option<std::io::Error>,
+    /// Told once, when the file cannot be written any more: the bus goes on without it.
+    failed: Option<OnFailure>,
 }
+
+/// What is told why a file cannot be written any more.
+pub type OnFailure = Box<dyn FnOnce(std::io::Error)>;
 
 impl<A> std::fmt::Debug for Trace<A> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
@@ -27,25 +30,35 @@ impl<A> std::fmt::Debug for Trace<A> {
 }
 
 impl<A: Adapter> Trace<A> {
-    /// Writes what goes over `adapter` to `path`, which is overwritten.
+    /// Writes what goes over `adapter` to `path`, which is overwritten. `failed` is told when that does not go on.
     ///
     /// # Errors
     /// [`AdapterError::Open`] where the file cannot be made.
-    pub fn new(adapter: A, path: &Path) -> Result<Self, AdapterError> {
+    pub fn new(adapter: A, path: &Path, failed: OnFailure) -> Result<Self, AdapterError> {
         let file = File::create(path).map_err(|source| AdapterError::Open {
             adapter: format!("trace file {}", path.display()),
             source,
         })?;
         let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let origin = wall.saturating_sub(adapter.now());
-        Ok(Self { adapter, file: BufWriter::new(file), origin, failed: None })
+        Ok(Self { adapter, file: BufWriter::new(file), origin, failed: Some(failed) })
     }
 
     fn note(&mut self, frame: &Frame) {
         let time = self.origin + self.adapter.now();
         let line = Line { time, interface: "can0".to_string(), frame: *frame };
-        if let Err(error) = writeln!(self.file, "{line}") {
-            self.failed.get_or_insert(error);
+        let Some(failed) = self.failed.take() else { return };
+        match writeln!(self.file, "{line}") {
+            Ok(()) => self.failed = Some(failed),
+            Err(error) => failed(error),
+        }
+    }
+}
+
+impl<A> Drop for Trace<A> {
+    fn drop(&mut self) {
+        if let (Err(error), Some(failed)) = (self.file.flush(), self.failed.take()) {
+            failed(error);
         }
     }
 }

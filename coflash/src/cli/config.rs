@@ -63,6 +63,10 @@ fn with_default(command: Command, id: &str, value: &str) -> Command {
     } else {
         command
     };
+    // What `lss` gives a device is said on the command line alone.
+    if command.get_name() == "lss" {
+        return command;
+    }
     let names: Vec<String> =
         command.get_subcommands().map(|subcommand| subcommand.get_name().to_string()).collect();
     names.into_iter().fold(command, |command, name| {

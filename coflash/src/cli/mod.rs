@@ -106,7 +106,12 @@ impl Command {
 
 impl Cli {
     fn context(&self) -> Context {
-        Context { bus: self.bus.clone(), trace: self.trace.clone(), out: self.output }
+        Context {
+            bus: self.bus.clone(),
+            trace: self.trace.clone(),
+            config: self.config.clone(),
+            out: self.output,
+        }
     }
 }
 
@@ -133,12 +138,16 @@ fn command_line() -> Result<Cli, Failure> {
     // The file has to be known before the command line can be read in earnest.
     let first = Cli::command().ignore_errors(true).get_matches();
     let named = first.get_one::<PathBuf>("config").cloned();
-    let command = match config::find(named) {
-        Some(path) => config::apply(Cli::command(), &path)?,
-        None => Cli::command(),
-    };
-    let mut matches = command.get_matches();
+    let mut matches = configured(named)?.get_matches();
     Cli::from_arg_matches_mut(&mut matches).map_err(|error| Failure::bare_usage(error.to_string()))
+}
+
+/// The commands and their options, with defaults from the configuration file.
+fn configured(named: Option<PathBuf>) -> Result<clap::Command, Failure> {
+    match config::find(named) {
+        Some(path) => config::apply(Cli::command(), &path),
+        None => Ok(Cli::command()),
+    }
 }
 
 /// What every command is given.
@@ -146,6 +155,8 @@ struct Context {
     /// What `--bus`, `COFLASH_BUS` or the configuration says.
     bus: Option<String>,
     trace: Option<PathBuf>,
+    /// The configuration file that `--config` or `COFLASH_CONFIG` names.
+    config: Option<PathBuf>,
     out: Output,
 }
 
@@ -162,7 +173,12 @@ impl Context {
         };
         let adapter = adapter::open_at(url, bit_rate)?;
         Ok(match &self.trace {
-            Some(path) => Box::new(Trace::new(adapter, path)?),
+            Some(path) => {
+                let (out, name) = (self.out, path.display().to_string());
+                let failed =
+                    move |error| out.warn(format_args!("{name}: cannot be written any more: {error}"));
+                Box::new(Trace::new(adapter, path, Box::new(failed))?)
+            }
             None => adapter,
         })
     }

@@ -38,8 +38,10 @@ pub(super) struct Reset {
 impl Reset {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let command = if self.communication { NmtCommand::ResetCommunication } else { NmtCommand::ResetNode };
+        // A node-ID of the configuration file does not count against --all.
+        let node = self.node.filter(|_| !self.all);
         let mut adapter = context.open()?;
-        adapter.send(&command.emit(self.node))?;
+        adapter.send(&command.emit(node))?;
         let mut back: Vec<NodeId> = Vec::new();
         hear(&mut *adapter, self.boot_timeout, &cancelled()?, &mut |frame| {
             if let Some((node, NmtState::Initialisation)) = parse_state_message(frame) {
@@ -48,7 +50,7 @@ impl Reset {
                 }
             }
             // With a new node-ID it comes back as another one: only the one that was reset ends the waiting.
-            self.node.is_some_and(|node| back.contains(&node))
+            node.is_some_and(|node| back.contains(&node))
         })?;
         let words = match back.as_slice() {
             [] => "nobody has sent a boot-up message".to_string(),
@@ -59,9 +61,9 @@ impl Reset {
         };
         context.out.result(words, || {
             let back: Vec<u8> = back.iter().map(|node| node.get()).collect();
-            json!({ "command": "reset", "node": self.node.map(NodeId::get), "booted": back })
+            json!({ "command": "reset", "node": node.map(NodeId::get), "booted": back })
         });
-        match self.node {
+        match node {
             Some(node) if back.is_empty() => Err(Failure::no_boot_up(node)),
             _ => Ok(()),
         }

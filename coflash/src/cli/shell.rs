@@ -4,7 +4,7 @@ use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
-use clap::{Args, Parser};
+use clap::{Args, FromArgMatches};
 use rustyline::error::ReadlineError;
 use rustyline::DefaultEditor;
 
@@ -65,7 +65,10 @@ impl Shell {
 /// Runs one line.
 fn command(context: &Context, words: Vec<String>) -> Result<(), Failure> {
     let words = std::iter::once("coflash".to_string()).chain(words);
-    let cli = match Cli::try_parse_from(words) {
+    let read = super::configured(context.config.clone())?
+        .try_get_matches_from(words)
+        .and_then(|mut matches| Cli::from_arg_matches_mut(&mut matches));
+    let cli = match read {
         Ok(cli) => cli,
         Err(error) if !error.use_stderr() => {
             // Help that was asked for.
@@ -82,6 +85,7 @@ fn command(context: &Context, words: Vec<String>) -> Result<(), Failure> {
     let line = Context {
         bus: line.bus.or_else(|| context.bus.clone()),
         trace: line.trace.or_else(|| context.trace.clone()),
+        config: context.config.clone(),
         out: line.out.or(context.out),
     };
     cli.command.run(&line)
