@@ -27,4 +27,6 @@ fn main() {
     println!("cargo:rustc-link-search={}", templates.display());
     println!("cargo:rustc-link-arg-bins=-T{template}");
     println!("cargo:rustc-link-arg-bins=--nmagic");
+    // Functions that compile to the same code are one.
+    println!("cargo:rustc-link-arg-bins=--icf=all");
 }

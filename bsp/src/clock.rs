@@ -98,7 +98,7 @@ impl ClockTree {
             Source::Internal => (HSI, 0),
             Source::Crystal => (self.hse, 1 << 22),
         };
-        let pll = from / self.pll_input | self.pll_n << 6 | (self.pll_p / 2 - 1) << 16 | bit;
+        let pll = (from / self.pll_input) | (self.pll_n << 6) | ((self.pll_p / 2 - 1) << 16) | bit;
         // SAFETY: a valid word of PLLCFGR, as `checked` has seen to; the reserved bits and Q keep their reset values.
         rcc.pllcfgr().write(|w| unsafe { w.bits(PLLCFGR_RESET & 0xFF00_0000 | pll) });
         set(rcc, PLLON);
@@ -106,7 +106,7 @@ impl ClockTree {
         while rcc.cr().read().bits() & PLLRDY == 0 {}
         // SAFETY: dividers of the buses and the PLL as system clock.
         rcc.cfgr()
-            .write(|w| unsafe { w.bits(prescaler(self.apb1) << 10 | prescaler(self.apb2) << 13 | 0b10) });
+            .write(|w| unsafe { w.bits((prescaler(self.apb1) << 10) | (prescaler(self.apb2) << 13) | 0b10) });
         while rcc.cfgr().read().bits() & SWS != SWS_PLL {}
         source
     }
@@ -136,7 +136,7 @@ fn latency(wait_states: u32) {
     // them, and no other priority runs while clocks change.
     let acr = unsafe { &*pac::FLASH::ptr() }.acr();
     // SAFETY: 0 to 15.
-    acr.modify(|r, w| unsafe { w.bits(r.bits() & !0xF | wait_states) });
+    acr.modify(|r, w| unsafe { w.bits((r.bits() & !0xF) | wait_states) });
     while acr.read().bits() & 0xF != wait_states {}
 }
 

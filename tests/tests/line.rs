@@ -329,6 +329,8 @@ fn a_damaged_block_is_told_by_an_emergency_and_the_next_good_one_ends_it() {
     assert_eq!(emergencies(&bench, from), [[0x00, 0x63, 0x81, 0x06, 1, 0, 0, 0]]);
     let register = bench.ask(0x601, &[0x40, 0x01, 0x10, 0, 0, 0, 0, 0], 0x581).unwrap();
     assert_eq!(register[4], 0x81);
+    // Twice: that erases, and succeeds.
+    bench.session().command(1, canopen::program::ProgramControl::Clear).unwrap();
     bench.session().command(1, canopen::program::ProgramControl::Clear).unwrap();
     bench.session().await_idle(1, doing).unwrap();
     bench.run_ms(20);
