@@ -1,8 +1,6 @@
 //! The clock tree at the level of its registers (RM0090 sections 3.5 and 7), for code that has to be small, and to be able to
 //! leave it as a reset does. An application takes the HAL's way, [`crate::clocks`].
 
-use stm32f4xx_hal::pac;
-
 /// How a board makes its clocks out of its crystal.
 #[derive(Clone, Copy, Debug)]
 pub struct ClockTree {
@@ -32,18 +30,6 @@ pub enum Source {
 }
 
 const HSI: u32 = 16_000_000;
-const HSEON: u32 = 1 << 16;
-const HSERDY: u32 = 1 << 17;
-const PLLON: u32 = 1 << 24;
-const PLLRDY: u32 = 1 << 25;
-/// RCC_CR after a reset, but for the calibration, which is the chip's: HSI on, trimmed to the middle.
-const CR_RESET: u32 = 0x83;
-const PLLCFGR_RESET: u32 = 0x2400_3010;
-/// RCC_CFGR: what the system clock runs from, as told back.
-const SWS_PLL: u32 = 0b10 << 2;
-const SWS: u32 = 0b11 << 2;
-/// How often a crystal is looked at before it is given up: at 16 MHz and 8 cycles a look 50 ms, ten times what one takes.
-const PATIENCE: u32 = 100_000;
 
 impl ClockTree {
     /// The core's clock in Hz.
@@ -83,70 +69,94 @@ impl ClockTree {
         );
         self
     }
+}
 
-    /// Runs the core from the PLL. A crystal that does not start is done without, as long as the board has power: a device that can be
-    /// reached badly is better than none. From the state after a reset or after [`slow_down`](Self::slow_down).
-    pub fn speed_up(&self, rcc: &pac::RCC, wanted: Source) -> Source {
-        let mut source = Source::Internal;
-        if wanted == Source::Crystal {
-            set(rcc, HSEON);
-            if (0..PATIENCE).any(|_| rcc.cr().read().bits() & HSERDY != 0) {
-                source = Source::Crystal;
+/// The same on the chip.
+#[cfg(target_arch = "arm")]
+mod registers {
+    use stm32f4xx_hal::pac;
+
+    use super::{ClockTree, Source, HSI};
+
+    const HSEON: u32 = 1 << 16;
+    const HSERDY: u32 = 1 << 17;
+    const PLLON: u32 = 1 << 24;
+    const PLLRDY: u32 = 1 << 25;
+    /// RCC_CR after a reset, but for the calibration, which is the chip's: HSI on, trimmed to the middle.
+    const CR_RESET: u32 = 0x83;
+    const PLLCFGR_RESET: u32 = 0x2400_3010;
+    /// RCC_CFGR: what the system clock runs from, as told back.
+    const SWS_PLL: u32 = 0b10 << 2;
+    const SWS: u32 = 0b11 << 2;
+    /// How often a crystal is looked at before it is given up: at 16 MHz and 8 cycles a look 50 ms, ten times what one takes.
+    const PATIENCE: u32 = 100_000;
+
+    impl ClockTree {
+        /// Runs the core from the PLL. A crystal that does not start is done without, as long as the board has power: a device that can be
+        /// reached badly is better than none. From the state after a reset or after [`slow_down`](Self::slow_down).
+        pub fn speed_up(&self, rcc: &pac::RCC, wanted: Source) -> Source {
+            let mut source = Source::Internal;
+            if wanted == Source::Crystal {
+                set(rcc, HSEON);
+                if (0..PATIENCE).any(|_| rcc.cr().read().bits() & HSERDY != 0) {
+                    source = Source::Crystal;
+                }
             }
+            let (from, bit) = match source {
+                Source::Internal => (HSI, 0),
+                Source::Crystal => (self.hse, 1 << 22),
+            };
+            let pll = (from / self.pll_input) | (self.pll_n << 6) | ((self.pll_p / 2 - 1) << 16) | bit;
+            // SAFETY: a valid word of PLLCFGR, as `checked` has seen to; the reserved bits and Q keep their reset values.
+            rcc.pllcfgr().write(|w| unsafe { w.bits(PLLCFGR_RESET & 0xFF00_0000 | pll) });
+            set(rcc, PLLON);
+            latency(self.wait_states);
+            while rcc.cr().read().bits() & PLLRDY == 0 {}
+            // SAFETY: dividers of the buses and the PLL as system clock.
+            rcc.cfgr().write(|w| unsafe {
+                w.bits((prescaler(self.apb1) << 10) | (prescaler(self.apb2) << 13) | 0b10)
+            });
+            while rcc.cfgr().read().bits() & SWS != SWS_PLL {}
+            source
         }
-        let (from, bit) = match source {
-            Source::Internal => (HSI, 0),
-            Source::Crystal => (self.hse, 1 << 22),
-        };
-        let pll = (from / self.pll_input) | (self.pll_n << 6) | ((self.pll_p / 2 - 1) << 16) | bit;
-        // SAFETY: a valid word of PLLCFGR, as `checked` has seen to; the reserved bits and Q keep their reset values.
-        rcc.pllcfgr().write(|w| unsafe { w.bits(PLLCFGR_RESET & 0xFF00_0000 | pll) });
-        set(rcc, PLLON);
-        latency(self.wait_states);
-        while rcc.cr().read().bits() & PLLRDY == 0 {}
-        // SAFETY: dividers of the buses and the PLL as system clock.
-        rcc.cfgr()
-            .write(|w| unsafe { w.bits((prescaler(self.apb1) << 10) | (prescaler(self.apb2) << 13) | 0b10) });
-        while rcc.cfgr().read().bits() & SWS != SWS_PLL {}
-        source
+
+        /// Back to the clocks as after a reset.
+        pub fn slow_down(&self, rcc: &pac::RCC) {
+            // SAFETY: the reset value.
+            rcc.cfgr().write(|w| unsafe { w.bits(0) });
+            while rcc.cfgr().read().bits() & SWS != 0 {}
+            // SAFETY: the reset values; nothing runs from PLL or crystal any more.
+            rcc.cr().write(|w| unsafe { w.bits(CR_RESET) });
+            while rcc.cr().read().bits() & PLLRDY != 0 {}
+            // SAFETY: the reset value.
+            rcc.pllcfgr().write(|w| unsafe { w.bits(PLLCFGR_RESET) });
+            latency(0);
+        }
     }
 
-    /// Back to the clocks as after a reset.
-    pub fn slow_down(&self, rcc: &pac::RCC) {
-        // SAFETY: the reset value.
-        rcc.cfgr().write(|w| unsafe { w.bits(0) });
-        while rcc.cfgr().read().bits() & SWS != 0 {}
-        // SAFETY: the reset values; nothing runs from PLL or crystal any more.
-        rcc.cr().write(|w| unsafe { w.bits(CR_RESET) });
-        while rcc.cr().read().bits() & PLLRDY != 0 {}
-        // SAFETY: the reset value.
-        rcc.pllcfgr().write(|w| unsafe { w.bits(PLLCFGR_RESET) });
-        latency(0);
+    fn set(rcc: &pac::RCC, bit: u32) {
+        // SAFETY: a switch of CR in addition to those that are on.
+        rcc.cr().modify(|r, w| unsafe { w.bits(r.bits() | bit) });
     }
-}
 
-fn set(rcc: &pac::RCC, bit: u32) {
-    // SAFETY: a switch of CR in addition to those that are on.
-    rcc.cr().modify(|r, w| unsafe { w.bits(r.bits() | bit) });
-}
+    /// Wait states of the flash; the rest of its access control stays. The new value holds once it reads back (section 3.5.1).
+    fn latency(wait_states: u32) {
+        // SAFETY: the access control register is this module's as far as the wait states go; the flash driver does not touch
+        // them, and no other priority runs while clocks change.
+        let acr = unsafe { &*pac::FLASH::ptr() }.acr();
+        // SAFETY: 0 to 15.
+        acr.modify(|r, w| unsafe { w.bits((r.bits() & !0xF) | wait_states) });
+        while acr.read().bits() & 0xF != wait_states {}
+    }
 
-/// Wait states of the flash; the rest of its access control stays. The new value holds once it reads back (section 3.5.1).
-fn latency(wait_states: u32) {
-    // SAFETY: the access control register is this module's as far as the wait states go; the flash driver does not touch
-    // them, and no other priority runs while clocks change.
-    let acr = unsafe { &*pac::FLASH::ptr() }.acr();
-    // SAFETY: 0 to 15.
-    acr.modify(|r, w| unsafe { w.bits((r.bits() & !0xF) | wait_states) });
-    while acr.read().bits() & 0xF != wait_states {}
-}
-
-/// The bits of PPRE1 and PPRE2.
-const fn prescaler(divider: u32) -> u32 {
-    match divider {
-        2 => 0b100,
-        4 => 0b101,
-        8 => 0b110,
-        16 => 0b111,
-        _ => 0,
+    /// The bits of PPRE1 and PPRE2.
+    const fn prescaler(divider: u32) -> u32 {
+        match divider {
+            2 => 0b100,
+            4 => 0b101,
+            8 => 0b110,
+            16 => 0b111,
+            _ => 0,
+        }
     }
 }

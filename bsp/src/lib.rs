@@ -3,6 +3,8 @@
 //! One file per board, chosen by the cargo feature `board-…`, beside its memory map in
 //! `shared-abi/src/layout/`. To port coboot, copy a board file and go through it from top to bottom.
 //! [`can`] holds what all boards share.
+//!
+//! On the host there are the values of a board, without the drivers.
 #![no_std]
 
 pub mod can;
@@ -17,7 +19,9 @@ compile_error!("bsp: choose a board by one of the features `board-…`");
 
 pub use board::*;
 
+#[cfg(target_arch = "arm")]
 pub use stm32f4xx_hal as hal;
+#[cfg(target_arch = "arm")]
 pub use stm32f4xx_hal::pac;
 
 /// What the device says of itself in 1008h–100Ah and 1018h, for bootloader and application alike.

@@ -1,11 +1,6 @@
 //! STM32F407G-DISC1 with a CAN transceiver on PD0 and PD1.
 
 use shared_abi::layout::{self, Layout};
-use stm32f4xx_hal::can::{Can, CanExt};
-use stm32f4xx_hal::gpio::{GpioExt, Output, Pin};
-use stm32f4xx_hal::pac;
-use stm32f4xx_hal::prelude::*;
-use stm32f4xx_hal::rcc::{Config, Rcc, RccExt};
 
 use crate::clock::ClockTree;
 use crate::Identity;
@@ -44,43 +39,58 @@ pub const SYSCLK: u32 = CLOCK_TREE.sysclk();
 /// Clock of the CAN controller, in Hz: that of APB1.
 pub const CAN_CLOCK: u32 = CLOCK_TREE.apb1_clock();
 
-/// The CAN controller that coboot talks through.
-pub type CanController = Can<pac::CAN1>;
-/// The LED that shows life: LD4, green, high is on.
-pub type Led = Pin<'D', 12, Output>;
+#[cfg(target_arch = "arm")]
+pub use drivers::*;
 
-/// The board's parts, set up.
-pub struct Board {
-    /// The CAN controller with its pins; clocked, not yet configured.
-    pub can: CanController,
-    /// The LED.
-    pub led: Led,
-}
+/// The parts of the board and what is done to them.
+#[cfg(target_arch = "arm")]
+mod drivers {
+    use stm32f4xx_hal::can::{Can, CanExt};
+    use stm32f4xx_hal::gpio::{GpioExt, Output, Pin};
+    use stm32f4xx_hal::pac;
+    use stm32f4xx_hal::prelude::*;
+    use stm32f4xx_hal::rcc::{Config, Rcc, RccExt};
 
-/// The clocks as the HAL knows them, for the HAL's drivers. From the state after a reset.
-#[must_use]
-pub fn clocks(rcc: pac::RCC) -> Rcc {
-    rcc.freeze(Config::hse(CLOCK_TREE.hse.Hz()).sysclk(SYSCLK.Hz()).pclk1(CAN_CLOCK.Hz()))
-}
+    use super::{CAN_CLOCK, CLOCK_TREE, SYSCLK};
 
-/// Sets the pins up.
-#[must_use]
-pub fn init(rcc: &mut Rcc, can1: pac::CAN1, gpiod: pac::GPIOD) -> Board {
-    let gpiod = gpiod.split(rcc);
-    let led = gpiod.pd12.into_push_pull_output();
-    let can = can1.can((gpiod.pd1, gpiod.pd0), rcc);
-    Board { can, led }
-}
+    /// The CAN controller that coboot talks through.
+    pub type CanController = Can<pac::CAN1>;
+    /// The LED that shows life: LD4, green, high is on.
+    pub type Led = Pin<'D', 12, Output>;
 
-/// Whether the entry strap asks for the bootloader: the blue button B1 on PA0, high when pressed.
-///
-/// Leaves port A as after a reset.
-#[must_use]
-pub fn entry_strap(rcc: &pac::RCC, gpioa: &pac::GPIOA) -> bool {
-    rcc.ahb1enr().modify(|_, w| w.gpioaen().enabled());
-    // The clock needs two cycles before the first access (RM0090 section 7.3.10): reading back waits that long.
-    let _ = rcc.ahb1enr().read();
-    let pressed = gpioa.idr().read().idr0().is_high();
-    rcc.ahb1enr().modify(|_, w| w.gpioaen().disabled());
-    pressed
+    /// The board's parts, set up.
+    pub struct Board {
+        /// The CAN controller with its pins; clocked, not yet configured.
+        pub can: CanController,
+        /// The LED.
+        pub led: Led,
+    }
+
+    /// The clocks as the HAL knows them, for the HAL's drivers. From the state after a reset.
+    #[must_use]
+    pub fn clocks(rcc: pac::RCC) -> Rcc {
+        rcc.freeze(Config::hse(CLOCK_TREE.hse.Hz()).sysclk(SYSCLK.Hz()).pclk1(CAN_CLOCK.Hz()))
+    }
+
+    /// Sets the pins up.
+    #[must_use]
+    pub fn init(rcc: &mut Rcc, can1: pac::CAN1, gpiod: pac::GPIOD) -> Board {
+        let gpiod = gpiod.split(rcc);
+        let led = gpiod.pd12.into_push_pull_output();
+        let can = can1.can((gpiod.pd1, gpiod.pd0), rcc);
+        Board { can, led }
+    }
+
+    /// Whether the entry strap asks for the bootloader: the blue button B1 on PA0, high when pressed.
+    ///
+    /// Leaves port A as after a reset.
+    #[must_use]
+    pub fn entry_strap(rcc: &pac::RCC, gpioa: &pac::GPIOA) -> bool {
+        rcc.ahb1enr().modify(|_, w| w.gpioaen().enabled());
+        // The clock needs two cycles before the first access (RM0090 section 7.3.10): reading back waits that long.
+        let _ = rcc.ahb1enr().read();
+        let pressed = gpioa.idr().read().idr0().is_high();
+        rcc.ahb1enr().modify(|_, w| w.gpioaen().disabled());
+        pressed
+    }
 }
