@@ -33,7 +33,6 @@ mod app {
     use canopen::node::{self, NmtPolicy};
     use canopen::slave::{self, Output, Slave, SlaveDevice};
     use canopen::{BitRate, CobId, Frame, Instant};
-    use core::mem::take;
     use heapless::spsc::{Consumer, Producer, Queue};
     use rtic::Mutex;
     use rtic_monotonics::fugit::ExtU32;
@@ -51,8 +50,6 @@ mod app {
     #[shared]
     struct Shared {
         can: Port<CanController>,
-        /// Frames were lost because the protocol task came too late.
-        queue_overrun: bool,
     }
 
     #[local]
@@ -85,7 +82,7 @@ mod app {
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();
         (
-            Shared { can: Port::new(board.can), queue_overrun: false },
+            Shared { can: Port::new(board.can) },
             Local {
                 received,
                 to_handle,
@@ -105,12 +102,14 @@ mod app {
     }
 
     /// Empties the controller's FIFO: three frames deep, so nothing may hold this task up.
-    #[task(binds = CAN1_RX0, shared = [can, queue_overrun], local = [received], priority = 3)]
-    fn can_rx(cx: can_rx::Context) {
-        (cx.shared.can, cx.shared.queue_overrun).lock(|can, queue_overrun| {
+    #[task(binds = CAN1_RX0, shared = [can], local = [received], priority = 3)]
+    fn can_rx(mut cx: can_rx::Context) {
+        cx.shared.can.lock(|can| {
             while let Some(frame) = can.receive() {
                 // A full queue drops the frame; the client's time-out repeats it, and an emergency tells.
-                *queue_overrun |= cx.local.received.enqueue(frame).is_err();
+                if cx.local.received.enqueue(frame).is_err() {
+                    can.note_loss();
+                }
             }
         });
         rtic::pend(pac::Interrupt::CAN1_TX);
@@ -119,15 +118,15 @@ mod app {
     /// Speaks CANopen: whenever a frame came in, a mailbox became free or time has passed.
     #[task(
         binds = CAN1_TX,
-        shared = [can, queue_overrun],
+        shared = [can],
         local = [to_handle, slave, application, departure],
         priority = 2
     )]
     fn protocol(cx: protocol::Context) {
         let now = Instant::from_millis(Mono::now().ticks());
-        let protocol::SharedResources { mut can, mut queue_overrun, .. } = cx.shared;
+        let protocol::SharedResources { mut can, .. } = cx.shared;
         let protocol::LocalResources { to_handle, slave, application, departure, .. } = cx.local;
-        let status = (&mut can, &mut queue_overrun).lock(status);
+        let status = can.lock(status);
         slave.observe(status, now, application);
         // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
         carry_out(slave, &mut can, now, application);
@@ -169,9 +168,9 @@ mod app {
     }
 
     /// What the slave wants to know of its line.
-    fn status(can: &mut Port<CanController>, queue_overrun: &mut bool) -> Status {
+    fn status(can: &mut Port<CanController>) -> Status {
         let errors = can.errors();
-        let lost = [(can.take_overrun(), CONTROLLER_OVERRUN), (take(queue_overrun), QUEUE_OVERRUN)];
+        let lost = can.take_lost();
         Status {
             confinement: match errors {
                 Errors { off: true, .. } => Confinement::BusOff,
@@ -184,7 +183,8 @@ mod app {
                 Errors { last: Some(Ok(())), .. } => Heard::Frame,
                 Errors { last: Some(Err(())), .. } => Heard::Error,
             },
-            lost: lost.iter().map(|(lost, bit)| u16::from(*lost) * bit).sum(),
+            lost: u16::from(lost.in_controller) * CONTROLLER_OVERRUN
+                + u16::from(lost.in_queue) * QUEUE_OVERRUN,
         }
     }
 

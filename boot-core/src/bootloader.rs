@@ -22,6 +22,8 @@ use canopen::{AbortCode, NodeId};
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
+#[cfg(feature = "emcy")]
+use crate::decision::StayReason;
 use crate::download::{Downloader, Policy, Step};
 use crate::flash::Flash;
 use crate::node::NodeParameters;
@@ -105,8 +107,9 @@ pub struct Config {
     /// The bit rates that its controller can be set to.
     pub supports: fn(BitRate) -> bool,
     /// An emergency behind each boot-up, which tells a master that this is the bootloader and not the application: its
-    /// code FF00h (device specific, CiA 301 table 26) and these bytes.
-    pub boot_up_emergency: Option<[u8; 5]>,
+    /// code FF00h (device specific, CiA 301 table 26), "BOOT", and why the device stayed
+    /// ([`StayReason::code`](crate::decision::StayReason::code)).
+    pub boot_up_emergency: bool,
     /// How programs are downloaded.
     pub download: Policy,
 }
@@ -115,6 +118,8 @@ pub struct Config {
 pub struct Bootloader<'b, F: Flash, const PROGRAMS: usize> {
     config: &'static Config,
     serial_number: u32,
+    /// Why the device stayed in the bootloader.
+    reason: u8,
     /// Node-ID and bit rate as they are stored.
     node: NodeParameters,
     /// Node-ID in force.
@@ -126,11 +131,12 @@ pub struct Bootloader<'b, F: Flash, const PROGRAMS: usize> {
 }
 
 impl<'b, F: Flash, const PROGRAMS: usize> Bootloader<'b, F, PROGRAMS> {
-    /// Starts from what the flash holds. The larger `buffer`, the further the flash may lag behind the bus.
+    /// Starts from what the flash holds, for a device that stayed in the bootloader for this reason. The larger `buffer`, the further the flash may lag behind the bus.
     pub fn new(
         config: &'static Config,
         serial_number: u32,
         node: NodeParameters,
+        reason: u8,
         flash: F,
         buffer: &'b mut [u8],
     ) -> Self {
@@ -138,6 +144,7 @@ impl<'b, F: Flash, const PROGRAMS: usize> Bootloader<'b, F, PROGRAMS> {
         let mut bootloader = Self {
             config,
             serial_number,
+            reason,
             node,
             id: None,
             flash,
@@ -145,6 +152,10 @@ impl<'b, F: Flash, const PROGRAMS: usize> Bootloader<'b, F, PROGRAMS> {
             #[cfg(feature = "emcy")]
             emcy: Emcy::new(),
         };
+        #[cfg(feature = "emcy")]
+        if StayReason::is_trouble(reason) {
+            bootloader.emcy.raise(emcy::code::SOFTWARE, 0, [reason, 0, 0, 0, 0]);
+        }
         bootloader.node_id_changed(node.id);
         bootloader
     }
@@ -284,8 +295,8 @@ impl<F: Flash, const PROGRAMS: usize> SlaveDevice for Bootloader<'_, F, PROGRAMS
     fn node_id_changed(&mut self, id: Option<NodeId>) {
         self.id = id;
         #[cfg(feature = "emcy")]
-        if let (Some(_), Some(detail)) = (id, self.config.boot_up_emergency) {
-            self.emcy.announce(emcy::code::DEVICE_SPECIFIC, detail);
+        if id.is_some() && self.config.boot_up_emergency {
+            self.emcy.announce(emcy::code::DEVICE_SPECIFIC, [b'B', b'O', b'O', b'T', self.reason]);
         }
     }
 }

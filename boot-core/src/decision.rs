@@ -50,6 +50,31 @@ pub enum StayReason {
     Unsigned,
     /// The program may not be started.
     Program(Invalid),
+    /// The bootloader had a fault or a panic.
+    Fault,
+}
+
+impl StayReason {
+    /// The number under which the bus is told.
+    #[must_use]
+    pub const fn code(self) -> u8 {
+        match self {
+            Self::Requested => 0,
+            Self::Strap => 1,
+            Self::CrashLoop => 2,
+            Self::NoAutostart => 3,
+            Self::NodeId => 4,
+            Self::Unsigned => 5,
+            Self::Program(_) => 6,
+            Self::Fault => 7,
+        }
+    }
+
+    /// Whether a code stands for a misfortune that an emergency should tell of.
+    #[must_use]
+    pub const fn is_trouble(code: u8) -> bool {
+        code == Self::CrashLoop.code() || code == Self::Fault.code()
+    }
 }
 
 /// What the bootloader does after a reset.
@@ -74,8 +99,10 @@ pub fn decide(
 ) -> BootDecision {
     use BootDecision::{Start, Stay};
 
-    if circumstances.request == Some(BootRequest::Stay) {
-        return Stay(StayReason::Requested);
+    match circumstances.request {
+        Some(BootRequest::Stay) => return Stay(StayReason::Requested),
+        Some(BootRequest::Fault) => return Stay(StayReason::Fault),
+        _ => {}
     }
     if circumstances.strap {
         return Stay(StayReason::Strap);
@@ -84,7 +111,7 @@ pub fn decide(
         // A request is new: whoever makes it knows of the crashes before.
         Some(BootRequest::Trial(number)) => (number, true),
         Some(BootRequest::Start(number)) => (number, false),
-        Some(BootRequest::Stay) | None => {
+        _ => {
             if circumstances.crash_resets >= policy.max_crash_resets {
                 return Stay(StayReason::CrashLoop);
             }

@@ -60,7 +60,7 @@ static CONFIG: Config = Config {
     device: DEVICE,
     layout: LAYOUT_REF,
     supports: |rate| rate != BitRate::K800,
-    boot_up_emergency: None,
+    boot_up_emergency: false,
     download: Policy::DEFAULT,
 };
 
@@ -87,7 +87,7 @@ struct Bench<'f> {
 impl<'f> Bench<'f> {
     fn new(flash: &'f mut ModelFlash) -> Self {
         let buffer = Box::leak(vec![0; 256].into_boxed_slice());
-        Self { node: Bootloader::new(&CONFIG, 0, node(), flash, buffer) }
+        Self { node: Bootloader::new(&CONFIG, 0, node(), 0, flash, buffer) }
     }
 
     fn settle(&mut self) {

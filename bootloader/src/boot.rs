@@ -5,6 +5,7 @@
 
 use core::arch::global_asm;
 use core::ops::RangeInclusive;
+use core::sync::atomic::{AtomicU8, Ordering};
 
 use boot_core::canopen::{BitRate, NodeId};
 use boot_core::decision::{decide, BootDecision, Circumstances, Policy};
@@ -18,10 +19,14 @@ use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
 use shared_abi::warm_start::{BootRequest, Cell};
 
 use crate::flash::FlashController;
+use crate::watchdog::Watchdog;
 use crate::VERSION;
 
 /// What this product does after a reset.
 const POLICY: Policy = Policy { autostart: Some(1), max_crash_resets: 3, node_ids: NODE_IDS };
+/// A program that is started has to feed the independent watchdog within this time, in ms, from its first instruction on;
+/// `None` for a program that is started without one.
+const PROGRAM_WATCHDOG_MS: Option<u16> = None;
 /// Node-IDs with which programs may be started.
 const NODE_IDS: RangeInclusive<u8> = 1..=127;
 
@@ -84,7 +89,7 @@ extern "C" fn stage() {
     CLOCK_TREE.slow_down(&rcc);
     flash.release(&rcc);
     match decision {
-        BootDecision::Stay(_) => {}
+        BootDecision::Stay(reason) => STAY_REASON.store(reason.code(), Ordering::Relaxed),
         BootDecision::Start { program, trial } => {
             let handoff = Handoff::new(&BootInfo {
                 node_id,
@@ -95,6 +100,9 @@ extern "C" fn stage() {
                 bootloader_version: VERSION,
                 serial_number: bsp::serial_number(),
             });
+            if let Some(ms) = PROGRAM_WATCHDOG_MS {
+                Watchdog::start(&peripherals.IWDG, ms);
+            }
             // SAFETY: the layout's handoff region, checked to be RAM of that size in no image. No interrupt was enabled
             // and no bus master started since the reset.
             unsafe {
@@ -143,6 +151,15 @@ pub const fn supports(rate: BitRate) -> bool {
 
 /// How the board's CAN controller makes each bit rate.
 pub const TIMINGS: [Option<BitTiming>; 9] = BitTiming::table(CAN_CLOCK, BitRate::TABLE);
+
+/// Why the bootloader stayed, for `init`. It lies where the start-up clears nothing.
+#[link_section = ".uninit.stay_reason"]
+static STAY_REASON: AtomicU8 = AtomicU8::new(0);
+
+/// Why the bootloader stayed ([`StayReason::code`](boot_core::decision::StayReason::code)).
+pub fn stay_reason() -> u8 {
+    STAY_REASON.load(Ordering::Relaxed)
+}
 
 /// The warm-start cell of this board.
 pub fn warm_start_cell() -> Cell {

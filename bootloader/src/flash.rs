@@ -25,23 +25,18 @@ pub struct FlashController {
 impl FlashController {
     /// Takes the controller.
     ///
-    /// Its caches go off: they would show words as they were before they were programmed (section 3.5.4), and a
-    /// bootloader that runs from RAM gains nothing by them.
+    /// Its caches are off after a reset, and stay so: they would show words as they were before they were programmed (section
+    /// 3.5.4), and a bootloader that runs from RAM gains nothing by them.
     pub fn new(registers: pac::FLASH, crc: pac::CRC, rcc: &pac::RCC, flash: Region) -> Self {
         rcc.ahb1enr().modify(|_, w| w.crcen().enabled());
-        registers.acr().modify(|_, w| w.dcen().clear_bit().icen().clear_bit().prften().clear_bit());
-        registers.acr().modify(|_, w| w.dcrst().set_bit().icrst().set_bit());
-        registers.acr().modify(|_, w| w.dcrst().clear_bit().icrst().clear_bit());
         Self { registers, crc, flash, running: false }
     }
 
     /// Leaves both as after a reset.
     pub fn release(self, rcc: &pac::RCC) {
-        rcc.ahb1rstr().modify(|_, w| w.crcrst().set_bit());
-        rcc.ahb1rstr().modify(|_, w| w.crcrst().clear_bit());
+        self.crc.cr().write(|w| w.reset().set_bit());
         rcc.ahb1enr().modify(|_, w| w.crcen().disabled());
         self.clear_flags();
-        self.registers.acr().reset();
     }
 
     /// Opens the control register for one operation. (A `write` starts from the register's reset value, in which LOCK is

@@ -6,6 +6,7 @@
 //! | `boot.rs` | from the reset to the jump, or to `init` below | start-up, jump |
 //! | `flash.rs` | the flash controller | registers |
 //! | `ram_vectors.rs` | the vector table in RAM | one copy |
+//! | `watchdog.rs` | feeds the watchdog when all tasks are alive | registers |
 //! | `callgate.rs` | services for the application | its ABI |
 //! | `memory.rs` | `memcpy` and its kin, small | assembly |
 //!
@@ -18,6 +19,7 @@ mod callgate;
 mod flash;
 mod memory;
 mod ram_vectors;
+mod watchdog;
 
 use cortex_m::peripheral::SCB;
 use panic_probe as _;
@@ -32,7 +34,7 @@ pub const VERSION: u32 = 0x0000_0001;
 /// A fault or a panic (which ends in one) must not silence the device: start again, and stay reachable.
 #[cortex_m_rt::exception]
 unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
-    boot::warm_start_cell().put(BootRequest::Stay);
+    boot::warm_start_cell().put(BootRequest::Fault);
     SCB::sys_reset()
 }
 
@@ -53,7 +55,6 @@ mod app {
     use bsp::clock::Source;
     use bsp::hal::rcc::RccExt;
     use bsp::{pac, CanController, CLOCK_TREE, IDENTITY, LAYOUT};
-    use core::mem::take;
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
     use rtic::Mutex;
@@ -62,6 +63,7 @@ mod app {
     use super::{boot, Mono};
     use crate::flash::FlashController;
     use crate::ram_vectors;
+    use crate::watchdog::{self, Task, Watchdog};
     use rtic_monotonics::fugit::ExtU32;
     use rtic_monotonics::Monotonic;
 
@@ -78,8 +80,8 @@ mod app {
     /// anything else happens.
     const FAREWELL_MS: u32 = 20;
 
-    /// Behind each boot-up, so that a master knows the bootloader from the application.
-    const BOOT_UP_EMERGENCY: Option<[u8; 5]> = Some(*b"BOOT\0");
+    /// Whether an emergency follows each boot-up, so that a master knows the bootloader from the application.
+    const BOOT_UP_EMERGENCY: bool = true;
 
     /// Programs of the layout, each a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
     const PROGRAMS: usize = LAYOUT.programs.len();
@@ -107,8 +109,6 @@ mod app {
     #[shared]
     struct Shared {
         can: Port<CanController>,
-        /// Frames were lost because the protocol task came too late.
-        queue_overrun: bool,
         bootloader: Bootloader<'static, FlashController, PROGRAMS>,
     }
 
@@ -118,6 +118,7 @@ mod app {
         to_handle: Consumer<'static, Frame>,
         slave: Slave,
         leaving: Option<Leaving>,
+        watchdog: Watchdog,
         led: bsp::Led,
     }
 
@@ -145,13 +146,21 @@ mod app {
             },
             ..slave::Config::default()
         };
-        let bootloader = Bootloader::new(&CONFIG, bsp::serial_number(), node, flash, cx.local.blocks);
+        let bootloader =
+            Bootloader::new(&CONFIG, bsp::serial_number(), node, boot::stay_reason(), flash, cx.local.blocks);
         let slave = Slave::new(bootloader.lss_address(), node.id, node.bit_rate, slave_config);
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();
         (
-            Shared { can: Port::new(board.can), queue_overrun: false, bootloader },
-            Local { received, to_handle, slave, leaving: None, led: board.led },
+            Shared { can: Port::new(board.can), bootloader },
+            Local {
+                received,
+                to_handle,
+                slave,
+                leaving: None,
+                watchdog: Watchdog::new(cx.device.IWDG),
+                led: board.led,
+            },
         )
     }
 
@@ -159,6 +168,7 @@ mod app {
     #[idle(shared = [bootloader])]
     fn idle(mut cx: idle::Context) -> ! {
         loop {
+            watchdog::check_in(Task::Flash);
             match cx.shared.bootloader.lock(|bootloader| bootloader.step()) {
                 Step::Programming | Step::Again => {}
                 // The monotonic wakes it every millisecond; a sector takes hundreds of them.
@@ -168,12 +178,14 @@ mod app {
     }
 
     /// Empties the controller's FIFO: three frames deep, so nothing may hold this task up.
-    #[task(binds = CAN1_RX0, shared = [can, queue_overrun], local = [received], priority = 3)]
-    fn can_rx(cx: can_rx::Context) {
-        (cx.shared.can, cx.shared.queue_overrun).lock(|can, queue_overrun| {
+    #[task(binds = CAN1_RX0, shared = [can], local = [received], priority = 3)]
+    fn can_rx(mut cx: can_rx::Context) {
+        cx.shared.can.lock(|can| {
             while let Some(frame) = can.receive() {
                 // A full queue drops the frame; the client's time-out repeats it, and an emergency tells.
-                *queue_overrun |= cx.local.received.enqueue(frame).is_err();
+                if cx.local.received.enqueue(frame).is_err() {
+                    can.note_loss();
+                }
             }
         });
         rtic::pend(pac::Interrupt::CAN1_TX);
@@ -182,15 +194,16 @@ mod app {
     /// Speaks CANopen: whenever a frame came in, a mailbox became free or time has passed.
     #[task(
         binds = CAN1_TX,
-        shared = [can, queue_overrun, bootloader],
+        shared = [can, bootloader],
         local = [to_handle, slave, leaving],
         priority = 2
     )]
     fn protocol(cx: protocol::Context) {
+        watchdog::check_in(Task::Protocol);
         let now = Instant::from_millis(Mono::now().ticks());
-        let protocol::SharedResources { mut can, mut queue_overrun, mut bootloader, .. } = cx.shared;
+        let protocol::SharedResources { mut can, mut bootloader, .. } = cx.shared;
         let protocol::LocalResources { to_handle, slave, leaving, .. } = cx.local;
-        let status = (&mut can, &mut queue_overrun).lock(status);
+        let status = can.lock(status);
         bootloader.lock(|bootloader| {
             slave.observe(status, now, bootloader);
             // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
@@ -242,9 +255,9 @@ mod app {
     }
 
     /// What the slave wants to know of its line.
-    fn status(can: &mut Port<CanController>, queue_overrun: &mut bool) -> Status {
+    fn status(can: &mut Port<CanController>) -> Status {
         let errors = can.errors();
-        let lost = [(can.take_overrun(), CONTROLLER_OVERRUN), (take(queue_overrun), QUEUE_OVERRUN)];
+        let lost = can.take_lost();
         Status {
             confinement: match errors {
                 Errors { off: true, .. } => Confinement::BusOff,
@@ -257,16 +270,18 @@ mod app {
                 Errors { last: Some(Ok(())), .. } => Heard::Frame,
                 Errors { last: Some(Err(())), .. } => Heard::Error,
             },
-            lost: lost.iter().map(|(lost, bit)| u16::from(*lost) * bit).sum(),
+            lost: u16::from(lost.in_controller) * CONTROLLER_OVERRUN
+                + u16::from(lost.in_queue) * QUEUE_OVERRUN,
         }
     }
 
     /// Lets time pass for the protocol, and shows life.
-    #[task(local = [led], priority = 2)]
+    #[task(local = [led, watchdog], priority = 2)]
     async fn tick(cx: tick::Context) {
         let mut ticks = 0_u32;
         loop {
             rtic::pend(pac::Interrupt::CAN1_TX);
+            cx.local.watchdog.feed();
             if ticks.is_multiple_of(100 / TICK_MS) {
                 cx.local.led.toggle();
             }

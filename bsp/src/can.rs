@@ -104,7 +104,16 @@ const LEC: u32 = 7 << 4;
 pub struct Port<I: MasterInstance> {
     can: Can<I>,
     waiting: Option<bxcan::Frame>,
-    overrun: bool,
+    lost: Lost,
+}
+
+/// Where frames were lost.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Lost {
+    /// In the controller: its FIFO was full.
+    pub in_controller: bool,
+    /// Behind it: whoever took them from the FIFO had no room.
+    pub in_queue: bool,
 }
 
 impl<I: MasterInstance> Port<I> {
@@ -113,7 +122,7 @@ impl<I: MasterInstance> Port<I> {
     pub fn new(controller: I) -> Self {
         let mut can = Can::builder(controller).leave_disabled();
         can.enable_interrupts(Interrupts::FIFO0_MESSAGE_PENDING | Interrupts::TRANSMIT_MAILBOX_EMPTY);
-        Self { can, waiting: None, overrun: false }
+        Self { can, waiting: None, lost: Lost::default() }
     }
 
     /// Sets bit timing and mode, and joins the bus with empty mailboxes.
@@ -164,9 +173,14 @@ impl<I: MasterInstance> Port<I> {
                 Ok(frame) => return convert(&frame),
                 Err(nb::Error::WouldBlock) => return None,
                 // The frames that are there are still good.
-                Err(nb::Error::Other(OverrunError { .. })) => self.overrun = true,
+                Err(nb::Error::Other(OverrunError { .. })) => self.lost.in_controller = true,
             }
         }
+    }
+
+    /// A frame that was taken from the FIFO found no room with its taker.
+    pub fn note_loss(&mut self) {
+        self.lost.in_queue = true;
     }
 
     /// Acknowledges the mailbox interrupt and moves a frame that waits into a mailbox. Whether there is room for one now.
@@ -213,13 +227,13 @@ impl<I: MasterInstance> Port<I> {
         Errors { off: status & BOFF != 0, passive: status & EPVF != 0, joined, last }
     }
 
-    /// Whether the FIFO was full and lost frames since the question before.
-    pub fn take_overrun(&mut self) -> bool {
+    /// Where frames were lost since the question before.
+    pub fn take_lost(&mut self) -> Lost {
         if self.read(RF0R) & FOVR0 != 0 {
             self.write(RF0R, FOVR0);
-            self.overrun = true;
+            self.lost.in_controller = true;
         }
-        core::mem::take(&mut self.overrun)
+        core::mem::take(&mut self.lost)
     }
 
     fn read(&self, offset: usize) -> u32 {

@@ -12,6 +12,7 @@ use crate::bxcan::BxCan;
 use crate::cpu::{Cpu, Entry, Exit};
 use crate::periph::flash::Noise;
 pub use crate::periph::flash::{Cut, FlashCut, FlashTimes};
+use crate::peripheral::Peripheral;
 use crate::time::{Span, Time};
 use chip::Chip;
 pub use chip::Counters;
@@ -405,6 +406,16 @@ impl Machine {
     }
 
     // --- looking and touching ----------------------------------------------------------------------------------------
+
+    /// Starts the independent watchdog with this reload value, as code would that then never feeds it; the prescaler stays.
+    pub fn start_watchdog(&mut self, reload: u32) {
+        let chip = self.cpu.chip_mut();
+        let now = chip.now();
+        for (offset, value) in [(0x00, 0xCCCC), (0x00, 0x5555), (0x08, reload), (0x00, 0xAAAA)] {
+            // These registers take these values at any time.
+            let _ = chip.iwdg.write(offset, value, now);
+        }
+    }
 
     /// CAN controller `n`; 0 is CAN1, the only one.
     ///

@@ -18,6 +18,8 @@ pub enum BootRequest {
     Trial(u8),
     /// Start program `n` as the autostart would.
     Start(u8),
+    /// Stay, because the bootloader itself had a fault or a panic; it asks this of itself.
+    Fault,
 }
 
 /// The cell as it lies in RAM: 16 bytes, little-endian.
@@ -26,7 +28,7 @@ pub enum BootRequest {
 pub struct WarmStart {
     /// [`MAGIC`].
     pub magic: u32,
-    /// 1 stay, 2 trial, 3 start.
+    /// 1 stay, 2 trial, 3 start, 4 fault.
     pub request: u32,
     /// The program number of a trial or start (1 to 254), 0 otherwise.
     pub argument: u32,
@@ -45,6 +47,7 @@ impl WarmStart {
             BootRequest::Stay => (1, 0),
             BootRequest::Trial(program) => (2, program as u32),
             BootRequest::Start(program) => (3, program as u32),
+            BootRequest::Fault => (4, 0),
         };
         let check = check_word(&[MAGIC, request, argument]);
         Self { magic: MAGIC, request, argument, check }
@@ -59,6 +62,7 @@ impl WarmStart {
             (1, Some(0)) => BootRequest::Stay,
             (2, Some(program @ 1..=254)) => BootRequest::Trial(program),
             (3, Some(program @ 1..=254)) => BootRequest::Start(program),
+            (4, Some(0)) => BootRequest::Fault,
             _ => return None,
         };
         // One encoder decides what is well-formed: magic, words and check must be exactly its.
@@ -111,8 +115,13 @@ mod tests {
 
     #[test]
     fn every_request_survives_the_cell_once() {
-        let requests =
-            [BootRequest::Stay, BootRequest::Trial(1), BootRequest::Start(1), BootRequest::Trial(254)];
+        let requests = [
+            BootRequest::Stay,
+            BootRequest::Trial(1),
+            BootRequest::Start(1),
+            BootRequest::Trial(254),
+            BootRequest::Fault,
+        ];
         for request in requests {
             let mut ram = WarmStart::EMPTY;
             // SAFETY: `ram` is ours and outlives the cell.

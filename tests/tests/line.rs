@@ -240,8 +240,8 @@ fn the_boot_up_of_the_bootloader_is_followed_by_an_emergency() {
         bench.run_ms(20);
         bench
     };
-    // Device specific, no error in the register, "BOOT".
-    assert_eq!(emergencies(&bench, Time::default()), [[0x00, 0xFF, 0, b'B', b'O', b'O', b'T', 0]]);
+    // Device specific, no error in the register, "BOOT", and why: no program.
+    assert_eq!(emergencies(&bench, Time::default()), [[0x00, 0xFF, 0, b'B', b'O', b'O', b'T', 6]]);
 }
 
 #[test]
