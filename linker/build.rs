@@ -15,6 +15,7 @@ fn main() {
         .expect("choose a board by one of the features `board-…`");
     let (image, template) = match env::var("CARGO_PKG_NAME").as_deref() {
         Ok("bootloader") => (Image::Bootloader, "bootloader.x"),
+        _ if env::var_os("CARGO_FEATURE_PROGRAM_2").is_some() => (Image::Program(2), "application.x"),
         _ => (Image::Program(1), "application.x"),
     };
     let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));

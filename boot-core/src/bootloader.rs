@@ -119,6 +119,7 @@ pub struct Bootloader<'b, F: Flash, const PROGRAMS: usize> {
     config: &'static Config,
     serial_number: u32,
     /// Why the device stayed in the bootloader.
+    #[cfg(feature = "emcy")]
     reason: u8,
     /// Node-ID and bit rate as they are stored.
     node: NodeParameters,
@@ -144,6 +145,7 @@ impl<'b, F: Flash, const PROGRAMS: usize> Bootloader<'b, F, PROGRAMS> {
         let mut bootloader = Self {
             config,
             serial_number,
+            #[cfg(feature = "emcy")]
             reason,
             node,
             id: None,
@@ -152,6 +154,8 @@ impl<'b, F: Flash, const PROGRAMS: usize> Bootloader<'b, F, PROGRAMS> {
             #[cfg(feature = "emcy")]
             emcy: Emcy::new(),
         };
+        #[cfg(not(feature = "emcy"))]
+        let _ = reason;
         #[cfg(feature = "emcy")]
         if StayReason::is_trouble(reason) {
             bootloader.emcy.raise(emcy::code::SOFTWARE, 0, [reason, 0, 0, 0, 0]);

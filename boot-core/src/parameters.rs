@@ -19,7 +19,8 @@ const BLANK: Slot = [ERASED; SLOT_WORDS];
 
 /// Tells a region's header ("CBNV" read as little-endian bytes).
 const HEADER_MAGIC: u32 = u32::from_le_bytes(*b"CBNV");
-/// Version of the journal's format.
+/// Version of the journal's format: what the values of the keys mean. A journal of an older one is read, and moves to this one
+/// with the next value that is stored; one of a newer version belongs to a newer bootloader and is left alone.
 const FORMAT: u32 = 1;
 /// How often a record that does not read back is tried in a further slot.
 const ATTEMPTS: u8 = 8;
@@ -71,6 +72,8 @@ struct Active {
     sequence: u32,
     /// The first slot behind the last one that is not blank.
     free: u32,
+    /// Of the version that is written today.
+    current: bool,
 }
 
 impl Journal {
@@ -79,20 +82,21 @@ impl Journal {
         let header = |region: usize| {
             let slot = read_slot(flash, &regions[region], 0);
             let sequence = slot[1];
-            (slot == header_slot(sequence)).then_some((region, sequence))
+            let sound = slot[3] <= FORMAT && slot == header_slot(sequence, slot[3]);
+            sound.then_some((region, sequence, slot[3]))
         };
         let newest = match (header(0), header(1)) {
             (Some(a), Some(b)) => Some(if b.1.wrapping_sub(a.1) as i32 > 0 { b } else { a }),
             (a, b) => a.or(b),
         };
-        let active = newest.map(|(region, sequence)| {
+        let active = newest.map(|(region, sequence, format)| {
             // Behind the slot of the last word that is not blank; a word at a time, because this is on the way of every start.
             let Region { base, .. } = regions[region];
             let mut words = slots(&regions[region]) * SLOT_WORDS as u32;
             while words > SLOT_WORDS as u32 && flash.read_word(base + 4 * (words - 1)) == ERASED {
                 words -= 1;
             }
-            Active { region, sequence, free: words.div_ceil(SLOT_WORDS as u32) }
+            Active { region, sequence, free: words.div_ceil(SLOT_WORDS as u32), current: format == FORMAT }
         });
         Self { regions, active }
     }
@@ -113,7 +117,7 @@ impl Journal {
     pub fn store(&self, key: Key, value: Value) -> Store {
         let record = record_slot(key.tag(), value);
         let state = match self.active {
-            Some(active) if active.free < slots(&self.regions[active.region]) => {
+            Some(active) if active.current && active.free < slots(&self.regions[active.region]) => {
                 let address = slot_address(&self.regions[active.region], active.free);
                 State::Append { writer: WordWriter::new(address) }
             }
@@ -229,11 +233,16 @@ impl Store {
                     }
                 },
                 State::Commit { to, sequence, writer } => {
-                    match write(writer, flash, &header_slot(*sequence)) {
+                    match write(writer, flash, &header_slot(*sequence, FORMAT)) {
                         Poll::Pending => return Poll::Pending,
                         Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
                         Poll::Ready(Ok(())) => {
-                            journal.active = Some(Active { region: target, sequence: *sequence, free: *to });
+                            journal.active = Some(Active {
+                                region: target,
+                                sequence: *sequence,
+                                free: *to,
+                                current: true,
+                            });
                             return Poll::Ready(Ok(()));
                         }
                     }
@@ -290,6 +299,6 @@ fn record_slot(tag: u32, [a, b, c, d]: Value) -> Slot {
     [tag, a, b, c, d, crc32(&bytes)]
 }
 
-fn header_slot(sequence: u32) -> Slot {
-    record_slot(HEADER_MAGIC, [sequence, !sequence, FORMAT, ERASED])
+fn header_slot(sequence: u32, format: u32) -> Slot {
+    record_slot(HEADER_MAGIC, [sequence, !sequence, format, ERASED])
 }

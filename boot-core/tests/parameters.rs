@@ -143,3 +143,30 @@ fn the_real_regions_hold_hundreds_of_records_between_two_erases() {
     let slots = LAYOUT.parameters[0].size / 24;
     assert!(slots > 600, "{slots}");
 }
+
+/// A slot as docs/adr/0004 has it: five words and their CRC.
+fn slot(words: [u32; 5]) -> Vec<u8> {
+    let mut bytes: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
+    bytes.extend(boot_core::crc32(&bytes).to_le_bytes());
+    bytes
+}
+
+#[test]
+fn a_journal_of_an_older_version_is_read_and_moves_to_this_one_and_a_newer_one_is_left_alone() {
+    for (version, known) in [(0, true), (1, true), (2, false)] {
+        let mut flash = ModelFlash::new(&SMALL);
+        let magic = u32::from_le_bytes(*b"CBNV");
+        flash.poke(REGIONS[0].base, &slot([magic, 7, !7, version, u32::MAX]));
+        flash.poke(REGIONS[0].base + 24, &slot([0x0001_0002, 1, 2, 3, 4]));
+        let mut journal = Journal::open(&flash, REGIONS);
+        assert_eq!(journal.get(&flash, Key::Program(2)), known.then_some([1, 2, 3, 4]), "version {version}");
+        if version == 0 {
+            store(&mut flash, &mut journal, Key::CrashCount, [9, 0, 0, 0]).unwrap();
+            let reopened = Journal::open(&flash, REGIONS);
+            assert_eq!(reopened.get(&flash, Key::Program(2)), Some([1, 2, 3, 4]));
+            assert_eq!(reopened.get(&flash, Key::CrashCount), Some([9, 0, 0, 0]));
+            // The other region, the next sequence number, today's version.
+            assert_eq!(flash.cells(REGIONS[1])[..24], slot([magic, 8, !8, 1, u32::MAX]));
+        }
+    }
+}

@@ -10,11 +10,11 @@
 pub mod can;
 pub mod clock;
 
-#[cfg(feature = "board-stm32f407g-disc1")]
+#[cfg(any(feature = "board-stm32f407g-disc1", feature = "board-stm32f407g-disc1-two"))]
 #[path = "stm32f407g_disc1.rs"]
 mod board;
 
-#[cfg(not(feature = "board-stm32f407g-disc1"))]
+#[cfg(not(any(feature = "board-stm32f407g-disc1", feature = "board-stm32f407g-disc1-two")))]
 compile_error!("bsp: choose a board by one of the features `board-…`");
 
 pub use board::*;

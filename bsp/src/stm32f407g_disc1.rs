@@ -6,7 +6,11 @@ use crate::clock::ClockTree;
 use crate::Identity;
 
 /// Who owns which address on this board.
-pub const LAYOUT: &Layout = &layout::stm32f407g_disc1::LAYOUT;
+pub const LAYOUT: &Layout = if cfg!(feature = "board-stm32f407g-disc1-two") {
+    &layout::stm32f407g_disc1_two::LAYOUT
+} else {
+    &layout::stm32f407g_disc1::LAYOUT
+};
 
 /// What the device says of itself.
 pub const IDENTITY: Identity = Identity {

@@ -10,9 +10,10 @@ use crate::geometry::{Geometry, Region};
 use crate::{callgate, handoff, warm_start};
 
 pub mod stm32f407g_disc1;
+pub mod stm32f407g_disc1_two;
 
 /// Every board that coboot knows, for tools that take a board by name.
-pub const BOARDS: &[&Layout] = &[&stm32f407g_disc1::LAYOUT];
+pub const BOARDS: &[&Layout] = &[&stm32f407g_disc1::LAYOUT, &stm32f407g_disc1_two::LAYOUT];
 
 /// The board of this name, as in `--board`.
 #[must_use]

@@ -56,6 +56,12 @@ impl Bench {
         Self::of(firmware::BOOTLOADER_COMPLETE, vec![Options::default()])
     }
 
+    /// A board with this bootloader.
+    #[must_use]
+    pub fn of_image(bootloader: &str) -> Self {
+        Self::of(bootloader, vec![Options::default()])
+    }
+
     /// So many boards whose bootloaders have every option, each with a unique ID and noise of its own. They share bus and
     /// node-ID until they are told others.
     ///

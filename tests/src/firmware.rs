@@ -15,6 +15,14 @@ pub const BOOTLOADER_COMPLETE: &str = "bootloader-complete.elf";
 pub const APP_V1: &str = "app-v1.elf";
 /// Version 2 of the application.
 pub const APP_V2: &str = "app-v2.elf";
+/// Version 2 of the application at the place of the second program, on a board that has one.
+pub const PROGRAM_2: &str = "app-program-2.elf";
+
+/// The name of an image of another board than the one that the tests are about.
+#[must_use]
+pub fn of_board(board: &str, image: &str) -> String {
+    format!("../{board}/{image}")
+}
 
 /// The board that the images are for: `COBOOT_BOARD`, or the first one.
 ///

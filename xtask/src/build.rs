@@ -16,7 +16,8 @@ pub const HELP: &str = "\
 usage: cargo xtask build [--board BOARD] [--yes]
 
 Builds the bootloader, standard and with every option, and both versions of the application, and puts
-them into target/firmware/BOARD/ as bootloader.elf, bootloader-complete.elf, app-v1.elf and app-v2.elf.
+them into target/firmware/BOARD/ as bootloader.elf, bootloader-complete.elf, app-v1.elf and app-v2.elf; for
+a board with room for two programs also app-program-2.elf.
 
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -50,6 +51,10 @@ pub fn images(board: &Layout) -> Outcome<Images> {
     // Version 1 is the template as it stands.
     image(&Build { board, package: "app-template", features: "" }, "app-v1.elf", program)?;
     image(&Build { board, package: "app-template", features: "version-2" }, "app-v2.elf", program)?;
+    if let Some(second) = board.programs.get(1) {
+        let features = "version-2,program-2";
+        image(&Build { board, package: "app-template", features }, "app-program-2.elf", *second)?;
+    }
     Ok(Images { dir: workspace::firmware_dir(board), bootloader })
 }
 

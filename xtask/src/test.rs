@@ -4,6 +4,8 @@ use std::io::{BufRead, BufReader, Write};
 use std::process::Stdio;
 use std::time::Instant;
 
+use shared_abi::layout::BOARDS;
+
 use crate::args::Args;
 use crate::setup::{self, Part, Setup};
 use crate::{build, process, workspace, Outcome};
@@ -28,6 +30,10 @@ pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     setup.prepare(&[Part::Firmware, Part::Emulator, Part::Python])?;
     let images = build::images(board)?;
+    // And one board with room for two programs, for the tests of that.
+    for two in BOARDS.iter().filter(|other| other.programs.len() > 1 && other.board != board.board) {
+        build::images(two)?;
+    }
     process::run(process::cargo("build").current_dir(workspace::root()).args(["--package", "coflash"]))?;
     let coflash =
         workspace::target_dir().join("debug").join("coflash").with_extension(std::env::consts::EXE_EXTENSION);

@@ -1,0 +1,108 @@
+//! A device with two programs: each has its own place, record and signature, and one is never at the mercy of the other.
+
+use canopen::program::ProgramControl;
+use canopen::{Address, NodeId};
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::firmware;
+use coflash::block_file::BlockFile;
+use coflash::convert::{blocks_of, Options, Region};
+use coflash::flash::{flash, FlashOptions};
+use coflash::read::read;
+use coflash::session::Doing;
+use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
+
+const VERSION: Address = Address::new(0x100A, 0);
+
+fn identification(bench: &mut Bench, program: u8) -> u32 {
+    let answer = bench.ask(0x601, &[0x40, 0x56, 0x1F, program, 0, 0, 0, 0], 0x581).expect("an answer");
+    u32::from_le_bytes([answer[4], answer[5], answer[6], answer[7]])
+}
+
+fn blocks(image: &str, program: usize) -> BlockFile {
+    let elf = firmware::elf(&firmware::of_board(LAYOUT.board, image));
+    let options =
+        Options { region: Region::Strict(LAYOUT.programs[program - 1].into()), ..Options::default() };
+    blocks_of(read(&elf, None, None).expect("an ELF of ours"), &options).expect("it fits").file
+}
+
+fn install(bench: &mut Bench, program: u8, file: &BlockFile) {
+    let options = FlashOptions { program, start: false, ..FlashOptions::default() };
+    flash(&mut bench.session(), file, &options, &mut |_| {}).unwrap();
+}
+
+fn restart(bench: &mut Bench) {
+    bench.power_off();
+    bench.run_ms(10);
+    bench.power_on();
+    bench.await_boot_up(1000);
+    bench.run_ms(20);
+}
+
+fn version(bench: &mut Bench) -> String {
+    bench.session().read_text(VERSION).unwrap()
+}
+
+#[test]
+fn two_programs_are_installed_started_and_erased_each_by_itself() {
+    let mut bench = Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER));
+    bench.power_on();
+    bench.await_boot_up(100);
+    // 1F50h to 1F57h have two sub-indices and no third.
+    for index in [0x50, 0x51, 0x56, 0x57] {
+        let highest = bench.ask(0x601, &[0x40, index, 0x1F, 0, 0, 0, 0, 0], 0x581).unwrap();
+        assert_eq!((highest[0], highest[4]), (0x4F, 2));
+        let third = bench.ask(0x601, &[0x40, index, 0x1F, 3, 0, 0, 0, 0], 0x581).unwrap();
+        assert_eq!(third, [0x80, index, 0x1F, 3, 0x11, 0, 0x09, 0x06]);
+    }
+
+    let (first, second) = (blocks(firmware::APP_V1, 1), blocks(firmware::PROGRAM_2, 2));
+    install(&mut bench, 2, &second);
+    // The autostart is the first program's; the second starts when it is asked for.
+    restart(&mut bench);
+    assert!(bench.session().device_type().unwrap().unwrap().is_bootloader());
+    assert_eq!(identification(&mut bench, 1), 0);
+    assert_eq!(identification(&mut bench, 2), second.program_crc());
+    bench.session().command(2, ProgramControl::Start).unwrap();
+    bench.await_boot_up(1000);
+    bench.run_ms(20);
+    assert_eq!(version(&mut bench), "2.0.0");
+
+    restart(&mut bench);
+    install(&mut bench, 1, &first);
+    restart(&mut bench);
+    assert_eq!(version(&mut bench), "1.0.0");
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up(1000);
+    bench.run_ms(20);
+
+    // Erasing one leaves the other whole, to the byte.
+    let place = (LAYOUT.programs[1].base - LAYOUT.chip.flash.base) as usize;
+    let before = bench.machine().flash()[place..].to_vec();
+    for _ in 0..2 {
+        bench.session().command(1, ProgramControl::Clear).unwrap();
+    }
+    bench.session().await_idle(1, Doing::Command(ProgramControl::Clear)).unwrap();
+    assert_eq!(identification(&mut bench, 1), 0);
+    assert!(bench.machine().flash()[place..] == before);
+    restart(&mut bench);
+    bench.session().command(2, ProgramControl::Start).unwrap();
+    bench.await_boot_up(1000);
+    bench.run_ms(20);
+    assert_eq!(version(&mut bench), "2.0.0");
+    assert!(NodeId::new(NODE).is_some());
+}
+
+/// A program that was linked for another place has no business here: its vectors would point into the other one.
+#[test]
+fn a_block_for_the_other_program_is_refused() {
+    let mut bench = Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER));
+    bench.power_on();
+    bench.await_boot_up(100);
+    let second = blocks(firmware::PROGRAM_2, 2);
+    let options = FlashOptions { program: 1, start: false, repeats: 0, ..FlashOptions::default() };
+    let refused = flash(&mut bench.session(), &second, &options, &mut |_| {}).unwrap_err();
+    let status = bench.ask(0x601, &[0x40, 0x57, 0x1F, 1, 0, 0, 0, 0], 0x581).unwrap();
+    assert_eq!(status[4], 0x0C, "ADDRESS: {refused}");
+    let (start, end) = (0x1_0000, LAYOUT.chip.flash.size as usize);
+    assert!(bench.machine().flash()[start..end].iter().all(|byte| *byte == 0xFF));
+}
