@@ -4,3 +4,4 @@ pub mod bench;
 pub mod eds;
 pub mod endpoint;
 pub mod firmware;
+pub mod throughput;

@@ -9,6 +9,7 @@ use std::process::ExitCode;
 
 mod args;
 mod arrows;
+mod bench;
 mod build;
 mod demo;
 mod eds;
@@ -75,6 +76,12 @@ const JOBS: &[Job] = &[
         about: "the fuzz targets, each for a while (nightly toolchain)",
         help: fuzz::HELP,
         run: fuzz::run,
+    },
+    Job {
+        name: "bench",
+        about: "how fast a program gets into the device, beside the limits of wire and flash",
+        help: bench::HELP,
+        run: bench::run,
     },
     Job {
         name: "size",

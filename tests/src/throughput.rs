@@ -1,0 +1,155 @@
+//! How long a program takes into the device, beside what the wire and the flash allow at best.
+
+use std::time::Duration;
+
+use canopen::program::ProgramControl;
+use canopen::sdo::wire::{BlockAck, BlockEnd, Request, Response};
+use canopen::{Address, BitRate, NodeId};
+use coflash::block_file::BlockFile;
+use coflash::convert::{blocks_of, Label, Options, Region};
+use coflash::read::{read, Firmware, Format};
+use coflash::session::{Doing, Session, Timing};
+use emulator::frame::Frame;
+
+use crate::bench::{Bench, NODE};
+use crate::firmware;
+
+const DATA: Address = Address::new(0x1F50, 1);
+const STATUS: Address = Address::new(0x1F57, 1);
+/// Bytes of a block, framing included: large enough that the wire hardly notices the framing, small enough that the last one is
+/// programmed in no time.
+const BLOCK_SIZE: usize = 4096;
+/// Typical erase times of the STM32F405/407 by words, in ms (datasheet DocID022152, flash memory programming).
+const ERASE_MS: [(u32, u64); 3] = [(16 * 1024, 250), (64 * 1024, 550), (128 * 1024, 1000)];
+/// Typical time to program a word, in us (the same table).
+const PROGRAM_US: u64 = 16;
+
+/// One measurement; all times in us.
+#[derive(Clone, Copy, Debug)]
+pub struct Measurement {
+    /// Bit rate in bit/s.
+    pub bit_rate: u32,
+    /// Size of the program in KiB.
+    pub kib: u32,
+    /// From the CLEAR command to the status that says "verified".
+    pub took: u64,
+    /// What one SDO block transfer of these bytes takes on the wire, without a pause: stuff bits, acknowledgements and
+    /// intermissions included.
+    pub wire: u64,
+    /// What erasing the sectors and programming the words take.
+    pub flash: u64,
+}
+
+impl Measurement {
+    /// The lower limit of both, as it is the slower that limits.
+    #[must_use]
+    pub fn limit(&self) -> u64 {
+        self.wire.max(self.flash)
+    }
+
+    /// How near it came, in percent.
+    #[must_use]
+    pub fn percent(&self) -> u64 {
+        self.limit() * 100 / self.took.max(1)
+    }
+}
+
+/// Downloads a program of this size at this bit rate, in virtual time.
+///
+/// # Panics
+/// If the device refuses it, or the firmware was not built.
+#[must_use]
+pub fn measure(rate: BitRate, kib: u32) -> Measurement {
+    let bit_rate = rate.bits_per_second().expect("a rate that can be set");
+    let mut bench = Bench::new();
+    let board = bench.boards()[0];
+    bench.commission(board, NODE, rate);
+    bench.set_host_bit_rate(bit_rate);
+    bench.power_on();
+    bench.run_ms(50);
+
+    let bytes = program(kib);
+    let file = blocks(&bytes);
+    let from = bench.time();
+    let poll = Timing {
+        poll_first: Duration::from_millis(2),
+        poll_most: Duration::from_millis(10),
+        ..Timing::default()
+    };
+    let mut session = Session::new(&mut bench, NodeId::new(NODE).expect("1 to 127"), poll);
+    session.command(1, ProgramControl::Clear).expect("CLEAR");
+    for block in file.blocks() {
+        session.write(DATA, &block.emit(), Doing::Block(block.number), &mut |_| {}).expect("a good block");
+        let status = session.await_idle(1, Doing::Read(STATUS)).expect("the status");
+        assert_eq!(status.to_word(), 0, "behind block {}", block.number);
+    }
+    let took = (bench.time() - from).0 / 1_000_000;
+    Measurement { bit_rate, kib, took, wire: wire_us(&bytes, bit_rate), flash: flash_us(bytes.len() as u32) }
+}
+
+/// The application, filled up with bytes that stuff as code does.
+fn program(kib: u32) -> Vec<u8> {
+    let base = firmware::board().programs[0].base;
+    let elf = firmware::elf(firmware::APP_V1);
+    let Firmware::Image(image) = read(&elf, None, None).expect("an ELF of ours") else {
+        panic!("an ELF is no block file");
+    };
+    let mut bytes: Vec<u8> =
+        (0..kib * 1024).map(|i| (i.wrapping_mul(2_654_435_761).rotate_left(9) >> 24) as u8).collect();
+    for (address, data) in image.segments() {
+        let at = (address - base) as usize;
+        bytes[at..at + data.len()].copy_from_slice(&data);
+    }
+    bytes
+}
+
+fn blocks(bytes: &[u8]) -> BlockFile {
+    let region = firmware::board().programs[0];
+    let image = read(bytes, Some(Format::Raw), Some(region.base)).expect("a raw image");
+    let options = Options {
+        region: Region::Strict(region.into()),
+        block_size: BLOCK_SIZE,
+        // Tells the size, so that sectors are erased ahead of the data.
+        label: Label::Device { vendor_id: bsp::IDENTITY.vendor_id, product_code: bsp::IDENTITY.product_code },
+        ..Options::default()
+    };
+    blocks_of(image, &options).expect("it fits").file
+}
+
+/// Frames of one block transfer, each with its stuff bits and the intermission behind it.
+fn wire_us(bytes: &[u8], bit_rate: u32) -> u64 {
+    let node = u16::from(NODE);
+    let bits = |id: u16, data: [u8; 8]| u64::from(Frame::standard(id, &data).expect("8 bytes").bus_bits());
+    let (asked, answered) = (0x600 + node, 0x580 + node);
+    let size = Some(bytes.len() as u32);
+    let mut all = bits(asked, Request::InitiateBlockDownload { at: DATA, crc: true, size }.emit())
+        + bits(answered, Response::InitiateBlockDownload { at: DATA, crc: true, blksize: 127 }.emit());
+    for sub_block in bytes.chunks(7 * 127) {
+        let mut seqno = 0;
+        for data in sub_block.chunks(7) {
+            seqno += 1;
+            let mut segment = [0; 8];
+            segment[0] = seqno;
+            segment[1..=data.len()].copy_from_slice(data);
+            all += bits(asked, segment);
+        }
+        all += bits(answered, Response::AckBlockDownload(BlockAck { ackseq: seqno, blksize: 127 }).emit());
+    }
+    all += bits(asked, Request::EndBlockDownload(BlockEnd { unused: 0, crc: 0xA5A5 }).emit());
+    all += bits(answered, Response::EndBlockDownload.emit());
+    all * 1_000_000 / u64::from(bit_rate)
+}
+
+fn flash_us(size: u32) -> u64 {
+    let board = firmware::board();
+    let region = board.programs[0];
+    let mut erase = 0;
+    let mut next = region.base;
+    while next < region.base + size {
+        let sector = board.chip.sector_at(next).expect("inside the flash").region;
+        let of_size = ERASE_MS.iter().find(|(bytes, _)| *bytes == sector.size);
+        erase += of_size.expect("a sector of the F4").1 * 1000;
+        next = sector.end();
+    }
+    erase + u64::from(size / 4) * PROGRAM_US
+}
