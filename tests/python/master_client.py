@@ -46,6 +46,8 @@ WRITE_ONLY, READ_ONLY, NO_OBJECT, NOT_STORED = 0x0601_0001, 0x0601_0002, 0x0602_
 # Emergencies (CiA 301, table 26): wrong data set, device specific; and bit 0 and 7 of the error register.
 DATA_SET, DEVICE_SPECIFIC, ERROR_RESET = 0x6300, 0xFF00, 0x0000
 GENERIC, MANUFACTURER = 0x01, 0x80
+# The emergency after boot-up: a bootloader, and why it stayed one (docs/protocol.md: 6 is "no program").
+NO_PROGRAM_TO_START = b"BOOT\x06"
 CRC_STATUS = 0x06
 
 
@@ -240,7 +242,7 @@ def use(network, path, node_ids, timeout):
     nodes[second].nmt.state = "RESET"
     consumers[second].await_state(second, BOOT_UP)
     for node_id in (first, second):
-        consumers[node_id].emergency(node_id, DEVICE_SPECIFIC, 0, b"BOOT\x00")
+        consumers[node_id].emergency(node_id, DEVICE_SPECIFIC, 0, NO_PROGRAM_TO_START)
     # A bootloader does not become operational.
     nodes[first].nmt.state = "OPERATIONAL"
     consumers[first].expect_state(first, PRE_OPERATIONAL)
