@@ -42,7 +42,8 @@ const EXCP_EXCEPTION_EXIT: u32 = 8;
 const EXCP_NOCP: u32 = 17;
 const EXCP_INVSTATE: u32 = 18;
 
-const XPSR_IT_T_IPSR: u32 = 0x0700_FC00 | 0x1FF;
+const XPSR_IT: u32 = 0x0600_FC00;
+const XPSR_IT_T_IPSR: u32 = XPSR_IT | XPSR_T | 0x1FF;
 const XPSR_T: u32 = 1 << 24;
 const XPSR_ALIGNED: u32 = 1 << 9;
 const CONTROL_NPRIV: u32 = 1 << 0;
@@ -238,7 +239,13 @@ impl Cpu {
     fn add_hooks(&mut self) -> Result<(), uc_error> {
         let geometry = self.uc.get_data().chip.geometry;
         self.uc.add_block_hook(1, 0, |uc, address, size| on_block(uc, address as u32, size))?;
-        self.uc.add_tlb_hook(1, 0, |uc, address, kind| on_tlb_miss(uc, address as u32, kind))?;
+        self.uc.add_tlb_hook(1, 0, |uc, address, kind| {
+            let entry = on_tlb_miss(uc, address as u32, kind);
+            if entry.is_some() && kind != MemType::FETCH {
+                forget_it_state(uc);
+            }
+            entry
+        })?;
         self.uc.add_intr_hook(|uc, number| {
             uc.get_data_mut().notes.exception = Some(number);
             let _ = uc.emu_stop();
@@ -1060,5 +1067,15 @@ fn on_protected_write(uc: &mut Unicorn<'_, State>, address: u32, size: usize, va
         let what = "read-only memory: the write is lost".into();
         chip.report(Access::Write, address, size as u8, value as u32, pc, what);
     }
+    forget_it_state(uc);
     true
+}
+
+/// For a hook in the middle of a block, Unicorn writes down where in an IT block the CPU is, and leaves it at that. The rest of the
+/// block does without; but the next one would begin as if it lay in that IT block.
+fn forget_it_state(uc: &mut Unicorn<'_, State>) {
+    let xpsr = read(uc, RegisterARM::XPSR);
+    if xpsr & XPSR_IT != 0 {
+        let _ = uc.reg_write(RegisterARM::XPSR_NZCVQG, u64::from(xpsr & !XPSR_IT));
+    }
 }

@@ -226,6 +226,14 @@ fn an_interrupt_within_a_conditional_block_leaves_it_whole() {
     assert!(word(&machine, OUT + 16) > 10_000, "ticks: {}", word(&machine, OUT + 16));
 }
 
+/// A load that has to look its page up tells the host where it is; the code behind its IT block is not conditional for that.
+#[test]
+fn a_load_within_a_conditional_block_leaves_the_code_behind_it_alone() {
+    let mut machine = machine(&programs::CONDITIONAL_LOADS);
+    machine.run_until(ms(1));
+    assert_eq!(word(&machine, OUT), 64 * 4);
+}
+
 #[test]
 fn masks_hold_for_code_without_privilege_which_cannot_change_them() {
     let mut machine = machine(&programs::UNPRIVILEGED);

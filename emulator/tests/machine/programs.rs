@@ -1001,3 +1001,35 @@ pub const CONDITIONS: Program = Program {
         0x0010, 0x2000,      // 028  .word 0x20000010
     ],
 };
+
+/// In 64 rounds the first load from a page of flash, within an IT block; behind the block four additions of 1. Their sum at
+/// 2000_0000h.
+pub const CONDITIONAL_LOADS: Program = Program {
+    base: 0x0800_0200,
+    vectors: &[],
+    code: &[
+        0x4A0B,              // 200  ldr r2, [pc, #44]
+        0x2500,              // 202  movs r5, #0
+        0x2640,              // 204  movs r6, #64
+        0x4292,              // 206 loop:  cmp r2, r2
+        0xBF07,              // 208  ittee eq
+        0x6811,              // 20A  ldreq r1, [r2, #0]
+        0x2300,              // 20C  moveq r3, #0
+        0x2301,              // 20E  movne r3, #1
+        0x2302,              // 210  movne r3, #2
+        0xE7FF,              // 212  b.n 8000214
+        0x3501,              // 214  adds r5, #1
+        0x3501,              // 216  adds r5, #1
+        0x3501,              // 218  adds r5, #1
+        0x3501,              // 21A  adds r5, #1
+        0xF502, 0x5280,      // 21C  add.w r2, r2, #4096
+        0x3E01,              // 220  subs r6, #1
+        0xD1F0,              // 222  bne.n 8000206
+        0xF04F, 0x5000,      // 224  mov.w r0, #536870912
+        0x6005,              // 228  str r5, [r0, #0]
+        0xBF30,              // 22A  wfi
+        0xE7FD,              // 22C  b.n 800022a
+        0x0000,              // 22E  .short 0x0000
+        0x0000, 0x0801,      // 230  .word 0x08010000
+    ],
+};
