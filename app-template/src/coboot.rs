@@ -9,8 +9,9 @@ use shared_abi::handoff::Handoff;
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::{BootRequest, Cell};
 
-/// How long the device stays after the answer to 80h is on the bus, in ms (SYS TEC manual L-1112d_10, 4.5).
-const FAREWELL_MS: u32 = 10;
+/// How long the device stays after the answer to 80h is on the bus, in ms: at least 10 (SYS TEC manual L-1112d_10, 4.5), and one
+/// that may be almost over.
+const FAREWELL_MS: u32 = 11;
 
 /// The bit rate without a bootloader.
 const DEFAULT_BIT_RATE: BitRate = match BitRate::from_bits_per_second(BIT_RATE) {
@@ -66,23 +67,39 @@ pub fn own_crc(layout: &Layout) -> Option<u32> {
     Callgate::find(layout).ok()?.crc32(start, end - start).ok()
 }
 
-/// The way back into the bootloader: first the answer, then a while, then the reset.
+/// Where the device goes.
+#[derive(Clone, Copy, Debug)]
+pub enum Destination {
+    /// Into the bootloader, which stays.
+    Bootloader,
+    /// Through a reset; what runs then is the bootloader's decision.
+    Reset,
+}
+
+/// The way out: first the answer, then a while in which nothing is said any more, then the reset.
 #[derive(Clone, Copy, Debug)]
 pub enum Departure {
-    /// The answer is not on the bus yet.
+    /// The device stays.
     Staying,
-    /// The device leaves at this time.
-    Leaving(Instant),
+    /// What is to be said first is not on the bus yet.
+    Answering(Destination),
+    /// The device leaves at this time. A frame that began now would be cut off by the reset.
+    Leaving(Destination, Instant),
 }
 
 impl Departure {
-    /// Goes on with it. `answered` says that the answer has reached the bus. Does not return from the last step.
-    pub fn proceed(&mut self, answered: bool, now: Instant) {
+    /// Goes on with it: `quiet` says that everything is on the bus. Whether the device is silent from now on; does not return when
+    /// its time is over.
+    pub fn proceed(&mut self, quiet: bool, now: Instant) -> bool {
         match *self {
-            Self::Staying if answered => *self = Self::Leaving(now + FAREWELL_MS),
-            Self::Leaving(at) if now.has_reached(at) => enter_bootloader(),
+            Self::Answering(destination) if quiet => *self = Self::Leaving(destination, now + FAREWELL_MS),
+            Self::Leaving(destination, at) if now.has_reached(at) => match destination {
+                Destination::Bootloader => enter_bootloader(),
+                Destination::Reset => restart(),
+            },
             _ => {}
         }
+        matches!(self, Self::Leaving(..))
     }
 }
 

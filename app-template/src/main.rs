@@ -39,7 +39,7 @@ mod app {
     use rtic_monotonics::Monotonic;
 
     use super::Mono;
-    use crate::coboot::{self, Departure};
+    use crate::coboot::{self, Departure, Destination};
     use crate::objects::{Application, HEARTBEAT_MS};
 
     /// Frames that may wait for the protocol task.
@@ -126,19 +126,21 @@ mod app {
         let now = Instant::from_millis(Mono::now().ticks());
         let protocol::SharedResources { mut can, .. } = cx.shared;
         let protocol::LocalResources { to_handle, slave, application, departure, .. } = cx.local;
+        if departure.proceed(slave.is_idle() && can.lock(|can| can.is_idle()), now) {
+            return;
+        }
         let status = can.lock(status);
         slave.observe(status, now, application);
         // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
         carry_out(slave, &mut can, now, application);
         while let Some(frame) = to_handle.dequeue() {
             if slave.handle(&frame, now, application) {
-                coboot::restart();
+                *departure = Departure::Answering(Destination::Reset);
             }
             carry_out(slave, &mut can, now, application);
         }
-        if application.is_called_back() {
-            let answered = slave.is_idle() && can.lock(|can| can.is_idle());
-            departure.proceed(answered, now);
+        if application.take_called_back() {
+            *departure = Departure::Answering(Destination::Bootloader);
         }
     }
 

@@ -62,9 +62,9 @@ impl Application {
         self.device.lss_address()
     }
 
-    /// Whether the device shall go back to the bootloader.
-    pub fn is_called_back(&self) -> bool {
-        self.called_back
+    /// Whether the device shall go back to the bootloader, once.
+    pub fn take_called_back(&mut self) -> bool {
+        core::mem::take(&mut self.called_back)
     }
 
     /// The 1F51h callback. It runs before the SDO answer is sent, so it only notes what is to be done: `main` waits until

@@ -27,6 +27,7 @@ use crate::decision::StayReason;
 use crate::download::{Downloader, Policy, Step};
 use crate::flash::Flash;
 use crate::node::NodeParameters;
+use crate::parameters::Parameters;
 
 /// The objects of a device with `programs` programs (1 to 254), of which there are [`entry_count`] (SYS TEC manual
 /// L-1112d_10, table 1).
@@ -115,7 +116,7 @@ pub struct Config {
 }
 
 /// The objects of the bootloader and what is behind them.
-pub struct Bootloader<'b, F: Flash, const PROGRAMS: usize> {
+pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize> {
     config: &'static Config,
     serial_number: u32,
     /// Why the device stayed in the bootloader.
@@ -126,22 +127,24 @@ pub struct Bootloader<'b, F: Flash, const PROGRAMS: usize> {
     /// Node-ID in force.
     id: Option<NodeId>,
     flash: F,
-    download: Downloader<'b, PROGRAMS>,
+    download: Downloader<'b, P, PROGRAMS>,
     #[cfg(feature = "emcy")]
     emcy: Emcy,
 }
 
-impl<'b, F: Flash, const PROGRAMS: usize> Bootloader<'b, F, PROGRAMS> {
-    /// Starts from what the flash holds, for a device that stayed in the bootloader for this reason. The larger `buffer`, the further the flash may lag behind the bus.
+impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PROGRAMS> {
+    /// Starts from what the parameters tell, for a device that stayed in the bootloader for this reason. The larger `buffer`,
+    /// the further the flash may lag behind the bus.
     pub fn new(
         config: &'static Config,
         serial_number: u32,
         node: NodeParameters,
         reason: u8,
+        parameters: P,
         flash: F,
         buffer: &'b mut [u8],
     ) -> Self {
-        let download = Downloader::new(config.layout, &config.download, &flash, buffer);
+        let download = Downloader::new(config.layout, &config.download, parameters, &flash, buffer);
         let mut bootloader = Self {
             config,
             serial_number,
@@ -210,7 +213,7 @@ impl<'b, F: Flash, const PROGRAMS: usize> Bootloader<'b, F, PROGRAMS> {
     }
 }
 
-impl<F: Flash, const PROGRAMS: usize> Objects for Bootloader<'_, F, PROGRAMS> {
+impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, F, P, PROGRAMS> {
     fn entries(&self) -> &'static [Entry] {
         self.config.entries
     }
@@ -269,7 +272,7 @@ impl<F: Flash, const PROGRAMS: usize> Objects for Bootloader<'_, F, PROGRAMS> {
     }
 }
 
-impl<F: Flash, const PROGRAMS: usize> LssDevice for Bootloader<'_, F, PROGRAMS> {
+impl<F: Flash, P: Parameters, const PROGRAMS: usize> LssDevice for Bootloader<'_, F, P, PROGRAMS> {
     fn supports(&mut self, rate: BitRate) -> bool {
         (self.config.supports)(rate)
     }
@@ -290,7 +293,7 @@ impl<F: Flash, const PROGRAMS: usize> LssDevice for Bootloader<'_, F, PROGRAMS> 
     }
 }
 
-impl<F: Flash, const PROGRAMS: usize> SlaveDevice for Bootloader<'_, F, PROGRAMS> {
+impl<F: Flash, P: Parameters, const PROGRAMS: usize> SlaveDevice for Bootloader<'_, F, P, PROGRAMS> {
     #[cfg(feature = "emcy")]
     fn line_event(&mut self, event: LineEvent) {
         self.emcy.line_event(event);

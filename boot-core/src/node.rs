@@ -4,7 +4,7 @@ use canopen::bit_rate::BitRate;
 use canopen::NodeId;
 
 use crate::flash::Flash;
-use crate::parameters::{Journal, Key, Value};
+use crate::parameters::{Key, Parameters, Value};
 
 /// What a device is called on its bus, and how fast that is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -21,12 +21,12 @@ const NO_NODE_ID: u32 = 0xFF;
 impl NodeParameters {
     /// What was stored, or the board's own values where nothing was, or nothing that this firmware can run with.
     pub fn load<F: Flash>(
-        journal: &Journal,
+        parameters: &impl Parameters,
         flash: &F,
         board: Self,
         supports: impl FnOnce(BitRate) -> bool,
     ) -> Self {
-        journal
+        parameters
             .get(flash, Key::Node)
             .and_then(Self::from_value)
             .filter(|stored| supports(stored.bit_rate))

@@ -57,13 +57,36 @@ pub enum StoreError {
     Flash(FlashFault),
     /// No slot took the record: the region is worn out.
     WornOut,
+    /// A store outside the flash failed.
+    Device,
+}
+
+/// Where parameters are kept: the [`Journal`] in flash, or what a board has for them (an EEPROM), which may leave the flash
+/// that it is handed alone.
+///
+/// Whoever implements it owes this: after a power cut at any moment [`get`](Self::get) gives the value from before the store
+/// or the new one, of every key; and every store comes to an end, a store that is full or worn out with an error.
+pub trait Parameters {
+    /// The value of a key, `None` where it was never stored.
+    fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value>;
+
+    /// Starts to store a value, one at a time; [`poll`](Self::poll) carries it through.
+    fn store(&mut self, key: Key, value: Value);
+
+    /// Carries on; `Pending` while the store works. Call again until ready.
+    ///
+    /// # Errors
+    /// Why the value could not be stored; then the old one is still there.
+    fn poll<F: Flash>(&mut self, flash: &mut F) -> Poll<Result<(), StoreError>>;
 }
 
 /// The journal. Holds where to read and write; the values stay in flash.
 #[derive(Debug)]
 pub struct Journal {
+    chip: &'static Geometry,
     regions: [Region; 2],
     active: Option<Active>,
+    storing: Option<Storing>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -78,7 +101,7 @@ struct Active {
 
 impl Journal {
     /// Finds the valid region and its end.
-    pub fn open<F: Flash>(flash: &F, regions: [Region; 2]) -> Self {
+    pub fn open<F: Flash>(flash: &F, chip: &'static Geometry, regions: [Region; 2]) -> Self {
         let header = |region: usize| {
             let slot = read_slot(flash, &regions[region], 0);
             let sequence = slot[1];
@@ -98,11 +121,12 @@ impl Journal {
             }
             Active { region, sequence, free: words.div_ceil(SLOT_WORDS as u32), current: format == FORMAT }
         });
-        Self { regions, active }
+        Self { chip, regions, active, storing: None }
     }
+}
 
-    /// The value of a key, `None` where it was never stored.
-    pub fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value> {
+impl Parameters for Journal {
+    fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value> {
         let active = self.active?;
         let region = &self.regions[active.region];
         (1..active.free).rev().find_map(|slot| {
@@ -112,10 +136,7 @@ impl Journal {
         })
     }
 
-    /// Starts to store a value; [`Store::poll`] carries it through.
-    #[must_use]
-    pub fn store(&self, key: Key, value: Value) -> Store {
-        let record = record_slot(key.tag(), value);
+    fn store(&mut self, key: Key, value: Value) {
         let state = match self.active {
             Some(active) if active.current && active.free < slots(&self.regions[active.region]) => {
                 let address = slot_address(&self.regions[active.region], active.free);
@@ -124,13 +145,22 @@ impl Journal {
             None => State::Begin,
             Some(active) => State::Erase { eraser: SectorEraser::new(self.regions[1 - active.region]) },
         };
-        Store { record, attempts: 0, state }
+        self.storing = Some(Storing { record: record_slot(key.tag(), value), attempts: 0, state });
+    }
+
+    fn poll<F: Flash>(&mut self, flash: &mut F) -> Poll<Result<(), StoreError>> {
+        let Some(mut storing) = self.storing.take() else { return Poll::Ready(Ok(())) };
+        let outcome = self.carry_on(&mut storing, flash);
+        if outcome.is_pending() {
+            self.storing = Some(storing);
+        }
+        outcome
     }
 }
 
 /// A value on its way into the journal.
 #[derive(Debug)]
-pub struct Store {
+struct Storing {
     record: Slot,
     attempts: u8,
     state: State,
@@ -154,33 +184,27 @@ enum State {
     Commit { to: u32, sequence: u32, writer: WordWriter },
 }
 
-impl Store {
-    /// Carries on; `Pending` while the flash works. Call again until ready.
-    pub fn poll<F: Flash>(
-        &mut self,
-        journal: &mut Journal,
-        flash: &mut F,
-        chip: &Geometry,
-    ) -> Poll<Result<(), StoreError>> {
+impl Journal {
+    fn carry_on<F: Flash>(&mut self, storing: &mut Storing, flash: &mut F) -> Poll<Result<(), StoreError>> {
         loop {
-            let target = journal.active.map_or(0, |active| 1 - active.region);
-            let new = journal.regions[target];
-            self.state = match &mut self.state {
+            let target = self.active.map_or(0, |active| 1 - active.region);
+            let new = self.regions[target];
+            storing.state = match &mut storing.state {
                 State::Append { writer } => {
-                    let Poll::Ready(outcome) = write(writer, flash, &self.record) else {
+                    let Poll::Ready(outcome) = write(writer, flash, &storing.record) else {
                         return Poll::Pending;
                     };
                     // `store` starts here only with an active region, and nothing takes it away.
-                    let Some(active) = &mut journal.active else {
+                    let Some(active) = &mut self.active else {
                         return Poll::Ready(Err(StoreError::WornOut));
                     };
                     active.free += 1;
                     match outcome {
                         Ok(()) => return Poll::Ready(Ok(())),
                         // Left half-charged by a power cut, or worn: leave the slot, take the next.
-                        Err(FlashFault::Verify) if self.attempts < ATTEMPTS => {
-                            self.attempts += 1;
-                            let region = &journal.regions[active.region];
+                        Err(FlashFault::Verify) if storing.attempts < ATTEMPTS => {
+                            storing.attempts += 1;
+                            let region = &self.regions[active.region];
                             if active.free < slots(region) {
                                 State::Append { writer: WordWriter::new(slot_address(region, active.free)) }
                             } else {
@@ -194,17 +218,17 @@ impl Store {
                 // A new device: its master shall not wait for an erase that changes nothing.
                 State::Begin if is_blank(flash, new) => State::Collect { from: 1, to: 1 },
                 State::Begin => State::Erase { eraser: SectorEraser::new(new) },
-                State::Erase { eraser } => match eraser.poll(flash, chip) {
+                State::Erase { eraser } => match eraser.poll(flash, self.chip) {
                     Poll::Pending => return Poll::Pending,
                     Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
                     Poll::Ready(Ok(())) => State::Collect { from: 1, to: 1 },
                 },
                 State::Collect { from, to } => {
                     let (from, to) = (*from, *to);
-                    match journal.active {
+                    match self.active {
                         Some(active) if from < active.free => {
-                            let old = &journal.regions[active.region];
-                            match living_slot(flash, old, from, active.free, self.record[0]) {
+                            let old = &self.regions[active.region];
+                            match living_slot(flash, old, from, active.free, storing.record[0]) {
                                 Some(slot) => {
                                     let writer = WordWriter::new(slot_address(&new, to));
                                     State::Copy { from, to, slot, writer }
@@ -220,11 +244,11 @@ impl Store {
                     Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
                     Poll::Ready(Ok(())) => State::Collect { from: *from + 1, to: *to + 1 },
                 },
-                State::Add { to, writer } => match write(writer, flash, &self.record) {
+                State::Add { to, writer } => match write(writer, flash, &storing.record) {
                     Poll::Pending => return Poll::Pending,
                     Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
                     Poll::Ready(Ok(())) => {
-                        let sequence = journal.active.map_or(1, |active| active.sequence.wrapping_add(1));
+                        let sequence = self.active.map_or(1, |active| active.sequence.wrapping_add(1));
                         State::Commit {
                             to: *to + 1,
                             sequence,
@@ -237,7 +261,7 @@ impl Store {
                         Poll::Pending => return Poll::Pending,
                         Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
                         Poll::Ready(Ok(())) => {
-                            journal.active = Some(Active {
+                            self.active = Some(Active {
                                 region: target,
                                 sequence: *sequence,
                                 free: *to,

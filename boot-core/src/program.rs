@@ -6,7 +6,7 @@ use shared_abi::vectors::{VectorFault, VectorTable};
 
 use crate::crc;
 use crate::flash::{fold, Flash};
-use crate::parameters::{Journal, Key, Value};
+use crate::parameters::{Key, Parameters, Value};
 
 /// The word that stands for "signed" in a program's record.
 pub const SIGNATURE: u32 = u32::from_le_bytes(*b"APP1");
@@ -26,9 +26,9 @@ impl ProgramRecord {
     /// The stored form of "no program".
     pub const NONE: Value = [0; 4];
 
-    /// From the journal; `None` where there is no program.
-    pub fn load<F: Flash>(journal: &Journal, flash: &F, number: u8) -> Option<Self> {
-        let [size, crc, signature, _] = journal.get(flash, Key::Program(number))?;
+    /// From the parameters; `None` where there is no program.
+    pub fn load<F: Flash>(parameters: &impl Parameters, flash: &F, number: u8) -> Option<Self> {
+        let [size, crc, signature, _] = parameters.get(flash, Key::Program(number))?;
         (size > 0).then_some(Self { size, crc, signed: signature == SIGNATURE })
     }
 
@@ -129,12 +129,12 @@ pub fn check_vectors<F: Flash>(
 /// The first thing that is wrong with it.
 pub fn verify<F: Flash>(
     flash: &F,
-    journal: &Journal,
+    parameters: &impl Parameters,
     layout: &Layout,
     number: u8,
 ) -> Result<VerifiedProgram, Invalid> {
     let region = layout.program(number).ok_or(Invalid::NoSuchProgram)?;
-    let record = ProgramRecord::load(journal, flash, number).ok_or(Invalid::Absent)?;
+    let record = ProgramRecord::load(parameters, flash, number).ok_or(Invalid::Absent)?;
     if record.size > region.size {
         return Err(Invalid::Size);
     }

@@ -81,13 +81,14 @@ const DEVICE: Device = Device {
 };
 
 struct Bench<'f> {
-    node: Bootloader<'static, &'f mut ModelFlash, 1>,
+    node: Bootloader<'static, &'f mut ModelFlash, Journal, 1>,
 }
 
 impl<'f> Bench<'f> {
     fn new(flash: &'f mut ModelFlash) -> Self {
         let buffer = Box::leak(vec![0; 256].into_boxed_slice());
-        Self { node: Bootloader::new(&CONFIG, 0, node(), 0, flash, buffer) }
+        let parameters = Journal::open(flash, LAYOUT.chip, LAYOUT.parameters);
+        Self { node: Bootloader::new(&CONFIG, 0, node(), 0, parameters, flash, buffer) }
     }
 
     fn settle(&mut self) {
@@ -193,7 +194,7 @@ fn program(len: usize, seed: u8) -> Vec<u8> {
 
 /// Which program would start after a reset, told by its first data byte; `Err` for none.
 fn autostart(flash: &ModelFlash) -> Result<u8, Invalid> {
-    let journal = Journal::open(flash, LAYOUT.parameters);
+    let journal = Journal::open(flash, LAYOUT.chip, LAYOUT.parameters);
     let verified = verify(flash, &journal, &LAYOUT, 1)?;
     if verified.signed() {
         Ok(flash.cells(PROGRAM)[8] ^ 8_u8.wrapping_mul(31))

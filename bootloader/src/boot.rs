@@ -10,7 +10,7 @@ use core::sync::atomic::{AtomicU8, Ordering};
 use boot_core::canopen::{BitRate, NodeId};
 use boot_core::decision::{decide, BootDecision, Circumstances, Policy};
 use boot_core::node::NodeParameters;
-use boot_core::parameters::{Journal, Key};
+use boot_core::parameters::{Journal, Key, Parameters as _};
 use boot_core::program::verify;
 use bsp::can::BitTiming;
 use bsp::clock::Source;
@@ -78,13 +78,13 @@ extern "C" fn stage() {
     // A CRC over a whole program wants speed. Exact it need not be, and the crystal would take its time.
     CLOCK_TREE.speed_up(&rcc, Source::Internal);
     let mut flash = FlashController::new(peripherals.FLASH, peripherals.CRC, &rcc, LAYOUT.chip.flash);
-    let mut journal = Journal::open(&flash, LAYOUT.parameters);
-    let crash_resets = count_crash_resets(&mut journal, &mut flash, reset_cause, request);
+    let mut parameters = parameters(&flash);
+    let crash_resets = count_crash_resets(&mut parameters, &mut flash, reset_cause, request);
 
-    let node = node_parameters(&journal, &flash);
+    let node = node_parameters(&parameters, &flash);
     let node_id = node.id.map_or(NO_NODE_ID, NodeId::get);
     let circumstances = Circumstances { request, strap, crash_resets, node_id };
-    let decision = decide(&circumstances, &POLICY, |number| verify(&flash, &journal, LAYOUT, number));
+    let decision = decide(&circumstances, &POLICY, |number| verify(&flash, &parameters, LAYOUT, number));
     // Whoever runs next finds the chip as after a reset.
     CLOCK_TREE.slow_down(&rcc);
     flash.release(&rcc);
@@ -136,9 +136,17 @@ const BOARD_NODE: NodeParameters = NodeParameters {
 /// Stands for no node-ID (CiA 305).
 const NO_NODE_ID: u8 = 255;
 
+/// Where this product keeps its parameters. One with an EEPROM puts its own [`boot_core::parameters::Parameters`] here.
+pub type Parameters = Journal;
+
+/// The parameters of this device.
+pub fn parameters(flash: &FlashController) -> Parameters {
+    Journal::open(flash, LAYOUT.chip, LAYOUT.parameters)
+}
+
 /// Node-ID and bit rate in force from this reset on.
-pub fn node_parameters(journal: &Journal, flash: &FlashController) -> NodeParameters {
-    NodeParameters::load(journal, flash, BOARD_NODE, supports)
+pub fn node_parameters(parameters: &Parameters, flash: &FlashController) -> NodeParameters {
+    NodeParameters::load(parameters, flash, BOARD_NODE, supports)
 }
 
 /// Whether the board's CAN controller can run at this bit rate.
@@ -169,18 +177,18 @@ pub fn warm_start_cell() -> Cell {
 
 /// Keeps the number of watchdog resets in a row. A request of somebody ends the row: it is a new beginning.
 fn count_crash_resets(
-    journal: &mut Journal,
+    parameters: &mut Parameters,
     flash: &mut FlashController,
     reset_cause: ResetCause,
     request: Option<BootRequest>,
 ) -> u32 {
     let crashed = matches!(reset_cause, ResetCause::IndependentWatchdog | ResetCause::WindowWatchdog);
-    let before = journal.get(flash, Key::CrashCount).map_or(0, |[count, ..]| count);
+    let before = parameters.get(flash, Key::CrashCount).map_or(0, |[count, ..]| count);
     let now = if crashed && request.is_none() { before.saturating_add(1) } else { 0 };
     if now != before {
-        let mut store = journal.store(Key::CrashCount, [now, 0, 0, 0]);
+        parameters.store(Key::CrashCount, [now, 0, 0, 0]);
         // Nothing else runs that could be kept waiting. A store that fails costs the count, not the start.
-        while store.poll(journal, flash, LAYOUT.chip).is_pending() {}
+        while parameters.poll(flash).is_pending() {}
     }
     now
 }

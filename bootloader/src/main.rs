@@ -50,7 +50,6 @@ mod app {
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant};
     use boot_core::download::{Policy, Step};
-    use boot_core::parameters::Journal;
     use bsp::can::{Errors, Mode, Port};
     use bsp::clock::Source;
     use bsp::hal::rcc::RccExt;
@@ -109,7 +108,7 @@ mod app {
     #[shared]
     struct Shared {
         can: Port<CanController>,
-        bootloader: Bootloader<'static, FlashController, PROGRAMS>,
+        bootloader: Bootloader<'static, FlashController, boot::Parameters, PROGRAMS>,
     }
 
     #[local]
@@ -117,13 +116,15 @@ mod app {
         received: Producer<'static, Frame>,
         to_handle: Consumer<'static, Frame>,
         slave: Slave,
-        leaving: Option<Leaving>,
+        leaving: Leaving,
         watchdog: Watchdog,
         led: bsp::Led,
     }
 
     /// The device is about to reset.
+    #[derive(Default)]
     pub struct Leaving {
+        wanted: bool,
         request: Option<BootRequest>,
         /// When; set once the answer is on the bus.
         at: Option<Instant>,
@@ -137,7 +138,8 @@ mod app {
         let board = bsp::init(&mut cx.device.RCC.constrain(), cx.device.CAN1, cx.device.GPIOD);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
-        let node = boot::node_parameters(&Journal::open(&flash, LAYOUT.parameters), &flash);
+        let parameters = boot::parameters(&flash);
+        let node = boot::node_parameters(&parameters, &flash);
         let slave_config = slave::Config {
             node: node::Config {
                 heartbeat_ms: HEARTBEAT_MS,
@@ -146,8 +148,15 @@ mod app {
             },
             ..slave::Config::default()
         };
-        let bootloader =
-            Bootloader::new(&CONFIG, bsp::serial_number(), node, boot::stay_reason(), flash, cx.local.blocks);
+        let bootloader = Bootloader::new(
+            &CONFIG,
+            bsp::serial_number(),
+            node,
+            boot::stay_reason(),
+            parameters,
+            flash,
+            cx.local.blocks,
+        );
         let slave = Slave::new(bootloader.lss_address(), node.id, node.bit_rate, slave_config);
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();
@@ -157,7 +166,7 @@ mod app {
                 received,
                 to_handle,
                 slave,
-                leaving: None,
+                leaving: Leaving::default(),
                 watchdog: Watchdog::new(cx.device.IWDG),
                 led: board.led,
             },
@@ -203,29 +212,28 @@ mod app {
         let now = Instant::from_millis(Mono::now().ticks());
         let protocol::SharedResources { mut can, mut bootloader, .. } = cx.shared;
         let protocol::LocalResources { to_handle, slave, leaving, .. } = cx.local;
+        if let Some(at) = leaving.at {
+            // A frame that began now would be cut off by the reset.
+            if now.has_reached(at) {
+                leave(leaving.request);
+            }
+            return;
+        }
         let status = can.lock(status);
         bootloader.lock(|bootloader| {
             slave.observe(status, now, bootloader);
             // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
             carry_out(slave, &mut can, now, bootloader);
             while let Some(frame) = to_handle.dequeue() {
-                if slave.handle(&frame, now, bootloader) {
-                    *leaving = Some(Leaving { request: None, at: None });
-                }
+                leaving.wanted |= slave.handle(&frame, now, bootloader);
                 carry_out(slave, &mut can, now, bootloader);
             }
             if let Some(request) = bootloader.take_leave() {
-                *leaving = Some(Leaving { request: Some(request), at: None });
+                *leaving = Leaving { wanted: true, request: Some(request), at: None };
             }
         });
-        if let Some(leaving) = leaving {
-            match leaving.at {
-                None if slave.is_idle() && can.lock(|can| can.is_idle()) => {
-                    leaving.at = Some(now + FAREWELL_MS)
-                }
-                Some(at) if now.has_reached(at) => leave(leaving.request),
-                _ => {}
-            }
+        if leaving.wanted && slave.is_idle() && can.lock(|can| can.is_idle()) {
+            leaving.at = Some(now + FAREWELL_MS);
         }
     }
 

@@ -46,7 +46,7 @@ impl Watchdog {
         // SAFETY: LSI / 64, 2 ms a count (section 21.4.2).
         registers.pr().write(|w| unsafe { w.bits(4) });
         // SAFETY: a reload value of 12 bits.
-        registers.rlr().write(|w| unsafe { w.bits((ms / 2).into()) });
+        registers.rlr().write(|w| unsafe { w.bits(ms / 2) });
     }
 
     /// Feeds it if all tasks have checked in since they last did. To be called by the task that drives the others.

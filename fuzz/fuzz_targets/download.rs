@@ -151,7 +151,7 @@ fuzz_target!(|bytes: &[u8]| {
 });
 
 /// What the SDO server does with a block.
-fn send(device: &mut Downloader<'_, 1>, block: &[u8]) -> Result<(), canopen::AbortCode> {
+fn send(device: &mut Downloader<'_, Journal, 1>, block: &[u8]) -> Result<(), canopen::AbortCode> {
     device.block_cancel();
     device.block_start(1, Some(block.len() as u32))?;
     for piece in block.chunks(7) {
@@ -164,7 +164,7 @@ fn send(device: &mut Downloader<'_, 1>, block: &[u8]) -> Result<(), canopen::Abo
 }
 
 /// Lets the flash's work come to its end.
-fn settle(device: &mut Downloader<'_, 1>, flash: &mut ModelFlash) {
+fn settle(device: &mut Downloader<'_, Journal, 1>, flash: &mut ModelFlash) {
     for _ in 0..200_000 {
         if device.step(flash) == Step::Idle && !device.busy() {
             return;

@@ -103,6 +103,7 @@ fn three_devices_are_updated_one_after_the_other_and_one_of_them_had_no_node_id(
             assert_eq!(bench.session_with(other).read_text(VERSION).unwrap(), expected, "node {other}");
         }
     }
+    let off = bench.time();
     bench.power_off();
     bench.run_ms(100);
     bench.power_on();
@@ -114,7 +115,10 @@ fn three_devices_are_updated_one_after_the_other_and_one_of_them_had_no_node_id(
         assert_eq!(session.read_text(VERSION).unwrap(), "2.0.0", "node {node}");
     }
     assert_eq!(running(&mut bench, NODE), None, "nobody has the board file's node-ID any more");
-    assert!(bench.records().iter().all(|record| record.outcome == Outcome::Good), "nobody disturbed anybody");
+    // But for a frame that was on its way when the power went.
+    let mut disturbed = bench.records();
+    disturbed.retain(|record| record.outcome != Outcome::Good && !(record.start..=record.end).contains(&off));
+    assert!(disturbed.is_empty(), "nobody disturbed anybody: {disturbed:?}");
     bench.assert_nothing_unmodelled();
 }
 

@@ -28,7 +28,7 @@ use shared_abi::warm_start::BootRequest;
 use crate::crc;
 use crate::flash::{is_blank, Flash, FlashFault, SectorEraser, WordWriter};
 use crate::node::NodeParameters;
-use crate::parameters::{Journal, Key, Store, StoreError, Value};
+use crate::parameters::{Key, Parameters, StoreError};
 use crate::program::{check_vectors, FlashCrc, ProgramRecord};
 use queue::Queue;
 
@@ -157,7 +157,7 @@ enum Reception {
 /// What is being done to the flash.
 enum Work {
     /// The record goes first, so that a program that is partly erased is no program. `all`: then every sector.
-    Invalidate { program: u8, store: Store, all: bool },
+    Invalidate { program: u8, all: bool },
     /// All sectors.
     Erase { program: u8, eraser: SectorEraser },
     /// One sector ahead of the data.
@@ -169,16 +169,16 @@ enum Work {
     /// The last block: is the flash what the host meant?
     Verify { program: u8, last: Last, crc: FlashCrc },
     /// The record of a program: after verification, and when the signature changes.
-    Record { program: u8, record: ProgramRecord, store: Store },
+    Record { program: u8, record: ProgramRecord },
     /// Node-ID and bit rate; of no program.
-    Node { store: Store },
+    Node,
 }
 
 /// The download of programs into flash. `PROGRAMS` is the number of programs in the layout.
-pub struct Downloader<'b, const PROGRAMS: usize> {
+pub struct Downloader<'b, P, const PROGRAMS: usize> {
     layout: &'static Layout,
     policy: &'static Policy,
-    journal: Journal,
+    parameters: P,
     programs: [Program; PROGRAMS],
     queue: Queue<'b>,
     /// Whose blocks are in the queue.
@@ -195,20 +195,20 @@ pub struct Downloader<'b, const PROGRAMS: usize> {
     node_stored: Result<(), StoreError>,
 }
 
-impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
+impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// Starts from what the parameters tell. The larger `buffer`, the further the flash may lag behind the bus; blocks larger
     /// than it, or than [`MAX_BLOCK_SIZE`], are refused.
     pub fn new<F: Flash>(
         layout: &'static Layout,
         policy: &'static Policy,
+        parameters: P,
         flash: &F,
         buffer: &'b mut [u8],
     ) -> Self {
-        let journal = Journal::open(flash, layout.parameters);
         let mut number = 0;
         let programs = [(); PROGRAMS].map(|()| {
             number += 1;
-            let record = ProgramRecord::load(&journal, flash, number);
+            let record = ProgramRecord::load(&parameters, flash, number);
             Program {
                 record,
                 identification: record.map_or(0, |record| record.crc),
@@ -219,7 +219,7 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
         Self {
             layout,
             policy,
-            journal,
+            parameters,
             programs,
             queue: Queue::new(buffer),
             owner: 0,
@@ -290,13 +290,14 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
         if self.busy() || self.leave.is_some() {
             return Err(FlashError::Busy);
         }
-        self.work = Some(Work::Node { store: self.journal.store(Key::Node, node.value()) });
+        self.parameters.store(Key::Node, node.value());
+        self.work = Some(Work::Node);
         Ok(())
     }
 
     /// How the last [`store_node`](Self::store_node) ended.
     pub fn node_stored(&self) -> Poll<Result<(), StoreError>> {
-        if matches!(self.work, Some(Work::Node { .. })) {
+        if matches!(self.work, Some(Work::Node)) {
             Poll::Pending
         } else {
             Poll::Ready(self.node_stored)
@@ -454,7 +455,7 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
         };
         let chip = self.layout.chip;
         let (program, outcome) = match &mut work {
-            Work::Node { store } => match store.poll(&mut self.journal, flash, chip) {
+            Work::Node => match self.parameters.poll(flash) {
                 Poll::Pending => (0, Poll::Pending),
                 Poll::Ready(outcome) => {
                     self.node_stored = outcome;
@@ -465,9 +466,9 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
                 Poll::Pending => (0, Poll::Pending),
                 Poll::Ready(_) => return Step::Again,
             },
-            Work::Invalidate { program, store, all } => {
+            Work::Invalidate { program, all } => {
                 let (program, all) = (*program, *all);
-                let outcome = store.poll(&mut self.journal, flash, chip);
+                let outcome = self.parameters.poll(flash);
                 if let Poll::Ready(Ok(())) = outcome {
                     if let Some(index) = self.index(program) {
                         self.programs[index].record = None;
@@ -520,8 +521,8 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
                 }
                 (program, Poll::Ready(Err(FlashError::NoValidProgram)))
             }
-            Work::Record { program, record, store } => {
-                let outcome = store.poll(&mut self.journal, flash, chip).map_err(|_| FlashError::NvData);
+            Work::Record { program, record } => {
+                let outcome = self.parameters.poll(flash).map_err(|_| FlashError::NvData);
                 if outcome == Poll::Ready(Ok(())) {
                     if let Some(index) = self.index(*program) {
                         self.programs[index].record = Some(*record);
@@ -649,24 +650,21 @@ impl<'b, const PROGRAMS: usize> Downloader<'b, PROGRAMS> {
         self.queue.capacity().min(MAX_BLOCK_SIZE)
     }
 
-    fn invalidate(&self, program: u8, all: bool) -> Work {
-        Work::Invalidate {
-            program,
-            store: self.journal.store(Key::Program(program), ProgramRecord::NONE),
-            all,
-        }
+    fn invalidate(&mut self, program: u8, all: bool) -> Work {
+        self.parameters.store(Key::Program(program), ProgramRecord::NONE);
+        Work::Invalidate { program, all }
     }
 
-    fn erase_all(&self, program: u8, record: Option<ProgramRecord>) -> Work {
+    fn erase_all(&mut self, program: u8, record: Option<ProgramRecord>) -> Work {
         match record {
             Some(_) => self.invalidate(program, true),
             None => Work::Erase { program, eraser: SectorEraser::new(self.region(program)) },
         }
     }
 
-    fn store_record(&self, program: u8, record: ProgramRecord) -> Work {
-        let value: Value = record.value();
-        Work::Record { program, record, store: self.journal.store(Key::Program(program), value) }
+    fn store_record(&mut self, program: u8, record: ProgramRecord) -> Work {
+        self.parameters.store(Key::Program(program), record.value());
+        Work::Record { program, record }
     }
 
     /// What the first twelve bytes tell: refuses before the rest is sent.
