@@ -2,16 +2,20 @@
 
 mod model;
 
+use std::task::Poll;
+
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config};
-use boot_core::download::{Policy, Step};
-use boot_core::flash::FlashFault;
+use boot_core::download::{Downloader, Policy, Step, Verdict};
+use boot_core::flash::{Flash, FlashFault};
 use boot_core::node::NodeParameters;
-use boot_core::parameters::Journal;
+use boot_core::parameters::{Journal, Key, Parameters, StoreError, Value};
 use boot_core::program::{verify, Invalid};
 use canopen::device::Device;
 use canopen::od::{Address, Entry, Objects};
+use canopen::program::{FlashError, ProgramControl};
 use canopen::{AbortCode, BitRate, NodeId};
 use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash};
+use shared_abi::block_file::Control;
 use shared_abi::geometry::{Geometry, Region, SectorRun, STM32F407VG};
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
@@ -55,7 +59,7 @@ const CLR_SIGNATURE: u8 = 0x84;
 
 static ENTRIES: [Entry; entry_count(1)] = entries(1);
 
-static CONFIG: Config = Config {
+const CONFIG: Config = Config {
     entries: &ENTRIES,
     device: DEVICE,
     layout: LAYOUT_REF,
@@ -86,9 +90,14 @@ struct Bench<'f> {
 
 impl<'f> Bench<'f> {
     fn new(flash: &'f mut ModelFlash) -> Self {
+        Self::with(flash, Policy::DEFAULT)
+    }
+
+    fn with(flash: &'f mut ModelFlash, download: Policy) -> Self {
         let buffer = Box::leak(vec![0; 256].into_boxed_slice());
+        let config = Box::leak(Box::new(Config { download, ..CONFIG }));
         let parameters = Journal::open(flash, LAYOUT.chip, LAYOUT.parameters);
-        Self { node: Bootloader::new(&CONFIG, 0, node(), 0, parameters, flash, buffer) }
+        Self { node: Bootloader::new(config, 0, node(), 0, parameters, flash, buffer) }
     }
 
     fn settle(&mut self) {
@@ -155,8 +164,26 @@ fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
         bytes.extend(word.to_le_bytes());
     }
     bytes.extend(data);
-    bytes.extend(crc32(&bytes).to_le_bytes());
+    bytes.extend(block_crc(&bytes).to_le_bytes());
     bytes
+}
+
+/// The CRC of blocks and programs, as the crate was built.
+fn block_crc(bytes: &[u8]) -> u32 {
+    if cfg!(feature = "crc-16") {
+        crc16(bytes)
+    } else {
+        crc32(bytes)
+    }
+}
+
+/// CRC-16/XMODEM from its definition (polynomial 1021h, start 0), bit by bit.
+fn crc16(bytes: &[u8]) -> u32 {
+    bytes.iter().fold(0, |crc, byte| {
+        (0..8).fold(crc ^ u32::from(*byte) << 8, |crc, _| {
+            (if crc & 0x8000 != 0 { crc << 1 ^ 0x1021 } else { crc << 1 }) & 0xFFFF
+        })
+    })
 }
 
 /// CRC-32/ISO-HDLC from its definition (reflected polynomial EDB88320h), bit by bit.
@@ -171,7 +198,7 @@ fn crc32(bytes: &[u8]) -> u32 {
 
 fn last(program: &[u8]) -> Vec<u8> {
     let mut data = (program.len() as u32).to_le_bytes().to_vec();
-    data.extend(crc32(program).to_le_bytes());
+    data.extend(block_crc(program).to_le_bytes());
     block(u32::MAX, 0, &data)
 }
 
@@ -209,14 +236,14 @@ fn a_program_goes_in_block_by_block_and_survives_a_restart() {
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = Bench::new(&mut flash);
     bench.install(&image);
-    assert_eq!(bench.word(IDENTIFICATION), crc32(&image));
+    assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
     assert_eq!(bench.command(SET_SIGNATURE), 0);
 
     assert_eq!(&flash.cells(PROGRAM)[..1000], image);
     assert!(flash.cells(PROGRAM)[1000..].iter().all(|byte| *byte == 0xFF));
     assert_eq!(autostart(&flash), Ok(0x11));
     let mut bench = Bench::new(&mut flash);
-    assert_eq!((bench.word(IDENTIFICATION), bench.status()), (crc32(&image), 0));
+    assert_eq!((bench.word(IDENTIFICATION), bench.status()), (block_crc(&image), 0));
 }
 
 /// CRC-32 of the digits 1 to 9, from the CRC catalogue (CRC-32/ISO-HDLC, "check").
@@ -346,7 +373,7 @@ fn a_program_whose_crc_or_vectors_are_wrong_is_no_program() {
         bench.good(&block(0, 0, &[0; 8]));
         bench.good(&block(1, PROGRAM.base, stored));
         assert_eq!(bench.block(&last(told)), (Ok(()), 0x02));
-        assert_eq!(bench.word(IDENTIFICATION), crc32(stored), "1F56h shows what is in flash");
+        assert_eq!(bench.word(IDENTIFICATION), block_crc(stored), "1F56h shows what is in flash");
         assert_eq!(bench.command(SET_SIGNATURE), 0x02);
         assert_eq!(bench.command(START), 0x02);
         assert_eq!(bench.node.take_leave(), None);
@@ -401,7 +428,7 @@ fn signature_and_start() {
     }
     // CLEAR alone loses nothing; a second one does.
     assert_eq!(bench.command(CLEAR), 0);
-    assert_eq!(bench.word(IDENTIFICATION), crc32(&image));
+    assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
     assert_eq!(bench.command(CLEAR), 0);
     assert_eq!(bench.word(IDENTIFICATION), 0);
     assert_eq!(bench.command(START), 0x02);
@@ -500,4 +527,289 @@ fn an_update_cut_anywhere_leaves_the_old_the_new_or_no_program() {
         }
     }
     assert!(seen.iter().all(|count| *count > 0), "old, new, none: {seen:?}");
+}
+
+/// Control block with identity: application size, vendor-ID, product code (SYS TEC manual, table 6).
+fn control(app_size: u32, vendor_id: u32, product_code: u32) -> Vec<u8> {
+    let words = [app_size, vendor_id, product_code];
+    block(0, 0, &words.iter().flat_map(|word| word.to_le_bytes()).collect::<Vec<_>>())
+}
+
+/// A wrong file costs nothing: the program that is installed stays, and starts.
+#[test]
+fn a_file_for_another_product_is_refused_before_anything_is_lost() {
+    fn no_downgrade(program: u8, control: &Control) -> Verdict {
+        assert_eq!(program, 1);
+        match control {
+            Control::Identity(told) if told.app_size == 0xBAD => Verdict::Refuse(FlashError::Unspecified),
+            Control::Identity(told) if told.app_size == 0x600D => Verdict::Accept,
+            _ => Verdict::Standard,
+        }
+    }
+    const DEVICE: (u32, u32) = (0x0102_0304, 0x0A0B_0C0D);
+    let policy = Policy { identity: Some(DEVICE), check: no_downgrade, ..Policy::DEFAULT };
+    let (old, new) = (program(200, 0xA0), program(200, 0xB0));
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with(&mut flash, policy);
+    bench.install(&old);
+    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    bench.node.flash().touched.clear();
+    for (what, file, status) in [
+        ("vendor-ID", control(0, DEVICE.0 ^ 1, DEVICE.1), 0x80),
+        ("product code", control(0, DEVICE.0, DEVICE.1 ^ 1), 0x82),
+        ("the integrator's no", control(0xBAD, DEVICE.0, DEVICE.1), 0x7E),
+    ] {
+        assert_eq!(bench.command(CLEAR), 0);
+        assert_eq!(bench.block(&file), (Err(AbortCode(0x0800_0020)), status), "{what}");
+        assert_eq!(
+            bench.block(&block_file(&new, 96)[1]).0,
+            Err(AbortCode(0x0800_0022)),
+            "{what}: no way past it"
+        );
+        assert_eq!(bench.node.flash().touched, [], "{what}");
+        assert_eq!(bench.command(START), 0, "{what}");
+        assert_eq!(bench.node.take_leave(), Some(BootRequest::Start(1)), "{what}");
+    }
+    // 0 stands for any; and what the integrator accepts needs no identity.
+    for file in [control(0, 0, 0), control(0, DEVICE.0, DEVICE.1), control(0x600D, 7, 7)] {
+        assert_eq!(bench.command(CLEAR), 0);
+        bench.good(&file);
+        for block in &block_file(&new, 96)[1..] {
+            bench.good(block);
+        }
+        assert_eq!(bench.command(SET_SIGNATURE), 0);
+    }
+    assert_eq!(autostart(&flash), Ok(0xB0));
+}
+
+#[test]
+fn while_programming_is_not_allowed_nothing_is_changed() {
+    use std::sync::atomic::{AtomicBool, Ordering};
+    static ALLOWED: AtomicBool = AtomicBool::new(true);
+    let policy = Policy { allowed: || ALLOWED.load(Ordering::Relaxed), ..Policy::DEFAULT };
+    let image = program(200, 0xC0);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with(&mut flash, policy);
+    bench.install(&image);
+    bench.node.flash().touched.clear();
+    ALLOWED.store(false, Ordering::Relaxed);
+    for command in [CLEAR, SET_SIGNATURE, CLR_SIGNATURE] {
+        assert_eq!(bench.node.write(CONTROL, &[command]), Err(AbortCode(0x0800_0022)));
+        assert_eq!(bench.status(), 0x84, "NO_ACCESS");
+    }
+    assert_eq!(bench.node.flash().touched, []);
+    // Reading, and starting what is there, is no programming.
+    assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
+    assert_eq!(bench.command(START), 0);
+    assert_eq!(bench.node.take_leave(), Some(BootRequest::Trial(1)));
+    ALLOWED.store(true, Ordering::Relaxed);
+    bench.install(&image);
+}
+
+#[test]
+fn a_start_or_a_block_during_an_erase_is_told_to_wait() {
+    let image = program(96, 0x11);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    bench.install(&image);
+    assert_eq!(bench.command(CLEAR), 0);
+    bench.node.write(CONTROL, &[CLEAR]).unwrap();
+    let mut erasing = 0;
+    loop {
+        match bench.node.step() {
+            Step::Erasing => erasing += 1,
+            Step::Idle => break,
+            _ => {}
+        }
+        if bench.status() & 1 == 0 {
+            continue;
+        }
+        for command in [START, SET_SIGNATURE, CLR_SIGNATURE] {
+            assert_eq!(bench.node.write(CONTROL, &[command]), Err(AbortCode(0x0800_0022)));
+            assert_eq!(bench.status(), 0x87, "busy, and MAN_BUSY");
+        }
+        assert_eq!(bench.node.download_start(DATA, None), Err(AbortCode(0x0800_0022)));
+    }
+    assert!(erasing > 8, "one at least per sector: {erasing}");
+    assert_eq!(bench.node.take_leave(), None);
+    assert_eq!(bench.command(START), 0x02, "nothing is left to be started");
+    bench.install(&image);
+}
+
+#[test]
+fn repeated_and_overlapping_blocks_are_refused_and_the_program_goes_on() {
+    let image = program(192, 0x22);
+    let good = block_file(&image, 96);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    assert_eq!(bench.command(CLEAR), 0);
+    bench.good(&good[0]);
+    bench.good(&good[1]);
+    assert_eq!(bench.block(&good[1]), (Err(AbortCode(0x0800_0022)), 0x88), "repeated: SEQUENCE");
+    bench.good(&good[2]);
+    // In order by its number, but over what is there: found out by looking at the flash.
+    let over = block(3, PROGRAM.base + 100, &[0; 16]);
+    assert_eq!(bench.block(&over), (Ok(()), 0x08), "NOTCLEARED");
+    assert_eq!(bench.block(&good[3]).0, Err(AbortCode(0x0800_0022)), "half a program is none");
+    bench.install(&image);
+    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    assert_eq!(autostart(&flash), Ok(0x22));
+}
+
+#[test]
+fn programs_that_do_not_exist_have_no_objects() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    for sub in [0, 2, 254, 255] {
+        assert_eq!(
+            bench.node.download_start(Address::new(0x1F50, sub), None),
+            Err(AbortCode(0x0609_0011)),
+            "{sub}"
+        );
+        assert_eq!(
+            bench.node.write(Address::new(0x1F51, sub), &[CLEAR]),
+            Err(AbortCode(0x0609_0011)),
+            "{sub}"
+        );
+    }
+    assert_eq!(bench.node.flash().touched, []);
+}
+
+/// Every operation of an update fails once, in each way: the status says so or the engine got over it; what would start is whole; and the
+/// next attempt succeeds.
+#[test]
+fn a_fault_at_any_operation_costs_no_more_than_another_attempt() {
+    let (old, new) = (program(200, 0xA0), program(300, 0xB0));
+    let mut installed = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut installed);
+    bench.install(&old);
+    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    let cells = installed.cells(CHIP.flash).to_vec();
+
+    /// As far as it goes: the first status that is not 0.
+    fn update(flash: &mut ModelFlash, new: &[u8]) -> u32 {
+        let mut bench = Bench::new(flash);
+        let mut status = bench.command(CLEAR);
+        for block in block_file(new, 96) {
+            if status != 0 {
+                return status;
+            }
+            status = bench.block(&block).1;
+        }
+        if status == 0 {
+            bench.command(SET_SIGNATURE)
+        } else {
+            status
+        }
+    }
+    let mut failed = 0;
+    for operation in 1.. {
+        let mut faultless = false;
+        for (fault, allowed) in [
+            (FlashFault::Failed, [0x0A, 0x10]),
+            (FlashFault::Verify, [0x0A, 0x10]),
+            (FlashFault::Protected, [0x0E, 0x10]),
+        ] {
+            let mut flash = ModelFlash::new(&CHIP);
+            flash.poke(CHIP.flash.base, &cells);
+            flash.fail = Some((operation, fault));
+            let status = update(&mut flash, &new);
+            faultless = flash.operations < operation;
+            if faultless {
+                break;
+            }
+            let what = format!("{fault:?} at operation {operation}");
+            match status {
+                0 => assert_eq!(autostart(&flash), Ok(0xB0), "{what}"),
+                status => {
+                    failed += 1;
+                    assert!(allowed.contains(&status), "{what}: {status:#x}");
+                    assert!(matches!(autostart(&flash), Ok(0xA0) | Err(_)), "{what}");
+                }
+            }
+            flash.fail = None;
+            assert_eq!(update(&mut flash, &new), 0, "{what}: the next attempt");
+            assert_eq!(autostart(&flash), Ok(0xB0), "{what}");
+        }
+        if faultless {
+            break;
+        }
+    }
+    assert!(failed > 80, "{failed}");
+}
+
+/// A store outside the flash takes the journal's place.
+#[test]
+fn parameters_may_be_kept_in_an_eeprom() {
+    /// Holds what it is told after a while, as one that is written byte by byte; fails when told to.
+    #[derive(Default)]
+    struct Eeprom {
+        values: Vec<(Key, Value)>,
+        storing: Option<(Key, Value, u32)>,
+        fails: bool,
+    }
+
+    impl Parameters for &mut Eeprom {
+        fn get<F: Flash>(&self, _: &F, key: Key) -> Option<Value> {
+            self.values.iter().rev().find(|(of, _)| *of == key).map(|(_, value)| *value)
+        }
+
+        fn store(&mut self, key: Key, value: Value) {
+            self.storing = Some((key, value, 20));
+        }
+
+        fn poll<F: Flash>(&mut self, _: &mut F) -> Poll<Result<(), StoreError>> {
+            match &mut self.storing {
+                Some((.., 0)) if self.fails => Poll::Ready(Err(StoreError::Device)),
+                Some((key, value, 0)) => {
+                    let stored = (*key, *value);
+                    self.values.push(stored);
+                    self.storing = None;
+                    Poll::Ready(Ok(()))
+                }
+                Some((.., ticks)) => {
+                    *ticks -= 1;
+                    Poll::Pending
+                }
+                None => Poll::Ready(Ok(())),
+            }
+        }
+    }
+
+    let image = program(200, 0x5E);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut eeprom = Eeprom::default();
+    let mut buffer = [0; 256];
+    let mut device: Downloader<'_, _, 1> =
+        Downloader::new(&LAYOUT, &Policy::DEFAULT, &mut eeprom, &flash, &mut buffer);
+    let settle = |device: &mut Downloader<'_, &mut Eeprom, 1>, flash: &mut ModelFlash| {
+        for _ in 0..1_000_000 {
+            if device.step(flash) == Step::Idle {
+                return device.status(1).to_word();
+            }
+        }
+        panic!("the work does not end");
+    };
+    device.command(1, ProgramControl::Clear).unwrap();
+    for block in block_file(&image, 96) {
+        device.block_start(1, None).unwrap();
+        device.block_data(&block).unwrap();
+        device.block_end().unwrap();
+        assert_eq!(settle(&mut device, &mut flash), 0);
+    }
+    device.command(1, ProgramControl::SetSignature).unwrap();
+    assert_eq!(settle(&mut device, &mut flash), 0);
+    let nv = LAYOUT.parameters.map(|region| Region::new(region.base, region.size));
+    assert!(
+        !flash.touched.iter().any(|at| nv.iter().any(|nv| nv.contains(at.base, 1))),
+        "the journal's sectors"
+    );
+    assert!(verify(&flash, &&mut eeprom, &LAYOUT, 1).unwrap().signed());
+
+    eeprom.fails = true;
+    let mut device: Downloader<'_, _, 1> =
+        Downloader::new(&LAYOUT, &Policy::DEFAULT, &mut eeprom, &flash, &mut buffer);
+    device.command(1, ProgramControl::ClrSignature).unwrap();
+    assert_eq!(settle(&mut device, &mut flash), 0x10, "NVDATA");
+    assert!(verify(&flash, &&mut eeprom, &LAYOUT, 1).unwrap().signed(), "the old value is still there");
 }

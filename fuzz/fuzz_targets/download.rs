@@ -5,6 +5,7 @@
 #![no_main]
 
 use boot_core::download::{Downloader, Policy, Step};
+use boot_core::parameters::Journal;
 use canopen::program::{FlashError, FlashStatus, ProgramControl};
 use coboot_fuzz::model::ModelFlash;
 use coboot_fuzz::Input;
@@ -45,7 +46,9 @@ const LAST: u32 = u32::MAX;
 fuzz_target!(|bytes: &[u8]| {
     let mut flash = ModelFlash::new(&CHIP);
     let mut buffer = [0; BUFFER];
-    let mut device = Downloader::<1>::new(&LAYOUT, &Policy::DEFAULT, &flash, &mut buffer);
+    let journal = Journal::open(&flash, &CHIP, LAYOUT.parameters);
+    let mut device: Downloader<'_, _, 1> =
+        Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer);
     let mut input = Input::new(bytes);
     let mut next = 0_u32;
     // Whether the SDO server has a transfer open: it calls nothing else then.
@@ -127,7 +130,9 @@ fuzz_target!(|bytes: &[u8]| {
     }
 
     let mut buffer = [0; BUFFER];
-    let mut device = Downloader::<1>::new(&LAYOUT, &Policy::DEFAULT, &flash, &mut buffer);
+    let journal = Journal::open(&flash, &CHIP, LAYOUT.parameters);
+    let mut device: Downloader<'_, _, 1> =
+        Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer);
     device.command(1, ProgramControl::Clear).expect("CLEAR");
     settle(&mut device, &mut flash);
     assert_eq!(device.status(1), FlashStatus::OK);

@@ -1,5 +1,6 @@
 //! `cargo xtask test`: every test, with one summary at the end.
 
+use std::ffi::OsStr;
 use std::io::{BufRead, BufReader, Write};
 use std::process::Stdio;
 use std::time::Instant;
@@ -39,35 +40,19 @@ pub fn run(mut args: Args) -> Outcome {
         workspace::target_dir().join("debug").join("coflash").with_extension(std::env::consts::EXE_EXTENSION);
 
     let started = Instant::now();
-    let mut cargo = process::cargo("test");
-    cargo
-        .arg("--no-fail-fast")
-        .args(args.rest())
-        .current_dir(workspace::root())
-        .env("COBOOT_BOARD", board.board)
-        .env("COBOOT_FIRMWARE_DIR", &images.dir)
-        .env("COBOOT_COFLASH", &coflash)
-        .env("COBOOT_PYTHON", setup::python())
-        .stdout(Stdio::piped());
-    let mut tests = cargo.spawn().map_err(|error| process::not_started(&cargo, &error))?;
+    let environment: [(&str, &OsStr); 4] = [
+        ("COBOOT_BOARD", board.board.as_ref()),
+        ("COBOOT_FIRMWARE_DIR", images.dir.as_ref()),
+        ("COBOOT_COFLASH", coflash.as_ref()),
+        ("COBOOT_PYTHON", &setup::python().into_os_string()),
+    ];
     let mut summary = Summary::default();
-    if let Some(printed) = tests.stdout.take() {
-        let mut printed = BufReader::new(printed);
-        let mut line = Vec::new();
-        // By bytes: a test may print what is no text.
-        while printed.read_until(b'\n', &mut line).is_ok_and(|len| len > 0) {
-            let mut out = std::io::stdout().lock();
-            let _ = out.write_all(&line).and_then(|()| out.flush());
-            summary.take(&String::from_utf8_lossy(&line));
-            line.clear();
-        }
-    }
-    let status = tests.wait().map_err(|error| process::not_started(&cargo, &error))?;
-
-    if !status.success() && summary.failed == 0 {
-        // It counts as a failure, so that the last line never looks better than the run was.
-        summary.failed = 1;
-        summary.names_of_failed.push("something that did not build, or a test program that broke off".into());
+    let chosen = args.rest();
+    summary.run(&chosen, environment)?;
+    if chosen.is_empty() {
+        // What can be built differently by choice.
+        let other_crc = ["--package=boot-core", "--features=crc-16,crc-table", "--test=download"];
+        summary.run(&other_crc.map(String::from), environment)?;
     }
 
     println!();
@@ -95,6 +80,38 @@ struct Summary {
 }
 
 impl Summary {
+    /// Runs `cargo test` with these arguments, and takes what it prints.
+    fn run(&mut self, arguments: &[String], environment: [(&str, &OsStr); 4]) -> Outcome {
+        let mut cargo = process::cargo("test");
+        cargo
+            .arg("--no-fail-fast")
+            .args(arguments)
+            .current_dir(workspace::root())
+            .envs(environment)
+            .stdout(Stdio::piped());
+        let mut tests = cargo.spawn().map_err(|error| process::not_started(&cargo, &error))?;
+        let failed = self.failed;
+        if let Some(printed) = tests.stdout.take() {
+            let mut printed = BufReader::new(printed);
+            let mut line = Vec::new();
+            // By bytes: a test may print what is no text.
+            while printed.read_until(b'\n', &mut line).is_ok_and(|len| len > 0) {
+                let mut out = std::io::stdout().lock();
+                let _ = out.write_all(&line).and_then(|()| out.flush());
+                self.take(&String::from_utf8_lossy(&line));
+                line.clear();
+            }
+        }
+        let status = tests.wait().map_err(|error| process::not_started(&cargo, &error))?;
+        if !status.success() && self.failed == failed {
+            // It counts as a failure, so that the last line never looks better than the run was.
+            self.failed += 1;
+            self.names_of_failed
+                .push("something that did not build, or a test program that broke off".into());
+        }
+        Ok(())
+    }
+
     /// Takes one line of what a test program prints.
     fn take(&mut self, line: &str) {
         let line = line.trim_end();

@@ -49,7 +49,7 @@ pub enum Step {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Erase {
     /// With the first block that is for this device: until then the old program stays, and can be started. Sectors are erased as the
-    /// data need them. A second CLEAR in a row erases all at once.
+    /// data need them. A second CLEAR, with no block in between, erases all at once.
     #[default]
     WithFirstBlock,
     /// All sectors of the program, before anything else.
@@ -124,8 +124,8 @@ struct Program {
 enum Session {
     /// No block was taken yet.
     Idle,
-    /// CLEAR was acknowledged; nothing is lost yet.
-    Cleared,
+    /// CLEAR was acknowledged; nothing is lost yet. `just`: no block was sent since.
+    Cleared { just: bool },
     /// Blocks are being taken.
     Open {
         /// Number of the next one.
@@ -329,8 +329,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         state.error = None;
         match (command, state.record) {
             (Clear, record) => {
-                let again = state.session == Session::Cleared;
-                state.session = Session::Cleared;
+                let again = state.session == Session::Cleared { just: true };
+                state.session = Session::Cleared { just: true };
                 self.reception = Reception::Idle;
                 self.queue.clear();
                 self.work = match self.work.take() {
@@ -390,6 +390,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             if (size as usize) < FRAMING {
                 return Err(self.refuse(program, Refusal(FlashError::Format, AbortCode::LENGTH_TOO_LOW)));
             }
+        }
+        // A second CLEAR erases all, but not behind a block: it may come from a host that tries the same wrong file again.
+        if let Some(Session::Cleared { just }) = self.session(program) {
+            *just = false;
         }
         self.owner = program;
         self.queue.forget();
@@ -678,7 +682,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             (NUMBER_CONTROL, Session::Idle) if state.record.is_some() => {
                 return Err(untimely(FlashError::NotCleared));
             }
-            (NUMBER_CONTROL, Session::Idle | Session::Cleared) => {
+            (NUMBER_CONTROL, Session::Idle | Session::Cleared { .. }) => {
                 return if (self.policy.allowed)() { Ok(()) } else { Err(untimely(FlashError::NoAccess)) };
             }
             // The sequence begins anew, over what is there.
@@ -724,7 +728,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 self.queue.forget();
                 let (erased, ahead) = match self.programs[index].session {
                     // Known to be erased is nothing; what there are to be data for is erased ahead of them.
-                    Session::Cleared => (region.base, region.base + app_size.min(region.size)),
+                    Session::Cleared { .. } => (region.base, region.base + app_size.min(region.size)),
                     Session::Open { erased, ahead, .. } => (erased, ahead),
                     // No CLEAR: each block finds out whether its place is blank.
                     _ => (region.end(), region.end()),
