@@ -207,6 +207,12 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         self.download.take_leave()
     }
 
+    /// Ends here, whatever is being done, as a reset ends it: gives flash and buffer back, for whoever resets a device without
+    /// resetting itself.
+    pub fn into_parts(self) -> (F, &'b mut [u8]) {
+        (self.flash, self.download.into_buffer())
+    }
+
     /// The flash behind it.
     pub fn flash(&mut self) -> &mut F {
         &mut self.flash

@@ -37,6 +37,7 @@ const RULES: &[Rule] = &[
     Rule { name: "bootloader", may_use: &["boot-core", "bsp", "shared-abi"] },
     Rule { name: "app-template", may_use: &["canopen", "bsp", "shared-abi"] },
     Rule { name: "coflash", may_use: &["canopen", "shared-abi"] },
+    Rule { name: "coboot-node", may_use: &["boot-core", "coflash", "shared-abi"] },
     Rule { name: "emulator", may_use: &["shared-abi"] },
     Rule {
         name: "coboot-tests",
@@ -46,7 +47,7 @@ const RULES: &[Rule] = &[
 ];
 
 /// The crates that need no `unsafe` and say so to the compiler.
-const PURE: &[&str] = &["canopen", "boot-core", "coflash", "xtask"];
+const PURE: &[&str] = &["canopen", "boot-core", "coflash", "coboot-node", "xtask"];
 /// How they say it.
 const FORBID: &str = "#![forbid(unsafe_code)]";
 

@@ -232,6 +232,11 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         }
     }
 
+    /// Ends here, whatever is being done; gives the buffer back.
+    pub fn into_buffer(self) -> &'b mut [u8] {
+        self.queue.into_buffer()
+    }
+
     /// Whether sub-index `program` of 1F50h, 1F51h, 1F56h and 1F57h exists.
     #[must_use]
     pub fn has(&self, program: u8) -> bool {

@@ -16,6 +16,11 @@ impl<'b> Queue<'b> {
         Self { buffer, front: 0, queued: 0, open: 0 }
     }
 
+    /// The bytes behind it, for the next one.
+    pub(super) fn into_buffer(self) -> &'b mut [u8] {
+        self.buffer
+    }
+
     pub(super) fn capacity(&self) -> usize {
         self.buffer.len()
     }

@@ -10,7 +10,7 @@ use canopen::Frame;
 mod slcan;
 #[cfg(target_os = "linux")]
 mod socketcan;
-mod socketcand;
+pub mod socketcand;
 mod trace;
 
 pub use self::slcan::{Line, Slcan};

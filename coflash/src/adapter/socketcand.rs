@@ -1,4 +1,5 @@
-//! Client of the socketcand protocol: CAN frames as text over TCP (socketcand, `doc/protocol.md`, raw mode).
+//! The socketcand protocol: CAN frames as text over TCP (socketcand, `doc/protocol.md`, raw mode). The client, and what a
+//! server needs of its texts.
 
 use std::collections::VecDeque;
 use std::io::{self, ErrorKind, Read, Write};
@@ -145,31 +146,58 @@ impl Adapter for Socketcand {
 
 /// `< send 605 8 40 0 10 0 0 0 0 0 >`; a 29-bit identifier has eight digits.
 fn send_message(frame: &Frame) -> String {
-    let id = match frame.id() {
-        Id::Standard(id) => format!("{:03X}", id.as_raw()),
-        Id::Extended(id) => format!("{:08X}", id.as_raw()),
-    };
     let data: String = frame.data().iter().map(|byte| format!("{byte:02X} ")).collect();
-    format!("< send {id} {} {data}>", frame.dlc())
+    format!("< send {} {} {data}>", identifier(frame), frame.dlc())
 }
 
 /// `frame 585 12.345678 4000100000000000`; servers write the data with or without blanks between the bytes.
 fn parse_frame(message: &str) -> Option<Frame> {
     let mut words = message.split_ascii_whitespace();
     let ("frame", Some(id), Some(_time)) = (words.next()?, words.next(), words.next()) else { return None };
-    let number = hex_number(id)?;
-    let id: Id = if id.len() > 3 {
-        ExtendedId::new(number)?.into()
-    } else {
-        StandardId::new(u16::try_from(number).ok()?)?.into()
-    };
+    let id = parse_identifier(id)?;
     let digits: String = words.collect();
     Frame::new(id, &hex_bytes(&digits)?)
 }
 
+/// What a server says of a frame on the bus, so long after its start: `< frame 585 12.345678 4000100000000000 >`. Without data
+/// there are two blanks before the bracket; python-can wants them.
+#[must_use]
+pub fn frame_message(frame: &Frame, time: Duration) -> String {
+    let data: String = frame.data().iter().map(|byte| format!("{byte:02X}")).collect();
+    format!("< frame {} {}.{:06} {data} >", identifier(frame), time.as_secs(), time.subsec_micros())
+}
+
+/// The frame that a client sends: `send 605 8 40 0 10 0 0 0 0 0`, without the brackets. `None` for anything else.
+#[must_use]
+pub fn parse_send(message: &str) -> Option<Frame> {
+    let mut words = message.split_ascii_whitespace();
+    let ("send", id, dlc) = (words.next()?, parse_identifier(words.next()?)?, words.next()?) else {
+        return None;
+    };
+    let data = words.map(|word| u8::try_from(hex_number(word)?).ok()).collect::<Option<Vec<u8>>>()?;
+    (dlc == data.len().to_string()).then(|| Frame::new(id, &data)).flatten()
+}
+
+/// Three digits for 11 bits, eight for 29.
+fn identifier(frame: &Frame) -> String {
+    match frame.id() {
+        Id::Standard(id) => format!("{:03X}", id.as_raw()),
+        Id::Extended(id) => format!("{:08X}", id.as_raw()),
+    }
+}
+
+fn parse_identifier(word: &str) -> Option<Id> {
+    let number = hex_number(word)?;
+    Some(if word.len() > 3 {
+        ExtendedId::new(number)?.into()
+    } else {
+        StandardId::new(u16::try_from(number).ok()?)?.into()
+    })
+}
+
 /// Cuts the byte stream into messages, however TCP has split and joined them.
 #[derive(Debug, Default)]
-struct Messages {
+pub struct Messages {
     /// What has arrived of a message that is not complete.
     partial: Option<Vec<u8>>,
     complete: VecDeque<String>,
@@ -177,7 +205,8 @@ struct Messages {
 }
 
 impl Messages {
-    fn add(&mut self, bytes: &[u8]) {
+    /// Takes what has arrived.
+    pub fn add(&mut self, bytes: &[u8]) {
         for &byte in bytes {
             match (byte, &mut self.partial) {
                 (b'<', partial) => *partial = Some(Vec::new()),
@@ -193,8 +222,12 @@ impl Messages {
         }
     }
 
-    /// The oldest complete message. The error is what a peer said that speaks another language.
-    fn next(&mut self) -> Result<Option<String>, String> {
+    /// The oldest complete message, without its brackets.
+    ///
+    /// # Errors
+    /// What a peer said that speaks another language.
+    #[allow(clippy::should_implement_trait)]
+    pub fn next(&mut self) -> Result<Option<String>, String> {
         if self.overlong {
             return Err("a message without end".to_string());
         }
@@ -244,6 +277,37 @@ mod tests {
         ] {
             assert_eq!(parse_frame(bad), None, "{bad}");
         }
+    }
+
+    /// Both directions as socketcand's protocol description writes them, and what python-can needs.
+    #[test]
+    fn a_server_reads_and_writes_messages_of_the_protocol() {
+        assert_eq!(parse_send("send 123 0"), Some(frame(0x123, &[])));
+        assert_eq!(parse_send("send 123 4 11 22 33 44"), Some(frame(0x123, &[0x11, 0x22, 0x33, 0x44])));
+        assert_eq!(parse_send("send 1 1 5"), Some(frame(1, &[5])));
+        let extended = Frame::new(ExtendedId::new(0x1AAA_AAAA).unwrap(), &[0x11, 0xF1]).unwrap();
+        assert_eq!(parse_send("send 1AAAAAAA 2 11 F1"), Some(extended));
+        for bad in [
+            "",
+            "send",
+            "send 123",
+            "send 123 1",
+            "send 123 1 11 22",
+            "send 123 9 1 2 3 4 5 6 7 8 9",
+            "send 123 01 11",
+            "send 123 1 111",
+            "send 123 1 +1",
+            "send 800 0",
+            "send 20000000 0",
+            "sendrtr 123 0",
+            "frame 123 1.0 11",
+        ] {
+            assert_eq!(parse_send(bad), None, "{bad}");
+        }
+        let time = Duration::from_micros(23_024_242);
+        assert_eq!(frame_message(&frame(0x23, &[0x11, 0xA2]), time), "< frame 023 23.024242 11A2 >");
+        assert_eq!(frame_message(&frame(0x7E5, &[]), time), "< frame 7E5 23.024242  >");
+        assert_eq!(frame_message(&extended, time), "< frame 1AAAAAAA 23.024242 11F1 >");
     }
 
     /// A server that plays `script`: what to wait for, and what to answer then.

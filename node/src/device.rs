@@ -1,0 +1,261 @@
+//! A device: what the firmware's boot stage and tasks do around `boot-core`, without a chip.
+//!
+//! A START leaves a request and resets, as on the chip, and so does whatever else ends the bootloader; the boot decision is made
+//! anew. Where it falls on a program there is no CPU to run it: the device is silent from then on, or a
+//! [stand-in](crate::stand_in) answers.
+
+use std::io;
+use std::time::Duration;
+
+use boot_core::bootloader::{self, Bootloader};
+use boot_core::canopen::node::{self, NmtPolicy};
+use boot_core::canopen::od::Entry;
+use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
+use boot_core::canopen::{BitRate, Frame, Instant, NodeId};
+use boot_core::decision::{decide, BootDecision, Circumstances, Policy, StayReason};
+use boot_core::download::Step;
+use boot_core::node::NodeParameters;
+use boot_core::parameters::Journal;
+use boot_core::program::{verify, ProgramRecord};
+use shared_abi::warm_start::BootRequest;
+
+use crate::file_flash::FileFlash;
+use crate::stand_in::StandIn;
+
+/// Bytes of blocks that may wait for the flash, as in the firmware for the STM32F407.
+pub const BUFFER: usize = 80 * 1024;
+/// How long a device stays after the answer to its leaving, in ms: clients want to see the answer before anything else happens.
+const FAREWELL_MS: u32 = 20;
+/// The file is never older than this while the flash changes.
+const SAVE_AFTER: Duration = Duration::from_millis(250);
+/// What the device does after a reset: the firmware's policy. Nothing here can crash.
+const POLICY: Policy = Policy { autostart: Some(1), max_crash_resets: 3, node_ids: 1..=127 };
+/// Stands for no node-ID (CiA 305).
+const NO_NODE_ID: u8 = 255;
+
+/// Whether a device can be set to this bit rate. The bus has none of its own, so any can be; there is nothing to find out.
+#[must_use]
+pub fn supports(rate: BitRate) -> bool {
+    rate != BitRate::Auto
+}
+
+/// What does not change in a device's life.
+#[derive(Clone, Copy, Debug)]
+pub struct Setup {
+    /// The bootloader.
+    pub config: &'static bootloader::Config,
+    /// The object dictionary of the stand-in; `None` for a program that is silent.
+    pub stand_in: Option<&'static [Entry]>,
+    /// 1018h/4.
+    pub serial_number: u32,
+    /// Node-ID and bit rate until others are stored.
+    pub node: NodeParameters,
+    /// The entry strap is set: the device stays in the bootloader whatever program there is.
+    pub strap: bool,
+}
+
+/// What came of a reset.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Event {
+    /// The bootloader runs.
+    Bootloader {
+        /// `None` while the device waits for one.
+        node: Option<NodeId>,
+        /// Why.
+        reason: StayReason,
+    },
+    /// A program would run.
+    Program {
+        /// Its number.
+        number: u8,
+        /// Started without a signature, for once.
+        trial: bool,
+        /// The node-ID that it would have.
+        node: Option<NodeId>,
+    },
+}
+
+/// A device with `PROGRAMS` programs.
+pub struct Device<'b, const PROGRAMS: usize> {
+    setup: Setup,
+    life: Life<'b, PROGRAMS>,
+}
+
+/// What runs between two resets.
+enum Life<'b, const PROGRAMS: usize> {
+    Bootloader(Box<Running<Bootloader<'b, FileFlash, PROGRAMS>>>),
+    StandIn(Box<Running<StandIn>>, Idle<'b>),
+    Silent(Idle<'b>),
+    /// Only while one takes the place of the other.
+    None,
+}
+
+/// What the bootloader will need again.
+struct Idle<'b> {
+    flash: FileFlash,
+    buffer: &'b mut [u8],
+}
+
+/// A program on the bus.
+struct Running<D> {
+    device: D,
+    slave: Slave,
+    leaving: Option<Leaving>,
+}
+
+/// The device is about to reset.
+#[derive(Clone, Copy)]
+struct Leaving {
+    request: Option<BootRequest>,
+    /// When; set once the answer is on the bus.
+    at: Option<Instant>,
+}
+
+impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
+    /// Switches a device on.
+    #[must_use]
+    pub fn new(setup: Setup, flash: FileFlash, buffer: &'b mut [u8]) -> (Self, Event) {
+        let mut device = Self { setup, life: Life::None };
+        let event = device.reset(Idle { flash, buffer }, None);
+        (device, event)
+    }
+
+    /// Takes a frame of the bus, whatever it is.
+    pub fn handle(&mut self, frame: &Frame, now: Instant) {
+        match &mut self.life {
+            Life::Bootloader(running) => running.handle(frame, now),
+            Life::StandIn(running, _) => running.handle(frame, now),
+            Life::Silent(_) | Life::None => {}
+        }
+    }
+
+    /// Carries everything on: a bounded piece of work on the flash, frames to send, a reset. Whether there is more to do at once.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn work(
+        &mut self,
+        now: Instant,
+        send: &mut impl FnMut(Frame),
+        tell: &mut impl FnMut(Event),
+    ) -> io::Result<bool> {
+        let leave;
+        let mut more = false;
+        match &mut self.life {
+            Life::Bootloader(running) => {
+                more = running.device.step() == Step::Again;
+                // What is finished is in the file before anybody is told of it.
+                let finished = !running.device.busy();
+                let flash = running.device.flash();
+                if finished && flash.is_urgent() || flash.unsaved().is_some_and(|since| since >= SAVE_AFTER) {
+                    flash.save()?;
+                }
+                if let Some(request) = running.device.take_leave() {
+                    running.leaving = Some(Leaving { request: Some(request), at: None });
+                }
+                leave = running.talk(now, send);
+            }
+            Life::StandIn(running, _) => {
+                if running.device.is_called_back() && running.leaving.is_none() {
+                    running.leaving = Some(Leaving { request: Some(BootRequest::Stay), at: None });
+                }
+                leave = running.talk(now, send);
+            }
+            Life::Silent(_) | Life::None => return Ok(false),
+        }
+        if let Some(request) = leave {
+            let idle = match std::mem::replace(&mut self.life, Life::None) {
+                Life::Bootloader(running) => {
+                    let (flash, buffer) = running.device.into_parts();
+                    Idle { flash, buffer }
+                }
+                Life::StandIn(_, idle) | Life::Silent(idle) => idle,
+                Life::None => return Ok(false),
+            };
+            tell(self.reset(idle, request));
+            more = true;
+        }
+        Ok(more)
+    }
+
+    /// The boot stage: bootloader or program.
+    fn reset(&mut self, idle: Idle<'b>, request: Option<BootRequest>) -> Event {
+        let Setup { config, stand_in, serial_number, node, strap } = self.setup;
+        let Idle { flash, buffer } = idle;
+        let journal = Journal::open(&flash, config.layout.parameters);
+        let node = NodeParameters::load(&journal, &flash, node, supports);
+        let circumstances = Circumstances {
+            request,
+            strap,
+            crash_resets: 0,
+            node_id: node.id.map_or(NO_NODE_ID, NodeId::get),
+        };
+        let verified = |number| verify(&flash, &journal, config.layout, number);
+        match decide(&circumstances, &POLICY, verified) {
+            BootDecision::Stay(reason) => {
+                let device = Bootloader::new(config, serial_number, node, reason.code(), flash, buffer);
+                let address = device.lss_address();
+                let slave = slave(address, node, config.device.heartbeat_ms, NmtPolicy::StayPreOperational);
+                self.life = Life::Bootloader(Box::new(Running { device, slave, leaving: None }));
+                Event::Bootloader { node: node.id, reason }
+            }
+            BootDecision::Start { program, trial } => {
+                let number = program.number();
+                let record = |number| ProgramRecord::load(&journal, &flash, number);
+                let crcs = (1..=PROGRAMS as u8).map(|number| record(number).map_or(0, |record| record.crc));
+                let crcs = crcs.collect();
+                let idle = Idle { flash, buffer };
+                self.life = match stand_in {
+                    None => Life::Silent(idle),
+                    Some(entries) => {
+                        let says = boot_core::canopen::device::Device { serial_number, ..config.device };
+                        let device = StandIn::new(entries, says, number, crcs);
+                        let address = device.lss_address();
+                        let slave = slave(address, node, config.device.heartbeat_ms, NmtPolicy::Follow);
+                        Life::StandIn(Box::new(Running { device, slave, leaving: None }), idle)
+                    }
+                };
+                Event::Program { number, trial, node: node.id }
+            }
+        }
+    }
+}
+
+fn slave(
+    address: boot_core::canopen::lss::LssAddress,
+    node: NodeParameters,
+    heartbeat_ms: u16,
+    nmt: NmtPolicy,
+) -> Slave {
+    let config = slave::Config {
+        node: node::Config { heartbeat_ms, nmt, ..node::Config::default() },
+        ..slave::Config::default()
+    };
+    Slave::new(address, node.id, node.bit_rate, config)
+}
+
+impl<D: SlaveDevice> Running<D> {
+    fn handle(&mut self, frame: &Frame, now: Instant) {
+        if self.slave.handle(frame, now, &mut self.device) {
+            self.leaving = Some(Leaving { request: None, at: None });
+        }
+    }
+
+    /// Sends what there is to send. The request with which the device resets, once it is time.
+    fn talk(&mut self, now: Instant, send: &mut impl FnMut(Frame)) -> Option<Option<BootRequest>> {
+        while let Some(output) = self.slave.poll(now, true, &mut self.device) {
+            match output {
+                Output::Send(frame) => send(frame),
+                // The bus has no bit rate, no filters and no bus-off.
+                Output::Join(_) | Output::Listen(_) | Output::ComeBack | Output::Accept(_) => {}
+            }
+        }
+        let leaving = self.leaving.as_mut()?;
+        match leaving.at {
+            None if self.slave.is_idle() => leaving.at = Some(now + FAREWELL_MS),
+            Some(at) if now.has_reached(at) => return Some(leaving.request),
+            _ => {}
+        }
+        None
+    }
+}

@@ -1,0 +1,258 @@
+//! `coboot-node`: bootloader nodes on a bus of the host.
+#![forbid(unsafe_code)]
+
+use std::error::Error;
+use std::io::{self, Write};
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use boot_core::bootloader::{self, entries, entry_count};
+use boot_core::canopen::device;
+use boot_core::canopen::od::Entry;
+use boot_core::canopen::program::BOOTLOADER_DEVICE_TYPE;
+use boot_core::canopen::{BitRate, Instant, NodeId};
+use boot_core::download::Policy;
+use boot_core::node::NodeParameters;
+use clap::{Parser, ValueEnum};
+use coboot_node::device::{supports, Device, Event, Setup, BUFFER};
+use coboot_node::file_flash::{FileFlash, Speed};
+use coboot_node::server::Server;
+use coboot_node::stand_in::StandIn;
+use coflash::adapter::{self, Adapter};
+use shared_abi::layout::{self, Layout};
+
+/// How often time passes for the nodes while nothing happens.
+const TICK: Duration = Duration::from_millis(2);
+
+/// Bootloader nodes on a CAN bus of the host, each with a file in place of its flash.
+///
+/// They run the bootloader of the firmware and take programs as it does. There is no CPU behind them: a program that is started
+/// is silent from then on, or a stand-in answers for it. Ctrl-C is cutting the power: all that a node said to be stored is in its
+/// file.
+#[derive(Debug, Parser)]
+#[command(name = "coboot-node", version)]
+struct Args {
+    /// A bus to take part in: socketcand://HOST:PORT/BUS, or another of coflash's adapters
+    #[arg(long, value_name = "URL", required_unless_present = "listen")]
+    bus: Option<String>,
+
+    /// Offer a bus `can0` to socketcand clients at this address, for example 127.0.0.1:29536
+    #[arg(long, value_name = "HOST:PORT", conflicts_with = "bus")]
+    listen: Option<String>,
+
+    /// Node-ID; of several nodes the first one's
+    #[arg(long, value_name = "ID", default_value = "1", value_parser = clap::value_parser!(u8).range(1..=127))]
+    node: u8,
+
+    /// The nodes have no node-ID and wait for layer setting services
+    #[arg(long, conflicts_with = "node")]
+    unconfigured: bool,
+
+    /// How many nodes; node-ID and serial number count up
+    #[arg(long, default_value = "1", value_parser = clap::value_parser!(u8).range(1..=127))]
+    count: u8,
+
+    /// Serial number; of several nodes the first one's
+    #[arg(long, default_value = "1", value_parser = number)]
+    serial: u32,
+
+    /// Folder of the files, SERIAL.flash for each node: raw contents of the flash. What is not there is made, erased
+    #[arg(long, default_value = ".", value_name = "DIR")]
+    folder: PathBuf,
+
+    /// The board, whose sectors and programs the nodes have
+    #[arg(long, default_value = layout::BOARDS[0].board, value_parser = board)]
+    board: &'static Layout,
+
+    /// Vendor-ID; with vendor-ID and product code both 0 the nodes take programs for any product
+    #[arg(long, default_value = "0", value_parser = number)]
+    vendor_id: u32,
+
+    /// Product code
+    #[arg(long, default_value = "0", value_parser = number)]
+    product_code: u32,
+
+    /// Revision number
+    #[arg(long, default_value = "0x10000", value_parser = number)]
+    revision: u32,
+
+    /// Period of the heartbeat in ms, 0 for none
+    #[arg(long, default_value = "1000", value_name = "MS")]
+    heartbeat: u16,
+
+    /// How long the flash takes to erase and to program
+    #[arg(long, value_enum, default_value = "typical")]
+    flash: FlashSpeed,
+
+    /// The nodes stay in the bootloader whatever program they have, as with the entry strap set
+    #[arg(long)]
+    stay: bool,
+
+    /// For a program that was started something answers what a host asks a running application for
+    #[arg(long)]
+    stand_in: bool,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum FlashSpeed {
+    /// No time
+    Instant,
+    /// The typical times of the STM32F405/407
+    Typical,
+}
+
+impl From<FlashSpeed> for Speed {
+    fn from(speed: FlashSpeed) -> Self {
+        match speed {
+            FlashSpeed::Instant => Self::Instant,
+            FlashSpeed::Typical => Self::Typical,
+        }
+    }
+}
+
+fn board(name: &str) -> Result<&'static Layout, String> {
+    let names = || layout::BOARDS.iter().map(|layout| layout.board).collect::<Vec<_>>().join(", ");
+    layout::by_name(name).ok_or_else(|| format!("known boards: {}", names()))
+}
+
+fn number(text: &str) -> Result<u32, String> {
+    let parsed = match text.strip_prefix("0x") {
+        // `from_str_radix` would take a sign.
+        Some(digits) if digits.starts_with('+') => None,
+        Some(digits) => u32::from_str_radix(digits, 16).ok(),
+        None => text.parse().ok().filter(|_| !text.starts_with('+')),
+    };
+    parsed.ok_or_else(|| "it is no number of 32 bits (4096 or 0x1000)".to_owned())
+}
+
+fn main() -> ExitCode {
+    let args = Args::parse();
+    let result = match args.board.programs.len() {
+        1 => run::<1>(&args, &entries::<{ entry_count(1) }>(1)),
+        2 => run::<2>(&args, &entries::<{ entry_count(2) }>(2)),
+        programs => Err(format!("a board with {programs} programs is not known here").into()),
+    };
+    match result {
+        Ok(never) => match never {},
+        Err(error) => {
+            // If that cannot be written either, the exit code has to do.
+            let _ = writeln!(io::stderr(), "coboot-node: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run<const PROGRAMS: usize>(
+    args: &Args,
+    entries: &[Entry],
+) -> Result<std::convert::Infallible, Box<dyn Error>> {
+    let setups = setups(args, entries, PROGRAMS as u8)?;
+    let mut flashes = Vec::new();
+    for setup in &setups {
+        let path = args.folder.join(format!("{}.flash", setup.serial_number));
+        let flash = FileFlash::open(&path, args.board, args.flash.into())
+            .map_err(|error| format!("{}: {error}", path.display()))?;
+        flashes.push(flash);
+    }
+    let mut bus: Box<dyn Adapter> = match (&args.bus, &args.listen) {
+        (Some(url), _) => adapter::open(url).map_err(|error| format!("{error}; {}", error.advice()))?,
+        (None, Some(address)) => {
+            let server =
+                Server::bind(address, "can0").map_err(|error| format!("listening at {address}: {error}"))?;
+            say(&format!("bus: socketcand://{}/can0", server.address()));
+            Box::new(server)
+        }
+        (None, None) => return Err("name a bus: --bus URL or --listen HOST:PORT".into()),
+    };
+
+    let mut buffers = vec![[0; BUFFER]; setups.len()];
+    let mut devices = Vec::new();
+    for ((setup, flash), buffer) in setups.into_iter().zip(flashes).zip(&mut buffers) {
+        let (device, event) = Device::<PROGRAMS>::new(setup, flash, buffer);
+        tell(setup.serial_number, event);
+        devices.push((setup.serial_number, device));
+    }
+    let mut more = true;
+    loop {
+        // What the nodes send does not concern the other nodes: they are slaves.
+        let frame = bus.receive(if more { Duration::ZERO } else { TICK })?;
+        // Wraps after 49 days, as it does on the chip.
+        let now = Instant::from_millis(bus.now().as_millis() as u32);
+        more = frame.is_some();
+        for (serial, device) in &mut devices {
+            if let Some(frame) = &frame {
+                device.handle(frame, now);
+            }
+            let mut sent = Ok(());
+            let mut send = |frame| {
+                if sent.is_ok() {
+                    sent = bus.send(&frame);
+                }
+            };
+            more |= device
+                .work(now, &mut send, &mut |event| tell(*serial, event))
+                .map_err(|error| format!("the file of serial number {serial} cannot be written: {error}"))?;
+            sent?;
+        }
+    }
+}
+
+/// What the nodes are; lives as long as the process.
+fn setups(args: &Args, entries: &[Entry], programs: u8) -> Result<Vec<Setup>, Box<dyn Error>> {
+    let config: &'static bootloader::Config = Box::leak(Box::new(bootloader::Config {
+        entries: entries.to_vec().leak(),
+        device: device::Device {
+            device_type: BOOTLOADER_DEVICE_TYPE,
+            name: "coboot-node",
+            hardware_version: "none",
+            software_version: concat!("coboot ", env!("CARGO_PKG_VERSION")),
+            heartbeat_ms: args.heartbeat,
+            vendor_id: args.vendor_id,
+            product_code: args.product_code,
+            revision: args.revision,
+            serial_number: 0,
+        },
+        layout: args.board,
+        supports,
+        boot_up_emergency: true,
+        download: Policy {
+            identity: Some((args.vendor_id, args.product_code)).filter(|identity| *identity != (0, 0)),
+            ..Policy::DEFAULT
+        },
+    }));
+    let stand_in: Option<&'static [Entry]> = args.stand_in.then(|| &*Vec::leak(StandIn::entries(programs)));
+    let setup = |n: u8| -> Option<Setup> {
+        let id = match args.unconfigured {
+            true => None,
+            false => Some(NodeId::new(args.node.checked_add(n)?)?),
+        };
+        Some(Setup {
+            config,
+            stand_in,
+            serial_number: args.serial.checked_add(n.into())?,
+            node: NodeParameters { id, bit_rate: BitRate::K125 },
+            strap: args.stay,
+        })
+    };
+    let setups: Option<Vec<Setup>> = (0..args.count).map(setup).collect();
+    Ok(setups.ok_or("so many nodes from there on have no node-IDs (1 to 127) or serial numbers (32 bits)")?)
+}
+
+/// Says what came of a reset.
+fn tell(serial: u32, event: Event) {
+    let (node, what) = match event {
+        Event::Bootloader { node, reason } => (node, format!("bootloader ({reason:?})")),
+        Event::Program { number, trial, node } => {
+            let trial = if trial { ", on trial" } else { "" };
+            (node, format!("would start program {number}{trial}"))
+        }
+    };
+    let node = node.map_or("no node-ID".to_owned(), |node| format!("node {}", node.get()));
+    say(&format!("serial {serial}, {node}: {what}"));
+}
+
+fn say(line: &str) {
+    // Nobody has to read it.
+    let _ = writeln!(io::stdout(), "{line}");
+}
