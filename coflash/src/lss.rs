@@ -111,7 +111,7 @@ impl<'a> Master<'a> {
         for (command, number) in SELECT.into_iter().zip(numbers) {
             self.send(with_number(command, number))?;
         }
-        self.await_answer(SELECTED)?.map(|_| ()).ok_or(no_answer(LssDoing::Select))
+        self.await_answer(SELECTED, self.answer)?.map(|_| ()).ok_or(no_answer(LssDoing::Select))
     }
 
     /// Asks the device in configuration state for its address.
@@ -182,34 +182,61 @@ impl<'a> Master<'a> {
     /// [`Error::Lss`] where the device has gone in the middle.
     pub fn fastscan(&mut self, progress: &mut dyn FnMut(u32)) -> Result<Option<LssAddress>, Error> {
         self.drain()?;
-        if !self.is_there(0, ANYBODY, 0, 0)? {
+        if !self.is_there(0, ANYBODY, 0, 0, self.answer)? {
+            return Ok(None);
+        }
+        // Answers of several devices come close behind one another, as a rule. Where one was so late that it was taken for
+        // the answer to the next question, the whole time is left for it.
+        let address = match self.identify(self.answer / 5, progress)? {
+            None => self.identify(self.answer, progress)?,
+            found => found,
+        };
+        address.map(Some).ok_or(no_answer(LssDoing::Fastscan))
+    }
+
+    /// The address of one device; `None` where it comes out as one that no device has. `late` is how long further answers may
+    /// lag behind the first.
+    fn identify(
+        &mut self,
+        late: Duration,
+        progress: &mut dyn FnMut(u32),
+    ) -> Result<Option<LssAddress>, Error> {
+        // Takes all devices to the first part of their addresses.
+        if !self.is_there(0, ANYBODY, 0, 0, late)? {
             return Ok(None);
         }
         let mut numbers = [0; 4];
         for (part, number) in (0..).zip(&mut numbers) {
             for bit in (0..32).rev() {
                 // "Do your bits from 31 down to this one read as these?": silence means that this one is set.
-                if !self.is_there(*number, bit, part, part)? {
+                if !self.is_there(*number, bit, part, part, late)? {
                     *number |= 1 << bit;
                 }
                 progress(u32::from(part) * 32 + 32 - u32::from(bit));
             }
             // The whole number once more: who has it goes on to the next part, or is found.
-            if !self.is_there(*number, 0, part, (part + 1) % 4)? {
-                return Err(no_answer(LssDoing::Fastscan));
+            if !self.is_there(*number, 0, part, (part + 1) % 4, late)? {
+                return Ok(None);
             }
         }
         let [vendor_id, product_code, revision, serial_number] = numbers;
         Ok(Some(LssAddress { vendor_id, product_code, revision, serial_number }))
     }
 
-    /// One question of fastscan.
-    fn is_there(&mut self, number: u32, bit: u8, part: u8, next: u8) -> Result<bool, Error> {
+    /// One question of fastscan. Several devices may answer, all with the same frame; these are all heard before the next
+    /// question.
+    fn is_there(&mut self, number: u32, bit: u8, part: u8, next: u8, late: Duration) -> Result<bool, Error> {
         let [a, b, c, d] = number.to_le_bytes();
         self.send([FASTSCAN, a, b, c, d, bit, part, next])?;
-        // Several devices may answer, all with the same frame: on the bus that is one. A late one would spoil the next
-        // question, but then the confirmation fails.
-        Ok(self.await_answer(IDENTIFIED)?.is_some())
+        if self.await_answer(IDENTIFIED, self.answer)?.is_none() {
+            return Ok(false);
+        }
+        // At most as many as there are node-IDs.
+        let mut more = 0;
+        while more < 127 && self.await_answer(IDENTIFIED, late)?.is_some() {
+            more += 1;
+        }
+        Ok(true)
     }
 
     /// Gives an order that is answered with an error code.
@@ -225,7 +252,7 @@ impl<'a> Master<'a> {
     fn ask(&mut self, request: [u8; 8]) -> Result<Option<[u8; 8]>, Error> {
         self.drain()?;
         self.send(request)?;
-        self.await_answer(request[0])
+        self.await_answer(request[0], self.answer)
     }
 
     fn send(&mut self, request: [u8; 8]) -> Result<(), Error> {
@@ -242,8 +269,8 @@ impl<'a> Master<'a> {
         Ok(())
     }
 
-    fn await_answer(&mut self, command: u8) -> Result<Option<[u8; 8]>, Error> {
-        let deadline = self.adapter.now() + self.answer;
+    fn await_answer(&mut self, command: u8, within: Duration) -> Result<Option<[u8; 8]>, Error> {
+        let deadline = self.adapter.now() + within;
         loop {
             self.check_cancelled()?;
             let left = deadline.saturating_sub(self.adapter.now());

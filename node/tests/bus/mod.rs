@@ -1,0 +1,233 @@
+//! Nodes and hosts as programs of their own, and the folder of a test.
+
+// Each test uses its part of it.
+#![allow(dead_code)]
+
+use std::ffi::OsString;
+use std::io::{BufRead, BufReader, Read};
+use std::net::TcpStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::mpsc::{channel, Receiver};
+use std::time::Duration;
+use std::{env, fs, thread};
+
+use serde_json::Value;
+
+/// How long a program may take before it counts as hanging.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+/// A folder of one test, away at the end.
+pub struct Folder(PathBuf);
+
+impl Folder {
+    pub fn new(test: &str) -> Self {
+        let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("nodes-{test}"));
+        let _ = fs::remove_dir_all(&path);
+        fs::create_dir_all(&path).unwrap();
+        Self(path)
+    }
+
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.0.join(name)
+    }
+
+    pub fn write(&self, name: &str, bytes: &[u8]) {
+        fs::write(self.path(name), bytes).unwrap();
+    }
+
+    pub fn read(&self, name: &str) -> Vec<u8> {
+        fs::read(self.path(name)).unwrap()
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// What a program said, once it has ended.
+pub struct Done {
+    pub exit: i32,
+    pub out: String,
+    pub err: String,
+}
+
+/// A program at work; killed when it is dropped.
+pub struct Running {
+    child: Child,
+    err: thread::JoinHandle<String>,
+    out: Receiver<String>,
+}
+
+impl Running {
+    fn start(command: &mut Command) -> Self {
+        let command = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut child = command.spawn().unwrap_or_else(|error| panic!("{command:?}: {error}"));
+        let (stdout, mut stderr) = (child.stdout.take().unwrap(), child.stderr.take().unwrap());
+        let (lines, out) = channel();
+        thread::spawn(move || {
+            for line in BufReader::new(stdout).lines().map_while(Result::ok) {
+                let _ = lines.send(line);
+            }
+        });
+        let err = thread::spawn(move || {
+            let mut text = String::new();
+            let _ = stderr.read_to_string(&mut text);
+            text
+        });
+        Self { child, err, out }
+    }
+
+    /// Waits until it has ended by itself.
+    pub fn wait(mut self) -> Done {
+        let mut out = String::new();
+        loop {
+            match self.out.recv_timeout(PATIENCE) {
+                Ok(line) => out += &(line + "\n"),
+                Err(std::sync::mpsc::RecvTimeoutError::Disconnected) => break,
+                Err(error) => {
+                    let _ = self.child.kill();
+                    panic!("it hangs ({error}); it said: {out}")
+                }
+            }
+        }
+        let exit = self.child.wait().unwrap().code().unwrap_or(-1);
+        let err = std::mem::replace(&mut self.err, thread::spawn(String::new)).join().unwrap();
+        Done { exit, out, err }
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// `coboot-node` in the folder of a test.
+pub fn node(folder: &Folder, arguments: &[&str]) -> Running {
+    Running::start(Command::new(env!("CARGO_BIN_EXE_coboot-node")).args(arguments).current_dir(&folder.0))
+}
+
+/// Nodes at work.
+pub struct Nodes {
+    running: Running,
+    url: String,
+}
+
+impl Nodes {
+    /// With a bus of their own.
+    pub fn start(folder: &Folder, arguments: &[&str]) -> Self {
+        let running = node(folder, &[&["--listen", "127.0.0.1:0"], arguments].concat());
+        let line = running.out.recv_timeout(PATIENCE).unwrap_or_default();
+        let Some(url) = line.strip_prefix("bus: ").map(str::to_owned) else {
+            panic!("{line:?}: {}", running.wait().err)
+        };
+        Self { running, url }
+    }
+
+    /// On a bus of somebody else.
+    pub fn join(folder: &Folder, url: &str, arguments: &[&str]) -> Self {
+        let running = node(folder, &[&["--bus", url], arguments].concat());
+        Self { running, url: url.to_owned() }
+    }
+
+    pub fn url(&self) -> &str {
+        &self.url
+    }
+
+    pub fn address(&self) -> &str {
+        self.url.trim_start_matches("socketcand://").trim_end_matches("/can0")
+    }
+
+    /// Waits until they say this.
+    #[track_caller]
+    pub fn await_line(&self, line: &str) {
+        let mut said = Vec::new();
+        while let Ok(found) = self.running.out.recv_timeout(PATIENCE) {
+            if found == line {
+                return;
+            }
+            said.push(found);
+        }
+        panic!("they never say {line:?}, but {said:?}");
+    }
+
+    /// Waits until they have ended by themselves.
+    pub fn ended(self) -> Done {
+        self.running.wait()
+    }
+}
+
+/// The host tool, in the folder of a test, with a bus.
+pub struct Coflash<'a> {
+    folder: &'a Folder,
+    url: &'a str,
+}
+
+impl<'a> Coflash<'a> {
+    pub fn new(folder: &'a Folder, nodes: &'a Nodes) -> Self {
+        Self { folder, url: nodes.url() }
+    }
+
+    pub fn spawn(&self, arguments: &[&str]) -> Running {
+        let nowhere = self.folder.path("nowhere");
+        Running::start(
+            Command::new(program())
+                .args(arguments)
+                .current_dir(&self.folder.0)
+                .env("COFLASH_BUS", self.url)
+                .env("XDG_CONFIG_HOME", &nowhere)
+                .env("XDG_STATE_HOME", &nowhere)
+                .env_remove("COFLASH_CONFIG"),
+        )
+    }
+
+    pub fn run(&self, arguments: &[&str]) -> Done {
+        self.spawn(arguments).wait()
+    }
+
+    /// What it says when all goes well.
+    #[track_caller]
+    pub fn done(&self, arguments: &[&str]) -> String {
+        let done = self.run(arguments);
+        assert_eq!(done.exit, 0, "{arguments:?}: {}{}", done.out, done.err);
+        done.out
+    }
+
+    /// The same as JSON.
+    #[track_caller]
+    pub fn json(&self, arguments: &[&str]) -> Value {
+        let out = self.done(&[arguments, &["--json"]].concat());
+        serde_json::from_str(&out).unwrap_or_else(|error| panic!("{error}: {out}"))
+    }
+}
+
+/// `COBOOT_COFLASH`, or what was built beside the nodes.
+fn program() -> OsString {
+    env::var_os("COBOOT_COFLASH").unwrap_or_else(|| {
+        let name = Path::new("coflash").with_extension(env::consts::EXE_EXTENSION);
+        let path = Path::new(env!("CARGO_BIN_EXE_coboot-node")).with_file_name(name);
+        assert!(
+            path.exists(),
+            "{}: build it by `cargo build -p coflash`, or run `cargo xtask test`",
+            path.display()
+        );
+        path.into_os_string()
+    })
+}
+
+/// The next message of a server.
+pub fn message(stream: &mut TcpStream) -> String {
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    let mut text = String::new();
+    let mut byte = [0];
+    while !text.ends_with('>') {
+        stream.read_exact(&mut byte).unwrap();
+        text.push(byte[0].into());
+    }
+    text
+}

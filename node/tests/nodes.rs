@@ -1,0 +1,298 @@
+//! `coboot-node` as its users run it: over real sockets, with `coflash` as the host, and the file read from outside.
+
+mod bus;
+
+use std::fs;
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::time::Duration;
+
+use bus::{node, Coflash, Folder, Nodes};
+
+/// A program as far as a bootloader looks at one: initial stack pointer in RAM, reset vector inside, Thumb bit set.
+fn program() -> Vec<u8> {
+    let mut bytes: Vec<u8> = (0..300 * 1024_u32).map(|i| (i * 7 + (i >> 8) * 13) as u8).collect();
+    bytes[..8].copy_from_slice(&[0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x01, 0x08]);
+    bytes
+}
+
+/// zlib's crc32 over [`program`].
+const CRC: &str = "A6FB8F81h";
+
+/// What the flash of a device with the program at 0801_0000h holds behind its parameters.
+fn flashed() -> Vec<u8> {
+    let mut bytes = program();
+    bytes.resize(0xF_0000, 0xFF);
+    bytes
+}
+
+const FLASH: &[&str] = &["flash", "program.bin", "-I", "binary", "--board", "stm32f407g-disc1"];
+
+fn folder(test: &str) -> Folder {
+    let folder = Folder::new(test);
+    folder.write("program.bin", &program());
+    folder
+}
+
+#[test]
+fn the_file_holds_the_program_and_nothing_else() {
+    let folder = folder("holds");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant"]);
+    nodes.await_line("serial 1, node 5: bootloader (Program(Absent))");
+    let flash = folder.read("1.flash");
+    assert_eq!(flash, vec![0xFF; 1 << 20], "erased by default");
+
+    let coflash = Coflash::new(&folder, &nodes);
+    let said = coflash.done(&[FLASH, &["-N", "5", "--no-start"]].concat());
+    assert!(said.contains(&format!("verified: CRC {CRC}")), "{said}");
+    let flash = folder.read("1.flash");
+    assert!(flash[..0x8000].iter().all(|byte| *byte == 0xFF), "where the chip has its bootloader");
+    assert!(flash[0x8000..0xC000].iter().any(|byte| *byte != 0xFF), "the parameters");
+    assert!(flash[0x1_0000..] == flashed());
+    assert!(coflash.done(&["info", "-N", "5"]).contains(&format!("CRC             {CRC}")));
+
+    // It survives: killed without notice, the device comes up as a chip would.
+    drop(nodes);
+    let nodes = Nodes::start(&folder, &["--node", "5"]);
+    nodes.await_line("serial 1, node 5: would start program 1");
+    // No CPU, no answer.
+    let coflash = Coflash::new(&folder, &nodes);
+    assert_eq!(coflash.run(&["status", "-N", "5", "--sdo-timeout", "50"]).exit, 5);
+    drop(nodes);
+    let nodes = Nodes::start(&folder, &["--node", "5", "--stay"]);
+    nodes.await_line("serial 1, node 5: bootloader (Strap)");
+    assert!(Coflash::new(&folder, &nodes).done(&["info", "-N", "5"]).contains(CRC));
+    assert!(folder.read("1.flash")[0x1_0000..] == flashed());
+}
+
+#[test]
+fn a_stand_in_answers_for_the_program_and_lets_itself_be_called_back() {
+    let folder = folder("stand-in");
+    let nodes = Nodes::start(&folder, &["--node", "7", "--flash", "instant", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let said = coflash.done(&[FLASH, &["-N", "7", "--trial-run", "--verify"]].concat());
+    assert!(said.contains("running: an application"), "{said}");
+    nodes.await_line("serial 1, node 7: would start program 1, on trial");
+    nodes.await_line("serial 1, node 7: bootloader (Requested)");
+    nodes.await_line("serial 1, node 7: would start program 1");
+    // CiA 302-3: it runs, and 1F56h is what it was in the bootloader.
+    assert_eq!(coflash.json(&["read", "1F51/1", "-N", "7"])["number"], 1);
+    assert_eq!(coflash.json(&["read", "1F56/1", "-N", "7"])["hex"], "818FFBA6");
+    let said = coflash.done(&["enter", "-N", "7"]);
+    assert!(said.contains("the bootloader is running"), "{said}");
+    // The old program is no obstacle to the next one.
+    coflash.done(&[FLASH, &["-N", "7", "--no-start"]].concat());
+    coflash.done(&["unsign", "-N", "7"]);
+    coflash.done(&["reset", "-N", "7"]);
+    nodes.await_line("serial 1, node 7: bootloader (Unsigned)");
+    // What the bus was told is in the file when it is told.
+    drop(nodes);
+    let nodes = Nodes::start(&folder, &["--node", "7"]);
+    nodes.await_line("serial 1, node 7: bootloader (Unsigned)");
+}
+
+#[test]
+fn many_nodes_take_their_programs_at_the_same_time() {
+    let folder = folder("many");
+    let nodes = Nodes::start(&folder, &["--node", "10", "--count", "5", "--stand-in", "--serial", "0x100"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    coflash.done(&[FLASH, &["-N", "10-14", "--at-once", "5"]].concat());
+    for serial in 0x100..0x105 {
+        assert!(folder.read(&format!("{serial}.flash"))[0x1_0000..] == flashed(), "{serial}");
+    }
+    let scan = coflash.json(&["scan", "-N", "9-15", "--sdo-timeout", "100"]);
+    let found: Vec<_> = scan["nodes"].as_array().unwrap().iter().map(|found| &found["node"]).collect();
+    assert_eq!(found, [10, 11, 12, 13, 14]);
+    assert_eq!(scan["nodes"][4]["info"]["serial_number"], 0x104);
+}
+
+#[test]
+fn the_power_is_cut_in_the_middle_and_the_program_is_none() {
+    let folder = folder("cut");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    coflash.done(&[FLASH, &["-N", "5", "--no-start"]].concat());
+    // Over the old program, which is gone with the first block.
+    let flashing = coflash.spawn(&[FLASH, &["-N", "5"]].concat());
+    let beginning = program()[..0x400].to_vec();
+    while folder.read("1.flash")[0x1_0000..0x1_0400] == beginning {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    drop(nodes);
+    assert_eq!(flashing.wait().exit, 4, "the adapter is gone");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--stand-in"]);
+    nodes.await_line("serial 1, node 5: bootloader (Program(Absent))");
+    Coflash::new(&folder, &nodes).done(&[FLASH, &["-N", "5"]].concat());
+    assert!(folder.read("1.flash")[0x1_0000..] == flashed());
+}
+
+#[test]
+fn nodes_are_commissioned_by_layer_setting_services() {
+    let folder = folder("lss");
+    let start = |folder: &Folder| {
+        Nodes::start(
+            folder,
+            &["--unconfigured", "--count", "2", "--serial", "77", "--product-code", "0x1234"],
+        )
+    };
+    let nodes = start(&folder);
+    nodes.await_line("serial 77, no node-ID: bootloader (NodeId)");
+    let coflash = Coflash::new(&folder, &nodes);
+    let said = coflash.done(&["lss", "fastscan", "--assign", "40", "--store", "--lss-timeout", "20"]);
+    assert!(said.contains("40") && said.contains("41"), "{said}");
+    assert_eq!(coflash.json(&["read", "1018/2", "-N", "41"])["number"], 0x1234);
+    drop(nodes);
+    let nodes = start(&folder);
+    nodes.await_line("serial 77, node 40: bootloader (Program(Absent))");
+    nodes.await_line("serial 78, node 41: bootloader (Program(Absent))");
+    let coflash = Coflash::new(&folder, &nodes);
+    let device = ["--vendor", "0", "--product", "0x1234", "--revision", "0x10000", "--serial", "78"];
+    let said = coflash.done(&[&["lss", "bit-rate", "500", "--store"][..], &device].concat());
+    assert!(said.contains("500"), "{said}");
+    let said = coflash.done(&[&["lss", "assign", "-N", "9", "--reset", "--store"][..], &device].concat());
+    assert!(said.contains('9'), "{said}");
+    assert_eq!(coflash.json(&["read", "1018/4", "-N", "9"])["number"], 78);
+    let said = coflash.done(&[&["lss", "inquire"][..], &device].concat());
+    assert!(said.contains("serial 0000004Eh: node 9"), "{said}");
+    coflash.done(&[&["lss", "store"][..], &device].concat());
+}
+
+/// A device of another product: nothing is lost, and what comes of it is the manual's number.
+#[test]
+fn a_program_for_another_product_is_refused() {
+    let folder = folder("product");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--product-code", "99", "--flash", "instant"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    coflash.done(&[FLASH, &["-N", "5", "--no-start", "--vid", "0", "--pid", "99"]].concat());
+    let before = folder.read("1.flash");
+    let said = coflash.run(&[FLASH, &["-N", "5", "--vid", "0", "--pid", "98"]].concat());
+    assert_eq!(said.exit, 6, "{}", said.err);
+    assert!(said.err.contains("60000182"), "{}", said.err);
+    assert!(folder.read("1.flash")[0x1_0000..] == before[0x1_0000..]);
+}
+
+#[test]
+fn two_programs_have_their_places() {
+    let folder = folder("two");
+    let nodes =
+        Nodes::start(&folder, &["--board", "stm32f407g-disc1-two", "--flash", "instant", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    // Vectors of program 2: reset at 0808_0200h.
+    let mut second = program();
+    second.truncate(1000);
+    second[6] = 0x08;
+    folder.write("second.bin", &second);
+    let flash = ["-I", "binary", "--board", "stm32f407g-disc1-two"];
+    coflash.done(&[&["flash", "second.bin", "-N", "1", "-P", "2", "--no-start"][..], &flash].concat());
+    let file = folder.read("1.flash");
+    assert_eq!(file[0x8_0000..0x8_03E8], second);
+    assert!(file[0x1_0000..0x8_0000].iter().chain(&file[0x8_03E8..]).all(|byte| *byte == 0xFF));
+    let said = coflash.done(&["start", "-N", "1", "-P", "2"]);
+    assert!(said.contains("an application"), "{said}");
+    nodes.await_line("serial 1, node 1: would start program 2");
+    assert_eq!(coflash.json(&["read", "1F51/2", "-N", "1"])["number"], 1);
+    assert_eq!(coflash.json(&["read", "1F51/1", "-N", "1"])["number"], 0);
+    // zlib's crc32 over the 1000 bytes.
+    assert_eq!(coflash.json(&["read", "1F56/2", "-N", "1"])["hex"], "1BD5F407");
+}
+
+/// A node on somebody else's bus: here that of other nodes.
+#[test]
+fn nodes_join_a_bus() {
+    let folder = folder("join");
+    let hosts = Nodes::start(&folder, &["--node", "1"]);
+    let guests = Nodes::join(&folder, hosts.url(), &["--node", "2", "--serial", "2", "--flash", "instant"]);
+    guests.await_line("serial 2, node 2: bootloader (Program(Absent))");
+    let coflash = Coflash::new(&folder, &hosts);
+    coflash.done(&[FLASH, &["-N", "2", "--no-start"]].concat());
+    assert!(folder.read("2.flash")[0x1_0000..] == flashed());
+    assert_eq!(folder.read("1.flash"), vec![0xFF; 1 << 20]);
+    // The bus is gone: an end with a reason.
+    drop(hosts);
+    let said = guests.ended();
+    assert_eq!(said.exit, 1);
+    assert!(said.err.contains("is gone"), "{}", said.err);
+}
+
+#[test]
+fn clients_that_misbehave_harm_nobody() {
+    let folder = folder("hostile");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--heartbeat", "1"]);
+    let connect = || {
+        let mut stream = TcpStream::connect(nodes.address()).unwrap();
+        let mut hi = [0; 6];
+        stream.read_exact(&mut hi).unwrap();
+        assert_eq!(&hi, b"< hi >");
+        stream
+    };
+    // What is no message at all.
+    let mut stream = connect();
+    stream.write_all(&[b"<".to_vec(), vec![b'x'; 100_000]].concat()).unwrap();
+    // The server ends it; a reset is an end, too.
+    let mut rest = Vec::new();
+    let _ = stream.read_to_end(&mut rest);
+    // What makes no sense.
+    let mut stream = connect();
+    for message in ["rawmode", "send 605 0", "open can1", "fly", "\u{fffd}", ""] {
+        stream.write_all(format!("< {message} >").as_bytes()).unwrap();
+        let said = bus::message(&mut stream);
+        assert!(said.starts_with("< error "), "{message}: {said}");
+    }
+    stream.write_all(b"< open can0 >").unwrap();
+    assert_eq!(bus::message(&mut stream), "< ok >");
+    for message in ["send 605", "send 605 2 1", "send 800 0", "sendrtr 605 0", "send 605 8 1 2 3 4 5 6 7 800"]
+    {
+        stream.write_all(format!("< {message} >").as_bytes()).unwrap();
+        let said = bus::message(&mut stream);
+        assert!(said.starts_with("< error "), "{message}: {said}");
+    }
+    // Who never reads (the heartbeats of 1 ms fill what waits for it) holds nobody up.
+    stream.write_all(b"< rawmode >").unwrap();
+    let silent = [stream, connect(), connect()];
+    let coflash = Coflash::new(&folder, &nodes);
+    coflash.done(&[FLASH, &["-N", "5", "--no-start"]].concat());
+    assert!(folder.read("1.flash")[0x1_0000..] == flashed());
+    drop(silent);
+}
+
+#[test]
+fn what_cannot_be_is_said() {
+    let folder = folder("wrong");
+    let refused = |arguments: &[&str], exit, why: &str| {
+        let said = node(&folder, arguments).wait();
+        assert_eq!(said.exit, exit, "{arguments:?}: {}", said.err);
+        assert!(said.err.contains(why), "{arguments:?}: {}", said.err);
+    };
+    folder.write("9.flash", b"short");
+    let listen = ["--listen", "127.0.0.1:0"];
+    refused(
+        &[&listen[..], &["--serial", "9"]].concat(),
+        1,
+        "9.flash: it has 5 bytes, and the flash of an stm32f407vg has 1048576",
+    );
+    assert_eq!(folder.read("9.flash"), b"short");
+    refused(&[&listen[..], &["--folder", "nowhere"]].concat(), 1, "nowhere");
+    refused(&[&listen[..], &["--node", "120", "--count", "9"]].concat(), 1, "have no node-IDs");
+    refused(&[&listen[..], &["--serial", "0xFFFFFFFF", "--count", "2"]].concat(), 1, "serial numbers");
+    refused(&["--listen", "nowhere.invalid:1"], 1, "listening at nowhere.invalid:1: ");
+    refused(&["--bus", "socketcand://127.0.0.1:1/can0"], 1, "cannot be opened");
+    refused(&["--bus", "rubbish"], 1, "it has no ':'");
+    refused(&[], 2, "--bus <URL>");
+    for [option, value] in [
+        ["--node", "0"],
+        ["--node", "128"],
+        ["--count", "0"],
+        ["--serial", "+1"],
+        ["--serial", "0x+1"],
+        ["--serial", "0x100000000"],
+        ["--board", "none"],
+        ["--flash", "slow"],
+        ["--heartbeat", "65536"],
+    ] {
+        refused(&[&listen[..], &[option, value]].concat(), 2, "invalid value");
+    }
+    let url = "socketcand://127.0.0.1:1/can0";
+    refused(&[&listen[..], &["--bus", url]].concat(), 2, "cannot be used with");
+    fs::create_dir(folder.path("8.flash")).unwrap();
+    refused(&[&listen[..], &["--serial", "8"]].concat(), 1, "8.flash: ");
+}
