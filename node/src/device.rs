@@ -83,7 +83,7 @@ pub struct Device<'b, const PROGRAMS: usize> {
 
 /// What runs between two resets.
 enum Life<'b, const PROGRAMS: usize> {
-    Bootloader(Box<Running<Bootloader<'b, FileFlash, PROGRAMS>>>),
+    Bootloader(Box<Running<Bootloader<'b, FileFlash, Journal, PROGRAMS>>>),
     StandIn(Box<Running<StandIn>>, Idle<'b>),
     Silent(Idle<'b>),
     /// Only while one takes the place of the other.
@@ -182,7 +182,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
     fn reset(&mut self, idle: Idle<'b>, request: Option<BootRequest>) -> Event {
         let Setup { config, stand_in, serial_number, node, strap } = self.setup;
         let Idle { flash, buffer } = idle;
-        let journal = Journal::open(&flash, config.layout.parameters);
+        let journal = Journal::open(&flash, config.layout.chip, config.layout.parameters);
         let node = NodeParameters::load(&journal, &flash, node, supports);
         let circumstances = Circumstances {
             request,
@@ -193,7 +193,8 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         let verified = |number| verify(&flash, &journal, config.layout, number);
         match decide(&circumstances, &POLICY, verified) {
             BootDecision::Stay(reason) => {
-                let device = Bootloader::new(config, serial_number, node, reason.code(), flash, buffer);
+                let device =
+                    Bootloader::new(config, serial_number, node, reason.code(), journal, flash, buffer);
                 let address = device.lss_address();
                 let slave = slave(address, node, config.device.heartbeat_ms, NmtPolicy::StayPreOperational);
                 self.life = Life::Bootloader(Box::new(Running { device, slave, leaving: None }));
@@ -236,6 +237,10 @@ fn slave(
 
 impl<D: SlaveDevice> Running<D> {
     fn handle(&mut self, frame: &Frame, now: Instant) {
+        // Who is about to reset takes nothing on.
+        if self.leaving.is_some_and(|leaving| leaving.at.is_some()) {
+            return;
+        }
         if self.slave.handle(frame, now, &mut self.device) {
             self.leaving = Some(Leaving { request: None, at: None });
         }
@@ -243,6 +248,9 @@ impl<D: SlaveDevice> Running<D> {
 
     /// Sends what there is to send. The request with which the device resets, once it is time.
     fn talk(&mut self, now: Instant, send: &mut impl FnMut(Frame)) -> Option<Option<BootRequest>> {
+        if let Some(Leaving { request, at: Some(at) }) = self.leaving {
+            return now.has_reached(at).then_some(request);
+        }
         while let Some(output) = self.slave.poll(now, true, &mut self.device) {
             match output {
                 Output::Send(frame) => send(frame),
@@ -250,11 +258,8 @@ impl<D: SlaveDevice> Running<D> {
                 Output::Join(_) | Output::Listen(_) | Output::ComeBack | Output::Accept(_) => {}
             }
         }
-        let leaving = self.leaving.as_mut()?;
-        match leaving.at {
-            None if self.slave.is_idle() => leaving.at = Some(now + FAREWELL_MS),
-            Some(at) if now.has_reached(at) => return Some(leaving.request),
-            _ => {}
+        if let Some(leaving) = self.leaving.as_mut().filter(|_| self.slave.is_idle()) {
+            leaving.at = Some(now + FAREWELL_MS);
         }
         None
     }
