@@ -71,7 +71,7 @@ fn after_any_cut_the_old_or_the_new_value_is_read_and_the_neighbour_is_untouched
 
     let mut points = 0;
     for operation in 1..=operations {
-        for cut in [Cut::Before, Cut::After, Cut::Torn(1), Cut::Torn(2), Cut::Torn(3)] {
+        for cut in [Cut::Before, Cut::After, Cut::Torn(1), Cut::Torn(2), Cut::Unstable(1), Cut::Unstable(2)] {
             let mut flash = ModelFlash::new(&SMALL);
             flash.cut = Some((operation, cut));
             let mut done = 0;

@@ -1,6 +1,8 @@
 //! A strict flash: it does what the F4's does, refuses what the F4 would silently spoil, and loses power on demand.
 #![allow(dead_code)]
 
+use std::cell::Cell;
+use std::collections::BTreeMap;
 use std::panic::panic_any;
 use std::task::Poll;
 
@@ -17,6 +19,9 @@ pub enum Cut {
     Before,
     /// A part: some bits of the word, a part of the sector.
     Torn(u64),
+    /// A part, and some bits are left between 0 and 1: they read differently each time, until they are programmed to 0 or erased
+    /// once more.
+    Unstable(u64),
     /// All, but nobody has seen it.
     After,
 }
@@ -27,9 +32,14 @@ enum Operation {
     Program { address: u32, word: u32 },
 }
 
+#[derive(Clone)]
 pub struct ModelFlash {
     chip: &'static Geometry,
     cells: Vec<u8>,
+    /// Bits that read differently each time, by cell.
+    unstable: BTreeMap<usize, u8>,
+    /// Moves with every reading of an unstable bit.
+    noise: Cell<u64>,
     running: Option<Operation>,
     /// Polls until the running operation ends.
     polls_left: u32,
@@ -48,6 +58,8 @@ impl ModelFlash {
         Self {
             chip,
             cells: vec![0xFF; chip.flash.size as usize],
+            unstable: BTreeMap::new(),
+            noise: Cell::new(0),
             running: None,
             polls_left: 0,
             operations: 0,
@@ -93,8 +105,9 @@ impl ModelFlash {
             if number == self.operations {
                 match cut {
                     Cut::Before => {}
-                    Cut::After => self.complete(operation, u64::MAX, true),
-                    Cut::Torn(seed) => self.complete(operation, seed, false),
+                    Cut::After => self.complete(operation),
+                    Cut::Torn(seed) => self.tear(operation, seed, false),
+                    Cut::Unstable(seed) => self.tear(operation, seed, true),
                 }
                 panic_any(PowerCut);
             }
@@ -102,31 +115,60 @@ impl ModelFlash {
         Ok(())
     }
 
-    /// Does the operation, or the part of it that the bits of `seed` select.
-    fn complete(&mut self, operation: Operation, seed: u64, whole: bool) {
-        // splitmix64: a different pattern for every operation.
-        let mut state = seed.wrapping_add(u64::from(self.operations));
-        let mut random = move || {
-            state = state.wrapping_add(0x9E37_79B9_7F4A_7C15);
-            let z = (state ^ state >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-            let z = (z ^ z >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
-            z ^ z >> 31
-        };
+    /// Where the operation acts, and what it makes of the cells there.
+    fn effect(&self, operation: Operation) -> Vec<(usize, u8)> {
         match operation {
             Operation::Erase(region) => {
                 let at = self.index(region.base);
-                for cell in &mut self.cells[at..at + region.size as usize] {
-                    *cell |= if whole { 0xFF } else { random() as u8 };
-                }
+                (at..at + region.size as usize).map(|at| (at, 0xFF)).collect()
             }
             Operation::Program { address, word } => {
                 let at = self.index(address);
-                for (cell, byte) in self.cells[at..at + 4].iter_mut().zip(word.to_le_bytes()) {
-                    *cell &= byte | if whole { 0 } else { random() as u8 };
+                word.to_le_bytes()
+                    .into_iter()
+                    .enumerate()
+                    .map(|(i, byte)| (at + i, self.cells[at + i] & byte))
+                    .collect()
+            }
+        }
+    }
+
+    fn complete(&mut self, operation: Operation) {
+        for (at, becomes) in self.effect(operation) {
+            self.cells[at] = becomes;
+            match operation {
+                Operation::Erase(_) => drop(self.unstable.remove(&at)),
+                // What is programmed to 0 is so for certain; a 1 stays what it was.
+                Operation::Program { .. } => {
+                    if let Some(bits) = self.unstable.get_mut(&at) {
+                        *bits &= becomes;
+                    }
                 }
             }
         }
     }
+
+    /// Does the part of the operation that the bits of `seed` select.
+    fn tear(&mut self, operation: Operation, seed: u64, unstable: bool) {
+        let mut state = seed.wrapping_add(u64::from(self.operations));
+        for (at, becomes) in self.effect(operation) {
+            let before = self.cells[at];
+            let changed = (before ^ becomes) & splitmix64(&mut state) as u8;
+            self.cells[at] = before ^ changed;
+            let between = (before ^ becomes) & splitmix64(&mut state) as u8;
+            if unstable && between != 0 {
+                *self.unstable.entry(at).or_default() |= between;
+            }
+        }
+    }
+}
+
+/// The next number: a different pattern for every state.
+fn splitmix64(state: &mut u64) -> u64 {
+    *state = state.wrapping_add(0x9E37_79B9_7F4A_7C15);
+    let z = (*state ^ *state >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    let z = (z ^ z >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
+    z ^ z >> 31
 }
 
 impl Flash for ModelFlash {
@@ -135,7 +177,17 @@ impl Flash for ModelFlash {
         for (i, byte) in buffer.iter_mut().enumerate() {
             let address = address.wrapping_add(i as u32);
             let inside = self.chip.flash.contains(address, 1);
-            *byte = if inside { self.cells[self.index(address)] } else { 0xFF };
+            if !inside {
+                *byte = 0xFF;
+                continue;
+            }
+            let at = self.index(address);
+            *byte = self.cells[at];
+            if let Some(bits) = self.unstable.get(&at) {
+                let mut state = self.noise.get();
+                *byte ^= bits & splitmix64(&mut state) as u8;
+                self.noise.set(state);
+            }
         }
     }
 
@@ -161,7 +213,7 @@ impl Flash for ModelFlash {
                 return Poll::Ready(Err(error));
             }
         }
-        self.complete(operation, 0, true);
+        self.complete(operation);
         Poll::Ready(Ok(()))
     }
 }
