@@ -418,6 +418,23 @@ pub fn erase(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event))
     Ok(())
 }
 
+/// An erasure that is over sooner than this was put off, or had little to do. Erasing a sector of flash takes longer.
+const PUT_OFF: Duration = Duration::from_millis(100);
+
+/// Gets rid of the program, without another one in its place. A bootloader that puts the erasure off until the first block comes
+/// (figure 12 of the manual) is told a second time, which there means at once; elsewhere that erases what is erased already.
+///
+/// # Errors
+/// As [`erase`].
+pub fn erase_at_once(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
+    let began = session.now();
+    execute(session, number, ProgramControl::Clear)?;
+    if session.now().saturating_sub(began) < PUT_OFF {
+        execute(session, number, ProgramControl::Clear)?;
+    }
+    Ok(())
+}
+
 /// Step 14: signs the program, so that it starts by itself.
 ///
 /// # Errors

@@ -46,10 +46,18 @@ fn the_steps_of_an_update_one_by_one() {
     assert_eq!((said.out.as_str(), fake.writes().len()), ("node 5: the bootloader is running already\n", 0));
 
     // The application is called back before its program is erased.
-    let (said, json, fake) = on(|| quick(APPLICATION), &["erase"]);
+    let slow = || {
+        let mut fake = quick(APPLICATION);
+        fake.erase_time = Duration::from_millis(150);
+        fake
+    };
+    let (said, json, fake) = on(slow, &["erase"]);
     assert!(said.out.starts_with("node 5: program 1 is erased, in "), "{}", said.out);
     assert!(json["seconds"].is_number());
     assert_eq!(fake.writes(), ["command 80", "command 03"]);
+    // One that was done in no time was put off until there is a block; at once is another one.
+    let (_, _, fake) = on(|| quick(BOOTLOADER), &["erase"]);
+    assert_eq!(fake.writes(), ["command 03"; 2]);
 
     let (said, _, fake) = on(|| quick(BOOTLOADER), &["sign"]);
     assert_eq!(said.out, "node 5: program 1 is signed: it starts by itself from now on\n");
@@ -129,6 +137,28 @@ fn read_shows_values_as_what_they_are() {
     let (said, json, _) = on(|| quick(APPLICATION), &["read", "2000/1"]);
     assert_eq!((said.exit, &json["error"]["number"]), (6, &"0x60000025".into()));
     assert!(said.err.contains("node 5 refuses reading 2000h/1: abort 06020000h"), "{}", said.err);
+}
+
+#[test]
+fn a_program_is_read_back_where_the_device_allows_it() {
+    let folder = Folder::new("read-back");
+    // Every byte there is, and an end inside a segment of 7.
+    let program: Vec<u8> = (0..=513_u32).map(|i| (i ^ i >> 8) as u8).collect();
+    for knows in [Blocks::Refused(0x0504_0001), Blocks::Known(127)] {
+        let fake = || {
+            let mut fake = quick(BOOTLOADER);
+            (fake.readable, fake.knows_blocks) = (Some(program.clone()), knows);
+            fake
+        };
+        let (said, json, _) = on(fake, &["read", "1F50/1", "-o", &folder.path("back.bin")]);
+        assert!(said.out.starts_with("node 5, 1F50h/1: 514 bytes to "), "{}{}", said.out, said.err);
+        assert_eq!((&json["size"], &json["hex"]), (&514.into(), &Value::Null));
+        assert!(fs::read(folder.path("back.bin")).unwrap() == program);
+    }
+    // CiA 301: 06010001h, attempt to read a write only object.
+    let (said, json, _) = on(|| quick(BOOTLOADER), &["read", "1F50/1"]);
+    assert_eq!((said.exit, &json["error"]["number"]), (6, &"0x60000025".into()));
+    assert!(said.err.contains("abort 06010001h"), "{}", said.err);
 }
 
 #[test]

@@ -1,7 +1,9 @@
 //! `coflash start`, `enter`, `erase`, `sign`, `unsign` and `status`: the single steps of an update.
 
 use clap::Args;
-use coflash::flash::{call_back, enter_bootloader, erase, find, reset_status, sign, start, unsign, Event};
+use coflash::flash::{
+    call_back, enter_bootloader, erase_at_once, find, reset_status, sign, start, unsign, Event,
+};
 use coflash::info::{program_info, ProgramInfo};
 use coflash::session::Session;
 use coflash::Error;
@@ -115,7 +117,7 @@ impl Erase {
         with(context, "erase", &self.program, |session, number, tell| {
             enter_bootloader(session, number, tell)?;
             let began = session.now();
-            erase(session, number, tell)?;
+            erase_at_once(session, number)?;
             let seconds = session.now().saturating_sub(began).as_secs_f64();
             Ok((format!("program {number} is erased, in {seconds:.1} s"), json!({ "seconds": seconds })))
         })
@@ -125,6 +127,8 @@ impl Erase {
 impl Sign {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         with(context, "sign", &self.program, |session, number, tell| {
+            // Nobody there is told at once; a command that goes unanswered is waited for.
+            tell(Event::Found(find(session)?));
             sign(session, number, tell)?;
             Ok((format!("program {number} is signed: it starts by itself from now on"), json!({})))
         })
@@ -133,7 +137,8 @@ impl Sign {
 
 impl Unsign {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, "unsign", &self.program, |session, number, _| {
+        with(context, "unsign", &self.program, |session, number, tell| {
+            tell(Event::Found(find(session)?));
             unsign(session, number)?;
             let words =
                 format!("program {number} is not signed any more: the device stays in the bootloader");

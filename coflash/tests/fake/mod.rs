@@ -61,6 +61,8 @@ pub struct Fake {
     pub crc_of_application: Option<u32>,
     /// Whether the device answers nothing while it is busy.
     pub deaf_while_busy: bool,
+    /// What 1F50h/1 reads, if the device allows that.
+    pub readable: Option<Vec<u8>>,
     pub erase_time: Duration,
     pub restart_time: Duration,
     /// How long it goes on answering before it restarts.
@@ -116,6 +118,7 @@ impl Fake {
             crc: None,
             crc_of_application: None,
             deaf_while_busy: false,
+            readable: None,
             erase_time: Duration::from_secs(2),
             restart_time: Duration::from_millis(300),
             leave_time: Duration::ZERO,
@@ -361,7 +364,8 @@ impl Fake {
                 number(application.or(self.crc).unwrap_or(crc))
             }
             (0x1F57, 1) => number(if self.busy() { 1 } else { self.status }),
-            (0x1018 | 0x1F51 | 0x1F56 | 0x1F57, _) => Err(0x0609_0011),
+            (0x1F50, 1) => self.readable.clone().ok_or(0x0601_0001),
+            (0x1018 | 0x1F50 | 0x1F51 | 0x1F56 | 0x1F57, _) => Err(0x0609_0011),
             _ => Err(0x0602_0000),
         }
     }

@@ -3,12 +3,13 @@
 // Each test uses its part of it.
 #![allow(dead_code)]
 
+use std::cell::RefCell;
 use std::ffi::OsString;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::mpsc::{channel, Receiver};
+use std::sync::mpsc::{channel, Receiver, RecvTimeoutError};
 use std::time::Duration;
 use std::{env, fs, thread};
 
@@ -59,11 +60,12 @@ pub struct Running {
     child: Child,
     err: thread::JoinHandle<String>,
     out: Receiver<String>,
+    said: RefCell<String>,
 }
 
 impl Running {
     fn start(command: &mut Command) -> Self {
-        let command = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let command = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = command.spawn().unwrap_or_else(|error| panic!("{command:?}: {error}"));
         let (stdout, mut stderr) = (child.stdout.take().unwrap(), child.stderr.take().unwrap());
         let (lines, out) = channel();
@@ -77,25 +79,45 @@ impl Running {
             let _ = stderr.read_to_string(&mut text);
             text
         });
-        Self { child, err, out }
+        Self { child, err, out, said: RefCell::default() }
+    }
+
+    /// The number of its process.
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Its next line; `None` when there will be none.
+    fn line(&self) -> Option<String> {
+        match self.out.recv_timeout(PATIENCE) {
+            Ok(line) => {
+                *self.said.borrow_mut() += &format!("{line}\n");
+                Some(line)
+            }
+            Err(RecvTimeoutError::Disconnected) => None,
+            Err(RecvTimeoutError::Timeout) => panic!("it hangs; it said: {}", self.said.borrow()),
+        }
+    }
+
+    /// Waits until it says a line with this in it.
+    #[track_caller]
+    pub fn await_text(&self, text: &str) {
+        while let Some(line) = self.line() {
+            if line.contains(text) {
+                return;
+            }
+        }
+        panic!("it never says {text:?}, but: {}", self.said.borrow());
     }
 
     /// Waits until it has ended by itself.
     pub fn wait(mut self) -> Done {
-        let mut out = String::new();
-        loop {
-            match self.out.recv_timeout(PATIENCE) {
-                Ok(line) => out += &(line + "\n"),
-                Err(std::sync::mpsc::RecvTimeoutError::Disconnected) => break,
-                Err(error) => {
-                    let _ = self.child.kill();
-                    panic!("it hangs ({error}); it said: {out}")
-                }
-            }
-        }
+        // Nobody types any more.
+        drop(self.child.stdin.take());
+        while self.line().is_some() {}
         let exit = self.child.wait().unwrap().code().unwrap_or(-1);
         let err = std::mem::replace(&mut self.err, thread::spawn(String::new)).join().unwrap();
-        Done { exit, out, err }
+        Done { exit, out: self.said.take(), err }
     }
 }
 
@@ -122,7 +144,7 @@ impl Nodes {
     /// With a bus of their own.
     pub fn start(folder: &Folder, arguments: &[&str]) -> Self {
         let running = node(folder, &[&["--listen", "127.0.0.1:0"], arguments].concat());
-        let line = running.out.recv_timeout(PATIENCE).unwrap_or_default();
+        let line = running.line().unwrap_or_default();
         let Some(url) = line.strip_prefix("bus: ").map(str::to_owned) else {
             panic!("{line:?}: {}", running.wait().err)
         };
@@ -146,14 +168,7 @@ impl Nodes {
     /// Waits until they say this.
     #[track_caller]
     pub fn await_line(&self, line: &str) {
-        let mut said = Vec::new();
-        while let Ok(found) = self.running.out.recv_timeout(PATIENCE) {
-            if found == line {
-                return;
-            }
-            said.push(found);
-        }
-        panic!("they never say {line:?}, but {said:?}");
+        self.running.await_text(line);
     }
 
     /// Waits until they have ended by themselves.
@@ -188,6 +203,13 @@ impl<'a> Coflash<'a> {
 
     pub fn run(&self, arguments: &[&str]) -> Done {
         self.spawn(arguments).wait()
+    }
+
+    /// Runs it and types this.
+    pub fn typed(&self, arguments: &[&str], text: &str) -> Done {
+        let mut running = self.spawn(arguments);
+        running.child.stdin.take().unwrap().write_all(text.as_bytes()).unwrap();
+        running.wait()
     }
 
     /// What it says when all goes well.

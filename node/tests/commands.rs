@@ -1,0 +1,223 @@
+//! Every command of `coflash` that talks to a device, against nodes over a real socket. (`nodes.rs` has those that it needs itself;
+//! `convert`, `inspect`, `completions` and `man` talk to nobody.)
+
+mod bus;
+
+use std::process::Command;
+
+use bus::{Coflash, Folder, Nodes};
+use serde_json::{json, Value};
+
+/// A program as far as a bootloader looks at one: initial stack pointer in RAM, reset vector inside, Thumb bit set.
+fn program(first: u8) -> Vec<u8> {
+    let mut bytes = vec![first; 200 * 1024];
+    bytes[..8].copy_from_slice(&[0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x01, 0x08]);
+    bytes
+}
+
+const FLASH: &[&str] = &["flash", "program.bin", "-I", "binary", "--board", "stm32f407g-disc1"];
+
+fn folder(test: &str) -> Folder {
+    let folder = Folder::new(test);
+    folder.write("program.bin", &program(0xA5));
+    folder
+}
+
+/// Bytes of the program's region that are not erased.
+fn rest(folder: &Folder) -> usize {
+    folder.read("1.flash")[0x1_0000..].iter().filter(|byte| **byte != 0xFF).count()
+}
+
+#[test]
+fn the_steps_of_an_update_one_by_one() {
+    let folder = folder("steps");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let on = |words: &[&str]| coflash.done(&[words, &["-N", "5"]].concat());
+    // Nothing there yet: the manual's "no valid program" (1F57h = 02h), as coflash numbers it.
+    let refused = coflash.run(&["start", "-N", "5"]);
+    assert_eq!(refused.exit, 7, "{}", refused.err);
+    assert!(refused.err.contains("60000014"), "{}", refused.err);
+    on(FLASH);
+    assert!(on(&["status"]).contains("running"));
+    assert_eq!(on(&["enter"]), "node 5: the bootloader is running\n");
+    assert_eq!(on(&["enter"]), "node 5: the bootloader is running already\n");
+    assert!(on(&["unsign"]).contains("not signed any more"));
+    // START is a trial then, and the next reset ends in the bootloader.
+    assert!(on(&["start"]).contains("an application"));
+    nodes.await_line("serial 1, node 5: would start program 1, on trial");
+    on(&["reset"]);
+    nodes.await_line("serial 1, node 5: bootloader (Unsigned)");
+    assert_eq!(on(&["sign"]), "node 5: program 1 is signed: it starts by itself from now on\n");
+    assert!(on(&["start"]).contains("an application"));
+    // The application is called back before it is erased; then nothing is left of it.
+    assert!(rest(&folder) > 190 * 1024);
+    assert!(on(&["erase"]).starts_with("node 5: program 1 is erased, in "));
+    assert_eq!(rest(&folder), 0, "erased, not only marked");
+    let status = coflash.json(&["status", "-N", "5"]);
+    assert_eq!((&status["crc"], &status["bootloader"]), (&json!(0), &json!(true)));
+    let refused = coflash.run(&["sign", "-N", "5"]);
+    assert_eq!(refused.exit, 6, "{}", refused.err);
+    assert_ne!(coflash.json(&["status", "-N", "5"])["status"]["error"], Value::Null);
+    assert_eq!(coflash.json(&["status", "--clear", "-N", "5"])["status"]["error"], Value::Null);
+    assert_eq!(on(&["reset"]), "back on the bus: node 5\n");
+}
+
+/// The erasure of a whole program on flash that takes its time.
+#[test]
+fn erasing_waits_for_the_flash() {
+    let folder = folder("erase");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--board", "stm32f407g-disc1-two"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let two = ["-I", "binary", "--board", "stm32f407g-disc1-two", "-N", "5"];
+    coflash.done(&[&["flash", "program.bin", "--no-start"][..], &two].concat());
+    let erased = coflash.json(&["erase", "-N", "5"]);
+    assert_eq!(rest(&folder), 0);
+    // Sectors 4 to 7: 550 ms and three times a second, by the datasheet.
+    assert!(erased["seconds"].as_f64().unwrap() >= 3.55, "{erased}");
+}
+
+/// What a device refuses to read is told with its abort code (06010001h: it is write-only), in words.
+#[test]
+fn the_program_cannot_be_read_back() {
+    let folder = folder("read");
+    let nodes = Nodes::start(&folder, &["--node", "5"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let refused = coflash.run(&["read", "1F50/1", "-N", "5", "-o", "back.bin"]);
+    assert_eq!(refused.exit, 6);
+    assert!(refused.err.contains("node 5 refuses reading 1F50h/1: abort 06010001h"), "{}", refused.err);
+    assert!(!folder.path("back.bin").exists());
+}
+
+#[test]
+fn an_update_in_all_its_ways() {
+    let folder = folder("ways");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let board = ["--board", "stm32f407g-disc1"];
+    let region = ["--start-address", "0x08010000", "--end-address", "0x0801FFFF"];
+    let ways: [(&[&str], &[&str]); 6] = [
+        (&board, &["--segmented", "--no-start"]),
+        (&board, &["--trial-run", "--verify", "--check-target"]),
+        // The spellings of the manual's tools.
+        (
+            &board,
+            &["--prog_no", "1", "--chk_run", "--sdo_timeout", "1000", "--repeats", "5", "--delay", "50"],
+        ),
+        (&board, &["--block-size", "0x4000", "--block-repeats", "2"]),
+        (&board, &["--chk_tgt", "1", "--timeout", "700", "--verify"]),
+        (&region, &["--block-size", "64"]),
+    ];
+    for (number, (place, way)) in (1..).zip(ways) {
+        folder.write("program.bin", &program(number));
+        let update = ["flash", "program.bin", "-I", "binary", "--vid", "0", "--pid", "0", "-N", "5"];
+        coflash.done(&[&update[..], place, way].concat());
+        let file = folder.read("1.flash");
+        assert_eq!(file[0x1_0000..0x1_1000], program(number)[..0x1000], "{way:?}");
+    }
+    // The last one was cut off where it was told to be.
+    assert!(folder.read("1.flash")[0x2_0000..].iter().all(|byte| *byte != 6));
+}
+
+#[test]
+fn a_job_file_serves_its_devices_and_reports() {
+    let folder = folder("job");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--count", "3", "--flash", "instant", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    coflash.done(&["convert", "program.bin", "program.blk", "-I", "binary", "--board", "stm32f407g-disc1"]);
+    folder.write(
+        "job.toml",
+        b"image = 'program.blk'\n[[device]]\nnode = 5\n[[device]]\nnode = 6\nstart = false\n\
+          [[device]]\nlss = { vendor = 0, product = 0, revision = 0x10000, serial = 3 }\nnode = 20\nstart = false\n\
+          [[device]]\nnode = 99\n",
+    );
+    let words = ["flash", "--job", "job.toml", "--report", "report.json", "--sdo-timeout", "200"];
+    let done = coflash.run(&words);
+    assert_eq!(done.exit, 8, "one is not there: {}{}", done.out, done.err);
+    let report: Value = serde_json::from_slice(&folder.read("report.json")).unwrap();
+    let of = |node: u8| {
+        let devices = report["devices"].as_array().unwrap();
+        devices.iter().find(|device| device["node"] == node).unwrap_or_else(|| panic!("{report}"))
+    };
+    for node in [5, 6, 20] {
+        assert!(of(node)["error"].is_null(), "{report}");
+    }
+    assert!(!of(99)["error"].is_null(), "{report}");
+    for serial in [1, 2, 3] {
+        assert_eq!(folder.read(&format!("{serial}.flash"))[0x1_0000..0x1_1000], program(0xA5)[..0x1000]);
+    }
+    assert_eq!(coflash.json(&["read", "1F51/1", "-N", "5"])["number"], 1);
+    assert_eq!(coflash.json(&["read", "1F51/1", "-N", "6"])["number"], 0);
+}
+
+#[test]
+fn scan_monitor_and_shell_hear_the_nodes() {
+    let folder = folder("hear");
+    let nodes =
+        Nodes::start(&folder, &["--node", "5", "--count", "2", "--heartbeat", "50", "--flash", "instant"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let scan = coflash.json(&["scan", "--listen-only", "--listen", "500"]);
+    let found: Vec<&Value> = scan["nodes"].as_array().unwrap().iter().map(|node| &node["node"]).collect();
+    assert_eq!(found, [5, 6]);
+    let said = coflash.done(&["monitor", "--count", "3", "-N", "6"]);
+    assert_eq!(said.lines().count(), 3, "{said}");
+    assert!(said.lines().all(|line| line.contains("node 6: heartbeat, pre-operational")), "{said}");
+    let said = coflash.typed(&["shell"], "info -N 5\nread 1018/4 -N 6\nnonsense\nreset -N 5\n");
+    assert_eq!(said.exit, 2, "typed by a script, the first that fails is the last: {}", said.err);
+    assert!(said.out.contains("serial number     00000001h"), "{}{}", said.out, said.err);
+    assert!(said.out.contains("node 6, 1018h/4: 2 (00000002h)"), "{}{}", said.out, said.err);
+    // What goes over the bus, kept and shown again.
+    coflash.done(&["read", "1018/4", "-N", "6", "--trace", "bus.log"]);
+    let said = coflash.done(&["monitor", "--replay", "bus.log"]);
+    assert!(said.contains("to node 6: read 1018h/4 (serial number)"), "{said}");
+}
+
+/// Ctrl-C wherever the update happens to be; the same command once more, at once, does it.
+#[cfg(unix)]
+#[test]
+fn an_interrupted_update_is_started_again_at_once() {
+    let folder = folder("interrupt");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let update = [FLASH, &["-N", "5", "-v"]].concat();
+    // At the beginning, while blocks are written and sectors erased, and near the end.
+    for (version, until) in (1..).zip(["erasing", "10 %", "40 %", "90 %"]) {
+        folder.write("program.bin", &program(version));
+        let running = coflash.spawn(&update);
+        running.await_text(until);
+        let interrupted = Command::new("kill").args(["-INT", &running.id().to_string()]).status().unwrap();
+        assert!(interrupted.success());
+        let done = running.wait();
+        assert_eq!(done.exit, 130, "{until}: {}{}", done.out, done.err);
+        assert!(done.err.contains("run the same command again"), "{}", done.err);
+        coflash.done(&update);
+        assert_eq!(folder.read("1.flash")[0x1_0000..0x4_2000], program(version), "{until}");
+    }
+}
+
+#[test]
+fn no_bus_no_node_no_sense() {
+    let folder = folder("nobody");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let quick = ["--sdo-timeout", "50", "-N", "9"];
+    let commands: [&[&str]; 8] =
+        [&["info"], &["status"], &["start"], &["enter"], &["erase"], &["sign"], &["unsign"], FLASH];
+    let running = commands.map(|command| coflash.spawn(&[command, &quick].concat()));
+    for (running, command) in running.into_iter().zip(commands) {
+        let done = running.wait();
+        assert_eq!(done.exit, 5, "{command:?}: {}{}", done.out, done.err);
+        assert!(done.err.contains("node 9 does not answer"), "{}", done.err);
+    }
+    let done = coflash.run(&["info", "-N", "5", "--bus", "socketcand://127.0.0.1:1/can0"]);
+    assert_eq!(done.exit, 4, "{}", done.err);
+    let elsewhere = format!("socketcand://{}/can7", nodes.address());
+    let done = coflash.run(&["info", "-N", "5", "--bus", &elsewhere]);
+    assert_eq!(done.exit, 4, "{}", done.err);
+    assert!(done.err.contains("there is one bus here, can0"), "{}", done.err);
+    // A program that the device has none of.
+    let done = coflash.run(&[FLASH, &["-P", "1", "-N", "5", "--no-start"]].concat());
+    assert_eq!(done.exit, 0, "{}", done.err);
+    let done = coflash.run(&["start", "-N", "5", "-P", "2"]);
+    assert_eq!(done.exit, 7, "{}{}", done.out, done.err);
+}
