@@ -4,6 +4,9 @@
 //! latest sound record of a key is its value. When the region is full, the living records are copied to the other
 //! region, whose header is written **last**: until then the old region is the valid one, afterwards the new one is,
 //! and a cut leaves one of the two whole. Each slot carries a CRC, so a torn one reads as absent.
+//!
+//! A cut can leave bits between 0 and 1, which read well now and badly later. A header that reads well is therefore written once
+//! more before anything is added behind it: what was stored must not vanish with its region.
 
 use core::task::Poll;
 
@@ -97,6 +100,8 @@ struct Active {
     free: u32,
     /// Of the version that is written today.
     current: bool,
+    /// Its header was written, or written once more, since the power came.
+    firm: bool,
 }
 
 impl Journal {
@@ -119,7 +124,13 @@ impl Journal {
             while words > SLOT_WORDS as u32 && flash.read_word(base + 4 * (words - 1)) == ERASED {
                 words -= 1;
             }
-            Active { region, sequence, free: words.div_ceil(SLOT_WORDS as u32), current: format == FORMAT }
+            Active {
+                region,
+                sequence,
+                free: words.div_ceil(SLOT_WORDS as u32),
+                current: format == FORMAT,
+                firm: false,
+            }
         });
         Self { chip, regions, active, storing: None }
     }
@@ -137,15 +148,16 @@ impl Parameters for Journal {
     }
 
     fn store(&mut self, key: Key, value: Value) {
+        let record = record_slot(key.tag(), value);
         let state = match self.active {
-            Some(active) if active.current && active.free < slots(&self.regions[active.region]) => {
-                let address = slot_address(&self.regions[active.region], active.free);
-                State::Append { writer: WordWriter::new(address) }
+            Some(Active { current: true, firm: false, region, sequence, .. }) => {
+                self.write(What::Firm, region, 0, header_slot(sequence, FORMAT))
             }
+            Some(Active { current: true, .. }) => self.append(record),
             None => State::Begin,
-            Some(active) => State::Erase { eraser: SectorEraser::new(self.regions[1 - active.region]) },
+            Some(_) => self.change_over(),
         };
-        self.storing = Some(Storing { record: record_slot(key.tag(), value), attempts: 0, state });
+        self.storing = Some(Storing { record, attempts: 0, state });
     }
 
     fn poll<F: Flash>(&mut self, flash: &mut F) -> Poll<Result<(), StoreError>> {
@@ -168,56 +180,63 @@ struct Storing {
 
 #[derive(Clone, Copy, Debug)]
 enum State {
-    /// Into the first free slot of the active region.
-    Append { writer: WordWriter },
     /// No region is valid yet.
     Begin,
     /// Make the other region blank.
     Erase { eraser: SectorEraser },
     /// Look for the next living record of the old region, from slot `from` on; `to` is the next slot of the new one.
     Collect { from: u32, to: u32 },
-    /// Copy one living record.
-    Copy { from: u32, to: u32, slot: Slot, writer: WordWriter },
-    /// The new record itself.
-    Add { to: u32, writer: WordWriter },
+    /// Write a slot.
+    Write { what: What, slot: Slot, writer: WordWriter },
+}
+
+/// What a slot is written for.
+#[derive(Clone, Copy, Debug)]
+enum What {
+    /// The header of the active region once more.
+    Firm,
+    /// The new record, into the first free slot of the active region.
+    Append,
+    /// A living record of the old region, into slot `to` of the other one.
+    Copy { from: u32, to: u32 },
+    /// The new record behind them.
+    Add { to: u32 },
     /// The header, which makes the new region the valid one.
-    Commit { to: u32, sequence: u32, writer: WordWriter },
+    Commit { to: u32, sequence: u32 },
 }
 
 impl Journal {
+    /// To the first free slot, or to a region that has some.
+    fn append(&self, record: Slot) -> State {
+        match self.active {
+            Some(Active { region, free, .. }) if free < slots(&self.regions[region]) => {
+                self.write(What::Append, region, free, record)
+            }
+            _ => self.change_over(),
+        }
+    }
+
+    /// To the other region.
+    fn change_over(&self) -> State {
+        State::Erase { eraser: SectorEraser::new(self.regions[self.other()]) }
+    }
+
+    /// The region that is not the active one.
+    fn other(&self) -> usize {
+        self.active.map_or(0, |active| 1 - active.region)
+    }
+
+    fn write(&self, what: What, region: usize, number: u32, slot: Slot) -> State {
+        State::Write { what, slot, writer: WordWriter::new(slot_address(&self.regions[region], number)) }
+    }
+
     fn carry_on<F: Flash>(&mut self, storing: &mut Storing, flash: &mut F) -> Poll<Result<(), StoreError>> {
         loop {
-            let target = self.active.map_or(0, |active| 1 - active.region);
-            let new = self.regions[target];
+            let other = self.other();
             storing.state = match &mut storing.state {
-                State::Append { writer } => {
-                    let Poll::Ready(outcome) = write(writer, flash, &storing.record) else {
-                        return Poll::Pending;
-                    };
-                    // `store` starts here only with an active region, and nothing takes it away.
-                    let Some(active) = &mut self.active else {
-                        return Poll::Ready(Err(StoreError::WornOut));
-                    };
-                    active.free += 1;
-                    match outcome {
-                        Ok(()) => return Poll::Ready(Ok(())),
-                        // Left half-charged by a power cut, or worn: leave the slot, take the next.
-                        Err(FlashFault::Verify) if storing.attempts < ATTEMPTS => {
-                            storing.attempts += 1;
-                            let region = &self.regions[active.region];
-                            if active.free < slots(region) {
-                                State::Append { writer: WordWriter::new(slot_address(region, active.free)) }
-                            } else {
-                                State::Erase { eraser: SectorEraser::new(new) }
-                            }
-                        }
-                        Err(FlashFault::Verify) => return Poll::Ready(Err(StoreError::WornOut)),
-                        Err(error) => return Poll::Ready(Err(StoreError::Flash(error))),
-                    }
-                }
                 // A new device: its master shall not wait for an erase that changes nothing.
-                State::Begin if is_blank(flash, new) => State::Collect { from: 1, to: 1 },
-                State::Begin => State::Erase { eraser: SectorEraser::new(new) },
+                State::Begin if is_blank(flash, self.regions[other]) => State::Collect { from: 1, to: 1 },
+                State::Begin => self.change_over(),
                 State::Erase { eraser } => match eraser.poll(flash, self.chip) {
                     Poll::Pending => return Poll::Pending,
                     Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
@@ -226,58 +245,73 @@ impl Journal {
                 State::Collect { from, to } => {
                     let (from, to) = (*from, *to);
                     match self.active {
-                        Some(active) if from < active.free => {
-                            let old = &self.regions[active.region];
-                            match living_slot(flash, old, from, active.free, storing.record[0]) {
-                                Some(slot) => {
-                                    let writer = WordWriter::new(slot_address(&new, to));
-                                    State::Copy { from, to, slot, writer }
-                                }
+                        Some(Active { region, free, .. }) if from < free => {
+                            match living_slot(flash, &self.regions[region], from, free, storing.record[0]) {
+                                Some(slot) => self.write(What::Copy { from, to }, other, to, slot),
                                 None => State::Collect { from: from + 1, to },
                             }
                         }
-                        _ => State::Add { to, writer: WordWriter::new(slot_address(&new, to)) },
+                        _ => self.write(What::Add { to }, other, to, storing.record),
                     }
                 }
-                State::Copy { from, to, slot, writer } => match write(writer, flash, slot) {
-                    Poll::Pending => return Poll::Pending,
-                    Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
-                    Poll::Ready(Ok(())) => State::Collect { from: *from + 1, to: *to + 1 },
-                },
-                State::Add { to, writer } => match write(writer, flash, &storing.record) {
-                    Poll::Pending => return Poll::Pending,
-                    Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
-                    Poll::Ready(Ok(())) => {
-                        let sequence = self.active.map_or(1, |active| active.sequence.wrapping_add(1));
-                        State::Commit {
-                            to: *to + 1,
-                            sequence,
-                            writer: WordWriter::new(slot_address(&new, 0)),
-                        }
-                    }
-                },
-                State::Commit { to, sequence, writer } => {
-                    match write(writer, flash, &header_slot(*sequence, FORMAT)) {
-                        Poll::Pending => return Poll::Pending,
-                        Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
-                        Poll::Ready(Ok(())) => {
-                            self.active = Some(Active {
-                                region: target,
-                                sequence: *sequence,
-                                free: *to,
-                                current: true,
-                            });
-                            return Poll::Ready(Ok(()));
-                        }
+                State::Write { what, slot, writer } => {
+                    let (what, slot) = (*what, *slot);
+                    let Poll::Ready(outcome) = writer.poll(flash, SLOT_WORDS, |i| slot[i]) else {
+                        return Poll::Pending;
+                    };
+                    match self.written(what, outcome, storing)? {
+                        Some(next) => next,
+                        None => return Poll::Ready(Ok(())),
                     }
                 }
             };
         }
     }
-}
 
-fn write<F: Flash>(writer: &mut WordWriter, flash: &mut F, slot: &Slot) -> Poll<Result<(), FlashFault>> {
-    writer.poll(flash, SLOT_WORDS, |i| slot[i])
+    /// What follows when a slot was written or could not be; `None` when all is done.
+    fn written(
+        &mut self,
+        what: What,
+        outcome: Result<(), FlashFault>,
+        storing: &mut Storing,
+    ) -> Result<Option<State>, StoreError> {
+        if let (What::Append, Some(active)) = (what, &mut self.active) {
+            active.free += 1;
+        }
+        match outcome {
+            Ok(()) => {}
+            // Left half-charged by a power cut, or worn: another slot, or another region, or this one erased.
+            Err(FlashFault::Verify) if storing.attempts < ATTEMPTS => {
+                storing.attempts += 1;
+                return Ok(Some(match what {
+                    What::Append => self.append(storing.record),
+                    _ => self.change_over(),
+                }));
+            }
+            Err(FlashFault::Verify) => return Err(StoreError::WornOut),
+            Err(error) => return Err(StoreError::Flash(error)),
+        }
+        let other = self.other();
+        Ok(match what {
+            What::Firm => {
+                if let Some(active) = &mut self.active {
+                    active.firm = true;
+                }
+                Some(self.append(storing.record))
+            }
+            What::Append => None,
+            What::Copy { from, to } => Some(State::Collect { from: from + 1, to: to + 1 }),
+            What::Add { to } => {
+                let sequence = self.active.map_or(1, |active| active.sequence.wrapping_add(1));
+                let header = header_slot(sequence, FORMAT);
+                Some(self.write(What::Commit { to: to + 1, sequence }, other, 0, header))
+            }
+            What::Commit { to, sequence } => {
+                self.active = Some(Active { region: other, sequence, free: to, current: true, firm: true });
+                None
+            }
+        })
+    }
 }
 
 const fn slots(region: &Region) -> u32 {

@@ -4,4 +4,5 @@ pub mod bench;
 pub mod eds;
 pub mod endpoint;
 pub mod firmware;
+pub mod powercut;
 pub mod throughput;

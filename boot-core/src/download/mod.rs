@@ -353,10 +353,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 self.leave = Some(request(program));
             }
             (SetSignature | ClrSignature, Some(record)) => {
+                // Also where it is so already: after a power cut it may read so now and otherwise later.
                 let signed = command == SetSignature;
-                if record.signed != signed {
-                    self.work = Some(self.store_record(program, ProgramRecord { signed, ..record }));
-                }
+                self.work = Some(self.store_record(program, ProgramRecord { signed, ..record }));
             }
             (Start | SetSignature, None) => state.error = Some(FlashError::NoValidProgram),
             (Stop | StartBootloader | ResetStat | ClrSignature, _) => {}
@@ -738,10 +737,11 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     // No CLEAR: each block finds out whether its place is blank.
                     _ => (region.end(), region.end()),
                 };
-                self.programs[index].session = Session::Open { next: 1, erased, ahead };
-                if self.programs[index].record.is_some() && self.work.is_none() {
+                // Also where there is no record: one that a power cut left between 0 and 1 may be there the next time.
+                if matches!(self.programs[index].session, Session::Cleared { .. }) && self.work.is_none() {
                     self.work = Some(self.invalidate(program, false));
                 }
+                self.programs[index].session = Session::Open { next: 1, erased, ahead };
             }
             NUMBER_LAST => {
                 let data: [u8; LAST_SIZE] = self.queue.of_open(HEADER_SIZE);

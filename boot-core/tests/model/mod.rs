@@ -85,6 +85,12 @@ impl ModelFlash {
         &self.cells[at..at + region.size as usize]
     }
 
+    /// Whether every bit of it reads the same each time.
+    pub fn is_stable(&self, region: Region) -> bool {
+        let at = self.index(region.base);
+        self.unstable.range(at..at + region.size as usize).all(|(_, bits)| *bits == 0)
+    }
+
     /// Direct access, as by a debug probe.
     pub fn poke(&mut self, address: u32, bytes: &[u8]) {
         let at = self.index(address);
@@ -148,12 +154,30 @@ impl ModelFlash {
         }
     }
 
-    /// Does the part of the operation that the bits of `seed` select.
+    /// Does a part of the operation, which `seed` selects. An odd seed of a torn erase ends it in the middle of the sector; an odd
+    /// seed of an unstable operation does all of it but for one bit.
     fn tear(&mut self, operation: Operation, seed: u64, unstable: bool) {
-        let mut state = seed.wrapping_add(u64::from(self.operations));
-        for (at, becomes) in self.effect(operation) {
+        let mut state = seed.wrapping_add(u64::from(self.operations) << 8);
+        let odd = seed & 1 == 1;
+        let effect = self.effect(operation);
+        if odd && unstable {
+            let changed: Vec<_> = effect.iter().filter(|(at, becomes)| self.cells[*at] != *becomes).collect();
+            if let Some((at, becomes)) = changed.get(splitmix64(&mut state) as usize % changed.len().max(1)) {
+                let bits = self.cells[*at] ^ becomes;
+                let one = 1 << bits.trailing_zeros();
+                let at = *at;
+                self.complete(operation);
+                *self.unstable.entry(at).or_default() |= one;
+            }
+            return;
+        }
+        let middle = splitmix64(&mut state) as usize % effect.len();
+        for (i, (at, becomes)) in effect.into_iter().enumerate() {
             let before = self.cells[at];
-            let changed = (before ^ becomes) & splitmix64(&mut state) as u8;
+            let changed = match operation {
+                Operation::Erase(_) if odd => (before ^ becomes) & if i < middle { 0xFF } else { 0 },
+                _ => (before ^ becomes) & splitmix64(&mut state) as u8,
+            };
             self.cells[at] = before ^ changed;
             let between = (before ^ becomes) & splitmix64(&mut state) as u8;
             if unstable && between != 0 {

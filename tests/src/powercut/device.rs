@@ -1,0 +1,479 @@
+//! A device of `boot-core` and the flash model: power on, boot stage, bootloader; and the same with a bug in it.
+
+use core::task::Poll;
+
+use boot_core::bootloader::{entries, entry_count, Bootloader, Config};
+use boot_core::canopen::device::Device as Identity;
+use boot_core::canopen::lss::LssDevice;
+use boot_core::canopen::od::{Address, Entry, Objects};
+use boot_core::canopen::{AbortCode, BitRate, NodeId};
+use boot_core::crc32;
+use boot_core::decision::{self, decide, BootDecision, Circumstances};
+use boot_core::download::{Erase, Policy, Step};
+use boot_core::flash::{Flash, FlashFault};
+use boot_core::node::NodeParameters;
+use boot_core::parameters::{Journal, Key, Parameters, StoreError, Value};
+use boot_core::program::{verify, ProgramRecord};
+use shared_abi::geometry::{Geometry, Region, Sector, SectorRun, STM32F407VG};
+use shared_abi::layout::Layout;
+
+use super::model::ModelFlash;
+
+/// The F407 with sectors a 64th of their size: the same shape, and cheap to erase in a model.
+static CHIP: Geometry = Geometry {
+    chip: "small-f407",
+    flash: Region::new(0x0800_0000, 0x4400),
+    sectors: &[
+        SectorRun { count: 4, size: 0x200 },
+        SectorRun { count: 1, size: 0x400 },
+        SectorRun { count: 7, size: 0x800 },
+    ],
+    interrupts: 4,
+    ..STM32F407VG
+};
+
+/// Two programs; what has one uses the first.
+pub static LAYOUT: Layout = Layout {
+    board: "model",
+    chip: &CHIP,
+    bootloader: Region::new(0x0800_0000, 0x400),
+    callgate_offset: 0x200,
+    parameters: [Region::new(0x0800_0400, 0x200), Region::new(0x0800_0600, 0x200)],
+    programs: &[Region::new(0x0800_0800, 0x1C00), Region::new(0x0800_2400, 0x2000)],
+    ram: Region::new(0x2000_0000, 0x1_FFC0),
+    handoff: Region::new(0x2001_FFC0, 48),
+    warm_start: Region::new(0x2001_FFF0, 16),
+}
+.checked();
+
+const PROGRAMS: usize = 2;
+static ENTRIES: [Entry; entry_count(PROGRAMS as u8)] = entries(PROGRAMS as u8);
+
+/// Whom the programs are for.
+pub const VENDOR_ID: u32 = 0x0000_0319;
+/// See [`VENDOR_ID`].
+pub const PRODUCT_CODE: u32 = 0x0004_0001;
+
+const CONFIG: Config = Config {
+    entries: &ENTRIES,
+    device: Identity {
+        device_type: 0x1000_0000,
+        name: "model",
+        hardware_version: "0",
+        software_version: "0",
+        heartbeat_ms: 0,
+        vendor_id: VENDOR_ID,
+        product_code: PRODUCT_CODE,
+        revision: 0,
+        serial_number: 0,
+    },
+    layout: &LAYOUT,
+    supports: |_| true,
+    boot_up_emergency: false,
+    download: Policy { identity: Some((VENDOR_ID, PRODUCT_CODE)), ..Policy::DEFAULT },
+};
+static SOUND: Config = CONFIG;
+static HASTY: Config = Config { download: Policy { erase: Erase::AtOnce, ..CONFIG.download }, ..CONFIG };
+
+const DECISION: decision::Policy =
+    decision::Policy { autostart: Some(1), max_crash_resets: 3, node_ids: 1..=127 };
+
+/// Node-ID and bit rate of a device that was never told others.
+pub const BOARD_NODE: NodeParameters = NodeParameters { id: NodeId::new(1), bit_rate: BitRate::K125 };
+
+/// A mistake that somebody could make, and that the proof has to find.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Bug {
+    /// The record of the new program is stored, signed, before its data are there.
+    SignatureBeforeData,
+    /// The sectors are erased while the record still stands.
+    EraseBeforeInvalidating,
+    /// The program is erased before anybody knows whom the new one is for.
+    EraseBeforeCheck,
+    /// Records carry no CRC.
+    JournalWithoutCrc,
+    /// A full journal is erased first, and written again then.
+    CompactionInPlace,
+    /// A sector that begins blank is taken for erased.
+    BlankAtFirstSight,
+}
+
+impl Bug {
+    /// All of them.
+    pub const ALL: [Self; 6] = [
+        Self::SignatureBeforeData,
+        Self::EraseBeforeInvalidating,
+        Self::EraseBeforeCheck,
+        Self::JournalWithoutCrc,
+        Self::CompactionInPlace,
+        Self::BlankAtFirstSight,
+    ];
+}
+
+/// What the device does when it is switched on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Outcome {
+    /// It answers as bootloader.
+    Bootloader,
+    /// It runs this program, byte for byte; told by its seed.
+    Runs(u8),
+}
+
+/// A device with flash in it. Whatever else it has is lost with the power.
+#[derive(Clone)]
+pub struct Device {
+    /// Its flash.
+    pub flash: ModelFlash,
+    bug: Option<Bug>,
+}
+
+impl Device {
+    /// With an empty flash.
+    pub fn new(bug: Option<Bug>) -> Self {
+        Self { flash: ModelFlash::new(&CHIP), bug }
+    }
+
+    fn parameters(&self) -> Store {
+        Store::open(&self.flash, self.bug)
+    }
+
+    /// What the boot stage would do with this flash, without doing it.
+    ///
+    /// # Errors
+    /// If a program would run that is not one of ours, whole.
+    pub fn decision(&self) -> Result<Outcome, String> {
+        let parameters = self.parameters();
+        let node = NodeParameters::load(&parameters, &self.flash, BOARD_NODE, |_| true);
+        let circumstances = Circumstances {
+            request: None,
+            strap: false,
+            crash_resets: 0,
+            node_id: node.id.map_or(255, NodeId::get),
+        };
+        match decide(&circumstances, &DECISION, |n| verify(&self.flash, &parameters, &LAYOUT, n)) {
+            BootDecision::Stay(_) => Ok(Outcome::Bootloader),
+            BootDecision::Start { program, .. } => {
+                let region = LAYOUT.programs[usize::from(program.number()) - 1];
+                let cells = self.flash.cells(region);
+                let seed = cells[8];
+                let whole = image(program.number(), seed);
+                if cells[..whole.len()] == whole[..] {
+                    Ok(Outcome::Runs(seed))
+                } else {
+                    Err(format!("program {} would be started, and is not whole", program.number()))
+                }
+            }
+        }
+    }
+
+    /// Whether each program with a record is what the record says: nothing may vouch for a program that is not there.
+    ///
+    /// # Errors
+    /// The program that is not.
+    pub fn records_are_true(&self) -> Result<(), String> {
+        let parameters = self.parameters();
+        for (number, region) in (1..).zip(LAYOUT.programs) {
+            let Some(record) = ProgramRecord::load(&parameters, &self.flash, number) else { continue };
+            let program = Region::new(region.base, record.size.min(region.size));
+            if crc32(self.flash.cells(program)) != record.crc || !self.flash.is_stable(program) {
+                return Err(format!("program {number} has a record, and is not what it says"));
+            }
+        }
+        Ok(())
+    }
+
+    /// What program `number` is by its record: its seed, and whether it is signed.
+    pub fn installed(&self, number: u8) -> Option<(u8, bool)> {
+        let record = ProgramRecord::load(&self.parameters(), &self.flash, number)?;
+        Some((self.flash.cells(LAYOUT.programs[usize::from(number) - 1])[8], record.signed))
+    }
+
+    /// Node-ID and bit rate in force after the next reset.
+    pub fn node(&self) -> NodeParameters {
+        NodeParameters::load(&self.parameters(), &self.flash, BOARD_NODE, |_| true)
+    }
+
+    /// The power comes back.
+    pub fn power_on(&mut self) {
+        self.flash.power_on();
+        self.flash.touched.clear();
+    }
+
+    /// The boot stage with what it writes.
+    pub fn boot(&mut self) {
+        let mut parameters = self.parameters();
+        if parameters.get(&self.flash, Key::CrashCount).is_some_and(|[count, ..]| count > 0) {
+            parameters.store(Key::CrashCount, [0; 4]);
+            while parameters.poll(&mut self.flash).is_pending() {}
+        }
+    }
+
+    /// A value that the running device stores.
+    pub fn store(&mut self, key: Key, value: Value) {
+        let mut parameters = self.parameters();
+        parameters.store(key, value);
+        while parameters.poll(&mut self.flash).is_pending() {}
+    }
+
+    /// Bootloader mode, with a host that talks to it.
+    pub fn host<R>(&mut self, talk: impl FnOnce(&mut Host<'_, '_>) -> R) -> R {
+        let (parameters, node) = (self.parameters(), self.node());
+        let config = if self.bug == Some(Bug::EraseBeforeCheck) { &HASTY } else { &SOUND };
+        let flash = Chip { flash: &mut self.flash, bug: self.bug };
+        let mut buffer = [0; 256];
+        talk(&mut Host { node: Bootloader::new(config, 0, node, 0, parameters, flash, &mut buffer) })
+    }
+}
+
+/// What the host does by SDO and LSS, through the same calls that the protocol makes.
+pub struct Host<'b, 'f> {
+    node: Bootloader<'b, Chip<'f>, Store, PROGRAMS>,
+}
+
+impl Host<'_, '_> {
+    fn settle(&mut self) {
+        for _ in 0..1_000_000 {
+            if self.node.step() == Step::Idle {
+                return;
+            }
+        }
+        panic!("the work does not end");
+    }
+
+    /// 1F57h of a program.
+    fn status(&mut self, program: u8) -> u32 {
+        let mut bytes = [0; 4];
+        self.node.read(Address::new(0x1F57, program), &mut bytes).expect("1F57h can be read");
+        u32::from_le_bytes(bytes)
+    }
+
+    /// A command, carried out.
+    ///
+    /// # Errors
+    /// The abort or the status.
+    pub fn command(&mut self, program: u8, command: u8) -> Result<(), String> {
+        self.node.write(Address::new(0x1F51, program), &[command]).map_err(told)?;
+        self.settle();
+        self.ended(program)
+    }
+
+    /// A block, in SDO segments, and what becomes of it.
+    ///
+    /// # Errors
+    /// The abort or the status.
+    pub fn block(&mut self, program: u8, block: &[u8]) -> Result<(), String> {
+        let at = Address::new(0x1F50, program);
+        self.node.download_start(at, Some(block.len() as u32)).map_err(told)?;
+        for segment in block.chunks(7) {
+            if let Err(abort) = self.node.download_data(at, segment) {
+                self.node.download_cancel(at);
+                return Err(told(abort));
+            }
+        }
+        self.node.download_end(at).map_err(told)?;
+        self.settle();
+        self.ended(program)
+    }
+
+    fn ended(&mut self, program: u8) -> Result<(), String> {
+        match self.status(program) {
+            0 => Ok(()),
+            status => Err(format!("status {status:08X}h")),
+        }
+    }
+
+    /// LSS: configure node-ID and bit rate, and store them.
+    ///
+    /// # Errors
+    /// That they could not be stored.
+    pub fn store_node(&mut self, node: NodeParameters) -> Result<(), String> {
+        let mut outcome = LssDevice::store(&mut self.node, node.id, Some(node.bit_rate));
+        while outcome.is_pending() {
+            self.node.step();
+            outcome = self.node.stored();
+        }
+        match outcome {
+            Poll::Ready(Err(error)) => Err(format!("LSS store: {error:?}")),
+            _ => Ok(()),
+        }
+    }
+}
+
+fn told(abort: AbortCode) -> String {
+    format!("abort {abort:?}")
+}
+
+/// Program `number` with this seed: a plausible vector table, and data that tell it from any other.
+pub fn image(number: u8, seed: u8) -> Vec<u8> {
+    let base = LAYOUT.programs[usize::from(number) - 1].base;
+    let len = 150 + usize::from(seed % 16) * 8;
+    let mut bytes: Vec<u8> = (0..len).map(|i| (i as u8).wrapping_mul(31) ^ seed).collect();
+    bytes[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
+    bytes[4..8].copy_from_slice(&(base + 0x101).to_le_bytes());
+    bytes[8] = seed;
+    bytes
+}
+
+/// A chip as `boot-core` sees it, one bug included.
+struct Chip<'f> {
+    flash: &'f mut ModelFlash,
+    bug: Option<Bug>,
+}
+
+impl Flash for Chip<'_> {
+    fn read(&self, address: u32, buffer: &mut [u8]) {
+        self.flash.read(address, buffer);
+    }
+
+    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashFault> {
+        let mut first = [0; 4];
+        self.flash.read(sector.region.base, &mut first);
+        if self.bug == Some(Bug::BlankAtFirstSight) && first == [0xFF; 4] {
+            return Ok(());
+        }
+        self.flash.start_erase(sector)
+    }
+
+    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashFault> {
+        self.flash.start_program(address, word)
+    }
+
+    fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
+        self.flash.poll()
+    }
+}
+
+/// The journal, or something that somebody took for one.
+enum Store {
+    Journal(Journal),
+    /// Stores this record where it should take one away, or none at all.
+    Instead(Journal, Option<Value>),
+    /// One region, record behind record; a word in front of each tells what it is about. `checked`: with a CRC behind it.
+    Naive {
+        checked: bool,
+        work: Vec<(u32, u32)>,
+    },
+}
+
+impl Store {
+    fn open(flash: &ModelFlash, bug: Option<Bug>) -> Self {
+        let journal = Journal::open(flash, LAYOUT.chip, LAYOUT.parameters);
+        match bug {
+            Some(Bug::JournalWithoutCrc) => Self::Naive { checked: false, work: Vec::new() },
+            Some(Bug::CompactionInPlace) => Self::Naive { checked: true, work: Vec::new() },
+            Some(Bug::EraseBeforeInvalidating) => Self::Instead(journal, None),
+            Some(Bug::SignatureBeforeData) => {
+                let new = image(1, super::scenario::NEW);
+                let record = ProgramRecord { size: new.len() as u32, crc: crc32(&new), signed: true };
+                Self::Instead(journal, Some(record.value()))
+            }
+            _ => Self::Journal(journal),
+        }
+    }
+}
+
+/// Words of a naive record: its key, four of value, its CRC.
+const NAIVE: usize = 6;
+
+fn naive_key(key: Key) -> u32 {
+    match key {
+        Key::Program(number) => 0x100 + u32::from(number),
+        Key::CrashCount => 0x200,
+        Key::Node => 0x300,
+    }
+}
+
+fn naive_crc(words: &[u32]) -> u32 {
+    crc32(&words.iter().flat_map(|word| word.to_le_bytes()).collect::<Vec<_>>())
+}
+
+/// The records of the naive store, and where the next one goes.
+fn naive_records<F: Flash>(flash: &F, checked: bool) -> (Vec<[u32; NAIVE]>, u32) {
+    let region = LAYOUT.parameters[0];
+    let mut records = Vec::new();
+    for base in (region.base..region.end()).step_by(4 * NAIVE) {
+        let record: [u32; NAIVE] = core::array::from_fn(|i| flash.read_word(base + 4 * i as u32));
+        if record == [u32::MAX; NAIVE] || base + 4 * NAIVE as u32 > region.end() {
+            return (records, base);
+        }
+        if !checked || naive_crc(&record[..NAIVE - 1]) == record[NAIVE - 1] {
+            records.push(record);
+        }
+    }
+    (records, region.end())
+}
+
+impl Parameters for Store {
+    fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value> {
+        match self {
+            Self::Journal(journal) | Self::Instead(journal, _) => journal.get(flash, key),
+            Self::Naive { checked, .. } => {
+                let (records, _) = naive_records(flash, *checked);
+                let found = records.iter().rev().find(|record| record[0] == naive_key(key))?;
+                Some([found[1], found[2], found[3], found[4]])
+            }
+        }
+    }
+
+    fn store(&mut self, key: Key, value: Value) {
+        match self {
+            Self::Instead(journal, instead) if key == Key::Program(1) && value == ProgramRecord::NONE => {
+                if let Some(instead) = instead {
+                    journal.store(key, *instead);
+                }
+            }
+            Self::Journal(journal) | Self::Instead(journal, _) => journal.store(key, value),
+            Self::Naive { work, .. } => {
+                let mut record = vec![naive_key(key), value[0], value[1], value[2], value[3]];
+                record.push(naive_crc(&record));
+                // The address is found when the flash can be read.
+                *work = record.into_iter().map(|word| (u32::MAX, word)).collect();
+            }
+        }
+    }
+
+    fn poll<F: Flash>(&mut self, flash: &mut F) -> Poll<Result<(), StoreError>> {
+        let Self::Naive { checked, work } = self else {
+            let (Self::Journal(journal) | Self::Instead(journal, _)) = self else { unreachable!() };
+            return journal.poll(flash);
+        };
+        match flash.poll() {
+            Poll::Pending => return Poll::Pending,
+            Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
+            Poll::Ready(Ok(())) => {}
+        }
+        let region = LAYOUT.parameters[0];
+        if let Some(&(u32::MAX, key)) = work.first() {
+            let (mut records, mut end) = naive_records(flash, *checked);
+            if end + 4 * NAIVE as u32 > region.end() {
+                // The bug: until all is written again there is nothing.
+                let new: Vec<u32> = work.iter().map(|(_, word)| *word).collect();
+                records.retain(|record| record[0] != key);
+                let mut latest: Vec<[u32; NAIVE]> = Vec::new();
+                for record in records {
+                    latest.retain(|other| other[0] != record[0]);
+                    latest.push(record);
+                }
+                let words = latest.into_iter().flatten().chain(new);
+                *work = (region.base..).step_by(4).zip(words).collect();
+                let Some(sector) = LAYOUT.chip.sector_at(region.base) else { unreachable!() };
+                return match flash.start_erase(sector) {
+                    Ok(()) => Poll::Pending,
+                    Err(error) => Poll::Ready(Err(StoreError::Flash(error))),
+                };
+            }
+            for (address, _) in work.iter_mut() {
+                *address = end;
+                end += 4;
+            }
+        }
+        if work.is_empty() {
+            return Poll::Ready(Ok(()));
+        }
+        let (address, word) = work.remove(0);
+        match flash.start_program(address, word) {
+            Ok(()) => Poll::Pending,
+            Err(error) => Poll::Ready(Err(StoreError::Flash(error))),
+        }
+    }
+}

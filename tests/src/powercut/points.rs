@@ -1,0 +1,343 @@
+//! Cuts the power, looks what is there, and counts.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::panic::{catch_unwind, AssertUnwindSafe};
+use std::str::FromStr;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::Mutex;
+
+use super::device::{Bug, Device, Outcome};
+use super::model::{quiet_power_cuts, until_power_cut, Cut};
+use super::scenario::{Allowed, Scenario, Tell, SCENARIOS};
+
+/// How many violations a report tells in words.
+const TOLD: usize = 10;
+/// How often a device is looked at: bits between 0 and 1 read differently each time.
+const LOOKS: usize = 4;
+
+/// In which way an operation is cut.
+const KINDS: [(&str, Cut); 6] = [
+    ("before", Cut::Before),
+    ("after", Cut::After),
+    ("torn", Cut::Torn(7)),
+    ("torn-otherwise", Cut::Torn(8)),
+    ("unstable", Cut::Unstable(10)),
+    ("all-but-one-bit", Cut::Unstable(9)),
+];
+
+/// One cut: the number of the flash operation, counted from the power-on, and the way.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct At {
+    operation: u32,
+    kind: usize,
+}
+
+/// A point of the proof: a scenario, a cut, and perhaps another one in the recovery. Written as
+/// `update:37:torn` or `update:37:torn:12:after`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Point {
+    scenario: &'static str,
+    first: At,
+    second: Option<At>,
+}
+
+impl fmt::Display for Point {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.scenario)?;
+        for at in [Some(self.first), self.second].into_iter().flatten() {
+            write!(f, ":{}:{}", at.operation, KINDS[at.kind].0)?;
+        }
+        Ok(())
+    }
+}
+
+impl FromStr for Point {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let mut words = text.split(':');
+        let name = words.next().unwrap_or_default();
+        let scenario = SCENARIOS.iter().find(|scenario| scenario.name == name).ok_or_else(|| {
+            let names: Vec<_> = SCENARIOS.iter().map(|scenario| scenario.name).collect();
+            format!("{name:?} is no scenario; there are {}.", names.join(", "))
+        })?;
+        let mut at = || -> Result<Option<At>, String> {
+            let Some(operation) = words.next() else { return Ok(None) };
+            let operation =
+                operation.parse().map_err(|_| format!("{operation:?} is no number of an operation."))?;
+            let kind = words.next().unwrap_or_default();
+            let kind = KINDS.iter().position(|(name, _)| *name == kind).ok_or_else(|| {
+                let names: Vec<_> = KINDS.iter().map(|(name, _)| *name).collect();
+                format!("{kind:?} is no way to cut; there are {}.", names.join(", "))
+            })?;
+            Ok(Some(At { operation, kind }))
+        };
+        let first = at()?.ok_or("a point names an operation: update:37:torn.")?;
+        let point = Self { scenario: scenario.name, first, second: at()? };
+        match words.next() {
+            None => Ok(point),
+            Some(more) => Err(format!("{more:?}: a point has two cuts at most.")),
+        }
+    }
+}
+
+/// What a scenario has shown.
+#[derive(Clone, Debug, Default)]
+pub struct Report {
+    /// Flash operations of the scenario without a cut.
+    pub operations: u32,
+    /// Cuts, single and double.
+    pub points: u64,
+    /// What the device did when the power came back, and how often.
+    pub outcomes: BTreeMap<String, u64>,
+    /// Points at which something was found that must not be.
+    pub violations: u64,
+    /// The first of them: where, and what.
+    pub told: Vec<(Point, String)>,
+}
+
+impl Report {
+    fn add(&mut self, other: Self) {
+        self.points += other.points;
+        for (outcome, count) in other.outcomes {
+            *self.outcomes.entry(outcome).or_default() += count;
+        }
+        self.violations += other.violations;
+        self.told.extend(other.told);
+        self.told.truncate(TOLD);
+    }
+
+    fn count(&mut self, point: &Point, found: Result<Outcome, String>) -> bool {
+        self.points += 1;
+        match found {
+            Ok(outcome) => {
+                let outcome = match outcome {
+                    Outcome::Bootloader => "bootloader",
+                    Outcome::Runs(super::scenario::OLD) => "old program",
+                    Outcome::Runs(_) => "new program",
+                };
+                *self.outcomes.entry(outcome.into()).or_default() += 1;
+                true
+            }
+            Err(what) => {
+                self.violations += 1;
+                if self.told.len() < TOLD {
+                    self.told.push((point.clone(), what));
+                }
+                false
+            }
+        }
+    }
+}
+
+type Script = fn(&Scenario, &mut Device, &Allowed, Tell<'_>) -> Result<(), String>;
+
+/// A script, cut or not.
+struct Run {
+    cut: bool,
+    operations: u32,
+    /// Where the cut struck.
+    struck: String,
+    /// What may be found now.
+    allowed: Allowed,
+    /// What the device refused.
+    outcome: Result<(), String>,
+}
+
+fn run_script(
+    scenario: &Scenario,
+    script: Script,
+    device: &mut Device,
+    from: Allowed,
+    at: Option<At>,
+) -> Run {
+    let mut allowed = from.clone();
+    let mut outcome = Ok(());
+    device.flash.cut = at.map(|at| (at.operation, KINDS[at.kind].1));
+    let cut = until_power_cut(|| outcome = script(scenario, device, &from, &mut |now| allowed = now));
+    let operations = device.flash.operations;
+    let struck = device.flash.touched.last().map_or_else(String::new, |region| match region.size {
+        4 => format!("programming the word at {:08X}h", region.base),
+        size => format!("erasing {size} bytes at {:08X}h", region.base),
+    });
+    device.power_on();
+    Run { cut, operations, struck, allowed, outcome }
+}
+
+/// What the device does now, if that is allowed, whenever one looks.
+fn look(device: &Device, allowed: &Allowed) -> Result<Outcome, String> {
+    let mut last = Outcome::Bootloader;
+    for _ in 0..LOOKS {
+        device.records_are_true()?;
+        last = device.decision()?;
+        if !allowed.outcomes.contains(&last) {
+            return Err(format!("{last:?}, where {:?} may be", allowed.outcomes));
+        }
+        let node = device.node();
+        if !allowed.nodes.contains(&node) {
+            return Err(format!("{node:?}, where {:?} may be", allowed.nodes));
+        }
+        let second = device.installed(2);
+        if !allowed.second.contains(&second) {
+            return Err(format!("program 2 is {second:?}, where {:?} may be", allowed.second));
+        }
+    }
+    Ok(last)
+}
+
+/// What is exactly so.
+fn exactly(device: &Device) -> Result<Allowed, String> {
+    Ok(Allowed {
+        outcomes: vec![device.decision()?],
+        nodes: vec![device.node()],
+        second: vec![device.installed(2)],
+    })
+}
+
+/// The recovery, to its end.
+fn completes(scenario: &Scenario, device: &Device, from: &Allowed) -> Result<(Outcome, u32), String> {
+    let mut device = device.clone();
+    let run = run_script(scenario, Scenario::recover, &mut device, from.clone(), None);
+    run.outcome.map_err(|error| format!("the recovery does not complete: {error}"))?;
+    let outcome = look(&device, &scenario.end()).map_err(|what| format!("after the recovery: {what}"))?;
+    Ok((outcome, run.operations))
+}
+
+/// All points whose first cut is at this operation.
+fn at_operation(scenario: &Scenario, device: &Device, operation: u32, every_kind: bool) -> Report {
+    let mut report = Report::default();
+    let Ok(start) = exactly(device) else { return report };
+    for kind in 0..KINDS.len() {
+        let first = At { operation, kind };
+        let mut device = device.clone();
+        let run = run_script(scenario, Scenario::act, &mut device, start.clone(), Some(first));
+        let point = Point { scenario: scenario.name, first, second: None };
+        let found = look(&device, &run.allowed);
+        let recovery = completes(scenario, &device, &run.allowed);
+        let sound = found.and_then(|found| recovery.clone().map(|_| found));
+        if !report.count(&point, sound) {
+            continue;
+        }
+        let Ok((_, operations)) = recovery else { continue };
+        for operation in 1..=operations {
+            let turn = (first.operation + operation) as usize % KINDS.len();
+            for kind in (0..KINDS.len()).filter(|kind| every_kind || *kind == turn) {
+                let second = At { operation, kind };
+                let mut device = device.clone();
+                let run =
+                    run_script(scenario, Scenario::recover, &mut device, run.allowed.clone(), Some(second));
+                let point = Point { second: Some(second), ..point.clone() };
+                let found = look(&device, &run.allowed)
+                    .and_then(|found| completes(scenario, &device, &run.allowed).map(|_| found));
+                report.count(&point, found);
+            }
+        }
+    }
+    report
+}
+
+/// Cuts the power at every operation of a scenario, in every way, and at every operation of the recovery; there in one way that
+/// changes from operation to operation, or in `every_kind`.
+///
+/// # Errors
+/// If the scenario does not even work without a cut.
+pub fn run(scenario: &Scenario, every_kind: bool) -> Result<Report, String> {
+    run_until(scenario, None, every_kind, u64::MAX)
+}
+
+/// Whether a bug shows in this scenario. Looks no further than to the first time.
+#[must_use]
+pub fn shows(scenario: &Scenario, bug: Bug) -> bool {
+    run_until(scenario, Some(bug), false, 1).map_or(true, |report| report.violations > 0)
+}
+
+fn run_until(
+    scenario: &Scenario,
+    bug: Option<Bug>,
+    every_kind: bool,
+    violations: u64,
+) -> Result<Report, String> {
+    quiet_power_cuts_once();
+    let device = scenario.device(bug);
+    let start = exactly(&device)?;
+    let mut through = device.clone();
+    let run = run_script(scenario, Scenario::act, &mut through, start, None);
+    let operations = run.operations;
+    run.outcome?;
+    look(&through, &run.allowed)?;
+
+    let next = AtomicU32::new(1);
+    let total = Mutex::new(Report { operations, ..Report::default() });
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    std::thread::scope(|scope| {
+        for _ in 0..threads {
+            let device = device.clone();
+            let (next, total) = (&next, &total);
+            scope.spawn(move || loop {
+                let operation = next.fetch_add(1, Ordering::Relaxed);
+                if operation > operations {
+                    break;
+                }
+                let report =
+                    catch_unwind(AssertUnwindSafe(|| at_operation(scenario, &device, operation, every_kind)))
+                        .unwrap_or_else(|_| {
+                            let first = At { operation, kind: 0 };
+                            let point = Point { scenario: scenario.name, first, second: None };
+                            Report {
+                                violations: 1,
+                                told: vec![(point, "a panic".into())],
+                                ..Report::default()
+                            }
+                        });
+                let mut total = total.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+                total.add(report);
+                if total.violations >= violations {
+                    break;
+                }
+            });
+        }
+    });
+    Ok(total.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
+}
+
+/// One point, in words.
+#[must_use]
+pub fn reproduce(point: &Point) -> String {
+    quiet_power_cuts_once();
+    let Some(scenario) = SCENARIOS.iter().find(|scenario| scenario.name == point.scenario) else {
+        return format!("{point}: there is no such scenario.");
+    };
+    let mut device = scenario.device(None);
+    let mut text = format!("{point}: {}\n", scenario.about);
+    let mut allowed = match exactly(&device) {
+        Ok(start) => start,
+        Err(what) => return text + &what,
+    };
+    let mut script: Script = Scenario::act;
+    for at in [Some(point.first), point.second].into_iter().flatten() {
+        let run = run_script(scenario, script, &mut device, allowed, Some(at));
+        allowed = run.allowed;
+        let (operation, kind) = (at.operation, KINDS[at.kind].0);
+        text += &if run.cut {
+            format!("cut at operation {operation} ({kind}), {}\n", run.struck)
+        } else {
+            format!("no cut: there is no operation {operation}, {} are all\n", run.operations)
+        };
+        text += &match look(&device, &allowed) {
+            Ok(outcome) => format!("  power on: {outcome:?}, node {:?}\n", device.node()),
+            Err(what) => format!("  VIOLATION: {what}\n"),
+        };
+        script = Scenario::recover;
+    }
+    text += &match completes(scenario, &device, &allowed) {
+        Ok((outcome, operations)) => format!("recovery, {operations} operations: {outcome:?}\n"),
+        Err(what) => format!("  VIOLATION: {what}\n"),
+    };
+    text
+}
+
+fn quiet_power_cuts_once() {
+    static ONCE: std::sync::Once = std::sync::Once::new();
+    ONCE.call_once(quiet_power_cuts);
+}

@@ -1,0 +1,374 @@
+//! What is done to the device, and what may be found after a cut at any time.
+
+use boot_core::canopen::{BitRate, NodeId};
+use boot_core::crc32;
+use boot_core::node::NodeParameters;
+use boot_core::parameters::Key;
+
+use super::device::{image, Device, Outcome, BOARD_NODE, LAYOUT, PRODUCT_CODE, VENDOR_ID};
+
+/// Seed of the program that is there before an update.
+pub const OLD: u8 = 0xA3;
+/// Seed of the program that comes.
+pub const NEW: u8 = 0xB7;
+
+const START_OLD: Outcome = Outcome::Runs(OLD);
+const START_NEW: Outcome = Outcome::Runs(NEW);
+const STAY: Outcome = Outcome::Bootloader;
+
+const CLEAR: u8 = 0x03;
+const SET_SIGNATURE: u8 = 0x83;
+const CLR_SIGNATURE: u8 = 0x84;
+
+/// What may be found when the power comes back.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Allowed {
+    /// What the device may do.
+    pub outcomes: Vec<Outcome>,
+    /// What its node-ID and bit rate may be.
+    pub nodes: Vec<NodeParameters>,
+    /// What program 2 may be: its seed and whether it is signed.
+    pub second: Vec<Option<(u8, bool)>>,
+}
+
+/// Told by a script as it goes on.
+pub type Tell<'a> = &'a mut dyn FnMut(Allowed);
+
+/// A story: how the device is before, what is done to it, and what brings it to the end after a cut.
+pub struct Scenario {
+    /// Its name on the command line.
+    pub name: &'static str,
+    /// What it is about.
+    pub about: &'static str,
+    /// The device before.
+    prepare: fn(&mut Device),
+    /// What is done; tells what may be found from now on.
+    act: fn(&mut Device, Tell<'_>) -> Result<(), String>,
+    /// What a host does after a cut, with what may be found before.
+    recover: fn(&mut Device, &Allowed, Tell<'_>) -> Result<(), String>,
+    /// What must be found in the end.
+    end: fn() -> Allowed,
+}
+
+impl Scenario {
+    /// The device as it is before.
+    pub fn device(&self, bug: Option<super::Bug>) -> Device {
+        let mut device = Device::new(bug);
+        (self.prepare)(&mut device);
+        device.power_on();
+        device
+    }
+
+    /// Power on, and the story.
+    ///
+    /// # Errors
+    /// What the device refused.
+    pub fn act(&self, device: &mut Device, _: &Allowed, tell: Tell<'_>) -> Result<(), String> {
+        device.boot();
+        (self.act)(device, tell)
+    }
+
+    /// Power on, and what a host does then.
+    ///
+    /// # Errors
+    /// What the device refused.
+    pub fn recover(&self, device: &mut Device, from: &Allowed, tell: Tell<'_>) -> Result<(), String> {
+        device.boot();
+        (self.recover)(device, from, tell)
+    }
+
+    /// What must be found in the end.
+    pub fn end(&self) -> Allowed {
+        (self.end)()
+    }
+}
+
+fn allowed(outcomes: &[Outcome]) -> Allowed {
+    Allowed { outcomes: outcomes.to_vec(), nodes: vec![BOARD_NODE], second: vec![None] }
+}
+
+fn with_nodes(outcomes: &[Outcome], nodes: &[NodeParameters]) -> Allowed {
+    Allowed { nodes: nodes.to_vec(), ..allowed(outcomes) }
+}
+
+fn with_second(outcomes: &[Outcome], second: &[Option<(u8, bool)>]) -> Allowed {
+    Allowed { second: second.to_vec(), ..allowed(outcomes) }
+}
+
+// --- block files -----------------------------------------------------------------------------------------------------
+
+fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    for word in [number, address, data.len() as u32] {
+        bytes.extend(word.to_le_bytes());
+    }
+    bytes.extend(data);
+    bytes.extend(crc32(&bytes).to_le_bytes());
+    bytes
+}
+
+fn words(words: &[u32]) -> Vec<u8> {
+    words.iter().flat_map(|word| word.to_le_bytes()).collect()
+}
+
+/// The blocks of a program; `crc` is what the last one says.
+fn blocks(number: u8, image: &[u8], product_code: u32, crc: u32) -> Vec<Vec<u8>> {
+    let base = LAYOUT.programs[usize::from(number) - 1].base;
+    let size = image.len() as u32;
+    let mut file = vec![block(0, 0, &words(&[size, VENDOR_ID, product_code]))];
+    for (i, data) in (0..).zip(image.chunks(96)) {
+        file.push(block(1 + i, base + 96 * i, data));
+    }
+    file.push(block(u32::MAX, 0, &words(&[size, crc])));
+    file
+}
+
+fn good(number: u8, seed: u8) -> Vec<Vec<u8>> {
+    let image = image(number, seed);
+    blocks(number, &image, PRODUCT_CODE, crc32(&image))
+}
+
+/// CLEAR and the blocks. `begun` is called before the first one is.
+fn download(
+    device: &mut Device,
+    number: u8,
+    file: &[Vec<u8>],
+    mut begun: impl FnMut(),
+) -> Result<(), String> {
+    device.host(|host| {
+        host.command(number, CLEAR)?;
+        begun();
+        file.iter().try_for_each(|block| host.block(number, block))
+    })
+}
+
+fn install(device: &mut Device, number: u8, seed: u8, signed: bool) {
+    download(device, number, &good(number, seed), || ()).expect("a sound device takes a good program");
+    if signed {
+        device.host(|host| host.command(number, SET_SIGNATURE)).expect("a sound device signs it");
+    }
+}
+
+/// An update of program 1 to the new program.
+fn update(device: &mut Device, tell: Tell<'_>) -> Result<(), String> {
+    download(device, 1, &good(1, NEW), || tell(allowed(&[START_OLD, STAY])))?;
+    tell(allowed(&[STAY, START_NEW]));
+    device.host(|host| host.command(1, SET_SIGNATURE))?;
+    tell(allowed(&[START_NEW]));
+    Ok(())
+}
+
+/// The same after a cut, when nobody knows what is there.
+fn update_after_a_cut(device: &mut Device, _: &Allowed, tell: Tell<'_>) -> Result<(), String> {
+    download(device, 1, &good(1, NEW), || tell(allowed(&[START_OLD, STAY, START_NEW])))?;
+    tell(allowed(&[STAY, START_NEW]));
+    device.host(|host| host.command(1, SET_SIGNATURE))
+}
+
+// --- the stories -----------------------------------------------------------------------------------------------------
+
+/// All of them.
+pub const SCENARIOS: &[Scenario] = &[
+    Scenario {
+        name: "first-install",
+        about: "a program into an empty device",
+        prepare: |_| (),
+        act: |device, tell| {
+            tell(allowed(&[STAY]));
+            download(device, 1, &good(1, NEW), || ())?;
+            tell(allowed(&[STAY, START_NEW]));
+            device.host(|host| host.command(1, SET_SIGNATURE))?;
+            tell(allowed(&[START_NEW]));
+            Ok(())
+        },
+        recover: update_after_a_cut,
+        end: || allowed(&[START_NEW]),
+    },
+    Scenario {
+        name: "update",
+        about: "another program in the place of one that runs",
+        prepare: |device| install(device, 1, OLD, true),
+        act: |device, tell| {
+            tell(allowed(&[START_OLD]));
+            update(device, tell)
+        },
+        recover: update_after_a_cut,
+        end: || allowed(&[START_NEW]),
+    },
+    Scenario {
+        name: "wrong-crc",
+        about: "an update whose last block tells another CRC, then the right one",
+        prepare: |device| install(device, 1, OLD, true),
+        act: |device, tell| {
+            tell(allowed(&[START_OLD]));
+            let wrong = blocks(1, &image(1, NEW), PRODUCT_CODE, 0xDEAD_BEEF);
+            let outcome = download(device, 1, &wrong, || tell(allowed(&[START_OLD, STAY])));
+            if outcome.is_ok() {
+                return Err("a program with a wrong CRC was taken".into());
+            }
+            tell(allowed(&[STAY]));
+            if device.host(|host| host.command(1, SET_SIGNATURE)).is_ok() {
+                return Err("a program with a wrong CRC was signed".into());
+            }
+            update(device, tell)
+        },
+        recover: update_after_a_cut,
+        end: || allowed(&[START_NEW]),
+    },
+    Scenario {
+        name: "wrong-product",
+        about: "an update for another product, which costs nothing",
+        prepare: |device| install(device, 1, OLD, true),
+        act: |device, tell| {
+            tell(allowed(&[START_OLD]));
+            let image = image(1, NEW);
+            let wrong = blocks(1, &image, PRODUCT_CODE ^ 1, crc32(&image));
+            match download(device, 1, &wrong, || ()) {
+                Ok(()) => Err("a program for another product was taken".into()),
+                Err(_) => Ok(()),
+            }
+        },
+        recover: update_after_a_cut,
+        end: || allowed(&[START_OLD, START_NEW]),
+    },
+    Scenario {
+        name: "erase",
+        about: "a program taken away by two CLEARs",
+        prepare: |device| install(device, 1, OLD, true),
+        act: |device, tell| {
+            tell(allowed(&[START_OLD, STAY]));
+            device.host(|host| {
+                host.command(1, CLEAR)?;
+                host.command(1, CLEAR)
+            })?;
+            tell(allowed(&[STAY]));
+            Ok(())
+        },
+        recover: update_after_a_cut,
+        end: || allowed(&[STAY, START_NEW]),
+    },
+    Scenario {
+        name: "sign",
+        about: "a signature set",
+        prepare: |device| install(device, 1, OLD, false),
+        act: |device, tell| {
+            tell(allowed(&[STAY, START_OLD]));
+            device.host(|host| host.command(1, SET_SIGNATURE))?;
+            tell(allowed(&[START_OLD]));
+            Ok(())
+        },
+        recover: |device, _, _| device.host(|host| host.command(1, SET_SIGNATURE)),
+        end: || allowed(&[START_OLD]),
+    },
+    Scenario {
+        name: "unsign",
+        about: "a signature taken away",
+        prepare: |device| install(device, 1, OLD, true),
+        act: |device, tell| {
+            tell(allowed(&[STAY, START_OLD]));
+            device.host(|host| host.command(1, CLR_SIGNATURE))?;
+            tell(allowed(&[STAY]));
+            Ok(())
+        },
+        recover: |device, _, _| device.host(|host| host.command(1, CLR_SIGNATURE)),
+        end: || allowed(&[STAY]),
+    },
+    Scenario {
+        name: "lss-store",
+        about: "node-ID and bit rate stored by layer setting services",
+        prepare: |device| install(device, 1, OLD, true),
+        act: |device, tell| {
+            tell(with_nodes(&[START_OLD], &[BOARD_NODE, node(9)]));
+            device.host(|host| host.store_node(node(9)))?;
+            tell(with_nodes(&[START_OLD], &[node(9)]));
+            Ok(())
+        },
+        recover: |device, _, _| device.host(|host| host.store_node(node(9))),
+        end: || with_nodes(&[START_OLD], &[node(9)]),
+    },
+    Scenario {
+        name: "compaction",
+        about: "so many stores of node-ID and bit rate that the journal changes over twice",
+        prepare: |device| install(device, 1, OLD, true),
+        act: |device, tell| {
+            let mut last = BOARD_NODE;
+            for id in 1..=50 {
+                tell(with_nodes(&[START_OLD], &[last, node(id)]));
+                device.host(|host| host.store_node(node(id)))?;
+                last = node(id);
+                tell(with_nodes(&[START_OLD], &[last]));
+            }
+            Ok(())
+        },
+        recover: |device, from, tell| {
+            tell(Allowed { nodes: [&from.nodes[..], &[node(100)]].concat(), ..from.clone() });
+            device.host(|host| host.store_node(node(100)))
+        },
+        end: || with_nodes(&[START_OLD], &[node(50), node(100)]),
+    },
+    Scenario {
+        name: "crash-count",
+        about: "the count of crashes, cleared by a power-on",
+        prepare: |device| {
+            install(device, 1, OLD, true);
+            device.store(Key::CrashCount, [2, 0, 0, 0]);
+        },
+        act: |_, tell| {
+            tell(allowed(&[START_OLD]));
+            Ok(())
+        },
+        recover: |_, _, _| Ok(()),
+        end: || allowed(&[START_OLD]),
+    },
+    Scenario {
+        name: "second-program",
+        about: "program 2 updated while program 1 stays what it is",
+        prepare: |device| {
+            install(device, 1, OLD, true);
+            install(device, 2, OLD, true);
+        },
+        act: |device, tell| {
+            const OLD_THERE: Option<(u8, bool)> = Some((OLD, true));
+            const UNSIGNED: Option<(u8, bool)> = Some((NEW, false));
+            const NEW_THERE: Option<(u8, bool)> = Some((NEW, true));
+            tell(with_second(&[START_OLD], &[OLD_THERE]));
+            download(device, 2, &good(2, NEW), || {
+                tell(with_second(&[START_OLD], &[OLD_THERE, None, UNSIGNED]))
+            })?;
+            tell(with_second(&[START_OLD], &[UNSIGNED, NEW_THERE]));
+            device.host(|host| host.command(2, SET_SIGNATURE))?;
+            tell(with_second(&[START_OLD], &[NEW_THERE]));
+            Ok(())
+        },
+        recover: |device, _, tell| {
+            let any = [Some((OLD, true)), None, Some((NEW, false)), Some((NEW, true))];
+            download(device, 2, &good(2, NEW), || tell(with_second(&[START_OLD], &any)))?;
+            device.host(|host| host.command(2, SET_SIGNATURE))
+        },
+        end: || with_second(&[START_OLD], &[Some((NEW, true))]),
+    },
+    Scenario {
+        name: "beside-the-second",
+        about: "program 1 updated while program 2 stays what it is",
+        prepare: |device| {
+            install(device, 1, OLD, true);
+            install(device, 2, OLD, true);
+        },
+        act: |device, tell| {
+            let beside = |outcomes: &[Outcome]| with_second(outcomes, &[Some((OLD, true))]);
+            tell(beside(&[START_OLD]));
+            update(device, &mut |now| tell(beside(&now.outcomes)))
+        },
+        recover: |device, from, tell| {
+            let beside = |outcomes: &[Outcome]| with_second(outcomes, &[Some((OLD, true))]);
+            update_after_a_cut(device, from, &mut |now| tell(beside(&now.outcomes)))
+        },
+        end: || with_second(&[START_NEW], &[Some((OLD, true))]),
+    },
+];
+
+/// The node-ID and bit rate of this number.
+fn node(id: u8) -> NodeParameters {
+    let bit_rate = if id.is_multiple_of(2) { BitRate::K250 } else { BitRate::K500 };
+    NodeParameters { id: NodeId::new(id), bit_rate }
+}
