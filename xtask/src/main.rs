@@ -19,6 +19,7 @@ mod fuzz;
 mod json;
 mod layout;
 mod lint;
+mod powercut;
 mod process;
 mod setup;
 mod size;
@@ -82,6 +83,12 @@ const JOBS: &[Job] = &[
         about: "how fast a program gets into the device, beside the limits of wire and flash",
         help: bench::HELP,
         run: bench::run,
+    },
+    Job {
+        name: "powercut",
+        about: "cut the power at every flash operation, and look what is there",
+        help: powercut::HELP,
+        run: powercut::run,
     },
     Job {
         name: "size",
