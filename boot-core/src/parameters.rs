@@ -148,16 +148,16 @@ impl Parameters for Journal {
     }
 
     fn store(&mut self, key: Key, value: Value) {
-        let record = record_slot(key.tag(), value);
-        let state = match self.active {
+        let mut storing = Storing { record: record_slot(key.tag(), value), attempts: 0, state: State::Begin };
+        match self.active {
             Some(Active { current: true, firm: false, region, sequence, .. }) => {
-                self.write(What::Firm, region, 0, header_slot(sequence, FORMAT))
+                self.write(&mut storing, What::Firm, region, 0, header_slot(sequence, FORMAT));
             }
-            Some(Active { current: true, .. }) => self.append(record),
-            None => State::Begin,
-            Some(_) => self.change_over(),
-        };
-        self.storing = Some(Storing { record, attempts: 0, state });
+            Some(Active { current: true, .. }) => self.append(&mut storing),
+            None => {}
+            Some(_) => self.change_over(&mut storing),
+        }
+        self.storing = Some(storing);
     }
 
     fn poll<F: Flash>(&mut self, flash: &mut F) -> Poll<Result<(), StoreError>> {
@@ -178,7 +178,7 @@ struct Storing {
     state: State,
 }
 
-#[derive(Clone, Copy, Debug)]
+#[derive(Debug)]
 enum State {
     /// No region is valid yet.
     Begin,
@@ -207,18 +207,18 @@ enum What {
 
 impl Journal {
     /// To the first free slot, or to a region that has some.
-    fn append(&self, record: Slot) -> State {
+    fn append(&self, storing: &mut Storing) {
         match self.active {
             Some(Active { region, free, .. }) if free < slots(&self.regions[region]) => {
-                self.write(What::Append, region, free, record)
+                self.write(storing, What::Append, region, free, storing.record);
             }
-            _ => self.change_over(),
+            _ => self.change_over(storing),
         }
     }
 
     /// To the other region.
-    fn change_over(&self) -> State {
-        State::Erase { eraser: SectorEraser::new(self.regions[self.other()]) }
+    fn change_over(&self, storing: &mut Storing) {
+        storing.state = State::Erase { eraser: SectorEraser::new(self.regions[self.other()]) };
     }
 
     /// The region that is not the active one.
@@ -226,91 +226,99 @@ impl Journal {
         self.active.map_or(0, |active| 1 - active.region)
     }
 
-    fn write(&self, what: What, region: usize, number: u32, slot: Slot) -> State {
-        State::Write { what, slot, writer: WordWriter::new(slot_address(&self.regions[region], number)) }
+    fn write(&self, storing: &mut Storing, what: What, region: usize, number: u32, slot: Slot) {
+        let writer = WordWriter::new(slot_address(&self.regions[region], number));
+        storing.state = State::Write { what, slot, writer };
     }
 
     fn carry_on<F: Flash>(&mut self, storing: &mut Storing, flash: &mut F) -> Poll<Result<(), StoreError>> {
         loop {
             let other = self.other();
-            storing.state = match &mut storing.state {
+            match &mut storing.state {
                 // A new device: its master shall not wait for an erase that changes nothing.
-                State::Begin if is_blank(flash, self.regions[other]) => State::Collect { from: 1, to: 1 },
-                State::Begin => self.change_over(),
+                State::Begin if is_blank(flash, self.regions[other]) => {
+                    storing.state = State::Collect { from: 1, to: 1 };
+                }
+                State::Begin => self.change_over(storing),
                 State::Erase { eraser } => match eraser.poll(flash, self.chip) {
                     Poll::Pending => return Poll::Pending,
                     Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
-                    Poll::Ready(Ok(())) => State::Collect { from: 1, to: 1 },
+                    Poll::Ready(Ok(())) => storing.state = State::Collect { from: 1, to: 1 },
                 },
                 State::Collect { from, to } => {
-                    let (from, to) = (*from, *to);
+                    let (at, to) = (*from, *to);
+                    *from += 1;
                     match self.active {
-                        Some(Active { region, free, .. }) if from < free => {
-                            match living_slot(flash, &self.regions[region], from, free, storing.record[0]) {
-                                Some(slot) => self.write(What::Copy { from, to }, other, to, slot),
-                                None => State::Collect { from: from + 1, to },
+                        Some(Active { region, free, .. }) if at < free => {
+                            if let Some(slot) =
+                                living_slot(flash, &self.regions[region], at, free, storing.record[0])
+                            {
+                                self.write(storing, What::Copy { from: at + 1, to }, other, to, slot);
                             }
                         }
-                        _ => self.write(What::Add { to }, other, to, storing.record),
+                        _ => self.write(storing, What::Add { to }, other, to, storing.record),
                     }
                 }
                 State::Write { what, slot, writer } => {
-                    let (what, slot) = (*what, *slot);
+                    let what = *what;
                     let Poll::Ready(outcome) = writer.poll(flash, SLOT_WORDS, |i| slot[i]) else {
                         return Poll::Pending;
                     };
-                    match self.written(what, outcome, storing)? {
-                        Some(next) => next,
-                        None => return Poll::Ready(Ok(())),
+                    if let Poll::Ready(end) = self.written(what, outcome, storing) {
+                        return Poll::Ready(end);
                     }
                 }
-            };
+            }
         }
     }
 
-    /// What follows when a slot was written or could not be; `None` when all is done.
+    /// What follows when a slot was written or could not be; ready when all is done.
     fn written(
         &mut self,
         what: What,
         outcome: Result<(), FlashFault>,
         storing: &mut Storing,
-    ) -> Result<Option<State>, StoreError> {
+    ) -> Poll<Result<(), StoreError>> {
         if let (What::Append, Some(active)) = (what, &mut self.active) {
             active.free += 1;
         }
         match outcome {
             Ok(()) => {}
-            // Left half-charged by a power cut, or worn: another slot, or another region, or this one erased.
-            Err(FlashFault::Verify) if storing.attempts < ATTEMPTS => {
-                storing.attempts += 1;
-                return Ok(Some(match what {
-                    What::Append => self.append(storing.record),
-                    _ => self.change_over(),
-                }));
+            Err(FlashFault::Verify) if storing.attempts == ATTEMPTS => {
+                return Poll::Ready(Err(StoreError::WornOut));
             }
-            Err(FlashFault::Verify) => return Err(StoreError::WornOut),
-            Err(error) => return Err(StoreError::Flash(error)),
+            // Left half-charged by a power cut, or worn: another slot, another region, or this one erased.
+            Err(FlashFault::Verify) => {
+                storing.attempts += 1;
+                match what {
+                    What::Append => self.append(storing),
+                    _ => self.change_over(storing),
+                }
+                return Poll::Pending;
+            }
+            Err(error) => return Poll::Ready(Err(StoreError::Flash(error))),
         }
         let other = self.other();
-        Ok(match what {
+        match what {
             What::Firm => {
                 if let Some(active) = &mut self.active {
                     active.firm = true;
                 }
-                Some(self.append(storing.record))
+                self.append(storing);
             }
-            What::Append => None,
-            What::Copy { from, to } => Some(State::Collect { from: from + 1, to: to + 1 }),
+            What::Append => return Poll::Ready(Ok(())),
+            What::Copy { from, to } => storing.state = State::Collect { from, to: to + 1 },
             What::Add { to } => {
                 let sequence = self.active.map_or(1, |active| active.sequence.wrapping_add(1));
                 let header = header_slot(sequence, FORMAT);
-                Some(self.write(What::Commit { to: to + 1, sequence }, other, 0, header))
+                self.write(storing, What::Commit { to: to + 1, sequence }, other, 0, header);
             }
             What::Commit { to, sequence } => {
                 self.active = Some(Active { region: other, sequence, free: to, current: true, firm: true });
-                None
+                return Poll::Ready(Ok(()));
             }
-        })
+        }
+        Poll::Pending
     }
 }
 
