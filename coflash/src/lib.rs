@@ -10,6 +10,7 @@
 //! | [`adapter`] | ways to a CAN bus, chosen by URL |
 //! | [`session`] | SDO with one node: values, commands, status |
 //! | [`flash`] | the update procedure, with its steps as events |
+//! | [`job`] | a file that says which devices get what |
 //! | [`many`] | the same for many devices at once |
 //! | [`hub`] | several conversations over one adapter |
 //! | [`info`] | what a device says about itself |
@@ -18,6 +19,7 @@
 //! | [`decode`] | frames in words |
 //! | [`candump`] | logs of frames |
 //! | [`diagnose`] | why a device may be silent |
+//! | [`config`] | a file with defaults for options |
 //! | [`error`] | what can go wrong with a device, with numbers and advice |
 //!
 //! Flashing a file takes these lines:
@@ -45,6 +47,7 @@
 pub mod adapter;
 pub mod block_file;
 pub mod candump;
+pub mod config;
 pub mod convert;
 pub mod decode;
 pub mod diagnose;
@@ -54,6 +57,7 @@ pub mod hub;
 pub mod image;
 pub mod info;
 pub mod inspect;
+pub mod job;
 pub mod lss;
 pub mod many;
 pub mod read;

@@ -3,7 +3,11 @@
 
 mod bus;
 
+use std::io::Write;
+use std::net::TcpStream;
 use std::process::Command;
+use std::sync::mpsc::RecvTimeoutError;
+use std::time::Duration;
 
 use bus::{Coflash, Folder, Nodes};
 use serde_json::{json, Value};
@@ -220,4 +224,56 @@ fn no_bus_no_node_no_sense() {
     assert_eq!(done.exit, 0, "{}", done.err);
     let done = coflash.run(&["start", "-N", "5", "-P", "2"]);
     assert_eq!(done.exit, 7, "{}{}", done.out, done.err);
+}
+
+/// Two hosts at work on one node: each comes to an end and says what happened, and the node takes the next update.
+#[test]
+fn a_second_host_on_the_same_node_ends_in_words() {
+    let folder = folder("two-hosts");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    for round in 1..=2 {
+        folder.write("program.bin", &program(round));
+        let update = [FLASH, &["-N", "5", "-v", "--command-timeout", "5000"]].concat();
+        let first = coflash.spawn(&update);
+        first.await_text("10 %");
+        let second = coflash.spawn(&update);
+        for host in [first, second] {
+            let done = host.wait();
+            assert!(matches!(done.exit, 0 | 5 | 6 | 7), "{}: {}{}", done.exit, done.out, done.err);
+            assert_eq!(done.exit == 0, !done.err.contains("error: "), "{}", done.err);
+            assert!(!done.err.contains("panicked"), "{}", done.err);
+        }
+        coflash.done(&update);
+        assert_eq!(folder.read("1.flash")[0x1_0000..0x4_2000], program(round));
+    }
+}
+
+/// Somebody else fills the bus, also with frames that look like answers of other nodes and like nothing at all.
+#[test]
+fn frames_of_others_are_passed_over() {
+    let folder = folder("noise");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let (stop, stopped) = std::sync::mpsc::channel::<()>();
+    let address = nodes.address().to_owned();
+    let noise = std::thread::spawn(move || {
+        let mut stream = TcpStream::connect(address).unwrap();
+        assert_eq!(bus::message(&mut stream), "< hi >");
+        stream.write_all(b"< open can0 >").unwrap();
+        assert_eq!(bus::message(&mut stream), "< ok >");
+        // Answers of node 6; an SDO that is too short; a heartbeat of five bytes; a 29-bit frame with an answer's number; PDOs.
+        let frames = b"< send 586 8 60 50 1F 1 0 0 0 0 >< send 586 8 80 50 1F 1 0 0 0 8 >< send 585 3 60 50 1F >\
+                       < send 705 5 0 0 0 0 0 >< send 00000585 8 80 50 1F 1 0 0 0 8 >< send 185 8 1 2 3 4 5 6 7 8 >";
+        let mut rounds = 0;
+        while stopped.recv_timeout(Duration::from_millis(1)) == Err(RecvTimeoutError::Timeout) {
+            stream.write_all(frames).unwrap();
+            rounds += 1;
+        }
+        rounds
+    });
+    coflash.done(&[FLASH, &["-N", "5", "--trial-run", "--verify"]].concat());
+    drop(stop);
+    assert!(noise.join().unwrap() > 10);
+    assert_eq!(folder.read("1.flash")[0x1_0000..0x4_2000], program(0xA5));
 }

@@ -7,6 +7,7 @@ use canopen::sdo::wire::{BlockAck, BlockEnd, Request, Response};
 use canopen::{Address, BitRate, NodeId};
 use coflash::block_file::BlockFile;
 use coflash::convert::{blocks_of, Label, Options, Region};
+use coflash::flash::{flash, Event, FlashOptions};
 use coflash::read::{read, Firmware, Format};
 use coflash::session::{Doing, Session, Timing};
 use emulator::frame::Frame;
@@ -60,16 +61,9 @@ impl Measurement {
 /// If the device refuses it, or the firmware was not built.
 #[must_use]
 pub fn measure(rate: BitRate, kib: u32) -> Measurement {
-    let bit_rate = rate.bits_per_second().expect("a rate that can be set");
-    let mut bench = Bench::new();
-    let board = bench.boards()[0];
-    bench.commission(board, NODE, rate);
-    bench.set_host_bit_rate(bit_rate);
-    bench.power_on();
-    bench.run_ms(50);
-
+    let (mut bench, bit_rate) = board_at(rate);
     let bytes = program(kib);
-    let file = blocks(&bytes);
+    let file = blocks(&bytes, BLOCK_SIZE);
     let from = bench.time();
     let poll = Timing {
         poll_first: Duration::from_millis(2),
@@ -85,6 +79,69 @@ pub fn measure(rate: BitRate, kib: u32) -> Measurement {
     }
     let took = (bench.time() - from).0 / 1_000_000;
     Measurement { bit_rate, kib, took, wire: wire_us(&bytes, bit_rate), flash: flash_us(bytes.len() as u32) }
+}
+
+/// A board that is up at this bit rate, and the bit rate in bit/s.
+fn board_at(rate: BitRate) -> (Bench, u32) {
+    let bit_rate = rate.bits_per_second().expect("a rate that can be set");
+    let mut bench = Bench::new();
+    let board = bench.boards()[0];
+    bench.commission(board, NODE, rate);
+    bench.set_host_bit_rate(bit_rate);
+    bench.power_on();
+    bench.run_ms(50);
+    (bench, bit_rate)
+}
+
+/// How busy a bus is while `coflash flash` sends a program over it.
+#[derive(Clone, Copy, Debug)]
+pub struct Load {
+    /// Bit rate in bit/s.
+    pub bit_rate: u32,
+    /// Size of the program in KiB.
+    pub kib: u32,
+    /// Bytes of a block, framing included.
+    pub block_size: usize,
+    /// From the first block to the status that says "verified", in us.
+    pub took: u64,
+    /// Of that, with a frame on the bus or in the intermission behind it, in us.
+    pub busy: u64,
+    /// Frames, of both directions.
+    pub frames: usize,
+}
+
+impl Load {
+    /// The load, in percent.
+    #[must_use]
+    pub fn percent(&self) -> u64 {
+        self.busy * 100 / self.took.max(1)
+    }
+}
+
+/// Has the procedure of `coflash flash`, as it is without any option but `--no-start`, bring a program of this size into a board in
+/// virtual time. So what the bus is idle is the procedure's and the device's doing, not the computer's.
+///
+/// # Panics
+/// If the device refuses it, or the firmware was not built.
+#[must_use]
+pub fn load(rate: BitRate, kib: u32, block_size: usize) -> Load {
+    let (mut bench, bit_rate) = board_at(rate);
+    let file = blocks(&program(kib), block_size);
+    let (clock, mut from, mut to) = (bench.clock(), None, None);
+    let options = FlashOptions { start: false, ..FlashOptions::default() };
+    flash(&mut bench.session(), &file, &options, &mut |event| match event {
+        Event::Erased { .. } => from = Some(clock.get()),
+        Event::Verified { .. } => to = Some(clock.get()),
+        _ => {}
+    })
+    .expect("a board that is well");
+    let (from, to) = (from.expect("CLEAR"), to.expect("verified"));
+    let frames: Vec<_> =
+        bench.records().into_iter().filter(|record| record.start >= from && record.end <= to).collect();
+    let intermission = 3 * 1_000_000_000_000 / u64::from(bit_rate);
+    let busy: u64 = frames.iter().map(|record| (record.end - record.start).0 + intermission).sum();
+    let [took, busy] = [(to - from).0, busy].map(|picoseconds| picoseconds / 1_000_000);
+    Load { bit_rate, kib, block_size, took, busy, frames: frames.len() }
 }
 
 /// The application, filled up with bytes that stuff as code does.
@@ -103,12 +160,12 @@ fn program(kib: u32) -> Vec<u8> {
     bytes
 }
 
-fn blocks(bytes: &[u8]) -> BlockFile {
+fn blocks(bytes: &[u8], block_size: usize) -> BlockFile {
     let region = firmware::board().programs[0];
     let image = read(bytes, Some(Format::Raw), Some(region.base)).expect("a raw image");
     let options = Options {
         region: Region::Strict(region.into()),
-        block_size: BLOCK_SIZE,
+        block_size,
         // Tells the size, so that sectors are erased ahead of the data.
         label: Label::Device { vendor_id: bsp::IDENTITY.vendor_id, product_code: bsp::IDENTITY.product_code },
         ..Options::default()

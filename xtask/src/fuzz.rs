@@ -11,7 +11,8 @@ pub const HELP: &str = "\
 usage: cargo xtask fuzz [--seconds N] [--target NAME]
 
 Runs the fuzz targets of fuzz/: SDO server, SDO client, the wire between them, LSS, program download,
-parameter journal, firmware files. What they find in this run is built upon in the next one.
+parameter journal, firmware files, candump logs, the text of SLCAN and socketcand, job and
+configuration files. What they find in this run is built upon in the next one.
 
   --seconds N     how long each target runs (default: 30)
   --target NAME   this one alone

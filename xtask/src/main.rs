@@ -19,6 +19,7 @@ mod fuzz;
 mod json;
 mod layout;
 mod lint;
+mod portable;
 mod powercut;
 mod process;
 mod setup;
@@ -107,6 +108,12 @@ const JOBS: &[Job] = &[
         about: "formatting and clippy, of host and firmware, warnings denied",
         help: lint::HELP,
         run: lint::run,
+    },
+    Job {
+        name: "portable",
+        about: "the host tools' code compiles for Windows and macOS",
+        help: portable::HELP,
+        run: portable::run,
     },
     Job {
         name: "setup",

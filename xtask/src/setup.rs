@@ -65,7 +65,7 @@ impl Setup {
     pub fn prepare(&self, parts: &[Part]) -> Outcome {
         self.packages(parts)?;
         if parts.contains(&Part::Firmware) {
-            rust_target()?;
+            rust_target(TARGET)?;
         }
         if parts.contains(&Part::Lint) {
             rust_components()?;
@@ -232,22 +232,26 @@ fn exists(pattern: &str) -> bool {
     below(Path::new("/"), &parts)
 }
 
-fn rust_target() -> Outcome {
+/// Sees to it that the libraries of a Rust target are there.
+///
+/// # Errors
+/// When they are missing and cannot be had; the message has the line to run.
+pub fn rust_target(target: &str) -> Outcome {
     let is_there = || -> Outcome<bool> {
         let sysroot = process::output(Command::new("rustc").args(["--print", "sysroot"]))?;
-        Ok(Path::new(sysroot.trim()).join("lib/rustlib").join(TARGET).join("lib").is_dir())
+        Ok(Path::new(sysroot.trim()).join("lib/rustlib").join(target).join("lib").is_dir())
     };
     if is_there()? {
         return Ok(());
     }
-    println!("Adding the Rust target {TARGET} ...");
-    let added = process::run(Command::new("rustup").args(["target", "add", TARGET]));
+    println!("Adding the Rust target {target} ...");
+    let added = process::run(Command::new("rustup").args(["target", "add", target]));
     if added.is_ok() && is_there()? {
         return Ok(());
     }
     Err(format!(
-        "the Rust target {TARGET} is missing and could not be added. With rustup (https://rustup.rs) and a \
-         connection, this line does it:\n\n    rustup target add {TARGET}"
+        "the Rust target {target} is missing and could not be added. With rustup (https://rustup.rs) and a \
+         connection, this line does it:\n\n    rustup target add {target}"
     ))
 }
 

@@ -98,7 +98,7 @@ impl<L: Line> Slcan<L> {
     /// # Errors
     /// [`AdapterError::Protocol`] where the adapter refuses, [`AdapterError::Lost`] where it goes.
     pub fn open(line: L, name: String, bit_rate: Option<u32>) -> Result<Self, AdapterError> {
-        let mut adapter = Self { line, name, opened: Instant::now(), partial: Vec::new(), rest: Vec::new() };
+        let mut adapter = Self::opened(line, name);
         // Whatever was under way before: end it, and close the bus. A bus that is closed already is refused, which is well.
         adapter.say("\r\rC\r")?;
         adapter.settle()?;
@@ -110,6 +110,11 @@ impl<L: Line> Slcan<L> {
         }
         adapter.command("O\r", "opening the bus")?;
         Ok(adapter)
+    }
+
+    /// The adapter at the other end of `line`, whose bus is open already.
+    pub fn opened(line: L, name: String) -> Self {
+        Self { line, name, opened: Instant::now(), partial: Vec::new(), rest: Vec::new() }
     }
 
     /// Gives a command and waits for the answer, if one comes.

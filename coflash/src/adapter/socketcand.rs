@@ -144,14 +144,17 @@ impl Adapter for Socketcand {
     }
 }
 
-/// `< send 605 8 40 0 10 0 0 0 0 0 >`; a 29-bit identifier has eight digits.
-fn send_message(frame: &Frame) -> String {
+/// What a client says to send a frame: `< send 605 8 40 0 10 0 0 0 0 0 >`; a 29-bit identifier has eight digits.
+#[must_use]
+pub fn send_message(frame: &Frame) -> String {
     let data: String = frame.data().iter().map(|byte| format!("{byte:02X} ")).collect();
     format!("< send {} {} {data}>", identifier(frame), frame.dlc())
 }
 
-/// `frame 585 12.345678 4000100000000000`; servers write the data with or without blanks between the bytes.
-fn parse_frame(message: &str) -> Option<Frame> {
+/// The frame that a server tells of: `frame 585 12.345678 4000100000000000`, without the brackets; servers write the data with or
+/// without blanks between the bytes. `None` for anything else.
+#[must_use]
+pub fn parse_frame(message: &str) -> Option<Frame> {
     let mut words = message.split_ascii_whitespace();
     let ("frame", Some(id), Some(_time)) = (words.next()?, words.next(), words.next()) else { return None };
     let id = parse_identifier(id)?;

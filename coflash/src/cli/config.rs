@@ -1,16 +1,13 @@
-//! The configuration file: defaults for options, so that they need not be typed.
+//! Where the configuration file is, and its way into the command line.
 //!
 //! What the command line or the environment says wins over it.
 
 use std::path::{Path, PathBuf};
 
 use clap::Command;
+use coflash::config::{parse, Fault, KEYS};
 
 use super::output::Failure;
-
-/// The options that a file may give defaults for.
-const KEYS: [&str; 8] =
-    ["bus", "node", "board", "block-size", "sdo-timeout", "command-timeout", "boot-timeout", "block-repeats"];
 
 /// The file: what `--config` or `COFLASH_CONFIG` says, otherwise `coflash.toml` in the current folder, otherwise the user's
 /// own; `None` where there is none.
@@ -28,26 +25,14 @@ pub(super) fn find(named: Option<PathBuf>) -> Option<PathBuf> {
 /// The command line with the file's values as defaults.
 pub(super) fn apply(command: Command, path: &Path) -> Result<Command, Failure> {
     let text = std::fs::read_to_string(path).map_err(|error| Failure::unreadable(path, &error))?;
-    let table: toml::Table = text.parse().map_err(|error: toml::de::Error| {
-        let line =
-            error.span().map_or(1, |span| 1 + text[..span.start.min(text.len())].matches('\n').count());
-        Failure::line(path, line, error.message())
+    let settings = parse(&text).map_err(|fault| match fault {
+        Fault::Line(line, what) => Failure::line(path, line, &what),
+        Fault::Setting(what) => {
+            Failure::usage(format!("{}: {what}", path.display()), format!("it may have {}", KEYS.join(", ")))
+        }
     })?;
     let mut command = command;
-    for (key, value) in table {
-        let wrong = |what: String| {
-            Failure::usage(format!("{}: {what}", path.display()), format!("it may have {}", KEYS.join(", ")))
-        };
-        if !KEYS.contains(&key.as_str()) {
-            return Err(wrong(format!("there is no setting '{key}'")));
-        }
-        let value = match value {
-            toml::Value::String(text) => text,
-            toml::Value::Integer(number) => number.to_string(),
-            other => {
-                return Err(wrong(format!("'{key}' must be a number or a text, and is {}", other.type_str())))
-            }
-        };
+    for (key, value) in settings {
         command = with_default(command, &key.replace('-', "_"), &value);
     }
     Ok(command)
@@ -79,18 +64,6 @@ mod tests {
     use clap::CommandFactory;
 
     use super::*;
-
-    #[test]
-    fn the_documentations_example_is_all_that_a_file_may_have() {
-        let page = include_str!("../../../docs/coflash.md");
-        let example = page.split("```toml\n").nth(1).and_then(|block| block.split("```").next()).unwrap();
-        let table: toml::Table = example.parse().unwrap();
-        let mut keys: Vec<&str> = table.keys().map(String::as_str).collect();
-        let mut known = KEYS.to_vec();
-        keys.sort_unstable();
-        known.sort_unstable();
-        assert_eq!(keys, known);
-    }
 
     #[test]
     fn every_setting_is_an_option_of_some_command() {

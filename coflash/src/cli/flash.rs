@@ -10,6 +10,7 @@ use coflash::adapter::Adapter;
 use coflash::block_file::BlockFile;
 use coflash::convert::Label;
 use coflash::flash::{flash, DeviceState, Event, FlashOptions, Report, Target};
+use coflash::job::{self, Entry, Settings};
 use coflash::lss::{ensure_node_id, LssAddress};
 use coflash::many::{flash_many, Job, ManyOptions};
 use coflash::session::Transfers;
@@ -18,7 +19,6 @@ use serde_json::{json, Value};
 use super::convert::Labels;
 use super::device::{cancelled, Patience};
 use super::file::{warn_left_out, Source};
-use super::job::{self, Entry, Settings};
 use super::legacy::Legacy;
 use super::many::{document, summary, write_report, Board, Outcome};
 use super::output::Failure;
@@ -156,7 +156,9 @@ impl Flash {
         // Devices that get the same share it.
         let mut known: Vec<(PathBuf, Option<String>, u8, Arc<BlockFile>)> = Vec::new();
         let mut devices = Vec::new();
-        for entry in job::read(job)? {
+        let text = std::fs::read_to_string(job).map_err(|error| Failure::unreadable(job, &error))?;
+        let entries = job::parse(&text, job.parent().unwrap_or(Path::new("")));
+        for entry in entries.map_err(|fault| Failure::job(job, &fault))? {
             let Entry { node, address, settings } = entry;
             let image = settings.image.clone().unwrap_or_default();
             let program = settings.program.unwrap_or(self.program);

@@ -16,7 +16,6 @@ mod flash;
 mod generate;
 mod info;
 mod inspect;
-mod job;
 mod legacy;
 mod lss;
 mod many;

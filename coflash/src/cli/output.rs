@@ -12,6 +12,7 @@ use coflash::convert::ConvertError;
 use coflash::diagnose::diagnose;
 use coflash::error::LssFailure;
 use coflash::flash::DeviceState;
+use coflash::job::Fault;
 use coflash::read::FileError;
 use coflash::session::Session;
 use coflash::Error;
@@ -191,9 +192,9 @@ impl Failure {
         Self { exit, number, what, left: None, advice, told: false }
     }
 
-    /// A fault in one device of a job file.
-    pub(super) fn job(path: &Path, device: usize, why: &str) -> Self {
-        Self::new(Exit::File, None, format!("{}, device {device}: {why}", path.display()), None)
+    /// A fault in a job file.
+    pub(super) fn job(path: &Path, fault: &Fault) -> Self {
+        Self::new(Exit::File, None, format!("{}, {fault}", path.display()), None)
     }
 
     /// The same, with the state in which the device is left.

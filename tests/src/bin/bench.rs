@@ -3,10 +3,12 @@
 use std::process::ExitCode;
 
 use canopen::BitRate;
-use coboot_tests::throughput::{measure, Measurement};
+use coboot_tests::throughput::{load, measure, Load, Measurement};
 
 const RATES: [BitRate; 4] = [BitRate::K125, BitRate::K250, BitRate::K500, BitRate::K1000];
 const SIZES: [u32; 3] = [64, 256, 900];
+/// The default of `coflash`, and the one of the downloads above.
+const BLOCK_SIZES: [usize; 2] = [1024, 4096];
 
 fn main() -> ExitCode {
     let json = match std::env::args().nth(1).as_deref() {
@@ -32,10 +34,51 @@ fn main() -> ExitCode {
             }
         }
     }
+    if !json {
+        println!("\nThe bus while `coflash flash` sends a program, from the first block to verified.\n");
+        println!("   kbit/s   KiB  block size     measured    frames     busy");
+    }
+    let mut loads = Vec::new();
+    for rate in RATES {
+        for block_size in BLOCK_SIZES {
+            let row = load(rate, 256, block_size);
+            if json {
+                loads.push(load_as_json(&row));
+            } else {
+                println!("{}", load_as_text(&row));
+            }
+        }
+    }
     if json {
-        println!("[\n{}\n]", rows.join(",\n"));
+        let (rows, loads) = (rows.join(",\n"), loads.join(",\n"));
+        println!("{{\"downloads\": [\n{rows}\n],\n\"bus\": [\n{loads}\n]}}");
     }
     ExitCode::SUCCESS
+}
+
+fn load_as_text(row: &Load) -> String {
+    format!(
+        "{:>9} {:>5} {:>11} {:>10.3} s {:>9} {:>6} %",
+        row.bit_rate / 1000,
+        row.kib,
+        row.block_size,
+        row.took as f64 / 1e6,
+        row.frames,
+        row.percent()
+    )
+}
+
+fn load_as_json(row: &Load) -> String {
+    format!(
+        "  {{\"bit_rate\": {}, \"kib\": {}, \"block_size\": {}, \"measured_us\": {}, \"busy_us\": {}, \"frames\": {}, \"percent\": {}}}",
+        row.bit_rate,
+        row.kib,
+        row.block_size,
+        row.took,
+        row.busy,
+        row.frames,
+        row.percent()
+    )
 }
 
 fn as_text(row: &Measurement) -> String {

@@ -1,12 +1,12 @@
 //! The job file of `coflash flash --job`: which devices get what.
 
+use std::fmt;
 use std::path::{Path, PathBuf};
 
 use canopen::NodeId;
-use coflash::lss::LssAddress;
 use serde::Deserialize;
 
-use super::output::Failure;
+use crate::lss::LssAddress;
 
 /// A job file. What is said at its top holds for every device that does not say otherwise.
 #[derive(Debug, Deserialize)]
@@ -21,15 +21,21 @@ struct File {
 /// What can be said for all devices and for each of them.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub(super) struct Settings {
+pub struct Settings {
     /// The firmware, from the job file's folder.
-    pub(super) image: Option<PathBuf>,
-    pub(super) board: Option<String>,
-    pub(super) program: Option<u8>,
-    pub(super) check_target: Option<bool>,
-    pub(super) trial_run: Option<bool>,
-    pub(super) start: Option<bool>,
-    pub(super) verify: Option<bool>,
+    pub image: Option<PathBuf>,
+    /// The board, by its name.
+    pub board: Option<String>,
+    /// The program's number, 1 to 254.
+    pub program: Option<u8>,
+    /// Compare the device's identity first.
+    pub check_target: Option<bool>,
+    /// Start the program once and call it back before it is signed.
+    pub trial_run: Option<bool>,
+    /// Start the program at the end.
+    pub start: Option<bool>,
+    /// Compare the CRC once more at the very end.
+    pub verify: Option<bool>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -54,29 +60,47 @@ struct Lss {
 
 /// One device of a job file, with the file's defaults.
 #[derive(Debug)]
-pub(super) struct Entry {
-    pub(super) node: Option<NodeId>,
-    pub(super) address: Option<LssAddress>,
-    pub(super) settings: Settings,
+pub struct Entry {
+    /// Its node-ID, or the one that it is to get.
+    pub node: Option<NodeId>,
+    /// Its LSS address, if it is named by that.
+    pub address: Option<LssAddress>,
+    /// How to treat it.
+    pub settings: Settings,
 }
 
-/// Reads a job file.
-pub(super) fn read(path: &Path) -> Result<Vec<Entry>, Failure> {
-    let text = std::fs::read_to_string(path).map_err(|error| Failure::unreadable(path, &error))?;
-    parse(&text, path)
+/// Where a job file is wrong, and what about it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Fault {
+    /// In this line.
+    Line(usize, String),
+    /// In the device of this number, counted from 1.
+    Device(usize, String),
 }
 
-fn parse(text: &str, path: &Path) -> Result<Vec<Entry>, Failure> {
-    let file: File = toml::from_str(text).map_err(|error| {
-        let line =
-            error.span().map_or(1, |span| 1 + text[..span.start.min(text.len())].matches('\n').count());
-        Failure::line(path, line, error.message())
-    })?;
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Line(line, what) => write!(f, "line {line}: {what}"),
+            Self::Device(number, what) => write!(f, "device {number}: {what}"),
+        }
+    }
+}
+
+impl std::error::Error for Fault {}
+
+/// Takes a job file apart that lies in this folder. There is at least one device in it; each has an image, and a node-ID or an LSS
+/// address that no other one has.
+///
+/// # Errors
+/// The first thing that is wrong with it.
+pub fn parse(text: &str, folder: &Path) -> Result<Vec<Entry>, Fault> {
+    let file: File = toml::from_str(text)
+        .map_err(|error| Fault::Line(line_of(text, &error), error.message().to_string()))?;
     let File { defaults, devices } = file;
-    let folder = path.parent().unwrap_or(Path::new(""));
     let mut entries: Vec<Entry> = Vec::new();
     for (number, device) in (1..).zip(devices) {
-        let wrong = |what: String| Failure::job(path, number, &what);
+        let wrong = |what: String| Fault::Device(number, what);
         if let Some(key) = device.unknown.keys().find(|key| !SETTINGS.contains(&key.as_str())) {
             return Err(wrong(format!("there is no setting '{key}'")));
         }
@@ -118,9 +142,15 @@ fn parse(text: &str, path: &Path) -> Result<Vec<Entry>, Failure> {
         entries.push(Entry { node, address, settings });
     }
     if entries.is_empty() {
-        return Err(Failure::line(path, 1, "it names no device: write a [[device]] for each"));
+        return Err(Fault::Line(1, "it names no device: write a [[device]] for each".to_string()));
     }
     Ok(entries)
+}
+
+/// The line, counted from 1, in which TOML is wrong.
+pub(crate) fn line_of(text: &str, error: &toml::de::Error) -> usize {
+    let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
+    1 + before.matches('\n').count()
 }
 
 /// The names of [`Settings`]: serde hands these to the table of the unknown, too.
@@ -131,7 +161,7 @@ mod tests {
     use super::*;
 
     fn job(text: &str) -> Result<Vec<Entry>, String> {
-        parse(text, Path::new("folder/job.toml")).map_err(|failure| failure.to_string())
+        parse(text, Path::new("folder")).map_err(|fault| fault.to_string())
     }
 
     #[test]
@@ -152,7 +182,7 @@ mod tests {
 
     #[test]
     fn the_documentations_example_is_a_job() {
-        let page = include_str!("../../../docs/coflash.md");
+        let page = include_str!("../../docs/coflash.md");
         let example = page.split("```toml\n").skip(1).filter_map(|block| block.split("```").next());
         let example = example.into_iter().find(|block| block.contains("[[device]]")).unwrap();
         let entries = job(example).unwrap();
@@ -165,13 +195,13 @@ mod tests {
     #[test]
     fn a_fault_is_named_with_its_place() {
         for (text, words) in [
-            ("", "job.toml, line 1: it names no device"),
-            ("image = 'a'\n\nimage = 'b'\n", "job.toml, line 3: "),
-            ("image = 5\n", "job.toml, line 1: "),
-            ("[[device]]\nnode = 5\n", "job.toml, device 1: it has no image"),
+            ("", "line 1: it names no device"),
+            ("image = 'a'\n\nimage = 'b'\n", "line 3: "),
+            ("image = 5\n", "line 1: "),
+            ("[[device]]\nnode = 5\n", "device 1: it has no image"),
             ("image = 'a'\n[[device]]\n", "device 1: it has neither node nor lss"),
             ("image = 'a'\n[[device]]\nnode = 128\n", "device 1: node-IDs are 1 to 127"),
-            ("image = 'a'\n[[device]]\nnode = 300\n", "job.toml, line "),
+            ("image = 'a'\n[[device]]\nnode = 300\n", "line "),
             ("image = 'a'\nprogram = 255\n[[device]]\nnode = 1\n", "device 1: programs are 1 to 254"),
             (
                 "image = 'a'\n[[device]]\nnode = 1\n[[device]]\nnode = 1\n",

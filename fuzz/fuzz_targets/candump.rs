@@ -1,0 +1,28 @@
+//! Lines of a candump log.
+//!
+//! Must hold: any text gives a frame, nothing, or an error that can be shown; a frame that was understood is written so that it is
+//! understood as the same again, with the same decoding into words.
+#![no_main]
+
+use coflash::candump::Line;
+use coflash::decode::Decoder;
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(|bytes: &[u8]| {
+    let text = String::from_utf8_lossy(bytes);
+    let mut decoder = Decoder::new();
+    for line in text.lines() {
+        match Line::parse(line) {
+            Err(error) => assert!(!error.is_empty()),
+            Ok(None) => {}
+            Ok(Some(found)) => {
+                let again = Line::parse(&found.to_string()).expect("what was written reads back");
+                let again = again.expect("as a frame");
+                assert_eq!((&again.interface, again.frame), (&found.interface, found.frame));
+                // A log has microseconds.
+                assert_eq!(again.time.as_micros(), found.time.as_micros());
+                let _ = decoder.decode(&found.frame);
+            }
+        }
+    }
+});
