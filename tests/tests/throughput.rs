@@ -2,7 +2,7 @@
 //! verifying included.
 
 use canopen::BitRate;
-use coboot_tests::throughput::measure;
+use coboot_tests::throughput::{load, measure};
 
 #[test]
 fn a_download_at_1_mbit_uses_nine_tenths_of_the_wire() {
@@ -12,4 +12,14 @@ fn a_download_at_1_mbit_uses_nine_tenths_of_the_wire() {
         // Nothing is faster than its limits: the yardstick is right, too.
         assert!(measured.took >= measured.limit(), "{measured:?}");
     }
+}
+
+/// The host tool as it is, with its default block size, keeps a fast bus busy: sectors are erased ahead of the data, and
+/// a look at the status takes little of its time.
+#[test]
+fn the_host_tool_saturates_the_bus_at_1_mbit() {
+    let load = load(BitRate::K1000, 256, 1024);
+    assert!((95..=100).contains(&load.percent()), "{load:?}");
+    // 256 KiB by 7 in a frame, and what goes with it.
+    assert!((37_450..42_000).contains(&load.frames), "{load:?}");
 }
