@@ -1,8 +1,32 @@
 //! `cargo xtask powercut`: the power cut at every flash operation, and what is there when it comes back.
 
+use std::fmt::Display;
 use std::process::ExitCode;
+use std::str::FromStr;
 
+use coboot_tests::powercut::board::{self, Effort, Story};
 use coboot_tests::powercut::{reproduce, run, Point, Report, SCENARIOS};
+
+/// So many points of level 2 between the first and the last ones, without `--full`.
+const SAMPLE: u64 = 24;
+
+/// A point of one of the levels.
+enum AnyPoint {
+    Model(Point),
+    Board(board::Point),
+}
+
+impl FromStr for AnyPoint {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text.split(':').next() == Some(board::NAME) {
+            text.parse().map(Self::Board)
+        } else {
+            text.parse().map(Self::Model)
+        }
+    }
+}
 
 fn main() -> ExitCode {
     let mut arguments = std::env::args().skip(1);
@@ -11,7 +35,7 @@ fn main() -> ExitCode {
         match argument.as_str() {
             "--full" => full = true,
             "--json" => json = true,
-            "--reproduce" => match arguments.next().map(|text| text.parse::<Point>()) {
+            "--reproduce" => match arguments.next().map(|text| text.parse::<AnyPoint>()) {
                 Some(Ok(given)) => point = Some(given),
                 Some(Err(why)) => return refuse(&why),
                 None => return refuse("--reproduce wants a point, as update:37:torn."),
@@ -24,7 +48,13 @@ fn main() -> ExitCode {
         }
     }
     if let Some(point) = point {
-        print!("{}", reproduce(&point));
+        match point {
+            AnyPoint::Model(point) => print!("{}", reproduce(&point)),
+            AnyPoint::Board(point) => match Story::new() {
+                Ok(story) => print!("{}", story.reproduce(point)),
+                Err(why) => return refuse(&format!("the board fails without any cut: {why}")),
+            },
+        }
         return ExitCode::SUCCESS;
     }
 
@@ -44,14 +74,26 @@ fn main() -> ExitCode {
         points += report.points;
         violations += report.violations;
         if json {
-            rows.push(as_json(scenario.name, &report));
+            rows.push(as_json(1, scenario.name, &report));
         } else {
             println!("{}", as_text(scenario.name, &report));
         }
     }
+    let report = match Story::new() {
+        Ok(story) => story.run(if full { Effort::Full } else { Effort::Sample(SAMPLE) }),
+        Err(why) => return refuse(&format!("the board fails without any cut: {why}")),
+    };
+    points += report.points;
+    violations += report.violations;
+    if json {
+        rows.push(as_json(2, board::NAME, &report));
+    } else {
+        println!("\nLevel 2: the built firmware in the emulator; what it did behind each cut.\n");
+        println!("{}", as_text(board::NAME, &report));
+    }
     if json {
         println!(
-            "{{\"level\": 1, \"points\": {points}, \"violations\": {violations}, \"scenarios\": [\n{}\n]}}",
+            "{{\"points\": {points}, \"violations\": {violations}, \"scenarios\": [\n{}\n]}}",
             rows.join(",\n")
         );
     } else {
@@ -70,11 +112,11 @@ fn refuse(why: &str) -> ExitCode {
     ExitCode::FAILURE
 }
 
-fn outcomes(report: &Report) -> [u64; 3] {
+fn outcomes<P>(report: &Report<P>) -> [u64; 3] {
     ["bootloader", "old program", "new program"].map(|what| report.outcomes.get(what).copied().unwrap_or(0))
 }
 
-fn as_text(name: &str, report: &Report) -> String {
+fn as_text<P: Display>(name: &str, report: &Report<P>) -> String {
     let [bootloader, old, new] = outcomes(report);
     let mut text = format!(
         "{name:<18} {:>10} {:>9} {bootloader:>12} {old:>12} {new:>12} {:>11}",
@@ -86,12 +128,12 @@ fn as_text(name: &str, report: &Report) -> String {
     text
 }
 
-fn as_json(name: &str, report: &Report) -> String {
+fn as_json<P: Display>(level: u8, name: &str, report: &Report<P>) -> String {
     let [bootloader, old, new] = outcomes(report);
     let told: Vec<_> =
         report.told.iter().map(|(point, what)| format!("{:?}", format!("{point}: {what}"))).collect();
     format!(
-        "  {{\"scenario\": \"{name}\", \"operations\": {}, \"points\": {}, \"bootloader\": {bootloader}, \"old_program\": {old}, \"new_program\": {new}, \"violations\": {}, \"told\": [{}]}}",
+        "  {{\"level\": {level}, \"scenario\": \"{name}\", \"operations\": {}, \"points\": {}, \"bootloader\": {bootloader}, \"old_program\": {old}, \"new_program\": {new}, \"violations\": {}, \"told\": [{}]}}",
         report.operations,
         report.points,
         report.violations,

@@ -3,7 +3,6 @@
 //! A point starts from a copy of the flash of a board that runs version 1, so that points depend on nothing before them and run
 //! beside each other. What must be in the flash in the end is taken from the ELF files by the emulator's own loader.
 
-use std::collections::BTreeMap;
 use std::fmt;
 use std::panic::{catch_unwind, AssertUnwindSafe};
 use std::str::FromStr;
@@ -15,6 +14,7 @@ use coflash::block_file::BlockFile;
 use coflash::flash::{flash, FlashOptions};
 use emulator::machine::{Cut, FlashCut, Machine, Options, Stop};
 
+use super::points::{Report, TOLD};
 use crate::bench::{Bench, NODE};
 use crate::firmware;
 
@@ -26,7 +26,7 @@ const BIT_RATE: u32 = 1_000_000;
 /// A board with a program says its boot-up within this time; in ms.
 const BOOT_MS: u64 = 200;
 /// The name before the numbers of a point.
-const NAME: &str = "board";
+pub const NAME: &str = "board";
 /// The first and last operations of an update, which are those on the parameters: a sample has all of them.
 const EDGE: u64 = 10;
 
@@ -99,19 +99,6 @@ pub enum Effort {
     Sample(u64),
     /// Each operation in every way, and a cut in each recovery.
     Full,
-}
-
-/// What was shown.
-#[derive(Clone, Debug, Default)]
-pub struct Report {
-    /// Flash operations of the update without a cut.
-    pub operations: u64,
-    /// Points that were run.
-    pub points: u64,
-    /// What the device did when the power came back behind a cut, and how often.
-    pub outcomes: BTreeMap<&'static str, u64>,
-    /// Points at which something was found that must not be, and what.
-    pub violations: Vec<(Point, String)>,
 }
 
 /// What answers when the power is back.
@@ -301,7 +288,7 @@ impl Story {
 
     /// Runs points on all cores.
     #[must_use]
-    pub fn run(&self, effort: Effort) -> Report {
+    pub fn run(&self, effort: Effort) -> Report<Point> {
         let points = self.points(effort);
         let next = AtomicUsize::new(0);
         let total = Mutex::new(Report { operations: self.operations, ..Report::default() });
@@ -317,10 +304,15 @@ impl Story {
                         match found {
                             Ok(found) => {
                                 for outcome in found {
-                                    *total.outcomes.entry(outcome.name()).or_default() += 1;
+                                    *total.outcomes.entry(outcome.name().into()).or_default() += 1;
                                 }
                             }
-                            Err(what) => total.violations.push((point, what)),
+                            Err(what) => {
+                                total.violations += 1;
+                                if total.told.len() < TOLD {
+                                    total.told.push((point, what));
+                                }
+                            }
                         }
                     }
                 });

@@ -12,7 +12,7 @@ use super::model::{quiet_power_cuts, until_power_cut, Cut};
 use super::scenario::{Allowed, Scenario, Tell, SCENARIOS};
 
 /// How many violations a report tells in words.
-const TOLD: usize = 10;
+pub(super) const TOLD: usize = 10;
 /// How often a device is looked at: bits between 0 and 1 read differently each time.
 const LOOKS: usize = 4;
 
@@ -83,10 +83,10 @@ impl FromStr for Point {
 }
 
 /// What a scenario has shown.
-#[derive(Clone, Debug, Default)]
-pub struct Report {
+#[derive(Clone, Debug)]
+pub struct Report<P = Point> {
     /// Flash operations of the scenario without a cut.
-    pub operations: u32,
+    pub operations: u64,
     /// Cuts, single and double.
     pub points: u64,
     /// What the device did when the power came back, and how often.
@@ -94,7 +94,14 @@ pub struct Report {
     /// Points at which something was found that must not be.
     pub violations: u64,
     /// The first of them: where, and what.
-    pub told: Vec<(Point, String)>,
+    pub told: Vec<(P, String)>,
+}
+
+// Derived, it would want a point to have a default.
+impl<P> Default for Report<P> {
+    fn default() -> Self {
+        Self { operations: 0, points: 0, outcomes: BTreeMap::new(), violations: 0, told: Vec::new() }
+    }
 }
 
 impl Report {
@@ -268,7 +275,7 @@ fn run_until(
     look(&through, &run.allowed)?;
 
     let next = AtomicU32::new(1);
-    let total = Mutex::new(Report { operations, ..Report::default() });
+    let total = Mutex::new(Report { operations: operations.into(), ..Report::default() });
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     std::thread::scope(|scope| {
         for _ in 0..threads {
