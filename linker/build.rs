@@ -1,6 +1,8 @@
-//! The build script of every image: hands the linker the numbers of the chosen board and the image's template.
+//! The build script of every image: hands the linker the numbers of the chosen board and the image's template. For the
+//! bootloader it builds the resident part first, which is a program of its own.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::{env, fs};
 
 use shared_abi::layout::{Image, BOARDS};
@@ -13,16 +15,18 @@ fn main() {
             env::var_os(format!("CARGO_FEATURE_BOARD_{feature}")).is_some()
         })
         .expect("choose a board by one of the features `board-…`");
+    let has = |feature: &str| env::var_os(format!("CARGO_FEATURE_{feature}")).is_some();
     let (image, template) = match env::var("CARGO_PKG_NAME").as_deref() {
+        Ok("bootloader") if has("RESIDENT") => (Image::Bootloader, "resident.x"),
         Ok("bootloader") => (Image::Bootloader, "bootloader.x"),
-        _ if env::var_os("CARGO_FEATURE_PROGRAM_2").is_some() => (Image::Program(2), "application.x"),
+        _ if has("PROGRAM_2") => (Image::Program(2), "application.x"),
         _ => (Image::Program(1), "application.x"),
     };
     let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
     fs::write(out.join("memory.x"), layout.linker_script(image).to_string()).expect("OUT_DIR is writable");
 
-    let templates =
-        PathBuf::from(env::var_os("CARGO_MANIFEST_DIR").expect("cargo sets it")).join("../linker");
+    let package = PathBuf::from(env::var_os("CARGO_MANIFEST_DIR").expect("cargo sets it"));
+    let templates = package.join("../linker");
     println!("cargo:rerun-if-changed={}", templates.display());
     println!("cargo:rustc-link-search={}", out.display());
     println!("cargo:rustc-link-search={}", templates.display());
@@ -30,4 +34,43 @@ fn main() {
     println!("cargo:rustc-link-arg-bins=--nmagic");
     // Functions that compile to the same code are one.
     println!("cargo:rustc-link-arg-bins=--icf=all");
+    match template {
+        "resident.x" => println!("cargo:rustc-link-arg-bins=--oformat=binary"),
+        "bootloader.x" => resident(&package, &out),
+        _ => {}
+    }
+}
+
+/// Builds the resident part with the features of the bootloader, and leaves its bytes as `OUT_DIR/resident.bin`.
+fn resident(package: &Path, out: &Path) {
+    let workspace = package.join("..");
+    for used in ["bootloader/src", "boot-core/src", "bsp/src", "canopen/src", "shared-abi/src", ".cargo"] {
+        println!("cargo:rerun-if-changed={}", workspace.join(used).display());
+    }
+    let features = env::vars().filter_map(|(name, _)| {
+        let feature = name.strip_prefix("CARGO_FEATURE_")?.to_lowercase().replace('_', "-");
+        (feature != "default").then_some(feature)
+    });
+    let features: Vec<String> = features.chain(["resident".to_owned()]).collect();
+    // The folder of the outer build's profile; a lock of its own.
+    let target = out.ancestors().nth(3).expect("OUT_DIR lies deep in the target folder").join("resident");
+    let triple = env::var("TARGET").expect("cargo sets it");
+
+    let mut cargo = Command::new(env::var_os("CARGO").expect("cargo sets it"));
+    cargo.current_dir(&workspace).args(["build", "--quiet", "--package=bootloader", "--bin=resident"]);
+    cargo.args(["--profile=firmware", "--no-default-features", "--target", &triple, "--features"]);
+    cargo.arg(features.join(",")).arg("--target-dir").arg(&target);
+    // What the outer build was told about itself.
+    let own = ["CARGO_HOME", "CARGO_MAKEFLAGS", "CARGO_NET_OFFLINE"];
+    let told = env::vars_os().map(|(name, _)| name).filter(|name| {
+        let name = name.to_string_lossy();
+        name == "RUSTC_WORKSPACE_WRAPPER" || name.starts_with("CARGO") && !own.contains(&&*name)
+    });
+    for variable in told {
+        cargo.env_remove(variable);
+    }
+    let status = cargo.status().expect("cargo can be started");
+    assert!(status.success(), "the resident part of the bootloader does not build");
+    let built = target.join(&triple).join("firmware").join("resident");
+    fs::copy(&built, out.join("resident.bin")).expect("the resident part was built");
 }

@@ -5,6 +5,7 @@
 
 use core::ops::RangeInclusive;
 
+use shared_abi::handoff::ResetCause;
 use shared_abi::warm_start::BootRequest;
 
 use crate::program::{Invalid, VerifiedProgram};
@@ -16,7 +17,7 @@ pub struct Circumstances {
     pub request: Option<BootRequest>,
     /// The entry strap asks for the bootloader.
     pub strap: bool,
-    /// Resets in a row by which the watchdog ended a running application.
+    /// [`Policy::crash_resets`].
     pub crash_resets: u32,
     /// Node-ID of the device; one outside 1 to 127 is no node-ID.
     pub node_id: u8,
@@ -31,6 +32,24 @@ pub struct Policy {
     pub max_crash_resets: u32,
     /// Node-IDs with which programs may be started.
     pub node_ids: RangeInclusive<u8>,
+}
+
+impl Policy {
+    /// Resets in a row by which the application ended without being asked to, this one among them if it is one; `before` were counted. A
+    /// request is a new beginning, and so is a power-on or the reset pin, but not for an application that was given up already.
+    #[must_use]
+    pub fn crash_resets(&self, before: u32, cause: ResetCause, request: Option<BootRequest>) -> u32 {
+        use ResetCause::{IndependentWatchdog, LowPower, Software, WindowWatchdog};
+        match request {
+            Some(BootRequest::Fault) => before,
+            Some(_) => 0,
+            None if matches!(cause, IndependentWatchdog | WindowWatchdog | Software | LowPower) => {
+                before.saturating_add(1)
+            }
+            None if before < self.max_crash_resets => 0,
+            None => before,
+        }
+    }
 }
 
 /// Why the device stays in the bootloader.

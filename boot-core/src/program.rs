@@ -20,6 +20,8 @@ pub struct ProgramRecord {
     pub crc: u32,
     /// Whether 1F51h = 83h has marked it valid for the autostart.
     pub signed: bool,
+    /// The version that its control block told, 0 for none.
+    pub version: u32,
 }
 
 impl ProgramRecord {
@@ -28,14 +30,14 @@ impl ProgramRecord {
 
     /// From the parameters; `None` where there is no program.
     pub fn load<F: Flash>(parameters: &impl Parameters, flash: &F, number: u8) -> Option<Self> {
-        let [size, crc, signature, _] = parameters.get(flash, Key::Program(number))?;
-        (size > 0).then_some(Self { size, crc, signed: signature == SIGNATURE })
+        let [size, crc, signature, version] = parameters.get(flash, Key::Program(number))?;
+        (size > 0).then_some(Self { size, crc, signed: signature == SIGNATURE, version })
     }
 
     /// The stored form.
     #[must_use]
     pub const fn value(&self) -> Value {
-        [self.size, self.crc, if self.signed { SIGNATURE } else { 0 }, 0]
+        [self.size, self.crc, if self.signed { SIGNATURE } else { 0 }, self.version]
     }
 }
 

@@ -24,7 +24,7 @@ fn check(signed: bool, damage: impl FnOnce(&mut ModelFlash)) -> Result<VerifiedP
     bytes[4..8].copy_from_slice(&0x0801_0189_u32.to_le_bytes());
     flash.poke(0x0801_0000, &bytes);
     let mut journal = Journal::open(&flash, LAYOUT.chip, LAYOUT.parameters);
-    let record = ProgramRecord { size: 64, crc: boot_core::crc32(&bytes), signed };
+    let record = ProgramRecord { size: 64, crc: boot_core::crc32(&bytes), signed, version: 0 };
     journal.store(Key::Program(1), record.value());
     while journal.poll(&mut flash).is_pending() {}
     damage(&mut flash);

@@ -6,7 +6,7 @@ use core::task::Poll;
 
 use boot_core::crc;
 use boot_core::flash::{crc32_by_software, Flash, FlashFault};
-use bsp::pac;
+use bsp::{pac, LAYOUT};
 use shared_abi::geometry::{Region, Sector};
 
 /// Section 3.6.1: the two words that open the control register.
@@ -17,26 +17,45 @@ const WORDS: u8 = 0b10;
 /// The controller and the flash that it guards. The control register is locked whenever no operation runs.
 pub struct FlashController {
     registers: pac::FLASH,
-    crc: pac::CRC,
-    flash: Region,
+    /// The CRC unit, where it is not somebody else's.
+    crc: Option<pac::CRC>,
     running: bool,
 }
 
+/// What it guards.
+const FLASH: Region = LAYOUT.chip.flash;
+
 impl FlashController {
-    /// Takes the controller.
+    /// Takes the controller, and the CRC unit if `rcc` is there to switch it on.
     ///
-    /// Its caches are off after a reset, and stay so: they would show words as they were before they were programmed (section
-    /// 3.5.4), and a bootloader that runs from RAM gains nothing by them.
-    pub fn new(registers: pac::FLASH, crc: pac::CRC, rcc: &pac::RCC, flash: Region) -> Self {
-        rcc.ahb1enr().modify(|_, w| w.crcen().enabled());
-        Self { registers, crc, flash, running: false }
+    /// The caches of the flash have to be off: they would show words as they were before they were programmed (section
+    /// 3.5.4). They are so after a reset, and a bootloader that runs from RAM gains nothing by them.
+    ///
+    /// # Safety
+    /// Nobody else may use the two until this is dropped.
+    pub unsafe fn steal(rcc: Option<&pac::RCC>) -> Self {
+        let crc = rcc.map(|rcc| {
+            rcc.ahb1enr().modify(|_, w| w.crcen().enabled());
+            // SAFETY: the caller vouches for it.
+            unsafe { pac::CRC::steal() }
+        });
+        // SAFETY: the caller vouches for it.
+        Self { registers: unsafe { pac::FLASH::steal() }, crc, running: false }
     }
 
     /// Leaves both as after a reset.
     pub fn release(self, rcc: &pac::RCC) {
-        self.crc.cr().write(|w| w.reset().set_bit());
-        rcc.ahb1enr().modify(|_, w| w.crcen().disabled());
+        if let Some(crc) = &self.crc {
+            crc.cr().write(|w| w.reset().set_bit());
+            rcc.ahb1enr().modify(|_, w| w.crcen().disabled());
+        }
         self.clear_flags();
+    }
+
+    /// Whether somebody is at work on the flash, or has opened the control register for it.
+    #[cfg(feature = "resident")]
+    pub fn is_in_use(&self) -> bool {
+        self.registers.sr().read().bsy().bit_is_set() || self.registers.cr().read().lock().bit_is_clear()
     }
 
     /// Opens the control register for one operation. (A `write` starts from the register's reset value, in which LOCK is
@@ -66,7 +85,7 @@ impl FlashController {
 impl Flash for FlashController {
     fn read(&self, address: u32, buffer: &mut [u8]) {
         for (byte, address) in buffer.iter_mut().zip(address..) {
-            *byte = if self.flash.contains(address, 1) {
+            *byte = if FLASH.contains(address, 1) {
                 // SAFETY: the address is inside the memory-mapped flash, which is always readable; volatile, because
                 // the controller changes it behind the compiler's back.
                 unsafe { (address as *const u8).read_volatile() }
@@ -77,7 +96,7 @@ impl Flash for FlashController {
     }
 
     fn read_word(&self, address: u32) -> u32 {
-        if self.flash.contains(address, 4) && address.is_multiple_of(4) {
+        if FLASH.contains(address, 4) && address.is_multiple_of(4) {
             // SAFETY: as above, and aligned.
             unsafe { (address as *const u32).read_volatile() }
         } else {
@@ -88,14 +107,15 @@ impl Flash for FlashController {
     /// By the unit. It has the polynomial, but takes words with the most significant bit first, and starts anew: what went
     /// before comes back as one word that leaves it in the same state.
     fn crc32(&self, crc: u32, region: Region) -> u32 {
-        if !region.base.is_multiple_of(4) || !self.flash.contains(region.base, region.size) {
+        let Some(unit) = &self.crc else { return crc32_by_software(self, crc, region) };
+        if !region.base.is_multiple_of(4) || !FLASH.contains(region.base, region.size) {
             return crc32_by_software(self, crc, region);
         }
         let words = region.size / 4;
-        let unit = self.crc.dr();
+        let (control, unit) = (unit.cr(), unit.dr());
         // SAFETY: every word may be written to DR.
         let feed = |word: u32| unit.write(|w| unsafe { w.bits(word) });
-        self.crc.cr().write(|w| w.reset().set_bit());
+        control.write(|w| w.reset().set_bit());
         if crc != 0 {
             feed(u32::MAX ^ word_before((!crc).reverse_bits()));
         }
@@ -134,7 +154,7 @@ impl Flash for FlashController {
     }
 
     fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashFault> {
-        if !self.flash.contains(address, 4) || !address.is_multiple_of(4) {
+        if !FLASH.contains(address, 4) || !address.is_multiple_of(4) {
             return Err(FlashFault::Failed);
         }
         self.unlock();

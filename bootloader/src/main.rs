@@ -3,22 +3,23 @@
 //! | file | what it does | unsafe |
 //! |---|---|---|
 //! | `main.rs` | tasks: wiring only | no |
-//! | `boot.rs` | from the reset to the jump, or to `init` below | start-up, jump |
-//! | `flash.rs` | the flash controller | registers |
+//! | `product.rs` | the choices of a product | no |
+//! | `resident/` | what runs from flash: boot stage and callgate | jump, ABI |
+//! | `start.rs` | from the reset to the boot stage, and to `init` below | start-up |
+//! | `flash.rs` | the flash controller and the CRC unit | registers |
 //! | `ram_vectors.rs` | the vector table in RAM | one copy |
-//! | `watchdog.rs` | feeds the watchdog when all tasks are alive | registers |
-//! | `callgate.rs` | services for the application | its ABI |
+//! | `watchdog.rs` | feeds the watchdog when all tasks are alive | no |
 //! | `memory.rs` | `memcpy` and its kin, small | assembly |
 //!
 //! What the bootloader *is* stands in `boot-core` and `canopen`.
 #![no_std]
 #![no_main]
 
-mod boot;
-mod callgate;
 mod flash;
 mod memory;
+mod product;
 mod ram_vectors;
+mod start;
 mod watchdog;
 
 use cortex_m::peripheral::SCB;
@@ -28,13 +29,10 @@ use shared_abi::warm_start::BootRequest;
 
 systick_monotonic!(Mono, 1_000);
 
-/// Version of the bootloader: major in the upper half, minor in the lower.
-pub const VERSION: u32 = 0x0000_0001;
-
 /// A fault or a panic (which ends in one) must not silence the device: start again, and stay reachable.
 #[cortex_m_rt::exception]
 unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
-    boot::warm_start_cell().put(BootRequest::Fault);
+    product::warm_start_cell().put(BootRequest::Fault);
     SCB::sys_reset()
 }
 
@@ -59,7 +57,7 @@ mod app {
     use rtic::Mutex;
     use shared_abi::warm_start::BootRequest;
 
-    use super::{boot, Mono};
+    use super::{product, start, Mono};
     use crate::flash::FlashController;
     use crate::ram_vectors;
     use crate::watchdog::{self, Task, Watchdog};
@@ -100,7 +98,7 @@ mod app {
             serial_number: 0,
         },
         layout: LAYOUT,
-        supports: boot::supports,
+        supports: product::supports,
         boot_up_emergency: BOOT_UP_EMERGENCY,
         download: Policy { identity: Some((IDENTITY.vendor_id, IDENTITY.product_code)), ..Policy::DEFAULT },
     };
@@ -108,7 +106,7 @@ mod app {
     #[shared]
     struct Shared {
         can: Port<CanController>,
-        bootloader: Bootloader<'static, FlashController, boot::Parameters, PROGRAMS>,
+        bootloader: Bootloader<'static, FlashController, product::Parameters, PROGRAMS>,
     }
 
     #[local]
@@ -122,10 +120,9 @@ mod app {
     }
 
     /// The device is about to reset.
-    #[derive(Default)]
     pub struct Leaving {
         wanted: bool,
-        request: Option<BootRequest>,
+        request: BootRequest,
         /// When; set once the answer is on the bus.
         at: Option<Instant>,
     }
@@ -134,12 +131,13 @@ mod app {
     fn init(mut cx: init::Context) -> (Shared, Local) {
         ram_vectors::relocate(&mut cx.core.SCB);
         CLOCK_TREE.speed_up(&cx.device.RCC, Source::Crystal);
-        let flash = FlashController::new(cx.device.FLASH, cx.device.CRC, &cx.device.RCC, LAYOUT.chip.flash);
+        // SAFETY: the device's own are not used beside it.
+        let flash = unsafe { FlashController::steal(Some(&cx.device.RCC)) };
         let board = bsp::init(&mut cx.device.RCC.constrain(), cx.device.CAN1, cx.device.GPIOD);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
-        let parameters = boot::parameters(&flash);
-        let node = boot::node_parameters(&parameters, &flash);
+        let parameters = product::parameters(&flash);
+        let node = product::node_parameters(&parameters, &flash);
         let slave_config = slave::Config {
             node: node::Config {
                 heartbeat_ms: HEARTBEAT_MS,
@@ -152,7 +150,7 @@ mod app {
             &CONFIG,
             bsp::serial_number(),
             node,
-            boot::stay_reason(),
+            start::stay_reason(),
             parameters,
             flash,
             cx.local.blocks,
@@ -166,7 +164,7 @@ mod app {
                 received,
                 to_handle,
                 slave,
-                leaving: Leaving::default(),
+                leaving: Leaving { wanted: false, request: BootRequest::PowerOn, at: None },
                 watchdog: Watchdog::new(cx.device.IWDG),
                 led: board.led,
             },
@@ -225,11 +223,13 @@ mod app {
             // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
             carry_out(slave, &mut can, now, bootloader);
             while let Some(frame) = to_handle.dequeue() {
-                leaving.wanted |= slave.handle(&frame, now, bootloader);
+                if slave.handle(&frame, now, bootloader) {
+                    *leaving = Leaving { wanted: true, request: BootRequest::PowerOn, at: None };
+                }
                 carry_out(slave, &mut can, now, bootloader);
             }
             if let Some(request) = bootloader.take_leave() {
-                *leaving = Leaving { wanted: true, request: Some(request), at: None };
+                *leaving = Leaving { wanted: true, request, at: None };
             }
         });
         if leaving.wanted && slave.is_idle() && can.lock(|can| can.is_idle()) {
@@ -256,8 +256,8 @@ mod app {
     }
 
     fn configure(can: &mut impl Mutex<T = Port<CanController>>, rate: BitRate, mode: Mode) {
-        // Another rate is asked for by nobody: `boot::supports` says so.
-        if let Some(Some(timing)) = boot::TIMINGS.get(rate as usize) {
+        // Another rate is asked for by nobody: `product::supports` says so.
+        if let Some(Some(timing)) = product::TIMINGS.get(rate as usize) {
             can.lock(|can| can.configure(*timing, mode));
         }
     }
@@ -299,10 +299,8 @@ mod app {
     }
 
     /// Out of the bootloader: the boot stage decides anew, on a clean chip.
-    fn leave(request: Option<BootRequest>) -> ! {
-        if let Some(request) = request {
-            boot::warm_start_cell().put(request);
-        }
+    fn leave(request: BootRequest) -> ! {
+        product::warm_start_cell().put(request);
         SCB::sys_reset()
     }
 }

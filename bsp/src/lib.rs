@@ -9,6 +9,8 @@
 
 pub mod can;
 pub mod clock;
+#[cfg(target_arch = "arm")]
+pub mod watchdog;
 
 #[cfg(any(feature = "board-stm32f407g-disc1", feature = "board-stm32f407g-disc1-two"))]
 #[path = "stm32f407g_disc1.rs"]

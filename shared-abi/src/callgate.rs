@@ -17,7 +17,7 @@ pub const ABI_VERSION: u16 = 1;
 pub const TABLE_SIZE: u32 = 16;
 
 /// Bytes of the caller's stack that a call may use.
-pub const STACK: u32 = 256;
+pub const STACK: u32 = 1024;
 
 /// The entry point: a [selector](Selector), its argument structure, and a [result code](Status).
 pub type Entry = unsafe extern "C" fn(selector: u32, args: *mut core::ffi::c_void) -> i32;
@@ -38,12 +38,41 @@ pub struct Table<E = u32> {
     pub entry: E,
 }
 
-/// What can be called.
+/// What can be called: one service at a time, from one priority, with the flash controller left alone meanwhile. Every
+/// service that stores keeps the core from its flash for as long as that takes: some 100 us, and once in several hundred times a
+/// second, when a sector is erased.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Selector {
     /// CRC-32 over a range of flash; takes [`Crc32Args`].
     Crc32 = 1,
+    /// Node-ID and bit rate as they are stored; takes [`NodeArgs`].
+    ReadNode = 2,
+    /// Stores node-ID and bit rate, which are in force from the next reset on; takes [`NodeArgs`].
+    StoreNode = 3,
+    /// What is known of a program; takes [`ProgramArgs`].
+    ProgramInfo = 4,
+    /// Gives a program its signature, as 1F51h = 83h does, and forgets its crashes: how a trial confirms itself. Takes
+    /// [`ProgramArgs`], of which only the number counts.
+    Confirm = 5,
+    /// Takes a program's signature away, as 1F51h = 84h does. Takes [`ProgramArgs`], of which only the number counts.
+    Invalidate = 6,
+}
+
+impl Selector {
+    /// The selector of this number.
+    #[must_use]
+    pub const fn from_number(number: u32) -> Option<Self> {
+        Some(match number {
+            1 => Self::Crc32,
+            2 => Self::ReadNode,
+            3 => Self::StoreNode,
+            4 => Self::ProgramInfo,
+            5 => Self::Confirm,
+            6 => Self::Invalidate,
+            _ => return None,
+        })
+    }
 }
 
 /// What a call returns.
@@ -58,6 +87,14 @@ pub enum Status {
     BadPointer = -2,
     /// The range does not lie in flash, or is empty.
     BadRange = -3,
+    /// The flash controller is at work, or its control register is open: somebody uses it.
+    Busy = -4,
+    /// The flash did not take the value.
+    Failed = -5,
+    /// A node-ID, bit rate or program number that does not exist here.
+    BadArgument = -6,
+    /// Nothing is installed under this number.
+    NoProgram = -7,
 }
 
 /// Arguments of [`Selector::Crc32`].
@@ -71,6 +108,37 @@ pub struct Crc32Args {
     /// Result: CRC-32/ISO-HDLC, the function of 1F56h.
     pub crc: u32,
 }
+
+/// Arguments of [`Selector::ReadNode`] and [`Selector::StoreNode`].
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct NodeArgs {
+    /// 1 to 127; 255 for a device that waits for layer setting services to give it one.
+    pub node_id: u32,
+    /// In bit/s; 0 for a device that finds it out by listening.
+    pub bit_rate: u32,
+}
+
+/// Arguments of the selectors about a program.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ProgramArgs {
+    /// Which, 1 to 254.
+    pub number: u32,
+    /// Result: bytes from the start of its flash on.
+    pub size: u32,
+    /// Result: CRC over them.
+    pub crc: u32,
+    /// Result: the version that its control block told, 0 for none (SYS TEC manual L-1112d_10, figure 13).
+    pub version: u32,
+    /// Result: [`PROGRAM_INSTALLED`], [`PROGRAM_SIGNED`].
+    pub flags: u32,
+}
+
+/// In [`ProgramArgs::flags`]: it was downloaded completely, and its CRC was right then.
+pub const PROGRAM_INSTALLED: u32 = 1 << 0;
+/// In [`ProgramArgs::flags`]: it carries the signature, so that it starts by itself.
+pub const PROGRAM_SIGNED: u32 = 1 << 1;
 
 /// Why a call through the callgate failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -130,6 +198,52 @@ impl Callgate {
         let mut args = Crc32Args { address, len, crc: 0 };
         self.call(Selector::Crc32, (&raw mut args).cast())?;
         Ok(args.crc)
+    }
+
+    /// Node-ID and bit rate as they are stored.
+    ///
+    /// # Errors
+    /// [`CallgateError::Refused`] with [`Status::Busy`].
+    pub fn read_node(&self) -> Result<NodeArgs, CallgateError> {
+        let mut args = NodeArgs::default();
+        self.call(Selector::ReadNode, (&raw mut args).cast())?;
+        Ok(args)
+    }
+
+    /// Stores node-ID and bit rate; they are in force from the next reset on.
+    ///
+    /// # Errors
+    /// [`CallgateError::Refused`] with [`Status::BadArgument`], [`Status::Busy`] or [`Status::Failed`].
+    pub fn store_node(&self, mut node: NodeArgs) -> Result<(), CallgateError> {
+        self.call(Selector::StoreNode, (&raw mut node).cast())
+    }
+
+    /// What is known of a program.
+    ///
+    /// # Errors
+    /// [`CallgateError::Refused`] with [`Status::BadArgument`] or [`Status::Busy`].
+    pub fn program_info(&self, number: u8) -> Result<ProgramArgs, CallgateError> {
+        let mut args = ProgramArgs { number: number.into(), ..ProgramArgs::default() };
+        self.call(Selector::ProgramInfo, (&raw mut args).cast())?;
+        Ok(args)
+    }
+
+    /// Gives a program its signature and forgets its crashes: how a trial confirms itself.
+    ///
+    /// # Errors
+    /// [`CallgateError::Refused`] with [`Status::BadArgument`], [`Status::NoProgram`], [`Status::Busy`] or [`Status::Failed`].
+    pub fn confirm(&self, number: u8) -> Result<(), CallgateError> {
+        let mut args = ProgramArgs { number: number.into(), ..ProgramArgs::default() };
+        self.call(Selector::Confirm, (&raw mut args).cast())
+    }
+
+    /// Takes a program's signature away: it does not start by itself any more.
+    ///
+    /// # Errors
+    /// As for [`confirm`](Self::confirm).
+    pub fn invalidate(&self, number: u8) -> Result<(), CallgateError> {
+        let mut args = ProgramArgs { number: number.into(), ..ProgramArgs::default() };
+        self.call(Selector::Invalidate, (&raw mut args).cast())
     }
 
     fn call(&self, selector: Selector, args: *mut core::ffi::c_void) -> Result<(), CallgateError> {

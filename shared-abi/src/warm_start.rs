@@ -20,6 +20,8 @@ pub enum BootRequest {
     Start(u8),
     /// Stay, because the bootloader itself had a fault or a panic; it asks this of itself.
     Fault,
+    /// Start as after a power-on: what an NMT reset asks for. Whoever asks has not crashed.
+    PowerOn,
 }
 
 /// The cell as it lies in RAM: 16 bytes, little-endian.
@@ -28,7 +30,7 @@ pub enum BootRequest {
 pub struct WarmStart {
     /// [`MAGIC`].
     pub magic: u32,
-    /// 1 stay, 2 trial, 3 start, 4 fault.
+    /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on.
     pub request: u32,
     /// The program number of a trial or start (1 to 254), 0 otherwise.
     pub argument: u32,
@@ -48,6 +50,7 @@ impl WarmStart {
             BootRequest::Trial(program) => (2, program as u32),
             BootRequest::Start(program) => (3, program as u32),
             BootRequest::Fault => (4, 0),
+            BootRequest::PowerOn => (5, 0),
         };
         let check = check_word(&[MAGIC, request, argument]);
         Self { magic: MAGIC, request, argument, check }
@@ -63,6 +66,7 @@ impl WarmStart {
             (2, Some(program @ 1..=254)) => BootRequest::Trial(program),
             (3, Some(program @ 1..=254)) => BootRequest::Start(program),
             (4, Some(0)) => BootRequest::Fault,
+            (5, Some(0)) => BootRequest::PowerOn,
             _ => return None,
         };
         // One encoder decides what is well-formed: magic, words and check must be exactly its.
@@ -121,6 +125,7 @@ mod tests {
             BootRequest::Start(1),
             BootRequest::Trial(254),
             BootRequest::Fault,
+            BootRequest::PowerOn,
         ];
         for request in requests {
             let mut ram = WarmStart::EMPTY;
@@ -156,7 +161,9 @@ mod tests {
 
     #[test]
     fn a_well_checked_request_for_an_impossible_program_is_refused() {
-        for (request, argument) in [(1, 1), (2, 0), (2, 255), (3, 0), (3, 256), (0, 0), (4, 1)] {
+        for (request, argument) in
+            [(1, 1), (2, 0), (2, 255), (3, 0), (3, 256), (0, 0), (4, 1), (5, 1), (6, 0)]
+        {
             let check = check_word(&[MAGIC, request, argument]);
             let cell = WarmStart { magic: MAGIC, request, argument, check };
             assert_eq!(cell.request(), None, "{cell:?}");

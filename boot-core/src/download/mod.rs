@@ -117,6 +117,8 @@ struct Program {
     /// How the last block or command ended.
     error: Option<FlashError>,
     session: Session,
+    /// The version that the last control block told.
+    version: u32,
 }
 
 /// How far the download of a program is.
@@ -214,6 +216,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 identification: record.map_or(0, |record| record.crc),
                 error: None,
                 session: Session::Idle,
+                version: 0,
             }
         });
         Self {
@@ -521,9 +524,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     self.programs[index].identification = crc;
                     self.programs[index].session = Session::Idle;
                 }
+                let version = self.index(program).map_or(0, |index| self.programs[index].version);
                 let plausible = check_vectors(flash, self.region(program), self.layout).is_ok();
                 if crc == last.program_crc && plausible {
-                    let record = ProgramRecord { size: last.program_size, crc, signed: false };
+                    let record = ProgramRecord { size: last.program_size, crc, signed: false, version };
                     self.work = Some(self.store_record(program, record));
                     return Step::Again;
                 }
@@ -729,6 +733,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 let control = data.get(..header.size as usize).and_then(Control::parse);
                 let control = control.ok_or(unfit(FlashError::Format))?;
                 let app_size = self.check_identity(program, &control)?;
+                self.programs[index].version =
+                    if let Control::Dated { version, .. } = control { version } else { 0 };
                 self.queue.forget();
                 let (erased, ahead) = match self.programs[index].session {
                     // Known to be erased is nothing; what there are to be data for is erased ahead of them.

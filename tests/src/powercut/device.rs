@@ -364,7 +364,8 @@ impl Store {
             Some(Bug::EraseBeforeInvalidating) => Self::Instead(journal, None),
             Some(Bug::SignatureBeforeData) => {
                 let new = image(1, super::scenario::NEW);
-                let record = ProgramRecord { size: new.len() as u32, crc: crc32(&new), signed: true };
+                let record =
+                    ProgramRecord { size: new.len() as u32, crc: crc32(&new), signed: true, version: 0 };
                 Self::Instead(journal, Some(record.value()))
             }
             _ => Self::Journal(journal),

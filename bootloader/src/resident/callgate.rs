@@ -1,0 +1,150 @@
+//! The callgate: what an application may call (`shared_abi::callgate`).
+//!
+//! The flash controller may be the application's otherwise, and so may the CRC unit and the caches of the flash: they are taken when they are free,
+//! and left as they were found.
+
+use core::ffi::c_void;
+
+use boot_core::canopen::{BitRate, NodeId};
+use boot_core::flash::Flash;
+use boot_core::node::NodeParameters;
+use boot_core::parameters::{Key, Parameters as _, Value};
+use boot_core::program::ProgramRecord;
+use bsp::{pac, LAYOUT};
+use shared_abi::callgate::{
+    Crc32Args, NodeArgs, ProgramArgs, Selector, Status, PROGRAM_INSTALLED, PROGRAM_SIGNED,
+};
+use shared_abi::geometry::Region;
+
+use crate::caches::CachesOff;
+use crate::flash::FlashController;
+use crate::product::{self, NO_NODE_ID};
+
+/// # Safety
+/// `args` must point to the argument structure of `selector`; what can be told of a wrong pointer is refused.
+pub unsafe extern "C" fn entry(selector: u32, args: *mut c_void) -> i32 {
+    let Some(selector) = Selector::from_number(selector) else { return Status::UnknownSelector as i32 };
+    // SAFETY: the caller vouches for the structure; `argument` has looked where it lies.
+    let outcome = unsafe {
+        match selector {
+            Selector::Crc32 => argument(args).and_then(|args| crc32(&mut *args)),
+            Selector::ReadNode => argument(args).and_then(|args| read_node(&mut *args)),
+            Selector::StoreNode => argument(args).and_then(|args| store_node(&*args)),
+            Selector::ProgramInfo => argument(args).and_then(|args| program_info(&mut *args)),
+            Selector::Confirm => argument(args).and_then(|args| sign(&*args, true)),
+            Selector::Invalidate => argument(args).and_then(|args| sign(&*args, false)),
+        }
+    };
+    outcome.err().unwrap_or(Status::Ok) as i32
+}
+
+/// The argument structure, if it lies in RAM, aligned.
+fn argument<T>(args: *mut c_void) -> Result<*mut T, Status> {
+    let (address, size) = (args as u32, size_of::<T>() as u32);
+    let reachable = LAYOUT.chip.sram.contains(address, size) || LAYOUT.chip.ccm.contains(address, size);
+    if reachable && address.is_multiple_of(4) {
+        Ok(args.cast())
+    } else {
+        Err(Status::BadPointer)
+    }
+}
+
+/// Runs `act` with the flash, if nobody works on it.
+fn with_flash<T>(act: impl FnOnce(&mut FlashController) -> Result<T, Status>) -> Result<T, Status> {
+    // SAFETY: the application calls one service at a time and does not use the flash controller meanwhile.
+    let rcc = unsafe { pac::RCC::steal() };
+    let crc_is_free = rcc.ahb1enr().read().crcen().is_disabled();
+    // SAFETY: as above; the CRC unit only where its clock is off.
+    let mut flash = unsafe { FlashController::steal(crc_is_free.then_some(&rcc)) };
+    if flash.is_in_use() {
+        return Err(Status::Busy);
+    }
+    let outcome = act(&mut flash);
+    if crc_is_free {
+        flash.release(&rcc);
+    }
+    outcome
+}
+
+fn crc32(args: &mut Crc32Args) -> Result<(), Status> {
+    let region = Region::new(args.address, args.len);
+    if args.len == 0 || !LAYOUT.chip.flash.contains(args.address, args.len) {
+        return Err(Status::BadRange);
+    }
+    args.crc = with_flash(|flash| Ok(flash.crc32(0, region)))?;
+    Ok(())
+}
+
+fn read_node(args: &mut NodeArgs) -> Result<(), Status> {
+    with_flash(|flash| {
+        let node = product::node_parameters(&product::parameters(flash), flash);
+        *args = NodeArgs {
+            node_id: node.id.map_or(NO_NODE_ID, NodeId::get).into(),
+            bit_rate: node.bit_rate.or_zero(),
+        };
+        Ok(())
+    })
+}
+
+fn store_node(args: &NodeArgs) -> Result<(), Status> {
+    let id = match u8::try_from(args.node_id) {
+        Ok(NO_NODE_ID) => None,
+        Ok(id) => Some(NodeId::new(id).ok_or(Status::BadArgument)?),
+        Err(_) => return Err(Status::BadArgument),
+    };
+    let bit_rate = BitRate::from_bits_per_second(args.bit_rate).filter(|rate| product::supports(*rate));
+    let node = NodeParameters { id, bit_rate: bit_rate.ok_or(Status::BadArgument)? };
+    with_flash(|flash| store(flash, Key::Node, node.value()))
+}
+
+fn program_info(args: &mut ProgramArgs) -> Result<(), Status> {
+    let number = program(args)?;
+    with_flash(|flash| {
+        let record = ProgramRecord::load(&product::parameters(flash), flash, number);
+        *args = ProgramArgs { number: args.number, ..ProgramArgs::default() };
+        if let Some(record) = record {
+            args.size = record.size;
+            args.crc = record.crc;
+            args.version = record.version;
+            args.flags = PROGRAM_INSTALLED | if record.signed { PROGRAM_SIGNED } else { 0 };
+        }
+        Ok(())
+    })
+}
+
+/// Sets the signature of a program or takes it away. Whoever is signed has not crashed.
+fn sign(args: &ProgramArgs, signed: bool) -> Result<(), Status> {
+    let number = program(args)?;
+    with_flash(|flash| {
+        let parameters = product::parameters(flash);
+        let record = ProgramRecord::load(&parameters, flash, number).ok_or(Status::NoProgram)?;
+        let crashes = parameters.get(flash, Key::CrashCount).is_some_and(|[count, ..]| count > 0);
+        if record.signed != signed {
+            store(flash, Key::Program(number), ProgramRecord { signed, ..record }.value())?;
+        }
+        if signed && crashes {
+            store(flash, Key::CrashCount, [0; 4])?;
+        }
+        Ok(())
+    })
+}
+
+/// The number of a program of the layout.
+fn program(args: &ProgramArgs) -> Result<u8, Status> {
+    let number = u8::try_from(args.number).map_err(|_| Status::BadArgument)?;
+    LAYOUT.program(number).map(|_| number).ok_or(Status::BadArgument)
+}
+
+/// Stores a value and waits for it.
+fn store(flash: &mut FlashController, key: Key, value: Value) -> Result<(), Status> {
+    // They would show words as they were before they were programmed.
+    // SAFETY: the application calls one service at a time and does not use the flash controller meanwhile.
+    let _caches = unsafe { CachesOff::new() };
+    let mut parameters = product::parameters(flash);
+    parameters.store(key, value);
+    loop {
+        if let core::task::Poll::Ready(outcome) = parameters.poll(flash) {
+            return outcome.map_err(|_| Status::Failed);
+        }
+    }
+}

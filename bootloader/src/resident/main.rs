@@ -1,0 +1,54 @@
+//! The resident part of the bootloader: what runs from flash, beside an application that owns all RAM.
+//!
+//! | file | what it does | unsafe |
+//! |---|---|---|
+//! | `main.rs` | the header at the layout's fixed address | no |
+//! | `stage.rs` | from the reset to the jump, or to the rest of the bootloader | jump, handoff |
+//! | `callgate.rs` | services for the application | its ABI |
+//! | `caches.rs` | the caches of the flash, off for a while | registers |
+//!
+//! It is a program of its own, so that the linker can see that it has no variables: nothing but the stack and its own code is
+//! there when it runs. `linker/build.rs` builds it, and the bootloader carries it as bytes.
+#![no_std]
+#![no_main]
+
+mod caches;
+mod callgate;
+#[path = "../flash.rs"]
+mod flash;
+#[path = "../memory.rs"]
+mod memory;
+#[path = "../product.rs"]
+mod product;
+mod stage;
+
+use shared_abi::callgate::{Entry, Table, ABI_VERSION, MAGIC, TABLE_SIZE};
+use shared_abi::warm_start::BootRequest;
+
+/// What lies at the callgate's address: its table, and behind it the way in for the bootloader's own start-up.
+#[repr(C)]
+struct Header {
+    callgate: Table<Entry>,
+    stage: extern "C" fn() -> u32,
+}
+
+#[no_mangle]
+#[link_section = ".header"]
+static HEADER: Header = Header {
+    callgate: Table {
+        magic: MAGIC,
+        abi_version: ABI_VERSION,
+        length: TABLE_SIZE as u16,
+        bootloader_version: product::VERSION,
+        entry: callgate::entry,
+    },
+    stage: stage::stage,
+};
+const _: () = assert!(size_of::<Table<Entry>>() == TABLE_SIZE as usize);
+
+/// There is nobody to tell but the bootloader after the reset.
+#[panic_handler]
+fn panic(_: &core::panic::PanicInfo<'_>) -> ! {
+    product::warm_start_cell().put(BootRequest::Fault);
+    cortex_m::peripheral::SCB::sys_reset()
+}

@@ -1,0 +1,21 @@
+//! The independent watchdog (RM0090 section 21). Once started, only a reset stops it.
+
+use stm32f4xx_hal::pac;
+
+/// Starts it: a reset follows unless it is [fed](feed) every `ms` milliseconds, 2 to 8000, as the LSI counts them (± 50 %).
+pub fn start(registers: &pac::IWDG, ms: u16) {
+    // SAFETY: the keys of section 21.4.1.
+    let key = |key: u16| registers.kr().write(|w| unsafe { w.bits(key) });
+    key(0xCCCC);
+    key(0x5555);
+    // SAFETY: LSI / 64, 2 ms a count (section 21.4.2).
+    registers.pr().write(|w| unsafe { w.bits(4) });
+    // SAFETY: a reload value of 12 bits.
+    registers.rlr().write(|w| unsafe { w.bits(ms / 2) });
+}
+
+/// Puts the end off.
+pub fn feed(registers: &pac::IWDG) {
+    // SAFETY: the key that reloads the counter (section 21.4.1).
+    registers.kr().write(|w| unsafe { w.bits(0xAAAA) });
+}
