@@ -130,6 +130,7 @@ fn image(build: &Build<'_>, name: &str, region: Region) -> Outcome<PathBuf> {
     }
     let flash = Flash::of(&size::read(&to)?, region)
         .map_err(|problem| format!("{}: {problem}", workspace::shown(&to)))?;
-    println!("  {:<52} {:>6} of {} bytes", workspace::shown(&to), flash.used, region.size);
+    // Beside what cargo says: the standard output is the job's, which may be asked for JSON.
+    eprintln!("  {:<52} {:>6} of {} bytes", workspace::shown(&to), flash.used, region.size);
     Ok(to)
 }
