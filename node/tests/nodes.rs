@@ -100,7 +100,7 @@ fn many_nodes_take_their_programs_at_the_same_time() {
     for serial in 0x100..0x105 {
         assert!(folder.read(&format!("{serial}.flash"))[0x1_0000..] == flashed(), "{serial}");
     }
-    let scan = coflash.json(&["scan", "-N", "9-15", "--sdo-timeout", "100"]);
+    let scan = coflash.json(&["scan", "-N", "9-15", "--sdo-timeout", "500"]);
     let found: Vec<_> = scan["nodes"].as_array().unwrap().iter().map(|found| &found["node"]).collect();
     assert_eq!(found, [10, 11, 12, 13, 14]);
     assert_eq!(scan["nodes"][4]["info"]["serial_number"], 0x104);
@@ -138,7 +138,7 @@ fn nodes_are_commissioned_by_layer_setting_services() {
     let nodes = start(&folder);
     nodes.await_line("serial 77, no node-ID: bootloader (NodeId)");
     let coflash = Coflash::new(&folder, &nodes);
-    let said = coflash.done(&["lss", "fastscan", "--assign", "40", "--store", "--lss-timeout", "20"]);
+    let said = coflash.done(&["lss", "fastscan", "--assign", "40", "--store", "--lss-timeout", "60"]);
     assert!(said.contains("40") && said.contains("41"), "{said}");
     assert_eq!(coflash.json(&["read", "1018/2", "-N", "41"])["number"], 0x1234);
     drop(nodes);
