@@ -16,6 +16,19 @@ const PROGRAM_ENTRIES: [Entry; 6] = [
     Entry::sub(FLASH_STATUS, 1, "Flash status identification 1", DataType::Unsigned32, Access::Ro).default(0),
 ];
 
+/// How 1F51h = 80h leads back into the bootloader: 0 system reset, 1 watchdog reset, 2 jump.
+pub const WAY_BACK: u16 = 0x2000;
+/// What the bootloader knows of this program: bit 0 installed, bit 1 signed. Writing 1 confirms it, 0 takes the signature away.
+pub const CONFIRMATION: u16 = 0x2001;
+
+/// What shows the rest of coboot's services. A product has its own use for them.
+const SHOW_ENTRIES: [Entry; 2] = [
+    Entry::var(WAY_BACK, "Way back into the bootloader", DataType::Unsigned8, Access::Rw).default(0),
+    Entry::var(CONFIRMATION, "Confirmation", DataType::Unsigned8, Access::Rw),
+];
+
 /// The object dictionary.
-pub static ENTRIES: [Entry; 23] =
-    concat(concat::<11, 6, 17>(device::ENTRIES, emcy::ENTRIES), PROGRAM_ENTRIES);
+pub static ENTRIES: [Entry; 25] = concat(
+    concat::<17, 6, 23>(concat::<11, 6, 17>(device::ENTRIES, emcy::ENTRIES), PROGRAM_ENTRIES),
+    SHOW_ENTRIES,
+);

@@ -97,6 +97,7 @@ mod app {
     #[idle]
     fn idle(_: idle::Context) -> ! {
         loop {
+            coboot::leave_if_told();
             cortex_m::asm::wfi();
         }
     }
@@ -139,8 +140,8 @@ mod app {
             }
             carry_out(slave, &mut can, now, application);
         }
-        if application.take_called_back() {
-            *departure = Departure::Answering(Destination::Bootloader);
+        if let Some(way) = application.take_called_back() {
+            *departure = Departure::Answering(Destination::Bootloader(way));
         }
     }
 

@@ -14,8 +14,8 @@ use canopen::program::{
 use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, BitRate, NodeId};
 
-use crate::coboot::{self, Start};
-use crate::entries::ENTRIES;
+use crate::coboot::{self, Start, Way};
+use crate::entries::{CONFIRMATION, ENTRIES, WAY_BACK};
 
 /// 1000h: no standardised profile. Anything but the bootloader's 10000000h tells a host that the application runs.
 const DEVICE_TYPE: u32 = 0;
@@ -28,10 +28,16 @@ const SOFTWARE_VERSION: &str = if cfg!(feature = "version-2") { "2.0.0" } else {
 pub struct Application {
     device: Device,
     program_crc: u32,
+    /// Which program this is.
+    program: u8,
+    /// The way back into the bootloader (2000h).
+    way: Way,
     called_back: bool,
     emcy: Emcy,
     /// Node-ID in force.
     id: Option<NodeId>,
+    /// Bit rate that the device came up with.
+    bit_rate: BitRate,
 }
 
 impl Application {
@@ -51,7 +57,10 @@ impl Application {
         Self {
             device,
             program_crc: coboot::own_crc(LAYOUT).unwrap_or(0),
+            program: start.program,
+            way: Way::default(),
             called_back: false,
+            bit_rate: start.bit_rate,
             emcy: Emcy::new(),
             id: start.node_id,
         }
@@ -62,9 +71,9 @@ impl Application {
         self.device.lss_address()
     }
 
-    /// Whether the device shall go back to the bootloader, once.
-    pub fn take_called_back(&mut self) -> bool {
-        core::mem::take(&mut self.called_back)
+    /// Whether and how the device shall go back to the bootloader, once.
+    pub fn take_called_back(&mut self) -> Option<Way> {
+        core::mem::take(&mut self.called_back).then_some(self.way)
     }
 
     /// The 1F51h callback. It runs before the SDO answer is sent, so it only notes what is to be done: `main` waits until
@@ -99,6 +108,11 @@ impl Objects for Application {
             PROGRAM_CONTROL => put(buf, &[ProgramState::Running as u8]),
             PROGRAM_ID => put(buf, &self.program_crc.to_le_bytes()),
             FLASH_STATUS => put(buf, &FlashStatus::OK.to_word().to_le_bytes()),
+            WAY_BACK => put(buf, &[self.way as u8]),
+            CONFIRMATION => {
+                let info = coboot::program_info(self.program).map_err(|_| AbortCode::DEVICE_STATE)?;
+                put(buf, &[info.flags as u8])
+            }
             _ => Err(AbortCode::NO_DATA),
         }
     }
@@ -109,6 +123,14 @@ impl Objects for Application {
         }
         match (at.index, data) {
             (PROGRAM_CONTROL, &[value]) => self.program_control(ProgramControl::try_from(value)?),
+            (WAY_BACK, &[value]) => {
+                self.way = Way::from_number(value).ok_or(AbortCode::INVALID_VALUE)?;
+                Ok(())
+            }
+            (CONFIRMATION, &[value @ 0..=1]) => {
+                coboot::confirm(self.program, value == 1).map_err(|_| AbortCode::DEVICE_STATE)
+            }
+            (CONFIRMATION, _) => Err(AbortCode::INVALID_VALUE),
             _ => Err(AbortCode::UNSUPPORTED_ACCESS),
         }
     }
@@ -124,8 +146,9 @@ impl LssDevice for Application {
     }
 
     /// Storing is the bootloader's: its journal lies in flash that this program does not own.
-    fn store(&mut self, _: Option<NodeId>, _: Option<BitRate>) -> Poll<Result<(), StoreError>> {
-        Poll::Ready(Err(StoreError::Unsupported))
+    fn store(&mut self, id: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {
+        let rate = rate.unwrap_or(self.bit_rate);
+        Poll::Ready(coboot::store_node(id, rate).map_err(|_| StoreError::Failed))
     }
 }
 

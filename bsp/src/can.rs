@@ -210,7 +210,9 @@ impl<I: MasterInstance> Port<I> {
     }
 
     /// Whether everything given to it is on the bus and acknowledged.
-    pub fn is_idle(&self) -> bool {
+    pub fn is_idle(&mut self) -> bool {
+        // Who waits for this may do nothing else with the controller: its interrupt would come again and again.
+        self.can.clear_tx_interrupt();
         self.waiting.is_none() && self.can.is_transmitter_idle()
     }
 

@@ -8,6 +8,7 @@
 //! | [`handoff`] | what the bootloader tells the application about how it came up |
 //! | [`vectors`] | the proof that a vector table may be jumped to, and the jump |
 //! | [`callgate`] | the bootloader's services for the application, at a fixed address |
+//! | `reentry` | the way back from an application into its bootloader (on the target) |
 //! | [`block_file`] | the container that object 1F50h takes |
 //!
 //! Everything that crosses a border between two images is `repr(C)`, little-endian and versioned.
@@ -19,6 +20,8 @@ pub mod callgate;
 pub mod geometry;
 pub mod handoff;
 pub mod layout;
+#[cfg(target_arch = "arm")]
+pub mod reentry;
 pub mod vectors;
 pub mod warm_start;
 

@@ -40,13 +40,17 @@ pub unsafe extern "C" fn entry(selector: u32, args: *mut c_void) -> i32 {
 
 /// The argument structure, if it lies in RAM, aligned.
 fn argument<T>(args: *mut c_void) -> Result<*mut T, Status> {
-    let (address, size) = (args as u32, size_of::<T>() as u32);
-    let reachable = LAYOUT.chip.sram.contains(address, size) || LAYOUT.chip.ccm.contains(address, size);
-    if reachable && address.is_multiple_of(4) {
+    if is_in_ram(args as u32, size_of::<T>() as u32) {
         Ok(args.cast())
     } else {
         Err(Status::BadPointer)
     }
+}
+
+#[inline(never)]
+fn is_in_ram(address: u32, size: u32) -> bool {
+    let chip = LAYOUT.chip;
+    address.is_multiple_of(4) && (chip.sram.contains(address, size) || chip.ccm.contains(address, size))
 }
 
 /// Runs `act` with the flash, if nobody works on it.
