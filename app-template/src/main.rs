@@ -65,7 +65,7 @@ mod app {
     #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new()])]
     fn init(cx: init::Context) -> (Shared, Local) {
         let mut rcc = bsp::clocks(cx.device.RCC);
-        let board = bsp::init(&mut rcc, cx.device.CAN1, cx.device.GPIOD);
+        let board = bsp::init(&mut rcc, cx.device.CAN1);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
         // Same node-ID and bit rate as the bootloader: whoever talked to it goes on talking to this.

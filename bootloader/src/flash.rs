@@ -145,8 +145,8 @@ impl Flash for FlashController {
     fn start_erase(&mut self, sector: Sector) -> Result<(), FlashFault> {
         self.unlock();
         self.registers.cr().write(|w| {
-            // SAFETY: the geometry's sector numbers are those that SNB takes (section 3.8.5).
-            unsafe { w.snb().bits(sector.number) };
+            // SAFETY: the geometry's codes are those that SNB takes (sections 3.9.7 and 3.9.8).
+            unsafe { w.snb().bits(LAYOUT.chip.sector_code(sector.number)) };
             w.lock().clear_bit().psize().set(WORDS).ser().set_bit().strt().set_bit()
         });
         self.running = true;

@@ -133,7 +133,7 @@ mod app {
         CLOCK_TREE.speed_up(&cx.device.RCC, Source::Crystal);
         // SAFETY: the device's own are not used beside it.
         let flash = unsafe { FlashController::steal(Some(&cx.device.RCC)) };
-        let board = bsp::init(&mut cx.device.RCC.constrain(), cx.device.CAN1, cx.device.GPIOD);
+        let board = bsp::init(&mut cx.device.RCC.constrain(), cx.device.CAN1);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
         let parameters = product::parameters(&flash);

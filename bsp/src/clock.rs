@@ -1,4 +1,4 @@
-//! The clock tree at the level of its registers (RM0090 sections 3.5 and 7), for code that has to be small, and to be able to
+//! The clock tree at the level of its registers (RM0090 sections 3.5 and 7; RM0390 sections 3.4 and 6 say the same), for code that has to be small, and to be able to
 //! leave it as a reset does. An application takes the HAL's way, [`crate::clocks`].
 
 /// How a board makes its clocks out of its crystal.
@@ -6,6 +6,8 @@
 pub struct ClockTree {
     /// The crystal, in Hz.
     pub hse: u32,
+    /// Whether there is a clock on OSC_IN in place of a crystal.
+    pub hse_bypass: bool,
     /// Input of the PLL in Hz: 1 to 2 MHz, and a divisor of the crystal and of the 16 MHz of HSI.
     pub pll_input: u32,
     /// The PLL's multiplier, 50 to 432.
@@ -60,15 +62,38 @@ impl ClockTree {
             "board: the PLL's input must be 1 to 2 MHz"
         );
         assert!(vco >= 100_000_000 && vco <= 432_000_000, "board: the PLL must run at 100 to 432 MHz");
-        assert!(self.sysclk() <= 180_000_000, "board: the core is too fast");
-        assert!(self.apb1_clock() <= 45_000_000, "board: APB1 is too fast");
-        assert!(self.sysclk() / self.apb2 <= 90_000_000, "board: APB2 is too fast");
+        // Chips that can do 180 MHz need over-drive for more than this, which nothing here switches on.
+        assert!(
+            self.sysclk() <= 168_000_000,
+            "board: the core is too fast: 168 MHz at most, without over-drive"
+        );
+        assert!(
+            self.apb1_clock() <= 42_000_000,
+            "board: APB1 is too fast: 42 MHz at most, without over-drive"
+        );
+        assert!(
+            self.sysclk() / self.apb2 <= 84_000_000,
+            "board: APB2 is too fast: 84 MHz at most, without over-drive"
+        );
+        assert!(
+            is_divider(self.apb1) && is_divider(self.apb2),
+            "board: APB1 and APB2 are divided by 1, 2, 4, 8 or 16"
+        );
+        assert!(
+            self.pll_p >= 2 && self.pll_p <= 8 && self.pll_p.is_multiple_of(2),
+            "board: behind the PLL, the divider is 2, 4, 6 or 8"
+        );
         assert!(
             self.wait_states >= (self.sysclk() - 1) / 30_000_000 && self.wait_states <= 15,
             "board: the flash needs a wait state for every 30 MHz"
         );
         self
     }
+}
+
+/// Whether a bus can be divided by this.
+const fn is_divider(value: u32) -> bool {
+    value <= 16 && value.is_power_of_two()
 }
 
 /// The same on the chip.
@@ -80,6 +105,7 @@ mod registers {
 
     const HSEON: u32 = 1 << 16;
     const HSERDY: u32 = 1 << 17;
+    const HSEBYP: u32 = 1 << 18;
     const PLLON: u32 = 1 << 24;
     const PLLRDY: u32 = 1 << 25;
     /// RCC_CR after a reset, but for the calibration, which is the chip's: HSI on, trimmed to the middle.
@@ -97,6 +123,10 @@ mod registers {
         pub fn speed_up(&self, rcc: &pac::RCC, wanted: Source) -> Source {
             let mut source = Source::Internal;
             if wanted == Source::Crystal {
+                // The bypass can be chosen only while the oscillator is off (section 7.3.1).
+                if self.hse_bypass {
+                    set(rcc, HSEBYP);
+                }
                 set(rcc, HSEON);
                 if (0..PATIENCE).any(|_| rcc.cr().read().bits() & HSERDY != 0) {
                     source = Source::Crystal;

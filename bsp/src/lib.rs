@@ -12,14 +12,30 @@ pub mod clock;
 #[cfg(target_arch = "arm")]
 pub mod watchdog;
 
+/// A GPIO port, for the `init` of a board. The board file alone knows which ports that is about, so no caller hands them over;
+/// that it is asked for once is shown by the CAN controller, which exists once.
+#[cfg(target_arch = "arm")]
+macro_rules! take_port {
+    ($port:ident, $can:ident) => {{
+        let _: &pac::CAN1 = &$can;
+        // SAFETY: the pins of a board are set up by its `init` alone, and that takes the only CAN controller.
+        unsafe { pac::$port::steal() }
+    }};
+}
+
 #[cfg(any(feature = "board-stm32f407g-disc1", feature = "board-stm32f407g-disc1-two"))]
 #[path = "stm32f407g_disc1.rs"]
 mod board;
 
-#[cfg(not(any(feature = "board-stm32f407g-disc1", feature = "board-stm32f407g-disc1-two")))]
-compile_error!("bsp: choose a board by one of the features `board-…`");
+#[cfg(feature = "board-nucleo-f446re")]
+#[path = "nucleo_f446re.rs"]
+mod board;
 
-pub use board::*;
+#[cfg(feature = "board-stm32f429i-disc1")]
+#[path = "stm32f429i_disc1.rs"]
+mod board;
+
+pub use board::*; // Not found, or found twice? Choose one board by its feature `board-…`.
 
 #[cfg(target_arch = "arm")]
 pub use stm32f4xx_hal as hal;

@@ -30,6 +30,7 @@ pub const BIT_RATE: u32 = 125_000;
 /// A crystal of 8 MHz on OSC_IN and OSC_OUT; the fastest clocks that the chip allows at 3.3 V (datasheet DS8626, table 14).
 pub const CLOCK_TREE: ClockTree = ClockTree {
     hse: 8_000_000,
+    hse_bypass: false,
     pll_input: 2_000_000,
     pll_n: 168,
     pll_p: 2,
@@ -38,6 +39,9 @@ pub const CLOCK_TREE: ClockTree = ClockTree {
     wait_states: 5,
 }
 .checked();
+/// The pin that asks for the bootloader after a reset, as port and number, and the level that does.
+/// The blue button B1 on PA0, high when pressed (UM1472 section 6.4).
+pub const ENTRY_STRAP: (char, u8, bool) = ('A', 0, true);
 /// The core's clock, in Hz.
 pub const SYSCLK: u32 = CLOCK_TREE.sysclk();
 /// Clock of the CAN controller, in Hz: that of APB1.
@@ -78,18 +82,20 @@ mod drivers {
 
     /// Sets the pins up.
     #[must_use]
-    pub fn init(rcc: &mut Rcc, can1: pac::CAN1, gpiod: pac::GPIOD) -> Board {
-        let gpiod = gpiod.split(rcc);
+    pub fn init(rcc: &mut Rcc, can1: pac::CAN1) -> Board {
+        let gpiod = take_port!(GPIOD, can1).split(rcc);
         let led = gpiod.pd12.into_push_pull_output();
         let can = can1.can((gpiod.pd1, gpiod.pd0), rcc);
         Board { can, led }
     }
 
-    /// Whether the entry strap asks for the bootloader: the blue button B1 on PA0, high when pressed.
+    /// Whether the entry strap ([`ENTRY_STRAP`](super::ENTRY_STRAP)) asks for the bootloader.
     ///
     /// Leaves port A as after a reset.
     #[must_use]
-    pub fn entry_strap(rcc: &pac::RCC, gpioa: &pac::GPIOA) -> bool {
+    pub fn entry_strap(rcc: &pac::RCC) -> bool {
+        // SAFETY: the port's inputs are read, and nothing is changed.
+        let gpioa = unsafe { pac::GPIOA::steal() };
         rcc.ahb1enr().modify(|_, w| w.gpioaen().enabled());
         // The clock needs two cycles before the first access (RM0090 section 7.3.10): reading back waits that long.
         let _ = rcc.ahb1enr().read();

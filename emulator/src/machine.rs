@@ -5,6 +5,7 @@ pub mod clock;
 pub mod image;
 pub mod memory;
 pub mod report;
+pub mod variant;
 
 use shared_abi::geometry::Geometry;
 
@@ -422,7 +423,7 @@ impl Machine {
     /// # Panics
     /// When there is no such controller.
     pub fn can_mut(&mut self, n: usize) -> &mut BxCan {
-        assert_eq!(n, 0, "the STM32F407's CAN2 is not modelled");
+        assert_eq!(n, 0, "CAN2 is not modelled");
         &mut self.cpu.chip_mut().can1
     }
 
@@ -465,14 +466,16 @@ impl Machine {
     /// Drives a pin from outside (`Some`), or lets it go (`None`). Ports that the chip does not have are ignored.
     pub fn set_pin(&mut self, port: char, pin: u8, level: Option<bool>) {
         if let Some(index) = port_index(port) {
-            self.cpu.chip_mut().gpio[index].set_outside(pin, level);
+            if let Some(port) = self.cpu.chip_mut().gpio.get_mut(index) {
+                port.set_outside(pin, level);
+            }
         }
     }
 
     /// The level at a pin; low where there is no such port.
     #[must_use]
     pub fn pin(&self, port: char, pin: u8) -> bool {
-        port_index(port).is_some_and(|index| self.cpu.chip().gpio[index].level(pin))
+        port_index(port).and_then(|index| self.cpu.chip().gpio.get(index)).is_some_and(|port| port.level(pin))
     }
 
     /// What the program did that the model does not cover, or that the chip would punish.
@@ -508,5 +511,5 @@ impl Machine {
 }
 
 fn port_index(port: char) -> Option<usize> {
-    ('A'..='I').position(|name| name == port.to_ascii_uppercase())
+    ('A'..='K').position(|name| name == port.to_ascii_uppercase())
 }

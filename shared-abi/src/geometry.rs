@@ -1,5 +1,5 @@
-//! The silicon: what a chip has, as its reference manual states it (RM0090 rev 19, section 3.3
-//! "Embedded flash memory" and section 2.3 "Memory map"). Nothing here is a choice of ours; the
+//! The silicon: what a chip has, as its reference manual states it (RM0090 rev 19 for STM32F405–F439, RM0390 for
+//! STM32F446: section 3 "Embedded flash memory" and section 2 "Memory map"). Nothing here is a choice of ours; the
 //! choices are in [`crate::layout`].
 
 /// A half-open range of addresses: `base..base + size`.
@@ -43,7 +43,7 @@ impl Region {
 /// One erasable unit of the flash.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Sector {
-    /// The number that goes into `FLASH_CR.SNB`.
+    /// Its number in the manual's table; [`Geometry::sector_code`] makes of it what goes into `FLASH_CR.SNB`.
     pub number: u8,
     /// The bytes it covers.
     pub region: Region,
@@ -67,6 +67,8 @@ pub struct Geometry {
     pub flash: Region,
     /// Its sectors, in address order.
     pub sectors: &'static [SectorRun],
+    /// Number of the first sector of the second bank, on a chip that has two.
+    pub second_bank: Option<u8>,
     /// The RAM that both the CPU and the bus masters reach, as one contiguous range.
     pub sram: Region,
     /// Core-coupled RAM: data only, no code and no DMA. Size 0 where the chip has none.
@@ -88,12 +90,96 @@ pub const STM32F407VG: Geometry = Geometry {
         SectorRun { count: 1, size: 64 * KIB },
         SectorRun { count: 7, size: 128 * KIB },
     ],
+    second_bank: None,
     sram: Region::new(0x2000_0000, 128 * KIB),
     ccm: Region::new(0x1000_0000, 64 * KIB),
     interrupts: 82,
-};
+}
+.checked();
+
+/// STM32F429ZI and its packages: 2 MiB flash in two banks, 112 + 16 + 64 KiB SRAM, 64 KiB CCM.
+///
+/// RM0090 table 6 (sectors), section 2.3.1 (SRAM1, SRAM2 and SRAM3 follow one another), table 63 (91 interrupt lines).
+pub const STM32F429ZI: Geometry = Geometry {
+    chip: "stm32f429zi",
+    flash: Region::new(0x0800_0000, 2048 * KIB),
+    sectors: &[
+        SectorRun { count: 4, size: 16 * KIB },
+        SectorRun { count: 1, size: 64 * KIB },
+        SectorRun { count: 7, size: 128 * KIB },
+        SectorRun { count: 4, size: 16 * KIB },
+        SectorRun { count: 1, size: 64 * KIB },
+        SectorRun { count: 7, size: 128 * KIB },
+    ],
+    second_bank: Some(12),
+    sram: Region::new(0x2000_0000, (112 + 16 + 64) * KIB),
+    ccm: Region::new(0x1000_0000, 64 * KIB),
+    interrupts: 91,
+}
+.checked();
+
+/// STM32F446RE: 512 KiB flash, 112 + 16 KiB SRAM, no CCM.
+///
+/// RM0390 table 4 (sectors), section 2.2.2 (memory map), table 38 (97 interrupt lines).
+pub const STM32F446RE: Geometry = Geometry {
+    chip: "stm32f446re",
+    flash: Region::new(0x0800_0000, 512 * KIB),
+    sectors: &[
+        SectorRun { count: 4, size: 16 * KIB },
+        SectorRun { count: 1, size: 64 * KIB },
+        SectorRun { count: 3, size: 128 * KIB },
+    ],
+    second_bank: None,
+    sram: Region::new(0x2000_0000, 128 * KIB),
+    ccm: Region::new(0x1000_0000, 0),
+    interrupts: 97,
+}
+.checked();
 
 impl Geometry {
+    /// Gives the geometry back if it can be that of a chip; fails the build with the broken rule's name if not.
+    #[must_use]
+    pub const fn checked(self) -> Self {
+        let (mut total, mut count, mut run) = (0, 0, 0);
+        while run < self.sectors.len() {
+            let SectorRun { count: many, size } = self.sectors[run];
+            assert!(
+                many > 0 && (size == 16 * KIB || size == 64 * KIB || size == 128 * KIB),
+                "chip: a sector of the STM32F4 has 16, 64 or 128 KiB"
+            );
+            total += many as u32 * size;
+            count += many as u32;
+            run += 1;
+        }
+        assert!(total == self.flash.size, "chip: the sectors do not add up to the flash");
+        assert!(count <= 24, "chip: no STM32F4 has more than 24 sectors");
+        if let Some(first) = self.second_bank {
+            assert!(
+                first == 12 && self.sector(first).is_some(),
+                "chip: the second bank of an STM32F4 begins with sector 12"
+            );
+        }
+        assert!(
+            self.interrupts > 0 && self.vector_table_alignment() <= 512,
+            "chip: no STM32F4 has more than 112 interrupt lines"
+        );
+        assert!(
+            self.sram.base.is_multiple_of(4096) && self.sram.size.is_multiple_of(4096) && self.sram.size > 0,
+            "chip: the SRAM must be whole pages of 4 KiB"
+        );
+        self
+    }
+
+    /// What `FLASH_CR.SNB` takes for a sector: its number, but bit 4 chooses the second bank, whose sectors count from 0 again
+    /// (RM0090 section 3.9.8: sector 12 is 10000b).
+    #[must_use]
+    pub const fn sector_code(&self, number: u8) -> u8 {
+        match self.second_bank {
+            Some(first) if number >= first => 0x10 + (number - first),
+            _ => number,
+        }
+    }
+
     /// The sectors in address order.
     pub fn sectors(&self) -> impl Iterator<Item = Sector> + '_ {
         let mut next = 0;
@@ -191,6 +277,48 @@ mod tests {
         assert_eq!(STM32F407VG.sector_at(0x080F_FFFF).unwrap().number, 11);
         assert_eq!(STM32F407VG.sector_at(0x0810_0000), None);
         assert_eq!(STM32F407VG.sector_at(0x07FF_FFFF), None);
+    }
+
+    /// RM0090 table 6 and section 3.9.8 (SNB), at the borders.
+    #[test]
+    fn sectors_of_the_f429_are_those_of_the_manual() {
+        let table = [
+            (0, 0x0800_0000, 16, 0b00000),
+            (4, 0x0801_0000, 64, 0b00100),
+            (11, 0x080E_0000, 128, 0b01011),
+            (12, 0x0810_0000, 16, 0b10000),
+            (15, 0x0810_C000, 16, 0b10011),
+            (16, 0x0811_0000, 64, 0b10100),
+            (17, 0x0812_0000, 128, 0b10101),
+            (23, 0x081E_0000, 128, 0b11011),
+        ];
+        for (number, base, kib, code) in table {
+            let sector = Sector { number, region: Region::new(base, kib * 1024) };
+            assert_eq!(STM32F429ZI.sector(number), Some(sector));
+            assert_eq!(STM32F429ZI.sector_at(base), Some(sector));
+            assert_eq!(STM32F429ZI.sector_code(number), code, "sector {number}");
+        }
+        assert_eq!(STM32F429ZI.sector(24), None);
+        assert_eq!(STM32F429ZI.sector_at(0x0820_0000), None);
+    }
+
+    /// RM0390 table 4.
+    #[test]
+    fn sectors_of_the_f446_are_those_of_the_manual() {
+        let bases = [
+            0x0800_0000,
+            0x0800_4000,
+            0x0800_8000,
+            0x0800_C000,
+            0x0801_0000,
+            0x0802_0000,
+            0x0804_0000,
+            0x0806_0000,
+        ];
+        assert!(STM32F446RE.sectors().map(|sector| sector.region.base).eq(bases));
+        assert_eq!(STM32F446RE.sector_at(0x0807_FFFF).unwrap().number, 7);
+        assert_eq!(STM32F446RE.sector_at(0x0808_0000), None);
+        assert_eq!(STM32F446RE.sector_code(7), 7);
     }
 
     #[test]

@@ -9,11 +9,18 @@ use core::fmt;
 use crate::geometry::{Geometry, Region};
 use crate::{callgate, handoff, warm_start};
 
+pub mod nucleo_f446re;
 pub mod stm32f407g_disc1;
 pub mod stm32f407g_disc1_two;
+pub mod stm32f429i_disc1;
 
 /// Every board that coboot knows, for tools that take a board by name.
-pub const BOARDS: &[&Layout] = &[&stm32f407g_disc1::LAYOUT, &stm32f407g_disc1_two::LAYOUT];
+pub const BOARDS: &[&Layout] = &[
+    &stm32f407g_disc1::LAYOUT,
+    &stm32f407g_disc1_two::LAYOUT,
+    &nucleo_f446re::LAYOUT,
+    &stm32f429i_disc1::LAYOUT,
+];
 
 /// The board of this name, as in `--board`.
 #[must_use]
@@ -192,6 +199,7 @@ impl fmt::Display for LinkerScript<'_> {
         writeln!(f, "}}")?;
         for (symbol, value) in [
             ("__vector_table_alignment", layout.chip.vector_table_alignment()),
+            ("__vector_table_size", layout.chip.vector_table_size()),
             ("__callgate_table", layout.callgate()),
             ("__callgate_table_size", callgate::TABLE_SIZE),
             ("__handoff", layout.handoff.base),

@@ -4,7 +4,7 @@
 
 use std::panic::catch_unwind;
 
-use shared_abi::geometry::Region;
+use shared_abi::geometry::{Geometry, Region, SectorRun, STM32F446RE};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::layout::Layout;
 
@@ -70,5 +70,32 @@ fn each_broken_rule_is_named() {
     ];
     for (message, rule) in cases {
         assert!(message.contains(rule), "expected {rule:?}, got {message:?}");
+    }
+}
+
+/// What the check is for: the same values, each with one mistake.
+#[test]
+fn a_geometry_that_no_chip_has_is_refused() {
+    let wrong: [(&str, Geometry); 6] = [
+        (
+            "the sectors do not add up",
+            Geometry { flash: Region::new(0x0800_0000, 1024 * 1024), ..STM32F446RE },
+        ),
+        (
+            "16, 64 or 128 KiB",
+            Geometry { sectors: &[SectorRun { count: 16, size: 32 * 1024 }], ..STM32F446RE },
+        ),
+        (
+            "more than 24 sectors",
+            Geometry { sectors: &[SectorRun { count: 32, size: 16 * 1024 }], ..STM32F446RE },
+        ),
+        ("begins with sector 12", Geometry { second_bank: Some(12), ..STM32F446RE }),
+        ("interrupt lines", Geometry { interrupts: 113, ..STM32F446RE }),
+        ("whole pages", Geometry { sram: Region::new(0x2000_0000, 1000), ..STM32F446RE }),
+    ];
+    for (message, geometry) in wrong {
+        let panic = catch_unwind(|| geometry.checked()).expect_err(message);
+        let said = panic.downcast_ref::<&str>().copied().unwrap_or_default();
+        assert!(said.contains(message), "{said}, not {message}");
     }
 }

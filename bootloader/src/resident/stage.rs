@@ -19,13 +19,13 @@ use crate::product::{self, NO_NODE_ID, POLICY, PROGRAM_WATCHDOG_MS};
 /// ([`StayReason::code`](boot_core::decision::StayReason::code)).
 pub extern "C" fn stage() -> u32 {
     // SAFETY: nothing else runs yet; the rest of the bootloader takes them after this has returned.
-    let (rcc, gpioa, iwdg) = unsafe { (pac::RCC::steal(), pac::GPIOA::steal(), pac::IWDG::steal()) };
+    let (rcc, iwdg) = unsafe { (pac::RCC::steal(), pac::IWDG::steal()) };
 
     let reset_cause = ResetCause::from_rcc_csr(rcc.csr().read().bits());
     rcc.csr().modify(|_, w| w.rmvf().set_bit());
 
     let request = product::warm_start_cell().take();
-    let strap = bsp::entry_strap(&rcc, &gpioa);
+    let strap = bsp::entry_strap(&rcc);
 
     // A CRC over a whole program wants speed. Exact it need not be, and the crystal would take its time.
     CLOCK_TREE.speed_up(&rcc, Source::Internal);

@@ -5,6 +5,7 @@ use shared_abi::geometry::{Geometry, Region};
 use super::clock::CycleClock;
 use super::memory::{HostMemory, PAGE};
 use super::report::{Access, Report, Reports};
+use super::variant::{self, Variant};
 use super::{Options, ResetCause};
 use crate::bxcan::BxCan;
 use crate::cortex::exceptions::SYS_TICK;
@@ -37,8 +38,6 @@ const ITM: u32 = 0xE000_0000;
 const DWT: u32 = 0xE000_1000;
 const SCS: u32 = 0xE000_E000;
 const DBGMCU: u32 = 0xE004_2000;
-/// Device 413h (STM32F405/407), revision Y (RM0090 section 38.6.1).
-const DBGMCU_IDCODE: u32 = 0x100F_6413;
 
 /// Bit-band alias of the first MiB of SRAM space (PM0214 section 2.2.5); as much as there is SRAM is mapped.
 pub const SRAM_ALIAS: u32 = 0x2200_0000;
@@ -72,7 +71,7 @@ enum Place {
 type ClockEnable = Option<(u32, u32)>;
 
 /// Start, block, and its clock.
-const BLOCKS: [(u32, Block, ClockEnable); 16] = [
+const BLOCKS: [(u32, Block, ClockEnable); 18] = [
     (0x4000_3000, Block::Iwdg, None),
     (0x4000_6400, Block::Can1, Some((rcc::APB1ENR, 25))),
     (0x4000_7000, Block::Pwr, Some((rcc::APB1ENR, 28))),
@@ -86,6 +85,8 @@ const BLOCKS: [(u32, Block, ClockEnable); 16] = [
     (0x4002_1800, Block::Gpio(6), Some((rcc::AHB1ENR, 6))),
     (0x4002_1C00, Block::Gpio(7), Some((rcc::AHB1ENR, 7))),
     (0x4002_2000, Block::Gpio(8), Some((rcc::AHB1ENR, 8))),
+    (0x4002_2400, Block::Gpio(9), Some((rcc::AHB1ENR, 9))),
+    (0x4002_2800, Block::Gpio(10), Some((rcc::AHB1ENR, 10))),
     (0x4002_3000, Block::Crc, Some((rcc::AHB1ENR, 12))),
     (0x4002_3800, Block::Rcc, None),
     (0x4002_3C00, Block::Flash, None),
@@ -169,6 +170,7 @@ pub struct Counters {
 pub struct Chip {
     /// What the chip has.
     pub geometry: &'static Geometry,
+    variant: &'static Variant,
     /// From cycles to time.
     pub clock: CycleClock,
     /// Core registers and exceptions.
@@ -180,14 +182,14 @@ pub struct Chip {
     /// The watchdog.
     pub iwdg: Iwdg,
     /// The ports.
-    pub gpio: [Gpio; 9],
+    pub gpio: Vec<Gpio>,
     /// CAN1.
     pub can1: BxCan,
     pwr: Pwr,
     crc: Crc,
     syscfg: Syscfg,
     dbgmcu: [u32; 3],
-    /// SRAM1 and SRAM2, contiguous.
+    /// SRAM1, SRAM2 and (where there is one) SRAM3, contiguous.
     pub sram: HostMemory,
     /// Core-coupled memory.
     pub ccm: HostMemory,
@@ -246,18 +248,20 @@ impl Chip {
         }
         let kib = u16::try_from(geometry.flash.size / 1024).unwrap_or(u16::MAX);
         place(&mut system, FLASH_SIZE, &kib.to_le_bytes());
-        let rcc = Rcc::new(options.hse_hz);
+        let variant = variant::of(geometry);
+        let rcc = Rcc::new(variant, options.hse_hz);
         Self {
             geometry,
+            variant,
             clock: CycleClock::new(Time(0), HSI_HZ),
             scs: Scs::new(geometry.interrupts, HSI_HZ.into()),
             flash: Flash::new(geometry, options.flash_times),
             clocks: rcc.clocks(),
             rcc,
             iwdg: Iwdg::default(),
-            gpio: ['A', 'B', 'C', 'D', 'E', 'F', 'G', 'H', 'I'].map(Gpio::new),
+            gpio: ('A'..='K').take(variant.ports).map(Gpio::new).collect(),
             can1: BxCan::new(),
-            pwr: Pwr::default(),
+            pwr: Pwr::new(variant),
             crc: Crc::default(),
             syscfg: Syscfg::default(),
             dbgmcu: [0; 3],
@@ -332,7 +336,7 @@ impl Chip {
     /// Power-on: as a reset, but nothing is remembered.
     pub fn power_on(&mut self, now: Time, hse_hz: u32) {
         self.clock = CycleClock::new(now, HSI_HZ);
-        self.rcc = Rcc::new(hse_hz);
+        self.rcc = Rcc::new(self.variant, hse_hz);
         self.dbgmcu = [0; 3];
         self.counters.resets = 0;
         self.attention = false;
@@ -360,7 +364,7 @@ impl Chip {
                 "HCLK is {hclk} Hz with {latency} flash wait states: it needs {needed}, to be set before (FLASH_ACR)"
             ));
         }
-        // Datasheet, general operating conditions.
+        // Datasheet, general operating conditions; those of all chips, as over-drive is not modelled.
         for (name, hz, most) in
             [("HCLK", hclk, 168_000_000), ("PCLK1", pclk1, 42_000_000), ("PCLK2", pclk2, 84_000_000)]
         {
@@ -516,11 +520,13 @@ impl Chip {
     }
 
     /// Who answers at a word-aligned peripheral address.
-    fn place(address: u32) -> Place {
+    fn place(&self, address: u32) -> Place {
         let within = |base: u32, size: u32| Some(address.wrapping_sub(base)).filter(|&offset| offset < size);
-        let block = BLOCKS.iter().find_map(|&(base, block, enable)| {
-            within(base, BLOCK_SIZE).map(|offset| Place::Block { block, offset, enable })
-        });
+        let there = |block: Block| !matches!(block, Block::Gpio(port) if port >= self.gpio.len());
+        let block =
+            BLOCKS.iter().filter(|&&(_, block, _)| there(block)).find_map(|&(base, block, enable)| {
+                within(base, BLOCK_SIZE).map(|offset| Place::Block { block, offset, enable })
+            });
         block
             .or_else(|| within(SCS, PAGE).map(Place::Scs))
             .or_else(|| within(DWT, PAGE).map(Place::Dwt))
@@ -558,7 +564,7 @@ impl Chip {
 
     fn load_word(&mut self, address: u32) -> Result<u32, Unmodelled> {
         let now = self.now();
-        let result = match Self::place(address) {
+        let result = match self.place(address) {
             Place::Block { block, offset, enable } if self.has_clock(enable) => {
                 self.block_mut(block).read(offset, now)
             }
@@ -573,7 +579,7 @@ impl Chip {
                 self.scs.read(offset, now)
             }
             Place::Dwt(offset) => self.scs.read_dwt(offset, self.clock.cycles),
-            Place::Dbgmcu(0) => Ok(DBGMCU_IDCODE),
+            Place::Dbgmcu(0) => Ok(self.variant.idcode),
             Place::Dbgmcu(offset) => Ok(self.dbgmcu[offset as usize / 4 - 1]),
             // Stimulus ports that nobody listens to are ready.
             Place::Itm => Ok(1),
@@ -585,7 +591,7 @@ impl Chip {
 
     fn store_word(&mut self, address: u32, value: u32) -> Result<(), Unmodelled> {
         let now = self.now();
-        match Self::place(address) {
+        match self.place(address) {
             Place::Block { block, offset, enable } if self.has_clock(enable) => {
                 self.store_block(block, offset, value, now)
             }
@@ -685,6 +691,7 @@ impl Chip {
     fn reset_blocks(&mut self, before: [bool; BLOCKS.len()]) {
         let after = self.reset_bits();
         for (index, (_, block, _)) in BLOCKS.into_iter().enumerate() {
+            // Ports that the chip does not have have no reset bit either.
             if after[index] && !before[index] {
                 self.block_mut(block).reset();
             }

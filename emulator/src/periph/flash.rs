@@ -29,7 +29,10 @@ const SR_CLEARABLE: u32 = SR_EOP | SR_OPERR | SR_WRPERR | SR_PGAERR | SR_PGPERR 
 const CR_PG: u32 = 1 << 0;
 const CR_SER: u32 = 1 << 1;
 const CR_MER: u32 = 1 << 2;
-const CR_SNB: u32 = 0xF << 3;
+/// On a chip with one bank, the uppermost of the five bits is reserved.
+const CR_SNB: u32 = 0x1F << 3;
+/// Mass erase of the second bank, on a chip that has one.
+const CR_MER1: u32 = 1 << 15;
 const CR_PSIZE: u32 = 3 << 8;
 const CR_STRT: u32 = 1 << 16;
 const CR_EOPIE: u32 = 1 << 24;
@@ -41,6 +44,8 @@ const OPTCR_OPTLOCK: u32 = 1 << 0;
 const OPTCR_OPTSTRT: u32 = 1 << 1;
 /// Factory option bytes: no protection, BOR off, software watchdog (section 3.10.5).
 const OPTCR_FACTORY: u32 = 0x0FFF_AAED;
+/// OPTCR1 from the factory: no sector of the second bank is protected (section 3.9.11).
+const OPTCR1_FACTORY: u32 = 0x0FFF_0000;
 
 const ACR_MASK: u32 = 0x0000_1F07;
 
@@ -276,7 +281,9 @@ impl Flash {
 
     /// nWRP: a zero protects the sector (section 3.6.5).
     fn is_protected(&self, sector: Sector) -> bool {
-        self.options >> 16 & 1 << sector.number == 0
+        // The sectors of a second bank have theirs in OPTCR1, which stays as from the factory.
+        let second = self.geometry.second_bank.is_some_and(|first| sector.number >= first);
+        !second && self.options >> 16 & 1 << sector.number == 0
     }
 
     fn refuse(&mut self, flag: u32, why: &'static str) -> Store {
@@ -350,18 +357,26 @@ impl Flash {
 
     fn start_erase(&mut self, now: Time) -> Result<(), Unmodelled> {
         let all: Vec<Sector> = self.geometry.sectors().collect();
-        let sectors = match (self.cr & CR_SER != 0, self.cr & CR_MER != 0) {
-            (true, false) => {
-                let number = (self.cr & CR_SNB) >> 3;
-                match all.into_iter().find(|sector| u32::from(sector.number) == number) {
+        // MER and MER1 are bits for a bank each.
+        let banks = [self.cr & CR_MER != 0, self.cr & CR_MER1 != 0];
+        let sectors = match (self.cr & CR_SER != 0, banks) {
+            (true, [false, false]) => {
+                let code = (self.cr & CR_SNB) >> 3;
+                match self.sector_named(code) {
                     Some(sector) => vec![sector],
                     None => {
                         self.refuse(SR_PGSERR, "no such sector");
-                        return Err(Unmodelled(format!("FLASH_CR.SNB names sector {number}: there is none")));
+                        return Err(Unmodelled(format!("FLASH_CR.SNB is {code:05b}b: that names no sector")));
                     }
                 }
             }
-            (false, true) => all,
+            (false, [true, _] | [_, true]) => all
+                .into_iter()
+                .filter(|sector| {
+                    let first_of_second = self.geometry.second_bank.unwrap_or(u8::MAX);
+                    banks[usize::from(sector.number >= first_of_second)]
+                })
+                .collect(),
             _ => {
                 self.refuse(SR_PGSERR, "neither SER nor MER");
                 return Err(Unmodelled("FLASH_CR.STRT without exactly one of SER and MER".into()));
@@ -378,6 +393,21 @@ impl Flash {
         let takes = self.erase_time(&sectors);
         self.start(Operation::Erase { sectors }, takes, now);
         Ok(())
+    }
+
+    /// The sector that a value of SNB names. With two banks bit 4 is the bank and the others count its sectors from 0 (section
+    /// 3.9.8); values beyond are reserved.
+    fn sector_named(&self, code: u32) -> Option<Sector> {
+        let code = u8::try_from(code).ok()?;
+        let number = match self.geometry.second_bank {
+            None => code,
+            Some(first) => match (code & 0x10 != 0, code & 0xF) {
+                (_, within) if within >= first => return None,
+                (true, within) => first + within,
+                (false, within) => within,
+            },
+        };
+        self.geometry.sector(number)
     }
 
     fn offset_of(&self, sector: &Sector) -> (usize, usize) {
@@ -460,7 +490,8 @@ impl Flash {
             return Err(Unmodelled("FLASH_CR is written while it is locked: the chip ignores it".into()));
         }
         let start = self.wait_until_idle(now);
-        self.cr = value & CR_KEPT;
+        let second_bank = if self.geometry.second_bank.is_some() { CR_MER1 } else { 0 };
+        self.cr = value & (CR_KEPT | second_bank);
         if value & CR_LOCK != 0 {
             self.lock = Lock::Locked;
             return Ok(());
@@ -526,6 +557,7 @@ impl Peripheral for Flash {
                 self.cr | locked | if erasing { CR_STRT } else { 0 }
             }
             0x14 => self.options_written | if self.option_lock == Lock::Open { 0 } else { OPTCR_OPTLOCK },
+            0x18 if self.geometry.second_bank.is_some() => OPTCR1_FACTORY,
             _ => return Err(Unmodelled("the flash interface has no such register".into())),
         })
     }
@@ -556,6 +588,9 @@ impl Peripheral for Flash {
             }
             0x10 => self.write_cr(value, now),
             0x14 => self.write_optcr(value, now),
+            0x18 if self.geometry.second_bank.is_some() => {
+                Err(Unmodelled("FLASH_OPTCR1 (protection of the second bank) is not modelled".into()))
+            }
             _ => Err(Unmodelled("the flash interface has no such register".into())),
         }
     }
@@ -622,7 +657,7 @@ impl Noise {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shared_abi::geometry::STM32F407VG;
+    use shared_abi::geometry::{STM32F407VG, STM32F429ZI};
 
     const KEYR: u32 = 0x04;
     const SR: u32 = 0x0C;
@@ -683,6 +718,55 @@ mod tests {
         assert!(array[0x1_0000..0x2_0000].iter().all(|&byte| byte == 0xFF));
         assert!(array[..0x1_0000].iter().chain(&array[0x2_0000..]).all(|&byte| byte == 0));
         assert_eq!(flash.counters.sectors_erased, 1);
+    }
+
+    /// RM0090 section 3.9.8: SNB is 10000b for sector 12, the first of the second bank; 01100b to 01111b are not allowed.
+    #[test]
+    fn sectors_of_the_second_bank_have_codes_of_their_own() {
+        for (code, erased) in [
+            (0b01011, Some(0x000E_0000..0x0010_0000)),
+            (0b10000, Some(0x0010_0000..0x0010_4000)),
+            (0b10100, Some(0x0011_0000..0x0012_0000)),
+            (0b11011, Some(0x001E_0000..0x0020_0000)),
+            (0b01100, None),
+            (0b01111, None),
+            (0b11100, None),
+        ] {
+            let mut flash = Flash::new(&STM32F429ZI, FlashTimes::Typical);
+            flash.write(KEYR, 0x4567_0123, Time(0)).unwrap();
+            flash.write(KEYR, 0xCDEF_89AB, Time(0)).unwrap();
+            flash.array.bytes_mut().fill(0);
+            let result = flash.write(CR, CR_SER | code << 3 | X32 | CR_STRT, Time(0));
+            flash.advance(Time(u64::MAX));
+            assert_eq!(result.is_ok(), erased.is_some(), "{code:05b}");
+            let erased = erased.unwrap_or(0..0);
+            let wrong = flash
+                .array
+                .bytes()
+                .iter()
+                .enumerate()
+                .position(|(at, &byte)| (byte == 0xFF) != erased.contains(&at));
+            assert_eq!(wrong, None, "{code:05b}");
+        }
+    }
+
+    /// Section 3.9.8: MER erases bank 1, MER1 bank 2.
+    #[test]
+    fn a_mass_erase_is_one_of_a_bank() {
+        for (bits, erased) in
+            [(1 << 2, [true, false]), (1 << 15, [false, true]), (1 << 2 | 1 << 15, [true, true])]
+        {
+            let mut flash = Flash::new(&STM32F429ZI, FlashTimes::Typical);
+            flash.write(KEYR, 0x4567_0123, Time(0)).unwrap();
+            flash.write(KEYR, 0xCDEF_89AB, Time(0)).unwrap();
+            flash.array.bytes_mut().fill(0);
+            flash.write(CR, bits | X32 | CR_STRT, Time(0)).unwrap();
+            flash.advance(Time(u64::MAX));
+            for (bank, bytes) in flash.array.bytes().chunks(1 << 20).enumerate() {
+                let wanted = if erased[bank] { 0xFF } else { 0 };
+                assert!(bytes.iter().all(|&byte| byte == wanted), "{bits:X}, bank {bank}");
+            }
+        }
     }
 
     #[test]

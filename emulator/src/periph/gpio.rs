@@ -29,7 +29,7 @@ const INPUT: u32 = 0;
 const OUTPUT: u32 = 1;
 
 impl Gpio {
-    /// Port `port`, one of `'A'` to `'I'`.
+    /// Port `port`, one of `'A'` to `'K'`.
     #[must_use]
     pub fn new(port: char) -> Self {
         let name = match port {
@@ -41,7 +41,9 @@ impl Gpio {
             'F' => "GPIOF",
             'G' => "GPIOG",
             'H' => "GPIOH",
-            _ => "GPIOI",
+            'I' => "GPIOI",
+            'J' => "GPIOJ",
+            _ => "GPIOK",
         };
         // PA13, PA14, PA15 and PB3, PB4 wake up as debug pins (section 8.4, reset values).
         let (moder, ospeedr, pupdr) = match port {

@@ -1,30 +1,32 @@
-//! Power controller (RM0090 section 5).
+//! Power controller (RM0090 section 5, RM0390 section 5).
 
+use crate::machine::variant::Variant;
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::Time;
 
-const CR_RESET: u32 = 0x0000_4000;
-const CR_VOS: u32 = 1 << 14;
 const CR_DBP: u32 = 1 << 8;
 const CR_FPDS: u32 = 1 << 9;
 const CR_LOW_POWER: u32 = 0b11;
 const CR_PVD: u32 = 0b1111 << 4;
+/// On chips that can do 180 MHz.
+const CR_OVER_DRIVE: u32 = 0b11 << 16;
 const CSR_VOSRDY: u32 = 1 << 14;
 
 /// Regulator scale and backup-domain access; standby, stop and the voltage detector are not modelled.
 #[derive(Clone, Debug)]
 pub struct Pwr {
+    variant: &'static Variant,
     cr: u32,
     csr: u32,
 }
 
-impl Default for Pwr {
-    fn default() -> Self {
-        Self { cr: CR_RESET, csr: 0 }
-    }
-}
-
 impl Pwr {
+    /// As after a reset, on this chip.
+    #[must_use]
+    pub fn new(variant: &'static Variant) -> Self {
+        Self { variant, cr: variant.voltage_scale.1, csr: 0 }
+    }
+
     /// CR.DBP: whether the backup domain may be written.
     #[must_use]
     pub fn backup_writable(&self) -> bool {
@@ -49,9 +51,13 @@ impl Peripheral for Pwr {
         match offset {
             0x00 => {
                 // CWUF and CSBF read as zero.
-                self.cr = value & (CR_VOS | CR_DBP | CR_FPDS | CR_LOW_POWER | CR_PVD);
+                let (voltage_scale, _) = self.variant.voltage_scale;
+                self.cr = value & (voltage_scale | CR_DBP | CR_FPDS | CR_LOW_POWER | CR_PVD);
                 if value & CR_PVD != 0 {
                     return Err(Unmodelled("the voltage detector (PVD) is not modelled".into()));
+                }
+                if value & CR_OVER_DRIVE != 0 {
+                    return Err(Unmodelled("over-drive is not modelled, or the chip has none".into()));
                 }
             }
             0x04 => {
@@ -74,6 +80,6 @@ impl Peripheral for Pwr {
     fn interrupts(&self, _active: &mut Vec<u16>) {}
 
     fn reset(&mut self) {
-        *self = Self::default();
+        *self = Self::new(self.variant);
     }
 }

@@ -1,5 +1,6 @@
-//! Reset and clock control (RM0090 section 7, STM32F405/407).
+//! Reset and clock control (RM0090 sections 6 and 7, RM0390 section 6).
 
+use crate::machine::variant::Variant;
 use crate::machine::ResetCause;
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::{Span, Time};
@@ -25,6 +26,7 @@ const CR_PLLON: u32 = 1 << 24;
 const CR_PLLRDY: u32 = 1 << 25;
 const CR_PLLI2SON: u32 = 1 << 26;
 const CR_PLLI2SRDY: u32 = 1 << 27;
+const CR_PLLSAION: u32 = 1 << 28;
 const CR_TRIM: u32 = 0x1F << 3;
 const CR_RESET: u32 = 0x0000_0083;
 
@@ -84,29 +86,6 @@ impl Source {
     }
 }
 
-/// A register that is kept as written: (offset, reset value, bits that exist).
-const PLAIN: [(u32, u32, u32); 19] = [
-    (0x0C, 0, 0x0000_0000),              // CIR: see `write`
-    (0x10, 0, 0x22E0_11FF),              // AHB1RSTR
-    (0x14, 0, 0x0000_00F1),              // AHB2RSTR
-    (0x18, 0, 0x0000_0001),              // AHB3RSTR
-    (0x20, 0, 0x36FE_C9FF),              // APB1RSTR
-    (0x24, 0, 0x0007_5933),              // APB2RSTR
-    (AHB1ENR, 0x0010_0000, 0x7E74_11FF), // AHB1ENR
-    (AHB2ENR, 0, 0x0000_00F1),           // AHB2ENR
-    (AHB3ENR, 0, 0x0000_0001),           // AHB3ENR
-    (APB1ENR, 0, 0x36FE_C9FF),           // APB1ENR
-    (APB2ENR, 0, 0x0007_5F33),           // APB2ENR
-    (0x50, 0x7E67_91FF, 0x7E67_91FF),    // AHB1LPENR
-    (0x54, 0x0000_00F1, 0x0000_00F1),    // AHB2LPENR
-    (0x58, 0x0000_0001, 0x0000_0001),    // AHB3LPENR
-    (0x60, 0x36FE_C9FF, 0x36FE_C9FF),    // APB1LPENR
-    (0x64, 0x0007_5F33, 0x0007_5F33),    // APB2LPENR
-    (0x80, 0, 0xFFFF_FFFF),              // SSCGR
-    (0x84, 0x2000_3000, 0x7000_7FC0),    // PLLI2SCFGR
-    (PLLCFGR, 0x2400_3010, 0x0F43_7FFF), // PLLCFGR
-];
-
 const PLLCFGR: u32 = 0x04;
 /// Offset of RCC_AHB1ENR.
 pub const AHB1ENR: u32 = 0x30;
@@ -124,7 +103,9 @@ pub const APB2ENR: u32 = 0x44;
 pub struct Rcc {
     /// Frequency of the crystal or clock at OSC_IN; 0 where there is none.
     hse_hz: u32,
-    plain: [u32; PLAIN.len()],
+    variant: &'static Variant,
+    /// The values of the variant's plain registers, in its order.
+    plain: Vec<u32>,
     hsi: Source,
     hse: Source,
     pll: Source,
@@ -141,12 +122,13 @@ pub struct Rcc {
 }
 
 impl Rcc {
-    /// As after power-on, with a crystal of `hse_hz`; 0 means that there is none.
+    /// As after power-on, on this chip, with a crystal of `hse_hz`; 0 means that there is none.
     #[must_use]
-    pub fn new(hse_hz: u32) -> Self {
+    pub fn new(variant: &'static Variant, hse_hz: u32) -> Self {
         Self {
             hse_hz,
-            plain: PLAIN.map(|(_, reset, _)| reset),
+            variant,
+            plain: variant.rcc.iter().map(|&(_, reset, _)| reset).collect(),
             hsi: Source::On { ready: Time(0) },
             hse: Source::Off,
             pll: Source::Off,
@@ -182,7 +164,15 @@ impl Rcc {
     /// A register that is kept as written; 0 for any other.
     #[must_use]
     pub fn plain(&self, offset: u32) -> u32 {
-        PLAIN.iter().position(|&(at, _, _)| at == offset).map_or(0, |index| self.plain[index])
+        self.position(offset).map_or(0, |index| self.plain[index])
+    }
+
+    fn position(&self, offset: u32) -> Option<usize> {
+        self.variant.rcc.iter().position(|&(at, _, _)| at == offset)
+    }
+
+    fn unknown(&self) -> Unmodelled {
+        Unmodelled(format!("RCC has no such register on the {}, or it is not modelled", self.variant.name))
     }
 
     fn pll_hz(&self) -> u32 {
@@ -263,6 +253,9 @@ impl Rcc {
         if value & CR_CSSON != 0 {
             return Err(Unmodelled("the clock security system is not modelled".into()));
         }
+        if value & CR_PLLSAION != 0 {
+            return Err(Unmodelled("the PLL for SAI and display is not modelled".into()));
+        }
         Ok(())
     }
 }
@@ -287,8 +280,9 @@ impl Peripheral for Rcc {
                     | (if self.lsi.is_on() { CSR_LSION } else { 0 })
                     | (if self.lsi.is_ready(now) { CSR_LSIRDY } else { 0 })
             }
-            _ if PLAIN.iter().any(|&(at, _, _)| at == offset) => self.plain(offset),
-            _ => return Err(Unmodelled("RCC has no such register on the STM32F407".into())),
+            // CIR: see `write`.
+            0x0C => 0,
+            _ => self.position(offset).map(|index| self.plain[index]).ok_or_else(|| self.unknown())?,
         })
     }
 
@@ -326,10 +320,8 @@ impl Peripheral for Rcc {
                 }
             }
             _ => {
-                let Some(index) = PLAIN.iter().position(|&(at, _, _)| at == offset) else {
-                    return Err(Unmodelled("RCC has no such register on the STM32F407".into()));
-                };
-                self.plain[index] = value & PLAIN[index].2;
+                let index = self.position(offset).ok_or_else(|| self.unknown())?;
+                self.plain[index] = value & self.variant.rcc[index].2;
             }
         }
         Ok(())
@@ -357,7 +349,7 @@ impl Peripheral for Rcc {
 
     /// System reset: everything but the reset flags, the LSI's request and the backup domain (section 7.1.1).
     fn reset(&mut self) {
-        let fresh = Self::new(self.hse_hz);
+        let fresh = Self::new(self.variant, self.hse_hz);
         *self = Self {
             csr_flags: self.csr_flags,
             lse: self.lse,
@@ -370,14 +362,21 @@ impl Peripheral for Rcc {
 
 #[cfg(test)]
 mod tests {
+    use shared_abi::geometry::{STM32F407VG, STM32F446RE};
+
     use super::*;
+    use crate::machine::variant;
+
+    fn f407(hse_hz: u32) -> Rcc {
+        Rcc::new(variant::of(&STM32F407VG), hse_hz)
+    }
 
     const MS: u64 = 1_000_000_000;
 
     /// The usual set-up of the F407: 8 MHz crystal, M 8, N 336, P 2 give 168 MHz, APB1 a quarter, APB2 a half.
     #[test]
     fn the_pll_makes_168_mhz_from_an_8_mhz_crystal() {
-        let mut rcc = Rcc::new(8_000_000);
+        let mut rcc = f407(8_000_000);
         assert_eq!(rcc.clocks(), Clocks { hclk: 16_000_000, pclk1: 16_000_000, pclk2: 16_000_000 });
         rcc.write(0x00, CR_RESET | CR_HSEON, Time(0)).unwrap();
         assert_eq!(rcc.read(0x00, Time(2 * MS - 1)).unwrap() & CR_HSERDY, 0);
@@ -401,7 +400,7 @@ mod tests {
 
     #[test]
     fn reset_values_are_those_of_the_manual() {
-        let mut rcc = Rcc::new(8_000_000);
+        let mut rcc = f407(8_000_000);
         for (offset, value) in [
             (0x00, 0x0000_0083),
             (0x04, 0x2400_3010),
@@ -418,7 +417,7 @@ mod tests {
 
     #[test]
     fn reset_flags_gather_until_they_are_removed() {
-        let mut rcc = Rcc::new(8_000_000);
+        let mut rcc = f407(8_000_000);
         rcc.write(0x74, CSR_RMVF, Time(0)).unwrap();
         assert_eq!(rcc.read(0x74, Time(0)), Ok(0));
         rcc.note_reset(ResetCause::Software);
@@ -430,8 +429,23 @@ mod tests {
 
     #[test]
     fn without_a_crystal_hse_never_gets_ready() {
-        let mut rcc = Rcc::new(0);
+        let mut rcc = f407(0);
         assert!(rcc.write(0x00, CR_RESET | CR_HSEON, Time(0)).is_err());
         assert_eq!(rcc.read(0x00, Time(u64::MAX)).unwrap() & CR_HSERDY, 0);
+    }
+
+    /// What one chip of the family has, another has not: port I of the F407, the clock gates of the F446.
+    #[test]
+    fn registers_and_bits_are_those_of_the_chip() {
+        const CKGATENR: u32 = 0x90;
+        let mut f407 = f407(8_000_000);
+        let mut f446 = Rcc::new(variant::of(&STM32F446RE), 8_000_000);
+        for (rcc, there) in [(&mut f407, 0x1FF), (&mut f446, 0x0FF)] {
+            rcc.write(AHB1ENR, 0x7FF, Time(0)).unwrap();
+            assert_eq!(rcc.plain(AHB1ENR), there);
+        }
+        assert!(f407.read(CKGATENR, Time(0)).is_err() && f407.write(CKGATENR, 1, Time(0)).is_err());
+        f446.write(CKGATENR, 1, Time(0)).unwrap();
+        assert_eq!(f446.read(CKGATENR, Time(0)), Ok(1));
     }
 }

@@ -21,7 +21,7 @@ use emulator::pacing::{Pacer, Speed};
 use emulator::socketcand::Server;
 use emulator::time::Time;
 use emulator::world::{MachineId, World};
-use shared_abi::geometry::{Geometry, STM32F407VG};
+use shared_abi::geometry::{Geometry, STM32F407VG, STM32F429ZI, STM32F446RE};
 
 /// Runs boards on a virtual CAN bus and shows in words what happens.
 ///
@@ -89,15 +89,22 @@ struct Args {
     run_for: Option<Time>,
 }
 
-/// What is known of a board here: its chip and its crystal.
+/// What is known of a board here: its chip, its crystal, and pins that a resistor pulls up.
 #[derive(Debug)]
 struct Board {
     name: &'static str,
     chip: &'static Geometry,
     hse_hz: u32,
+    pulled_up: &'static [(char, u8)],
 }
 
-const BOARDS: &[Board] = &[Board { name: "stm32f407g-disc1", chip: &STM32F407VG, hse_hz: 8_000_000 }];
+const BOARDS: &[Board] = &[
+    Board { name: "stm32f407g-disc1", chip: &STM32F407VG, hse_hz: 8_000_000, pulled_up: &[] },
+    Board { name: "stm32f407g-disc1-two", chip: &STM32F407VG, hse_hz: 8_000_000, pulled_up: &[] },
+    // B1 (UM1724 section 7.6).
+    Board { name: "nucleo-f446re", chip: &STM32F446RE, hse_hz: 8_000_000, pulled_up: &[('C', 13)] },
+    Board { name: "stm32f429i-disc1", chip: &STM32F429ZI, hse_hz: 8_000_000, pulled_up: &[] },
+];
 
 fn board(name: &str) -> Result<&'static Board, String> {
     let names = || BOARDS.iter().map(|board| board.name).collect::<Vec<_>>().join(", ");
@@ -252,6 +259,9 @@ impl Bench {
                 },
             );
             let mut machine = machine.context("setting up the board")?;
+            for &(port, pin) in args.board.pulled_up {
+                machine.set_pin(port, pin, Some(true));
+            }
             for path in images(args) {
                 load(&mut machine, path)?;
             }

@@ -1,0 +1,108 @@
+//! STM32F429I-DISC1 with a CAN transceiver on PB8 and PB9.
+//!
+//! Every pin of CAN1 has another use on this board (UM1670 section 6.11): PD0 and PD1 are data lines of the SDRAM, PA11, PA12, PB8 and PB9 go
+//! to the display's parallel interface, where they end in inputs. So PB8 and PB9 are free as long as the display stays dark.
+
+use shared_abi::layout::{self, Layout};
+
+use crate::clock::ClockTree;
+use crate::Identity;
+
+/// Who owns which address on this board.
+pub const LAYOUT: &Layout = &layout::stm32f429i_disc1::LAYOUT;
+
+/// What the device says of itself.
+pub const IDENTITY: Identity = Identity {
+    vendor_id: 0,
+    product_code: 0x4291_D151,
+    revision: 0x0001_0000,
+    device_name: "coboot STM32F429I-DISC1",
+    hardware_version: "MB1075",
+};
+
+/// Node-ID of a device that was never told another one, 1 to 127; 255 for one that waits for layer setting services.
+pub const NODE_ID: u8 = 1;
+
+/// Bit rate of a device that was never told another one, in bit/s; 0 for one that finds it out by listening.
+pub const BIT_RATE: u32 = 125_000;
+
+/// A crystal of 8 MHz on OSC_IN and OSC_OUT (X3). 160 MHz and not 168 (180 with over-drive): APB1 at 40 MHz makes each bit rate of
+/// CiA 301, 42 MHz and 45 MHz do not make 800 kbit/s.
+pub const CLOCK_TREE: ClockTree = ClockTree {
+    hse: 8_000_000,
+    hse_bypass: false,
+    pll_input: 2_000_000,
+    pll_n: 160,
+    pll_p: 2,
+    apb1: 4,
+    apb2: 2,
+    wait_states: 5,
+}
+.checked();
+/// The pin that asks for the bootloader after a reset, as port and number, and the level that does.
+/// The blue button B1 on PA0, high when pressed (UM1670 section 6.6).
+pub const ENTRY_STRAP: (char, u8, bool) = ('A', 0, true);
+/// The core's clock, in Hz.
+pub const SYSCLK: u32 = CLOCK_TREE.sysclk();
+/// Clock of the CAN controller, in Hz: that of APB1.
+pub const CAN_CLOCK: u32 = CLOCK_TREE.apb1_clock();
+
+#[cfg(target_arch = "arm")]
+pub use drivers::*;
+
+/// The parts of the board and what is done to them.
+#[cfg(target_arch = "arm")]
+mod drivers {
+    use stm32f4xx_hal::can::{Can, CanExt};
+    use stm32f4xx_hal::gpio::{GpioExt, Output, Pin};
+    use stm32f4xx_hal::pac;
+    use stm32f4xx_hal::prelude::*;
+    use stm32f4xx_hal::rcc::{Config, Rcc, RccExt};
+
+    use super::{CAN_CLOCK, CLOCK_TREE, SYSCLK};
+
+    /// The CAN controller that coboot talks through.
+    pub type CanController = Can<pac::CAN1>;
+    /// The LED that shows life: LD3, green, high is on.
+    pub type Led = Pin<'G', 13, Output>;
+
+    /// The board's parts, set up.
+    pub struct Board {
+        /// The CAN controller with its pins; clocked, not yet configured.
+        pub can: CanController,
+        /// The LED.
+        pub led: Led,
+    }
+
+    /// The clocks as the HAL knows them, for the HAL's drivers. From the state after a reset.
+    #[must_use]
+    pub fn clocks(rcc: pac::RCC) -> Rcc {
+        rcc.freeze(Config::hse(CLOCK_TREE.hse.Hz()).sysclk(SYSCLK.Hz()).pclk1(CAN_CLOCK.Hz()))
+    }
+
+    /// Sets the pins up.
+    #[must_use]
+    pub fn init(rcc: &mut Rcc, can1: pac::CAN1) -> Board {
+        let gpiob = take_port!(GPIOB, can1).split(rcc);
+        let gpiog = take_port!(GPIOG, can1).split(rcc);
+        let led = gpiog.pg13.into_push_pull_output();
+        // AF9: CAN1_RX is PB8, CAN1_TX is PB9 (DS9405 table 12).
+        let can = can1.can((gpiob.pb9, gpiob.pb8), rcc);
+        Board { can, led }
+    }
+
+    /// Whether the entry strap ([`ENTRY_STRAP`](super::ENTRY_STRAP)) asks for the bootloader.
+    ///
+    /// Leaves port A as after a reset.
+    #[must_use]
+    pub fn entry_strap(rcc: &pac::RCC) -> bool {
+        // SAFETY: the port's inputs are read, and nothing is changed.
+        let gpioa = unsafe { pac::GPIOA::steal() };
+        rcc.ahb1enr().modify(|_, w| w.gpioaen().enabled());
+        // The clock needs two cycles before the first access (RM0090 section 7.3.10): reading back waits that long.
+        let _ = rcc.ahb1enr().read();
+        let pressed = gpioa.idr().read().idr0().is_high();
+        rcc.ahb1enr().modify(|_, w| w.gpioaen().disabled());
+        pressed
+    }
+}

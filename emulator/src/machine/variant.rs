@@ -1,0 +1,150 @@
+//! What differs between the chips beside memories and interrupt lines: which registers and bits exist, and what they say of
+//! themselves. Other chips of the family go by the STM32F407.
+
+use shared_abi::geometry::Geometry;
+
+/// A register of RCC that is kept as written: (offset, reset value, bits that exist).
+pub type Plain = (u32, u32, u32);
+
+/// One line of the family.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Variant {
+    /// What the chips are called in reports.
+    pub name: &'static str,
+    /// DBGMCU_IDCODE: device and revision.
+    pub idcode: u32,
+    /// How many GPIO ports there are, from A on.
+    pub ports: usize,
+    /// PWR_CR.VOS, and its value after a reset.
+    pub voltage_scale: (u32, u32),
+    /// The plain registers of RCC.
+    pub rcc: &'static [Plain],
+}
+
+/// STM32F405/407, device 413h, revision Y (RM0090 section 38.6.1). Registers: sections 5 and 7.
+static F407: Variant = Variant {
+    name: "STM32F407",
+    idcode: 0x100F_6413,
+    ports: 9,
+    voltage_scale: (1 << 14, 1 << 14),
+    rcc: &[
+        (0x10, 0, 0x2260_11FF),           // AHB1RSTR
+        (0x14, 0, 0x0000_00F1),           // AHB2RSTR
+        (0x18, 0, 0x0000_0001),           // AHB3RSTR
+        (0x20, 0, 0x36FE_C9FF),           // APB1RSTR
+        (0x24, 0, 0x0007_5933),           // APB2RSTR
+        (0x30, 0x0010_0000, 0x7E74_11FF), // AHB1ENR
+        (0x34, 0, 0x0000_00F1),           // AHB2ENR
+        (0x38, 0, 0x0000_0001),           // AHB3ENR
+        (0x40, 0, 0x36FE_C9FF),           // APB1ENR
+        (0x44, 0, 0x0007_5F33),           // APB2ENR
+        (0x50, 0x7E67_91FF, 0x7E67_91FF), // AHB1LPENR
+        (0x54, 0x0000_00F1, 0x0000_00F1), // AHB2LPENR
+        (0x58, 0x0000_0001, 0x0000_0001), // AHB3LPENR
+        (0x60, 0x36FE_C9FF, 0x36FE_C9FF), // APB1LPENR
+        (0x64, 0x0007_5F33, 0x0007_5F33), // APB2LPENR
+        (0x80, 0, 0xFFFF_FFFF),           // SSCGR
+        (0x84, 0x2000_3000, 0x7000_7FC0), // PLLI2SCFGR
+        (0x04, 0x2400_3010, 0x0F43_7FFF), // PLLCFGR
+    ],
+};
+
+/// STM32F42x/43x, device 419h, revision 3 (RM0090 section 38.6.1). Registers: sections 5 and 6.
+static F429: Variant = Variant {
+    name: "STM32F429",
+    idcode: 0x2001_6419,
+    ports: 11,
+    voltage_scale: (3 << 14, 3 << 14),
+    rcc: &[
+        (0x10, 0, 0x22E0_17FF),           // AHB1RSTR
+        (0x14, 0, 0x0000_00F1),           // AHB2RSTR
+        (0x18, 0, 0x0000_0001),           // AHB3RSTR
+        (0x20, 0, 0xF6FE_C9FF),           // APB1RSTR
+        (0x24, 0, 0x0477_7933),           // APB2RSTR
+        (0x30, 0x0010_0000, 0x7EF4_17FF), // AHB1ENR
+        (0x34, 0, 0x0000_00F1),           // AHB2ENR
+        (0x38, 0, 0x0000_0001),           // AHB3ENR
+        (0x40, 0, 0xF6FE_C9FF),           // APB1ENR
+        (0x44, 0, 0x0477_7F33),           // APB2ENR
+        (0x50, 0x7EEF_97FF, 0x7EEF_97FF), // AHB1LPENR
+        (0x54, 0x0000_00F1, 0x0000_00F1), // AHB2LPENR
+        (0x58, 0x0000_0001, 0x0000_0001), // AHB3LPENR
+        (0x60, 0xF6FE_C9FF, 0xF6FE_C9FF), // APB1LPENR
+        (0x64, 0x0477_7F33, 0x0477_7F33), // APB2LPENR
+        (0x80, 0, 0xFFFF_FFFF),           // SSCGR
+        (0x84, 0x2000_3000, 0x7F00_7FC0), // PLLI2SCFGR
+        (0x88, 0x2400_3000, 0x7F03_7FC0), // PLLSAICFGR
+        (0x8C, 0, 0x01F3_1F1F),           // DCKCFGR
+        (0x04, 0x2400_3010, 0x0F43_7FFF), // PLLCFGR
+    ],
+};
+
+/// STM32F446, device 421h, revision A (RM0390 section 33.6.1). Registers: sections 5 and 6.
+static F446: Variant = Variant {
+    name: "STM32F446",
+    idcode: 0x1000_6421,
+    ports: 8,
+    voltage_scale: (3 << 14, 3 << 14),
+    rcc: &[
+        (0x10, 0, 0x2060_10FF),           // AHB1RSTR
+        (0x14, 0, 0x0000_0081),           // AHB2RSTR
+        (0x18, 0, 0x0000_0003),           // AHB3RSTR
+        (0x20, 0, 0x37FF_C9FF),           // APB1RSTR
+        (0x24, 0, 0x00C7_7933),           // APB2RSTR
+        (0x30, 0, 0x6064_10FF),           // AHB1ENR
+        (0x34, 0, 0x0000_0081),           // AHB2ENR
+        (0x38, 0, 0x0000_0003),           // AHB3ENR
+        (0x40, 0, 0x3FFF_C9FF),           // APB1ENR
+        (0x44, 0, 0x00C7_7F33),           // APB2ENR
+        (0x50, 0x6067_90FF, 0x6067_90FF), // AHB1LPENR
+        (0x54, 0x0000_0081, 0x0000_0081), // AHB2LPENR
+        (0x58, 0x0000_0003, 0x0000_0003), // AHB3LPENR
+        (0x60, 0x3FFF_C9FF, 0x3FFF_C9FF), // APB1LPENR
+        (0x64, 0x00C7_7F33, 0x00C7_7F33), // APB2LPENR
+        (0x80, 0, 0xFFFF_FFFF),           // SSCGR
+        (0x84, 0x2400_3000, 0x7F03_7FFF), // PLLI2SCFGR
+        (0x88, 0x2400_3000, 0x7F03_7FFF), // PLLSAICFGR
+        (0x8C, 0, 0x1FF0_1F1F),           // DCKCFGR
+        (0x90, 0, 0x0000_007F),           // CKGATENR
+        (0x94, 0, 0x3CC0_0000),           // DCKCFGR2
+        (0x04, 0x2400_3010, 0x7F43_7FFF), // PLLCFGR
+    ],
+};
+
+/// The variant of a chip.
+#[must_use]
+pub fn of(chip: &Geometry) -> &'static Variant {
+    match chip.chip.get(..9) {
+        Some("stm32f446") => &F446,
+        Some("stm32f427" | "stm32f429" | "stm32f437" | "stm32f439") => &F429,
+        _ => &F407,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shared_abi::geometry::{STM32F407VG, STM32F429ZI, STM32F446RE};
+
+    use super::*;
+
+    #[test]
+    fn each_chip_has_its_own() {
+        // Device identifiers: RM0090 section 38.6.1, RM0390 section 33.6.1.
+        for (chip, device) in [(&STM32F407VG, 0x413), (&STM32F429ZI, 0x419), (&STM32F446RE, 0x421)] {
+            assert_eq!(of(chip).idcode & 0xFFF, device, "{}", chip.chip);
+        }
+    }
+
+    /// Where a bit resets a block, a bit enables it.
+    #[test]
+    fn the_reset_bits_of_a_block_have_clocks() {
+        for variant in [&F407, &F429, &F446] {
+            let mask =
+                |offset| variant.rcc.iter().find(|&&(at, ..)| at == offset).map_or(0, |&(.., mask)| mask);
+            for reset in [0x10, 0x14, 0x18, 0x20, 0x24] {
+                let without = mask(reset) & !mask(reset + 0x20);
+                assert_eq!(without, 0, "{}, offset {reset:02X}h", variant.name);
+            }
+        }
+    }
+}

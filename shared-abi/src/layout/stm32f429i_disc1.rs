@@ -1,0 +1,22 @@
+//! STM32F429I-DISC1 (STM32F429ZI: 2 MiB flash in two banks of 4×16, 64 and 7×128 KiB; 192 KiB SRAM).
+//!
+//! The program reaches across the border of the banks: sectors 4 to 11 of the first and all of the second, 12 to 23. The three
+//! SRAMs (112, 16 and 64 KiB) follow one another and are one to a program; handoff and warm-start cell are at the end of the
+//! third. The CCM is nobody's: it is not cleared by the bootloader, and the application may have it.
+
+use super::Layout;
+use crate::geometry::{Region, STM32F429ZI};
+
+/// The memory map of the STM32F429I-DISC1.
+pub const LAYOUT: Layout = Layout {
+    board: "stm32f429i-disc1",
+    chip: &STM32F429ZI,
+    bootloader: Region::new(0x0800_0000, 32 * 1024),
+    callgate_offset: 0x200,
+    parameters: [Region::new(0x0800_8000, 16 * 1024), Region::new(0x0800_C000, 16 * 1024)],
+    programs: &[Region::new(0x0801_0000, (2048 - 64) * 1024)],
+    ram: Region::new(0x2000_0000, 192 * 1024 - 64),
+    handoff: Region::new(0x2002_FFC0, 48),
+    warm_start: Region::new(0x2002_FFF0, 16),
+}
+.checked();
