@@ -91,6 +91,9 @@ impl Bench {
             .map(|options| {
                 let mut machine = Machine::new(firmware::board().chip, options).expect("the emulator starts");
                 machine.load(&bootloader).expect("the bootloader's ELF fits the flash");
+                // Nobody presses the button; the board's resistor pulls the pin the other way.
+                let (port, pin, pressed) = bsp::ENTRY_STRAP;
+                machine.set_pin(port, pin, Some(!pressed));
                 world.add_machine(machine)
             })
             .collect();

@@ -24,7 +24,7 @@ pub fn of_board(board: &str, image: &str) -> String {
     format!("../{board}/{image}")
 }
 
-/// The board that the images are for: `COBOOT_BOARD`, or the first one.
+/// The board that the images are for: `COBOOT_BOARD`, or the one whose board file is compiled in.
 ///
 /// # Panics
 /// If there is no such board.
@@ -34,7 +34,7 @@ pub fn board() -> &'static Layout {
         Ok(name) => {
             layout::by_name(&name).unwrap_or_else(|| panic!("COBOOT_BOARD: no board is called {name:?}"))
         }
-        Err(_) => layout::BOARDS[0],
+        Err(_) => bsp::LAYOUT,
     }
 }
 

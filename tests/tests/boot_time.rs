@@ -32,12 +32,11 @@ fn large_program() -> BlockFile {
 
 /// From power-on to the program counter in the program, in steps of 10 us.
 fn first_instruction(bench: &mut Bench) -> Span {
-    let base = firmware::board().programs[0].base;
     let from: Time = bench.time();
     bench.power_on();
     loop {
         bench.world.run_for(Span::from_micros(10));
-        if bench.machine().pc() >= base && bench.machine().pc() < 0x1000_0000 {
+        if firmware::board().programs[0].contains(bench.machine().pc(), 2) {
             return bench.time() - from;
         }
         assert!(bench.time() - from < Span::from_millis(1000), "the program does not start");

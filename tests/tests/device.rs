@@ -45,7 +45,12 @@ fn call_back(bench: &mut Bench) {
 
 /// Puts the flash of program 1 aside, to see whether anything touches it.
 fn program_flash(bench: &mut Bench) -> Vec<u8> {
-    bench.machine().flash()[0x1_0000..].to_vec()
+    bench.machine().flash()[(program_start() - firmware::board().chip.flash.base) as usize..].to_vec()
+}
+
+/// Where the flash of program 1 begins.
+fn program_start() -> u32 {
+    firmware::board().programs[0].base
 }
 
 fn crc32(bytes: &[u8]) -> u32 {
@@ -84,25 +89,25 @@ fn wrong_blocks_are_refused_with_abort_and_status_and_the_right_one_is_taken() {
     bench.session().command(1, ProgramControl::Clear).unwrap();
     assert_eq!(bench.session().await_idle(1, Doing::Read(STATUS)).unwrap().to_word(), 0);
     let blank = program_flash(&mut bench);
-    let mut bad_crc = block(1, 0x0801_0000, &[1; 100]);
+    let mut bad_crc = block(1, program_start(), &[1; 100]);
     bad_crc[50] ^= 0x10;
     assert_eq!(
-        send(&mut bench, &block(1, 0x0801_0000, &[1; 100])),
+        send(&mut bench, &block(1, program_start(), &[1; 100])),
         (Some(0x0800_0022), 0x88),
         "before block 0"
     );
     assert_eq!(send(&mut bench, &block(0, 0, &[0; 8])), (None, 0));
     for (what, bad, abort, status) in [
         ("wrong CRC", bad_crc, 0x0800_0020, 0x06),
-        ("wrong sequence", block(2, 0x0801_0000, &[1; 100]), 0x0800_0022, 0x88),
-        ("over the bootloader", block(1, 0x0800_0000, &[1; 100]), 0x0800_0020, 0x0E),
-        ("outside the flash", block(1, 0x0810_0000, &[1; 100]), 0x0800_0020, 0x0C),
-        ("too large", block(1, 0x0801_0000, &[1; 16384 - 15]), 0x0607_0012, 0x04),
+        ("wrong sequence", block(2, program_start(), &[1; 100]), 0x0800_0022, 0x88),
+        ("over the bootloader", block(1, firmware::board().bootloader.base, &[1; 100]), 0x0800_0020, 0x0E),
+        ("outside the flash", block(1, firmware::board().chip.flash.end(), &[1; 100]), 0x0800_0020, 0x0C),
+        ("too large", block(1, program_start(), &[1; 16384 - 15]), 0x0607_0012, 0x04),
     ] {
         assert_eq!(send(&mut bench, &bad), (Some(abort), status), "{what}");
         assert_eq!(program_flash(&mut bench), blank, "{what}");
     }
-    assert_eq!(send(&mut bench, &block(1, 0x0801_0000, &[1; 100])), (None, 0));
+    assert_eq!(send(&mut bench, &block(1, program_start(), &[1; 100])), (None, 0));
     bench.run_ms(2000);
     assert_eq!(program_flash(&mut bench)[..101], [&[1; 100][..], &[0xFF]].concat());
 }
@@ -114,7 +119,7 @@ fn the_largest_block_of_the_manual_is_taken() {
     bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
     assert_eq!(send(&mut bench, &block(0, 0, &[0; 8])), (None, 0));
     let data: Vec<u8> = (0..16384 - 16).map(|i| (i % 251) as u8).collect();
-    assert_eq!(send(&mut bench, &block(1, 0x0801_0000, &data)), (None, 0));
+    assert_eq!(send(&mut bench, &block(1, program_start(), &data)), (None, 0));
     // Erased and programmed in the background.
     bench.run_ms(2000);
     assert_eq!(program_flash(&mut bench)[..data.len()], data);
@@ -154,7 +159,7 @@ fn a_transfer_that_breaks_off_does_not_block_the_next_one() {
     let said: Vec<_> = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == RESPONSE).collect();
     assert_eq!(said.len(), 1, "{said:?}");
     assert_eq!(said[0].2, [0x80, 0x50, 0x1F, 0x01, 0x00, 0x00, 0x04, 0x05]);
-    assert_eq!(send(&mut bench, &block(1, 0x0801_0000, &[7; 64])), (None, 0));
+    assert_eq!(send(&mut bench, &block(1, program_start(), &[7; 64])), (None, 0));
 }
 
 /// The power goes at eleven points of an update: before anything is lost, during the erase, between blocks, in the
@@ -259,7 +264,7 @@ fn slowest_answer(bench: &mut Bench) -> (Span, u32) {
     (slowest, busy)
 }
 
-/// While 960 KiB are being erased: each SDO is answered within 5 ms, and the heartbeat keeps its period within 10 %.
+/// While all of the program's flash is being erased: each SDO is answered within 5 ms, and the heartbeat keeps its period within 10 %.
 #[test]
 fn never_silent_during_an_erase() {
     let mut bench = running_board();
@@ -269,7 +274,7 @@ fn never_silent_during_an_erase() {
     bench.session().command(1, ProgramControl::Clear).unwrap();
     bench.session().command(1, ProgramControl::Clear).unwrap();
     let (slowest, busy) = slowest_answer(&mut bench);
-    assert!(busy > 500, "the erase must have lasted: {busy} busy answers");
+    assert!(busy > 300, "the erase must have lasted: {busy} busy answers");
     // Both frames of the exchange are part of the measured time.
     assert!(slowest <= Span::from_millis(5), "{} us", slowest.0 / 1_000_000);
     let beats: Vec<Time> = bench
@@ -278,7 +283,9 @@ fn never_silent_during_an_erase() {
         .filter(|(_, id, _)| *id == HEARTBEAT)
         .map(|(at, ..)| at)
         .collect();
-    assert!(beats.len() >= 7, "{beats:?}");
+    // Typical erase times (DS8626 table 39 and its like): a second for 128 KiB.
+    let seconds = (firmware::board().programs[0].size / (128 * 1024)) as usize;
+    assert!(beats.len() >= seconds, "{beats:?}");
     for pair in beats.windows(2) {
         let period = pair[1] - pair[0];
         assert!((900..=1100).contains(&(period.0 / 1_000_000_000)), "{} ms", period.0 / 1_000_000_000);
@@ -290,11 +297,12 @@ fn never_silent_during_an_erase() {
 fn the_entry_strap_holds_the_device_in_the_bootloader() {
     let mut bench = running_board();
     bench.power_off();
-    bench.machine().set_pin('A', 0, Some(true));
+    let (port, pin, pressed) = bsp::ENTRY_STRAP;
+    bench.machine().set_pin(port, pin, Some(pressed));
     bench.power_on();
     bench.await_boot_up(1000);
     assert!(bench.session().device_type().unwrap().unwrap().is_bootloader());
-    bench.machine().set_pin('A', 0, Some(false));
+    bench.machine().set_pin(port, pin, Some(!pressed));
     bench.power_off();
     bench.power_on();
     bench.await_boot_up(1000);
@@ -331,7 +339,7 @@ fn noise_in_the_ram_is_no_request() {
     let flash_image = installed.machine().flash().to_vec();
     for seed in 0..20 {
         let mut bench = Bench::with(Options { seed, ..Options::default() });
-        bench.machine().load_bin(0x0800_0000, &flash_image).unwrap();
+        bench.machine().load_bin(firmware::board().chip.flash.base, &flash_image).unwrap();
         bench.power_on();
         bench.await_boot_up(1000);
         let running = bench.session().device_type().unwrap().unwrap();
@@ -355,8 +363,9 @@ fn the_callgate_needs_nothing_of_the_bootloaders_ram() {
         assert!(next < Time(30_000_000_000_000), "the application does not start");
     }
     // The application clears its own statics at the bottom; its stack is at the top.
-    let garbage: Vec<u8> = (0..0x1_F000_u32).map(|i| (i.wrapping_mul(0x9E37_79B1) >> 24) as u8).collect();
-    bench.machine().write_ram(0x2000_0400, &garbage[0x400..]).unwrap();
+    let garbage: Vec<u8> =
+        (0..layout.ram.size - 0xFC0).map(|i| (i.wrapping_mul(0x9E37_79B1) >> 24) as u8).collect();
+    bench.machine().write_ram(layout.ram.base + 0x400, &garbage[0x400..]).unwrap();
     bench.await_boot_up(1000);
     assert_eq!(bench.session().read_number(Address::new(0x1F56, 1)).unwrap(), crc);
     assert_eq!(crc, firmware::blocks(firmware::APP_V1).program_crc());
@@ -369,14 +378,14 @@ fn code_left_in_flash_would_not_answer_in_time() {
     let mut bench = running_board();
     call_back(&mut bench);
     // Behind the bootloader's image, in its own flash. ARMv7-M A7.7.44: ldr.w pc, [pc, #0], and the address behind it.
-    const STUB: u32 = 0x0800_7F00;
+    let stub_address = firmware::board().bootloader.end() - 0x100;
     // CAN1_TX is interrupt 19 (RM0090 table 61); the table of vectors lies at the beginning of the RAM.
-    const VECTOR: u32 = 0x2000_0000 + (16 + 19) * 4;
+    let vector = firmware::board().ram.base + (16 + 19) * 4;
     let mut handler = [0; 4];
-    bench.machine().read_memory(VECTOR, &mut handler).unwrap();
+    bench.machine().read_memory(vector, &mut handler).unwrap();
     let stub = [&[0xDF, 0xF8, 0x00, 0xF0], &handler[..]].concat();
-    bench.machine().load_bin(STUB, &stub).unwrap();
-    bench.machine().write_ram(VECTOR, &(STUB | 1).to_le_bytes()).unwrap();
+    bench.machine().load_bin(stub_address, &stub).unwrap();
+    bench.machine().write_ram(vector, &(stub_address | 1).to_le_bytes()).unwrap();
     assert!(
         bench.session().device_type().unwrap().unwrap().is_bootloader(),
         "it works as long as nothing is erased"

@@ -24,6 +24,13 @@ impl Args {
         self.own.iter().any(|word| word == "--help" || word == "-h")
     }
 
+    /// Whether an option is there, with its value; it is not taken.
+    pub fn has(&self, name: &str) -> bool {
+        self.own
+            .iter()
+            .any(|word| word.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('=')))
+    }
+
     /// Takes a flag; whether it was there.
     pub fn flag(&mut self, name: &str) -> bool {
         let before = self.own.len();
@@ -83,7 +90,9 @@ mod tests {
     #[test]
     fn options_are_taken_and_the_rest_is_passed_on_in_order() {
         let mut args = args("-p canopen --board nucleo sdo --yes -- --board kept --nocapture");
+        assert!(args.has("--board") && !args.has("--boar"));
         assert_eq!(args.value("--board"), Ok(Some("nucleo".into())));
+        assert!(!args.has("--board"), "it was taken");
         assert_eq!(args.value("--trace"), Ok(None));
         assert!(args.flag("--yes"));
         assert!(!args.flag("--yes"));

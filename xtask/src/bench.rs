@@ -25,7 +25,7 @@ pub fn run(mut args: Args) -> Outcome {
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
     let images = build::images(board)?;
     let mut bench = process::cargo("run");
-    bench.args(["--package", "coboot-tests", "--bin", "bench"]);
+    bench.args(build::tests_args(board)).args(["--bin", "bench"]);
     bench.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", &images.dir);
     // Optimised, as users have it.
     let cost = || {

@@ -111,6 +111,12 @@ pub fn firmware_args(package: &str, board: &Layout, features: &str) -> Vec<Strin
     .collect()
 }
 
+/// The arguments that make cargo build the crate of the emulated tests for a board.
+pub fn tests_args(board: &Layout) -> Vec<String> {
+    let features = format!("--features=board-{}", board.board);
+    ["--package=coboot-tests", "--no-default-features", &features].map(str::to_owned).to_vec()
+}
+
 /// Builds an image and puts it, by its name there, into the board's folder.
 fn image(build: &Build<'_>, name: &str, region: Region) -> Outcome<PathBuf> {
     let &Build { board, package, features } = build;

@@ -24,7 +24,7 @@ pub fn run(mut args: Args) -> Outcome {
     let images = build::images(board)?;
 
     let mut demo = process::cargo("run");
-    demo.args(["--package", "coboot-tests", "--bin", "demo", "--"]);
+    demo.args(build::tests_args(board)).args(["--bin", "demo", "--"]);
     if let Some(trace) = trace {
         demo.args(["--trace", &trace]);
     }

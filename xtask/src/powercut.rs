@@ -27,7 +27,7 @@ pub fn run(mut args: Args) -> Outcome {
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
     let images = build::images(board)?;
     let mut powercut = process::cargo("run");
-    powercut.args(["--package", "coboot-tests", "--bin", "powercut", "--"]);
+    powercut.args(build::tests_args(board)).args(["--bin", "powercut", "--"]);
     powercut.args(full.then_some("--full")).args(json.then_some("--json"));
     if let Some(point) = point {
         powercut.args(["--reproduce", &point]);

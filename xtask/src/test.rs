@@ -1,11 +1,11 @@
 //! `cargo xtask test`: every test, with one summary at the end.
 
-use std::ffi::OsStr;
+use std::ffi::{OsStr, OsString};
 use std::io::{BufRead, BufReader, Write};
 use std::process::Stdio;
 use std::time::Instant;
 
-use shared_abi::layout::BOARDS;
+use shared_abi::layout::{Layout, BOARDS};
 
 use crate::args::Args;
 use crate::setup::{self, Part, Setup};
@@ -15,9 +15,10 @@ pub const HELP: &str = "\
 usage: cargo xtask test [--board BOARD] [--yes] [ARGS]
 
 Sets the machine up, builds the firmware and runs the tests of all host crates, among them those that
-run the firmware in the emulator and those that use a third-party CANopen client.
+run the firmware in the emulator and those that use a third-party CANopen client; then the main ones
+among those with the firmware of every other board.
 
-  --board BOARD   the board (default: stm32f407g-disc1)
+  --board BOARD   only the tests that run firmware, all of them, with that of this board
   --yes           installs what is missing with sudo
   ARGS            go to cargo test: `cargo xtask test -p canopen sdo`, `cargo xtask test -- --nocapture`
 
@@ -27,10 +28,11 @@ interpreter with tests/python/requirements.txt installed).
 ";
 
 pub fn run(mut args: Args) -> Outcome {
+    let chosen_board = args.has("--board");
     let board = workspace::board(&mut args)?;
     let setup = Setup::from(&mut args);
     setup.prepare(&[Part::Firmware, Part::Emulator, Part::Python])?;
-    let images = build::images(board)?;
+    build::images(board)?;
     // And one board with room for two programs, for the tests of that.
     for two in BOARDS.iter().filter(|other| other.programs.len() > 1 && other.board != board.board) {
         build::images(two)?;
@@ -40,20 +42,26 @@ pub fn run(mut args: Args) -> Outcome {
         workspace::target_dir().join("debug").join("coflash").with_extension(std::env::consts::EXE_EXTENSION);
 
     let started = Instant::now();
-    let environment: [(&str, &OsStr); 4] = [
-        ("COBOOT_BOARD", board.board.as_ref()),
-        ("COBOOT_FIRMWARE_DIR", images.dir.as_ref()),
-        ("COBOOT_COFLASH", coflash.as_ref()),
-        ("COBOOT_PYTHON", &setup::python().into_os_string()),
-    ];
-    let mut summary = Summary::default();
+    let python = setup::python().into_os_string();
+    let mut suite = Suite { summary: Summary::default(), coflash: coflash.into_os_string(), python };
     let chosen = args.rest();
-    summary.run(&chosen, environment)?;
-    if chosen.is_empty() {
+    if chosen_board {
+        suite.run(board, &[build::tests_args(board), chosen].concat())?;
+    } else if chosen.is_empty() {
+        suite.run(board, &[])?;
         // What can be built differently by choice.
         let other_crc = ["--package=boot-core", "--features=crc-16,crc-table", "--test=download"];
-        summary.run(&other_crc.map(String::from), environment)?;
+        suite.run(board, &other_crc.map(String::from))?;
+        for other in BOARDS.iter().filter(|other| other.chip.chip != board.chip.chip) {
+            build::images(other)?;
+            println!("\n-- {} --", other.board);
+            let tests = MAIN_TESTS.iter().map(|test| format!("--test={test}"));
+            suite.run(other, &build::tests_args(other).into_iter().chain(tests).collect::<Vec<_>>())?;
+        }
+    } else {
+        suite.run(board, &chosen)?;
     }
+    let summary = suite.summary;
 
     println!();
     for name in &summary.names_of_failed {
@@ -66,6 +74,30 @@ pub fn run(mut args: Args) -> Outcome {
         0 => Ok(()),
         1 => Err("1 test failed; its output stands above.".into()),
         failed => Err(format!("{failed} tests failed; their output stands above.")),
+    }
+}
+
+/// The test programs that every board goes through each time: what a port can get wrong shows in them.
+const MAIN_TESTS: [&str; 5] = ["main_job", "device", "watchdog", "boot_time", "abi"];
+
+/// What has been tested so far, and what the tests need to know.
+struct Suite {
+    summary: Summary,
+    coflash: OsString,
+    python: OsString,
+}
+
+impl Suite {
+    /// Runs `cargo test` with these arguments, and the images of a board.
+    fn run(&mut self, board: &Layout, arguments: &[String]) -> Outcome {
+        let images = workspace::firmware_dir(board);
+        let environment: [(&str, &OsStr); 4] = [
+            ("COBOOT_BOARD", board.board.as_ref()),
+            ("COBOOT_FIRMWARE_DIR", images.as_ref()),
+            ("COBOOT_COFLASH", &self.coflash),
+            ("COBOOT_PYTHON", &self.python),
+        ];
+        self.summary.run(arguments, environment)
     }
 }
 
