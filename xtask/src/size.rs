@@ -23,8 +23,9 @@ it is over the budget.
   --yes           installs what is missing with sudo
 ";
 
-/// What the bootloader may take of its region, in bytes; the region itself is the hard limit.
-pub const BUDGET: u32 = 24 * 1024;
+/// What the bootloader may take of its region, in bytes; the region itself is the hard limit. The aim is 24 KiB
+/// (docs/adr/0007-resident-part.md).
+pub const BUDGET: u32 = 29 * 1024;
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;

@@ -1,0 +1,252 @@
+//! From the application back into the bootloader, and what the application may ask of it.
+
+use canopen::program::ProgramControl;
+use canopen::{Address, BitRate};
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::firmware;
+use coflash::error::Error;
+use coflash::flash::{flash, FlashOptions};
+use coflash::session::Doing;
+use emulator::machine::{ResetCause, Stop};
+use emulator::time::Span;
+
+const VERSION: Address = Address::new(0x100A, 0);
+/// The application template's own: the way back, and its confirmation.
+const WAY_BACK: Address = Address::new(0x2000, 0);
+const CONFIRMATION: Address = Address::new(0x2001, 0);
+const INSTALLED: u32 = 1;
+const SIGNED: u32 = 2;
+
+fn install(bench: &mut Bench, node: u8, image: &str) {
+    flash(&mut bench.session_with(node), &firmware::blocks(image), &FlashOptions::default(), &mut |_| {})
+        .unwrap();
+}
+
+/// A board that runs version 1.
+fn running_board() -> Bench {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    install(&mut bench, NODE, firmware::APP_V1);
+    bench.events();
+    bench
+}
+
+fn write(bench: &mut Bench, at: Address, value: u8) -> Result<(), Error> {
+    bench.session().write(at, &[value], Doing::Write(at), &mut |_| {})
+}
+
+fn is_bootloader(bench: &mut Bench, node: u8) -> bool {
+    bench.session_with(node).device_type().unwrap().unwrap().is_bootloader()
+}
+
+fn power_cycle(bench: &mut Bench) {
+    bench.power_off();
+    bench.run_ms(100);
+    bench.power_on();
+    bench.await_boot_up(1000);
+    bench.events();
+}
+
+/// Each way leads into a bootloader that does its whole work.
+#[test]
+fn three_ways_lead_back_and_the_bootloader_is_whole_behind_each() {
+    for (way, expected) in [
+        (0, vec![Stop::Reset(ResetCause::Software)]),
+        (1, vec![Stop::Reset(ResetCause::IndependentWatchdog)]),
+        // A jump: there is no reset.
+        (2, vec![]),
+    ] {
+        let mut bench = running_board();
+        write(&mut bench, WAY_BACK, way).unwrap();
+        let from = bench.time();
+        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+        let boot_up = bench.await_boot_up(1000);
+        let stops: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+        assert_eq!(stops, expected, "way {way}");
+        let answer =
+            bench.frames_since(from).into_iter().find(|(_, id, _)| *id == 0x580 + u32::from(NODE)).unwrap();
+        assert!(boot_up - answer.0 >= Span::from_millis(10), "way {way}");
+        assert!(is_bootloader(&mut bench, NODE), "way {way}");
+
+        install(&mut bench, NODE, firmware::APP_V2);
+        assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0", "way {way}");
+        // A request is good for once.
+        power_cycle(&mut bench);
+        assert!(!is_bootloader(&mut bench, NODE), "way {way}");
+        bench.assert_nothing_unmodelled();
+    }
+    let mut bench = running_board();
+    assert!(write(&mut bench, WAY_BACK, 3).is_err(), "there is no fourth way");
+}
+
+/// A jump out of thousands of interrupts, and again: no stray one reaches the other program.
+#[test]
+fn both_programs_take_interrupts_in_turn_and_none_goes_astray() {
+    let mut bench = running_board();
+    for round in 0..10 {
+        write(&mut bench, WAY_BACK, 2).unwrap();
+        // SDO requests back to back keep both CAN vectors busy until the last moment; SysTick never rests.
+        for _ in 0..100 {
+            bench.session().read_text(VERSION).unwrap();
+        }
+        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+        bench.await_boot_up(1000);
+        for _ in 0..100 {
+            assert!(is_bootloader(&mut bench, NODE), "round {round}");
+        }
+        bench.session().command(1, ProgramControl::Start).unwrap();
+        bench.await_boot_up(1000);
+    }
+    // Nothing but the resets behind START: no fault, no watchdog.
+    let events = bench.events();
+    assert_eq!(events.len(), 10, "{events:?}");
+    assert!(events.iter().all(|(_, stop)| *stop == Stop::Reset(ResetCause::Software)), "{events:?}");
+    let counters = bench.machine().counters();
+    let taken = |exception: usize| counters.exceptions[exception];
+    // SysTick is exception 15; CAN1_TX and CAN1_RX0 are interrupts 19 and 20 (RM0090 table 61).
+    for exception in [15, 16 + 19, 16 + 20] {
+        assert!(taken(exception) > 2000, "exception {exception}: {}", taken(exception));
+    }
+    // Vectors of this program and the other, and no other.
+    let expected = [15, 16 + 19, 16 + 20, 16 + 35];
+    let stray: Vec<_> = (0..counters.exceptions.len())
+        .filter(|exception| taken(*exception) > 0 && !expected.contains(exception))
+        .collect();
+    assert!(stray.is_empty(), "{stray:?}");
+    bench.assert_nothing_unmodelled();
+}
+
+/// The answer to 80h is on the bus, and 10 ms more have passed, at every bit rate.
+#[test]
+fn the_answer_comes_before_the_departure_at_every_bit_rate() {
+    for (rate, bits) in [
+        (BitRate::K10, 10_000),
+        (BitRate::K50, 50_000),
+        (BitRate::K250, 250_000),
+        (BitRate::K1000, 1_000_000),
+    ] {
+        let mut bench = Bench::new();
+        let board = bench.device;
+        bench.commission(board, NODE, rate);
+        bench.set_host_bit_rate(bits);
+        bench.power_on();
+        bench.await_boot_up(1000);
+        install(&mut bench, NODE, firmware::APP_V1);
+        bench.events();
+        let from = bench.time();
+        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+        bench.await_boot_up(2000);
+        let events = bench.events();
+        let [(reset, Stop::Reset(ResetCause::Software))] = events[..] else { panic!("{rate:?}: {events:?}") };
+        let frames = bench.frames_since(from);
+        let answer =
+            frames.iter().rfind(|(at, id, _)| *id == 0x580 + u32::from(NODE) && *at < reset).unwrap();
+        assert_eq!(answer.2, [0x60, 0x51, 0x1F, 0x01, 0, 0, 0, 0], "{rate:?}");
+        assert!(
+            reset - answer.0 >= Span::from_millis(10),
+            "{rate:?}: {} us",
+            (reset - answer.0).0 / 1_000_000
+        );
+    }
+}
+
+/// A program without signature is on trial: it confirms itself, or the next reset ends in the bootloader.
+#[test]
+fn a_trial_confirms_itself_through_the_callgate() {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let options = FlashOptions { trial_run: true, start: false, ..FlashOptions::default() };
+    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
+    for command in [ProgramControl::ClrSignature, ProgramControl::Start] {
+        bench.session().command(1, command).unwrap();
+        bench.run_ms(50);
+    }
+    bench.run_ms(500);
+    assert!(!is_bootloader(&mut bench, NODE));
+    assert_eq!(bench.session().read_number(CONFIRMATION).unwrap(), INSTALLED);
+    power_cycle(&mut bench);
+    assert!(is_bootloader(&mut bench, NODE), "it had not confirmed itself");
+
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    bench.await_boot_up(1000);
+    write(&mut bench, CONFIRMATION, 1).unwrap();
+    assert_eq!(bench.session().read_number(CONFIRMATION).unwrap(), INSTALLED | SIGNED);
+    power_cycle(&mut bench);
+    assert!(!is_bootloader(&mut bench, NODE), "it had");
+
+    write(&mut bench, CONFIRMATION, 0).unwrap();
+    assert!(write(&mut bench, CONFIRMATION, 2).is_err());
+    power_cycle(&mut bench);
+    assert!(is_bootloader(&mut bench, NODE), "it has taken that back");
+}
+
+/// Node-ID and bit rate set in the application are the bootloader's as well, and the other way round.
+#[test]
+fn node_id_and_bit_rate_are_shared() {
+    let mut bench = running_board();
+    // CiA 305: configuration state, node-ID 9, 250 kbit/s (3 of table 0), store.
+    bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+    for [command, a, b] in [[0x11, 9, 0], [0x13, 0, 3], [0x17, 0, 0]] {
+        let answer = bench.ask(0x7E5, &[command, a, b, 0, 0, 0, 0, 0], 0x7E4);
+        assert_eq!(answer.as_deref(), Some(&[command, 0, 0, 0, 0, 0, 0, 0][..]), "{command:02X}h");
+    }
+    bench.power_off();
+    bench.run_ms(100);
+    bench.set_host_bit_rate(250_000);
+    bench.power_on();
+    bench.await_boot_up_of(9, 1000);
+    assert!(!is_bootloader(&mut bench, 9));
+    bench.session_with(9).command(1, ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up_of(9, 1000);
+    assert!(is_bootloader(&mut bench, 9));
+    let serial = bench.session_with(9).read_number(Address::new(0x1018, 4)).unwrap();
+
+    // And from the bootloader: the next program has it from the handoff.
+    bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+    for [command, a, b] in [[0x11, 21, 0], [0x17, 0, 0]] {
+        let answer = bench.ask(0x7E5, &[command, a, b, 0, 0, 0, 0, 0], 0x7E4);
+        assert_eq!(answer.as_deref(), Some(&[command, 0, 0, 0, 0, 0, 0, 0][..]), "{command:02X}h");
+    }
+    bench.power_off();
+    bench.run_ms(100);
+    bench.power_on();
+    bench.await_boot_up_of(21, 1000);
+    assert!(!is_bootloader(&mut bench, 21));
+    assert_eq!(bench.session_with(21).read_number(Address::new(0x1018, 4)).unwrap(), serial);
+}
+
+/// An application that ends again and again without being asked to is given up, and stays so; a request is a new beginning.
+#[test]
+fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
+    let mut bench = running_board();
+    for reset in 1..=3 {
+        bench.events();
+        bench.machine().start_watchdog(64);
+        bench.run_ms(300);
+        assert_eq!(is_bootloader(&mut bench, NODE), reset == 3, "after {reset}");
+    }
+    power_cycle(&mut bench);
+    assert!(is_bootloader(&mut bench, NODE), "a power-on alone does not try it again");
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    bench.await_boot_up(1000);
+    assert!(!is_bootloader(&mut bench, NODE), "a request does");
+    // NMT reset node is asked for, and counts as no crash.
+    for _ in 0..5 {
+        bench.post(0x000, &[0x81, NODE]);
+        bench.await_boot_up(1000);
+        assert!(!is_bootloader(&mut bench, NODE));
+    }
+    // What confirms itself has not crashed.
+    for _ in 0..2 {
+        bench.machine().start_watchdog(64);
+        bench.run_ms(300);
+        assert!(!is_bootloader(&mut bench, NODE));
+        write(&mut bench, CONFIRMATION, 1).unwrap();
+        bench.machine().start_watchdog(64);
+        bench.run_ms(300);
+        assert!(!is_bootloader(&mut bench, NODE));
+        write(&mut bench, CONFIRMATION, 1).unwrap();
+    }
+}
