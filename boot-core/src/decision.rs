@@ -41,7 +41,7 @@ impl Policy {
     pub fn crash_resets(&self, before: u32, cause: ResetCause, request: Option<BootRequest>) -> u32 {
         use ResetCause::{IndependentWatchdog, LowPower, Software, WindowWatchdog};
         match request {
-            Some(BootRequest::Fault) => before,
+            Some(BootRequest::Fault | BootRequest::Resume(_)) => before,
             Some(_) => 0,
             None if matches!(cause, IndependentWatchdog | WindowWatchdog | Software | LowPower) => {
                 before.saturating_add(1)
@@ -71,6 +71,8 @@ pub enum StayReason {
     Program(Invalid),
     /// The bootloader had a fault or a panic.
     Fault,
+    /// A program could start, and waits for the end of the rescue window.
+    Rescue,
 }
 
 impl StayReason {
@@ -86,6 +88,7 @@ impl StayReason {
             Self::Unsigned => 5,
             Self::Program(_) => 6,
             Self::Fault => 7,
+            Self::Rescue => 8,
         }
     }
 
@@ -129,7 +132,7 @@ pub fn decide(
     let (number, trial) = match circumstances.request {
         // A request is new: whoever makes it knows of the crashes before.
         Some(BootRequest::Trial(number)) => (number, true),
-        Some(BootRequest::Start(number)) => (number, false),
+        Some(BootRequest::Start(number) | BootRequest::Resume(number)) => (number, false),
         _ => {
             if circumstances.crash_resets >= policy.max_crash_resets {
                 return Stay(StayReason::CrashLoop);

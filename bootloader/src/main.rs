@@ -59,6 +59,7 @@ mod app {
 
     use super::{product, start, Mono};
     use crate::flash::FlashController;
+    use crate::product::RESCUE_WINDOW_MS;
     use crate::ram_vectors;
     use crate::watchdog::{self, Task, Watchdog};
     use rtic_monotonics::fugit::ExtU32;
@@ -115,6 +116,8 @@ mod app {
         to_handle: Consumer<'static, Frame>,
         slave: Slave,
         leaving: Leaving,
+        /// The program that starts at the end of the rescue window.
+        waiting: Option<u8>,
         watchdog: Watchdog,
         led: bsp::Led,
     }
@@ -164,6 +167,7 @@ mod app {
                 received,
                 to_handle,
                 slave,
+                waiting: start::program_in_waiting(),
                 leaving: Leaving { wanted: false, request: BootRequest::PowerOn, at: None },
                 watchdog: Watchdog::new(cx.device.IWDG),
                 led: board.led,
@@ -202,14 +206,14 @@ mod app {
     #[task(
         binds = CAN1_TX,
         shared = [can, bootloader],
-        local = [to_handle, slave, leaving],
+        local = [to_handle, slave, leaving, waiting],
         priority = 2
     )]
     fn protocol(cx: protocol::Context) {
         watchdog::check_in(Task::Protocol);
         let now = Instant::from_millis(Mono::now().ticks());
         let protocol::SharedResources { mut can, mut bootloader, .. } = cx.shared;
-        let protocol::LocalResources { to_handle, slave, leaving, .. } = cx.local;
+        let protocol::LocalResources { to_handle, slave, leaving, waiting, .. } = cx.local;
         if let Some(at) = leaving.at {
             // A frame that began now would be cut off by the reset.
             if now.has_reached(at) {
@@ -223,6 +227,10 @@ mod app {
             // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
             carry_out(slave, &mut can, now, bootloader);
             while let Some(frame) = to_handle.dequeue() {
+                // The filters let nothing in but network management and what is for this device, or for layer setting services.
+                if RESCUE_WINDOW_MS > 0 && frame.cob_id() != Some(CobId::NMT) {
+                    *waiting = None;
+                }
                 if slave.handle(&frame, now, bootloader) {
                     *leaving = Leaving { wanted: true, request: BootRequest::PowerOn, at: None };
                 }
@@ -232,6 +240,13 @@ mod app {
                 *leaving = Leaving { wanted: true, request, at: None };
             }
         });
+        if let Some(program) = *waiting {
+            if now.has_reached(Instant::from_millis(RESCUE_WINDOW_MS.into())) {
+                // Whether or not anybody is there to hear the boot-up.
+                *leaving = Leaving { wanted: true, request: BootRequest::Resume(program), at: Some(now) };
+                return;
+            }
+        }
         if leaving.wanted && slave.is_idle() && can.lock(|can| can.is_idle()) {
             leaving.at = Some(now + FAREWELL_MS);
         }

@@ -3,6 +3,8 @@
 use core::arch::global_asm;
 use core::sync::atomic::{AtomicU32, Ordering};
 
+use crate::product::RESCUE_WINDOW_MS;
+
 const BYTES: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/resident.bin"));
 
 #[repr(C, align(4))]
@@ -48,4 +50,10 @@ static STAY_REASON: AtomicU32 = AtomicU32::new(0);
 /// Why the bootloader stayed ([`StayReason::code`](boot_core::decision::StayReason::code)).
 pub fn stay_reason() -> u8 {
     STAY_REASON.load(Ordering::Relaxed) as u8
+}
+
+/// The program that starts when the rescue window is over.
+pub fn program_in_waiting() -> Option<u8> {
+    let program = (STAY_REASON.load(Ordering::Relaxed) >> 8) as u8;
+    (RESCUE_WINDOW_MS > 0 && program > 0).then_some(program)
 }

@@ -22,6 +22,8 @@ pub enum BootRequest {
     Fault,
     /// Start as after a power-on: what an NMT reset asks for. Whoever asks has not crashed.
     PowerOn,
+    /// Go on with the start of program `n`, which was held back for a rescue window; the bootloader asks this of itself.
+    Resume(u8),
 }
 
 /// The cell as it lies in RAM: 16 bytes, little-endian.
@@ -30,9 +32,9 @@ pub enum BootRequest {
 pub struct WarmStart {
     /// [`MAGIC`].
     pub magic: u32,
-    /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on.
+    /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume.
     pub request: u32,
-    /// The program number of a trial or start (1 to 254), 0 otherwise.
+    /// The program number of a trial, start or resume (1 to 254), 0 otherwise.
     pub argument: u32,
     /// [`check_word`] over the three words before.
     pub check: u32,
@@ -51,6 +53,7 @@ impl WarmStart {
             BootRequest::Start(program) => (3, program as u32),
             BootRequest::Fault => (4, 0),
             BootRequest::PowerOn => (5, 0),
+            BootRequest::Resume(program) => (6, program as u32),
         };
         let check = check_word(&[MAGIC, request, argument]);
         Self { magic: MAGIC, request, argument, check }
@@ -67,6 +70,7 @@ impl WarmStart {
             (3, Some(program @ 1..=254)) => BootRequest::Start(program),
             (4, Some(0)) => BootRequest::Fault,
             (5, Some(0)) => BootRequest::PowerOn,
+            (6, Some(program @ 1..=254)) => BootRequest::Resume(program),
             _ => return None,
         };
         // One encoder decides what is well-formed: magic, words and check must be exactly its.
@@ -126,6 +130,7 @@ mod tests {
             BootRequest::Trial(254),
             BootRequest::Fault,
             BootRequest::PowerOn,
+            BootRequest::Resume(2),
         ];
         for request in requests {
             let mut ram = WarmStart::EMPTY;
@@ -162,7 +167,7 @@ mod tests {
     #[test]
     fn a_well_checked_request_for_an_impossible_program_is_refused() {
         for (request, argument) in
-            [(1, 1), (2, 0), (2, 255), (3, 0), (3, 256), (0, 0), (4, 1), (5, 1), (6, 0)]
+            [(1, 1), (2, 0), (2, 255), (3, 0), (3, 256), (0, 0), (4, 1), (5, 1), (6, 0), (7, 0)]
         {
             let check = check_word(&[MAGIC, request, argument]);
             let cell = WarmStart { magic: MAGIC, request, argument, check };

@@ -250,3 +250,66 @@ fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
         write(&mut bench, CONFIRMATION, 1).unwrap();
     }
 }
+
+/// With a rescue window a program that never answers is no dead end: whoever speaks to the device in time has it.
+#[test]
+fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
+    let mut bench = Bench::of_image(firmware::BOOTLOADER_RESCUE);
+    bench.power_on();
+    bench.await_boot_up(100);
+    install(&mut bench, NODE, firmware::APP_V1);
+    bench.events();
+
+    // Nobody speaks: half a second, then the program, by way of a reset.
+    bench.power_off();
+    bench.run_ms(100);
+    let from = bench.time();
+    bench.power_on();
+    let window = bench.await_boot_up(100);
+    let program = bench.await_boot_up(1000);
+    assert!(
+        (400..700).contains(&((program - window).0 / 1_000_000_000)),
+        "{} ms",
+        (program - window).0 / 1_000_000_000
+    );
+    assert!(!is_bootloader(&mut bench, NODE));
+    let told: Vec<_> =
+        bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == 0x80 + u32::from(NODE)).collect();
+    // 8: the rescue window.
+    assert_eq!(told[0].2, [0x00, 0xFF, 0x00, b'B', b'O', b'O', b'T', 8]);
+
+    // Network management is for everybody, and holds nothing.
+    bench.power_off();
+    bench.power_on();
+    bench.await_boot_up(100);
+    bench.post(0x000, &[0x01, 0]);
+    bench.await_boot_up(1000);
+    assert!(!is_bootloader(&mut bench, NODE));
+
+    // An SDO does, and so does a layer setting service.
+    for (id, data) in
+        [(0x600 + u16::from(NODE), [0x40, 0, 0x10, 0, 0, 0, 0, 0]), (0x7E5, [0x4C, 0, 0, 0, 0, 0, 0, 0])]
+    {
+        bench.power_off();
+        bench.run_ms(100);
+        bench.power_on();
+        bench.await_boot_up(100);
+        bench.run_ms(100);
+        bench.post(id, &data);
+        bench.run_ms(2000);
+        assert!(is_bootloader(&mut bench, NODE), "{id:X}h");
+    }
+    // START is a request: it does not wait.
+    let from = bench.time();
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    let at = bench.await_boot_up(1000);
+    assert!(at - from < Span::from_millis(200));
+
+    // The window is no new beginning for what crashes.
+    for reset in 1..=3 {
+        bench.machine().start_watchdog(64);
+        bench.run_ms(1200);
+        assert_eq!(is_bootloader(&mut bench, NODE), reset == 3, "after {reset}");
+    }
+    bench.assert_nothing_unmodelled();
+}

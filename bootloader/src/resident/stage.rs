@@ -4,7 +4,7 @@
 //! touched, and leaves those as after a reset.
 
 use boot_core::canopen::NodeId;
-use boot_core::decision::{decide, BootDecision, Circumstances};
+use boot_core::decision::{decide, BootDecision, Circumstances, StayReason};
 use boot_core::parameters::{Key, Parameters as _};
 use boot_core::program::verify;
 use bsp::clock::Source;
@@ -13,10 +13,10 @@ use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
 use shared_abi::warm_start::BootRequest;
 
 use crate::flash::FlashController;
-use crate::product::{self, NO_NODE_ID, POLICY, PROGRAM_WATCHDOG_MS};
+use crate::product::{self, NO_NODE_ID, POLICY, PROGRAM_WATCHDOG_MS, RESCUE_WINDOW_MS};
 
-/// Decides. Does not come back if a program is to run; else tells why the bootloader stays
-/// ([`StayReason::code`](boot_core::decision::StayReason::code)).
+/// Decides. Does not come back if a program is to run; else tells why the bootloader stays ([`StayReason::code`]), and in the next byte
+/// which program waits for the end of the rescue window.
 pub extern "C" fn stage() -> u32 {
     // SAFETY: nothing else runs yet; the rest of the bootloader takes them after this has returned.
     let (rcc, iwdg) = unsafe { (pac::RCC::steal(), pac::IWDG::steal()) };
@@ -43,6 +43,9 @@ pub extern "C" fn stage() -> u32 {
     flash.release(&rcc);
     match decision {
         BootDecision::Stay(reason) => reason.code().into(),
+        BootDecision::Start { program, .. } if RESCUE_WINDOW_MS > 0 && request.is_none() => {
+            u32::from(StayReason::Rescue.code()) | u32::from(program.number()) << 8
+        }
         BootDecision::Start { program, trial } => {
             let handoff = Handoff::new(&BootInfo {
                 node_id,
