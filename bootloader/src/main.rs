@@ -228,7 +228,7 @@ mod app {
             carry_out(slave, &mut can, now, bootloader);
             while let Some(frame) = to_handle.dequeue() {
                 // The filters let nothing in but network management and what is for this device, or for layer setting services.
-                if RESCUE_WINDOW_MS > 0 && frame.cob_id() != Some(CobId::NMT) {
+                if RESCUE_WINDOW_MS.is_some() && frame.cob_id() != Some(CobId::NMT) {
                     *waiting = None;
                 }
                 if slave.handle(&frame, now, bootloader) {
@@ -240,8 +240,8 @@ mod app {
                 *leaving = Leaving { wanted: true, request, at: None };
             }
         });
-        if let Some(program) = *waiting {
-            if now.has_reached(Instant::from_millis(RESCUE_WINDOW_MS.into())) {
+        if let (Some(program), Some(ms)) = (*waiting, RESCUE_WINDOW_MS) {
+            if now.has_reached(Instant::from_millis(ms.into())) {
                 // Whether or not anybody is there to hear the boot-up.
                 *leaving = Leaving { wanted: true, request: BootRequest::Resume(program), at: Some(now) };
                 return;

@@ -21,8 +21,8 @@ pub const POLICY: Policy = Policy { autostart: Some(1), max_crash_resets: 3, nod
 /// Node-IDs with which programs may be started.
 const NODE_IDS: RangeInclusive<u8> = 1..=127;
 /// How long a program that would start by itself is held back, in ms, so that a master can catch the device: an SDO request to it, or
-/// any layer setting service, keeps it in the bootloader. 0 for a program that starts at once. Shorter than the heartbeat.
-pub const RESCUE_WINDOW_MS: u16 = if cfg!(feature = "rescue-window") { 500 } else { 0 };
+/// any layer setting service, keeps it in the bootloader. `None` for a program that starts at once. Shorter than the heartbeat.
+pub const RESCUE_WINDOW_MS: Option<u16> = if cfg!(feature = "rescue-window") { Some(500) } else { None };
 /// A program that is started has to feed the independent watchdog within this time, in ms, from its first instruction on;
 /// `None` for a program that is started without one.
 pub const PROGRAM_WATCHDOG_MS: Option<u16> = None;

@@ -55,5 +55,5 @@ pub fn stay_reason() -> u8 {
 /// The program that starts when the rescue window is over.
 pub fn program_in_waiting() -> Option<u8> {
     let program = (STAY_REASON.load(Ordering::Relaxed) >> 8) as u8;
-    (RESCUE_WINDOW_MS > 0 && program > 0).then_some(program)
+    (RESCUE_WINDOW_MS.is_some() && program > 0).then_some(program)
 }

@@ -44,6 +44,9 @@ pub fn run(mut args: Args) -> Outcome {
     for (package, features) in FIRMWARE {
         clippy(&build::firmware_args(package, board, features));
     }
+    let mut resident = build::firmware_args("bootloader", board, "standard,resident");
+    resident.push("--bin=resident".to_owned());
+    clippy(&resident);
     if problems.is_empty() {
         Ok(())
     } else {

@@ -43,7 +43,7 @@ pub extern "C" fn stage() -> u32 {
     flash.release(&rcc);
     match decision {
         BootDecision::Stay(reason) => reason.code().into(),
-        BootDecision::Start { program, .. } if RESCUE_WINDOW_MS > 0 && request.is_none() => {
+        BootDecision::Start { program, .. } if RESCUE_WINDOW_MS.is_some() && request.is_none() => {
             u32::from(StayReason::Rescue.code()) | u32::from(program.number()) << 8
         }
         BootDecision::Start { program, trial } => {
