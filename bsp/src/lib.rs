@@ -37,6 +37,11 @@ mod board;
 
 pub use board::*; // Not found, or found twice? Choose one board by its feature `board-…`.
 
+const _: () = assert!(
+    BIT_RATE == 0 || can::BitTiming::new(CAN_CLOCK, BIT_RATE).is_some(),
+    "board: the clock of the CAN controller (APB1) cannot make BIT_RATE"
+);
+
 #[cfg(target_arch = "arm")]
 pub use stm32f4xx_hal as hal;
 #[cfg(target_arch = "arm")]

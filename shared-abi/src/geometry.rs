@@ -136,6 +136,9 @@ pub const STM32F446RE: Geometry = Geometry {
 }
 .checked();
 
+/// Every chip that is described here.
+pub const CHIPS: &[&Geometry] = &[&STM32F407VG, &STM32F429ZI, &STM32F446RE];
+
 impl Geometry {
     /// Gives the geometry back if it can be that of a chip; fails the build with the broken rule's name if not.
     #[must_use]

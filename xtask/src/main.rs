@@ -19,6 +19,7 @@ mod fuzz;
 mod json;
 mod layout;
 mod lint;
+mod new_board;
 mod portable;
 mod powercut;
 mod process;
@@ -71,6 +72,12 @@ const JOBS: &[Job] = &[
         about: "the memory map of a board, or its linker fragment",
         help: layout::HELP,
         run: layout::run,
+    },
+    Job {
+        name: "new-board",
+        about: "the two files of a port, with steps to go through",
+        help: new_board::HELP,
+        run: new_board::run,
     },
     Job { name: "eds", about: "the EDS files of bootloader and application", help: eds::HELP, run: eds::run },
     Job {

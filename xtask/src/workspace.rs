@@ -13,7 +13,7 @@ pub const TARGET: &str = "thumbv7em-none-eabihf";
 /// Cargo's profile of everything that goes onto the chip.
 pub const PROFILE: &str = "firmware";
 /// The board taken where `--board` names none.
-const DEFAULT_BOARD: &str = "stm32f407g-disc1";
+pub const DEFAULT_BOARD: &str = "stm32f407g-disc1";
 
 /// The root of the repository.
 pub fn root() -> &'static Path {

@@ -1,0 +1,284 @@
+//! The way to a new board (docs/porting.md): followed to the letter, and left in every way that the build has to notice.
+//!
+//! Both tests work on a copy of the repository, and share the folder of what is built with it.
+
+use std::ffi::OsStr;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+const TARGET: &str = "thumbv7em-none-eabihf";
+
+/// A copy of the repository.
+struct Copy {
+    root: PathBuf,
+    /// Cargo's folder, that of the tests themselves.
+    target: PathBuf,
+}
+
+impl Copy {
+    /// What is there from an earlier run is brought up to date: files that did not change keep their time, so that cargo
+    /// builds anew only what it has to.
+    fn new(name: &str) -> Self {
+        let tmp = Path::new(env!("CARGO_TARGET_TMPDIR"));
+        let root = tmp.join("porting").join(name);
+        let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+        synchronise(&source, &root);
+        Self { root, target: tmp.parent().expect("it lies in the target folder").to_owned() }
+    }
+
+    fn cargo(&self, words: &[&str], environment: &[(&str, &OsStr)]) -> Output {
+        // Firmware goes where `cargo xtask build` has it built: what it depends on is there already.
+        let firmware = words.contains(&TARGET);
+        let target = if firmware { self.target.join("fw") } else { self.target.clone() };
+        let mut cargo = Command::new(env!("CARGO"));
+        cargo.current_dir(&self.root).args(words).env("CARGO_TARGET_DIR", target);
+        cargo.envs(environment.iter().copied()).output().expect("cargo can be started")
+    }
+
+    fn succeed(&self, words: &[&str], environment: &[(&str, &OsStr)]) {
+        let output = self.cargo(words, environment);
+        assert!(output.status.success(), "cargo {}:\n{}", words.join(" "), text(&output));
+    }
+
+    /// Puts `new` in the place of `old`, which is there once; gives the file as it was.
+    fn edit(&self, file: &str, old: &str, new: &str) -> String {
+        let path = self.root.join(file);
+        let before = fs::read_to_string(&path).expect(file);
+        assert_eq!(before.matches(old).count(), 1, "{file}: {old:?}");
+        fs::write(&path, before.replace(old, new)).expect(file);
+        before
+    }
+}
+
+fn text(output: &Output) -> String {
+    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
+}
+
+/// Makes `to` what `from` is, but for version control and what was built.
+fn synchronise(from: &Path, to: &Path) {
+    fs::create_dir_all(to).expect("the copy can be made");
+    let names = |folder: &Path| -> Vec<_> {
+        fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("an entry").file_name()).collect()
+    };
+    let wanted: Vec<_> = names(from)
+        .into_iter()
+        .filter(|name| name != "target" && name != ".git" && name != "corpus")
+        .collect();
+    for name in names(to).into_iter().filter(|name| !wanted.contains(name)) {
+        let old = to.join(name);
+        let removed = if old.is_dir() { fs::remove_dir_all(old) } else { fs::remove_file(old) };
+        removed.expect("what is too much can be removed");
+    }
+    for name in wanted {
+        let (from, to) = (from.join(&name), to.join(&name));
+        if from.is_dir() {
+            synchronise(&from, &to);
+        } else {
+            let new = fs::read(&from).expect("a file");
+            if fs::read(&to).ok().as_ref() != Some(&new) {
+                fs::write(&to, new).expect("the copy can be written");
+            }
+        }
+    }
+}
+
+/// From `new-board` to an update on the emulated board. The steps are filled in with what a NUCLEO-F446RE is, the numbers
+/// that stand there at first are those of another board with another chip.
+#[test]
+fn a_board_is_made_as_the_guide_says() {
+    let copy = Copy::new("guide");
+    copy.succeed(&["run", "-q", "-p", "xtask", "--", "new-board", "my-board", "--chip", "stm32f446re"], &[]);
+
+    // Steps 1 to 4: the memory map fits the chip as it is laid down.
+    let board = "bsp/src/my_board.rs";
+    for (step, old, new) in [
+        (5, "product_code: 0x4007_D151", "product_code: 0x1234_5678"),
+        (5, "device_name: \"coboot STM32F407G-DISC1\"", "device_name: \"my board\""),
+        (8, "hse_bypass: false", "hse_bypass: true"),
+        (8, "pll_n: 168", "pll_n: 160"),
+        (9, "('A', 0, true)", "('C', 13, false)"),
+        (10, "Pin<'D', 12, Output>", "Pin<'A', 5, Output>"),
+        (
+            10,
+            "let gpiod = take_port!(GPIOD, can1).split(rcc);",
+            "let gpioa = take_port!(GPIOA, can1).split(rcc);",
+        ),
+        (10, "gpiod.pd12.into_push_pull_output();", "gpioa.pa5.into_push_pull_output();"),
+        (
+            11,
+            "can1.can((gpiod.pd1, gpiod.pd0), rcc)",
+            "{\n            let gpiob = take_port!(GPIOB, can1).split(rcc);\n            \
+             can1.can((gpiob.pb9, gpiob.pb8), rcc)\n        }",
+        ),
+        (12, "let gpioa = unsafe { pac::GPIOA::steal() };", "let gpioc = unsafe { pac::GPIOC::steal() };"),
+        (12, "w.gpioaen().enabled()", "w.gpiocen().enabled()"),
+        (12, "gpioa.idr().read().idr0().is_high()", "gpioc.idr().read().idr13().is_low()"),
+        (12, "w.gpioaen().disabled()", "w.gpiocen().disabled()"),
+    ] {
+        println!("step {step}: {new}");
+        copy.edit(board, old, new);
+    }
+
+    copy.succeed(&["run", "-q", "-p", "xtask", "--", "build", "--board", "my-board"], &[]);
+    let images = copy.target.join("firmware").join("my-board");
+    copy.succeed(
+        &[
+            "test",
+            "-p",
+            "coboot-tests",
+            "--no-default-features",
+            "--features=board-my-board",
+            "--test=main_job",
+            "--test=abi",
+        ],
+        &[("COBOOT_BOARD", "my-board".as_ref()), ("COBOOT_FIRMWARE_DIR", images.as_os_str())],
+    );
+}
+
+/// One mistake in an otherwise good port, and what the build says.
+struct Mistake {
+    file: &'static str,
+    right: &'static str,
+    wrong: &'static str,
+    /// What has to be looked at for it to be found.
+    by: By,
+    says: &'static str,
+}
+
+/// What finds a mistake.
+#[derive(Clone, Copy)]
+enum By {
+    /// `cargo check` of the memory maps.
+    Layout,
+    /// `cargo check` of the board file, on the host.
+    Board,
+    /// `cargo check` of the board file for the chip.
+    Drivers,
+    /// The linker.
+    Image,
+}
+
+const LAYOUT: &str = "shared-abi/src/layout/nucleo_f446re.rs";
+const BOARD: &str = "bsp/src/nucleo_f446re.rs";
+
+const MISTAKES: &[Mistake] = &[
+    Mistake {
+        file: LAYOUT,
+        right: "Region::new(0x0801_0000, 448 * 1024)",
+        wrong: "Region::new(0x0800_C000, 464 * 1024)",
+        by: By::Layout,
+        says: "layout: a program overlaps a parameter region",
+    },
+    Mistake {
+        file: LAYOUT,
+        right: "448 * 1024",
+        wrong: "440 * 1024",
+        by: By::Layout,
+        says: "layout: a program must start and end at sector borders",
+    },
+    Mistake {
+        file: LAYOUT,
+        right: "callgate_offset: 0x200",
+        wrong: "callgate_offset: 0x180",
+        by: By::Layout,
+        says: "layout: the callgate overlaps the bootloader's vector table",
+    },
+    Mistake {
+        file: LAYOUT,
+        right: "0x0801_0000",
+        wrong: "0x0801_0080",
+        by: By::Layout,
+        says: "layout: a program must start and end at sector borders",
+    },
+    Mistake {
+        file: LAYOUT,
+        right: "warm_start: Region::new(0x2001_FFF0",
+        wrong: "warm_start: Region::new(0x2002_0000",
+        by: By::Layout,
+        says: "layout: the warm-start cell must be the last RAM cell of the chip",
+    },
+    Mistake {
+        file: LAYOUT,
+        right: "128 * 1024 - 64",
+        wrong: "192 * 1024 - 64",
+        by: By::Layout,
+        says: "layout: the RAM of the images lies outside the chip's SRAM",
+    },
+    Mistake {
+        file: "shared-abi/src/geometry.rs",
+        right: "SectorRun { count: 3, size: 128 * KIB }",
+        wrong: "SectorRun { count: 4, size: 128 * KIB }",
+        by: By::Layout,
+        says: "chip: the sectors do not add up to the flash",
+    },
+    Mistake {
+        file: BOARD,
+        right: "pll_n: 160",
+        wrong: "pll_n: 163",
+        by: By::Board,
+        says: "board: the clock of the CAN controller (APB1) cannot make BIT_RATE",
+    },
+    Mistake {
+        file: BOARD,
+        right: "pll_n: 160",
+        wrong: "pll_n: 180",
+        by: By::Board,
+        says: "board: the core is too fast",
+    },
+    Mistake {
+        file: BOARD,
+        right: "wait_states: 5",
+        wrong: "wait_states: 4",
+        by: By::Board,
+        says: "board: the flash needs a wait state for every 30 MHz",
+    },
+    // DS10693 table 11: PB7 has no CAN1.
+    Mistake {
+        file: BOARD,
+        right: "(gpiob.pb9, gpiob.pb8)",
+        wrong: "(gpiob.pb7, gpiob.pb8)",
+        by: By::Drivers,
+        says: "can1::Tx: From<stm32f4xx_hal::gpio::Pin<'B', 7>>",
+    },
+    Mistake {
+        file: "bsp/Cargo.toml",
+        right: "stm32f4xx-hal/stm32f446",
+        wrong: "stm32f4xx-hal/stm32f407",
+        by: By::Image,
+        says: "the PAC's vector table has not the size that the layout's chip has",
+    },
+];
+
+#[test]
+fn a_mistake_in_a_port_fails_the_build_and_is_named() {
+    let copy = Copy::new("mistakes");
+    let board = "--features=board-nucleo-f446re";
+    let triple = ["--target", TARGET, "--profile=firmware"];
+    let look = |by: By| match by {
+        By::Layout => copy.cargo(&["check", "-p", "shared-abi"], &[]),
+        By::Board => copy.cargo(&["check", "-p", "bsp", board], &[]),
+        By::Drivers => copy.cargo(&[&["check", "-p", "bsp", board][..], &triple].concat(), &[]),
+        By::Image => {
+            let words = ["build", "-p", "bootloader", "--no-default-features", board];
+            copy.cargo(&[&words[..], &triple].concat(), &[])
+        }
+    };
+    // Without a mistake there is none.
+    for by in [By::Layout, By::Board, By::Drivers, By::Image] {
+        let output = look(by);
+        assert!(output.status.success(), "{}", text(&output));
+    }
+    for mistake in MISTAKES {
+        let before = copy.edit(mistake.file, mistake.right, mistake.wrong);
+        let output = look(mistake.by);
+        fs::write(copy.root.join(mistake.file), before).expect("the file can be written");
+        let said = text(&output);
+        assert!(!output.status.success(), "built with {} in {}", mistake.wrong, mistake.file);
+        // Types are told with or without their paths, and lines may be broken anywhere.
+        let flat = |text: &str| {
+            text.replace("stm32f4xx_hal::gpio::", "").split_whitespace().collect::<Vec<_>>().join(" ")
+        };
+        assert!(flat(&said).contains(&flat(mistake.says)), "{}, not told by:\n{said}", mistake.says);
+    }
+}
