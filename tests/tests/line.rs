@@ -113,8 +113,9 @@ fn every_bit_rate_of_the_table_is_served_and_the_others_are_refused() {
     }
     let mut bench = empty_board();
     configuration_state(&mut bench);
-    // 800 kbit/s: 42 MHz is no multiple of it. Index 10 and table 1 are nobody's.
-    for (table, index) in [(0, 1), (0, 10), (0, 255), (1, 4)] {
+    // 800 kbit/s: 42 MHz is no multiple of it, 40 MHz is. Index 10 and table 1 are nobody's.
+    let unserved = (!bsp::CAN_CLOCK.is_multiple_of(800_000)).then_some((0, 1));
+    for (table, index) in unserved.into_iter().chain([(0, 10), (0, 255), (1, 4)]) {
         let request = [0x13, table, index, 0, 0, 0, 0, 0];
         assert_eq!(lss(&mut bench, request), [0x13, 1, 0, 0, 0, 0, 0, 0], "table {table} index {index}");
     }
