@@ -11,6 +11,8 @@ use shared_abi::layout::{self, Layout};
 pub const BOOTLOADER: &str = "bootloader.elf";
 /// The bootloader with every option.
 pub const BOOTLOADER_COMPLETE: &str = "bootloader-complete.elf";
+/// The one without any option: no emergencies, no layer setting services.
+pub const BOOTLOADER_MINIMAL: &str = "bootloader-minimal.elf";
 /// The standard one with a rescue window of half a second.
 pub const BOOTLOADER_RESCUE: &str = "bootloader-rescue.elf";
 /// Version 1 of the application.

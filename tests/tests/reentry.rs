@@ -1,7 +1,7 @@
 //! From the application back into the bootloader, and what the application may ask of it.
 
 use canopen::program::ProgramControl;
-use canopen::{Address, BitRate};
+use canopen::{AbortCode, Address, BitRate};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coflash::error::Error;
@@ -182,39 +182,74 @@ fn a_trial_confirms_itself_through_the_callgate() {
     assert!(is_bootloader(&mut bench, NODE), "it has taken that back");
 }
 
-/// Node-ID and bit rate set in the application are the bootloader's as well, and the other way round.
+/// Gives a node another node-ID and, if told, bit rate by layer setting services (CiA 305), and stores them.
+fn store_by_lss(bench: &mut Bench, node: u8, rate: Option<BitRate>) {
+    bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+    let rate = rate.map(|rate| [0x13, 0, rate as u8]);
+    for [command, a, b] in [Some([0x11, node, 0]), rate, Some([0x17, 0, 0])].into_iter().flatten() {
+        let answer = bench.ask(0x7E5, &[command, a, b, 0, 0, 0, 0, 0], 0x7E4);
+        assert_eq!(answer.as_deref(), Some(&[command, 0, 0, 0, 0, 0, 0, 0][..]), "{command:02X}h");
+    }
+    bench.power_off();
+    bench.run_ms(100);
+    bench.power_on();
+}
+
+/// Node-ID and bit rate set in the application are the bootloader's as well, and the other way round (SYS TEC manual L-1112d_10,
+/// 3.4.4): where both serve LSS, and where the application alone does.
 #[test]
 fn node_id_and_bit_rate_are_shared() {
-    let mut bench = running_board();
-    // CiA 305: configuration state, node-ID 9, 250 kbit/s (3 of table 0), store.
-    bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
-    for [command, a, b] in [[0x11, 9, 0], [0x13, 0, 3], [0x17, 0, 0]] {
-        let answer = bench.ask(0x7E5, &[command, a, b, 0, 0, 0, 0, 0], 0x7E4);
-        assert_eq!(answer.as_deref(), Some(&[command, 0, 0, 0, 0, 0, 0, 0][..]), "{command:02X}h");
-    }
-    bench.power_off();
-    bench.run_ms(100);
-    bench.set_host_bit_rate(250_000);
-    bench.power_on();
-    bench.await_boot_up_of(9, 1000);
-    assert!(!is_bootloader(&mut bench, 9));
-    bench.session_with(9).command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up_of(9, 1000);
-    assert!(is_bootloader(&mut bench, 9));
-    let serial = bench.session_with(9).read_number(Address::new(0x1018, 4)).unwrap();
+    for bootloader in [firmware::BOOTLOADER, firmware::BOOTLOADER_MINIMAL] {
+        let mut bench = Bench::of_image(bootloader);
+        bench.power_on();
+        bench.await_boot_up(100);
+        install(&mut bench, NODE, firmware::APP_V1);
+        let serial = bench.session().read_number(Address::new(0x1018, 4)).unwrap();
 
-    // And from the bootloader: the next program has it from the handoff.
-    bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
-    for [command, a, b] in [[0x11, 21, 0], [0x17, 0, 0]] {
-        let answer = bench.ask(0x7E5, &[command, a, b, 0, 0, 0, 0, 0], 0x7E4);
-        assert_eq!(answer.as_deref(), Some(&[command, 0, 0, 0, 0, 0, 0, 0][..]), "{command:02X}h");
+        store_by_lss(&mut bench, 9, Some(BitRate::K250));
+        bench.set_host_bit_rate(250_000);
+        bench.await_boot_up_of(9, 1000);
+        assert!(!is_bootloader(&mut bench, 9));
+        bench.session_with(9).command(1, ProgramControl::StartBootloader).unwrap();
+        bench.await_boot_up_of(9, 1000);
+        assert!(is_bootloader(&mut bench, 9));
+        assert_eq!(bench.session_with(9).read_number(Address::new(0x1018, 4)).unwrap(), serial);
+        if bootloader == firmware::BOOTLOADER_MINIMAL {
+            continue;
+        }
+        // And from the bootloader: the program has it from the handoff.
+        store_by_lss(&mut bench, 21, None);
+        bench.await_boot_up_of(21, 1000);
+        assert!(!is_bootloader(&mut bench, 21));
+        assert_eq!(bench.session_with(21).read_number(Address::new(0x1018, 4)).unwrap(), serial);
     }
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
-    bench.await_boot_up_of(21, 1000);
-    assert!(!is_bootloader(&mut bench, 21));
-    assert_eq!(bench.session_with(21).read_number(Address::new(0x1018, 4)).unwrap(), serial);
+}
+
+/// On a bootloader with another version of the ABI, or with none, the application does without, and can be called back.
+#[test]
+fn an_application_on_a_bootloader_with_another_abi_does_without_it() {
+    let table = firmware::board().callgate();
+    // The version of the ABI (a half-word behind the magic), and the magic itself.
+    for (at, value) in [(table + 4, 9_u16), (table, 0)] {
+        let mut bench = running_board();
+        bench.power_off();
+        bench.machine().load_bin(at, &value.to_le_bytes()).unwrap();
+        bench.power_on();
+        bench.await_boot_up(1000);
+        assert!(!is_bootloader(&mut bench, NODE));
+        assert_eq!(
+            bench.session().read_number(Address::new(0x1F56, 1)).unwrap(),
+            0,
+            "no CRC without a callgate"
+        );
+        // 08000022h: not in this state of the device.
+        let refused = bench.session().read_number(CONFIRMATION).unwrap_err();
+        assert!(matches!(refused, Error::Refused { code: AbortCode::DEVICE_STATE, .. }), "{refused:?}");
+        assert!(write(&mut bench, CONFIRMATION, 1).is_err());
+        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+        bench.await_boot_up(1000);
+        assert!(is_bootloader(&mut bench, NODE));
+    }
 }
 
 /// An application that ends again and again without being asked to is given up, and stays so; a request is a new beginning.

@@ -15,10 +15,10 @@ use crate::{process, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask build [--board BOARD] [--yes]
 
-Builds the bootloader, standard, with every option and with a rescue window, and both versions of the
-application, and puts them into target/firmware/BOARD/ as bootloader.elf, bootloader-complete.elf,
-bootloader-rescue.elf, app-v1.elf and app-v2.elf; for a board with room for two programs also
-app-program-2.elf.
+Builds the bootloader, standard, with every option, without any and with a rescue window, and both
+versions of the application, and puts them into target/firmware/BOARD/ as bootloader.elf,
+bootloader-complete.elf, bootloader-minimal.elf, bootloader-rescue.elf, app-v1.elf and app-v2.elf; for a
+board with room for two programs also app-program-2.elf.
 
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -48,6 +48,8 @@ pub fn images(board: &Layout) -> Outcome<Images> {
     let bootloader = bootloader(board)?;
     let complete = Build { board, package: "bootloader", features: COMPLETE };
     image(&complete, "bootloader-complete.elf", board.bootloader)?;
+    let minimal = Build { board, package: "bootloader", features: "" };
+    image(&minimal, "bootloader-minimal.elf", board.bootloader)?;
     let rescue = Build { board, package: "bootloader", features: "standard,rescue-window" };
     image(&rescue, "bootloader-rescue.elf", board.bootloader)?;
     let program = board.programs[0];
