@@ -14,24 +14,12 @@ use canopen::device::Device;
 use canopen::od::{Address, Entry, Objects};
 use canopen::program::{FlashError, ProgramControl};
 use canopen::{AbortCode, BitRate, NodeId};
-use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash};
+use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP};
 use shared_abi::block_file::Control;
-use shared_abi::geometry::{Geometry, Region, SectorRun, STM32F407VG};
+use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
-/// The F407 with sectors a 64th of their size: the same shape, and cheap to erase in a model.
-static CHIP: Geometry = Geometry {
-    chip: "small-f407",
-    flash: Region::new(0x0800_0000, 0x4400),
-    sectors: &[
-        SectorRun { count: 4, size: 0x200 },
-        SectorRun { count: 1, size: 0x400 },
-        SectorRun { count: 7, size: 0x800 },
-    ],
-    interrupts: 4,
-    ..STM32F407VG
-};
 const LAYOUT: Layout = Layout {
     board: "model",
     chip: &CHIP,

@@ -7,25 +7,13 @@
 use boot_core::download::{Downloader, Policy, Step};
 use boot_core::parameters::Journal;
 use canopen::program::{FlashError, FlashStatus, ProgramControl};
-use coboot_fuzz::model::ModelFlash;
+use coboot_fuzz::model::{ModelFlash, CHIP};
 use coboot_fuzz::Input;
 use coflash::block_file::{Block, CRC};
 use libfuzzer_sys::fuzz_target;
-use shared_abi::geometry::{Geometry, Region, SectorRun, STM32F407VG};
+use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
-/// The F407 with sectors a 64th of their size: the same shape, and cheap to erase in a model.
-static CHIP: Geometry = Geometry {
-    chip: "small-f407",
-    flash: Region::new(0x0800_0000, 0x4400),
-    sectors: &[
-        SectorRun { count: 4, size: 0x200 },
-        SectorRun { count: 1, size: 0x400 },
-        SectorRun { count: 7, size: 0x800 },
-    ],
-    interrupts: 4,
-    ..STM32F407VG
-};
 static LAYOUT: Layout = Layout {
     board: "model",
     chip: &CHIP,

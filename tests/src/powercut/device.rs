@@ -14,23 +14,10 @@ use boot_core::flash::{Flash, FlashFault};
 use boot_core::node::NodeParameters;
 use boot_core::parameters::{Journal, Key, Parameters, StoreError, Value};
 use boot_core::program::{verify, ProgramRecord};
-use shared_abi::geometry::{Geometry, Region, Sector, SectorRun, STM32F407VG};
+use shared_abi::geometry::{Region, Sector};
 use shared_abi::layout::Layout;
 
-use super::model::ModelFlash;
-
-/// The F407 with sectors a 64th of their size: the same shape, and cheap to erase in a model.
-static CHIP: Geometry = Geometry {
-    chip: "small-f407",
-    flash: Region::new(0x0800_0000, 0x4400),
-    sectors: &[
-        SectorRun { count: 4, size: 0x200 },
-        SectorRun { count: 1, size: 0x400 },
-        SectorRun { count: 7, size: 0x800 },
-    ],
-    interrupts: 4,
-    ..STM32F407VG
-};
+use super::model::{ModelFlash, CHIP};
 
 /// Two programs; what has one uses the first.
 pub static LAYOUT: Layout = Layout {
