@@ -18,7 +18,8 @@ const PROGRAM_ENTRIES: [Entry; 6] = [
 
 /// How 1F51h = 80h leads back into the bootloader: 0 system reset, 1 watchdog reset, 2 jump.
 pub const WAY_BACK: u16 = 0x2000;
-/// What the bootloader knows of this program: bit 0 installed, bit 1 signed. Writing 1 confirms it, 0 takes the signature away.
+/// What the bootloader knows of this program: bit 0 installed, bit 1 signed. Writing with bit 1 set
+/// confirms it, without takes the signature away.
 pub const CONFIRMATION: u16 = 0x2001;
 
 /// What shows the rest of coboot's services. A product has its own use for them.

@@ -13,6 +13,7 @@ use canopen::program::{
 };
 use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, BitRate, NodeId};
+use shared_abi::callgate::PROGRAM_SIGNED;
 
 use crate::coboot::{self, Start, Way};
 use crate::entries::{CONFIRMATION, ENTRIES, WAY_BACK};
@@ -127,8 +128,9 @@ impl Objects for Application {
                 self.way = Way::from_number(value).ok_or(AbortCode::INVALID_VALUE)?;
                 Ok(())
             }
-            (CONFIRMATION, &[value @ 0..=1]) => {
-                coboot::confirm(self.program, value == 1).map_err(|_| AbortCode::DEVICE_STATE)
+            (CONFIRMATION, &[value @ 0..=3]) => {
+                let signed = u32::from(value) & PROGRAM_SIGNED != 0;
+                coboot::confirm(self.program, signed).map_err(|_| AbortCode::DEVICE_STATE)
             }
             (CONFIRMATION, _) => Err(AbortCode::INVALID_VALUE),
             _ => Err(AbortCode::UNSUPPORTED_ACCESS),

@@ -171,13 +171,13 @@ fn a_trial_confirms_itself_through_the_callgate() {
 
     bench.session().command(1, ProgramControl::Start).unwrap();
     bench.await_boot_up(1000);
-    write(&mut bench, CONFIRMATION, 1).unwrap();
+    write(&mut bench, CONFIRMATION, SIGNED as u8).unwrap();
     assert_eq!(bench.session().read_number(CONFIRMATION).unwrap(), INSTALLED | SIGNED);
     power_cycle(&mut bench);
     assert!(!is_bootloader(&mut bench, NODE), "it had");
 
     write(&mut bench, CONFIRMATION, 0).unwrap();
-    assert!(write(&mut bench, CONFIRMATION, 2).is_err());
+    assert!(write(&mut bench, CONFIRMATION, 4).is_err());
     power_cycle(&mut bench);
     assert!(is_bootloader(&mut bench, NODE), "it has taken that back");
 }
@@ -245,7 +245,7 @@ fn an_application_on_a_bootloader_with_another_abi_does_without_it() {
         // 08000022h: not in this state of the device.
         let refused = bench.session().read_number(CONFIRMATION).unwrap_err();
         assert!(matches!(refused, Error::Refused { code: AbortCode::DEVICE_STATE, .. }), "{refused:?}");
-        assert!(write(&mut bench, CONFIRMATION, 1).is_err());
+        assert!(write(&mut bench, CONFIRMATION, SIGNED as u8).is_err());
         bench.session().command(1, ProgramControl::StartBootloader).unwrap();
         bench.await_boot_up(1000);
         assert!(is_bootloader(&mut bench, NODE));
@@ -278,11 +278,11 @@ fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
         bench.machine().start_watchdog(64);
         bench.run_ms(300);
         assert!(!is_bootloader(&mut bench, NODE));
-        write(&mut bench, CONFIRMATION, 1).unwrap();
+        write(&mut bench, CONFIRMATION, SIGNED as u8).unwrap();
         bench.machine().start_watchdog(64);
         bench.run_ms(300);
         assert!(!is_bootloader(&mut bench, NODE));
-        write(&mut bench, CONFIRMATION, 1).unwrap();
+        write(&mut bench, CONFIRMATION, SIGNED as u8).unwrap();
     }
 }
 
