@@ -348,3 +348,38 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     }
     bench.assert_nothing_unmodelled();
 }
+
+/// What a broken application, or noise, may leave in the warm-start cell: it asks for nothing, or for what cannot be had.
+#[test]
+fn a_cell_that_asks_for_what_is_not_there_does_no_harm() {
+    let magic = u32::from_le_bytes(*b"CBW1");
+    let check = |words: [u32; 3]| {
+        // The fold of the ABI, written again: rotate by 5, exclusive or, multiply; inverted in the end.
+        !words
+            .iter()
+            .fold(0xC0B0_07A5_u32, |fold, word| (fold.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B1))
+    };
+    let sound = |words: [u32; 3]| [words[0], words[1], words[2], check(words)];
+    let older = u32::from_le_bytes(*b"CBW0");
+    for (what, cell, stays) in [
+        ("noise", [0x1234_5678, 0x9ABC_DEF0, 0x0F1E_2D3C, 0x4B5A_6978], false),
+        ("an older version", sound([older, 1, 0]), false),
+        ("a wrong check word", [magic, 1, 0, check([magic, 1, 0]) ^ 1], false),
+        ("an unknown request", sound([magic, 99, 0]), false),
+        ("an impossible argument", sound([magic, 3, 255]), false),
+        ("stay, for comparison", sound([magic, 1, 0]), true),
+        ("a program that is not there", sound([magic, 3, 7]), true),
+        ("a trial of one", sound([magic, 2, 200]), true),
+    ] {
+        let mut bench = running_board();
+        let bytes: Vec<u8> = cell.iter().flat_map(|word| word.to_le_bytes()).collect();
+        bench.machine().write_ram(firmware::board().warm_start.base, &bytes).unwrap();
+        bench.machine().reset_pin();
+        bench.await_boot_up(1000);
+        assert_eq!(is_bootloader(&mut bench, NODE), stays, "{what}");
+        // Used up: the next reset starts the program.
+        bench.machine().reset_pin();
+        bench.await_boot_up(1000);
+        assert!(!is_bootloader(&mut bench, NODE), "{what}");
+    }
+}
