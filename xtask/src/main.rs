@@ -12,6 +12,8 @@ mod arrows;
 mod bench;
 mod build;
 mod demo;
+#[cfg(test)]
+mod docs;
 mod eds;
 mod elf;
 mod emulate;
