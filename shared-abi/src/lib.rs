@@ -32,13 +32,19 @@ pub mod warm_start;
 /// simple enough to be written again in C in three lines.
 #[must_use]
 pub const fn check_word(words: &[u32]) -> u32 {
-    const SEED: u32 = 0xC0B0_07A5;
-    let mut fold = SEED;
+    let mut fold = CHECK_SEED;
     let mut i = 0;
     while i < words.len() {
-        fold = fold.rotate_left(5) ^ words[i];
-        fold = fold.wrapping_mul(0x9E37_79B1);
+        fold = fold.rotate_left(CHECK_ROTATION) ^ words[i];
+        fold = fold.wrapping_mul(CHECK_FACTOR);
         i += 1;
     }
     !fold
 }
+
+/// Where the fold of [`check_word`] begins.
+pub const CHECK_SEED: u32 = 0xC0B0_07A5;
+/// By how many bits it is rotated to the left before each word.
+pub const CHECK_ROTATION: u32 = 5;
+/// What it is multiplied with after each word.
+pub const CHECK_FACTOR: u32 = 0x9E37_79B1;

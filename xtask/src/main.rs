@@ -18,6 +18,7 @@ mod eds;
 mod elf;
 mod emulate;
 mod fuzz;
+mod header;
 mod json;
 mod layout;
 mod lint;
@@ -80,6 +81,12 @@ const JOBS: &[Job] = &[
         about: "the two files of a port, with steps to go through",
         help: new_board::HELP,
         run: new_board::run,
+    },
+    Job {
+        name: "header",
+        about: "the C header of the ABI between bootloader and application",
+        help: header::HELP,
+        run: header::run,
     },
     Job { name: "eds", about: "the EDS files of bootloader and application", help: eds::HELP, run: eds::run },
     Job {

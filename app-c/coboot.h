@@ -1,0 +1,311 @@
+/* What coboot and an application in C must agree on. Made from shared-abi by `cargo xtask header`: change it there.
+ *
+ * C11, freestanding, no library. Addresses come from the linker: `cargo xtask layout --ld program-1` prints the
+ * symbols __handoff, __warm_start and __callgate_table of a board. The functions that need the chip are there when
+ * the compiler's target is Arm; the rest works on any machine.
+ */
+#ifndef COBOOT_H
+#define COBOOT_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+/* The check word that guards a record in RAM. It tells a record from the noise of an unpowered RAM. */
+
+#define COBOOT_CHECK_SEED UINT32_C(0xC0B007A5)
+#define COBOOT_CHECK_ROTATION UINT32_C(0x5)
+#define COBOOT_CHECK_FACTOR UINT32_C(0x9E3779B1)
+
+/* Over so many words. They are put together from bytes: records have smaller fields, too. */
+static inline uint32_t coboot_check_word(const void *record, size_t words)
+{
+    const unsigned char *byte = record;
+    uint32_t fold = COBOOT_CHECK_SEED;
+    for (size_t i = 0; i < words; i++, byte += 4) {
+        uint32_t word = byte[0] | (uint32_t)byte[1] << 8 | (uint32_t)byte[2] << 16 | (uint32_t)byte[3] << 24;
+        fold = (fold << COBOOT_CHECK_ROTATION | fold >> (32 - COBOOT_CHECK_ROTATION)) ^ word;
+        fold *= COBOOT_CHECK_FACTOR;
+    }
+    return ~fold;
+}
+
+/* ---- The warm-start cell: what the application asks of the bootloader across a reset ---- */
+
+#define COBOOT_WARM_START_MAGIC UINT32_C(0x31574243)
+
+/* Requests. Those for a program take its number, 1 to 254; the others 0. */
+#define COBOOT_REQUEST_STAY UINT32_C(0x1)
+#define COBOOT_REQUEST_TRIAL UINT32_C(0x2)
+#define COBOOT_REQUEST_START UINT32_C(0x3)
+#define COBOOT_REQUEST_POWER_ON UINT32_C(0x5)
+
+struct coboot_warm_start {
+    uint32_t magic;
+    uint32_t request;
+    uint32_t argument;
+    uint32_t check;
+};
+_Static_assert(sizeof(struct coboot_warm_start) == 16, "coboot_warm_start");
+_Static_assert(offsetof(struct coboot_warm_start, magic) == 0, "coboot_warm_start: magic");
+_Static_assert(offsetof(struct coboot_warm_start, request) == 4, "coboot_warm_start: request");
+_Static_assert(offsetof(struct coboot_warm_start, argument) == 8, "coboot_warm_start: argument");
+_Static_assert(offsetof(struct coboot_warm_start, check) == 12, "coboot_warm_start: check");
+
+/* The cell that carries a request. */
+static inline struct coboot_warm_start coboot_request(uint32_t request, uint32_t program)
+{
+    struct coboot_warm_start cell = { COBOOT_WARM_START_MAGIC, request, program, 0 };
+    cell.check = coboot_check_word(&cell, offsetof(struct coboot_warm_start, check) / sizeof(uint32_t));
+    return cell;
+}
+
+/* ---- The handoff: how the device came up ---- */
+
+#define COBOOT_HANDOFF_MAGIC UINT32_C(0x4F484243)
+#define COBOOT_HANDOFF_VERSION UINT32_C(0x1)
+
+/* Reset causes. */
+#define COBOOT_RESET_UNKNOWN UINT32_C(0x0)
+#define COBOOT_RESET_POWER_ON UINT32_C(0x1)
+#define COBOOT_RESET_PIN UINT32_C(0x2)
+#define COBOOT_RESET_SOFTWARE UINT32_C(0x3)
+#define COBOOT_RESET_INDEPENDENT_WATCHDOG UINT32_C(0x4)
+#define COBOOT_RESET_WINDOW_WATCHDOG UINT32_C(0x5)
+#define COBOOT_RESET_LOW_POWER UINT32_C(0x6)
+#define COBOOT_RESET_BROWN_OUT UINT32_C(0x7)
+
+struct coboot_handoff {
+    uint32_t magic;
+    uint16_t version;
+    uint16_t length;
+    uint8_t node_id;
+    uint8_t program;
+    uint8_t reset_cause;
+    uint8_t trial;
+    uint32_t bit_rate;
+    uint32_t bootloader_version;
+    uint32_t serial_number;
+    uint32_t reserved[5];
+    uint32_t check;
+};
+_Static_assert(sizeof(struct coboot_handoff) == 48, "coboot_handoff");
+_Static_assert(offsetof(struct coboot_handoff, magic) == 0, "coboot_handoff: magic");
+_Static_assert(offsetof(struct coboot_handoff, version) == 4, "coboot_handoff: version");
+_Static_assert(offsetof(struct coboot_handoff, length) == 6, "coboot_handoff: length");
+_Static_assert(offsetof(struct coboot_handoff, node_id) == 8, "coboot_handoff: node_id");
+_Static_assert(offsetof(struct coboot_handoff, program) == 9, "coboot_handoff: program");
+_Static_assert(offsetof(struct coboot_handoff, reset_cause) == 10, "coboot_handoff: reset_cause");
+_Static_assert(offsetof(struct coboot_handoff, trial) == 11, "coboot_handoff: trial");
+_Static_assert(offsetof(struct coboot_handoff, bit_rate) == 12, "coboot_handoff: bit_rate");
+_Static_assert(offsetof(struct coboot_handoff, bootloader_version) == 16, "coboot_handoff: bootloader_version");
+_Static_assert(offsetof(struct coboot_handoff, serial_number) == 20, "coboot_handoff: serial_number");
+_Static_assert(offsetof(struct coboot_handoff, reserved) == 24, "coboot_handoff: reserved");
+_Static_assert(offsetof(struct coboot_handoff, check) == 44, "coboot_handoff: check");
+
+/* Whether a bootloader wrote it, and it is whole. Later versions only give names to reserved words. */
+static inline bool coboot_handoff_is_sound(const struct coboot_handoff *handoff)
+{
+    const size_t guarded = offsetof(struct coboot_handoff, check) / sizeof(uint32_t);
+    return handoff->magic == COBOOT_HANDOFF_MAGIC && handoff->version >= COBOOT_HANDOFF_VERSION
+        && handoff->length == sizeof *handoff && handoff->node_id >= 1 && handoff->node_id <= 127
+        && handoff->check == coboot_check_word(handoff, guarded);
+}
+
+/* ---- The callgate: services of the bootloader that an application calls like a function ----
+ *
+ * One at a time, from one priority, with the flash controller left alone meanwhile. It uses the caller's stack alone,
+ * and no FPU. What stores keeps the core from its flash as long as that takes: some 100 us, and some hundred ms once in
+ * several hundred times, when a sector is erased.
+ */
+
+#define COBOOT_CALLGATE_MAGIC UINT32_C(0x47434243)
+#define COBOOT_CALLGATE_ABI_VERSION UINT32_C(0x1)
+#define COBOOT_CALLGATE_TABLE_SIZE UINT32_C(0x10)
+
+/* Bytes of the caller's stack that a call may use. */
+#define COBOOT_CALLGATE_STACK UINT32_C(0x400)
+
+struct coboot_callgate {
+    uint32_t magic;
+    uint16_t abi_version;
+    uint16_t length;
+    uint32_t bootloader_version;
+    uint32_t entry;
+};
+_Static_assert(sizeof(struct coboot_callgate) == 16, "coboot_callgate");
+_Static_assert(offsetof(struct coboot_callgate, magic) == 0, "coboot_callgate: magic");
+_Static_assert(offsetof(struct coboot_callgate, abi_version) == 4, "coboot_callgate: abi_version");
+_Static_assert(offsetof(struct coboot_callgate, length) == 6, "coboot_callgate: length");
+_Static_assert(offsetof(struct coboot_callgate, bootloader_version) == 8, "coboot_callgate: bootloader_version");
+_Static_assert(offsetof(struct coboot_callgate, entry) == 12, "coboot_callgate: entry");
+
+/* What can be called. */
+#define COBOOT_SELECTOR_CRC32 UINT32_C(0x1)
+#define COBOOT_SELECTOR_READ_NODE UINT32_C(0x2)
+#define COBOOT_SELECTOR_STORE_NODE UINT32_C(0x3)
+#define COBOOT_SELECTOR_PROGRAM_INFO UINT32_C(0x4)
+#define COBOOT_SELECTOR_CONFIRM UINT32_C(0x5)
+#define COBOOT_SELECTOR_INVALIDATE UINT32_C(0x6)
+
+/* COBOOT_SELECTOR_CRC32: from `address` on, any alignment, `len` bytes of flash; gives `crc`. */
+struct coboot_crc32_args {
+    uint32_t address;
+    uint32_t len;
+    uint32_t crc;
+};
+_Static_assert(sizeof(struct coboot_crc32_args) == 12, "coboot_crc32_args");
+_Static_assert(offsetof(struct coboot_crc32_args, address) == 0, "coboot_crc32_args: address");
+_Static_assert(offsetof(struct coboot_crc32_args, len) == 4, "coboot_crc32_args: len");
+_Static_assert(offsetof(struct coboot_crc32_args, crc) == 8, "coboot_crc32_args: crc");
+
+/* COBOOT_SELECTOR_READ_NODE and _STORE_NODE: node-ID 1 to 127, or 255 for none; bit rate in bit/s, 0 for one to be found
+ * out by listening. */
+struct coboot_node_args {
+    uint32_t node_id;
+    uint32_t bit_rate;
+};
+_Static_assert(sizeof(struct coboot_node_args) == 8, "coboot_node_args");
+_Static_assert(offsetof(struct coboot_node_args, node_id) == 0, "coboot_node_args: node_id");
+_Static_assert(offsetof(struct coboot_node_args, bit_rate) == 4, "coboot_node_args: bit_rate");
+
+/* COBOOT_SELECTOR_PROGRAM_INFO, _CONFIRM and _INVALIDATE: about program `number`; the first gives the rest. */
+struct coboot_program_args {
+    uint32_t number;
+    uint32_t size;
+    uint32_t crc;
+    uint32_t version;
+    uint32_t flags;
+};
+_Static_assert(sizeof(struct coboot_program_args) == 20, "coboot_program_args");
+_Static_assert(offsetof(struct coboot_program_args, number) == 0, "coboot_program_args: number");
+_Static_assert(offsetof(struct coboot_program_args, size) == 4, "coboot_program_args: size");
+_Static_assert(offsetof(struct coboot_program_args, crc) == 8, "coboot_program_args: crc");
+_Static_assert(offsetof(struct coboot_program_args, version) == 12, "coboot_program_args: version");
+_Static_assert(offsetof(struct coboot_program_args, flags) == 16, "coboot_program_args: flags");
+
+/* In `flags`: downloaded completely and right; signed, so that it starts by itself. */
+#define COBOOT_PROGRAM_INSTALLED UINT32_C(0x1)
+#define COBOOT_PROGRAM_SIGNED UINT32_C(0x2)
+
+/* What a call returns. */
+#define COBOOT_STATUS_OK INT32_C(0) /* done */
+#define COBOOT_STATUS_UNKNOWN_SELECTOR INT32_C(-1) /* this bootloader has no such selector */
+#define COBOOT_STATUS_BAD_POINTER INT32_C(-2) /* the argument pointer is null, misaligned or not in RAM */
+#define COBOOT_STATUS_BAD_RANGE INT32_C(-3) /* the range does not lie in flash, or is empty */
+#define COBOOT_STATUS_BUSY INT32_C(-4) /* somebody uses the flash controller */
+#define COBOOT_STATUS_FAILED INT32_C(-5) /* the flash did not take the value */
+#define COBOOT_STATUS_BAD_ARGUMENT INT32_C(-6) /* a node-ID, bit rate or program number that does not exist here */
+#define COBOOT_STATUS_NO_PROGRAM INT32_C(-7) /* nothing is installed under this number */
+
+/* Whether the application understands a callgate. */
+enum coboot_callgate_state {
+    COBOOT_CALLGATE_GOOD,          /* it may be called */
+    COBOOT_CALLGATE_ABSENT,        /* another bootloader, or none */
+    COBOOT_CALLGATE_OTHER_VERSION, /* a bootloader of coboot with another ABI: its `abi_version` */
+};
+
+static inline enum coboot_callgate_state coboot_callgate_state(const struct coboot_callgate *gate)
+{
+    if (gate->magic != COBOOT_CALLGATE_MAGIC || gate->length < COBOOT_CALLGATE_TABLE_SIZE) {
+        return COBOOT_CALLGATE_ABSENT;
+    }
+    return gate->abi_version == COBOOT_CALLGATE_ABI_VERSION ? COBOOT_CALLGATE_GOOD : COBOOT_CALLGATE_OTHER_VERSION;
+}
+
+#if defined(__arm__)
+
+extern const struct coboot_callgate __callgate_table;
+extern volatile struct coboot_handoff __handoff;
+extern volatile struct coboot_warm_start __warm_start;
+
+/* Copies the handoff. False where no bootloader left a sound one (a debugger started the application, say). */
+static inline bool coboot_read_handoff(struct coboot_handoff *handoff)
+{
+    const volatile unsigned char *from = (const volatile unsigned char *)&__handoff;
+    unsigned char *to = (unsigned char *)handoff;
+    for (size_t i = 0; i < sizeof *handoff; i++) {
+        to[i] = from[i];
+    }
+    return coboot_handoff_is_sound(handoff);
+}
+
+/* The callgate of the bootloader underneath, or a null pointer. */
+static inline const struct coboot_callgate *coboot_callgate(void)
+{
+    const struct coboot_callgate *gate = &__callgate_table;
+    return coboot_callgate_state(gate) == COBOOT_CALLGATE_GOOD ? gate : NULL;
+}
+
+/* Calls a service of a callgate that was found, with the structure of its selector. */
+static inline int32_t coboot_call(const struct coboot_callgate *gate, uint32_t selector, void *args)
+{
+    typedef int32_t (*entry)(uint32_t selector, void *args);
+    return ((entry)(uintptr_t)gate->entry)(selector, args);
+}
+
+/* CRC-32/ISO-HDLC over flash: the function of 1F56h. */
+static inline int32_t coboot_crc32(const struct coboot_callgate *gate, uint32_t address, uint32_t len, uint32_t *crc)
+{
+    struct coboot_crc32_args args = { .address = address, .len = len };
+    int32_t status = coboot_call(gate, COBOOT_SELECTOR_CRC32, &args);
+    *crc = args.crc;
+    return status;
+}
+
+/* Node-ID and bit rate as they are stored. */
+static inline int32_t coboot_read_node(const struct coboot_callgate *gate, struct coboot_node_args *node)
+{
+    return coboot_call(gate, COBOOT_SELECTOR_READ_NODE, node);
+}
+
+/* Stores node-ID and bit rate; they are in force from the next reset on. */
+static inline int32_t coboot_store_node(const struct coboot_callgate *gate, uint32_t node_id, uint32_t bit_rate)
+{
+    struct coboot_node_args args = { .node_id = node_id, .bit_rate = bit_rate };
+    return coboot_call(gate, COBOOT_SELECTOR_STORE_NODE, &args);
+}
+
+/* What is known of a program. */
+static inline int32_t coboot_program_info(const struct coboot_callgate *gate, uint32_t number,
+                                          struct coboot_program_args *info)
+{
+    info->number = number;
+    return coboot_call(gate, COBOOT_SELECTOR_PROGRAM_INFO, info);
+}
+
+/* Gives a program its signature: how a trial confirms itself. */
+static inline int32_t coboot_confirm(const struct coboot_callgate *gate, uint32_t number)
+{
+    struct coboot_program_args args = { .number = number };
+    return coboot_call(gate, COBOOT_SELECTOR_CONFIRM, &args);
+}
+
+/* Takes a program's signature away: it does not start by itself any more. */
+static inline int32_t coboot_invalidate(const struct coboot_callgate *gate, uint32_t number)
+{
+    struct coboot_program_args args = { .number = number };
+    return coboot_call(gate, COBOOT_SELECTOR_INVALIDATE, &args);
+}
+
+/* Leaves a request for the bootloader and resets the chip. What asked for it has to be answered before: wait until the
+ * answer is on the bus, then 10 ms, and send nothing more.
+ */
+static inline _Noreturn void coboot_reset(uint32_t request, uint32_t program)
+{
+    const struct coboot_warm_start cell = coboot_request(request, program);
+    __asm volatile("cpsid i" ::: "memory");
+    __warm_start.magic = cell.magic;
+    __warm_start.request = cell.request;
+    __warm_start.argument = cell.argument;
+    __warm_start.check = cell.check;
+    __asm volatile("dsb" ::: "memory");
+    /* AIRCR: the key, SYSRESETREQ, and the priority grouping as it is (ARMv7-M B3.2.6). */
+    volatile uint32_t *aircr = (volatile uint32_t *)UINT32_C(0xE000ED0C);
+    *aircr = (*aircr & UINT32_C(0x700)) | UINT32_C(0x05FA0004);
+    for (;;) {
+    }
+}
+
+#endif
+#endif

@@ -1,0 +1,183 @@
+/* What coboot and an application in C must agree on. Made from shared-abi by `cargo xtask header`: change it there.
+ *
+ * C11, freestanding, no library. Addresses come from the linker: `cargo xtask layout --ld program-1` prints the
+ * symbols __handoff, __warm_start and __callgate_table of a board. The functions that need the chip are there when
+ * the compiler's target is Arm; the rest works on any machine.
+ */
+#ifndef COBOOT_H
+#define COBOOT_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+/* The check word that guards a record in RAM. It tells a record from the noise of an unpowered RAM. */
+
+@CHECK@
+
+/* Over so many words. They are put together from bytes: records have smaller fields, too. */
+static inline uint32_t coboot_check_word(const void *record, size_t words)
+{
+    const unsigned char *byte = record;
+    uint32_t fold = COBOOT_CHECK_SEED;
+    for (size_t i = 0; i < words; i++, byte += 4) {
+        uint32_t word = byte[0] | (uint32_t)byte[1] << 8 | (uint32_t)byte[2] << 16 | (uint32_t)byte[3] << 24;
+        fold = (fold << COBOOT_CHECK_ROTATION | fold >> (32 - COBOOT_CHECK_ROTATION)) ^ word;
+        fold *= COBOOT_CHECK_FACTOR;
+    }
+    return ~fold;
+}
+
+/* ---- The warm-start cell: what the application asks of the bootloader across a reset ---- */
+
+@WARM_START@
+
+/* The cell that carries a request. */
+static inline struct coboot_warm_start coboot_request(uint32_t request, uint32_t program)
+{
+    struct coboot_warm_start cell = { COBOOT_WARM_START_MAGIC, request, program, 0 };
+    cell.check = coboot_check_word(&cell, offsetof(struct coboot_warm_start, check) / sizeof(uint32_t));
+    return cell;
+}
+
+/* ---- The handoff: how the device came up ---- */
+
+@HANDOFF@
+
+/* Whether a bootloader wrote it, and it is whole. Later versions only give names to reserved words. */
+static inline bool coboot_handoff_is_sound(const struct coboot_handoff *handoff)
+{
+    const size_t guarded = offsetof(struct coboot_handoff, check) / sizeof(uint32_t);
+    return handoff->magic == COBOOT_HANDOFF_MAGIC && handoff->version >= COBOOT_HANDOFF_VERSION
+        && handoff->length == sizeof *handoff && handoff->node_id >= 1 && handoff->node_id <= 127
+        && handoff->check == coboot_check_word(handoff, guarded);
+}
+
+/* ---- The callgate: services of the bootloader that an application calls like a function ----
+ *
+ * One at a time, from one priority, with the flash controller left alone meanwhile. It uses the caller's stack alone,
+ * and no FPU. What stores keeps the core from its flash as long as that takes: some 100 us, and some hundred ms once in
+ * several hundred times, when a sector is erased.
+ */
+
+@CALLGATE@
+
+/* What can be called. */
+@SELECTORS@
+
+@ARGUMENTS@
+
+/* What a call returns. */
+@STATUS@
+
+/* Whether the application understands a callgate. */
+enum coboot_callgate_state {
+    COBOOT_CALLGATE_GOOD,          /* it may be called */
+    COBOOT_CALLGATE_ABSENT,        /* another bootloader, or none */
+    COBOOT_CALLGATE_OTHER_VERSION, /* a bootloader of coboot with another ABI: its `abi_version` */
+};
+
+static inline enum coboot_callgate_state coboot_callgate_state(const struct coboot_callgate *gate)
+{
+    if (gate->magic != COBOOT_CALLGATE_MAGIC || gate->length < COBOOT_CALLGATE_TABLE_SIZE) {
+        return COBOOT_CALLGATE_ABSENT;
+    }
+    return gate->abi_version == COBOOT_CALLGATE_ABI_VERSION ? COBOOT_CALLGATE_GOOD : COBOOT_CALLGATE_OTHER_VERSION;
+}
+
+#if defined(__arm__)
+
+extern const struct coboot_callgate __callgate_table;
+extern volatile struct coboot_handoff __handoff;
+extern volatile struct coboot_warm_start __warm_start;
+
+/* Copies the handoff. False where no bootloader left a sound one (a debugger started the application, say). */
+static inline bool coboot_read_handoff(struct coboot_handoff *handoff)
+{
+    const volatile unsigned char *from = (const volatile unsigned char *)&__handoff;
+    unsigned char *to = (unsigned char *)handoff;
+    for (size_t i = 0; i < sizeof *handoff; i++) {
+        to[i] = from[i];
+    }
+    return coboot_handoff_is_sound(handoff);
+}
+
+/* The callgate of the bootloader underneath, or a null pointer. */
+static inline const struct coboot_callgate *coboot_callgate(void)
+{
+    const struct coboot_callgate *gate = &__callgate_table;
+    return coboot_callgate_state(gate) == COBOOT_CALLGATE_GOOD ? gate : NULL;
+}
+
+/* Calls a service of a callgate that was found, with the structure of its selector. */
+static inline int32_t coboot_call(const struct coboot_callgate *gate, uint32_t selector, void *args)
+{
+    typedef int32_t (*entry)(uint32_t selector, void *args);
+    return ((entry)(uintptr_t)gate->entry)(selector, args);
+}
+
+/* CRC-32/ISO-HDLC over flash: the function of 1F56h. */
+static inline int32_t coboot_crc32(const struct coboot_callgate *gate, uint32_t address, uint32_t len, uint32_t *crc)
+{
+    struct coboot_crc32_args args = { .address = address, .len = len };
+    int32_t status = coboot_call(gate, COBOOT_SELECTOR_CRC32, &args);
+    *crc = args.crc;
+    return status;
+}
+
+/* Node-ID and bit rate as they are stored. */
+static inline int32_t coboot_read_node(const struct coboot_callgate *gate, struct coboot_node_args *node)
+{
+    return coboot_call(gate, COBOOT_SELECTOR_READ_NODE, node);
+}
+
+/* Stores node-ID and bit rate; they are in force from the next reset on. */
+static inline int32_t coboot_store_node(const struct coboot_callgate *gate, uint32_t node_id, uint32_t bit_rate)
+{
+    struct coboot_node_args args = { .node_id = node_id, .bit_rate = bit_rate };
+    return coboot_call(gate, COBOOT_SELECTOR_STORE_NODE, &args);
+}
+
+/* What is known of a program. */
+static inline int32_t coboot_program_info(const struct coboot_callgate *gate, uint32_t number,
+                                          struct coboot_program_args *info)
+{
+    info->number = number;
+    return coboot_call(gate, COBOOT_SELECTOR_PROGRAM_INFO, info);
+}
+
+/* Gives a program its signature: how a trial confirms itself. */
+static inline int32_t coboot_confirm(const struct coboot_callgate *gate, uint32_t number)
+{
+    struct coboot_program_args args = { .number = number };
+    return coboot_call(gate, COBOOT_SELECTOR_CONFIRM, &args);
+}
+
+/* Takes a program's signature away: it does not start by itself any more. */
+static inline int32_t coboot_invalidate(const struct coboot_callgate *gate, uint32_t number)
+{
+    struct coboot_program_args args = { .number = number };
+    return coboot_call(gate, COBOOT_SELECTOR_INVALIDATE, &args);
+}
+
+/* Leaves a request for the bootloader and resets the chip. What asked for it has to be answered before: wait until the
+ * answer is on the bus, then 10 ms, and send nothing more.
+ */
+static inline _Noreturn void coboot_reset(uint32_t request, uint32_t program)
+{
+    const struct coboot_warm_start cell = coboot_request(request, program);
+    __asm volatile("cpsid i" ::: "memory");
+    __warm_start.magic = cell.magic;
+    __warm_start.request = cell.request;
+    __warm_start.argument = cell.argument;
+    __warm_start.check = cell.check;
+    __asm volatile("dsb" ::: "memory");
+    /* AIRCR: the key, SYSRESETREQ, and the priority grouping as it is (ARMv7-M B3.2.6). */
+    volatile uint32_t *aircr = (volatile uint32_t *)UINT32_C(0xE000ED0C);
+    *aircr = (*aircr & UINT32_C(0x700)) | UINT32_C(0x05FA0004);
+    for (;;) {
+    }
+}
+
+#endif
+#endif
