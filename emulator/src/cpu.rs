@@ -449,11 +449,14 @@ impl Cpu {
         let chip = self.chip_mut();
         let geometry = chip.geometry;
         let Ok(len) = u32::try_from(bytes.len()) else { return false };
-        for (region, memory) in [(geometry.sram, &mut chip.sram), (geometry.ccm, &mut chip.ccm)] {
+        // The CCM holds no code: looking for translations of it would be a fetch from there.
+        for (region, memory, holds_code) in
+            [(geometry.sram, &mut chip.sram, true), (geometry.ccm, &mut chip.ccm, false)]
+        {
             if region.contains(address, len) {
                 let at = (address - region.base) as usize;
                 memory.bytes_mut()[at..at + bytes.len()].copy_from_slice(bytes);
-                if len > 0 {
+                if len > 0 && holds_code {
                     chip.stale.push((address, len));
                 }
                 return true;
