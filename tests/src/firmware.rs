@@ -21,6 +21,10 @@ pub const APP_V1: &str = "app-v1.elf";
 pub const APP_V2: &str = "app-v2.elf";
 /// Version 2 of the application at the place of the second program, on a board that has one.
 pub const PROGRAM_2: &str = "app-program-2.elf";
+/// The application in C, and the same one at the place of the second program.
+pub const APP_C: &str = "app-c.elf";
+/// See [`APP_C`].
+pub const APP_C_PROGRAM_2: &str = "app-c-program-2.elf";
 
 /// The name of an image of another board than the one that the tests are about.
 #[must_use]

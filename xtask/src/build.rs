@@ -1,10 +1,11 @@
 //! `cargo xtask build`: the images that go onto the chip.
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use shared_abi::geometry::Region;
-use shared_abi::layout::Layout;
+use shared_abi::layout::{Image, Layout};
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
@@ -15,10 +16,10 @@ use crate::{process, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask build [--board BOARD] [--yes]
 
-Builds the bootloader, standard, with every option, without any and with a rescue window, and both
-versions of the application, and puts them into target/firmware/BOARD/ as bootloader.elf,
-bootloader-complete.elf, bootloader-minimal.elf, bootloader-rescue.elf, app-v1.elf and app-v2.elf; for a
-board with room for two programs also app-program-2.elf.
+Builds the bootloader, standard, with every option, without any and with a rescue window, both versions
+of the application and the one in C, and puts them into target/firmware/BOARD/ as bootloader.elf,
+bootloader-complete.elf, bootloader-minimal.elf, bootloader-rescue.elf, app-v1.elf, app-v2.elf and
+app-c.elf; for a board with room for two programs also app-program-2.elf and app-c-program-2.elf.
 
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -36,8 +37,9 @@ pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let setup = Setup::from(&mut args);
     args.none_left()?;
-    setup.prepare(&[Part::Firmware])?;
-    images(board).map(drop)
+    setup.prepare(&[Part::Firmware, Part::C])?;
+    images(board)?;
+    c_applications(board)
 }
 
 /// Builds all images of a board and prints their sizes.
@@ -61,6 +63,77 @@ pub fn images(board: &Layout) -> Outcome<Images> {
         image(&Build { board, package: "app-template", features }, "app-program-2.elf", *second)?;
     }
     Ok(Images { dir: workspace::firmware_dir(board), bootloader })
+}
+
+/// Builds the application in C for each program of a board. A board that app-c/boards does not know has none.
+///
+/// # Errors
+/// When it does not build, or is no image of this board.
+pub fn c_applications(board: &Layout) -> Outcome {
+    let sources = workspace::root().join("app-c");
+    if !sources.join("boards").join(board.board).with_extension("h").exists() {
+        eprintln!("  app-c/boards has no {}.h: no application in C", board.board);
+        return Ok(());
+    }
+    let dir = workspace::firmware_dir(board);
+    for (number, region) in (1..).zip(board.programs) {
+        let name = if number == 1 { "app-c".to_owned() } else { format!("app-c-program-{number}") };
+        let work = dir.join("c").join(&name);
+        let write = |path: &Path, bytes: &[u8]| {
+            fs::write(path, bytes)
+                .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(path)))
+        };
+        fs::create_dir_all(&work)
+            .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&work)))?;
+        let script = board.linker_script(Image::Program(number)).to_string();
+        write(&work.join("layout.x"), script.as_bytes())?;
+        let mut objects = Vec::new();
+        for source in C_SOURCES {
+            let object = work.join(source).with_extension("o");
+            let mut clang = process::clang();
+            clang.current_dir(&sources).args(C_FLAGS);
+            clang.arg(format!("-DBOARD=\"boards/{}.h\"", board.board));
+            process::run(clang.arg("-c").arg(source).arg("-o").arg(&object))?;
+            objects.push(object);
+        }
+        let elf = dir.join(name).with_extension("elf");
+        let mut linker = Command::new(rust_lld()?);
+        linker.args(["-flavor", "gnu", "--gc-sections", "--nmagic", "--fatal-warnings", "-o"]).arg(&elf);
+        linker.arg("-L").arg(&work).arg("-T").arg(sources.join("app.x"));
+        process::run(linker.args(objects))?;
+        report(&elf, *region)?;
+    }
+    Ok(())
+}
+
+/// What the application in C is made of.
+const C_SOURCES: [&str; 4] = ["startup.c", "can.c", "probe.c", "main.c"];
+/// How it is compiled. It keeps the FPU off, so it is compiled for a chip without one; what it calls in the bootloader takes and
+/// gives no floating-point numbers.
+const C_FLAGS: &[&str] = &[
+    "--target=thumbv7em-none-eabi",
+    "-mcpu=cortex-m4",
+    "-mfloat-abi=soft",
+    "-std=c11",
+    "-ffreestanding",
+    "-fno-builtin",
+    "-ffunction-sections",
+    "-fdata-sections",
+    "-Os",
+    "-g",
+    "-fdebug-compilation-dir=app-c",
+    "-Wall",
+    "-Wextra",
+    "-Werror",
+];
+
+/// The linker that comes with the Rust toolchain: what links the rest of the firmware.
+fn rust_lld() -> Outcome<PathBuf> {
+    let said = process::output(Command::new("rustc").args(["--version", "--verbose"]))?;
+    let host = said.lines().find_map(|line| line.strip_prefix("host: ")).unwrap_or_default();
+    let sysroot = process::output(Command::new("rustc").args(["--print", "sysroot"]))?;
+    let tools = Path::new(sysroot.trim()).join("lib/rustlib").join(host).join("bin");
+    Ok(tools.join("rust-lld").with_extension(std::env::consts::EXE_EXTENSION))
 }
 
 /// Builds the bootloader of a board and prints its size.
@@ -139,9 +212,18 @@ fn image(build: &Build<'_>, name: &str, region: Region) -> Outcome<PathBuf> {
         fs::write(&to, &file)
             .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&to)))?;
     }
-    let flash = Flash::of(&size::read(&to)?, region)
-        .map_err(|problem| format!("{}: {problem}", workspace::shown(&to)))?;
-    // Beside what cargo says: the standard output is the job's, which may be asked for JSON.
-    eprintln!("  {:<52} {:>6} of {} bytes", workspace::shown(&to), flash.used, region.size);
+    report(&to, region)?;
     Ok(to)
+}
+
+/// Prints the size of an image.
+///
+/// # Errors
+/// When it lies outside its flash.
+fn report(image: &Path, region: Region) -> Outcome {
+    let flash = Flash::of(&size::read(image)?, region)
+        .map_err(|problem| format!("{}: {problem}", workspace::shown(image)))?;
+    // Beside what cargo says: the standard output is the job's, which may be asked for JSON.
+    eprintln!("  {:<52} {:>6} of {} bytes", workspace::shown(image), flash.used, region.size);
+    Ok(())
 }

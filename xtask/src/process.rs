@@ -18,6 +18,11 @@ pub fn cargo(subcommand: &str) -> Command {
     command
 }
 
+/// The C compiler for the chip: clang, or what the variable `CLANG` names.
+pub fn clang() -> Command {
+    Command::new(env::var_os("CLANG").unwrap_or_else(|| "clang".into()))
+}
+
 /// Runs a program to its end; what it prints is seen.
 ///
 /// # Errors

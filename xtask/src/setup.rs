@@ -16,8 +16,8 @@ pub const HELP: &str = "\
 usage: cargo xtask setup [--yes]
 
 Brings the machine to where every other job runs: the Rust target thumbv7em-none-eabihf, rustfmt and
-clippy (by rustup); cmake, make, pkg-config and libclang to build the emulator's CPU, python3 with venv (by
-apt-get); and a Python environment in target/python with tests/python/requirements.txt.
+clippy (by rustup); cmake, make, pkg-config and libclang to build the emulator's CPU, clang for the application
+in C, python3 with venv (by apt-get); and a Python environment in target/python with tests/python/requirements.txt.
 
 The other jobs do this themselves, each for what it needs. As root it installs what is missing; for
 anyone else it stops with the line to run, or, with --yes, runs that line.
@@ -30,6 +30,8 @@ anyone else it stops with the line to run, or, with --yes, runs that line.
 pub enum Part {
     /// Code for the chip: the Rust target.
     Firmware,
+    /// The application in C: a compiler for the chip.
+    C,
     /// The emulator: Unicorn is C built by cmake, and its bindings are made with libclang.
     Emulator,
     /// The third-party CANopen client: a Python environment.
@@ -47,7 +49,7 @@ pub struct Setup {
 pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     args.none_left()?;
-    setup.prepare(&[Part::Firmware, Part::Emulator, Part::Python, Part::Lint])?;
+    setup.prepare(&[Part::Firmware, Part::C, Part::Emulator, Part::Python, Part::Lint])?;
     println!("Everything is there.");
     Ok(())
 }
@@ -142,6 +144,7 @@ enum Tool {
     Cmake,
     PkgConfig,
     Libclang,
+    Clang,
     Python,
     Venv,
 }
@@ -155,6 +158,7 @@ impl Tool {
             Self::Cmake => "cmake",
             Self::PkgConfig => "pkg-config",
             Self::Libclang => "libclang-dev",
+            Self::Clang => "clang",
             Self::Python => "python3",
             Self::Venv => "python3-venv",
         }
@@ -174,6 +178,11 @@ impl Tool {
             // The configure script inside Unicorn stops without it, and the build then misses a header.
             Self::PkgConfig => process::succeeds("pkg-config", &["--version"]),
             Self::Libclang => libclang_is_there(),
+            // One without the target for Arm is of no use here.
+            Self::Clang => {
+                let arm = ["--target=thumbv7em-none-eabi", "-E", "-x", "c", "/dev/null"];
+                process::succeeds(process::clang().get_program(), &arm)
+            }
             Self::Python => process::succeeds("python3", &["--version"]),
             // Debian's python3 comes without ensurepip.
             Self::Venv => process::succeeds("python3", &["-c", "import venv, ensurepip"]),
@@ -187,6 +196,7 @@ fn missing_packages(parts: &[Part], is_there: impl Fn(Tool) -> bool) -> Vec<&'st
     for part in parts {
         tools.extend_from_slice(match part {
             Part::Emulator => &[Tool::CCompiler, Tool::Make, Tool::Cmake, Tool::PkgConfig, Tool::Libclang],
+            Part::C => &[Tool::Clang],
             Part::Python if !python_environment_is_there() => &[Tool::Python, Tool::Venv],
             Part::Python | Part::Firmware | Part::Lint => &[],
         });
@@ -329,7 +339,8 @@ mod tests {
             missing_packages(&[Part::Emulator], |tool| !matches!(tool, Tool::Cmake | Tool::Libclang)),
             ["cmake", "libclang-dev"]
         );
-        assert!(missing_packages(&[Part::Emulator, Part::Python], |_| true).is_empty());
+        assert_eq!(missing_packages(&[Part::C], nothing), ["clang"]);
+        assert!(missing_packages(&[Part::C, Part::Emulator, Part::Python], |_| true).is_empty());
     }
 
     #[test]

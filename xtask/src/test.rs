@@ -23,7 +23,7 @@ among those with the firmware of every other board.
   ARGS            go to cargo test: `cargo xtask test -p canopen sdo`, `cargo xtask test -- --nocapture`
 
 The tests find what was built by these variables: COBOOT_BOARD, COBOOT_FIRMWARE_DIR (bootloader.elf,
-app-v1.elf, app-v2.elf), COBOOT_COFLASH (the command line of the host tool) and COBOOT_PYTHON (an
+app-v1.elf, app-v2.elf, app-c.elf), COBOOT_COFLASH (the command line of the host tool) and COBOOT_PYTHON (an
 interpreter with tests/python/requirements.txt installed).
 ";
 
@@ -31,11 +31,13 @@ pub fn run(mut args: Args) -> Outcome {
     let chosen_board = args.has("--board");
     let board = workspace::board(&mut args)?;
     let setup = Setup::from(&mut args);
-    setup.prepare(&[Part::Firmware, Part::Emulator, Part::Python])?;
+    setup.prepare(&[Part::Firmware, Part::C, Part::Emulator, Part::Python])?;
     build::images(board)?;
+    build::c_applications(board)?;
     // And one board with room for two programs, for the tests of that.
     for two in BOARDS.iter().filter(|other| other.programs.len() > 1 && other.board != board.board) {
         build::images(two)?;
+        build::c_applications(two)?;
     }
     process::run(process::cargo("build").current_dir(workspace::root()).args(["--package", "coflash"]))?;
     let coflash =
@@ -54,6 +56,7 @@ pub fn run(mut args: Args) -> Outcome {
         suite.run(board, &other_crc.map(String::from))?;
         for other in BOARDS.iter().filter(|other| other.chip.chip != board.chip.chip) {
             build::images(other)?;
+            build::c_applications(other)?;
             println!("\n-- {} --", other.board);
             let tests = MAIN_TESTS.iter().map(|test| format!("--test={test}"));
             suite.run(other, &build::tests_args(other).into_iter().chain(tests).collect::<Vec<_>>())?;
@@ -78,7 +81,7 @@ pub fn run(mut args: Args) -> Outcome {
 }
 
 /// The test programs that every board goes through each time: what a port can get wrong shows in them.
-const MAIN_TESTS: [&str; 5] = ["main_job", "device", "watchdog", "boot_time", "abi"];
+const MAIN_TESTS: [&str; 6] = ["main_job", "device", "watchdog", "boot_time", "abi", "c_application"];
 
 /// What has been tested so far, and what the tests need to know.
 struct Suite {

@@ -1,0 +1,87 @@
+#include "can.h"
+
+#include "registers.h"
+
+/* The register of a bit timing with the sample point near 87.5 % (CiA 301) and as many quanta as fit (section 32.7.7), or 0. */
+static uint32_t bit_timing(uint32_t clock, uint32_t bit_rate)
+{
+    if (bit_rate == 0 || clock % bit_rate != 0) {
+        return 0;
+    }
+    const uint32_t cycles = clock / bit_rate;
+    for (uint32_t quanta = 25; quanta >= 8; quanta--) {
+        const uint32_t segment_2 = (quanta + 4) / 8;
+        const uint32_t segment_1 = quanta - 1 - segment_2;
+        if (cycles % quanta == 0 && cycles / quanta <= 1024 && segment_1 <= 16) {
+            return (cycles / quanta - 1) | (segment_1 - 1) << 16 | (segment_2 - 1) << 20;
+        }
+    }
+    return 0;
+}
+
+/* An identifier in a filter bank of 16-bit lists: data frames with 11 bits. */
+static uint32_t listed(uint16_t id)
+{
+    return (uint32_t)id << 5;
+}
+
+bool can_start(uint32_t clock, uint32_t bit_rate, uint16_t hear_1, uint16_t hear_2)
+{
+    const uint32_t timing = bit_timing(clock, bit_rate);
+    if (timing == 0) {
+        return false;
+    }
+    RCC_APB1ENR |= RCC_APB1ENR_CAN1EN;
+    (void)RCC_APB1ENR;
+    /* Out of sleep, into initialisation. */
+    CAN_MCR = CAN_MCR_INRQ | CAN_MCR_ABOM;
+    while ((CAN_MSR & CAN_MSR_INAK) == 0) {
+    }
+    CAN_BTR = timing;
+    CAN_FMR |= CAN_FMR_FINIT;
+    CAN_FA1R = 0;
+    CAN_FM1R = 1;
+    CAN_F0R1 = listed(hear_1) | listed(hear_2) << 16;
+    CAN_F0R2 = CAN_F0R1;
+    CAN_FA1R = 1;
+    CAN_FMR &= ~CAN_FMR_FINIT;
+    /* The controller itself waits for 11 recessive bits. */
+    CAN_MCR = CAN_MCR_ABOM;
+    return true;
+}
+
+bool can_is_free(enum can_mailbox mailbox)
+{
+    return (CAN_TSR & CAN_TSR_TME(mailbox)) != 0;
+}
+
+static uint32_t word_of(const uint8_t *bytes)
+{
+    return bytes[0] | (uint32_t)bytes[1] << 8 | (uint32_t)bytes[2] << 16 | (uint32_t)bytes[3] << 24;
+}
+
+void can_send(enum can_mailbox mailbox, const struct can_frame *frame)
+{
+    CAN_TDTR(mailbox) = frame->len;
+    CAN_TDLR(mailbox) = word_of(&frame->data[0]);
+    CAN_TDHR(mailbox) = word_of(&frame->data[4]);
+    CAN_TIR(mailbox) = (uint32_t)frame->id << 21 | CAN_TIR_TXRQ;
+}
+
+bool can_receive(struct can_frame *frame)
+{
+    if ((CAN_RF0R & CAN_RF0R_FMP0) == 0) {
+        return false;
+    }
+    const uint32_t words[2] = { CAN_RDL0R, CAN_RDH0R };
+    frame->id = (uint16_t)(CAN_RI0R >> 21);
+    const uint32_t len = CAN_RDT0R & 0xF;
+    frame->len = len < 8 ? (uint8_t)len : 8;
+    for (unsigned i = 0; i < 8; i++) {
+        frame->data[i] = (uint8_t)(words[i / 4] >> 8 * (i % 4));
+    }
+    CAN_RF0R = CAN_RF0R_RFOM0;
+    while ((CAN_RF0R & CAN_RF0R_RFOM0) != 0) {
+    }
+    return true;
+}

@@ -1,0 +1,46 @@
+/* From the jump into this program to `main`, and the vectors. */
+#include "registers.h"
+
+extern uint32_t _stack_start, __data_start, __data_end, __bss_start, __bss_end;
+extern const uint32_t __data_load;
+
+void main(void);
+void tick(void);
+void reset(void);
+
+/* Whatever has no handler here starts the device again; what runs then is the bootloader's decision. */
+static void unexpected(void)
+{
+    SCB_AIRCR = SCB_AIRCR_RESET;
+    for (;;) {
+    }
+}
+
+/* More interrupts than any chip of the family has, so that every vector is somebody's. */
+enum { EXCEPTIONS = 16, INTERRUPTS = 112 };
+
+typedef void (*vector)(void);
+
+__attribute__((section(".vector_table"), used)) static const vector vectors[EXCEPTIONS + INTERRUPTS] = {
+    [0] = (vector)(uintptr_t)&_stack_start,
+    [1] = reset,
+    [2 ... 14] = unexpected,
+    [15] = tick,
+    [16 ... EXCEPTIONS + INTERRUPTS - 1] = unexpected,
+};
+
+void reset(void)
+{
+    /* The bootloader has set it; a debugger may not have. */
+    SCB_VTOR = (uint32_t)(uintptr_t)vectors;
+    /* Volatile, or the compiler would call a library for these. */
+    const volatile uint32_t *from = &__data_load;
+    for (volatile uint32_t *to = &__data_start; to < &__data_end; to++, from++) {
+        *to = *from;
+    }
+    for (volatile uint32_t *to = &__bss_start; to < &__bss_end; to++) {
+        *to = 0;
+    }
+    main();
+    unexpected();
+}

@@ -1,0 +1,538 @@
+//! An application in C: what a program that knows coboot by its generated header alone gets from it, and what it cannot break.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use canopen::program::ProgramControl;
+use canopen::{Address, BitRate, NodeId};
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::firmware;
+use coflash::convert::{blocks_of, Options, Region};
+use coflash::flash::{flash, FlashOptions, Report};
+use coflash::read::read;
+use coflash::session::{Doing, Session, Timing};
+use emulator::machine::{ResetCause, Stop};
+use emulator::time::Span;
+use shared_abi::callgate;
+use shared_abi::layout::stm32f407g_disc1_two;
+
+const DEVICE_TYPE: Address = Address::new(0x1000, 0);
+const CRC: Address = Address::new(0x1F56, 1);
+const ANSWERS: u32 = 0x580 + NODE as u32;
+
+/// The selectors and status codes, typed again.
+const CRC32: u32 = 1;
+const READ_NODE: u32 = 2;
+const STORE_NODE: u32 = 3;
+const PROGRAM_INFO: u32 = 4;
+const CONFIRM: u32 = 5;
+const INVALIDATE: u32 = 6;
+const OK: i32 = 0;
+const UNKNOWN_SELECTOR: i32 = -1;
+const BAD_POINTER: i32 = -2;
+const BAD_RANGE: i32 = -3;
+const BUSY: i32 = -4;
+const BAD_ARGUMENT: i32 = -6;
+const NO_PROGRAM: i32 = -7;
+
+/// Sub-indices of the application's object 2100h (app-c/probe.h).
+mod probe {
+    use canopen::Address;
+    pub const SELECTOR: Address = Address::new(0x2100, 1);
+    pub const POINTER: Address = Address::new(0x2100, 2);
+    pub const WORDS: [Address; 5] = [
+        Address::new(0x2100, 3),
+        Address::new(0x2100, 4),
+        Address::new(0x2100, 5),
+        Address::new(0x2100, 6),
+        Address::new(0x2100, 7),
+    ];
+    pub const CALL: Address = Address::new(0x2100, 8);
+    pub const STACK: Address = Address::new(0x2100, 9);
+    pub const ADDRESS: Address = Address::new(0x2100, 10);
+    pub const SEED: Address = Address::new(0x2100, 11);
+    pub const FLASH_OPEN: Address = Address::new(0x2100, 12);
+}
+
+fn install(bench: &mut Bench, image: &str) -> Report {
+    let options = FlashOptions { verify: true, ..FlashOptions::default() };
+    flash(&mut bench.session(), &firmware::blocks(image), &options, &mut |_| {}).unwrap()
+}
+
+/// A board that runs the application, and the report of its installation.
+fn running_board() -> (Bench, Report) {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let report = install(&mut bench, firmware::APP_C);
+    bench.events();
+    (bench, report)
+}
+
+fn number(bench: &mut Bench, at: Address) -> u32 {
+    bench.session().read_number(at).unwrap()
+}
+
+/// Writes a word. A call that erases a sector of the journal may take longer than a host usually waits.
+fn put(bench: &mut Bench, at: Address, value: u32) {
+    let timing = Timing { sdo: Duration::from_secs(3), ..Timing::default() };
+    let mut session = Session::new(bench, NodeId::new(NODE).unwrap(), timing);
+    session.write(at, &value.to_le_bytes(), Doing::Write(at), &mut |_| {}).unwrap();
+}
+
+fn is_bootloader(bench: &mut Bench, node: u8) -> bool {
+    bench.session_with(node).device_type().unwrap().unwrap().is_bootloader()
+}
+
+fn power_cycle(bench: &mut Bench) {
+    bench.power_off();
+    bench.run_ms(100);
+    bench.power_on();
+    bench.await_boot_up(1000);
+    bench.events();
+}
+
+/// What a call did.
+struct Called {
+    status: i32,
+    words: [u32; 5],
+    stack: u32,
+}
+
+/// Calls a selector with these words as its argument structure.
+fn call(bench: &mut Bench, selector: u32, words: [u32; 5]) -> Called {
+    let good = number(bench, probe::ADDRESS);
+    call_with(bench, selector, good, words)
+}
+
+/// Calls a selector with a pointer of the caller's choice.
+fn call_with(bench: &mut Bench, selector: u32, pointer: u32, words: [u32; 5]) -> Called {
+    put(bench, probe::SELECTOR, selector);
+    put(bench, probe::POINTER, pointer);
+    for (at, word) in probe::WORDS.into_iter().zip(words) {
+        put(bench, at, word);
+    }
+    put(bench, probe::CALL, 0);
+    let stack = number(bench, probe::STACK);
+    // The way in alone puts something on it; more than it may would be RAM that is not the callgate's.
+    assert!((8..=callgate::STACK).contains(&stack), "selector {selector} took {stack} bytes of stack");
+    Called {
+        status: number(bench, probe::CALL) as i32,
+        words: probe::WORDS.map(|at| number(bench, at)),
+        stack,
+    }
+}
+
+/// CRC-32/ISO-HDLC, bit by bit.
+fn crc32(bytes: &[u8]) -> u32 {
+    !bytes.iter().fold(u32::MAX, |crc, byte| {
+        (0..8).fold(crc ^ u32::from(*byte), |crc, _| crc >> 1 ^ (0xEDB8_8320 * (crc & 1)))
+    })
+}
+
+#[test]
+fn it_is_a_node_like_any_other() {
+    assert_eq!(crc32(b"123456789"), 0xCBF4_3926, "the check value of the CRC catalogue");
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let identity = [1, 2, 3, 4].map(|sub| Address::new(0x1018, sub));
+    let of_bootloader = identity.map(|at| number(&mut bench, at));
+    let report = install(&mut bench, firmware::APP_C);
+    bench.events();
+    let program = firmware::board().programs[0];
+    let start = (program.base - firmware::board().chip.flash.base) as usize;
+    let image = &bench.machine().flash()[start..start + report.program_size as usize];
+    assert_eq!(report.program_crc, crc32(image));
+    assert_eq!(number(&mut bench, CRC), report.program_crc, "through the callgate");
+    assert_eq!(number(&mut bench, DEVICE_TYPE), 0);
+    assert_eq!(number(&mut bench, Address::new(0x1F51, 1)), 1, "running");
+    let of_application = identity.map(|at| number(&mut bench, at));
+    assert_eq!((of_application[0], of_application[1]), (of_bootloader[0], of_bootloader[1]));
+    assert_eq!(of_application[3], of_bootloader[3], "from the handoff");
+
+    // Requests byte for byte, and the answers that CiA 301 gives them.
+    for (request, answer) in [
+        ([0x40, 0x00, 0x10, 0, 0, 0, 0, 0], [0x43, 0x00, 0x10, 0, 0, 0, 0, 0]),
+        ([0x40, 0x18, 0x10, 0, 0, 0, 0, 0], [0x4F, 0x18, 0x10, 0, 4, 0, 0, 0]),
+        ([0x2B, 0x17, 0x10, 0, 100, 0, 0, 0], [0x60, 0x17, 0x10, 0, 0, 0, 0, 0]),
+        ([0x40, 0x17, 0x10, 0, 0, 0, 0, 0], [0x4B, 0x17, 0x10, 0, 100, 0, 0, 0]),
+        ([0x2F, 0x17, 0x10, 0, 100, 0, 0, 0], [0x80, 0x17, 0x10, 0, 0x10, 0, 0x07, 0x06]),
+        ([0x21, 0x17, 0x10, 0, 100, 0, 0, 0], [0x80, 0x17, 0x10, 0, 0x10, 0, 0x07, 0x06]),
+        ([0x23, 0x00, 0x10, 0, 1, 0, 0, 0], [0x80, 0x00, 0x10, 0, 0x02, 0, 0x01, 0x06]),
+        ([0x40, 0x08, 0x10, 0, 0, 0, 0, 0], [0x80, 0x08, 0x10, 0, 0, 0, 0x02, 0x06]),
+        ([0x40, 0x18, 0x10, 5, 0, 0, 0, 0], [0x80, 0x18, 0x10, 5, 0x11, 0, 0x09, 0x06]),
+        ([0x2F, 0x51, 0x1F, 1, 0x42, 0, 0, 0], [0x80, 0x51, 0x1F, 1, 0x30, 0, 0x09, 0x06]),
+        ([0x2F, 0x51, 0x1F, 1, 3, 0, 0, 0], [0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 0x08]),
+        ([0x2F, 0x51, 0x1F, 1, 1, 0, 0, 0], [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0]),
+        ([0xC6, 0x50, 0x1F, 1, 0, 0, 0, 0], [0x80, 0x50, 0x1F, 1, 0x01, 0, 0x04, 0x05]),
+    ] {
+        assert_eq!(bench.ask(0x601, &request, ANSWERS).as_deref(), Some(&answer[..]), "{request:02X?}");
+    }
+    // What is no SDO, and an abort, get none.
+    for request in [&[0x40, 0, 0x10][..], &[0x80, 0, 0x10, 0, 0, 0, 0, 0]] {
+        assert_eq!(bench.ask(0x601, request, ANSWERS), None);
+    }
+
+    // A heartbeat every 100 ms from now on; it tells the NMT state. Who is stopped answers no SDO.
+    for (command, state) in [(0x01, 0x05), (0x02, 0x04), (0x80, 0x7F)] {
+        bench.post(0x000, &[command, NODE]);
+        bench.run_ms(20);
+        let from = bench.time();
+        bench.run_ms(1000);
+        let heartbeats = bench.frames_since(from);
+        assert!((9..=11).contains(&heartbeats.len()), "{heartbeats:?}");
+        for (_, id, data) in heartbeats {
+            assert_eq!((id, &data[..]), (0x701, &[state][..]));
+        }
+        let answer = bench.ask(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0], ANSWERS);
+        assert_eq!(answer.is_some(), state != 0x04);
+    }
+    // Not for this node.
+    bench.post(0x000, &[0x81, NODE + 1]);
+    bench.run_ms(100);
+    assert_eq!(bench.events(), []);
+    // Nobody has crashed when an NMT command asked for a reset.
+    for _ in 0..4 {
+        bench.post(0x000, &[0x81, NODE]);
+        bench.await_boot_up(1000);
+        assert!(!is_bootloader(&mut bench, NODE));
+    }
+    bench.assert_nothing_unmodelled();
+}
+
+#[test]
+fn it_can_be_called_back_at_every_bit_rate() {
+    for (rate, bits) in [
+        (BitRate::K10, 10_000),
+        (BitRate::K125, 125_000),
+        (BitRate::K500, 500_000),
+        (BitRate::K1000, 1_000_000),
+    ] {
+        let mut bench = Bench::new();
+        let board = bench.device;
+        bench.commission(board, NODE, rate);
+        bench.set_host_bit_rate(bits);
+        bench.power_on();
+        bench.await_boot_up(1000);
+        install(&mut bench, firmware::APP_C);
+        bench.events();
+        let from = bench.time();
+        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+        bench.await_boot_up(2000);
+        let events = bench.events();
+        let [(reset, Stop::Reset(ResetCause::Software))] = events[..] else { panic!("{rate:?}: {events:?}") };
+        let frames = bench.frames_since(from);
+        let answer = frames.iter().rfind(|(at, id, _)| *id == ANSWERS && *at < reset).unwrap();
+        assert_eq!(answer.2, [0x60, 0x51, 0x1F, 0x01, 0, 0, 0, 0], "{rate:?}");
+        assert!(
+            reset - answer.0 >= Span::from_millis(10),
+            "{rate:?}: {} us",
+            (reset - answer.0).0 / 1_000_000
+        );
+        assert!(is_bootloader(&mut bench, NODE), "{rate:?}");
+        install(&mut bench, firmware::APP_V2);
+        assert_eq!(bench.session().read_text(Address::new(0x100A, 0)).unwrap(), "2.0.0", "{rate:?}");
+    }
+}
+
+/// Each service does what it says, with two kinds of garbage in all RAM that the application does not use.
+#[test]
+fn every_service_works_on_the_stack_alone() {
+    let (mut bench, report) = running_board();
+    let layout = firmware::board();
+    let flash = layout.chip.flash;
+    let program = layout.programs[0];
+    let mut stacks = BTreeMap::new();
+    for seed in [0, 0xDEAD_BEEF] {
+        put(&mut bench, probe::SEED, seed);
+        // The CCM is nobody's, and the cells between the parts are not the callgate's.
+        let ccm = vec![seed as u8 | 1; layout.chip.ccm.size as usize];
+        if !ccm.is_empty() {
+            bench.machine().write_ram(layout.chip.ccm.base, &ccm).unwrap();
+        }
+        let mut cells = [0; 64];
+        bench.machine().read_memory(layout.ram.end(), &mut cells).unwrap();
+
+        let mut run = |bench: &mut Bench, selector, words| {
+            let called = call(bench, selector, words);
+            let most = stacks.entry(selector).or_insert(0);
+            *most = called.stack.max(*most);
+            (called.status, called.words)
+        };
+        for (address, len) in [
+            (program.base, report.program_size),
+            (program.base + 1, 7),
+            (flash.base, layout.bootloader.size),
+            (flash.end() - 1, 1),
+        ] {
+            let place = (address - flash.base) as usize;
+            let expected = crc32(&bench.machine().flash()[place..place + len as usize]);
+            let (status, words) = run(&mut bench, CRC32, [address, len, !expected, 4, 5]);
+            assert_eq!((status, words), (OK, [address, len, expected, 4, 5]), "{address:#x}, {len}");
+        }
+        // What stands behind the structure is not touched.
+        let (status, words) = run(&mut bench, READ_NODE, [0, 0, 3, 4, 5]);
+        assert_eq!((status, words), (OK, [1, 125_000, 3, 4, 5]));
+        let installed_signed = 0b11;
+        let info = [1, report.program_size, report.program_crc, 0, installed_signed];
+        assert_eq!(run(&mut bench, PROGRAM_INFO, [1, 9, 9, 9, 9]), (OK, info));
+        assert_eq!(run(&mut bench, INVALIDATE, [1, 6, 7, 8, 9]), (OK, [1, 6, 7, 8, 9]));
+        assert_eq!(run(&mut bench, PROGRAM_INFO, [1; 5]).1[4], 0b01);
+        assert_eq!(run(&mut bench, CONFIRM, [1, 6, 7, 8, 9]), (OK, [1, 6, 7, 8, 9]));
+        assert_eq!(run(&mut bench, PROGRAM_INFO, [1; 5]).1, info);
+        assert_eq!(run(&mut bench, STORE_NODE, [9, 250_000, 3, 4, 5]), (OK, [9, 250_000, 3, 4, 5]));
+        assert_eq!(run(&mut bench, READ_NODE, [0; 5]).1[..2], [9, 250_000]);
+        assert_eq!(run(&mut bench, STORE_NODE, [1, 125_000, 3, 4, 5]).0, OK);
+
+        let mut after = ccm.clone();
+        if !ccm.is_empty() {
+            bench.machine().read_memory(layout.chip.ccm.base, &mut after).unwrap();
+        }
+        assert!(after == ccm, "the CCM was written to");
+        let mut cells_after = [0; 64];
+        bench.machine().read_memory(layout.ram.end(), &mut cells_after).unwrap();
+        assert_eq!(cells_after, cells, "handoff and warm-start cell");
+    }
+    println!("bytes of stack by selector: {stacks:?} of {}", callgate::STACK);
+    assert_eq!(bench.events(), []);
+    bench.assert_nothing_unmodelled();
+}
+
+/// The journal's sectors are full some time; the call that finds them so has the most to do.
+#[test]
+fn a_thousand_stores_fill_the_journal_and_go_on() {
+    let (mut bench, _) = running_board();
+    let journal = |bench: &mut Bench| {
+        let [a, b] = firmware::board().parameters;
+        let base = firmware::board().chip.flash.base;
+        [a, b].map(|sector| bench.machine().flash()[(sector.base - base) as usize..][..32].to_vec())
+    };
+    let before = journal(&mut bench);
+    let mut most = call(&mut bench, STORE_NODE, [2, 125_000, 0, 0, 0]).stack;
+    let mut erased = 0;
+    let mut heads = before;
+    for n in 0..1000 {
+        put(&mut bench, probe::WORDS[0], n % 127 + 1);
+        put(&mut bench, probe::CALL, 0);
+        assert_eq!(number(&mut bench, probe::CALL), 0, "store {n}");
+        most = most.max(number(&mut bench, probe::STACK));
+        let now = journal(&mut bench);
+        erased += u32::from(now != heads);
+        heads = now;
+    }
+    assert!(erased > 0, "no sector was changed: store more often");
+    assert!(most <= callgate::STACK, "{most} bytes");
+    println!("{most} bytes of stack, {erased} changes of sector");
+    let called = call(&mut bench, READ_NODE, [0; 5]);
+    assert_eq!((called.status, called.words[0]), (OK, 999 % 127 + 1));
+    assert_eq!(bench.events(), []);
+}
+
+/// No argument of an application brings the device down or changes anything.
+#[test]
+fn every_hostile_call_has_its_status_and_does_nothing() {
+    let (mut bench, _) = running_board();
+    let layout = firmware::board();
+    let flash = layout.chip.flash;
+    let ram = layout.chip.sram;
+    let before = bench.machine().flash().to_vec();
+    let good = number(&mut bench, probe::ADDRESS);
+    for selector in [0, 7, 8, 0x7FFF_FFFF, 0x8000_0001, u32::MAX] {
+        // The selector is looked at first: no pointer makes another one of it.
+        for pointer in [good, 0] {
+            assert_eq!(
+                call_with(&mut bench, selector, pointer, [1; 5]).status,
+                UNKNOWN_SELECTOR,
+                "{selector}"
+            );
+        }
+    }
+    let pointers = [
+        0,
+        4,
+        good + 1,
+        good + 2,
+        flash.base,
+        layout.programs[0].base,
+        ram.base - 4,
+        // Its end lies behind that of the RAM.
+        ram.end() - 4,
+        ram.end(),
+        0x4000_0000,
+        0xE000_ED00,
+        0xFFFF_FFFC,
+        u32::MAX,
+    ];
+    for selector in [CRC32, READ_NODE, STORE_NODE, PROGRAM_INFO, CONFIRM, INVALIDATE] {
+        for pointer in pointers {
+            let status = call_with(&mut bench, selector, pointer, [1; 5]).status;
+            assert_eq!(status, BAD_POINTER, "{selector}, {pointer:#x}");
+        }
+    }
+    for (address, len) in [
+        (flash.base, 0),
+        (flash.base, flash.size + 1),
+        (flash.base, u32::MAX),
+        (flash.base - 1, 1),
+        (flash.end(), 1),
+        (flash.end() - 1, 2),
+        (flash.end() - 4, 0xF800_0000),
+        (0, 4),
+        (0x1FFF_7A10, 12),
+        (ram.base, 4),
+        (0x4002_3C00, 4),
+        (u32::MAX, 1),
+        (u32::MAX, u32::MAX),
+    ] {
+        let called = call(&mut bench, CRC32, [address, len, 3, 4, 5]);
+        assert_eq!((called.status, called.words[2]), (BAD_RANGE, 3), "{address:#x}, {len:#x}");
+    }
+    for node in [
+        [0, 125_000],
+        [128, 125_000],
+        [254, 125_000],
+        [256, 125_000],
+        [257, 125_000],
+        [u32::MAX, 125_000],
+        [5, 1],
+        [5, 125_001],
+        [5, u32::MAX],
+    ] {
+        let called = call(&mut bench, STORE_NODE, [node[0], node[1], 3, 4, 5]);
+        assert_eq!(called.status, BAD_ARGUMENT, "{node:?}");
+    }
+    for selector in [PROGRAM_INFO, CONFIRM, INVALIDATE] {
+        let absent = layout.programs.len() as u32 + 1;
+        for program in [0, absent, 254, 255, 256, 257, u32::MAX] {
+            let status = call(&mut bench, selector, [program; 5]).status;
+            assert_eq!(status, BAD_ARGUMENT, "{selector}, program {program}");
+        }
+    }
+    // Somebody has the flash controller open.
+    put(&mut bench, probe::FLASH_OPEN, 1);
+    for (selector, words) in [
+        (CRC32, [flash.base, 4, 0, 0, 0]),
+        (READ_NODE, [0; 5]),
+        (STORE_NODE, [5, 125_000, 0, 0, 0]),
+        (PROGRAM_INFO, [1; 5]),
+        (CONFIRM, [1; 5]),
+        (INVALIDATE, [1; 5]),
+    ] {
+        let called = call(&mut bench, selector, words);
+        assert_eq!((called.status, called.words), (BUSY, words), "{selector}");
+    }
+    put(&mut bench, probe::FLASH_OPEN, 0);
+
+    assert!(bench.machine().flash() == before, "flash was changed");
+    assert_eq!(bench.events(), [], "the device went down");
+    assert_eq!(call(&mut bench, READ_NODE, [0; 5]).words[..2], [1, 125_000]);
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up(1000);
+    assert!(is_bootloader(&mut bench, NODE));
+}
+
+#[test]
+fn a_node_id_that_it_stores_is_in_force_from_the_next_reset_on() {
+    let (mut bench, _) = running_board();
+    assert_eq!(call(&mut bench, STORE_NODE, [42, 500_000, 0, 0, 0]).status, OK);
+    assert_eq!(number(&mut bench, DEVICE_TYPE), 0, "not before");
+    bench.power_off();
+    bench.run_ms(100);
+    bench.set_host_bit_rate(500_000);
+    bench.power_on();
+    bench.await_boot_up_of(42, 1000);
+    assert!(!is_bootloader(&mut bench, 42));
+    bench.session_with(42).command(1, ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up_of(42, 1000);
+    assert!(is_bootloader(&mut bench, 42));
+}
+
+#[test]
+fn a_trial_confirms_itself_and_takes_it_back() {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let options = FlashOptions { start: false, ..FlashOptions::default() };
+    flash(&mut bench.session(), &firmware::blocks(firmware::APP_C), &options, &mut |_| {}).unwrap();
+    let start_unsigned = |bench: &mut Bench| {
+        for command in [ProgramControl::ClrSignature, ProgramControl::Start] {
+            bench.session().command(1, command).unwrap();
+            bench.run_ms(100);
+        }
+        bench.run_ms(500);
+        assert!(!is_bootloader(bench, NODE));
+        assert_eq!(call(bench, PROGRAM_INFO, [1; 5]).words[4], 0b01, "installed, not signed");
+    };
+    start_unsigned(&mut bench);
+    power_cycle(&mut bench);
+    assert!(is_bootloader(&mut bench, NODE), "it had not confirmed itself");
+    start_unsigned(&mut bench);
+    assert_eq!(call(&mut bench, CONFIRM, [1; 5]).status, OK);
+    power_cycle(&mut bench);
+    assert!(!is_bootloader(&mut bench, NODE), "it had");
+    assert_eq!(call(&mut bench, INVALIDATE, [1; 5]).status, OK);
+    power_cycle(&mut bench);
+    assert!(is_bootloader(&mut bench, NODE), "it has taken that back");
+}
+
+/// Two programs: each knows of the other; one that is not there is told as such; one that was linked for the place of the other is
+/// refused in words.
+#[test]
+fn the_other_program_and_a_program_for_the_other_place() {
+    let layout = &stm32f407g_disc1_two::LAYOUT;
+    if firmware::board().chip != layout.chip {
+        // The bench is that of another chip.
+        return;
+    }
+    let image = |name: &str| firmware::of_board(layout.board, name);
+    let elf = |name: &str| read(&firmware::elf(&image(name)), None, None).expect("an ELF of ours");
+    let strict = |program: usize| Region::Strict(layout.programs[program - 1].into());
+
+    // coflash sees it before anything is sent.
+    let options = Options { region: strict(1), ..Options::default() };
+    let refused = blocks_of(elf(firmware::APP_C_PROGRAM_2), &options).unwrap_err().to_string();
+    assert!(refused.contains("0x08080000"), "{refused}");
+
+    let mut bench = Bench::of_image(&image(firmware::BOOTLOADER));
+    bench.power_on();
+    bench.await_boot_up(100);
+    let once = FlashOptions { repeats: 0, ..FlashOptions::default() };
+    // A host that does not know the board: the bootloader sees it.
+    let blocks = blocks_of(elf(firmware::APP_C_PROGRAM_2), &Options::default()).unwrap().file;
+    let refused = flash(&mut bench.session(), &blocks, &once, &mut |_| {}).unwrap_err();
+    assert_eq!(number(&mut bench, Address::new(0x1F57, 1)), 0x0C, "ADDRESS: {refused}");
+    println!("{refused}");
+
+    // A host that moves it to the first place makes blocks that fit, of a program that does not: its vectors point to the second.
+    let moved = layout.programs[0].base.wrapping_sub(layout.programs[1].base);
+    let options = Options { region: strict(1), adjust_start: moved, ..Options::default() };
+    let blocks = blocks_of(elf(firmware::APP_C_PROGRAM_2), &options).unwrap().file;
+    let refused = flash(&mut bench.session(), &blocks, &once, &mut |_| {}).unwrap_err();
+    println!("{refused}");
+    let status = number(&mut bench, Address::new(0x1F57, 1));
+    assert_eq!(status & 0xFF, 0x02, "NOVALPROG: {refused}");
+    bench.power_off();
+    bench.run_ms(10);
+    bench.power_on();
+    bench.await_boot_up(1000);
+    assert!(is_bootloader(&mut bench, NODE));
+
+    // And the right ones.
+    let blocks =
+        blocks_of(elf(firmware::APP_C), &Options { region: strict(1), ..Options::default() }).unwrap().file;
+    flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).unwrap();
+    assert_eq!(call(&mut bench, PROGRAM_INFO, [2, 9, 9, 9, 9]).words, [2, 0, 0, 0, 0]);
+    for selector in [CONFIRM, INVALIDATE] {
+        assert_eq!(call(&mut bench, selector, [2; 5]).status, NO_PROGRAM);
+    }
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up(1000);
+    let options = Options { region: strict(2), ..Options::default() };
+    let blocks = blocks_of(elf(firmware::APP_C_PROGRAM_2), &options).unwrap().file;
+    let second = FlashOptions { program: 2, ..FlashOptions::default() };
+    let report = flash(&mut bench.session(), &blocks, &second, &mut |_| {}).unwrap();
+    assert_eq!(number(&mut bench, CRC), report.program_crc, "its own");
+    let info = call(&mut bench, PROGRAM_INFO, [2, 9, 9, 9, 9]).words;
+    assert_eq!(info, [2, report.program_size, report.program_crc, 0, 0b11]);
+}
