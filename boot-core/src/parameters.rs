@@ -1,6 +1,6 @@
 //! Non-volatile parameters: a journal over two flash regions that survives a power cut at every operation.
 //!
-//! A region holds slots of six words. Slot 0 is the header; every other slot is one [`Record`], written once. The
+//! A region holds slots of six words. Slot 0 is the header; every other slot is one record, written once. The
 //! latest sound record of a key is its value. When the region is full, the living records are copied to the other
 //! region, whose header is written **last**: until then the old region is the valid one, afterwards the new one is,
 //! and a cut leaves one of the two whole. Each slot carries a CRC, so a torn one reads as absent.

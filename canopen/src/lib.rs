@@ -16,7 +16,7 @@
 //! | `emcy` | emergency producer, 1001h, 1003h, 1014h (feature `emcy`) |
 //! | [`lss`] | layer setting services: node-ID and bit rate over the bus |
 //! | [`bit_rate`] | the bit rates of CANopen, and how to find out one |
-//! | [`line`] | what the CAN controller tells: error passive, bus-off, frames lost |
+//! | [`line`](mod@line) | what the CAN controller tells: error passive, bus-off, frames lost |
 //! | [`slave`] | a device on the bus: node, LSS and line tied together |
 //! | [`program`] | program download: the words of CiA 302-3 |
 #![no_std]

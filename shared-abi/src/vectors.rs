@@ -17,7 +17,7 @@ pub enum VectorFault {
 }
 
 /// A vector table that has passed its checks. Only [`VectorTable::check`] makes one, and only one of these can be
-/// [jumped](VectorTable::jump) to.
+/// jumped to (`VectorTable::jump`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct VectorTable {
     address: u32,

@@ -1,4 +1,4 @@
-//! `cargo xtask lint`: formatting and clippy, with warnings denied.
+//! `cargo xtask lint`: formatting, clippy and rustdoc, with warnings denied.
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
@@ -7,8 +7,8 @@ use crate::{build, process, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask lint [--board BOARD] [--yes]
 
-Checks the formatting of every crate, and runs clippy over host crates (with their tests) and
-over the firmware of a board, with warnings denied.
+Checks the formatting of every crate, runs clippy over host crates (with their tests) and over the
+firmware of a board, and makes the documentation of the host crates, all with warnings denied.
 
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -47,6 +47,9 @@ pub fn run(mut args: Args) -> Outcome {
     let mut resident = build::firmware_args("bootloader", board, "standard,resident");
     resident.push("--bin=resident".to_owned());
     clippy(&resident);
+    let mut doc = process::cargo("doc");
+    doc.current_dir(workspace::root()).args(["--quiet", "--no-deps", "--keep-going"]);
+    problems.extend(process::run(doc.env("RUSTDOCFLAGS", "--deny=warnings")).err());
     if problems.is_empty() {
         Ok(())
     } else {
