@@ -12,6 +12,7 @@ mod arrows;
 mod bench;
 mod build;
 mod demo;
+mod diagrams;
 #[cfg(test)]
 mod docs;
 mod eds;
@@ -88,6 +89,12 @@ const JOBS: &[Job] = &[
         help: header::HELP,
         run: header::run,
     },
+    Job {
+        name: "diagrams",
+        about: "the pictures of the documents, from text",
+        help: diagrams::HELP,
+        run: diagrams::run,
+    },
     Job { name: "eds", about: "the EDS files of bootloader and application", help: eds::HELP, run: eds::run },
     Job {
         name: "fuzz",
@@ -121,7 +128,7 @@ const JOBS: &[Job] = &[
     },
     Job {
         name: "lint",
-        about: "formatting and clippy, of host and firmware, warnings denied",
+        about: "formatting, clippy and documentation, warnings denied",
         help: lint::HELP,
         run: lint::run,
     },
