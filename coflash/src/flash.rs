@@ -164,7 +164,10 @@ impl fmt::Display for Event {
             }
             Self::CallingBack => f.write_str("calling the application back to the bootloader"),
             Self::InBootloader => f.write_str("the bootloader is running"),
-            Self::Erasing => f.write_str("erasing the old program"),
+            Self::Erasing => f.write_str("telling it to erase the old program"),
+            Self::Erased { took } if *took < PUT_OFF => {
+                f.write_str("it will, with the first block that it finds good")
+            }
             Self::Erased { took } => write!(f, "erased in {:.1} s", took.as_secs_f64()),
             Self::Progress { done, total } => write!(f, "{done} of {total} bytes"),
             Self::Repeating { block, repeat, of, why } => {
@@ -271,10 +274,17 @@ fn procedure(
         call_back(session, number)?;
         tell(Event::InBootloader);
     }
-    *state = DeviceState::Erased;
+    let before = std::mem::replace(state, DeviceState::Erased);
     erase(session, number, tell)?;
     let transfer_began = session.now();
-    let repeats = send_blocks(session, file, options, tell)?;
+    let sent = send_blocks(session, file, options, tell);
+    if sent.as_ref().is_err_and(Error::refuses_control_block)
+        && identification(session, number).is_ok_and(|crc| crc != 0)
+    {
+        // The device erases with the first good block, and there was none: it still has the CRC of its program.
+        *state = before;
+    }
+    let repeats = sent?;
     let transfer = session.now().saturating_sub(transfer_began);
     verify(session, number, file.program_crc(), tell)?;
     *state = DeviceState::Unsigned;
@@ -597,8 +607,13 @@ pub fn verify(
     Ok(())
 }
 
+/// 1F56h: the CRC over the program that is in the device, 0 for none.
+fn identification(session: &mut Session<'_>, number: u8) -> Result<u32, Error> {
+    session.read_number(Address::new(program::PROGRAM_ID, number))
+}
+
 fn compare_crc(session: &mut Session<'_>, number: u8, crc: u32) -> Result<(), Error> {
-    let device = session.read_number(Address::new(program::PROGRAM_ID, number))?;
+    let device = identification(session, number)?;
     if device != crc {
         return Err(Error::WrongCrc { device, file: crc });
     }

@@ -92,7 +92,7 @@ fn the_whole_procedure_from_a_running_application() {
         [
             "calling the application back to the bootloader",
             "the bootloader is running",
-            "erasing the old program"
+            "telling it to erase the old program"
         ]
     );
     assert_eq!(words[4][..9], *"erased in");

@@ -168,6 +168,7 @@ fn a_program_for_another_product_is_refused() {
     let said = coflash.run(&[FLASH, &["-N", "5", "--vid", "0", "--pid", "98"]].concat());
     assert_eq!(said.exit, 6, "{}", said.err);
     assert!(said.err.contains("60000182"), "{}", said.err);
+    assert!(said.err.contains("nothing was changed in it"), "{}", said.err);
     assert!(folder.read("1.flash")[0x1_0000..] == before[0x1_0000..]);
 }
 
