@@ -35,6 +35,10 @@ const NO_NODE_ID: u8 = 0xFF;
 /// How long a slave may take for its answer, unless told otherwise. Fastscan waits so long for each bit that is set in an
 /// address, so that patience costs time there.
 pub const ANSWER: Duration = Duration::from_millis(100);
+/// How long a device may take to store what it was given: it may have to erase a sector of its flash for that.
+const STORE_ANSWER: Duration = Duration::from_secs(2);
+/// Error code of a store: the device has no place for it (CiA 305).
+const STORE_UNSUPPORTED: u8 = 1;
 
 /// What the master was about when something went wrong.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -172,7 +176,11 @@ impl<'a> Master<'a> {
     /// # Errors
     /// [`Error::Lss`].
     pub fn store(&mut self) -> Result<(), Error> {
-        self.order([STORE, 0, 0, 0, 0, 0, 0, 0], LssDoing::Store)
+        let patience = self.answer;
+        self.answer = patience.max(STORE_ANSWER);
+        let stored = self.order([STORE, 0, 0, 0, 0, 0, 0, 0], LssDoing::Store);
+        self.answer = patience;
+        stored
     }
 
     /// Finds one of the devices without a node-ID, bit by bit of its address, and switches it into configuration state;
@@ -298,7 +306,7 @@ impl<'a> Master<'a> {
 }
 
 /// Sees to it that the device with this address has a node-ID: its own, or the one that is asked for, which it is given if
-/// need be. Afterwards it is on the bus with it.
+/// need be, and stores if it can: it has to outlive the restart into the program. Afterwards it is on the bus with it.
 ///
 /// # Errors
 /// [`Error::Lss`] where the device does not answer, has no node-ID and none is asked for, or refuses; [`Error::NoAnswer`]
@@ -324,6 +332,14 @@ pub fn ensure_node_id(
         (Some(own), Some(node)) if own == node => (own, None),
         (old, Some(node)) => {
             master.set_node_id(Some(node))?;
+            match master.store() {
+                // It cannot, or has never heard of the service.
+                Err(Error::Lss {
+                    failure: LssFailure::Refused { code: STORE_UNSUPPORTED, .. } | LssFailure::NoAnswer,
+                    ..
+                }) => {}
+                stored => stored?,
+            }
             (node, old)
         }
     };

@@ -157,6 +157,26 @@ fn nodes_are_commissioned_by_layer_setting_services() {
     coflash.done(&[&["lss", "store"][..], &device].concat());
 }
 
+/// From the factory to a running program in one job: the node-ID that a device is given by its LSS address outlives the restart.
+#[test]
+fn a_device_without_node_id_is_given_one_and_flashed_in_one_job() {
+    let folder = folder("lss-job");
+    let nodes = Nodes::start(
+        &folder,
+        &["--unconfigured", "--serial", "77", "--product-code", "0x1234", "--flash", "instant", "--stand-in"],
+    );
+    folder.write(
+        "job.toml",
+        b"image = \"program.bin\"\n[[device]]\nlss = { vendor = 0, product = 0x1234, revision = 0x10000, serial = 77 }\nnode = 23\n",
+    );
+    let coflash = Coflash::new(&folder, &nodes);
+    let options = &FLASH[2..];
+    coflash.done(&[&["flash", "--job", "job.toml"][..], options].concat());
+    assert_eq!(coflash.json(&["read", "1018/4", "-N", "23"])["number"], 77);
+    let said = coflash.done(&["info", "-N", "23"]);
+    assert!(said.contains("application"), "{said}");
+}
+
 /// A device of another product: nothing is lost, and what comes of it is the manual's number.
 #[test]
 fn a_program_for_another_product_is_refused() {
