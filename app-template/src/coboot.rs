@@ -1,4 +1,5 @@
-//! Everything between this application and the bootloader underneath: how it came up, what it may call, and the way back.
+//! Everything between this application and the bootloader underneath: how it came up, what it may call, and the
+//! way back.
 
 use core::sync::atomic::{AtomicU8, Ordering};
 
@@ -11,7 +12,8 @@ use shared_abi::layout::Layout;
 use shared_abi::reentry;
 use shared_abi::warm_start::BootRequest;
 
-/// How long the device stays after the answer to 80h is on the bus, in ms: at least 10 (SYS TEC manual L-1112d_10, 4.5), and one
+/// How long the device stays after the answer to 80h is on the bus, in ms: at least 10 (SYS TEC manual L-1112d_10,
+/// 4.5), and one
 /// that may be almost over.
 const FAREWELL_MS: u32 = 11;
 
@@ -73,7 +75,8 @@ pub fn own_crc(layout: &Layout) -> Option<u32> {
     Callgate::find(layout).ok()?.crc32(start, end - start).ok()
 }
 
-/// Stores node-ID and bit rate for bootloader and application; `None` and [`BitRate::Auto`] as layer setting services mean them.
+/// Stores node-ID and bit rate for bootloader and application; `None` and [`BitRate::Auto`] as layer setting
+/// services mean them.
 ///
 /// # Errors
 /// What the bootloader says.

@@ -1,4 +1,5 @@
-//! The table of the application's object dictionary. It needs nothing of the chip, so that the EDS file can be made from it
+//! The table of the application's object dictionary. It needs nothing of the chip, so that the EDS file can be
+//! made from it
 //! on the host.
 
 use canopen::device;

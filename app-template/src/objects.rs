@@ -77,7 +77,8 @@ impl Application {
         core::mem::take(&mut self.called_back).then_some(self.way)
     }
 
-    /// The 1F51h callback. It runs before the SDO answer is sent, so it only notes what is to be done: `main` waits until
+    /// The 1F51h callback. It runs before the SDO answer is sent, so it only notes what is to be done: `main`
+    /// waits until
     /// the answer is on the bus, then leaves.
     fn program_control(&mut self, command: ProgramControl) -> Result<(), AbortCode> {
         match command {

@@ -107,7 +107,8 @@ pub struct Config {
     pub layout: &'static Layout,
     /// The bit rates that its controller can be set to.
     pub supports: fn(BitRate) -> bool,
-    /// An emergency behind each boot-up, which tells a master that this is the bootloader and not the application: its
+    /// An emergency behind each boot-up, which tells a master that this is the bootloader and not the application:
+    /// its
     /// code FF00h (device specific, CiA 301 table 26), "BOOT", and why the device stayed
     /// ([`StayReason::code`](crate::decision::StayReason::code)).
     pub boot_up_emergency: bool,
@@ -133,7 +134,8 @@ pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize> {
 }
 
 impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PROGRAMS> {
-    /// Starts from what the parameters tell, for a device that stayed in the bootloader for this reason. The larger `buffer`,
+    /// Starts from what the parameters tell, for a device that stayed in the bootloader for this reason. The
+    /// larger `buffer`,
     /// the further the flash may lag behind the bus.
     pub fn new(
         config: &'static Config,
@@ -207,7 +209,8 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         self.download.take_leave()
     }
 
-    /// Ends here, whatever is being done, as a reset ends it: gives flash and buffer back, for whoever resets a device without
+    /// Ends here, whatever is being done, as a reset ends it: gives flash and buffer back, for whoever resets a
+    /// device without
     /// resetting itself.
     pub fn into_parts(self) -> (F, &'b mut [u8]) {
         (self.flash, self.download.into_buffer())

@@ -663,7 +663,8 @@ fn programs_that_do_not_exist_have_no_objects() {
     assert_eq!(bench.node.flash().touched, []);
 }
 
-/// Every operation of an update fails once, in each way: the status says so or the engine got over it; what would start is whole; and the
+/// Every operation of an update fails once, in each way: the status says so or the engine got over it; what would
+/// start is whole; and the
 /// next attempt succeeds.
 #[test]
 fn a_fault_at_any_operation_costs_no_more_than_another_attempt() {

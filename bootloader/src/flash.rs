@@ -28,7 +28,8 @@ const FLASH: Region = LAYOUT.chip.flash;
 impl FlashController {
     /// Takes the controller, and the CRC unit if `rcc` is there to switch it on.
     ///
-    /// The caches of the flash have to be off: they would show words as they were before they were programmed (section
+    /// The caches of the flash have to be off: they would show words as they were before they were programmed
+    /// (section
     /// 3.5.4). They are so after a reset, and a bootloader that runs from RAM gains nothing by them.
     ///
     /// # Safety
@@ -58,7 +59,8 @@ impl FlashController {
         self.registers.sr().read().bsy().bit_is_set() || self.registers.cr().read().lock().bit_is_clear()
     }
 
-    /// Opens the control register for one operation. (A `write` starts from the register's reset value, in which LOCK is
+    /// Opens the control register for one operation. (A `write` starts from the register's reset value, in which
+    /// LOCK is
     /// set: whoever writes it has to clear that.)
     fn unlock(&mut self) {
         // What an earlier operation left behind would be taken for the outcome of this one.
@@ -104,7 +106,8 @@ impl Flash for FlashController {
         }
     }
 
-    /// By the unit. It has the polynomial, but takes words with the most significant bit first, and starts anew: what went
+    /// By the unit. It has the polynomial, but takes words with the most significant bit first, and starts anew:
+    /// what went
     /// before comes back as one word that leaves it in the same state.
     fn crc32(&self, crc: u32, region: Region) -> u32 {
         let Some(unit) = &self.crc else { return crc32_by_software(self, crc, region) };

@@ -67,14 +67,16 @@ mod app {
 
     /// Frames that may wait for the protocol task. It has a higher priority than all that takes long, so few do.
     const RX_QUEUE: usize = 32;
-    /// Bytes of blocks that may wait for the flash: what RAM is free. While a sector of 128 KiB is erased, a bus at 1 Mbit/s
+    /// Bytes of blocks that may wait for the flash: what RAM is free. While a sector of 128 KiB is erased, a bus
+    /// at 1 Mbit/s
     /// brings some 55 KiB.
     const BLOCK_QUEUE: usize = 80 * 1024;
     /// Period of the heartbeat in ms.
     const HEARTBEAT_MS: u16 = 1000;
     /// How often the protocol looks at its deadlines, in ms.
     const TICK_MS: u32 = 2;
-    /// How long the device stays after the answer to its leaving is on the bus, in ms: clients want to see the answer before
+    /// How long the device stays after the answer to its leaving is on the bus, in ms: clients want to see the
+    /// answer before
     /// anything else happens.
     const FAREWELL_MS: u32 = 20;
 
@@ -227,7 +229,8 @@ mod app {
             // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
             carry_out(slave, &mut can, now, bootloader);
             while let Some(frame) = to_handle.dequeue() {
-                // The filters let nothing in but network management and what is for this device, or for layer setting services.
+                // The filters let nothing in but network management and what is for this device, or for layer
+                // setting services.
                 if RESCUE_WINDOW_MS.is_some() && frame.cob_id() != Some(CobId::NMT) {
                     *waiting = None;
                 }

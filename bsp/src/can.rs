@@ -1,4 +1,5 @@
-//! What every board does with its bxCAN: bit timing, filters, frames, and the state of the controller (RM0090 section 32).
+//! What every board does with its bxCAN: bit timing, filters, frames, and the state of the controller (RM0090
+//! section 32).
 
 use bxcan::filter::ListEntry16;
 use bxcan::{Can, Fifo, Interrupts, Mailbox, MasterInstance, OverrunError, StandardId};
@@ -17,7 +18,8 @@ pub struct BitTiming {
 
 impl BitTiming {
     /// The timing that makes `bit_rate` (bit/s) out of `clock` (Hz) exactly, with the sample point as near to 87.5 %
-    /// as it gets (the point that CiA 301 recommends) and as many quanta as fit; `None` where the clock cannot make it.
+    /// as it gets (the point that CiA 301 recommends) and as many quanta as fit; `None` where the clock cannot
+    /// make it.
     #[must_use]
     pub const fn new(clock: u32, bit_rate: u32) -> Option<Self> {
         if bit_rate == 0 || !clock.is_multiple_of(bit_rate) {
@@ -127,7 +129,8 @@ impl<I: MasterInstance> Port<I> {
 
     /// Sets bit timing and mode, and joins the bus with empty mailboxes.
     ///
-    /// Joining takes 11 recessive bits on the bus; the controller waits for them by itself and this function does not.
+    /// Joining takes 11 recessive bits on the bus; the controller waits for them by itself and this function does
+    /// not.
     pub fn configure(&mut self, timing: BitTiming, mode: Mode) {
         let config = self.can.modify_config();
         config.set_bit_timing(timing.register()).set_silent(mode == Mode::Silent).leave_disabled();
@@ -183,7 +186,8 @@ impl<I: MasterInstance> Port<I> {
         self.lost.in_queue = true;
     }
 
-    /// Acknowledges the mailbox interrupt and moves a frame that waits into a mailbox. Whether there is room for one now.
+    /// Acknowledges the mailbox interrupt and moves a frame that waits into a mailbox. Whether there is room for
+    /// one now.
     pub fn has_room(&mut self) -> bool {
         self.can.clear_tx_interrupt();
         if let Some(frame) = self.waiting.take() {
@@ -239,7 +243,8 @@ impl<I: MasterInstance> Port<I> {
     }
 
     fn read(&self, offset: usize) -> u32 {
-        // SAFETY: `REGISTERS` is the base of the controller that this port owns, the offset one of the registers above;
+        // SAFETY: `REGISTERS` is the base of the controller that this port owns, the offset one of the registers
+        // above;
         // reading them has no effect.
         unsafe { I::REGISTERS.cast::<u32>().byte_add(offset).read_volatile() }
     }

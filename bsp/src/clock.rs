@@ -1,4 +1,5 @@
-//! The clock tree at the level of its registers (RM0090 sections 3.5 and 7; RM0390 sections 3.4 and 6 say the same), for code that has to be small, and to be able to
+//! The clock tree at the level of its registers (RM0090 sections 3.5 and 7; RM0390 sections 3.4 and 6 say the
+//! same), for code that has to be small, and to be able to
 //! leave it as a reset does. An application takes the HAL's way, [`crate::clocks`].
 
 /// How a board makes its clocks out of its crystal.
@@ -114,11 +115,13 @@ mod registers {
     /// RCC_CFGR: what the system clock runs from, as told back.
     const SWS_PLL: u32 = 0b10 << 2;
     const SWS: u32 = 0b11 << 2;
-    /// How often a crystal is looked at before it is given up: at 16 MHz and 8 cycles a look 50 ms, ten times what one takes.
+    /// How often a crystal is looked at before it is given up: at 16 MHz and 8 cycles a look 50 ms, ten times what
+    /// one takes.
     const PATIENCE: u32 = 100_000;
 
     impl ClockTree {
-        /// Runs the core from the PLL. A crystal that does not start is done without, as long as the board has power: a device that can be
+        /// Runs the core from the PLL. A crystal that does not start is done without, as long as the board has
+        /// power: a device that can be
         /// reached badly is better than none. From the state after a reset or after [`slow_down`](Self::slow_down).
         pub fn speed_up(&self, rcc: &pac::RCC, wanted: Source) -> Source {
             let mut source = Source::Internal;
@@ -137,7 +140,8 @@ mod registers {
                 Source::Crystal => (self.hse, 1 << 22),
             };
             let pll = (from / self.pll_input) | (self.pll_n << 6) | ((self.pll_p / 2 - 1) << 16) | bit;
-            // SAFETY: a valid word of PLLCFGR, as `checked` has seen to; the reserved bits and Q keep their reset values.
+            // SAFETY: a valid word of PLLCFGR, as `checked` has seen to; the reserved bits and Q keep their reset
+            // values.
             rcc.pllcfgr().write(|w| unsafe { w.bits(PLLCFGR_RESET & 0xFF00_0000 | pll) });
             set(rcc, PLLON);
             latency(self.wait_states);
@@ -169,9 +173,11 @@ mod registers {
         rcc.cr().modify(|r, w| unsafe { w.bits(r.bits() | bit) });
     }
 
-    /// Wait states of the flash; the rest of its access control stays. The new value holds once it reads back (section 3.5.1).
+    /// Wait states of the flash; the rest of its access control stays. The new value holds once it reads back
+    /// (section 3.5.1).
     fn latency(wait_states: u32) {
-        // SAFETY: the access control register is this module's as far as the wait states go; the flash driver does not touch
+        // SAFETY: the access control register is this module's as far as the wait states go; the flash driver does
+        // not touch
         // them, and no other priority runs while clocks change.
         let acr = unsafe { &*pac::FLASH::ptr() }.acr();
         // SAFETY: 0 to 15.

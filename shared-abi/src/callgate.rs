@@ -22,7 +22,8 @@ pub const STACK: u32 = 1024;
 /// The entry point: a [selector](Selector), its argument structure, and a [result code](Status).
 pub type Entry = unsafe extern "C" fn(selector: u32, args: *mut core::ffi::c_void) -> i32;
 
-/// The table in flash. `E` is the [`Entry`] in the bootloader that defines it and its 32-bit address for everyone else.
+/// The table in flash. `E` is the [`Entry`] in the bootloader that defines it and its 32-bit address for everyone
+/// else.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Table<E = u32> {
@@ -38,8 +39,10 @@ pub struct Table<E = u32> {
     pub entry: E,
 }
 
-/// What can be called: one service at a time, from one priority, with the flash controller left alone meanwhile. Every
-/// service that stores keeps the core from its flash for as long as that takes: some 100 us, and once in several hundred times a
+/// What can be called: one service at a time, from one priority, with the flash controller left alone meanwhile.
+/// Every
+/// service that stores keeps the core from its flash for as long as that takes: some 100 us, and once in several
+/// hundred times a
 /// second, when a sector is erased.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
@@ -52,7 +55,8 @@ pub enum Selector {
     StoreNode = 3,
     /// What is known of a program; takes [`ProgramArgs`].
     ProgramInfo = 4,
-    /// Gives a program its signature, as 1F51h = 83h does, and forgets its crashes: how a trial confirms itself. Takes
+    /// Gives a program its signature, as 1F51h = 83h does, and forgets its crashes: how a trial confirms itself.
+    /// Takes
     /// [`ProgramArgs`], of which only the number counts.
     Confirm = 5,
     /// Takes a program's signature away, as 1F51h = 84h does. Takes [`ProgramArgs`], of which only the number counts.
@@ -186,7 +190,8 @@ impl Callgate {
     /// # Errors
     /// [`CallgateError::Absent`] or [`CallgateError::Version`].
     pub fn find(layout: &Layout) -> Result<Self, CallgateError> {
-        // SAFETY: a checked layout puts the table inside the flash, which is always readable; any bits make a `Table`.
+        // SAFETY: a checked layout puts the table inside the flash, which is always readable; any bits make a
+        // `Table`.
         Self::check(unsafe { (layout.callgate() as *const Table).read_volatile() })
     }
 
@@ -231,7 +236,8 @@ impl Callgate {
     /// Gives a program its signature and forgets its crashes: how a trial confirms itself.
     ///
     /// # Errors
-    /// [`CallgateError::Refused`] with [`Status::BadArgument`], [`Status::NoProgram`], [`Status::Busy`] or [`Status::Failed`].
+    /// [`CallgateError::Refused`] with [`Status::BadArgument`], [`Status::NoProgram`], [`Status::Busy`] or
+    /// [`Status::Failed`].
     pub fn confirm(&self, number: u8) -> Result<(), CallgateError> {
         let mut args = ProgramArgs { number: number.into(), ..ProgramArgs::default() };
         self.call(Selector::Confirm, (&raw mut args).cast())

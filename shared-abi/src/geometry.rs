@@ -99,7 +99,8 @@ pub const STM32F407VG: Geometry = Geometry {
 
 /// STM32F429ZI and its packages: 2 MiB flash in two banks, 112 + 16 + 64 KiB SRAM, 64 KiB CCM.
 ///
-/// RM0090 table 6 (sectors), section 2.3.1 (SRAM1, SRAM2 and SRAM3 follow one another), table 63 (91 interrupt lines).
+/// RM0090 table 6 (sectors), section 2.3.1 (SRAM1, SRAM2 and SRAM3 follow one another), table 63 (91 interrupt
+/// lines).
 pub const STM32F429ZI: Geometry = Geometry {
     chip: "stm32f429zi",
     flash: Region::new(0x0800_0000, 2048 * KIB),
@@ -173,7 +174,8 @@ impl Geometry {
         self
     }
 
-    /// What `FLASH_CR.SNB` takes for a sector: its number, but bit 4 chooses the second bank, whose sectors count from 0 again
+    /// What `FLASH_CR.SNB` takes for a sector: its number, but bit 4 chooses the second bank, whose sectors count
+    /// from 0 again
     /// (RM0090 section 3.9.8: sector 12 is 10000b).
     #[must_use]
     pub const fn sector_code(&self, number: u8) -> u8 {

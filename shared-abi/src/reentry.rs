@@ -6,7 +6,8 @@
 //! | [`watchdog_reset`] | a millisecond | code that may not write the system control block |
 //! | [`jump`] | the list below | a chip whose reset would switch something off that must stay on |
 //!
-//! Each leaves a request in the warm-start cell. The answer to the command that asked for it has to be on the bus before: wait for the
+//! Each leaves a request in the warm-start cell. The answer to the command that asked for it has to be on the bus
+//! before: wait for the
 //! transmit mailboxes to be empty, then 10 ms (SYS TEC manual L-1112d_10, 4.5), and let nothing else be sent.
 
 use crate::layout::Layout;
@@ -14,17 +15,20 @@ use crate::warm_start::{BootRequest, Cell};
 
 /// Leaves the request where the bootloader looks for it.
 fn leave_request(layout: &Layout, request: BootRequest) {
-    // SAFETY: the layout's warm-start region, checked to be RAM of that size that the linker scripts keep out of every image.
+    // SAFETY: the layout's warm-start region, checked to be RAM of that size that the linker scripts keep out of
+    // every image.
     unsafe { Cell::at(layout.warm_start.base as *mut _) }.put(request);
 }
 
 fn read(register: u32) -> u32 {
-    // SAFETY: every caller in this file names a register of the core or of an STM32F4 that can be read without side effects.
+    // SAFETY: every caller in this file names a register of the core or of an STM32F4 that can be read without
+    // side effects.
     unsafe { (register as *const u32).read_volatile() }
 }
 
 fn write(register: u32, value: u32) {
-    // SAFETY: every caller in this file names a register of the core or of an STM32F4. Interrupts are off, and nobody comes
+    // SAFETY: every caller in this file names a register of the core or of an STM32F4. Interrupts are off, and
+    // nobody comes
     // back to what was set up before.
     unsafe { (register as *mut u32).write_volatile(value) }
 }
@@ -49,7 +53,8 @@ pub fn system_reset(layout: &Layout, request: BootRequest) -> ! {
     }
 }
 
-/// Lets the independent watchdog reset the chip: within a millisecond if it is not running yet, else when it runs out.
+/// Lets the independent watchdog reset the chip: within a millisecond if it is not running yet, else when it runs
+/// out.
 pub fn watchdog_reset(layout: &Layout, request: BootRequest) -> ! {
     // RM0090 section 21.4.
     const KR: u32 = 0x4000_3000;
@@ -87,7 +92,8 @@ pub fn jump(layout: &Layout, request: BootRequest) -> ! {
     release_core();
     leave_request(layout, request);
     let table = layout.bootloader.base;
-    // SAFETY: the layout's bootloader begins with its vector table: first stack pointer and Reset. Nothing can interrupt any more,
+    // SAFETY: the layout's bootloader begins with its vector table: first stack pointer and Reset. Nothing can
+    // interrupt any more,
     // and nobody comes back. All operands are in registers when the stack changes.
     unsafe {
         core::arch::asm!(
@@ -115,7 +121,8 @@ fn release_peripherals() {
     const PLLCFGR: u32 = RCC + 0x04;
     const CFGR: u32 = RCC + 0x08;
     const CIR: u32 = RCC + 0x0C;
-    /// AHB1, AHB2, AHB3, APB1, APB2: offset of the reset register, that of the clock register behind it, and what that is after a
+    /// AHB1, AHB2, AHB3, APB1, APB2: offset of the reset register, that of the clock register behind it, and what
+    /// that is after a
     /// reset (the clock of the CCM RAM).
     const BUSES: [(u32, u32, u32); 5] =
         [(0x10, 0x30, 0x0010_0000), (0x14, 0x34, 0), (0x18, 0x38, 0), (0x20, 0x40, 0), (0x24, 0x44, 0)];

@@ -1,6 +1,7 @@
 //! The warm-start cell: what the application asks of the bootloader across a reset.
 //!
-//! The cell is the last RAM cell of the chip ([`Layout::warm_start`](crate::layout::Layout::warm_start)), in no image's RAM. It survives a
+//! The cell is the last RAM cell of the chip ([`Layout::warm_start`](crate::layout::Layout::warm_start)), in no
+//! image's RAM. It survives a
 //! warm reset and holds noise after a power-on; whatever it holds is treated as hostile input, and it
 //! is read once: [`Cell::take`] consumes it.
 
@@ -22,7 +23,8 @@ pub enum BootRequest {
     Fault,
     /// Start as after a power-on: what an NMT reset asks for. Whoever asks has not crashed.
     PowerOn,
-    /// Go on with the start of program `n`, which was held back for a rescue window; the bootloader asks this of itself.
+    /// Go on with the start of program `n`, which was held back for a rescue window; the bootloader asks this of
+    /// itself.
     Resume(u8),
 }
 

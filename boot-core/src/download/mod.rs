@@ -1,14 +1,17 @@
 //! Program download by block file: 1F50h takes the blocks, 1F51h the commands, 1F57h tells what became of them.
 //!
-//! Two halves that never wait for each other. The **SDO half** (`block_…`, [`Downloader::command`]) judges what comes in: it
+//! Two halves that never wait for each other. The **SDO half** (`block_…`, [`Downloader::command`]) judges what
+//! comes in: it
 //! refuses at once, with an abort and a status, or accepts and leaves work behind. The **flash half**
 //! ([`Downloader::step`]) carries the work through, an operation or a bounded computation at a time.
 //!
-//! Between them lies a queue of blocks. While it has room for another block the status is not busy, although the flash
+//! Between them lies a queue of blocks. While it has room for another block the status is not busy, although the
+//! flash
 //! works: a host that looks at the status between blocks sends the next one while those before are being programmed,
 //! and sectors are erased ahead of the data.
 //!
-//! Nothing of an installed program is lost before the first block of another one was judged good: CLEAR is carried out
+//! Nothing of an installed program is lost before the first block of another one was judged good: CLEAR is carried
+//! out
 //! with it (SYS TEC manual L-1112d_10, figure 12), see [`Erase`].
 
 mod queue;
@@ -48,7 +51,8 @@ pub enum Step {
 /// When CLEAR erases.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Erase {
-    /// With the first block that is for this device: until then the old program stays, and can be started. Sectors are erased as the
+    /// With the first block that is for this device: until then the old program stays, and can be started. Sectors
+    /// are erased as the
     /// data need them. A second CLEAR, with no block in between, erases all at once.
     #[default]
     WithFirstBlock,
@@ -70,7 +74,8 @@ pub enum Verdict {
 /// What can be chosen about the download.
 #[derive(Clone, Copy, Debug)]
 pub struct Policy {
-    /// Vendor-ID and product code of the device. A control block that tells others is refused; 0 in it stands for any.
+    /// Vendor-ID and product code of the device. A control block that tells others is refused; 0 in it stands for
+    /// any.
     pub identity: Option<(u32, u32)>,
     /// The integrator's own check, with all that the control block tells (`TgtProcessAppInfoData` of the manual).
     pub check: fn(program: u8, control: &Control) -> Verdict,
@@ -78,7 +83,8 @@ pub struct Policy {
     pub allowed: fn() -> bool,
     /// When CLEAR erases.
     pub erase: Erase,
-    /// Bytes of flash that one step of a CRC covers: the longest that other work of the same priority is kept waiting.
+    /// Bytes of flash that one step of a CRC covers: the longest that other work of the same priority is kept
+    /// waiting.
     pub crc_step: u32,
 }
 
@@ -198,7 +204,8 @@ pub struct Downloader<'b, P, const PROGRAMS: usize> {
 }
 
 impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
-    /// Starts from what the parameters tell. The larger `buffer`, the further the flash may lag behind the bus; blocks larger
+    /// Starts from what the parameters tell. The larger `buffer`, the further the flash may lag behind the bus;
+    /// blocks larger
     /// than it, or than [`MAX_BLOCK_SIZE`], are refused.
     pub fn new<F: Flash>(
         layout: &'static Layout,
@@ -398,7 +405,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 return Err(self.refuse(program, Refusal(FlashError::Format, AbortCode::LENGTH_TOO_LOW)));
             }
         }
-        // A second CLEAR erases all, but not behind a block: it may come from a host that tries the same wrong file again.
+        // A second CLEAR erases all, but not behind a block: it may come from a host that tries the same wrong
+        // file again.
         if let Some(Session::Cleared { just }) = self.session(program) {
             *just = false;
         }
@@ -743,7 +751,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     // No CLEAR: each block finds out whether its place is blank.
                     _ => (region.end(), region.end()),
                 };
-                // Also where there is no record: one that a power cut left between 0 and 1 may be there the next time.
+                // Also where there is no record: one that a power cut left between 0 and 1 may be there the next
+                // time.
                 if matches!(self.programs[index].session, Session::Cleared { .. }) && self.work.is_none() {
                     self.work = Some(self.invalidate(program, false));
                 }

@@ -1,6 +1,7 @@
 //! The blocks that were received and are not in flash yet: a ring of bytes, so that the flash may lag behind the bus.
 //!
-//! A block is *open* while it arrives. It is judged as a whole, and then either joins the queue or is forgotten. Offsets
+//! A block is *open* while it arrives. It is judged as a whole, and then either joins the queue or is forgotten.
+//! Offsets
 //! count from the front of the queue or of the open block.
 
 /// A ring of bytes; its front is the oldest block.

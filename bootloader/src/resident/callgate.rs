@@ -1,6 +1,7 @@
 //! The callgate: what an application may call (`shared_abi::callgate`).
 //!
-//! The flash controller may be the application's otherwise, and so may the CRC unit and the caches of the flash: they are taken when they are free,
+//! The flash controller may be the application's otherwise, and so may the CRC unit and the caches of the flash:
+//! they are taken when they are free,
 //! and left as they were found.
 
 use core::ffi::c_void;

@@ -7,7 +7,8 @@
 //! | `callgate.rs` | services for the application | its ABI |
 //! | `caches.rs` | the caches of the flash, off for a while | registers |
 //!
-//! It is a program of its own, so that the linker can see that it has no variables: nothing but the stack and its own code is
+//! It is a program of its own, so that the linker can see that it has no variables: nothing but the stack and its
+//! own code is
 //! there when it runs. `linker/build.rs` builds it, and the bootloader carries it as bytes.
 #![no_std]
 #![no_main]

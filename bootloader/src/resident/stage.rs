@@ -1,6 +1,7 @@
 //! The boot stage: from the reset to the jump into a program, or to the rest of the bootloader.
 //!
-//! It runs before any peripheral but the reset flags, the warm-start cell, the flash controller, the CRC unit and the entry strap was
+//! It runs before any peripheral but the reset flags, the warm-start cell, the flash controller, the CRC unit and
+//! the entry strap was
 //! touched, and leaves those as after a reset.
 
 use boot_core::canopen::NodeId;
@@ -15,7 +16,8 @@ use shared_abi::warm_start::BootRequest;
 use crate::flash::FlashController;
 use crate::product::{self, NO_NODE_ID, POLICY, PROGRAM_WATCHDOG_MS, RESCUE_WINDOW_MS};
 
-/// Decides. Does not come back if a program is to run; else tells why the bootloader stays ([`StayReason::code`]), and in the next byte
+/// Decides. Does not come back if a program is to run; else tells why the bootloader stays ([`StayReason::code`]),
+/// and in the next byte
 /// which program waits for the end of the rescue window.
 pub extern "C" fn stage() -> u32 {
     // SAFETY: nothing else runs yet; the rest of the bootloader takes them after this has returned.
@@ -59,7 +61,8 @@ pub extern "C" fn stage() -> u32 {
             if let Some(ms) = PROGRAM_WATCHDOG_MS {
                 bsp::watchdog::start(&iwdg, ms);
             }
-            // SAFETY: the layout's handoff region, checked to be RAM of that size in no image. No interrupt was enabled
+            // SAFETY: the layout's handoff region, checked to be RAM of that size in no image. No interrupt was
+            // enabled
             // and no bus master started since the reset.
             unsafe {
                 handoff.write(LAYOUT.handoff.base as *mut Handoff);

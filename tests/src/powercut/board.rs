@@ -1,6 +1,7 @@
 //! Level 2: the built firmware on the emulated chip, updated by `coflash`, its power cut at flash operations.
 //!
-//! A point starts from a copy of the flash of a board that runs version 1, so that points depend on nothing before them and run
+//! A point starts from a copy of the flash of a board that runs version 1, so that points depend on nothing before
+//! them and run
 //! beside each other. What must be in the flash in the end is taken from the ELF files by the emulator's own loader.
 
 use std::fmt;
@@ -19,7 +20,8 @@ use crate::bench::{Bench, NODE};
 use crate::firmware;
 
 const VERSION: Address = Address::new(0x100A, 0);
-/// As fast as the bus can be. It is stored in the device, and is not what a device without parameters uses: one that answers
+/// As fast as the bus can be. It is stored in the device, and is not what a device without parameters uses: one
+/// that answers
 /// has kept them.
 const RATE: BitRate = BitRate::K1000;
 const BIT_RATE: u32 = 1_000_000;
@@ -51,7 +53,8 @@ impl At {
     }
 }
 
-/// A cut in the update, and perhaps another one in the recovery. Written as `board:37:torn` or `board:37:torn:12:after`.
+/// A cut in the update, and perhaps another one in the recovery. Written as `board:37:torn` or
+/// `board:37:torn:12:after`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Point {
     first: At,

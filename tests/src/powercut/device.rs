@@ -335,7 +335,8 @@ enum Store {
     Journal(Journal),
     /// Stores this record where it should take one away, or none at all.
     Instead(Journal, Option<Value>),
-    /// One region, record behind record; a word in front of each tells what it is about. `checked`: with a CRC behind it.
+    /// One region, record behind record; a word in front of each tells what it is about. `checked`: with a CRC
+    /// behind it.
     Naive {
         checked: bool,
         work: Vec<(u32, u32)>,

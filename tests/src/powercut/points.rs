@@ -244,7 +244,8 @@ fn at_operation(scenario: &Scenario, device: &Device, operation: u32, every_kind
     report
 }
 
-/// Cuts the power at every operation of a scenario, in every way, and at every operation of the recovery; there in one way that
+/// Cuts the power at every operation of a scenario, in every way, and at every operation of the recovery; there in
+/// one way that
 /// changes from operation to operation, or in `every_kind`.
 ///
 /// # Errors
