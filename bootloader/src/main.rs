@@ -9,6 +9,7 @@
 //! | `flash.rs` | the flash controller and the CRC unit | registers |
 //! | `ram_vectors.rs` | the vector table in RAM | one copy |
 //! | `watchdog.rs` | feeds the watchdog when all tasks are alive | no |
+//! | `log.rs` | a few words over RTT (feature `log-rtt`) | no |
 //! | `memory.rs` | `memcpy` and its kin, small | assembly |
 //!
 //! What the bootloader *is* stands in `boot-core` and `canopen`.
@@ -16,6 +17,7 @@
 #![no_main]
 
 mod flash;
+mod log;
 mod memory;
 mod product;
 mod ram_vectors;
@@ -55,10 +57,11 @@ mod app {
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
     use rtic::Mutex;
-    use shared_abi::warm_start::BootRequest;
+    use shared_abi::warm_start::{BootRequest, WarmStart};
 
     use super::{product, start, Mono};
     use crate::flash::FlashController;
+    use crate::log::{self, log};
     use crate::product::RESCUE_WINDOW_MS;
     use crate::ram_vectors;
     use crate::watchdog::{self, Task, Watchdog};
@@ -163,6 +166,7 @@ mod app {
         let slave = Slave::new(bootloader.lss_address(), node.id, node.bit_rate, slave_config);
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();
+        log!("stayed in the bootloader; why", start::stay_reason().into());
         (
             Shared { can: Port::new(board.can), bootloader },
             Local {
@@ -182,7 +186,12 @@ mod app {
     fn idle(mut cx: idle::Context) -> ! {
         loop {
             watchdog::check_in(Task::Flash);
-            match cx.shared.bootloader.lock(|bootloader| bootloader.step()) {
+            let step = cx.shared.bootloader.lock(|bootloader| {
+                let step = bootloader.step();
+                log::status(bootloader, PROGRAMS as u8);
+                step
+            });
+            match step {
                 Step::Programming | Step::Again => {}
                 // The monotonic wakes it every millisecond; a sector takes hundreds of them.
                 Step::Idle | Step::Erasing => cortex_m::asm::wfi(),
@@ -229,6 +238,7 @@ mod app {
             // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
             carry_out(slave, &mut can, now, bootloader);
             while let Some(frame) = to_handle.dequeue() {
+                log::received(&frame);
                 // The filters let nothing in but network management and what is for this device, or for layer
                 // setting services.
                 if RESCUE_WINDOW_MS.is_some() && frame.cob_id() != Some(CobId::NMT) {
@@ -252,6 +262,7 @@ mod app {
         }
         if leaving.wanted && slave.is_idle() && can.lock(|can| can.is_idle()) {
             leaving.at = Some(now + FAREWELL_MS);
+            log!("leaving; request", WarmStart::new(leaving.request).request);
         }
     }
 
@@ -264,7 +275,10 @@ mod app {
     ) {
         while let Some(output) = slave.poll(now, can.lock(|can| can.has_room()), device) {
             match output {
-                Output::Send(frame) => can.lock(|can| can.send(&frame)),
+                Output::Send(frame) => {
+                    log::sent(&frame);
+                    can.lock(|can| can.send(&frame));
+                }
                 Output::Join(rate) => configure(can, rate, Mode::Normal),
                 Output::Listen(rate) => configure(can, rate, Mode::Silent),
                 Output::ComeBack => can.lock(|can| can.come_back()),

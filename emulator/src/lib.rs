@@ -10,6 +10,7 @@ pub mod machine;
 pub mod pacing;
 pub mod periph;
 pub mod peripheral;
+pub mod rtt;
 pub mod socketcand;
 pub mod time;
 pub mod world;

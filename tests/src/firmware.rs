@@ -15,6 +15,8 @@ pub const BOOTLOADER_COMPLETE: &str = "bootloader-complete.elf";
 pub const BOOTLOADER_MINIMAL: &str = "bootloader-minimal.elf";
 /// The standard one with a rescue window of half a second.
 pub const BOOTLOADER_RESCUE: &str = "bootloader-rescue.elf";
+/// The standard one that tells a debug probe what it does.
+pub const BOOTLOADER_LOG: &str = "bootloader-log.elf";
 /// Version 1 of the application.
 pub const APP_V1: &str = "app-v1.elf";
 /// Version 2 of the application.

@@ -16,10 +16,10 @@ use crate::{process, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask build [--board BOARD] [--yes]
 
-Builds the bootloader, standard, with every option, without any and with a rescue window, both versions
-of the application and the one in C, and puts them into target/firmware/BOARD/ as bootloader.elf,
-bootloader-complete.elf, bootloader-minimal.elf, bootloader-rescue.elf, app-v1.elf, app-v2.elf and
-app-c.elf; for a board with room for two programs also app-program-2.elf and app-c-program-2.elf.
+Builds the bootloader, standard, with every option, without any, with a rescue window and with words
+for a debug probe, both versions of the application and the one in C, and puts them into
+target/firmware/BOARD/ as bootloader.elf, bootloader-complete.elf, bootloader-minimal.elf,
+bootloader-rescue.elf, bootloader-log.elf, app-v1.elf, app-v2.elf and app-c.elf; for a board with room for two programs also app-program-2.elf and app-c-program-2.elf.
 
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -31,6 +31,8 @@ pub struct Images {
     pub dir: PathBuf,
     /// The bootloader among them.
     pub bootloader: PathBuf,
+    /// The one that tells a debug probe what it does.
+    pub log: PathBuf,
 }
 
 pub fn run(mut args: Args) -> Outcome {
@@ -54,6 +56,8 @@ pub fn images(board: &Layout) -> Outcome<Images> {
     image(&minimal, "bootloader-minimal.elf", board.bootloader)?;
     let rescue = Build { board, package: "bootloader", features: "standard,rescue-window" };
     image(&rescue, "bootloader-rescue.elf", board.bootloader)?;
+    let log = Build { board, package: "bootloader", features: LOG };
+    let log = image(&log, "bootloader-log.elf", board.bootloader)?;
     let program = board.programs[0];
     // Version 1 is the template as it stands.
     image(&Build { board, package: "app-template", features: "" }, "app-v1.elf", program)?;
@@ -62,7 +66,7 @@ pub fn images(board: &Layout) -> Outcome<Images> {
         let features = "version-2,program-2";
         image(&Build { board, package: "app-template", features }, "app-program-2.elf", *second)?;
     }
-    Ok(Images { dir: workspace::firmware_dir(board), bootloader })
+    Ok(Images { dir: workspace::firmware_dir(board), bootloader, log })
 }
 
 /// Builds the application in C for each program of a board. A board that app-c/boards does not know has none.
@@ -148,6 +152,8 @@ pub fn bootloader(board: &Layout) -> Outcome<PathBuf> {
 pub const OPTIONAL: [&str; 4] = ["auto-bit-rate", "block-upload", "emcy", "lss"];
 /// Those of them that a product usually has: this bootloader is the one that is measured against the budget.
 pub const STANDARD: &str = "standard";
+/// The standard one, with words for a debug probe.
+pub const LOG: &str = "standard,log-rtt";
 /// All of them.
 pub const COMPLETE: &str = "complete";
 

@@ -20,6 +20,7 @@ const FIRMWARE: &[(&str, &str)] = &[
     ("bootloader", ""),
     ("bootloader", build::STANDARD),
     ("bootloader", build::COMPLETE),
+    ("bootloader", build::LOG),
     ("app-template", ""),
     ("app-template", "version-2"),
 ];

@@ -18,10 +18,11 @@ use emulator::bus::Outcome;
 use emulator::candump::{Handle, Lines};
 use emulator::machine::{FlashTimes, Machine, Options, ResetCause, Stop};
 use emulator::pacing::{Pacer, Speed};
+use emulator::rtt;
 use emulator::socketcand::Server;
-use emulator::time::Time;
+use emulator::time::{Span, Time};
 use emulator::world::{MachineId, World};
-use shared_abi::geometry::{Geometry, STM32F407VG, STM32F429ZI, STM32F446RE};
+use shared_abi::geometry::{Geometry, Region, STM32F407VG, STM32F429ZI, STM32F446RE};
 
 /// Runs boards on a virtual CAN bus and shows in words what happens.
 ///
@@ -233,11 +234,18 @@ struct Bench {
     said: Rc<RefCell<Vec<(Time, String)>>>,
 }
 
-/// A board and how many of its reports have been shown.
+/// A board, how many of its reports have been shown, and what it tells a debug probe.
 struct Watched {
     id: MachineId,
     shown: usize,
+    sram: Region,
+    log: rtt::Reader,
+    /// When its RAM is looked at next.
+    look: Time,
 }
+
+/// How often a board's RAM is looked at for what it tells a debug probe.
+const LOOK: Span = Span::from_millis(5);
 
 impl Bench {
     fn new(args: &Args) -> Result<Self> {
@@ -265,7 +273,13 @@ impl Bench {
             for path in images(args) {
                 load(&mut machine, path)?;
             }
-            boards.push(Watched { id: world.add_machine(machine), shown: 0 });
+            boards.push(Watched {
+                id: world.add_machine(machine),
+                shown: 0,
+                sram: args.board.chip.sram,
+                log: rtt::Reader::default(),
+                look: Time(0),
+            });
         }
         let port = world.add_host_port(args.bit_rate);
         let trace = match &args.trace {
@@ -374,6 +388,12 @@ impl Bench {
             let new = reports.get(board.shown..).unwrap_or_default();
             lines.extend(new.iter().map(|report| (report.time, format!("{name}: {}", unmodelled(report)))));
             board.shown = reports.len();
+            let now = self.world.now();
+            if now >= board.look {
+                board.look = now + LOOK;
+                let told = board.log.lines(self.world.machine_mut(board.id), board.sram);
+                lines.extend(told.into_iter().map(|line| (now, format!("{name}: log: {line}"))));
+            }
         }
         lines.sort_by_key(|(at, _)| *at);
         lines.iter().try_for_each(|(at, line)| say(&format!("{at} {line}")))

@@ -1,0 +1,153 @@
+//! What a program writes for a debug probe: SEGGER's RTT (J-Link manual UM08001, chapter 16), read from RAM as a probe does it.
+
+use shared_abi::geometry::Region;
+
+use crate::machine::Machine;
+
+/// How a control block begins.
+const ID: &[u8; 16] = b"SEGGER RTT\0\0\0\0\0\0";
+/// Number of buffers up behind it.
+const UP_BUFFERS: u32 = 16;
+/// The first buffer's description: name, memory, size, the program's offset, the probe's offset.
+const MEMORY: u32 = 28;
+const SIZE: u32 = 32;
+const WRITTEN: u32 = 36;
+const READ: u32 = 40;
+/// No buffer of a chip like this is larger.
+const LARGEST: u32 = 64 * 1024;
+/// A line is cut here, if the program does not end it.
+const LONGEST_LINE: usize = 256;
+
+/// Reads the first buffer of a board's control block.
+#[derive(Debug, Default)]
+pub struct Reader {
+    /// Where the block was last.
+    block: Option<u32>,
+    /// What was read of a line that is not complete.
+    line: Vec<u8>,
+}
+
+impl Reader {
+    /// The lines that the program has written since the last time. `sram` is where the block is looked for. A block of noise gives
+    /// nothing.
+    pub fn lines(&mut self, machine: &mut Machine, sram: Region) -> Vec<String> {
+        let is_there = |block: &u32| read::<16>(machine, *block).as_ref() == Some(ID);
+        // A reset may have brought another program.
+        self.block = self.block.filter(is_there).or_else(|| find(machine, sram));
+        let news = self.block.and_then(|block| take(machine, block)).unwrap_or_default();
+        let mut lines = Vec::new();
+        for byte in news {
+            if byte != b'\n' && self.line.len() < LONGEST_LINE {
+                self.line.push(byte);
+                continue;
+            }
+            let line = String::from_utf8_lossy(&std::mem::take(&mut self.line)).into_owned();
+            lines.push(line.trim_end().chars().map(|c| if c.is_control() { '?' } else { c }).collect());
+        }
+        lines
+    }
+}
+
+fn read<const N: usize>(machine: &Machine, address: u32) -> Option<[u8; N]> {
+    let mut bytes = [0; N];
+    machine.read_memory(address, &mut bytes).ok()?;
+    Some(bytes)
+}
+
+fn find(machine: &Machine, sram: Region) -> Option<u32> {
+    let mut ram = vec![0; sram.size as usize];
+    machine.read_memory(sram.base, &mut ram).ok()?;
+    let at = ram.chunks_exact(4).position(|word| word == &ID[..4]);
+    let mut from = at? * 4;
+    while let Some(found) = ram.get(from..from + ID.len()) {
+        if found == ID {
+            return Some(sram.base + from as u32);
+        }
+        from += 4;
+    }
+    None
+}
+
+/// Takes what lies between the two offsets, and moves the probe's one.
+fn take(machine: &mut Machine, block: u32) -> Option<Vec<u8>> {
+    let word = |machine: &Machine, offset: u32| {
+        read::<4>(machine, block.checked_add(offset)?).map(u32::from_le_bytes)
+    };
+    let (memory, size) = (word(machine, MEMORY)?, word(machine, SIZE)?);
+    let (written, from) = (word(machine, WRITTEN)?, word(machine, READ)?);
+    if word(machine, UP_BUFFERS)? == 0 || size > LARGEST || written >= size || from >= size || written == from
+    {
+        return None;
+    }
+    let mut ring = vec![0; size as usize];
+    machine.read_memory(memory, &mut ring).ok()?;
+    let (written_at, from) = (written as usize, from as usize);
+    let bytes = if from < written_at {
+        ring[from..written_at].to_vec()
+    } else {
+        [&ring[from..], &ring[..written_at]].concat()
+    };
+    machine.write_ram(block + READ, &written.to_le_bytes()).ok()?;
+    Some(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::machine::Options;
+    use shared_abi::geometry::STM32F407VG;
+
+    const BLOCK: u32 = 0x2000_0100;
+    const RING: u32 = 0x2000_0200;
+
+    fn machine(fields: [u32; 5], ring: &[u8]) -> Machine {
+        let mut machine = Machine::new(&STM32F407VG, Options::default()).unwrap();
+        let [memory, size, written, from, up] = fields;
+        let mut block = ID.to_vec();
+        for word in [up, 0, 0, memory, size, written, from, 0] {
+            block.extend(word.to_le_bytes());
+        }
+        machine.write_ram(RING, ring).unwrap();
+        machine.write_ram(BLOCK, &block).unwrap();
+        machine
+    }
+
+    fn lines(machine: &mut Machine) -> Vec<String> {
+        Reader::default().lines(machine, STM32F407VG.sram)
+    }
+
+    #[test]
+    fn what_lies_round_the_corner_is_read_once() {
+        let mut machine = machine([RING, 8, 3, 6, 1], b"y\r\nxxxhe");
+        assert_eq!(lines(&mut machine), ["hey"]);
+        assert_eq!(read(&machine, BLOCK + READ), Some(3_u32.to_le_bytes()));
+        assert!(lines(&mut machine).is_empty());
+    }
+
+    #[test]
+    fn noise_is_no_text() {
+        for fields in [
+            [RING, 8, 8, 0, 1],
+            [RING, 8, 3, 9, 1],
+            [RING, u32::MAX, 3, 0, 1],
+            [0x4000_0000, 8, 3, 0, 1],
+            [u32::MAX, 8, 3, 0, 1],
+            [RING, 0, 0, 0, 1],
+            [RING, 8, 3, 0, 0],
+        ] {
+            assert!(lines(&mut machine(fields, b"ab\ndefgh")).is_empty(), "{fields:x?}");
+        }
+    }
+
+    #[test]
+    fn a_line_goes_on_with_the_next_look_and_has_an_end() {
+        let mut machine = machine([RING, 1024, 2, 0, 1], b"on\x07e\n");
+        let mut reader = Reader::default();
+        assert!(reader.lines(&mut machine, STM32F407VG.sram).is_empty());
+        machine.write_ram(BLOCK + WRITTEN, &5_u32.to_le_bytes()).unwrap();
+        assert_eq!(reader.lines(&mut machine, STM32F407VG.sram), ["on?e"]);
+        machine.write_ram(RING, &[b'a'; 1024]).unwrap();
+        machine.write_ram(BLOCK + WRITTEN, &1000_u32.to_le_bytes()).unwrap();
+        assert!(reader.lines(&mut machine, STM32F407VG.sram).iter().all(|line| line.len() <= LONGEST_LINE));
+    }
+}
