@@ -95,7 +95,7 @@ fn take(machine: &mut Machine, block: u32) -> Option<Vec<u8>> {
 mod tests {
     use super::*;
     use crate::machine::Options;
-    use shared_abi::geometry::STM32F407VG;
+    use shared_abi::geometry::{STM32F407VG, STM32F429ZI, STM32F446RE};
 
     const BLOCK: u32 = 0x2000_0100;
     const RING: u32 = 0x2000_0200;
@@ -122,6 +122,19 @@ mod tests {
         assert_eq!(lines(&mut machine), ["hey"]);
         assert_eq!(read(&machine, BLOCK + READ), Some(3_u32.to_le_bytes()));
         assert!(lines(&mut machine).is_empty());
+    }
+
+    /// SRAM in three parts, without a gap (RM0090 section 2.3.1).
+    #[test]
+    fn every_chip_has_one() {
+        for chip in [&STM32F446RE, &STM32F429ZI] {
+            let mut machine = Machine::new(chip, Options::default()).unwrap();
+            let block = chip.sram.end() - 64;
+            let bytes: Vec<u8> = [1, 0, 0, RING, 8, 3, 0, 0].into_iter().flat_map(u32::to_le_bytes).collect();
+            machine.write_ram(RING, b"hi\n").unwrap();
+            machine.write_ram(block, &[ID, &bytes[..]].concat()).unwrap();
+            assert_eq!(Reader::default().lines(&mut machine, chip.sram), ["hi"], "{}", chip.chip);
+        }
     }
 
     #[test]
