@@ -185,7 +185,7 @@ fn an_interrupted_update_is_started_again_at_once() {
     let coflash = Coflash::new(&folder, &nodes);
     let update = [FLASH, &["-N", "5", "-v"]].concat();
     // At the beginning, while blocks are written and sectors erased, and near the end.
-    for (version, until) in (1..).zip(["erasing", "10 %", "40 %", "90 %"]) {
+    for (version, until) in (1..).zip(["erase the old program", "10 %", "40 %", "90 %"]) {
         folder.write("program.bin", &program(version));
         let running = coflash.spawn(&update);
         running.await_text(until);
