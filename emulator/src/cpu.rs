@@ -910,6 +910,17 @@ fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
             return stop(uc);
         }
     }
+    let chip = &mut uc.get_data_mut().chip;
+    if let Some(watch) = &mut chip.watch {
+        let inside = watch.code.contains(address, 1);
+        if inside != watch.inside {
+            // With an empty TLB, the first access to each page is seen.
+            watch.inside = inside;
+            chip.flush_tlb = true;
+            chip.leave = true;
+            return stop(uc);
+        }
+    }
     let state = uc.get_data_mut();
     let block = state.notes.blocks.look(&state.chip, address, size);
     let chip = &mut state.chip;
@@ -1019,6 +1030,10 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
                 entry(paddr, Prot::READ | Prot::EXEC)
             }
         };
+    }
+    let is_ram = geometry.sram.contains(address, 1) || geometry.ccm.contains(address, 1);
+    if let Some(watch) = chip.watch.as_mut().filter(|watch| watch.inside && is_ram) {
+        watch.touched.insert(address & !(PAGE - 1));
     }
     if geometry.sram.contains(address, 1) {
         let page = ((address - geometry.sram.base) / PAGE) as usize;

@@ -7,7 +7,9 @@ pub mod memory;
 pub mod report;
 pub mod variant;
 
-use shared_abi::geometry::Geometry;
+use std::collections::BTreeSet;
+
+use shared_abi::geometry::{Geometry, Region};
 
 use crate::bxcan::BxCan;
 use crate::cpu::{Cpu, Entry, Exit};
@@ -15,8 +17,8 @@ use crate::periph::flash::Noise;
 pub use crate::periph::flash::{Cut, FlashCut, FlashTimes};
 use crate::peripheral::Peripheral;
 use crate::time::{Span, Time};
-use chip::Chip;
 pub use chip::Counters;
+use chip::{Chip, Watch};
 pub use image::LoadedImage;
 pub use report::{Access, Report};
 
@@ -487,6 +489,17 @@ impl Machine {
     /// Forgets the reports.
     pub fn clear_reports(&mut self) {
         self.cpu.chip_mut().reports.clear();
+    }
+
+    /// Notes from now on where in RAM the code in this region goes.
+    pub fn watch(&mut self, code: Region) {
+        self.cpu.chip_mut().watch = Some(Watch { code, inside: false, touched: BTreeSet::new() });
+    }
+
+    /// Hands out which pages of RAM (4 KiB, by their first addresses) the code that is watched has accessed since the last time.
+    pub fn take_touched(&mut self) -> Vec<u32> {
+        let watch = self.cpu.chip_mut().watch.as_mut();
+        watch.map(|watch| std::mem::take(&mut watch.touched).into_iter().collect()).unwrap_or_default()
     }
 
     /// What was counted.

@@ -1,5 +1,7 @@
 //! Everything of the chip that is not the instruction set: memories, peripherals, clocks, and who answers where.
 
+use std::collections::BTreeSet;
+
 use shared_abi::geometry::{Geometry, Region};
 
 use super::clock::CycleClock;
@@ -55,6 +57,16 @@ enum Block {
     Pwr,
     Syscfg,
     Can1,
+}
+
+/// Where in RAM a piece of code goes.
+pub struct Watch {
+    /// The code.
+    pub code: Region,
+    /// It runs.
+    pub inside: bool,
+    /// The pages of RAM that it accessed, by their addresses.
+    pub touched: BTreeSet<u32>,
 }
 
 /// Who answers at an address, with the offset in its registers.
@@ -229,6 +241,8 @@ pub struct Chip {
     guarded: bool,
     /// The block that runs: address and length in bytes.
     pub block: (u32, u32),
+    /// Code that is watched.
+    pub watch: Option<Watch>,
 
     clocks: Clocks,
     lines: Vec<u16>,
@@ -294,6 +308,7 @@ impl Chip {
             flush_tlb: false,
             guarded: false,
             block: (0, 0),
+            watch: None,
             lines: Vec::new(),
         }
     }

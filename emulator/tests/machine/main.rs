@@ -6,7 +6,7 @@ mod programs;
 use emulator::machine::{Access, Cut, FlashCut, FlashTimes, Machine, Options, ResetCause, Stop};
 use emulator::time::Time;
 use programs::Program;
-use shared_abi::geometry::STM32F407VG;
+use shared_abi::geometry::{Region, STM32F407VG};
 
 const MS: u64 = 1_000_000_000;
 const STACK: u32 = 0x2001_0000;
@@ -576,6 +576,35 @@ fn the_chip_says_who_it_is() {
     assert_eq!(word(&machine, 0x1FFF_7A18), 0xDEAD_BEEF);
     assert_eq!(word(&machine, 0x1FFF_7A20) >> 16, 1024, "flash size in KiB at 1FFF_7A22h");
     assert_eq!(word(&machine, 0x0000_0000), STACK, "flash is aliased at 0");
+}
+
+#[test]
+fn where_in_ram_a_piece_of_code_goes_is_told() {
+    let program = &programs::STORES_AND_SLEEPS;
+    let len = 2 * program.code.len() as u32;
+    let mut machine = with_options(program, Options::default());
+    machine.watch(Region::new(program.base, len));
+    machine.run_until(ms(1));
+    assert_eq!(words(&machine, 2), [42, STACK]);
+    assert_eq!(machine.take_touched(), [OUT], "two words of one page");
+    assert_eq!(machine.take_touched(), [0; 0], "once");
+    machine.reset_pin();
+    machine.run_until(ms(2));
+    assert_eq!(machine.take_touched(), [OUT], "again");
+    machine.watch(Region::new(program.base + len, 0x1000));
+    machine.reset_pin();
+    machine.run_until(ms(3));
+    assert_eq!(machine.take_touched(), [0; 0], "other code");
+}
+
+#[test]
+fn the_host_may_write_into_the_ccm_while_a_program_runs() {
+    let mut machine = machine(&programs::STORES_AND_SLEEPS);
+    machine.run_until(ms(1));
+    machine.write_ram(0x1000_0000, &[0xA5; 64]).unwrap();
+    assert_eq!(machine.run_until(ms(2)), Stop::Deadline);
+    assert_eq!(machine.reports(), []);
+    assert_eq!(word(&machine, 0x1000_003C), 0xA5A5_A5A5);
 }
 
 // --- hostile input ---------------------------------------------------------------------------------------------------
