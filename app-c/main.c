@@ -104,6 +104,7 @@ static const struct object objects[] = {
     { 0x2100, PROBE_ADDRESS, 4, RO, &probe_values[PROBE_ADDRESS] },
     { 0x2100, PROBE_SEED, 4, RW, &probe_values[PROBE_SEED] },
     { 0x2100, PROBE_FLASH_OPEN, 4, RW, &probe_values[PROBE_FLASH_OPEN] },
+    { 0x2100, PROBE_SP, 4, RO, &probe_values[PROBE_SP] },
 };
 
 void tick(void);

@@ -50,6 +50,7 @@ __attribute__((noinline)) void probe_call(void)
     __asm volatile("cpsie i" ::: "memory");
 
     probe_values[PROBE_CALL] = (uint32_t)status;
+    probe_values[PROBE_SP] = (uint32_t)(uintptr_t)sp;
     probe_values[PROBE_STACK] = (uint32_t)((uintptr_t)sp - (uintptr_t)changed);
 }
 

@@ -24,7 +24,9 @@ enum probe_sub {
     PROBE_SEED = 11,
     /* 1: this program has the flash controller open, as somebody who is programming; 0: it is locked. */
     PROBE_FLASH_OPEN = 12,
-    PROBE_LAST = PROBE_FLASH_OPEN,
+    /* Where the stack pointer was at the last call. */
+    PROBE_SP = 13,
+    PROBE_LAST = PROBE_SP,
 };
 
 extern uint32_t probe_values[PROBE_LAST + 1];

@@ -7,13 +7,14 @@ use canopen::program::ProgramControl;
 use canopen::{Address, BitRate, NodeId};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::convert::{blocks_of, Options, Region};
+use coflash::convert::{self, blocks_of, Options};
 use coflash::flash::{flash, FlashOptions, Report};
 use coflash::read::read;
 use coflash::session::{Doing, Session, Timing};
 use emulator::machine::{ResetCause, Stop};
 use emulator::time::Span;
 use shared_abi::callgate;
+use shared_abi::geometry::Region;
 use shared_abi::layout::stm32f407g_disc1_two;
 
 const DEVICE_TYPE: Address = Address::new(0x1000, 0);
@@ -52,7 +53,11 @@ mod probe {
     pub const ADDRESS: Address = Address::new(0x2100, 10);
     pub const SEED: Address = Address::new(0x2100, 11);
     pub const FLASH_OPEN: Address = Address::new(0x2100, 12);
+    pub const SP: Address = Address::new(0x2100, 13);
 }
+
+/// What the emulator tells accesses by.
+const PAGE: u32 = 4096;
 
 fn install(bench: &mut Bench, image: &str) -> Report {
     let options = FlashOptions { verify: true, ..FlashOptions::default() };
@@ -120,6 +125,15 @@ fn call_with(bench: &mut Bench, selector: u32, pointer: u32, words: [u32; 5]) ->
         status: number(bench, probe::CALL) as i32,
         words: probe::WORDS.map(|at| number(bench, at)),
         stack,
+    }
+}
+
+/// Bytes of a selector's argument structure.
+fn size_of_arguments(selector: u32) -> u32 {
+    match selector {
+        CRC32 => 12,
+        READ_NODE | STORE_NODE => 8,
+        _ => 20,
     }
 }
 
@@ -236,7 +250,24 @@ fn it_can_be_called_back_at_every_bit_rate() {
     }
 }
 
-/// Each service does what it says, with two kinds of garbage in all RAM that the application does not use.
+/// The pages of RAM that the callgate has accessed since the last time: those of its part of the stack, and of the structure that was
+/// handed over.
+fn assert_stack_alone(bench: &mut Bench, good: u32, selector: u32) {
+    let sp = number(bench, probe::SP);
+    let pages = |region: Region| region.base / PAGE..=(region.end() - 1) / PAGE;
+    let arguments = pages(Region::new(good, size_of_arguments(selector)));
+    let stack = pages(Region::new(sp - callgate::STACK, callgate::STACK));
+    let touched: Vec<_> = bench.machine().take_touched().into_iter().map(|address| address / PAGE).collect();
+    for page in &touched {
+        assert!(arguments.contains(page) || stack.contains(page), "selector {selector}: {page:#x}");
+    }
+    for pages in [arguments, stack] {
+        assert!(touched.iter().any(|page| pages.contains(page)), "selector {selector}: {touched:x?}");
+    }
+}
+
+/// Each service does what it says, with two kinds of garbage in all RAM that the application does not use, and with an eye on
+/// each page of RAM.
 #[test]
 fn every_service_works_on_the_stack_alone() {
     let (mut bench, report) = running_board();
@@ -244,6 +275,9 @@ fn every_service_works_on_the_stack_alone() {
     let flash = layout.chip.flash;
     let program = layout.programs[0];
     let mut stacks = BTreeMap::new();
+    // Once it was installed, nothing of the bootloader runs but the callgate.
+    bench.machine().watch(layout.bootloader);
+    let good = number(&mut bench, probe::ADDRESS);
     for seed in [0, 0xDEAD_BEEF] {
         put(&mut bench, probe::SEED, seed);
         // The CCM is nobody's, and the cells between the parts are not the callgate's.
@@ -255,7 +289,10 @@ fn every_service_works_on_the_stack_alone() {
         bench.machine().read_memory(layout.ram.end(), &mut cells).unwrap();
 
         let mut run = |bench: &mut Bench, selector, words| {
+            bench.machine().take_touched();
             let called = call(bench, selector, words);
+            // Loads count as well: the pattern tells of stores alone.
+            assert_stack_alone(bench, good, selector);
             let most = stacks.entry(selector).or_insert(0);
             *most = called.stack.max(*most);
             (called.status, called.words)
@@ -487,7 +524,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
     }
     let image = |name: &str| firmware::of_board(layout.board, name);
     let elf = |name: &str| read(&firmware::elf(&image(name)), None, None).expect("an ELF of ours");
-    let strict = |program: usize| Region::Strict(layout.programs[program - 1].into());
+    let strict = |program: usize| convert::Region::Strict(layout.programs[program - 1].into());
 
     // coflash sees it before anything is sent.
     let options = Options { region: strict(1), ..Options::default() };
