@@ -245,10 +245,6 @@ fn it_can_be_called_back_at_every_bit_rate() {
             (reset - answer.0).0 / 1_000_000
         );
         assert!(is_bootloader(&mut bench, NODE), "{rate:?}");
-        if rate == BitRate::K125 {
-            install(&mut bench, firmware::APP_V2);
-            assert_eq!(bench.session().read_text(Address::new(0x100A, 0)).unwrap(), "2.0.0");
-        }
     }
 }
 
