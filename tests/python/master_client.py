@@ -2,10 +2,10 @@
 
 python-canopen and python-can as they come from the package index. Two things to do, each a run of its own:
 
-    master_client.py HOST:PORT commission 10 11 12
+    master_client.py HOST:PORT commission 10 11 12 [--refused-bit-rate 1]
         finds the devices without a node-ID by LSS fastscan, gives them these IDs and 250 kbit/s, stores both
 
-    master_client.py HOST:PORT use app.blk 10 11 12
+    master_client.py HOST:PORT use app.blk 10 11 12 --device-name NAME
         NMT, heartbeat, emergencies; SDO expedited, segmented and by blocks in both directions; the last device
         gets the program, while the others go on
 
@@ -35,12 +35,11 @@ from canopen_client import (
     step,
 )
 
-# Indices of the table of bit rates (CiA 305, table 1): a good one, and one that 42 MHz cannot make.
-RATE_250K, RATE_800K = 3, 1
+# Index in the table of bit rates (CiA 305, table 1).
+RATE_250K = 3
 UNCONFIGURED = 255
 # What a heartbeat says (CiA 301, table 37).
 BOOT_UP, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x05, 0x7F
-DEVICE_NAME = b"coboot STM32F407G-DISC1"
 # Abort codes (CiA 301, table 22).
 WRITE_ONLY, READ_ONLY, NO_OBJECT, NOT_STORED = 0x0601_0001, 0x0601_0002, 0x0602_0000, 0x0800_0020
 # Emergencies (CiA 301, table 26): wrong data set, device specific; and bit 0 and 7 of the error register.
@@ -109,7 +108,7 @@ def scan(master, attempts=4):
     raise Failed("fastscan finds nobody")
 
 
-def commission(network, node_ids):
+def commission(network, node_ids, refused_bit_rate):
     master = network.lss
     boot_ups = queue.Queue()
 
@@ -129,7 +128,8 @@ def commission(network, node_ids):
         identity = scan(master)
         expect("node-ID in force", master.inquire_node_id(), UNCONFIGURED)
         expect("node-ID 128", refused_by_lss(lambda: master.configure_node_id(128)), "LSS Error: 1")
-        expect("800 kbit/s", refused_by_lss(lambda: master.configure_bit_timing(RATE_800K)), "LSS Error: 1")
+        refused = refused_by_lss(lambda: master.configure_bit_timing(refused_bit_rate))
+        expect(f"bit rate of index {refused_bit_rate}", refused, "LSS Error: 1")
         master.configure_node_id(node_id)
         master.configure_bit_timing(RATE_250K)
         master.store_configuration()
@@ -209,12 +209,12 @@ def download_by_blocks(sdo, index, subindex, value):
             rest = rest[stream.write(rest) :]
 
 
-def talk(node):
+def talk(node, device_name):
     """SDO upload in three ways, and what is refused."""
     sdo = node.sdo
     expect("1000h", sdo.upload(0x1000, 0), DEVICE_TYPE_BOOTLOADER.to_bytes(4, "little"))
-    expect("1008h, segmented", sdo.upload(0x1008, 0), DEVICE_NAME)
-    expect("1008h, by blocks", upload_by_blocks(sdo, 0x1008, 0), DEVICE_NAME)
+    expect("1008h, segmented", sdo.upload(0x1008, 0), device_name)
+    expect("1008h, by blocks", upload_by_blocks(sdo, 0x1008, 0), device_name)
     expect("1000h, by blocks", upload_by_blocks(sdo, 0x1000, 0), DEVICE_TYPE_BOOTLOADER.to_bytes(4, "little"))
     expect("read of 1F50h", abort_of(lambda: sdo.upload(0x1F50, 1)), WRITE_ONLY)
     expect("block upload of 1F50h", abort_of(lambda: upload_by_blocks(sdo, 0x1F50, 1)), WRITE_ONLY)
@@ -223,7 +223,7 @@ def talk(node):
     expect("read of 2000h", abort_of(lambda: sdo.upload(0x2000, 0)), NO_OBJECT)
 
 
-def use(network, path, node_ids, timeout):
+def use(network, path, node_ids, device_name, timeout):
     blocks = read_blocks(path)
     _, crc = program_of(blocks)
     nodes = {node_id: network.add_node(node_id, object_dictionary()) for node_id in node_ids}
@@ -233,7 +233,7 @@ def use(network, path, node_ids, timeout):
 
     for node_id, node in nodes.items():
         expect(f"{node_id}: heartbeat", node.nmt.wait_for_heartbeat(timeout=5), "PRE-OPERATIONAL")
-        talk(node)
+        talk(node, device_name)
     step("all are in pre-operational state and answer in every way of SDO")
 
     first, second, last = node_ids
@@ -266,7 +266,7 @@ def use(network, path, node_ids, timeout):
         download_by_blocks(sdo, 0x1F50, 1, block)
         if number == 1:
             # The device erases behind the first good block: neither it nor anybody else is silent meanwhile.
-            talk(nodes[first])
+            talk(nodes[first], device_name)
             for node_id, node in nodes.items():
                 expect(f"{node_id}: heartbeat", node.nmt.wait_for_heartbeat(timeout=5), "PRE-OPERATIONAL")
         device.wait_until_idle(f"block {number:X}h")
@@ -280,7 +280,7 @@ def use(network, path, node_ids, timeout):
     consumers[last].await_state(last, BOOT_UP)
     device.wait_for(lambda value: value != DEVICE_TYPE_BOOTLOADER, "start")
     expect("the application's 1F56h", device.sdo[0x1F56][1].raw, crc)
-    expect("the application's 1008h, by blocks", upload_by_blocks(sdo, 0x1008, 0), DEVICE_NAME)
+    expect("the application's 1008h, by blocks", upload_by_blocks(sdo, 0x1008, 0), device_name)
     # An application follows the NMT master.
     nodes[last].nmt.state = "OPERATIONAL"
     consumers[last].await_state(last, OPERATIONAL)
@@ -296,6 +296,13 @@ def main():
     commissioning = what.add_parser("commission")
     using = what.add_parser("use")
     using.add_argument("block_file")
+    commissioning.add_argument(
+        "--refused-bit-rate",
+        type=int,
+        default=10,
+        help="index of a bit rate (CiA 305, table 1) that the device's clock cannot make (10, which is nobody's)",
+    )
+    using.add_argument("--device-name", required=True, help="what 1008h reads")
     for command in (commissioning, using):
         command.add_argument("node_ids", type=int, nargs=3)
     options = parser.parse_args()
@@ -305,9 +312,10 @@ def main():
     try:
         network.connect(interface="socketcand", host=host, port=int(port), channel=options.channel, tcp_tune=True)
         if options.what == "commission":
-            commission(network, options.node_ids)
+            commission(network, options.node_ids, options.refused_bit_rate)
         else:
-            use(network, options.block_file, options.node_ids, options.timeout)
+            name = options.device_name.encode("ascii")
+            use(network, options.block_file, options.node_ids, name, options.timeout)
     except (Failed, OSError, queue.Empty, SdoError, lss.LssError, canopen.nmt.NmtError, can.CanError) as error:
         step(f"FAILED: {error!r}")
         return 1

@@ -77,9 +77,12 @@ fn three_devices_are_updated_one_after_the_other_and_one_of_them_had_no_node_id(
     // Is anybody without a node-ID? Then the one with this identity gets the next one that is free.
     let unconfigured = bench.ask(LSS_REQUEST, &[0x4C, 0, 0, 0, 0, 0, 0, 0], LSS_RESPONSE);
     assert_eq!(unconfigured.as_deref(), Some(&[0x50, 0, 0, 0, 0, 0, 0, 0][..]));
-    // Vendor, product and revision as the board file has them: 0, 4007D151h, 00010000h.
-    for part in [[0x40, 0, 0, 0, 0], [0x41, 0x51, 0xD1, 0x07, 0x40], [0x42, 0, 0, 1, 0]] {
-        let [command, a, b, c, d] = part;
+    // Vendor, product and revision as the board file has them.
+    let identity = &bsp::IDENTITY;
+    for (command, part) in
+        [(0x40, identity.vendor_id), (0x41, identity.product_code), (0x42, identity.revision)]
+    {
+        let [a, b, c, d] = part.to_le_bytes();
         bench.post(LSS_REQUEST, &[command, a, b, c, d, 0, 0, 0]);
     }
     let [a, b, c, d] = serials[2].to_le_bytes();

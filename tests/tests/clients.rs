@@ -49,9 +49,10 @@ fn python_canopen_identifies_flashes_and_starts_the_device() {
     let output = endpoint.run(&mut python);
     let said = text(&output);
     assert!(output.status.success(), "{said}");
+    let bsp::Identity { vendor_id, product_code, revision, .. } = bsp::IDENTITY;
     for line in [
         "1000h device type = 10000000h",
-        "1018h vendor 00000000h, product 4007D151h, revision 00010000h",
+        &format!("1018h vendor {vendor_id:08X}h, product {product_code:08X}h, revision {revision:08X}h"),
         "1F57h flash status = 00000000h",
         "cleared",
         "signed",

@@ -142,10 +142,10 @@ fn as_sdo_client_it_reads_downloads_by_blocks_and_by_segments_and_starts_the_pro
         let identity = client.read_identity().await.unwrap();
         assert_eq!(
             [identity.vendor_id, identity.product_code, identity.revision],
-            [0, 0x4007_D151, 0x0001_0000]
+            [bsp::IDENTITY.vendor_id, bsp::IDENTITY.product_code, bsp::IDENTITY.revision]
         );
         // Segments.
-        assert_eq!(client.read_device_name().await.as_deref(), Ok("coboot STM32F407G-DISC1"));
+        assert_eq!(client.read_device_name().await.as_deref(), Ok(bsp::IDENTITY.device_name));
         // Blocks: of the server's answer C6h (CRC, size announced) zencan 0.0.5 takes two bits for the subcommand, where CiA
         // 301 has one and the other says that the size follows. So it gives up, without a word; the server serves the
         // next request all the same. (Block upload to a client is shown with python-canopen.)
@@ -182,7 +182,7 @@ fn as_sdo_client_it_reads_downloads_by_blocks_and_by_segments_and_starts_the_pro
     on(&mut bench, async |sender, receiver| {
         let client = &mut SdoClient::new_std(NODE, sender, receiver);
         assert_eq!(client.read_software_version().await.as_deref(), Ok("1.0.0"));
-        assert_eq!(client.read_device_name().await.as_deref(), Ok("coboot STM32F407G-DISC1"));
+        assert_eq!(client.read_device_name().await.as_deref(), Ok(bsp::IDENTITY.device_name));
         assert_eq!(client.read_u32(0x1F56, 1).await, Ok(file.program_crc()));
     });
     bench.assert_nothing_unmodelled();
@@ -217,8 +217,9 @@ fn as_lss_master_it_finds_three_devices_by_fastscan_and_gives_each_a_node_id() {
     // The scan finds the lowest number first.
     let mut sorted = serials;
     sorted.sort_unstable();
+    let bsp::Identity { vendor_id, product_code, revision, .. } = bsp::IDENTITY;
     let expected: Vec<LssIdentity> =
-        sorted.iter().map(|serial| LssIdentity::new(0, 0x4007_D151, 0x0001_0000, *serial)).collect();
+        sorted.iter().map(|serial| LssIdentity::new(vendor_id, product_code, revision, *serial)).collect();
     assert_eq!(identities, expected);
 
     // Now, and after the power was off.
@@ -233,7 +234,7 @@ fn as_lss_master_it_finds_three_devices_by_fastscan_and_gives_each_a_node_id() {
         for (n, (node, identity)) in nodes.iter().zip(&expected).enumerate() {
             assert_eq!(node.node_id, 10 + n as u8);
             assert_eq!(node.identity, Some(*identity));
-            assert_eq!(node.device_name.as_deref(), Some("coboot STM32F407G-DISC1"));
+            assert_eq!(node.device_name.as_deref(), Some(bsp::IDENTITY.device_name));
             assert_eq!(node.nmt_state, Some(NmtState::PreOperational));
         }
         bench.power_off();
