@@ -79,7 +79,8 @@ static F429: Variant = Variant {
     ],
 };
 
-/// STM32F446, device 421h, revision A (RM0390 section 33.6.1). Registers: sections 5 and 6.
+/// STM32F446, device 421h, revision A (RM0390, DBGMCU_IDCODE). Reset values and bits of the registers as the PAC has them.
+/// Bit 20 of AHB1ENR, on the others the clock of the CCM RAM, is set after a reset here too, as the PAC has it.
 static F446: Variant = Variant {
     name: "STM32F446",
     idcode: 0x1000_6421,
@@ -91,7 +92,7 @@ static F446: Variant = Variant {
         (0x18, 0, 0x0000_0003),           // AHB3RSTR
         (0x20, 0, 0x37FF_C9FF),           // APB1RSTR
         (0x24, 0, 0x00C7_7933),           // APB2RSTR
-        (0x30, 0, 0x6064_10FF),           // AHB1ENR
+        (0x30, 0x0010_0000, 0x6074_10FF), // AHB1ENR
         (0x34, 0, 0x0000_0081),           // AHB2ENR
         (0x38, 0, 0x0000_0003),           // AHB3ENR
         (0x40, 0, 0x3FFF_C9FF),           // APB1ENR
@@ -129,7 +130,7 @@ mod tests {
 
     #[test]
     fn each_chip_has_its_own() {
-        // Device identifiers: RM0090 section 38.6.1, RM0390 section 33.6.1.
+        // Device identifiers: RM0090 section 38.6.1, RM0390, DBGMCU_IDCODE.
         for (chip, device) in [(&STM32F407VG, 0x413), (&STM32F429ZI, 0x419), (&STM32F446RE, 0x421)] {
             assert_eq!(of(chip).idcode & 0xFFF, device, "{}", chip.chip);
         }

@@ -441,6 +441,8 @@ mod tests {
         let mut f407 = f407(8_000_000);
         let mut f446 = Rcc::new(variant::of(&STM32F446RE), 8_000_000);
         for (rcc, there) in [(&mut f407, 0x1FF), (&mut f446, 0x0FF)] {
+            // As the PACs of both have it.
+            assert_eq!(rcc.plain(AHB1ENR), 0x0010_0000);
             rcc.write(AHB1ENR, 0x7FF, Time(0)).unwrap();
             assert_eq!(rcc.plain(AHB1ENR), there);
         }
