@@ -23,7 +23,7 @@ pub const NODE_ID: u8 = 1;
 /// Bit rate of a device that was never told another one, in bit/s; 0 for one that finds it out by listening.
 pub const BIT_RATE: u32 = 125_000;
 
-/// 8 MHz from the ST-LINK on OSC_IN (MCO; UM1724 section 7.7.1: as delivered). HSI alone would do for the core, but 1 % is too much
+/// 8 MHz from the ST-LINK on OSC_IN (MCO; UM1724: as delivered). HSI alone would do for the core, but 1 % is too much
 /// for CAN above 125 kbit/s. Where the ST-LINK has been broken off and no crystal X3 is fitted, the bootloader falls back to HSI.
 ///
 /// 160 MHz and not the 180 MHz that the chip could do with over-drive: APB1 at 40 MHz makes each bit rate of CiA 301, 45 MHz and
@@ -40,7 +40,7 @@ pub const CLOCK_TREE: ClockTree = ClockTree {
 }
 .checked();
 /// The pin that asks for the bootloader after a reset, as port and number, and the level that does.
-/// The blue button B1 on PC13, low when pressed; the board pulls it up (UM1724 section 7.6).
+/// The blue button B1 on PC13, low when pressed; the board pulls it up (UM1724).
 pub const ENTRY_STRAP: (char, u8, bool) = ('C', 13, false);
 /// The core's clock, in Hz.
 pub const SYSCLK: u32 = CLOCK_TREE.sysclk();
@@ -91,7 +91,7 @@ mod drivers {
         let gpioa = take_port!(GPIOA, can1).split(rcc);
         let gpiob = take_port!(GPIOB, can1).split(rcc);
         let led = gpioa.pa5.into_push_pull_output();
-        // AF9: CAN1_RX is PB8, CAN1_TX is PB9 (DS10693 table 11).
+        // AF9: CAN1_RX is PB8, CAN1_TX is PB9 (DS10693, alternate functions; the HAL's table has the same).
         let can = can1.can((gpiob.pb9, gpiob.pb8), rcc);
         Board { can, led }
     }
@@ -104,7 +104,7 @@ mod drivers {
         // SAFETY: the port's inputs are read, and nothing is changed.
         let gpioc = unsafe { pac::GPIOC::steal() };
         rcc.ahb1enr().modify(|_, w| w.gpiocen().enabled());
-        // The clock needs two cycles before the first access (RM0390 section 6.2.10): reading back waits that long.
+        // The clock needs two cycles before the first access (RM0390, RCC): reading back waits that long.
         let _ = rcc.ahb1enr().read();
         let pressed = gpioc.idr().read().idr13().is_low();
         rcc.ahb1enr().modify(|_, w| w.gpiocen().disabled());

@@ -1,6 +1,6 @@
 //! STM32F429I-DISC1 with a CAN transceiver on PB8 and PB9.
 //!
-//! Every pin of CAN1 has another use on this board (UM1670 section 6.11): PD0 and PD1 are data lines of the SDRAM, PA11, PA12, PB8 and PB9 go
+//! Every pin of CAN1 has another use on this board (UM1670): PD0 and PD1 are data lines of the SDRAM, PA11, PA12, PB8 and PB9 go
 //! to the display's parallel interface, where they end in inputs. So PB8 and PB9 are free as long as the display stays dark.
 
 use shared_abi::layout::{self, Layout};
@@ -40,7 +40,7 @@ pub const CLOCK_TREE: ClockTree = ClockTree {
 }
 .checked();
 /// The pin that asks for the bootloader after a reset, as port and number, and the level that does.
-/// The blue button B1 on PA0, high when pressed (UM1670 section 6.6).
+/// The blue button B1 on PA0, high when pressed (UM1670).
 pub const ENTRY_STRAP: (char, u8, bool) = ('A', 0, true);
 /// The core's clock, in Hz.
 pub const SYSCLK: u32 = CLOCK_TREE.sysclk();
@@ -86,7 +86,7 @@ mod drivers {
         let gpiob = take_port!(GPIOB, can1).split(rcc);
         let gpiog = take_port!(GPIOG, can1).split(rcc);
         let led = gpiog.pg13.into_push_pull_output();
-        // AF9: CAN1_RX is PB8, CAN1_TX is PB9 (DS9405 table 12).
+        // AF9: CAN1_RX is PB8, CAN1_TX is PB9 (DS9405, alternate functions; the HAL's table has the same).
         let can = can1.can((gpiob.pb9, gpiob.pb8), rcc);
         Board { can, led }
     }

@@ -99,8 +99,7 @@ pub const STM32F407VG: Geometry = Geometry {
 
 /// STM32F429ZI and its packages: 2 MiB flash in two banks, 112 + 16 + 64 KiB SRAM, 64 KiB CCM.
 ///
-/// RM0090 table 6 (sectors), section 2.3.1 (SRAM1, SRAM2 and SRAM3 follow one another), table 63 (91 interrupt
-/// lines).
+/// RM0090 (sectors; SRAM1, SRAM2 and SRAM3 follow one another); 91 interrupt lines as the PAC has them.
 pub const STM32F429ZI: Geometry = Geometry {
     chip: "stm32f429zi",
     flash: Region::new(0x0800_0000, 2048 * KIB),
@@ -121,7 +120,7 @@ pub const STM32F429ZI: Geometry = Geometry {
 
 /// STM32F446RE: 512 KiB flash, 112 + 16 KiB SRAM, no CCM.
 ///
-/// RM0390 table 4 (sectors), section 2.2.2 (memory map), table 38 (97 interrupt lines).
+/// RM0390 (sectors, memory map); 97 interrupt lines as the PAC has them.
 pub const STM32F446RE: Geometry = Geometry {
     chip: "stm32f446re",
     flash: Region::new(0x0800_0000, 512 * KIB),
@@ -307,7 +306,7 @@ mod tests {
         assert_eq!(STM32F429ZI.sector_at(0x0820_0000), None);
     }
 
-    /// RM0390 table 4.
+    /// RM0390, the sectors.
     #[test]
     fn sectors_of_the_f446_are_those_of_the_manual() {
         let bases = [

@@ -102,7 +102,7 @@ struct Board {
 const BOARDS: &[Board] = &[
     Board { name: "stm32f407g-disc1", chip: &STM32F407VG, hse_hz: 8_000_000, pulled_up: &[] },
     Board { name: "stm32f407g-disc1-two", chip: &STM32F407VG, hse_hz: 8_000_000, pulled_up: &[] },
-    // B1 (UM1724 section 7.6).
+    // B1 (UM1724).
     Board { name: "nucleo-f446re", chip: &STM32F446RE, hse_hz: 8_000_000, pulled_up: &[('C', 13)] },
     Board { name: "stm32f429i-disc1", chip: &STM32F429ZI, hse_hz: 8_000_000, pulled_up: &[] },
 ];
