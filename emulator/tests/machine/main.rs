@@ -234,6 +234,18 @@ fn a_load_within_a_conditional_block_leaves_the_code_behind_it_alone() {
     assert_eq!(word(&machine, OUT), 64 * 4);
 }
 
+/// New code in flash is run, also where the old was read before it was run.
+#[test]
+fn code_that_was_read_before_it_was_run_can_be_replaced() {
+    let mut machine = machine(&programs::CALLS_WHAT_IT_HAS_READ);
+    // movs r0, #n; bx lr
+    for (n, at) in [(1_u8, 1), (2, 2), (3, 3)] {
+        machine.load_bin(0x0801_0000, &[n, 0x20, 0x70, 0x47]).unwrap();
+        machine.run_until(ms(at));
+        assert_eq!(word(&machine, OUT), u32::from(n));
+    }
+}
+
 #[test]
 fn masks_hold_for_code_without_privilege_which_cannot_change_them() {
     let mut machine = machine(&programs::UNPRIVILEGED);

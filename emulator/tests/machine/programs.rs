@@ -1033,3 +1033,19 @@ pub const CONDITIONAL_LOADS: Program = Program {
         0x0000, 0x0801,      // 230  .word 0x08010000
     ],
 };
+
+/// Reads the word at 0801_0000h, then calls what is there for ever, and keeps its result at 2000_0000h.
+pub const CALLS_WHAT_IT_HAS_READ: Program = Program {
+    base: 0x0800_0200,
+    vectors: &[],
+    code: &[
+        0x4C03,              // 200  ldr r4, [pc, #12]
+        0xF04F, 0x5500,      // 202  mov.w r5, #536870912
+        0x6821,              // 206  ldr r1, [r4, #0]
+        0x3401,              // 208  adds r4, #1
+        0x47A0,              // 20A loop:  blx r4
+        0x6028,              // 20C  str r0, [r5, #0]
+        0xE7FC,              // 20E  b.n 800020a
+        0x0000, 0x0801,      // 210  .word 0x08010000
+    ],
+};
