@@ -1025,7 +1025,8 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
             }
             _ => {
                 // As for RAM: a page that was only read so far must come by here when it is fetched from, to be noted.
-                let executed = &mut state.notes.flash_executed[((paddr - geometry.flash.base) / PAGE) as usize];
+                let executed =
+                    &mut state.notes.flash_executed[((paddr - geometry.flash.base) / PAGE) as usize];
                 *executed |= kind == MemType::FETCH;
                 entry(paddr, if *executed { Prot::READ | Prot::EXEC } else { Prot::READ })
             }
