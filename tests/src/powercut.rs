@@ -17,5 +17,5 @@ mod points;
 mod scenario;
 
 pub use device::Bug;
-pub use points::{reproduce, run, shows, Point, Report};
+pub use points::{reproduce, run, shows, Point, Report, Shown};
 pub use scenario::{Scenario, SCENARIOS};

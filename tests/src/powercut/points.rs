@@ -254,10 +254,27 @@ pub fn run(scenario: &Scenario, every_kind: bool) -> Result<Report, String> {
     run_until(scenario, None, every_kind, u64::MAX)
 }
 
-/// Whether a bug shows in this scenario. Looks no further than to the first time.
+/// How a bug shows in a scenario.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Shown {
+    /// Not at all.
+    No,
+    /// The scenario fails although the power stays: no power cut is needed to find this bug.
+    Uncut(String),
+    /// At this point, which is the first.
+    ByCut(Point, String),
+}
+
+/// How a bug shows in this scenario. Looks no further than to the first time.
 #[must_use]
-pub fn shows(scenario: &Scenario, bug: Bug) -> bool {
-    run_until(scenario, Some(bug), false, 1).map_or(true, |report| report.violations > 0)
+pub fn shows(scenario: &Scenario, bug: Bug) -> Shown {
+    match run_until(scenario, Some(bug), false, 1) {
+        Err(what) => Shown::Uncut(what),
+        Ok(report) => match report.told.into_iter().next() {
+            Some((point, what)) => Shown::ByCut(point, what),
+            None => Shown::No,
+        },
+    }
 }
 
 fn run_until(
@@ -274,10 +291,13 @@ fn run_until(
     let operations = run.operations;
     run.outcome?;
     look(&through, &run.allowed)?;
+    completes(scenario, &through, &run.allowed)?;
 
     let next = AtomicU32::new(1);
     let total = Mutex::new(Report { operations: operations.into(), ..Report::default() });
-    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    // One that is to stop early goes through the operations in order: what it tells is the first, whoever asks.
+    let threads =
+        if violations == 1 { 1 } else { std::thread::available_parallelism().map_or(1, usize::from) };
     std::thread::scope(|scope| {
         for _ in 0..threads {
             let device = device.clone();
