@@ -420,6 +420,14 @@ impl Machine {
         }
     }
 
+    /// Protects a sector of the flash by its option byte, as a debug probe does, or no longer.
+    ///
+    /// # Panics
+    /// For a sector of a second bank, whose option bytes are not modelled.
+    pub fn protect_sector(&mut self, number: u8, protected: bool) {
+        self.cpu.chip_mut().flash.protect_sector(number, protected);
+    }
+
     /// CAN controller `n`; 0 is CAN1, the only one.
     ///
     /// # Panics

@@ -262,6 +262,15 @@ impl Bench {
         Session::new(self, node, Timing::default())
     }
 
+    /// Whether a node answers as a bootloader, and not as an application.
+    ///
+    /// # Panics
+    /// If it does not answer.
+    pub fn is_bootloader(&mut self, node: u8) -> bool {
+        let told = self.session_with(node).device_type().expect("an answer");
+        told.expect("1000h is mandatory").is_bootloader()
+    }
+
     /// Fails if the firmware of any board touched anything that the emulator does not model.
     ///
     /// # Panics

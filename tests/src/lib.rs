@@ -1,6 +1,7 @@
 //! What the tests and the demonstration share: the built firmware, and the bench that it runs on.
 
 pub mod bench;
+pub mod call_back;
 pub mod eds;
 pub mod endpoint;
 pub mod firmware;

@@ -6,13 +6,11 @@ use std::time::Duration;
 use canopen::program::ProgramControl;
 use canopen::{Address, BitRate, NodeId};
 use coboot_tests::bench::{Bench, NODE};
-use coboot_tests::firmware;
+use coboot_tests::{call_back, firmware};
 use coflash::convert::{self, blocks_of, Options};
 use coflash::flash::{flash, FlashOptions, Report};
 use coflash::read::read;
 use coflash::session::{Doing, Session, Timing};
-use emulator::machine::{ResetCause, Stop};
-use emulator::time::Span;
 use shared_abi::callgate;
 use shared_abi::geometry::Region;
 use shared_abi::layout::stm32f407g_disc1_two;
@@ -33,6 +31,7 @@ const UNKNOWN_SELECTOR: i32 = -1;
 const BAD_POINTER: i32 = -2;
 const BAD_RANGE: i32 = -3;
 const BUSY: i32 = -4;
+const FAILED: i32 = -5;
 const BAD_ARGUMENT: i32 = -6;
 const NO_PROGRAM: i32 = -7;
 
@@ -83,10 +82,6 @@ fn put(bench: &mut Bench, at: Address, value: u32) {
     let timing = Timing { sdo: Duration::from_secs(3), ..Timing::default() };
     let mut session = Session::new(bench, NodeId::new(NODE).unwrap(), timing);
     session.write(at, &value.to_le_bytes(), Doing::Write(at), &mut |_| {}).unwrap();
-}
-
-fn is_bootloader(bench: &mut Bench, node: u8) -> bool {
-    bench.session_with(node).device_type().unwrap().unwrap().is_bootloader()
 }
 
 fn power_cycle(bench: &mut Bench) {
@@ -210,42 +205,21 @@ fn it_is_a_node_like_any_other() {
     for _ in 0..4 {
         bench.post(0x000, &[0x81, NODE]);
         bench.await_boot_up(1000);
-        assert!(!is_bootloader(&mut bench, NODE));
+        assert!(!bench.is_bootloader(NODE));
     }
     bench.assert_nothing_unmodelled();
 }
 
+/// And another program may take its place.
 #[test]
 fn it_can_be_called_back_at_every_bit_rate() {
-    for (rate, bits) in [
-        (BitRate::K10, 10_000),
-        (BitRate::K125, 125_000),
-        (BitRate::K500, 500_000),
-        (BitRate::K1000, 1_000_000),
-    ] {
-        let mut bench = Bench::new();
-        let board = bench.device;
-        bench.commission(board, NODE, rate);
-        bench.set_host_bit_rate(bits);
-        bench.power_on();
-        bench.await_boot_up(1000);
-        install(&mut bench, firmware::APP_C);
-        bench.events();
-        let from = bench.time();
-        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-        bench.await_boot_up(2000);
-        let events = bench.events();
-        let [(reset, Stop::Reset(ResetCause::Software))] = events[..] else { panic!("{rate:?}: {events:?}") };
-        let frames = bench.frames_since(from);
-        let answer = frames.iter().rfind(|(at, id, _)| *id == ANSWERS && *at < reset).unwrap();
-        assert_eq!(answer.2, [0x60, 0x51, 0x1F, 0x01, 0, 0, 0, 0], "{rate:?}");
-        assert!(
-            reset - answer.0 >= Span::from_millis(10),
-            "{rate:?}: {} us",
-            (reset - answer.0).0 / 1_000_000
-        );
-        assert!(is_bootloader(&mut bench, NODE), "{rate:?}");
-    }
+    call_back::at_every_bit_rate(firmware::APP_C, |rate, mut bench| {
+        // One bit rate is enough for this.
+        if rate == BitRate::K1000 {
+            install(&mut bench, firmware::APP_V2);
+            assert_eq!(bench.session().read_text(Address::new(0x100A, 0)).unwrap(), "2.0.0");
+        }
+    });
 }
 
 /// The pages of RAM that the callgate has accessed since the last time: those of its part of the stack, and of the structure that was
@@ -464,7 +438,7 @@ fn every_hostile_call_has_its_status_and_does_nothing() {
     assert_eq!(call(&mut bench, READ_NODE, [0; 5]).words[..2], [1, 125_000]);
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
-    assert!(is_bootloader(&mut bench, NODE));
+    assert!(bench.is_bootloader(NODE));
 }
 
 #[test]
@@ -477,10 +451,45 @@ fn a_node_id_that_it_stores_is_in_force_from_the_next_reset_on() {
     bench.set_host_bit_rate(500_000);
     bench.power_on();
     bench.await_boot_up_of(42, 1000);
-    assert!(!is_bootloader(&mut bench, 42));
+    assert!(!bench.is_bootloader(42));
     bench.session_with(42).command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up_of(42, 1000);
-    assert!(is_bootloader(&mut bench, 42));
+    assert!(bench.is_bootloader(42));
+}
+
+/// The flash takes nothing any more, as when somebody has protected the parameters' sectors by the option bytes: whoever stores is
+/// told so, everything else goes on, and so does storing once they can be written again.
+#[test]
+fn a_flash_that_refuses_is_told_and_harms_nothing() {
+    let (mut bench, report) = running_board();
+    let sectors: Vec<u8> = {
+        let chip = firmware::board().chip;
+        firmware::board().parameters.map(|region| chip.sector_at(region.base).unwrap().number).into()
+    };
+    let before = bench.machine().flash().to_vec();
+    for sector in &sectors {
+        bench.machine().protect_sector(*sector, true);
+    }
+    // Twice: a refusal leaves the flash controller as it was, or the next call would be told that it is busy.
+    for _ in 0..2 {
+        for (selector, words) in [(STORE_NODE, [9, 250_000, 3, 4, 5]), (INVALIDATE, [1, 2, 3, 4, 5])] {
+            let called = call(&mut bench, selector, words);
+            assert_eq!((called.status, called.words), (FAILED, words), "{selector}");
+        }
+    }
+    let info = [1, report.program_size, report.program_crc, 0, 0b11];
+    assert_eq!(call(&mut bench, PROGRAM_INFO, [1; 5]).words, info, "still signed");
+    assert_eq!(call(&mut bench, READ_NODE, [0; 5]).words[..2], [1, 125_000]);
+    assert_eq!(call(&mut bench, CRC32, [firmware::board().programs[0].base, 4, 0, 0, 0]).status, OK);
+    assert!(bench.machine().flash() == before, "flash was changed");
+
+    for sector in &sectors {
+        bench.machine().protect_sector(*sector, false);
+    }
+    assert_eq!(call(&mut bench, STORE_NODE, [9, 250_000, 3, 4, 5]).status, OK);
+    assert_eq!(call(&mut bench, READ_NODE, [0; 5]).words[..2], [9, 250_000]);
+    assert_eq!(call(&mut bench, INVALIDATE, [1; 5]).status, OK);
+    assert_eq!(bench.events(), [], "the device went down");
 }
 
 #[test]
@@ -496,19 +505,19 @@ fn a_trial_confirms_itself_and_takes_it_back() {
             bench.run_ms(100);
         }
         bench.run_ms(500);
-        assert!(!is_bootloader(bench, NODE));
+        assert!(!bench.is_bootloader(NODE));
         assert_eq!(call(bench, PROGRAM_INFO, [1; 5]).words[4], 0b01, "installed, not signed");
     };
     start_unsigned(&mut bench);
     power_cycle(&mut bench);
-    assert!(is_bootloader(&mut bench, NODE), "it had not confirmed itself");
+    assert!(bench.is_bootloader(NODE), "it had not confirmed itself");
     start_unsigned(&mut bench);
     assert_eq!(call(&mut bench, CONFIRM, [1; 5]).status, OK);
     power_cycle(&mut bench);
-    assert!(!is_bootloader(&mut bench, NODE), "it had");
+    assert!(!bench.is_bootloader(NODE), "it had");
     assert_eq!(call(&mut bench, INVALIDATE, [1; 5]).status, OK);
     power_cycle(&mut bench);
-    assert!(is_bootloader(&mut bench, NODE), "it has taken that back");
+    assert!(bench.is_bootloader(NODE), "it has taken that back");
 }
 
 /// Two programs: each knows of the other; one that is not there is told as such; one that was linked for the place of the other is
@@ -551,7 +560,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
     bench.run_ms(10);
     bench.power_on();
     bench.await_boot_up(1000);
-    assert!(is_bootloader(&mut bench, NODE));
+    assert!(bench.is_bootloader(NODE));
 
     // And the right ones.
     let blocks =

@@ -3,7 +3,7 @@
 use canopen::program::ProgramControl;
 use canopen::{AbortCode, Address, BitRate};
 use coboot_tests::bench::{Bench, NODE};
-use coboot_tests::firmware;
+use coboot_tests::{call_back, firmware};
 use coflash::error::Error;
 use coflash::flash::{flash, FlashOptions};
 use coflash::session::Doing;
@@ -36,10 +36,6 @@ fn write(bench: &mut Bench, at: Address, value: u8) -> Result<(), Error> {
     bench.session().write(at, &[value], Doing::Write(at), &mut |_| {})
 }
 
-fn is_bootloader(bench: &mut Bench, node: u8) -> bool {
-    bench.session_with(node).device_type().unwrap().unwrap().is_bootloader()
-}
-
 fn power_cycle(bench: &mut Bench) {
     bench.power_off();
     bench.run_ms(100);
@@ -67,13 +63,13 @@ fn three_ways_lead_back_and_the_bootloader_is_whole_behind_each() {
         let answer =
             bench.frames_since(from).into_iter().find(|(_, id, _)| *id == 0x580 + u32::from(NODE)).unwrap();
         assert!(boot_up - answer.0 >= Span::from_millis(10), "way {way}");
-        assert!(is_bootloader(&mut bench, NODE), "way {way}");
+        assert!(bench.is_bootloader(NODE), "way {way}");
 
         install(&mut bench, NODE, firmware::APP_V2);
         assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0", "way {way}");
         // A request is good for once.
         power_cycle(&mut bench);
-        assert!(!is_bootloader(&mut bench, NODE), "way {way}");
+        assert!(!bench.is_bootloader(NODE), "way {way}");
         bench.assert_nothing_unmodelled();
     }
     let mut bench = running_board();
@@ -93,7 +89,7 @@ fn both_programs_take_interrupts_in_turn_and_none_goes_astray() {
         bench.session().command(1, ProgramControl::StartBootloader).unwrap();
         bench.await_boot_up(1000);
         for _ in 0..100 {
-            assert!(is_bootloader(&mut bench, NODE), "round {round}");
+            assert!(bench.is_bootloader(NODE), "round {round}");
         }
         bench.session().command(1, ProgramControl::Start).unwrap();
         bench.await_boot_up(1000);
@@ -120,35 +116,7 @@ fn both_programs_take_interrupts_in_turn_and_none_goes_astray() {
 /// The answer to 80h is on the bus, and 10 ms more have passed, at every bit rate.
 #[test]
 fn the_answer_comes_before_the_departure_at_every_bit_rate() {
-    for (rate, bits) in [
-        (BitRate::K10, 10_000),
-        (BitRate::K50, 50_000),
-        (BitRate::K250, 250_000),
-        (BitRate::K1000, 1_000_000),
-    ] {
-        let mut bench = Bench::new();
-        let board = bench.device;
-        bench.commission(board, NODE, rate);
-        bench.set_host_bit_rate(bits);
-        bench.power_on();
-        bench.await_boot_up(1000);
-        install(&mut bench, NODE, firmware::APP_V1);
-        bench.events();
-        let from = bench.time();
-        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-        bench.await_boot_up(2000);
-        let events = bench.events();
-        let [(reset, Stop::Reset(ResetCause::Software))] = events[..] else { panic!("{rate:?}: {events:?}") };
-        let frames = bench.frames_since(from);
-        let answer =
-            frames.iter().rfind(|(at, id, _)| *id == 0x580 + u32::from(NODE) && *at < reset).unwrap();
-        assert_eq!(answer.2, [0x60, 0x51, 0x1F, 0x01, 0, 0, 0, 0], "{rate:?}");
-        assert!(
-            reset - answer.0 >= Span::from_millis(10),
-            "{rate:?}: {} us",
-            (reset - answer.0).0 / 1_000_000
-        );
-    }
+    call_back::at_every_bit_rate(firmware::APP_V1, |_, _| {});
 }
 
 /// A program without signature is on trial: it confirms itself, or the next reset ends in the bootloader.
@@ -164,22 +132,22 @@ fn a_trial_confirms_itself_through_the_callgate() {
         bench.run_ms(50);
     }
     bench.run_ms(500);
-    assert!(!is_bootloader(&mut bench, NODE));
+    assert!(!bench.is_bootloader(NODE));
     assert_eq!(bench.session().read_number(CONFIRMATION).unwrap(), INSTALLED);
     power_cycle(&mut bench);
-    assert!(is_bootloader(&mut bench, NODE), "it had not confirmed itself");
+    assert!(bench.is_bootloader(NODE), "it had not confirmed itself");
 
     bench.session().command(1, ProgramControl::Start).unwrap();
     bench.await_boot_up(1000);
     write(&mut bench, CONFIRMATION, SIGNED as u8).unwrap();
     assert_eq!(bench.session().read_number(CONFIRMATION).unwrap(), INSTALLED | SIGNED);
     power_cycle(&mut bench);
-    assert!(!is_bootloader(&mut bench, NODE), "it had");
+    assert!(!bench.is_bootloader(NODE), "it had");
 
     write(&mut bench, CONFIRMATION, 0).unwrap();
     assert!(write(&mut bench, CONFIRMATION, 4).is_err());
     power_cycle(&mut bench);
-    assert!(is_bootloader(&mut bench, NODE), "it has taken that back");
+    assert!(bench.is_bootloader(NODE), "it has taken that back");
 }
 
 /// Gives a node another node-ID and, if told, bit rate by layer setting services (CiA 305), and stores them.
@@ -209,10 +177,10 @@ fn node_id_and_bit_rate_are_shared() {
         store_by_lss(&mut bench, 9, Some(BitRate::K250));
         bench.set_host_bit_rate(250_000);
         bench.await_boot_up_of(9, 1000);
-        assert!(!is_bootloader(&mut bench, 9));
+        assert!(!bench.is_bootloader(9));
         bench.session_with(9).command(1, ProgramControl::StartBootloader).unwrap();
         bench.await_boot_up_of(9, 1000);
-        assert!(is_bootloader(&mut bench, 9));
+        assert!(bench.is_bootloader(9));
         assert_eq!(bench.session_with(9).read_number(Address::new(0x1018, 4)).unwrap(), serial);
         if bootloader == firmware::BOOTLOADER_MINIMAL {
             continue;
@@ -220,7 +188,7 @@ fn node_id_and_bit_rate_are_shared() {
         // And from the bootloader: the program has it from the handoff.
         store_by_lss(&mut bench, 21, None);
         bench.await_boot_up_of(21, 1000);
-        assert!(!is_bootloader(&mut bench, 21));
+        assert!(!bench.is_bootloader(21));
         assert_eq!(bench.session_with(21).read_number(Address::new(0x1018, 4)).unwrap(), serial);
     }
 }
@@ -236,7 +204,7 @@ fn an_application_on_a_bootloader_with_another_abi_does_without_it() {
         bench.machine().load_bin(at, &value.to_le_bytes()).unwrap();
         bench.power_on();
         bench.await_boot_up(1000);
-        assert!(!is_bootloader(&mut bench, NODE));
+        assert!(!bench.is_bootloader(NODE));
         assert_eq!(
             bench.session().read_number(Address::new(0x1F56, 1)).unwrap(),
             0,
@@ -248,7 +216,7 @@ fn an_application_on_a_bootloader_with_another_abi_does_without_it() {
         assert!(write(&mut bench, CONFIRMATION, SIGNED as u8).is_err());
         bench.session().command(1, ProgramControl::StartBootloader).unwrap();
         bench.await_boot_up(1000);
-        assert!(is_bootloader(&mut bench, NODE));
+        assert!(bench.is_bootloader(NODE));
     }
 }
 
@@ -260,28 +228,28 @@ fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
         bench.events();
         bench.machine().start_watchdog(64);
         bench.run_ms(300);
-        assert_eq!(is_bootloader(&mut bench, NODE), reset == 3, "after {reset}");
+        assert_eq!(bench.is_bootloader(NODE), reset == 3, "after {reset}");
     }
     power_cycle(&mut bench);
-    assert!(is_bootloader(&mut bench, NODE), "a power-on alone does not try it again");
+    assert!(bench.is_bootloader(NODE), "a power-on alone does not try it again");
     bench.session().command(1, ProgramControl::Start).unwrap();
     bench.await_boot_up(1000);
-    assert!(!is_bootloader(&mut bench, NODE), "a request does");
+    assert!(!bench.is_bootloader(NODE), "a request does");
     // NMT reset node is asked for, and counts as no crash.
     for _ in 0..5 {
         bench.post(0x000, &[0x81, NODE]);
         bench.await_boot_up(1000);
-        assert!(!is_bootloader(&mut bench, NODE));
+        assert!(!bench.is_bootloader(NODE));
     }
     // What confirms itself has not crashed.
     for _ in 0..2 {
         bench.machine().start_watchdog(64);
         bench.run_ms(300);
-        assert!(!is_bootloader(&mut bench, NODE));
+        assert!(!bench.is_bootloader(NODE));
         write(&mut bench, CONFIRMATION, SIGNED as u8).unwrap();
         bench.machine().start_watchdog(64);
         bench.run_ms(300);
-        assert!(!is_bootloader(&mut bench, NODE));
+        assert!(!bench.is_bootloader(NODE));
         write(&mut bench, CONFIRMATION, SIGNED as u8).unwrap();
     }
 }
@@ -307,7 +275,7 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
         "{} ms",
         (program - window).0 / 1_000_000_000
     );
-    assert!(!is_bootloader(&mut bench, NODE));
+    assert!(!bench.is_bootloader(NODE));
     let told: Vec<_> =
         bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == 0x80 + u32::from(NODE)).collect();
     // 8: the rescue window.
@@ -319,7 +287,7 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     bench.await_boot_up(100);
     bench.post(0x000, &[0x01, 0]);
     bench.await_boot_up(1000);
-    assert!(!is_bootloader(&mut bench, NODE));
+    assert!(!bench.is_bootloader(NODE));
 
     // An SDO does, and so does a layer setting service.
     for (id, data) in
@@ -332,7 +300,7 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
         bench.run_ms(100);
         bench.post(id, &data);
         bench.run_ms(2000);
-        assert!(is_bootloader(&mut bench, NODE), "{id:X}h");
+        assert!(bench.is_bootloader(NODE), "{id:X}h");
     }
     // START is a request: it does not wait.
     let from = bench.time();
@@ -344,7 +312,7 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     for reset in 1..=3 {
         bench.machine().start_watchdog(64);
         bench.run_ms(1200);
-        assert_eq!(is_bootloader(&mut bench, NODE), reset == 3, "after {reset}");
+        assert_eq!(bench.is_bootloader(NODE), reset == 3, "after {reset}");
     }
     bench.assert_nothing_unmodelled();
 }
@@ -376,10 +344,10 @@ fn a_cell_that_asks_for_what_is_not_there_does_no_harm() {
         bench.machine().write_ram(firmware::board().warm_start.base, &bytes).unwrap();
         bench.machine().reset_pin();
         bench.await_boot_up(1000);
-        assert_eq!(is_bootloader(&mut bench, NODE), stays, "{what}");
+        assert_eq!(bench.is_bootloader(NODE), stays, "{what}");
         // Used up: the next reset starts the program.
         bench.machine().reset_pin();
         bench.await_boot_up(1000);
-        assert!(!is_bootloader(&mut bench, NODE), "{what}");
+        assert!(!bench.is_bootloader(NODE), "{what}");
     }
 }

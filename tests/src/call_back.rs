@@ -1,0 +1,61 @@
+//! The way back into the bootloader, asked for over the bus, at each bit rate that the board can make.
+
+use bsp::can::BitTiming;
+use canopen::program::ProgramControl;
+use canopen::BitRate;
+use coflash::flash::{flash, FlashOptions};
+use emulator::machine::{ResetCause, Stop};
+use emulator::time::Span;
+
+use crate::bench::{Bench, NODE};
+use crate::firmware;
+
+/// The bit rates of CiA 301, in bit/s.
+const RATES: [(BitRate, u32); 8] = [
+    (BitRate::K10, 10_000),
+    (BitRate::K20, 20_000),
+    (BitRate::K50, 50_000),
+    (BitRate::K125, 125_000),
+    (BitRate::K250, 250_000),
+    (BitRate::K500, 500_000),
+    (BitRate::K800, 800_000),
+    (BitRate::K1000, 1_000_000),
+];
+
+/// What has to be between the answer and the departure (SYS TEC manual L-1112d_10, 4.5).
+const PAUSE: Span = Span::from_millis(10);
+
+/// At each bit rate of the board: installs the program, asks it by 1F51h for the bootloader, and looks that the answer is whole
+/// on the bus, and 10 ms more have passed, when the chip is reset. `then` goes on with the board, whose bootloader has
+/// answered.
+///
+/// # Panics
+/// When the board does not do that.
+pub fn at_every_bit_rate(image: &str, mut then: impl FnMut(BitRate, Bench)) {
+    let blocks = firmware::blocks(image);
+    for (rate, bits) in RATES {
+        if BitTiming::new(bsp::CAN_CLOCK, bits).is_none() {
+            continue;
+        }
+        let mut bench = Bench::new();
+        let board = bench.device;
+        bench.commission(board, NODE, rate);
+        bench.set_host_bit_rate(bits);
+        bench.power_on();
+        bench.await_boot_up(1000);
+        flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).expect("it is installed");
+        bench.events();
+        let from = bench.time();
+        bench.session().command(1, ProgramControl::StartBootloader).expect("it is answered");
+        bench.await_boot_up(2000);
+        let events = bench.events();
+        let [(reset, Stop::Reset(ResetCause::Software))] = events[..] else { panic!("{rate:?}: {events:?}") };
+        let frames = bench.frames_since(from);
+        let answer = frames.iter().rfind(|(at, id, _)| *id == 0x580 + u32::from(NODE) && *at < reset);
+        let (at, _, data) = answer.expect("an answer before the reset");
+        assert_eq!(data[..], [0x60, 0x51, 0x1F, 0x01, 0, 0, 0, 0], "{rate:?}");
+        assert!(reset - *at >= PAUSE, "{rate:?}: {} us", (reset - *at).0 / 1_000_000);
+        assert!(bench.is_bootloader(NODE), "{rate:?}");
+        then(rate, bench);
+    }
+}
