@@ -14,9 +14,7 @@ use canopen::od::concat;
 use canopen::od::{put, Access, Address, DataType, Entry, Objects};
 #[cfg(feature = "emcy")]
 use canopen::program::FlashError;
-use canopen::program::{
-    ProgramControl, ProgramState, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID,
-};
+use canopen::program::{ProgramControl, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID};
 use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, NodeId};
 use shared_abi::layout::Layout;
@@ -204,6 +202,12 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         self.download.busy()
     }
 
+    /// Whether a reset now would take back what a host was told is done or under way.
+    #[must_use]
+    pub fn is_finishing(&self) -> bool {
+        self.download.is_finishing()
+    }
+
     /// The request to leave the bootloader, once; the answer to the command may still be on its way.
     pub fn take_leave(&mut self) -> Option<BootRequest> {
         self.download.take_leave()
@@ -239,7 +243,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
             return read;
         }
         match at.index {
-            PROGRAM_CONTROL => put(buf, &[ProgramState::Stopped as u8]),
+            PROGRAM_CONTROL => put(buf, &[self.download.state(at.sub) as u8]),
             PROGRAM_ID => put(buf, &self.download.identification(at.sub).to_le_bytes()),
             FLASH_STATUS => put(buf, &self.download.status(at.sub).to_word().to_le_bytes()),
             _ => Err(AbortCode::NO_DATA),
@@ -259,6 +263,11 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
 
     fn download_start(&mut self, at: Address, size: Option<u32>) -> Result<(), AbortCode> {
         self.download.block_start(at.sub, size)
+    }
+
+    #[cfg(feature = "streams")]
+    fn download_space(&mut self, _at: Address, held: bool) -> usize {
+        self.download.space(held)
     }
 
     fn download_data(&mut self, _at: Address, data: &[u8]) -> Result<(), AbortCode> {

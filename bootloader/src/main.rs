@@ -260,7 +260,9 @@ mod app {
                 return;
             }
         }
-        if leaving.wanted && slave.is_idle() && can.lock(|can| can.is_idle()) {
+        // What a host was told is done is not lost by a reset that comes too early.
+        let finishing = bootloader.lock(|bootloader| bootloader.is_finishing());
+        if leaving.wanted && !finishing && slave.is_idle() && can.lock(|can| can.is_idle()) {
             leaving.at = Some(now + FAREWELL_MS);
             log!("leaving; request", WarmStart::new(leaving.request).request);
         }

@@ -333,9 +333,11 @@ pub trait Objects {
     }
 
     /// Bytes that [`download_data`](Self::download_data) could take at present. The server holds its answer back, and with it the
-    /// client, until there is room for a segment (7 bytes).
-    fn download_space(&mut self, at: Address) -> usize {
-        let _ = at;
+    /// client, until there is room for a segment (7 bytes). It asks with `held` once it has done so for
+    /// [`HOLD_MS`](crate::sdo::server::HOLD_MS): what is told then should come out of a reserve, so that the client is slowed
+    /// down but never left without an answer.
+    fn download_space(&mut self, at: Address, held: bool) -> usize {
+        let _ = (at, held);
         usize::MAX
     }
 

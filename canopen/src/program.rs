@@ -81,6 +81,8 @@ pub enum ProgramState {
     Stopped = 0,
     /// It runs: this is the application.
     Running = 1,
+    /// There is none to run.
+    Absent = 3,
 }
 
 /// The word of 1F57h.

@@ -360,6 +360,29 @@ fn a_full_consumer_holds_the_answer_back() {
     still_serves(&mut bench);
 }
 
+/// Slowed down, but not left alone: a segment every 2 ms, until there is really no room.
+#[test]
+fn a_client_that_is_held_back_is_served_from_the_reserve() {
+    let mut bench = Bench::new();
+    bench.device.space = Some(15);
+    bench.device.reserve = 10;
+    assert_eq!(bench.ask(START_9.0), None);
+    bench.now += 1;
+    assert_eq!(bench.poll(), None);
+    bench.now += 1;
+    assert_eq!(bench.poll(), Some(response(START_9.1)));
+    assert_eq!(bench.ask(FIRST.0), None);
+    bench.now += 2;
+    assert_eq!(bench.poll(), Some(response(FIRST.1)), "8 bytes of the reserve are left");
+    bench.expect(&[([0x1B, 8, 9, 0, 0, 0, 0, 0], [0x30, 0, 0, 0, 0, 0, 0, 0])]);
+    // A sub-block from the reserve is one segment long.
+    bench.device.space = Some(100);
+    bench.device.reserve = 100;
+    assert_eq!(bench.ask([0xC0, 0x50, 0x1F, 1, 0, 0, 0, 0]), None);
+    bench.now += 2;
+    assert_eq!(bench.poll(), Some(response([0xA4, 0x50, 0x1F, 1, 1, 0, 0, 0])));
+}
+
 /// Found by fuzzing: such a client was not held back by the answer that it did not wait for.
 #[test]
 fn a_client_that_sends_regardless_of_room_is_refused() {

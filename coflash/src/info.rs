@@ -143,11 +143,13 @@ impl fmt::Display for ProgramInfo {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         const STOPPED: u32 = ProgramState::Stopped as u32;
         const RUNNING: u32 = ProgramState::Running as u32;
+        const ABSENT: u32 = ProgramState::Absent as u32;
         writeln!(f, "  program {}", self.number)?;
         match self.control {
             None => {}
             Some(STOPPED) => writeln!(f, "    state           stopped")?,
             Some(RUNNING) => writeln!(f, "    state           running")?,
+            Some(ABSENT) => writeln!(f, "    state           there is none")?,
             Some(other) => writeln!(f, "    state           {other:02X}h")?,
         }
         if let Some(crc) = self.crc {

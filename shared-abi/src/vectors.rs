@@ -36,9 +36,7 @@ impl VectorTable {
         if !program.base.is_multiple_of(chip.vector_table_alignment()) {
             return Err(VectorFault::Misaligned);
         }
-        // A full descending stack: the pointer may stand right behind the last byte, and needs room below.
-        let on_stack = |ram: &Region| ram.size > 0 && initial_sp > ram.base && initial_sp <= ram.end();
-        if !initial_sp.is_multiple_of(8) || !(on_stack(&layout.ram) || on_stack(&chip.ccm)) {
+        if !Self::is_stack_pointer(initial_sp, layout) {
             return Err(VectorFault::StackPointer);
         }
         let table = chip.vector_table_size();
@@ -50,6 +48,14 @@ impl VectorTable {
             return Err(VectorFault::NotThumb);
         }
         Ok(Self { address: program.base, initial_sp, reset })
+    }
+
+    /// Whether a word may be the first one of a table: a pointer to the end of a stack in RAM.
+    #[must_use]
+    pub fn is_stack_pointer(word: u32, layout: &Layout) -> bool {
+        // A full descending stack: the pointer may stand right behind the last byte, and needs room below.
+        let on_stack = |ram: &Region| ram.size > 0 && word > ram.base && word <= ram.end();
+        word.is_multiple_of(8) && (on_stack(&layout.ram) || on_stack(&layout.chip.ccm))
     }
 
     /// Address of the table: what `VTOR` takes.

@@ -14,11 +14,15 @@
 //! out
 //! with it (SYS TEC manual L-1112d_10, figure 12), see [`Erase`].
 
+#[cfg(feature = "intel-hex")]
+mod ihex;
 mod queue;
+#[cfg(feature = "streams")]
+mod stream;
 
 use core::task::Poll;
 
-use canopen::program::{FlashError, FlashStatus, ProgramControl};
+use canopen::program::{FlashError, FlashStatus, ProgramControl, ProgramState};
 use canopen::sdo::AbortCode;
 use shared_abi::block_file::{
     Control, Header, Last, CONTROL_MAX, CRC_SIZE, FRAMING, HEADER_SIZE, LAST_SIZE, MAX_BLOCK_SIZE,
@@ -34,6 +38,10 @@ use crate::node::NodeParameters;
 use crate::parameters::{Key, Parameters, StoreError};
 use crate::program::{check_vectors, FlashCrc, ProgramRecord};
 use queue::Queue;
+#[cfg(feature = "streams")]
+use shared_abi::vectors::VectorTable;
+#[cfg(feature = "streams")]
+use stream::Stream;
 
 /// What came of a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -83,6 +91,14 @@ pub struct Policy {
     pub allowed: fn() -> bool,
     /// When CLEAR erases.
     pub erase: Erase,
+    /// Whether a complete raw image or Intel HEX download is valid without the signature (83h) that those who send it know
+    /// nothing of.
+    pub valid_without_signature: bool,
+    /// Whether 1F51h = 2 always starts the program, as CiA 302-3 has it; otherwise it does so right behind a raw image or
+    /// Intel HEX, and resets the status in all other cases.
+    pub reset_starts: bool,
+    /// Whether a valid raw image or Intel HEX starts by itself when it is complete.
+    pub starts_by_itself: bool,
     /// Bytes of flash that one step of a CRC covers: the longest that other work of the same priority is kept
     /// waiting.
     pub crc_step: u32,
@@ -95,6 +111,9 @@ impl Policy {
         check: |_, _| Verdict::Standard,
         allowed: || true,
         erase: Erase::WithFirstBlock,
+        valid_without_signature: true,
+        reset_starts: false,
+        starts_by_itself: false,
         crc_step: 1024,
     };
 }
@@ -125,6 +144,8 @@ struct Program {
     session: Session,
     /// The version that the last control block told.
     version: u32,
+    /// A raw image or Intel HEX came last, completely, and no command since.
+    streamed: bool,
 }
 
 /// How far the download of a program is.
@@ -151,6 +172,18 @@ enum Session {
 #[derive(Clone, Copy, Debug)]
 enum Reception {
     Idle,
+    /// Too few bytes to know what it is, of as many as were announced.
+    #[cfg(feature = "streams")]
+    Unknown {
+        program: u8,
+        size: Option<u32>,
+    },
+    /// A whole program.
+    #[cfg(feature = "streams")]
+    Stream {
+        program: u8,
+        stream: Stream,
+    },
     /// The header is not complete.
     Header {
         program: u8,
@@ -160,6 +193,18 @@ enum Reception {
         program: u8,
         header: Header,
     },
+}
+
+impl Reception {
+    /// Which program it is of.
+    fn program(&self) -> Option<u8> {
+        match *self {
+            Self::Idle => None,
+            #[cfg(feature = "streams")]
+            Self::Unknown { program, .. } | Self::Stream { program, .. } => Some(program),
+            Self::Header { program } | Self::Data { program, .. } => Some(program),
+        }
+    }
 }
 
 /// What is being done to the flash.
@@ -175,12 +220,23 @@ enum Work {
     /// What was being done does not matter any more, but the flash has yet to finish it.
     Settle,
     /// The last block: is the flash what the host meant?
-    Verify { program: u8, last: Last, crc: FlashCrc },
+    Verify { program: u8, expected: Expected, crc: FlashCrc },
     /// The record of a program: after verification, and when the signature changes.
     Record { program: u8, record: ProgramRecord },
     /// Node-ID and bit rate; of no program.
     Node,
 }
+
+/// What a program has to be that was sent completely.
+#[derive(Clone, Copy, Debug)]
+struct Expected {
+    size: u32,
+    /// `None`: what is in flash, word for word what was sent.
+    crc: Option<u32>,
+}
+
+/// The first two vectors at least: without them under the CRC nothing can be started.
+const SMALLEST_PROGRAM: u32 = 8;
 
 /// The download of programs into flash. `PROGRAMS` is the number of programs in the layout.
 pub struct Downloader<'b, P, const PROGRAMS: usize> {
@@ -194,7 +250,11 @@ pub struct Downloader<'b, P, const PROGRAMS: usize> {
     reception: Reception,
     work: Option<Work>,
     /// To be verified when the queue is empty.
-    last: Option<Last>,
+    expected: Option<Expected>,
+    /// The program is started when it is verified: its host did not wait for that.
+    start_verified: bool,
+    /// The abort for whoever goes on sending when the flash has failed.
+    fault: AbortCode,
     /// A request that waits for the device to leave the bootloader.
     leave: Option<BootRequest>,
     /// How a piece of work on a program ended, or a block that was damaged; to be told.
@@ -224,6 +284,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 error: None,
                 session: Session::Idle,
                 version: 0,
+                streamed: false,
             }
         });
         Self {
@@ -235,7 +296,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             owner: 0,
             reception: Reception::Idle,
             work: None,
-            last: None,
+            expected: None,
+            start_verified: false,
+            fault: AbortCode::DEVICE_STATE,
             leave: None,
             outcome: None,
             node_stored: Ok(()),
@@ -266,13 +329,22 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             ) => of == program,
             _ => false,
         };
-        let full = self.owner == program && (self.last.is_some() || !self.has_room());
+        let full = self.owner == program && (self.expected.is_some() || !self.has_room());
         FlashStatus { busy: busy || full, error, detail: 0 }
     }
 
     /// Whether the queue takes a block of the largest size. (One that is not even as large takes one at a time.)
     fn has_room(&self) -> bool {
         self.queue.is_empty() || self.queue.free() >= MAX_BLOCK_SIZE
+    }
+
+    /// 1F51h: no program runs, whether or not there is one.
+    #[must_use]
+    pub fn state(&self, program: u8) -> ProgramState {
+        match self.index(program).and_then(|index| self.programs[index].record) {
+            Some(_) => ProgramState::Stopped,
+            None => ProgramState::Absent,
+        }
     }
 
     /// 1F56h: the CRC over the program, 0 where there is none.
@@ -284,7 +356,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// Whether there is work for [`Downloader::step`].
     #[must_use]
     pub fn busy(&self) -> bool {
-        self.work.is_some() || self.last.is_some() || !self.queue.is_empty() || self.sector_ahead().is_some()
+        self.work.is_some()
+            || self.expected.is_some()
+            || !self.queue.is_empty()
+            || self.sector_ahead().is_some()
     }
 
     /// The request to leave the bootloader, once: the answer to the command may still be on its way.
@@ -333,7 +408,17 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         }
         // A new beginning does not wait for the end of the old one.
         let broken_off =
-            command == Clear && self.owner == program && self.last.is_none() && self.is_downloading();
+            command == Clear && self.owner == program && self.expected.is_none() && self.is_downloading();
+        let streamed = self.programs[index].streamed;
+        // Who sends a program in one go means by 2 what CiA 302-3 says: reset the program, which starts it.
+        let command = match command {
+            ResetStat if streamed || self.policy.reset_starts => Start,
+            command => command,
+        };
+        if command == Start && streamed && self.leave.is_none() && self.is_finishing() {
+            self.start_verified = true;
+            return Ok(());
+        }
         if self.leave.is_some() || (self.busy() && !broken_off) {
             return Err(self.refuse(program, untimely(FlashError::Busy)));
         }
@@ -342,26 +427,18 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         }
         let state = &mut self.programs[index];
         state.error = None;
+        state.streamed = false;
         match (command, state.record) {
-            (Clear, record) => {
+            (Clear, _) => {
                 let again = state.session == Session::Cleared { just: true };
                 state.session = Session::Cleared { just: true };
                 self.reception = Reception::Idle;
-                self.queue.clear();
-                self.work = match self.work.take() {
-                    // The record is gone only when this is through.
-                    Some(work @ Work::Invalidate { .. }) => Some(work),
-                    None if again || self.policy.erase == Erase::AtOnce => {
-                        Some(self.erase_all(program, record))
-                    }
-                    None => None,
-                    Some(_) => Some(Work::Settle),
-                };
+                self.break_off();
+                if self.work.is_none() && (again || self.policy.erase == Erase::AtOnce) {
+                    self.work = Some(self.invalidate(program, true));
+                }
             }
-            (Start, Some(record)) => {
-                let request = if record.signed { BootRequest::Start } else { BootRequest::Trial };
-                self.leave = Some(request(program));
-            }
+            (Start, Some(record)) => self.start(program, record),
             (SetSignature | ClrSignature, Some(record)) => {
                 // Also where it is so already: after a power cut it may read so now and otherwise later.
                 let signed = command == SetSignature;
@@ -371,6 +448,28 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             (Stop | StartBootloader | ResetStat | ClrSignature, _) => {}
         }
         Ok(())
+    }
+
+    fn start(&mut self, program: u8, record: ProgramRecord) {
+        let request = if record.signed { BootRequest::Start } else { BootRequest::Trial };
+        self.leave = Some(request(program));
+    }
+
+    /// What was received is not wanted any more.
+    fn break_off(&mut self) {
+        self.queue.clear();
+        self.work = match self.work.take() {
+            Some(Work::EraseNext { .. } | Work::Write { .. }) => Some(Work::Settle),
+            // A record is gone, or there, only when this is through.
+            work => work,
+        };
+    }
+
+    /// Whether a program was sent completely, or a command acknowledged, and it is not carried through yet: whoever resets
+    /// the device now takes that back.
+    #[must_use]
+    pub fn is_finishing(&self) -> bool {
+        self.expected.is_some() || matches!(self.work, Some(Work::Verify { .. } | Work::Record { .. }))
     }
 
     /// Whether the flash works on blocks and nothing else.
@@ -393,12 +492,16 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     pub fn block_start(&mut self, program: u8, size: Option<u32>) -> Result<(), AbortCode> {
         self.index(program).ok_or(AbortCode::NO_SUB_INDEX)?;
         let others = self.owner != program && self.busy();
-        if self.leave.is_some() || self.last.is_some() || others || !self.is_downloading() || !self.has_room()
+        if self.leave.is_some()
+            || self.expected.is_some()
+            || others
+            || !self.is_downloading()
+            || !self.has_room()
         {
             return Err(self.refuse(program, untimely(FlashError::Busy)));
         }
         if let Some(size) = size {
-            if size as usize > self.largest() {
+            if !cfg!(feature = "streams") && size as usize > self.largest() {
                 return Err(self.refuse(program, Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH)));
             }
             if (size as usize) < FRAMING {
@@ -410,9 +513,16 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         if let Some(Session::Cleared { just }) = self.session(program) {
             *just = false;
         }
+        if let Some(index) = self.index(program) {
+            self.programs[index].streamed = false;
+        }
         self.owner = program;
         self.queue.forget();
-        self.reception = Reception::Header { program };
+        #[cfg(feature = "streams")]
+        let reception = Reception::Unknown { program, size };
+        #[cfg(not(feature = "streams"))]
+        let reception = Reception::Header { program };
+        self.reception = reception;
         Ok(())
     }
 
@@ -421,17 +531,25 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// # Errors
     /// The abort that ends the transfer.
     pub fn block_data(&mut self, data: &[u8]) -> Result<(), AbortCode> {
-        let (Reception::Header { program } | Reception::Data { program, .. }) = self.reception else {
-            return Err(AbortCode::DEVICE_STATE);
-        };
+        let program = self.reception.program().ok_or(self.fault)?;
+        self.take(program, data).map_err(|refusal| self.refuse(program, refusal))
+    }
+
+    fn take(&mut self, program: u8, data: &[u8]) -> Result<(), Refusal> {
+        #[cfg(feature = "streams")]
+        if let Reception::Stream { stream, .. } = self.reception {
+            return self.stream_data(program, stream, data);
+        }
         if self.queue.open() + data.len() > self.largest() || !self.queue.push(data) {
-            return Err(self.refuse(program, Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH)));
+            return Err(Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH));
+        }
+        #[cfg(feature = "streams")]
+        if let Reception::Unknown { size, .. } = self.reception {
+            self.tell_format(program, size)?;
         }
         if matches!(self.reception, Reception::Header { .. }) && self.queue.open() >= HEADER_SIZE {
             let header = Header::parse(&self.queue.of_open(0));
-            if let Err(refusal) = self.judge_header(program, header) {
-                return Err(self.refuse(program, refusal));
-            }
+            self.judge_header(program, header)?;
             self.reception = Reception::Data { program, header };
         }
         Ok(())
@@ -442,27 +560,25 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// # Errors
     /// The abort that answers instead of the last acknowledgement.
     pub fn block_end(&mut self) -> Result<(), AbortCode> {
-        let reception = core::mem::replace(&mut self.reception, Reception::Idle);
-        let (program, outcome) = match reception {
-            Reception::Idle => return Err(AbortCode::DEVICE_STATE),
-            Reception::Header { program } => {
-                (program, Err(Refusal(FlashError::Format, AbortCode::LENGTH_TOO_LOW)))
-            }
-            Reception::Data { program, header } => (program, self.accept(program, header)),
+        let program = self.reception.program().ok_or(self.fault)?;
+        let outcome = match self.reception {
+            Reception::Data { header, .. } => self.accept(program, header),
+            #[cfg(feature = "streams")]
+            Reception::Stream { stream, .. } => self.stream_end(program, stream),
+            _ => Err(Refusal(FlashError::Format, AbortCode::LENGTH_TOO_LOW)),
         };
-        match outcome {
-            Ok(()) => {
-                if let Some(index) = self.index(program) {
-                    self.programs[index].error = None;
-                }
-                Ok(())
-            }
-            Err(refusal) => Err(self.refuse(program, refusal)),
+        outcome.map_err(|refusal| self.refuse(program, refusal))?;
+        self.reception = Reception::Idle;
+        if let Some(index) = self.index(program) {
+            self.programs[index].error = None;
         }
+        Ok(())
     }
 
     /// 1F50h: the transfer ended before the block did. The block may be sent again.
     pub fn block_cancel(&mut self) {
+        #[cfg(feature = "streams")]
+        self.break_stream();
         self.reception = Reception::Idle;
         self.queue.forget();
     }
@@ -494,7 +610,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                         self.programs[index].identification = 0;
                     }
                     if all {
-                        self.work = Some(self.erase_all(program, None));
+                        let eraser = SectorEraser::new(self.region(program));
+                        self.work = Some(Work::Erase { program, eraser });
                     }
                     return Step::Again;
                 }
@@ -522,8 +639,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 }
                 (program, outcome.map_err(write_error))
             }
-            Work::Verify { program, last, crc } => {
-                let (program, last) = (*program, *last);
+            Work::Verify { program, expected, crc } => {
+                let (program, expected) = (*program, *expected);
                 let Some(crc) = crc.step(flash, self.policy.crc_step) else {
                     self.work = Some(work);
                     return Step::Again;
@@ -534,8 +651,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 }
                 let version = self.index(program).map_or(0, |index| self.programs[index].version);
                 let plausible = check_vectors(flash, self.region(program), self.layout).is_ok();
-                if crc == last.program_crc && plausible {
-                    let record = ProgramRecord { size: last.program_size, crc, signed: false, version };
+                if expected.crc.is_none_or(|told| told == crc) && plausible {
+                    let signed = expected.crc.is_none() && self.policy.valid_without_signature;
+                    let record = ProgramRecord { size: expected.size, crc, signed, version };
                     self.work = Some(self.store_record(program, record));
                     return Step::Again;
                 }
@@ -556,6 +674,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             self.work = Some(work);
             return if erasing { Step::Erasing } else { Step::Programming };
         };
+        self.fault = match work {
+            Work::Erase { .. } | Work::EraseNext { .. } => AbortCode::GENERAL,
+            _ => AbortCode::HARDWARE,
+        };
         self.end(program, outcome);
         Step::Again
     }
@@ -566,12 +688,19 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             let state = &mut self.programs[index];
             state.error = outcome.err();
             if outcome.is_err() {
+                state.streamed = false;
                 if state.session != Session::Idle {
                     state.session = Session::Failed;
                 }
                 self.queue.clear();
                 self.reception = Reception::Idle;
-                self.last = None;
+                self.expected = None;
+            }
+        }
+        let start = core::mem::take(&mut self.start_verified);
+        if let (true, Ok(()), Some(index)) = (start, outcome, self.index(program)) {
+            if let Some(record) = self.programs[index].record {
+                self.start(program, record);
             }
         }
         self.outcome = Some((program, outcome));
@@ -587,11 +716,11 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             eraser: SectorEraser::new(region),
         };
         let work = if self.queue.is_empty() {
-            match (self.last, self.sector_ahead()) {
-                (Some(last), None) => {
-                    self.last = None;
-                    let crc = FlashCrc::new(Region::new(self.region(program).base, last.program_size));
-                    Work::Verify { program, last, crc }
+            match (self.expected, self.sector_ahead()) {
+                (Some(expected), None) => {
+                    self.expected = None;
+                    let crc = FlashCrc::new(Region::new(self.region(program).base, expected.size));
+                    Work::Verify { program, expected, crc }
                 }
                 (_, Some(ahead)) => match sector(ahead) {
                     Some(region) => erase_next(region),
@@ -647,14 +776,13 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
 
     /// Ends a reception and shows why. The error that ended a session stays to be seen.
     fn refuse(&mut self, program: u8, Refusal(error, abort): Refusal) -> AbortCode {
-        self.reception = Reception::Idle;
-        self.queue.forget();
         if let Some(index) = self.index(program) {
             let state = &mut self.programs[index];
             if state.session != Session::Failed || state.error.is_none() {
                 state.error = Some(error);
             }
         }
+        self.block_cancel();
         if error == FlashError::Crc {
             self.outcome = Some((program, Err(error)));
         }
@@ -675,13 +803,6 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         Work::Invalidate { program, all }
     }
 
-    fn erase_all(&mut self, program: u8, record: Option<ProgramRecord>) -> Work {
-        match record {
-            Some(_) => self.invalidate(program, true),
-            None => Work::Erase { program, eraser: SectorEraser::new(self.region(program)) },
-        }
-    }
-
     fn store_record(&mut self, program: u8, record: ProgramRecord) -> Work {
         self.parameters.store(Key::Program(program), record.value());
         Work::Record { program, record }
@@ -695,22 +816,63 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             return Err(Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH));
         }
         match (header.number, state.session) {
-            (NUMBER_CONTROL, Session::Idle) if state.record.is_some() => {
-                return Err(untimely(FlashError::NotCleared));
-            }
-            (NUMBER_CONTROL, Session::Idle | Session::Cleared { .. }) => {
-                return if (self.policy.allowed)() { Ok(()) } else { Err(untimely(FlashError::NoAccess)) };
-            }
             // The sequence begins anew, over what is there.
             (NUMBER_CONTROL, Session::Open { .. }) => return Ok(()),
+            (NUMBER_CONTROL, _) => return self.may_begin(program),
             (NUMBER_LAST, Session::Open { next, .. }) if next > 1 => return Ok(()),
             (number, Session::Open { next, .. }) if number == next => {}
             _ => return Err(untimely(FlashError::Sequence)),
         }
-        let target = (header.flash_address, header.size);
         if header.size == 0 {
             return Err(unfit(FlashError::Format));
         }
+        self.check_place(program, Region::new(header.flash_address, header.size))
+    }
+
+    /// Whether the download of a program may begin.
+    fn may_begin(&self, program: u8) -> Result<(), Refusal> {
+        let Some(index) = self.index(program) else { return Err(unfit(FlashError::Unspecified)) };
+        let state = &self.programs[index];
+        match state.session {
+            Session::Idle if state.record.is_some() => Err(untimely(FlashError::NotCleared)),
+            Session::Idle | Session::Cleared { .. } if (self.policy.allowed)() => Ok(()),
+            Session::Idle | Session::Cleared { .. } => Err(untimely(FlashError::NoAccess)),
+            Session::Open { .. } | Session::Failed => Err(untimely(FlashError::Sequence)),
+        }
+    }
+
+    /// The download begins, of a program of this size; 0 where that is not known.
+    fn open_session(&mut self, program: u8, size: u32) {
+        let region = self.region(program);
+        let Some(session) = self.session(program) else { return };
+        let (erased, ahead) = match *session {
+            // Known to be erased is nothing; what there are to be data for is erased ahead of them.
+            Session::Cleared { .. } => (region.base, region.base + size.min(region.size)),
+            Session::Open { erased, ahead, .. } => (erased, ahead),
+            // No CLEAR: each block finds out whether its place is blank.
+            _ => (region.end(), region.end()),
+        };
+        let cleared = matches!(session, Session::Cleared { .. });
+        *session = Session::Open { next: 1, erased, ahead };
+        // Also where there is no record: one that a power cut left between 0 and 1 may be there the next time.
+        if cleared && self.work.is_none() {
+            self.work = Some(self.invalidate(program, false));
+        }
+    }
+
+    /// The program was sent completely.
+    fn expect(&mut self, program: u8, expected: Expected) {
+        let end = self.region(program).base + expected.size;
+        self.expected = Some(expected);
+        // What no block has written belongs to the program all the same, and reads FFh.
+        if let Some(Session::Open { ahead, .. }) = self.session(program) {
+            *ahead = (*ahead).max(end);
+        }
+    }
+
+    /// Whether data of this program may go there.
+    fn check_place(&self, program: u8, place: Region) -> Result<(), Refusal> {
+        let target = (place.base, place.size);
         if !self.region(program).contains(target.0, target.1) {
             let secured = [self.layout.bootloader, self.layout.parameters[0], self.layout.parameters[1]];
             let touches = |region: &Region| {
@@ -744,37 +906,20 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 self.programs[index].version =
                     if let Control::Dated { version, .. } = control { version } else { 0 };
                 self.queue.forget();
-                let (erased, ahead) = match self.programs[index].session {
-                    // Known to be erased is nothing; what there are to be data for is erased ahead of them.
-                    Session::Cleared { .. } => (region.base, region.base + app_size.min(region.size)),
-                    Session::Open { erased, ahead, .. } => (erased, ahead),
-                    // No CLEAR: each block finds out whether its place is blank.
-                    _ => (region.end(), region.end()),
-                };
-                // Also where there is no record: one that a power cut left between 0 and 1 may be there the next
-                // time.
-                if matches!(self.programs[index].session, Session::Cleared { .. }) && self.work.is_none() {
-                    self.work = Some(self.invalidate(program, false));
-                }
-                self.programs[index].session = Session::Open { next: 1, erased, ahead };
+                self.open_session(program, app_size);
             }
             NUMBER_LAST => {
                 let data: [u8; LAST_SIZE] = self.queue.of_open(HEADER_SIZE);
                 let last = data.get(..header.size as usize).and_then(Last::parse);
                 let last = last.ok_or(unfit(FlashError::Format))?;
-                // The first two vectors at least: without them under the CRC nothing can be started.
-                if last.program_size < 8 {
+                if last.program_size < SMALLEST_PROGRAM {
                     return Err(unfit(FlashError::Format));
                 }
                 if last.program_size > region.size {
                     return Err(unfit(FlashError::Address));
                 }
                 self.queue.forget();
-                self.last = Some(last);
-                // What no block has written belongs to the program all the same, and reads FFh.
-                if let Session::Open { ahead, .. } = &mut self.programs[index].session {
-                    *ahead = (*ahead).max(region.base + last.program_size);
-                }
+                self.expect(program, Expected { size: last.program_size, crc: Some(last.program_crc) });
             }
             number => {
                 self.queue.commit();

@@ -52,6 +52,15 @@ impl<'b> Queue<'b> {
         true
     }
 
+    /// Puts other bytes in place of some of the open block.
+    #[cfg(feature = "streams")]
+    pub(super) fn patch(&mut self, offset: usize, bytes: &[u8]) {
+        for (i, byte) in bytes.iter().enumerate() {
+            let at = self.place(self.queued + offset + i);
+            self.buffer[at] = *byte;
+        }
+    }
+
     /// The open block is good: it joins the queue.
     pub(super) fn commit(&mut self) {
         self.queued += self.open;

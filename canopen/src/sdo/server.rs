@@ -22,6 +22,9 @@ use crate::time::Instant;
 /// The longest variable or string, in bytes. Longer things are domains.
 pub const VALUE_MAX: usize = 64;
 
+/// How long an answer is held back for want of room before the device is asked for room in its reserve, in milliseconds.
+pub const HOLD_MS: u32 = 2;
+
 /// What can be chosen about a server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Config {
@@ -207,7 +210,7 @@ impl SdoServer {
                 Err(code) => self.abort(code, objects),
             }
         }
-        if !self.grant(objects) {
+        if !self.grant(now, objects) {
             return None;
         }
         let answer = self.answer.take()?;
@@ -237,10 +240,14 @@ impl SdoServer {
 
     /// Whether the answer that waits may go: one that makes the client send data waits until there is room for them. An
     /// answer that opens a sub-block is told here how large it may be.
-    fn grant(&mut self, objects: &mut impl Objects) -> bool {
+    fn grant(&mut self, now: Instant, objects: &mut impl Objects) -> bool {
         let Some(answer) = &mut self.answer else { return false };
         let Some(incoming) = self.state.incoming() else { return true };
-        let space = if incoming.is_domain() { objects.download_space(self.at) } else { usize::MAX };
+        let mut space =
+            if incoming.is_domain() { objects.download_space(self.at, false) } else { usize::MAX };
+        if space < SEGMENT && now.has_reached(self.moved + HOLD_MS) {
+            space = objects.download_space(self.at, true).min(SEGMENT);
+        }
         let most = self.config.blksize.clamp(1, BLKSIZE_MAX);
         let granted = (space / SEGMENT).min(usize::from(most)) as u8;
         let State::BlockDownload { receiver, .. } = &mut self.state else { return granted != 0 };
@@ -591,7 +598,7 @@ impl Incoming {
         if self.is_domain() {
             if !data.is_empty() {
                 // Held back are the answers; a client that sends without having got one, or expedited, is refused.
-                if objects.download_space(at) < data.len() {
+                if objects.download_space(at, true) < data.len() {
                     return Err(AbortCode::OUT_OF_MEMORY);
                 }
                 objects.download_data(at, data)?;

@@ -63,6 +63,8 @@ pub struct Device {
     pub events: Vec<Event>,
     /// Room left for domain data; `None` for any.
     pub space: Option<usize>,
+    /// Of that, what only a client gets that is held back.
+    pub reserve: usize,
     /// Refuses the end of a domain download.
     pub refuse_end: Option<AbortCode>,
 }
@@ -109,8 +111,8 @@ impl Objects for Device {
         Ok(())
     }
 
-    fn download_space(&mut self, _at: Address) -> usize {
-        self.space.unwrap_or(usize::MAX)
+    fn download_space(&mut self, _at: Address, held: bool) -> usize {
+        self.space.unwrap_or(usize::MAX).saturating_sub(if held { 0 } else { self.reserve })
     }
 
     fn download_data(&mut self, _at: Address, data: &[u8]) -> Result<(), AbortCode> {

@@ -244,8 +244,13 @@ pub const SCENARIOS: &[Scenario] = &[
             tell(allowed(&[STAY]));
             Ok(())
         },
-        recover: update_after_a_cut,
-        end: || allowed(&[STAY, START_NEW]),
+        recover: |device, _, _| {
+            device.host(|host| {
+                host.command(1, CLEAR)?;
+                host.command(1, CLEAR)
+            })
+        },
+        end: || allowed(&[STAY]),
     },
     Scenario {
         name: "sign",

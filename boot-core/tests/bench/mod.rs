@@ -1,0 +1,258 @@
+//! A bootloader on the model of the flash, and what a host sends it.
+#![allow(dead_code, reason = "each test file uses some of it")]
+
+use boot_core::bootloader::{entries, entry_count, Bootloader, Config};
+use boot_core::download::{Policy, Step};
+use boot_core::node::NodeParameters;
+use boot_core::parameters::Journal;
+use boot_core::program::{verify, Invalid};
+use canopen::device::Device;
+use canopen::od::{Address, Entry, Objects};
+use canopen::{AbortCode, BitRate, NodeId};
+use shared_abi::geometry::Region;
+use shared_abi::layout::Layout;
+
+use crate::model::{ModelFlash, CHIP};
+
+pub const LAYOUT: Layout = Layout {
+    board: "model",
+    chip: &CHIP,
+    bootloader: Region::new(0x0800_0000, 0x400),
+    callgate_offset: 0x200,
+    parameters: [Region::new(0x0800_0400, 0x200), Region::new(0x0800_0600, 0x200)],
+    programs: &[Region::new(0x0800_0800, 0x3C00)],
+    ram: Region::new(0x2000_0000, 0x1_FFC0),
+    handoff: Region::new(0x2001_FFC0, 48),
+    warm_start: Region::new(0x2001_FFF0, 16),
+}
+.checked();
+pub static LAYOUT_REF: &Layout = &LAYOUT;
+pub const PROGRAM: Region = LAYOUT.programs[0];
+
+pub const DATA: Address = Address::new(0x1F50, 1);
+pub const CONTROL: Address = Address::new(0x1F51, 1);
+pub const IDENTIFICATION: Address = Address::new(0x1F56, 1);
+pub const STATUS: Address = Address::new(0x1F57, 1);
+
+pub const CLEAR: u8 = 0x03;
+pub const START: u8 = 0x01;
+pub const SET_SIGNATURE: u8 = 0x83;
+pub const CLR_SIGNATURE: u8 = 0x84;
+
+pub static ENTRIES: [Entry; entry_count(1)] = entries(1);
+
+pub const CONFIG: Config = Config {
+    entries: &ENTRIES,
+    device: DEVICE,
+    layout: LAYOUT_REF,
+    supports: |rate| rate != BitRate::K800,
+    boot_up_emergency: false,
+    download: Policy::DEFAULT,
+};
+
+pub fn node() -> NodeParameters {
+    NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 }
+}
+
+pub const DEVICE: Device = Device {
+    device_type: 0x1000_0000,
+    name: "model",
+    hardware_version: "0",
+    software_version: "0",
+    heartbeat_ms: 0,
+    vendor_id: 0,
+    product_code: 0,
+    revision: 0,
+    serial_number: 0,
+};
+
+pub struct Bench<'f> {
+    pub node: Bootloader<'static, &'f mut ModelFlash, Journal, 1>,
+}
+
+impl<'f> Bench<'f> {
+    pub fn new(flash: &'f mut ModelFlash) -> Self {
+        Self::with(flash, Policy::DEFAULT)
+    }
+
+    pub fn with(flash: &'f mut ModelFlash, download: Policy) -> Self {
+        Self::with_buffer(flash, download, 256)
+    }
+
+    pub fn with_buffer(flash: &'f mut ModelFlash, download: Policy, size: usize) -> Self {
+        let buffer = Box::leak(vec![0; size].into_boxed_slice());
+        let config = Box::leak(Box::new(Config { download, ..CONFIG }));
+        let parameters = Journal::open(flash, LAYOUT.chip, LAYOUT.parameters);
+        Self { node: Bootloader::new(config, 0, node(), 0, parameters, flash, buffer) }
+    }
+
+    pub fn settle(&mut self) {
+        for _ in 0..1_000_000 {
+            if self.node.step() == Step::Idle {
+                return;
+            }
+        }
+        panic!("the work does not end");
+    }
+
+    pub fn word(&mut self, at: Address) -> u32 {
+        let mut bytes = [0; 4];
+        let len = self.node.read(at, &mut bytes).unwrap();
+        assert!(len <= 4);
+        u32::from_le_bytes(bytes)
+    }
+
+    /// 1F51h.
+    pub fn read_state(&mut self) -> u8 {
+        let mut byte = [0];
+        assert_eq!(self.node.read(CONTROL, &mut byte), Ok(1));
+        byte[0]
+    }
+
+    /// The first bytes of a program, in segments.
+    pub fn begin(&mut self, data: &[u8]) {
+        self.node.download_start(DATA, None).unwrap();
+        for segment in data.chunks(7) {
+            while self.node.download_space(DATA, false) < segment.len() {
+                assert_ne!(self.node.step(), Step::Idle, "there is never room");
+            }
+            self.node.download_data(DATA, segment).unwrap();
+        }
+    }
+
+    pub fn status(&mut self) -> u32 {
+        self.word(STATUS)
+    }
+
+    /// A command, carried out; gives the status.
+    pub fn command(&mut self, command: u8) -> u32 {
+        self.node.write(CONTROL, &[command]).unwrap();
+        self.settle();
+        self.status()
+    }
+
+    /// A block in SDO segments; the abort, if any, and then the status when all work is done.
+    pub fn block(&mut self, block: &[u8]) -> (Result<(), AbortCode>, u32) {
+        let outcome = self.transfer(block);
+        self.settle();
+        (outcome, self.status())
+    }
+
+    pub fn transfer(&mut self, block: &[u8]) -> Result<(), AbortCode> {
+        self.node.download_start(DATA, Some(block.len() as u32))?;
+        for segment in block.chunks(7) {
+            // As the SDO server does it: an error ends the transfer and cancels the consumer.
+            if let Err(abort) = self.node.download_data(DATA, segment) {
+                self.node.download_cancel(DATA);
+                return Err(abort);
+            }
+        }
+        self.node.download_end(DATA)
+    }
+
+    /// A whole program in one download, `pieces` of it at a time, with the flash working in between when there is no room;
+    /// the abort, if any, and then the status when all work is done.
+    pub fn stream(&mut self, data: &[u8], size: Option<u32>, pieces: usize) -> (Result<(), AbortCode>, u32) {
+        let outcome = self.pour(data, size, pieces);
+        self.settle();
+        (outcome, self.status())
+    }
+
+    /// The same, but for the work that is left when all is sent.
+    pub fn pour(&mut self, data: &[u8], size: Option<u32>, pieces: usize) -> Result<(), AbortCode> {
+        self.node.download_start(DATA, size)?;
+        for segment in data.chunks(pieces) {
+            while self.node.download_space(DATA, false) < segment.len() {
+                assert_ne!(self.node.step(), Step::Idle, "there is never room");
+            }
+            if let Err(abort) = self.node.download_data(DATA, segment) {
+                self.node.download_cancel(DATA);
+                return Err(abort);
+            }
+        }
+        self.node.download_end(DATA)
+    }
+
+    pub fn good(&mut self, block: &[u8]) {
+        assert_eq!(self.block(block), (Ok(()), 0));
+    }
+
+    pub fn install(&mut self, program: &[u8]) {
+        assert_eq!(self.command(CLEAR), 0);
+        for block in block_file(program, 96) {
+            self.good(&block);
+        }
+    }
+}
+
+pub fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    for word in [number, address, data.len() as u32] {
+        bytes.extend(word.to_le_bytes());
+    }
+    bytes.extend(data);
+    bytes.extend(block_crc(&bytes).to_le_bytes());
+    bytes
+}
+
+/// The CRC of blocks and programs, as the crate was built.
+pub fn block_crc(bytes: &[u8]) -> u32 {
+    if cfg!(feature = "crc-16") {
+        crc16(bytes)
+    } else {
+        crc32(bytes)
+    }
+}
+
+/// CRC-16/XMODEM from its definition (polynomial 1021h, start 0), bit by bit.
+pub fn crc16(bytes: &[u8]) -> u32 {
+    bytes.iter().fold(0, |crc, byte| {
+        (0..8).fold(crc ^ u32::from(*byte) << 8, |crc, _| {
+            (if crc & 0x8000 != 0 { crc << 1 ^ 0x1021 } else { crc << 1 }) & 0xFFFF
+        })
+    })
+}
+
+/// CRC-32/ISO-HDLC from its definition (reflected polynomial EDB88320h), bit by bit.
+pub fn crc32(bytes: &[u8]) -> u32 {
+    !bytes.iter().fold(u32::MAX, |crc, byte| {
+        (0..8).fold(
+            crc ^ u32::from(*byte),
+            |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xEDB8_8320 } else { crc >> 1 },
+        )
+    })
+}
+
+pub fn last(program: &[u8]) -> Vec<u8> {
+    let mut data = (program.len() as u32).to_le_bytes().to_vec();
+    data.extend(block_crc(program).to_le_bytes());
+    block(u32::MAX, 0, &data)
+}
+
+pub fn block_file(program: &[u8], chunk: usize) -> Vec<Vec<u8>> {
+    let mut file = vec![block(0, 0, &[0; 8])];
+    for (i, data) in program.chunks(chunk).enumerate() {
+        file.push(block(1 + i as u32, PROGRAM.base + (i * chunk) as u32, data));
+    }
+    file.push(last(program));
+    file
+}
+
+/// A program with a plausible vector table, filled with `seed`.
+pub fn program(len: usize, seed: u8) -> Vec<u8> {
+    let mut bytes: Vec<u8> = (0..len).map(|i| (i as u8).wrapping_mul(31) ^ seed).collect();
+    bytes[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
+    bytes[4..8].copy_from_slice(&(PROGRAM.base + 0x101).to_le_bytes());
+    bytes
+}
+
+/// Which program would start after a reset, told by its first data byte; `Err` for none.
+pub fn autostart(flash: &ModelFlash) -> Result<u8, Invalid> {
+    let journal = Journal::open(flash, LAYOUT.chip, LAYOUT.parameters);
+    let verified = verify(flash, &journal, &LAYOUT, 1)?;
+    if verified.signed() {
+        Ok(flash.cells(PROGRAM)[8] ^ 8_u8.wrapping_mul(31))
+    } else {
+        Err(Invalid::Absent)
+    }
+}
