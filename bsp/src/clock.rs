@@ -100,6 +100,7 @@ const fn is_divider(value: u32) -> bool {
 /// The same on the chip.
 #[cfg(target_arch = "arm")]
 mod registers {
+    use shared_abi::reset;
     use stm32f4xx_hal::pac;
 
     use super::{ClockTree, Source, HSI};
@@ -109,9 +110,6 @@ mod registers {
     const HSEBYP: u32 = 1 << 18;
     const PLLON: u32 = 1 << 24;
     const PLLRDY: u32 = 1 << 25;
-    /// RCC_CR after a reset, but for the calibration, which is the chip's: HSI on, trimmed to the middle.
-    const CR_RESET: u32 = 0x83;
-    const PLLCFGR_RESET: u32 = 0x2400_3010;
     /// RCC_CFGR: what the system clock runs from, as told back.
     const SWS_PLL: u32 = 0b10 << 2;
     const SWS: u32 = 0b11 << 2;
@@ -142,7 +140,7 @@ mod registers {
             let pll = (from / self.pll_input) | (self.pll_n << 6) | ((self.pll_p / 2 - 1) << 16) | bit;
             // SAFETY: a valid word of PLLCFGR, as `checked` has seen to; the reserved bits and Q keep their reset
             // values.
-            rcc.pllcfgr().write(|w| unsafe { w.bits(PLLCFGR_RESET & 0xFF00_0000 | pll) });
+            rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR & 0xFF00_0000 | pll) });
             set(rcc, PLLON);
             latency(self.wait_states);
             while rcc.cr().read().bits() & PLLRDY == 0 {}
@@ -160,10 +158,10 @@ mod registers {
             rcc.cfgr().write(|w| unsafe { w.bits(0) });
             while rcc.cfgr().read().bits() & SWS != 0 {}
             // SAFETY: the reset values; nothing runs from PLL or crystal any more.
-            rcc.cr().write(|w| unsafe { w.bits(CR_RESET) });
+            rcc.cr().write(|w| unsafe { w.bits(reset::RCC_CR) });
             while rcc.cr().read().bits() & PLLRDY != 0 {}
             // SAFETY: the reset value.
-            rcc.pllcfgr().write(|w| unsafe { w.bits(PLLCFGR_RESET) });
+            rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR) });
             latency(0);
         }
     }

@@ -2,13 +2,15 @@
 //!
 //! One file per board, chosen by the cargo feature `board-…`, beside its memory map in
 //! `shared-abi/src/layout/`. To port coboot, copy a board file and go through it from top to bottom.
-//! [`can`] holds what all boards share.
+//! The rest of the crate is what all boards share.
 //!
 //! On the host there are the values of a board, without the drivers.
 #![no_std]
 
 pub mod can;
 pub mod clock;
+#[cfg(target_arch = "arm")]
+mod drivers;
 #[cfg(target_arch = "arm")]
 pub mod watchdog;
 
@@ -35,13 +37,26 @@ mod board;
 #[path = "stm32f429i_disc1.rs"]
 mod board;
 
+/// The core's clock, in Hz.
+pub const SYSCLK: u32 = CLOCK_TREE.sysclk();
+/// Clock of the CAN controller, in Hz: that of APB1.
+pub const CAN_CLOCK: u32 = CLOCK_TREE.apb1_clock();
+
 pub use board::*; // Not found, or found twice? Choose one board by its feature `board-…`.
 
 const _: () = assert!(
     BIT_RATE == 0 || can::BitTiming::new(CAN_CLOCK, BIT_RATE).is_some(),
     "board: the clock of the CAN controller (APB1) cannot make BIT_RATE"
 );
+const _: () = assert!(
+    ENTRY_STRAP.0 >= 'A'
+        && (ENTRY_STRAP.0 as u32) < 'A' as u32 + LAYOUT.chip.ports as u32
+        && ENTRY_STRAP.1 < 16,
+    "board: the chip has no such pin as ENTRY_STRAP names"
+);
 
+#[cfg(target_arch = "arm")]
+pub use drivers::{clocks, entry_strap, Board, CanController};
 #[cfg(target_arch = "arm")]
 pub use stm32f4xx_hal as hal;
 #[cfg(target_arch = "arm")]

@@ -39,46 +39,26 @@ pub const CLOCK_TREE: ClockTree = ClockTree {
     wait_states: 5,
 }
 .checked();
+
 /// The pin that asks for the bootloader after a reset, as port and number, and the level that does.
 /// The blue button B1 on PA0, high when pressed (UM1670).
 pub const ENTRY_STRAP: (char, u8, bool) = ('A', 0, true);
-/// The core's clock, in Hz.
-pub const SYSCLK: u32 = CLOCK_TREE.sysclk();
-/// Clock of the CAN controller, in Hz: that of APB1.
-pub const CAN_CLOCK: u32 = CLOCK_TREE.apb1_clock();
 
 #[cfg(target_arch = "arm")]
-pub use drivers::*;
+pub use pins::*;
 
-/// The parts of the board and what is done to them.
+/// LED and CAN controller, by the types that the HAL has for pins.
 #[cfg(target_arch = "arm")]
-mod drivers {
-    use stm32f4xx_hal::can::{Can, CanExt};
+mod pins {
+    use stm32f4xx_hal::can::CanExt;
     use stm32f4xx_hal::gpio::{GpioExt, Output, Pin};
     use stm32f4xx_hal::pac;
-    use stm32f4xx_hal::prelude::*;
-    use stm32f4xx_hal::rcc::{Config, Rcc, RccExt};
+    use stm32f4xx_hal::rcc::Rcc;
 
-    use super::{CAN_CLOCK, CLOCK_TREE, SYSCLK};
+    use crate::Board;
 
-    /// The CAN controller that coboot talks through.
-    pub type CanController = Can<pac::CAN1>;
     /// The LED that shows life: LD3, green, high is on.
     pub type Led = Pin<'G', 13, Output>;
-
-    /// The board's parts, set up.
-    pub struct Board {
-        /// The CAN controller with its pins; clocked, not yet configured.
-        pub can: CanController,
-        /// The LED.
-        pub led: Led,
-    }
-
-    /// The clocks as the HAL knows them, for the HAL's drivers. From the state after a reset.
-    #[must_use]
-    pub fn clocks(rcc: pac::RCC) -> Rcc {
-        rcc.freeze(Config::hse(CLOCK_TREE.hse.Hz()).sysclk(SYSCLK.Hz()).pclk1(CAN_CLOCK.Hz()))
-    }
 
     /// Sets the pins up.
     #[must_use]
@@ -89,20 +69,5 @@ mod drivers {
         // AF9: CAN1_RX is PB8, CAN1_TX is PB9 (DS9405, alternate functions; the HAL's table has the same).
         let can = can1.can((gpiob.pb9, gpiob.pb8), rcc);
         Board { can, led }
-    }
-
-    /// Whether the entry strap ([`ENTRY_STRAP`](super::ENTRY_STRAP)) asks for the bootloader.
-    ///
-    /// Leaves port A as after a reset.
-    #[must_use]
-    pub fn entry_strap(rcc: &pac::RCC) -> bool {
-        // SAFETY: the port's inputs are read, and nothing is changed.
-        let gpioa = unsafe { pac::GPIOA::steal() };
-        rcc.ahb1enr().modify(|_, w| w.gpioaen().enabled());
-        // The clock needs two cycles before the first access (RM0090 section 7.3.10): reading back waits that long.
-        let _ = rcc.ahb1enr().read();
-        let pressed = gpioa.idr().read().idr0().is_high();
-        rcc.ahb1enr().modify(|_, w| w.gpioaen().disabled());
-        pressed
     }
 }

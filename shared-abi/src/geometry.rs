@@ -75,6 +75,8 @@ pub struct Geometry {
     pub ccm: Region,
     /// Number of interrupt lines behind the 16 exceptions of the core.
     pub interrupts: u16,
+    /// Number of GPIO ports, from A on (the memory map's table of register boundaries). Packages have fewer.
+    pub ports: u8,
 }
 
 const KIB: u32 = 1024;
@@ -94,6 +96,7 @@ pub const STM32F407VG: Geometry = Geometry {
     sram: Region::new(0x2000_0000, 128 * KIB),
     ccm: Region::new(0x1000_0000, 64 * KIB),
     interrupts: 82,
+    ports: 9,
 }
 .checked();
 
@@ -115,6 +118,7 @@ pub const STM32F429ZI: Geometry = Geometry {
     sram: Region::new(0x2000_0000, (112 + 16 + 64) * KIB),
     ccm: Region::new(0x1000_0000, 64 * KIB),
     interrupts: 91,
+    ports: 11,
 }
 .checked();
 
@@ -133,6 +137,7 @@ pub const STM32F446RE: Geometry = Geometry {
     sram: Region::new(0x2000_0000, 128 * KIB),
     ccm: Region::new(0x1000_0000, 0),
     interrupts: 97,
+    ports: 8,
 }
 .checked();
 

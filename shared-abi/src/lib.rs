@@ -9,6 +9,7 @@
 //! | [`vectors`] | the proof that a vector table may be jumped to, and the jump |
 //! | [`callgate`] | the bootloader's services for the application, at a fixed address |
 //! | `reentry` | the way back from an application into its bootloader (on the target) |
+//! | `reset` | registers after a reset, for those who leave the chip so (on the target) |
 //! | [`block_file`] | the container that object 1F50h takes |
 //!
 //! Everything that crosses a border between two images is `repr(C)`, little-endian and versioned.
@@ -22,6 +23,8 @@ pub mod handoff;
 pub mod layout;
 #[cfg(target_arch = "arm")]
 pub mod reentry;
+#[cfg(target_arch = "arm")]
+pub mod reset;
 pub mod vectors;
 pub mod warm_start;
 

@@ -11,6 +11,7 @@
 //! transmit mailboxes to be empty, then 10 ms (SYS TEC manual L-1112d_10, 4.5), and let nothing else be sent.
 
 use crate::layout::Layout;
+use crate::reset;
 use crate::warm_start::{BootRequest, Cell};
 
 /// Leaves the request where the bootloader looks for it.
@@ -123,9 +124,14 @@ fn release_peripherals() {
     const CIR: u32 = RCC + 0x0C;
     /// AHB1, AHB2, AHB3, APB1, APB2: offset of the reset register, that of the clock register behind it, and what
     /// that is after a
-    /// reset (the clock of the CCM RAM).
-    const BUSES: [(u32, u32, u32); 5] =
-        [(0x10, 0x30, 0x0010_0000), (0x14, 0x34, 0), (0x18, 0x38, 0), (0x20, 0x40, 0), (0x24, 0x44, 0)];
+    /// reset.
+    const BUSES: [(u32, u32, u32); 5] = [
+        (0x10, 0x30, reset::RCC_AHB1ENR),
+        (0x14, 0x34, 0),
+        (0x18, 0x38, 0),
+        (0x20, 0x40, 0),
+        (0x24, 0x44, 0),
+    ];
     const FLASH_ACR: u32 = 0x4002_3C00;
     const HSION: u32 = 1 << 0;
     const HSIRDY: u32 = 1 << 1;
@@ -137,9 +143,9 @@ fn release_peripherals() {
     while read(CR) & HSIRDY == 0 {}
     write(CFGR, 0);
     while read(CFGR) & SWS != 0 {}
-    write(CR, 0x83);
+    write(CR, reset::RCC_CR);
     while read(CR) & PLLRDY != 0 {}
-    write(PLLCFGR, 0x2400_3010);
+    write(PLLCFGR, reset::RCC_PLLCFGR);
     write(CIR, 0);
     for (resets, clocks, after) in BUSES {
         write(RCC + resets, u32::MAX);

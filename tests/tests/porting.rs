@@ -227,6 +227,14 @@ const MISTAKES: &[Mistake] = &[
         by: By::Board,
         says: "board: the flash needs a wait state for every 30 MHz",
     },
+    // RM0390, register boundary addresses: ports A to H.
+    Mistake {
+        file: BOARD,
+        right: "('C', 13, false)",
+        wrong: "('I', 13, false)",
+        by: By::Board,
+        says: "board: the chip has no such pin as ENTRY_STRAP names",
+    },
     // DS10693 table 11: PB7 has no CAN1.
     Mistake {
         file: BOARD,

@@ -19,6 +19,7 @@ pub static CHIP: Geometry = Geometry {
         SectorRun { count: 7, size: 0x800 },
     ],
     interrupts: 4,
+    ports: 1,
     ..STM32F407VG
 };
 

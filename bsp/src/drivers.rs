@@ -1,0 +1,45 @@
+//! What is done to every board in the same way; the board file has the numbers and the pins.
+
+use stm32f4xx_hal::can::Can;
+use stm32f4xx_hal::pac;
+use stm32f4xx_hal::prelude::*;
+use stm32f4xx_hal::rcc::{Config, Rcc, RccExt};
+
+use crate::{Led, CAN_CLOCK, CLOCK_TREE, ENTRY_STRAP, SYSCLK};
+
+/// The CAN controller that coboot talks through.
+pub type CanController = Can<pac::CAN1>;
+
+/// The board's parts, set up by its `init`.
+pub struct Board {
+    /// The CAN controller with its pins; clocked, not yet configured.
+    pub can: CanController,
+    /// The LED.
+    pub led: Led,
+}
+
+/// The clocks as the HAL knows them, for the HAL's drivers. From the state after a reset.
+#[must_use]
+pub fn clocks(rcc: pac::RCC) -> Rcc {
+    let hse = Config::hse(CLOCK_TREE.hse.Hz());
+    let hse = if CLOCK_TREE.hse_bypass { hse.bypass_hse_oscillator() } else { hse };
+    rcc.freeze(hse.sysclk(SYSCLK.Hz()).pclk1(CAN_CLOCK.Hz()))
+}
+
+/// Whether the entry strap ([`ENTRY_STRAP`]) asks for the bootloader. Leaves its port as after a reset.
+#[must_use]
+pub fn entry_strap(rcc: &pac::RCC) -> bool {
+    const PORT: u32 = ENTRY_STRAP.0 as u32 - 'A' as u32;
+    /// The ports lie behind one another (RM0090 and RM0390, register boundary addresses), and the switches of their clocks in the
+    /// same order (RCC_AHB1ENR).
+    const IDR: *const u32 = (0x4002_0010 + 0x400 * PORT) as *const u32;
+    // SAFETY: switches on the clock of a port that nobody uses before the board's `init`.
+    rcc.ahb1enr().modify(|r, w| unsafe { w.bits(r.bits() | 1 << PORT) });
+    // The clock needs two cycles before the first access: reading back waits that long.
+    let _ = rcc.ahb1enr().read();
+    // SAFETY: the inputs of a port that the chip has (`lib.rs` looks) are read, and nothing is changed.
+    let inputs = unsafe { IDR.read_volatile() };
+    // SAFETY: and off again.
+    rcc.ahb1enr().modify(|r, w| unsafe { w.bits(r.bits() & !(1 << PORT)) });
+    (inputs & 1 << ENTRY_STRAP.1 != 0) == ENTRY_STRAP.2
+}
