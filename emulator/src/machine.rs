@@ -455,6 +455,12 @@ impl Machine {
         }
     }
 
+    /// The word of a peripheral's or the core's register as a load would give it, whether the peripheral has a clock or not; `None`
+    /// where nothing is modelled. What a load does to a register is done, so this is for machines that are looked at and left.
+    pub fn register(&mut self, address: u32) -> Option<u32> {
+        self.cpu.chip_mut().register(address)
+    }
+
     /// Writes into RAM.
     ///
     /// # Errors

@@ -82,7 +82,8 @@ pub fn run(mut args: Args) -> Outcome {
 }
 
 /// The test programs that every board goes through each time: what a port can get wrong shows in them.
-const MAIN_TESTS: [&str; 6] = ["main_job", "device", "watchdog", "boot_time", "abi", "c_application"];
+const MAIN_TESTS: [&str; 7] =
+    ["main_job", "device", "watchdog", "boot_time", "abi", "c_application", "handover"];
 
 /// What has been tested so far, and what the tests need to know.
 struct Suite {

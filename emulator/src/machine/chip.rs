@@ -604,6 +604,16 @@ impl Chip {
         result
     }
 
+    /// The word of a register as a load would give it, whether its block has a clock or not; `None` where nothing is modelled.
+    /// What a load does to the register is done.
+    pub fn register(&mut self, address: u32) -> Option<u32> {
+        let now = self.now();
+        match self.place(address & !3) {
+            Place::Block { block, offset, .. } => self.block_mut(block).read(offset, now).ok(),
+            _ => self.load_word(address & !3).ok(),
+        }
+    }
+
     fn store_word(&mut self, address: u32, value: u32) -> Result<(), Unmodelled> {
         let now = self.now();
         match self.place(address) {

@@ -321,7 +321,9 @@ impl Peripheral for Rcc {
             }
             _ => {
                 let index = self.position(offset).ok_or_else(|| self.unknown())?;
-                self.plain[index] = value & self.variant.rcc[index].2;
+                // Reserved bits stay what they are after a reset.
+                let (_, reset, bits) = self.variant.rcc[index];
+                self.plain[index] = value & bits | reset & !bits;
             }
         }
         Ok(())

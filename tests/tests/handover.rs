@@ -1,0 +1,132 @@
+//! What a program finds when it is jumped to: a chip as after a reset, register by register.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+use canopen::program::ProgramControl;
+use canopen::Address;
+use coboot_tests::bench::Bench;
+use coboot_tests::firmware;
+use coflash::convert::{blocks_of, Options};
+use coflash::flash::{flash, FlashOptions};
+use coflash::read::{read, Format};
+use coflash::session::Doing;
+
+/// The application template's way back (object 2000h), and that of the three which is a jump.
+const WAY_BACK: Address = Address::new(0x2000, 0);
+const JUMP: u8 = 2;
+
+/// A jump to itself, in Thumb.
+const HERE: [u8; 2] = [0xFE, 0xE7];
+
+const RCC: u32 = 0x4002_3800;
+const AHB1ENR: u32 = RCC + 0x30;
+const APB1ENR: u32 = RCC + 0x40;
+const FLASH_ACR: u32 = 0x4002_3C00;
+const CAN_MCR: u32 = 0x4000_6400;
+/// All GPIO ports.
+const PORTS: Range<u32> = 0x4002_0000..0x4002_2C00;
+const SYST_CSR: u32 = 0xE000_E010;
+const NVIC_ISER: u32 = 0xE000_E100;
+const VTOR: u32 = 0xE000_ED08;
+
+/// What a reset does not set, or sets to what the way to it was: the flags of the reset's cause (RCC_CSR), and reload and current
+/// value of SysTick (ARMv7-M B3.3: unknown).
+const LEFT_OUT: [u32; 3] = [RCC + 0x74, 0xE000_E014, 0xE000_E018];
+
+/// All registers that the emulator models, of peripherals and core, with or without clock. Not what tells time: the cycle counter
+/// lies outside.
+fn registers(bench: &mut Bench) -> BTreeMap<u32, u32> {
+    let addresses = (0x4000_0000..0x4008_0000).chain(0xE000_E000..0xE000_F000).step_by(4);
+    addresses
+        .filter(|address| !LEFT_OUT.contains(address))
+        .filter_map(|address| Some((address, bench.machine().register(address)?)))
+        .collect()
+}
+
+/// Puts an endless loop in the place of a program's first instruction; gives its address.
+fn stop_at_reset_of(bench: &mut Bench, table: u32) -> u32 {
+    let mut vector = [0; 4];
+    bench.machine().read_memory(table + 4, &mut vector).unwrap();
+    let first = u32::from_le_bytes(vector) & !1;
+    bench.machine().load_bin(first, &HERE).unwrap();
+    first
+}
+
+/// The registers in which two chips differ, in words.
+fn differences(found: &BTreeMap<u32, u32>, reset: &BTreeMap<u32, u32>) -> Vec<String> {
+    assert_eq!(found.len(), reset.len(), "the same registers are there");
+    let differ = found.iter().filter(|(address, value)| reset[address] != **value);
+    differ.map(|(address, value)| format!("{address:08X}: {value:08X}, not {:08X}", reset[address])).collect()
+}
+
+/// A board that runs an application.
+fn running_board() -> Bench {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let blocks = firmware::blocks(firmware::APP_V1);
+    flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).unwrap();
+    bench.events();
+    bench
+}
+
+/// The registers at the bootloader's first instruction after a reset.
+fn after_a_reset(bench: &mut Bench) -> BTreeMap<u32, u32> {
+    let first = stop_at_reset_of(bench, firmware::board().bootloader.base);
+    bench.machine().reset_pin();
+    bench.run_ms(10);
+    assert_eq!(bench.machine().pc(), first);
+    registers(bench)
+}
+
+/// An application that jumps leaves everything as a reset does: clocks, pins, peripherals, interrupts.
+#[test]
+fn the_bootloader_finds_the_chip_as_after_a_reset() {
+    let mut bench = running_board();
+    bench.session().write(WAY_BACK, &[JUMP], Doing::Write(WAY_BACK), &mut |_| {}).unwrap();
+    let running = registers(&mut bench);
+    let first = stop_at_reset_of(&mut bench, firmware::board().bootloader.base);
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    bench.run_ms(100);
+    assert_eq!(bench.events(), [], "there is no reset");
+    assert_eq!(bench.machine().pc(), first);
+    let found = registers(&mut bench);
+    let reset = after_a_reset(&mut bench);
+    // There was something to put back: the clocks, the controller, a pin, the interrupts, the timer, the caches.
+    for register in [RCC, AHB1ENR, APB1ENR, FLASH_ACR, CAN_MCR, SYST_CSR, NVIC_ISER, VTOR] {
+        assert_ne!(running[&register], reset[&register], "{register:08X}");
+    }
+    assert!(running.range(PORTS).any(|(register, value)| reset[register] != *value), "pins");
+    let differences = differences(&found, &reset);
+    assert!(differences.is_empty(), "{differences:#?}");
+}
+
+/// And the boot stage, which has looked at the strap and checked the program at full speed, leaves the same to the application, but
+/// for the place of the vector table.
+#[test]
+fn the_application_finds_the_chip_as_after_a_reset() {
+    let program = firmware::board().programs[0].base;
+    let first = program + 0x200;
+    // A program that does nothing: a vector table and a loop. It does nothing to the registers either.
+    let mut image = vec![0; 0x400];
+    image[..4].copy_from_slice(&firmware::board().ram.end().to_le_bytes());
+    image[4..8].copy_from_slice(&(first | 1).to_le_bytes());
+    image[0x200..0x202].copy_from_slice(&HERE);
+    let image = read(&image, Some(Format::Raw), Some(program)).unwrap();
+    let blocks = blocks_of(image, &Options::default()).unwrap().file;
+
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let options = FlashOptions { start: false, ..FlashOptions::default() };
+    flash(&mut bench.session(), &blocks, &options, &mut |_| {}).unwrap();
+    bench.machine().reset_pin();
+    bench.run_ms(100);
+    assert_eq!(bench.machine().pc(), first, "it was started");
+    let found = registers(&mut bench);
+    let mut reset = after_a_reset(&mut bench);
+    assert_eq!(reset.insert(VTOR, program), Some(0));
+    let differences = differences(&found, &reset);
+    assert!(differences.is_empty(), "{differences:#?}");
+}
