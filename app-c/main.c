@@ -47,11 +47,12 @@ enum { PROGRAM_START_BOOTLOADER = 0x80, PROGRAM_SET_SIGNATURE = 0x83, PROGRAM_CL
 static volatile uint32_t now_ms;
 
 static uint8_t node_id = DEFAULT_NODE_ID;
+static uint8_t program_number = 1;
 static uint8_t nmt_state = PRE_OPERATIONAL;
 
 /* The way out: first the answer, then a while in which nothing is said any more, then the reset. */
 static enum { STAYING, ANSWERING, LEAVING } departure;
-static uint32_t departure_request;
+static uint32_t departure_request, departure_argument;
 static uint32_t leave_at_ms;
 
 /* Values of the object dictionary. */
@@ -132,18 +133,26 @@ static enum abort_code find(uint16_t index, uint8_t sub, const struct object **f
 }
 
 /* The 1F51h callback. It runs before the answer is sent, so it only notes what is to be done. */
+static enum abort_code depart_with(uint32_t request, uint32_t argument)
+{
+    departure = ANSWERING;
+    departure_request = request;
+    departure_argument = argument;
+    return GOOD;
+}
+
 static enum abort_code program_control(uint32_t command)
 {
     switch (command) {
     case PROGRAM_START_BOOTLOADER:
-        departure = ANSWERING;
-        departure_request = COBOOT_REQUEST_STAY;
-        return GOOD;
+    case PROGRAM_STOP: /* The bootloader runs instead. */
+        return depart_with(COBOOT_REQUEST_STAY, 0);
     case PROGRAM_START: /* It runs already. */
         return GOOD;
-    case PROGRAM_STOP:
-    case PROGRAM_RESET_STAT:
-    case PROGRAM_CLEAR:
+    case PROGRAM_RESET_STAT: /* CiA 302-3: reset program, which starts it anew. */
+        return depart_with(COBOOT_REQUEST_START, program_number);
+    case PROGRAM_CLEAR: /* The bootloader carries it out. */
+        return depart_with(COBOOT_REQUEST_CLEAR, program_number);
     case PROGRAM_SET_SIGNATURE:
     case PROGRAM_CLR_SIGNATURE: /* The bootloader's to do. */
         return ABORT_DEVICE_STATE;
@@ -256,8 +265,7 @@ static void nmt(const struct can_frame *frame)
     case NMT_RESET_NODE:
     case NMT_RESET_COMMUNICATION:
         /* There is little to reset: both go through a reset that nobody takes for a crash. */
-        departure = ANSWERING;
-        departure_request = COBOOT_REQUEST_POWER_ON;
+        (void)depart_with(COBOOT_REQUEST_POWER_ON, 0);
         break;
     default:
         break;
@@ -284,7 +292,7 @@ static bool depart(void)
         leave_at_ms = now_ms + FAREWELL_MS;
     }
     if (departure == LEAVING && (int32_t)(now_ms - leave_at_ms) >= 0) {
-        coboot_reset(departure_request, 0);
+        coboot_reset(departure_request, departure_argument);
     }
     return departure != STAYING;
 }
@@ -333,14 +341,19 @@ void main(void)
 
     if (coboot_read_handoff(&handoff)) {
         node_id = handoff.node_id;
+        program_number = (uint8_t)handoff.program;
         identity[4] = handoff.serial_number;
         if (handoff.bit_rate != 0) {
             bit_rate = handoff.bit_rate;
         }
     }
     const struct coboot_callgate *gate = coboot_callgate();
+    /* What the bootloader has verified is larger than this image where more was downloaded with it. */
     const uint32_t start = (uint32_t)(uintptr_t)&__vector_table, end = (uint32_t)(uintptr_t)&__image_end;
-    if (gate != NULL && coboot_crc32(gate, start, end - start, &program_crc) != COBOOT_STATUS_OK) {
+    struct coboot_program program;
+    if (gate != NULL && coboot_program_info(gate, program_number, &program) == COBOOT_STATUS_OK) {
+        program_crc = program.crc;
+    } else if (gate != NULL && coboot_crc32(gate, start, end - start, &program_crc) != COBOOT_STATUS_OK) {
         program_crc = 0;
     }
     probe_init();

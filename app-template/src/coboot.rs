@@ -1,7 +1,7 @@
 //! Everything between this application and the bootloader underneath: how it came up, what it may call, and the
 //! way back.
 
-use core::sync::atomic::{AtomicU8, Ordering};
+use core::sync::atomic::{AtomicU32, Ordering};
 
 use bsp::can::BitTiming;
 use bsp::{BIT_RATE, CAN_CLOCK, LAYOUT, NODE_ID};
@@ -10,7 +10,7 @@ use shared_abi::callgate::{Callgate, CallgateError, NodeArgs, ProgramArgs};
 use shared_abi::handoff::Handoff;
 use shared_abi::layout::Layout;
 use shared_abi::reentry;
-use shared_abi::warm_start::BootRequest;
+use shared_abi::warm_start::{BootRequest, WarmStart};
 
 /// How long the device stays after the answer to 80h is on the bus, in ms: at least 10 (SYS TEC manual L-1112d_10,
 /// 4.5), and one
@@ -64,15 +64,16 @@ pub fn how_we_came_up(layout: &Layout) -> Start {
     }
 }
 
-/// CRC over this program in flash, computed by the bootloader through its callgate: what 1F56h reads there as well.
-/// `None` without a bootloader.
-pub fn own_crc(layout: &Layout) -> Option<u32> {
+/// What 1F56h reads in the bootloader as well: the CRC over what was downloaded as this program. Without that (a debugger has put the
+/// program there), over the program as it was linked, computed through the callgate; 0 without a bootloader.
+pub fn program_crc(number: u8) -> u32 {
     extern "C" {
         static __vector_table: u8;
         static __image_end: u8;
     }
     let (start, end) = (&raw const __vector_table as u32, &raw const __image_end as u32);
-    Callgate::find(layout).ok()?.crc32(start, end - start).ok()
+    let computed = || Callgate::find(LAYOUT)?.crc32(start, end - start);
+    program_info(number).map(|info| info.crc).or_else(|_| computed()).unwrap_or(0)
 }
 
 /// Stores node-ID and bit rate for bootloader and application; `None` and [`BitRate::Auto`] as layer setting
@@ -107,15 +108,6 @@ pub fn confirm(number: u8, content: bool) -> Result<(), CallgateError> {
     }
 }
 
-/// Where the device goes.
-#[derive(Clone, Copy, Debug)]
-pub enum Destination {
-    /// Into the bootloader, which stays.
-    Bootloader(Way),
-    /// Through a reset, as after a power-on: nobody has crashed.
-    Reset,
-}
-
 /// How the device goes back into the bootloader (`shared_abi::reentry`).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Way {
@@ -146,47 +138,40 @@ pub enum Departure {
     /// The device stays.
     Staying,
     /// What is to be said first is not on the bus yet.
-    Answering(Destination),
+    Answering(Way, BootRequest),
     /// The device leaves at this time. A frame that began now would be cut off by the reset.
-    Leaving(Destination, Instant),
+    Leaving(Way, BootRequest, Instant),
 }
 
 impl Departure {
     /// Goes on with it: `quiet` says that everything is on the bus. Whether the device is silent from now on.
     pub fn proceed(&mut self, quiet: bool, now: Instant) -> bool {
         match *self {
-            Self::Answering(destination) if quiet => *self = Self::Leaving(destination, now + FAREWELL_MS),
-            Self::Leaving(destination, at) if now.has_reached(at) => leave_by_idle(destination),
+            Self::Answering(way, request) if quiet => *self = Self::Leaving(way, request, now + FAREWELL_MS),
+            Self::Leaving(way, request, at) if now.has_reached(at) => leave_by_idle(way, request),
             _ => {}
         }
         matches!(self, Self::Leaving(..))
     }
 }
 
-/// Told to `idle`, where no exception is active: 0 to stay, else one of these.
-static LEAVING: AtomicU8 = AtomicU8::new(0);
-const RESET: u8 = 1;
-const SYSTEM_RESET: u8 = 2;
-const WATCHDOG: u8 = 3;
-const JUMP: u8 = 4;
+/// Told to `idle`, where no exception is active: 0 to stay, else the way (1 to 3), and from bit 8 on the request as the
+/// warm-start cell has it, from bit 16 on its argument.
+static LEAVING: AtomicU32 = AtomicU32::new(0);
 
-fn leave_by_idle(destination: Destination) {
-    let how = match destination {
-        Destination::Reset => RESET,
-        Destination::Bootloader(Way::SystemReset) => SYSTEM_RESET,
-        Destination::Bootloader(Way::Watchdog) => WATCHDOG,
-        Destination::Bootloader(Way::Jump) => JUMP,
-    };
-    LEAVING.store(how, Ordering::Relaxed);
+fn leave_by_idle(way: Way, request: BootRequest) {
+    let WarmStart { request, argument, .. } = WarmStart::new(request);
+    LEAVING.store((way as u32 + 1) | request << 8 | argument << 16, Ordering::Relaxed);
 }
 
 /// To be called by `idle` whenever it wakes. Does not return if the device is to leave.
 pub fn leave_if_told() {
-    match LEAVING.load(Ordering::Relaxed) {
-        RESET => reentry::system_reset(LAYOUT, BootRequest::PowerOn),
-        SYSTEM_RESET => reentry::system_reset(LAYOUT, BootRequest::Stay),
-        WATCHDOG => reentry::watchdog_reset(LAYOUT, BootRequest::Stay),
-        JUMP => reentry::jump(LAYOUT, BootRequest::Stay),
-        _ => {}
+    let told = LEAVING.load(Ordering::Relaxed);
+    let Some(way) = (told as u8).checked_sub(1).and_then(Way::from_number) else { return };
+    let request = WarmStart::encode(told >> 8 & 0xFF, told >> 16).request().unwrap_or(BootRequest::Stay);
+    match way {
+        Way::SystemReset => reentry::system_reset(LAYOUT, request),
+        Way::Watchdog => reentry::watchdog_reset(LAYOUT, request),
+        Way::Jump => reentry::jump(LAYOUT, request),
     }
 }

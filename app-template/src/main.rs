@@ -39,7 +39,9 @@ mod app {
     use rtic_monotonics::Monotonic;
 
     use super::Mono;
-    use crate::coboot::{self, Departure, Destination};
+    use shared_abi::warm_start::BootRequest;
+
+    use crate::coboot::{self, Departure, Way};
     use crate::objects::{Application, HEARTBEAT_MS};
 
     /// Frames that may wait for the protocol task.
@@ -136,12 +138,12 @@ mod app {
         carry_out(slave, &mut can, now, application);
         while let Some(frame) = to_handle.dequeue() {
             if slave.handle(&frame, now, application) {
-                *departure = Departure::Answering(Destination::Reset);
+                *departure = Departure::Answering(Way::SystemReset, BootRequest::PowerOn);
             }
             carry_out(slave, &mut can, now, application);
         }
-        if let Some(way) = application.take_called_back() {
-            *departure = Departure::Answering(Destination::Bootloader(way));
+        if let Some((way, request)) = application.take_leave() {
+            *departure = Departure::Answering(way, request);
         }
     }
 

@@ -2,7 +2,7 @@
 
 use core::task::Poll;
 
-use bsp::{IDENTITY, LAYOUT};
+use bsp::IDENTITY;
 use canopen::device::Device;
 use canopen::emcy::Emcy;
 use canopen::line::LineEvent;
@@ -14,6 +14,7 @@ use canopen::program::{
 use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, BitRate, NodeId};
 use shared_abi::callgate::PROGRAM_SIGNED;
+use shared_abi::warm_start::BootRequest;
 
 use crate::coboot::{self, Start, Way};
 use crate::entries::{CONFIRMATION, ENTRIES, WAY_BACK};
@@ -33,7 +34,7 @@ pub struct Application {
     program: u8,
     /// The way back into the bootloader (2000h).
     way: Way,
-    called_back: bool,
+    leave_for: Option<BootRequest>,
     emcy: Emcy,
     /// Node-ID in force.
     id: Option<NodeId>,
@@ -57,10 +58,10 @@ impl Application {
         };
         Self {
             device,
-            program_crc: coboot::own_crc(LAYOUT).unwrap_or(0),
+            program_crc: coboot::program_crc(start.program),
             program: start.program,
             way: Way::default(),
-            called_back: false,
+            leave_for: None,
             bit_rate: start.bit_rate,
             emcy: Emcy::new(),
             id: start.node_id,
@@ -72,25 +73,30 @@ impl Application {
         self.device.lss_address()
     }
 
-    /// Whether and how the device shall go back to the bootloader, once.
-    pub fn take_called_back(&mut self) -> Option<Way> {
-        core::mem::take(&mut self.called_back).then_some(self.way)
+    /// Whether, how and with which request the device shall go back to the bootloader, once.
+    pub fn take_leave(&mut self) -> Option<(Way, BootRequest)> {
+        self.leave_for.take().map(|request| (self.way, request))
     }
 
     /// The 1F51h callback. It runs before the SDO answer is sent, so it only notes what is to be done: `main`
     /// waits until
     /// the answer is on the bus, then leaves.
     fn program_control(&mut self, command: ProgramControl) -> Result<(), AbortCode> {
-        match command {
-            ProgramControl::StartBootloader => {
-                self.called_back = true;
-                Ok(())
-            }
+        self.leave_for = Some(match command {
+            // While a program is stopped the bootloader runs.
+            ProgramControl::StartBootloader | ProgramControl::Stop => BootRequest::Stay,
+            // CiA 302-3 calls it "reset program", which starts it anew.
+            ProgramControl::ResetStat => BootRequest::Start(self.program),
+            // The bootloader carries it out.
+            ProgramControl::Clear => BootRequest::Clear(self.program),
             // It runs already.
-            ProgramControl::Start => Ok(()),
+            ProgramControl::Start => return Ok(()),
             // The bootloader's to do; this program cannot do it to itself.
-            _ => Err(AbortCode::DEVICE_STATE),
-        }
+            ProgramControl::SetSignature | ProgramControl::ClrSignature => {
+                return Err(AbortCode::DEVICE_STATE)
+            }
+        });
+        Ok(())
     }
 }
 

@@ -202,6 +202,14 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         self.download.busy()
     }
 
+    /// 1F51h: a command, as if it had been written.
+    ///
+    /// # Errors
+    /// The abort that would answer it.
+    pub fn command(&mut self, program: u8, command: ProgramControl) -> Result<(), AbortCode> {
+        self.download.command(program, command)
+    }
+
     /// Whether a reset now would take back what a host was told is done or under way.
     #[must_use]
     pub fn is_finishing(&self) -> bool {
@@ -256,7 +264,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
             return written;
         }
         match (at.index, data) {
-            (PROGRAM_CONTROL, &[value]) => self.download.command(at.sub, ProgramControl::try_from(value)?),
+            (PROGRAM_CONTROL, &[value]) => self.command(at.sub, ProgramControl::try_from(value)?),
             _ => Err(AbortCode::UNSUPPORTED_ACCESS),
         }
     }

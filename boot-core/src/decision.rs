@@ -124,7 +124,7 @@ pub fn decide(
     use BootDecision::{Start, Stay};
 
     match circumstances.request {
-        Some(BootRequest::Stay) => return Stay(StayReason::Requested),
+        Some(BootRequest::Stay | BootRequest::Clear(_)) => return Stay(StayReason::Requested),
         Some(BootRequest::Fault) => return Stay(StayReason::Fault),
         _ => {}
     }

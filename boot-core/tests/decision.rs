@@ -59,6 +59,7 @@ fn what_asks_for_the_bootloader_wins() {
     };
     let request = |request| Circumstances { request: Some(request), ..QUIET };
     assert_eq!(stay(request(BootRequest::Stay), policy()), StayReason::Requested);
+    assert_eq!(stay(request(BootRequest::Clear(1)), policy()), StayReason::Requested);
     assert_eq!(stay(Circumstances { strap: true, ..QUIET }, policy()), StayReason::Strap);
     assert_eq!(
         stay(Circumstances { strap: true, ..request(BootRequest::Start(1)) }, policy()),

@@ -46,7 +46,7 @@ mod app {
     use boot_core::canopen::line::{Confinement, Status, CONTROLLER_OVERRUN, QUEUE_OVERRUN};
     use boot_core::canopen::node::{self, NmtPolicy};
     use boot_core::canopen::od::Entry;
-    use boot_core::canopen::program::BOOTLOADER_DEVICE_TYPE;
+    use boot_core::canopen::program::{ProgramControl, BOOTLOADER_DEVICE_TYPE};
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant};
     use boot_core::download::{Policy, Step};
@@ -154,7 +154,7 @@ mod app {
             },
             ..slave::Config::default()
         };
-        let bootloader = Bootloader::new(
+        let mut bootloader = Bootloader::new(
             &CONFIG,
             bsp::serial_number(),
             node,
@@ -163,6 +163,10 @@ mod app {
             flash,
             cx.local.blocks,
         );
+        if let Some(program) = start::program_to_clear() {
+            // Acknowledged by the application; what becomes of it is in 1F57h.
+            let _ = bootloader.command(program, ProgramControl::Clear);
+        }
         let slave = Slave::new(bootloader.lss_address(), node.id, node.bit_rate, slave_config);
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();

@@ -55,6 +55,12 @@ pub fn stay_reason() -> u8 {
     STAY_REASON.load(Ordering::Relaxed) as u8
 }
 
+/// The program whose CLEAR was asked of the application.
+pub fn program_to_clear() -> Option<u8> {
+    let program = (STAY_REASON.load(Ordering::Relaxed) >> 16) as u8;
+    (program > 0).then_some(program)
+}
+
 /// The program that starts when the rescue window is over.
 pub fn program_in_waiting() -> Option<u8> {
     let program = (STAY_REASON.load(Ordering::Relaxed) >> 8) as u8;

@@ -26,6 +26,8 @@ pub enum BootRequest {
     /// Go on with the start of program `n`, which was held back for a rescue window; the bootloader asks this of
     /// itself.
     Resume(u8),
+    /// Stay, and carry out CLEAR of program `n`, which was asked of the application (1F51h = 3).
+    Clear(u8),
 }
 
 /// The cell as it lies in RAM: 16 bytes, little-endian.
@@ -34,9 +36,9 @@ pub enum BootRequest {
 pub struct WarmStart {
     /// [`MAGIC`].
     pub magic: u32,
-    /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume.
+    /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume, 7 clear.
     pub request: u32,
-    /// The program number of a trial, start or resume (1 to 254), 0 otherwise.
+    /// The program number of a trial, start, resume or clear (1 to 254), 0 otherwise.
     pub argument: u32,
     /// [`check_word`] over the three words before.
     pub check: u32,
@@ -56,7 +58,14 @@ impl WarmStart {
             BootRequest::Fault => (4, 0),
             BootRequest::PowerOn => (5, 0),
             BootRequest::Resume(program) => (6, program as u32),
+            BootRequest::Clear(program) => (7, program as u32),
         };
+        Self::encode(request, argument)
+    }
+
+    /// The cell with these words, whatever they ask for.
+    #[must_use]
+    pub const fn encode(request: u32, argument: u32) -> Self {
         let check = check_word(&[MAGIC, request, argument]);
         Self { magic: MAGIC, request, argument, check }
     }
@@ -73,6 +82,7 @@ impl WarmStart {
             (4, Some(0)) => BootRequest::Fault,
             (5, Some(0)) => BootRequest::PowerOn,
             (6, Some(program @ 1..=254)) => BootRequest::Resume(program),
+            (7, Some(program @ 1..=254)) => BootRequest::Clear(program),
             _ => return None,
         };
         // One encoder decides what is well-formed: magic, words and check must be exactly its.
@@ -133,6 +143,7 @@ mod tests {
             BootRequest::Fault,
             BootRequest::PowerOn,
             BootRequest::Resume(2),
+            BootRequest::Clear(3),
         ];
         for request in requests {
             let mut ram = WarmStart::EMPTY;
@@ -169,7 +180,7 @@ mod tests {
     #[test]
     fn a_well_checked_request_for_an_impossible_program_is_refused() {
         for (request, argument) in
-            [(1, 1), (2, 0), (2, 255), (3, 0), (3, 256), (0, 0), (4, 1), (5, 1), (6, 0), (7, 0)]
+            [(1, 1), (2, 0), (2, 255), (3, 0), (3, 256), (0, 0), (4, 1), (5, 1), (6, 0), (7, 0), (8, 1)]
         {
             let check = check_word(&[MAGIC, request, argument]);
             let cell = WarmStart { magic: MAGIC, request, argument, check };

@@ -5,5 +5,6 @@ pub mod call_back;
 pub mod eds;
 pub mod endpoint;
 pub mod firmware;
+pub mod ihex;
 pub mod powercut;
 pub mod throughput;

@@ -144,8 +144,12 @@ pub fn load(rate: BitRate, kib: u32, block_size: usize) -> Load {
     Load { bit_rate, kib, block_size, took, busy, frames: frames.len() }
 }
 
-/// The application, filled up with bytes that stuff as code does.
-fn program(kib: u32) -> Vec<u8> {
+/// The application, filled up to so many KiB with bytes that stuff as code does.
+///
+/// # Panics
+/// If it was not built.
+#[must_use]
+pub fn program(kib: u32) -> Vec<u8> {
     let base = firmware::board().programs[0].base;
     let elf = firmware::elf(firmware::APP_V1);
     let Firmware::Image(image) = read(&elf, None, None).expect("an ELF of ours") else {

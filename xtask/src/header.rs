@@ -122,6 +122,7 @@ fn warm_start() -> String {
             ("REQUEST_TRIAL", request(BootRequest::Trial(1))),
             ("REQUEST_START", request(BootRequest::Start(1))),
             ("REQUEST_POWER_ON", request(BootRequest::PowerOn)),
+            ("REQUEST_CLEAR", request(BootRequest::Clear(1))),
         ])
         + "\n"
         + &structure!("coboot_warm_start", WarmStart, magic, request, argument, check)

@@ -17,8 +17,7 @@ use crate::flash::FlashController;
 use crate::product::{self, NO_NODE_ID, POLICY, PROGRAM_WATCHDOG_MS, RESCUE_WINDOW_MS};
 
 /// Decides. Does not come back if a program is to run; else tells why the bootloader stays ([`StayReason::code`]),
-/// and in the next byte
-/// which program waits for the end of the rescue window.
+/// in the next byte which program waits for the end of the rescue window, and in the one behind that which is to be cleared.
 pub extern "C" fn stage() -> u32 {
     // SAFETY: nothing else runs yet; the rest of the bootloader takes them after this has returned.
     let (rcc, iwdg) = unsafe { (pac::RCC::steal(), pac::IWDG::steal()) };
@@ -44,7 +43,10 @@ pub extern "C" fn stage() -> u32 {
     CLOCK_TREE.slow_down(&rcc);
     flash.release(&rcc);
     match decision {
-        BootDecision::Stay(reason) => reason.code().into(),
+        BootDecision::Stay(reason) => {
+            let clear = if let Some(BootRequest::Clear(program)) = request { program } else { 0 };
+            u32::from(reason.code()) | u32::from(clear) << 16
+        }
         BootDecision::Start { program, .. } if RESCUE_WINDOW_MS.is_some() && request.is_none() => {
             u32::from(StayReason::Rescue.code()) | u32::from(program.number()) << 8
         }

@@ -244,7 +244,7 @@ impl Host<'_, '_> {
         self.ended(program)
     }
 
-    /// A block, in SDO segments, and what becomes of it.
+    /// A block, or a whole program, in SDO segments, and what becomes of it.
     ///
     /// # Errors
     /// The abort or the status.
@@ -252,6 +252,9 @@ impl Host<'_, '_> {
         let at = Address::new(0x1F50, program);
         self.node.download_start(at, Some(block.len() as u32)).map_err(told)?;
         for segment in block.chunks(7) {
+            while self.node.download_space(at, false) < segment.len() {
+                self.node.step();
+            }
             if let Err(abort) = self.node.download_data(at, segment) {
                 self.node.download_cancel(at);
                 return Err(told(abort));

@@ -5,6 +5,8 @@ use boot_core::crc32;
 use boot_core::node::NodeParameters;
 use boot_core::parameters::Key;
 
+use crate::ihex::intel_hex;
+
 use super::device::{image, Device, Outcome, BOARD_NODE, LAYOUT, PRODUCT_CODE, VENDOR_ID};
 
 /// Seed of the program that is there before an update.
@@ -158,6 +160,21 @@ fn update(device: &mut Device, tell: Tell<'_>) -> Result<(), String> {
     Ok(())
 }
 
+/// An update of program 1 in one go.
+fn update_at_once(device: &mut Device, data: Vec<u8>, tell: Tell<'_>) -> Result<(), String> {
+    download(device, 1, &[data], || tell(allowed(&[START_OLD, STAY, START_NEW])))?;
+    tell(allowed(&[START_NEW]));
+    Ok(())
+}
+
+fn raw() -> Vec<u8> {
+    image(1, NEW)
+}
+
+fn hex() -> Vec<u8> {
+    intel_hex(LAYOUT.programs[0].base, &image(1, NEW)).into_bytes()
+}
+
 /// The same after a cut, when nobody knows what is there.
 fn update_after_a_cut(device: &mut Device, _: &Allowed, tell: Tell<'_>) -> Result<(), String> {
     download(device, 1, &good(1, NEW), || tell(allowed(&[START_OLD, STAY, START_NEW])))?;
@@ -193,6 +210,28 @@ pub const SCENARIOS: &[Scenario] = &[
             update(device, tell)
         },
         recover: update_after_a_cut,
+        end: || allowed(&[START_NEW]),
+    },
+    Scenario {
+        name: "raw",
+        about: "another program as a raw image, which is valid without a signature command",
+        prepare: |device| install(device, 1, OLD, true),
+        act: |device, tell| {
+            tell(allowed(&[START_OLD]));
+            update_at_once(device, raw(), tell)
+        },
+        recover: |device, _, tell| update_at_once(device, raw(), tell),
+        end: || allowed(&[START_NEW]),
+    },
+    Scenario {
+        name: "hex",
+        about: "another program as Intel HEX",
+        prepare: |device| install(device, 1, OLD, true),
+        act: |device, tell| {
+            tell(allowed(&[START_OLD]));
+            update_at_once(device, hex(), tell)
+        },
+        recover: |device, _, tell| update_at_once(device, hex(), tell),
         end: || allowed(&[START_NEW]),
     },
     Scenario {

@@ -1,0 +1,172 @@
+//! A whole program in one SDO download, with the real images: raw and Intel HEX, segmented and in blocks.
+
+use canopen::{Address, BitRate};
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::ihex::intel_hex;
+use coboot_tests::{firmware, throughput};
+use coflash::session::{Doing, Transfers};
+use emulator::machine::{FlashTimes, Options};
+use emulator::time::{Span, Time};
+
+const DATA: Address = Address::new(0x1F50, 1);
+const CONTROL: Address = Address::new(0x1F51, 1);
+const IDENTIFICATION: Address = Address::new(0x1F56, 1);
+const VERSION: Address = Address::new(0x100A, 0);
+const REQUEST: u32 = 0x600 + NODE as u32;
+const RESPONSE: u32 = 0x580 + NODE as u32;
+const HEARTBEAT: u32 = 0x700 + NODE as u32;
+
+const CLEAR: u8 = 3;
+const RESET: u8 = 2;
+
+fn write(bench: &mut Bench, at: Address, data: &[u8], transfers: Transfers) {
+    let mut session = bench.session();
+    session.transfer_by(transfers);
+    session.write(at, data, Doing::Block(0), &mut |_| {}).unwrap();
+}
+
+fn board_at_1_mbit(options: Options) -> Bench {
+    let mut bench = Bench::with(options);
+    let board = bench.boards()[0];
+    bench.commission(board, NODE, BitRate::K1000);
+    bench.set_host_bit_rate(1_000_000);
+    bench.power_on();
+    bench.run_ms(50);
+    bench
+}
+
+/// CRC-32/ISO-HDLC, by the crate of that name.
+fn crc32(bytes: &[u8]) -> u32 {
+    crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(bytes)
+}
+
+/// A master that knows CiA 302-3 alone: clear, one download, and 1F51h = 2 right behind it, without asking for 1F57h.
+#[test]
+fn a_program_in_one_download_starts_by_reset_program() {
+    let raw = throughput::program(20);
+    let hex = intel_hex(firmware::board().programs[0].base, &raw).into_bytes();
+    for (data, transfers) in [
+        (&raw, Transfers::Segments),
+        (&raw, Transfers::Blocks),
+        (&hex, Transfers::Segments),
+        (&hex, Transfers::Blocks),
+    ] {
+        let mut bench = board_at_1_mbit(Options::default());
+        assert_eq!(bench.session().read_number(CONTROL).unwrap(), 3, "no program");
+        write(&mut bench, CONTROL, &[CLEAR], transfers);
+        write(&mut bench, DATA, data, transfers);
+        write(&mut bench, CONTROL, &[RESET], transfers);
+        bench.await_boot_up(2000);
+        let mut session = bench.session();
+        assert_eq!(session.read_text(VERSION).unwrap(), "1.0.0");
+        assert_eq!(session.read_number(CONTROL).unwrap(), 1, "running");
+        assert_eq!(session.read_number(IDENTIFICATION).unwrap(), crc32(&raw));
+        // Valid without a signature: it starts by itself.
+        bench.power_off();
+        bench.power_on();
+        bench.await_boot_up(1000);
+        assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0");
+        bench.assert_nothing_unmodelled();
+    }
+}
+
+/// The same with NMT reset node right behind the last segment.
+#[test]
+fn a_reset_right_behind_the_download_does_not_lose_it() {
+    let raw = throughput::program(20);
+    let mut bench = board_at_1_mbit(Options::default());
+    write(&mut bench, CONTROL, &[CLEAR], Transfers::Blocks);
+    write(&mut bench, DATA, &raw, Transfers::Blocks);
+    bench.post(0, &[0x81, NODE]);
+    bench.await_boot_up(2000);
+    assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0");
+}
+
+/// At 1 Mbit/s with a flash as slow as the data sheet allows, which the bus is twice as fast as: each answer comes within 5 ms
+/// nevertheless, and the heartbeat keeps its period within 10 %.
+#[test]
+fn never_silent_while_the_flash_is_slower_than_the_bus() {
+    let raw = throughput::program(300);
+    for transfers in [Transfers::Blocks, Transfers::Segments] {
+        let options = Options { flash_times: FlashTimes::Worst, ..Options::default() };
+        let mut bench = board_at_1_mbit(options);
+        let from = bench.time();
+        write(&mut bench, CONTROL, &[CLEAR], transfers);
+        write(&mut bench, DATA, &raw, transfers);
+        let to = bench.time();
+        let mut asked = from;
+        let mut slowest = Span(0);
+        let mut beats: Vec<Time> = Vec::new();
+        for (at, id, _) in bench.frames_since(from) {
+            match id {
+                REQUEST => asked = at,
+                RESPONSE => slowest = slowest.max(at - asked),
+                HEARTBEAT => beats.push(at),
+                _ => {}
+            }
+        }
+        assert!(slowest <= Span::from_millis(5), "{transfers:?}: {} us", slowest.0 / 1_000_000);
+        // Three sectors of 128 KiB and smaller ones, 2 s and more each.
+        assert!(to - from > Span::from_millis(8000), "{transfers:?}: the flash was not the slower one");
+        assert!(beats.len() >= 7, "{beats:?}");
+        for pair in beats.windows(2) {
+            let period = pair[1] - pair[0];
+            assert!((900..=1100).contains(&(period.0 / 1_000_000_000)), "{} ms", period.0 / 1_000_000_000);
+        }
+        write(&mut bench, CONTROL, &[RESET], transfers);
+        bench.await_boot_up(5000);
+        assert_eq!(bench.session().read_number(IDENTIFICATION).unwrap(), crc32(&raw));
+        assert_eq!(bench.machine().counters().flash_stalls, 0);
+    }
+}
+
+/// A master as CiA 302-2 and 302-3 describe it, which knows nothing of coboot, updates a running device: it compares 1F56h, stops the
+/// program, clears it, sends the new one, waits for 1F57h, compares, starts, and finds 1F51h and 1F56h of the application.
+#[test]
+fn a_cia_302_master_updates_a_running_device() {
+    let old = throughput::program(20);
+    let mut new = throughput::program(21);
+    new.truncate(20 * 1024 + 333);
+    // Whether it stops the program first, or clears it at once.
+    for stop in [true, false] {
+        let mut bench = board_at_1_mbit(Options::default());
+        let by = Transfers::Segments;
+        write(&mut bench, CONTROL, &[CLEAR], by);
+        write(&mut bench, DATA, &old, by);
+        write(&mut bench, CONTROL, &[1], by);
+        bench.await_boot_up(2000);
+
+        assert_ne!(bench.session().read_number(IDENTIFICATION).unwrap(), crc32(&new), "it needs an update");
+        if stop {
+            write(&mut bench, CONTROL, &[0], by);
+            bench.await_boot_up(1000);
+            assert_eq!(bench.session().read_number(CONTROL).unwrap(), 0, "stopped");
+        }
+        write(&mut bench, CONTROL, &[CLEAR], by);
+        if !stop {
+            bench.await_boot_up(1000);
+        }
+        assert!(bench.is_bootloader(NODE));
+        write(&mut bench, DATA, &new, by);
+        let status = bench.session().await_idle(1, Doing::Read(DATA)).unwrap();
+        assert_eq!(status.to_word(), 0);
+        assert_eq!(bench.session().read_number(IDENTIFICATION).unwrap(), crc32(&new));
+        write(&mut bench, CONTROL, &[1], by);
+        bench.await_boot_up(1000);
+        assert_eq!(bench.session().read_number(CONTROL).unwrap(), 1, "running");
+        assert_eq!(bench.session().read_number(IDENTIFICATION).unwrap(), crc32(&new));
+    }
+}
+
+/// Reset program, written to the application, starts it anew; what was cleared by the application's own hand needs no second CLEAR.
+#[test]
+fn reset_program_starts_the_application_anew() {
+    let mut bench = board_at_1_mbit(Options::default());
+    write(&mut bench, CONTROL, &[CLEAR], Transfers::Blocks);
+    write(&mut bench, DATA, &throughput::program(20), Transfers::Blocks);
+    write(&mut bench, CONTROL, &[RESET], Transfers::Blocks);
+    bench.await_boot_up(2000);
+    write(&mut bench, CONTROL, &[RESET], Transfers::Blocks);
+    bench.await_boot_up(1000);
+    assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0");
+}
