@@ -39,6 +39,7 @@ static inline uint32_t coboot_check_word(const void *record, size_t words)
 #define COBOOT_REQUEST_TRIAL UINT32_C(0x2)
 #define COBOOT_REQUEST_START UINT32_C(0x3)
 #define COBOOT_REQUEST_POWER_ON UINT32_C(0x5)
+#define COBOOT_REQUEST_CLEAR UINT32_C(0x7)
 
 struct coboot_warm_start {
     uint32_t magic;
