@@ -119,11 +119,30 @@ fn a_board_is_made_as_the_guide_says() {
         copy.edit(board, old, new);
     }
 
+    let header = "app-c/boards/my-board.h";
+    for (step, old, new) in [
+        (12, "CAN_PORT 'D'", "CAN_PORT 'B'"),
+        (12, "CAN_RX_PIN 0", "CAN_RX_PIN 8"),
+        (12, "CAN_TX_PIN 1", "CAN_TX_PIN 9"),
+        (13, "LED_PORT 'D'", "LED_PORT 'A'"),
+        (13, "LED_PIN 12", "LED_PIN 5"),
+        (14, "HSE_BYPASS 0", "HSE_BYPASS 1"),
+        (15, "0x4007D151", "0x12345678"),
+    ] {
+        println!("step {step}: {new}");
+        copy.edit(header, old, new);
+    }
+
+    let images = copy.target.join("firmware").join("my-board");
+    let app_c = images.join("app-c.elf");
+    // Of an earlier run.
+    let _ = fs::remove_file(&app_c);
     copy.succeed(&["run", "-q", "-p", "xtask", "--", "build", "--board", "my-board"]);
+    assert!(app_c.exists(), "no application in C");
     // The main job, in the emulator: on a chip and a map that are those of another board.
     let mut demo = Command::new(env!("CARGO_BIN_EXE_demo"));
     demo.env("COBOOT_BOARD", "nucleo-f446re");
-    demo.env("COBOOT_FIRMWARE_DIR", copy.target.join("firmware").join("my-board"));
+    demo.env("COBOOT_FIRMWARE_DIR", &images);
     let output = demo.output().expect("the demo can be started");
     assert!(output.status.success(), "{}", text(&output));
     let told = text(&output);

@@ -4,29 +4,37 @@ use std::fs;
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
-use crate::{process, workspace, Outcome};
+use crate::workspace::DEFAULT_BOARD;
+use crate::{build, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask eds [--out FOLDER] [--yes]
+usage: cargo xtask eds [--board BOARD] [--out FOLDER] [--yes]
 
 Writes the electronic data sheets of bootloader and application template (CiA 306-1), for
 configuration tools and masters. They are made from the tables of the object dictionaries; run this
 after a change there, a test compares.
 
-  --out FOLDER    where to (default: docs/eds)
+  --board BOARD   the board whose identity and bit rates they tell (default: stm32f407g-disc1)
+  --out FOLDER    where to (default: docs/eds, which are those of the default board; for another one
+                  target/eds/BOARD)
   --yes           installs what is missing with sudo
 ";
 
 pub fn run(mut args: Args) -> Outcome {
+    let board = workspace::board(&mut args)?;
     let out = args.value("--out")?;
     let setup = Setup::from(&mut args);
     args.none_left()?;
     // The crate that makes them is also that of the emulated tests.
     setup.prepare(&[Part::Emulator])?;
-    let folder = out.map_or_else(|| workspace::root().join("docs/eds"), Into::into);
+    let folder = match out {
+        Some(folder) => folder.into(),
+        None if board.board == DEFAULT_BOARD => workspace::root().join("docs/eds"),
+        None => workspace::target_dir().join("eds").join(board.board),
+    };
     fs::create_dir_all(&folder)
         .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&folder)))?;
     let mut eds = process::cargo("run");
-    eds.args(["--quiet", "--package", "coboot-tests", "--bin", "eds", "--"]).arg(&folder);
+    eds.arg("--quiet").args(build::tests_args(board)).args(["--bin=eds", "--"]).arg(&folder);
     process::run(&mut eds)
 }

@@ -1,4 +1,4 @@
-//! `cargo xtask new-board`: lays down the two files of a port, and registers them.
+//! `cargo xtask new-board`: lays down the files of a port, two and a header for programs in C, and registers them.
 
 use std::fs;
 use std::path::Path;
@@ -12,8 +12,9 @@ use crate::{workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask new-board NAME --chip CHIP [--from BOARD]
 
-Lays down the two files of a port with numbered steps to go through, and registers the board in the crates
-that have to know of it. docs/porting.md goes on from there.
+Lays down the two files of a port, and the header with the same numbers for the application in C, with numbered
+steps to go through, and registers the board in the crates that have to know of it. docs/porting.md goes on
+from there.
 
   NAME            of the board, as it will be given to --board: small letters, digits and hyphens
   --chip CHIP     its chip, of those in shared-abi/src/geometry.rs
@@ -46,7 +47,7 @@ pub fn run(mut args: Args) -> Outcome {
         println!("  {} {path}", if *is_new { "new     " } else { "changed " });
     }
     println!(
-        "\nNow go through the steps in the two new files; docs/porting.md tells which test proves each.\n\
+        "\nNow go through the steps in the new files; docs/porting.md tells which test proves each.\n\
          Then: cargo xtask build --board {name} && cargo xtask test --board {name} --test main_job"
     );
     Ok(())
@@ -96,6 +97,8 @@ fn changes(
         format!("--from {from}: {error} Name a board that has a file of its own in bsp/src.")
     })?;
 
+    let c_header = read(&format!("app-c/boards/{from}.h"))?;
+
     let mut changes = Vec::new();
     let mut change = |path: &str, edit: &dyn Fn(&str) -> Option<String>| {
         let text = edit(&read(path)?)
@@ -130,6 +133,7 @@ fn changes(
     for (path, text) in [
         (format!("shared-abi/src/layout/{module}.rs"), layout_file(name, chip)),
         (format!("bsp/src/{module}.rs"), with_steps(&board_file, name, from, &module)?),
+        (format!("app-c/boards/{name}.h"), c_with_steps(&c_header, name, from)?),
     ] {
         changes.push(Change { path, text, is_new: true });
     }
@@ -216,6 +220,35 @@ const STEPS: &[(&str, &str)] = &[
     ("        let can = can1.can(", "Step 11: the CAN pins, transmit and receive. The build fails for pins that the chip cannot use for CAN1."),
 ];
 
+/// What stands in a board's header for C, and the step that it belongs to.
+const C_STEPS: &[(&str, &str)] = &[
+    ("#define CAN_PORT", "Step 12: the CAN pins of step 11."),
+    ("#define LED_PORT", "Step 13: the LED of step 10."),
+    ("#define HSE_HZ", "Step 14: the crystal of step 8."),
+    ("#define VENDOR_ID", "Step 15: what the device says of itself, as in step 5."),
+];
+
+/// The header of another board for C, with the steps as comments in the place of its own.
+fn c_with_steps(source: &str, name: &str, from: &str) -> Outcome<String> {
+    let mut text = format!(
+        "/* {name}. Begun as a copy of {from}: go through the steps, and take their comments out. */\n"
+    );
+    let mut steps = 0;
+    for line in source.lines().filter(|line| line.starts_with("#define ")) {
+        if let Some((_, step)) = C_STEPS.iter().find(|(what, _)| line.starts_with(what)) {
+            text += &format!("/* {step} */\n");
+            steps += 1;
+        }
+        text += line;
+        text.push('\n');
+    }
+    if steps == C_STEPS.len() {
+        Ok(text)
+    } else {
+        Err(format!("app-c/boards/{from}.h does not look as expected; take another board with --from."))
+    }
+}
+
 /// A board file copied from another board's, with the steps as comments in front of what they are about.
 fn with_steps(source: &str, name: &str, from: &str, module: &str) -> Outcome<String> {
     let mut text = String::new();
@@ -268,13 +301,15 @@ mod tests {
     }
 
     #[test]
-    fn two_new_files_and_the_board_where_boards_are_listed() {
+    fn new_files_and_the_board_where_boards_are_listed() {
         for from in ["stm32f407g-disc1", "nucleo-f446re", "stm32f429i-disc1"] {
             let changes = changes("my-board", &STM32F446RE, from, &read).unwrap();
             let new: Vec<_> =
                 changes.iter().filter(|change| change.is_new).map(|change| &*change.path).collect();
-            assert_eq!(new, ["shared-abi/src/layout/my_board.rs", "bsp/src/my_board.rs"]);
-            assert_eq!(changes.len(), 9);
+            let expected =
+                ["shared-abi/src/layout/my_board.rs", "bsp/src/my_board.rs", "app-c/boards/my-board.h"];
+            assert_eq!(new, expected);
+            assert_eq!(changes.len(), 10);
             for change in &changes {
                 assert!(
                     change.text.contains("my-board") || change.text.contains("my_board"),
@@ -290,6 +325,18 @@ mod tests {
                     "step {step}, from {from}"
                 );
             }
+            let header = &changes[9].text;
+            for step in 12..=15 {
+                assert_eq!(
+                    header.matches(&format!("/* Step {step}: ")).count(),
+                    1,
+                    "step {step}, from {from}"
+                );
+            }
+            assert!(
+                header.lines().all(|line| line.starts_with("/* ") || line.starts_with("#define ")),
+                "{header}"
+            );
             assert!(board.contains("pub const LAYOUT: &Layout = &layout::my_board::LAYOUT;\n"), "{board}");
         }
     }
