@@ -350,7 +350,7 @@ void main(void)
     const struct coboot_callgate *gate = coboot_callgate();
     /* What the bootloader has verified is larger than this image where more was downloaded with it. */
     const uint32_t start = (uint32_t)(uintptr_t)&__vector_table, end = (uint32_t)(uintptr_t)&__image_end;
-    struct coboot_program program;
+    struct coboot_program_args program;
     if (gate != NULL && coboot_program_info(gate, program_number, &program) == COBOOT_STATUS_OK) {
         program_crc = program.crc;
     } else if (gate != NULL && coboot_crc32(gate, start, end - start, &program_crc) != COBOOT_STATUS_OK) {
