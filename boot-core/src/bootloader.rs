@@ -14,8 +14,15 @@ use canopen::od::concat;
 use canopen::od::{put, Access, Address, DataType, Entry, Objects};
 #[cfg(feature = "emcy")]
 use canopen::program::FlashError;
-use canopen::program::{ProgramControl, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID};
+#[cfg(feature = "read-back")]
+use canopen::program::SOFTWARE_VERSION;
+use canopen::program::{
+    ProgramControl, ENABLE_FLASH, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, UNLOCK,
+    UNLOCK_FIRMWARE,
+};
 use canopen::slave::SlaveDevice;
+#[cfg(feature = "password")]
+use canopen::{password::Lock, Instant};
 use canopen::{AbortCode, NodeId};
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
@@ -26,11 +33,44 @@ use crate::download::{Downloader, Policy, Step};
 use crate::flash::Flash;
 use crate::node::NodeParameters;
 use crate::parameters::Parameters;
+#[cfg(feature = "read-back")]
+use crate::stored_version::StoredVersion;
+
+/// What dialects add to the object dictionary.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Extras {
+    /// Where the password is written that 1F50h waits for.
+    pub password: PasswordObject,
+    /// Whether 1F50h can be read.
+    pub read_back: bool,
+}
+
+impl Extras {
+    /// Nothing.
+    pub const NONE: Self = Self { password: PasswordObject::None, read_back: false };
+}
+
+/// Where a password is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PasswordObject {
+    /// There is none.
+    None,
+    /// 7F50h of a program, 32 bits: it voids the program and opens its 1F50h (ESAcademy).
+    EnableFlash,
+    /// 6005h/1, a text: it opens 1F50h of all programs (lifts; CiA 814-1 clause 6.3).
+    Unlock,
+}
 
 /// The objects of a device with `programs` programs (1 to 254), of which there are [`entry_count`] (SYS TEC manual
 /// L-1112d_10, table 1).
 #[must_use]
 pub const fn entries<const LEN: usize>(programs: u8) -> [Entry; LEN] {
+    entries_with(programs, Extras::NONE)
+}
+
+/// The same with what a dialect adds, of which there are [`entry_count_with`].
+#[must_use]
+pub const fn entries_with<const LEN: usize>(programs: u8, extras: Extras) -> [Entry; LEN] {
     let mut entries = [COMMON[0]; LEN];
     let mut len = 0;
     while len < COMMON.len() {
@@ -39,7 +79,10 @@ pub const fn entries<const LEN: usize>(programs: u8) -> [Entry; LEN] {
     }
     let mut object = 0;
     while object < PROGRAM_OBJECTS.len() {
-        let (array, name, each) = PROGRAM_OBJECTS[object];
+        let (array, name, mut each) = PROGRAM_OBJECTS[object];
+        if array == PROGRAM_DATA && extras.read_back {
+            each.access = Access::Rw;
+        }
         entries[len] = Entry::array(array, name, programs);
         len += 1;
         let mut number = 1;
@@ -50,6 +93,26 @@ pub const fn entries<const LEN: usize>(programs: u8) -> [Entry; LEN] {
         }
         object += 1;
     }
+    match extras.password {
+        PasswordObject::None => {}
+        PasswordObject::Unlock => {
+            entries[len] = Entry::record(UNLOCK, "Lock/unlock parameters", UNLOCK_FIRMWARE);
+            entries[len + 1] =
+                Entry::sub(UNLOCK, UNLOCK_FIRMWARE, "Firmware update", DataType::VisibleString, Access::Wo);
+            len += 2;
+        }
+        PasswordObject::EnableFlash => {
+            entries[len] = Entry::array(ENABLE_FLASH, "Enable flash programming", programs);
+            len += 1;
+            let mut number = 1;
+            while number <= programs {
+                let name = "Enable flash programming of a program";
+                entries[len] = Entry::sub(ENABLE_FLASH, number, name, DataType::Unsigned32, Access::Wo);
+                len += 1;
+                number += 1;
+            }
+        }
+    }
     assert!(len == LEN, "bootloader::entries: the length is not that of entry_count");
     entries
 }
@@ -57,7 +120,19 @@ pub const fn entries<const LEN: usize>(programs: u8) -> [Entry; LEN] {
 /// How many entries the object dictionary has.
 #[must_use]
 pub const fn entry_count(programs: u8) -> usize {
-    COMMON.len() + PROGRAM_OBJECTS.len() * (1 + programs as usize)
+    entry_count_with(programs, Extras::NONE)
+}
+
+/// The same with what a dialect adds.
+#[must_use]
+pub const fn entry_count_with(programs: u8, extras: Extras) -> usize {
+    let array = 1 + programs as usize;
+    let password = match extras.password {
+        PasswordObject::None => 0,
+        PasswordObject::Unlock => 2,
+        PasswordObject::EnableFlash => array,
+    };
+    COMMON.len() + PROGRAM_OBJECTS.len() * array + password
 }
 
 /// 1F50h, 1F51h, 1F56h, 1F57h: the array, and what each of its elements is.
@@ -101,6 +176,8 @@ pub struct Config {
     pub entries: &'static [Entry],
     /// What it says of itself; but for the serial number, which every device has its own of.
     pub device: Device,
+    /// The node-ID while the bootloader runs; `None` for the device's own.
+    pub node_id: Option<NodeId>,
     /// Who owns which address.
     pub layout: &'static Layout,
     /// The bit rates that its controller can be set to.
@@ -112,6 +189,8 @@ pub struct Config {
     pub boot_up_emergency: bool,
     /// How programs are downloaded.
     pub download: Policy,
+    /// What opens 1F50h where [`Policy::locked`] says that something has to; it is written where [`Extras::password`] says.
+    pub password: &'static [u8],
 }
 
 /// The objects of the bootloader and what is behind them.
@@ -129,6 +208,13 @@ pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize> {
     download: Downloader<'b, P, PROGRAMS>,
     #[cfg(feature = "emcy")]
     emcy: Emcy,
+    #[cfg(feature = "password")]
+    lock: Lock,
+    /// The time that was told last.
+    #[cfg(feature = "password")]
+    now: Instant,
+    #[cfg(feature = "read-back")]
+    stored_version: StoredVersion,
 }
 
 impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PROGRAMS> {
@@ -156,6 +242,12 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
             download,
             #[cfg(feature = "emcy")]
             emcy: Emcy::new(),
+            #[cfg(feature = "password")]
+            lock: Lock::new(config.password),
+            #[cfg(feature = "password")]
+            now: Instant::from_millis(0),
+            #[cfg(feature = "read-back")]
+            stored_version: StoredVersion::new(),
         };
         #[cfg(not(feature = "emcy"))]
         let _ = reason;
@@ -163,8 +255,14 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         if StayReason::is_trouble(reason) {
             bootloader.emcy.raise(emcy::code::SOFTWARE, 0, [reason, 0, 0, 0, 0]);
         }
-        bootloader.node_id_changed(node.id);
+        bootloader.node_id_changed(config.node_id.or(node.id));
         bootloader
+    }
+
+    /// The node-ID in force.
+    #[must_use]
+    pub fn node_id(&self) -> Option<NodeId> {
+        self.id
     }
 
     /// Who the device is, for layer setting services.
@@ -177,7 +275,17 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
     pub fn step(&mut self) -> Step {
         let step = self.download.step(&mut self.flash);
         self.tell_outcome();
+        #[cfg(feature = "read-back")]
+        if step == Step::Idle && self.config.download.read_back {
+            return self.stored_version.step(&self.flash, self.download.installed(1));
+        }
         step
+    }
+
+    /// Tells the time: at least every few milliseconds.
+    #[cfg(feature = "password")]
+    pub fn set_time(&mut self, now: Instant) {
+        self.now = now;
     }
 
     /// Tells by an emergency what became of work on the flash.
@@ -188,8 +296,8 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
             Some((_, Ok(()))) => self.emcy.clear(emcy::register::MANUFACTURER),
             Some((program, Err(error))) => {
                 let code = match error {
-                    FlashError::NoValidProgram | FlashError::Crc => emcy::code::DATA_SET,
-                    _ => emcy::code::HARDWARE,
+                    FlashError::Write | FlashError::Secured | FlashError::NvData => emcy::code::HARDWARE,
+                    _ => emcy::code::DATA_SET,
                 };
                 self.emcy.raise(code, emcy::register::MANUFACTURER, [error.code(), program, 0, 0, 0]);
             }
@@ -212,7 +320,12 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
 
     /// Whether a reset now would take back what a host was told is done or under way.
     #[must_use]
-    pub fn is_finishing(&self) -> bool {
+    pub fn is_finishing(&mut self) -> bool {
+        // A reset would let somebody try passwords faster.
+        #[cfg(feature = "password")]
+        if self.lock.is_waiting(self.now) {
+            return true;
+        }
         self.download.is_finishing()
     }
 
@@ -247,6 +360,12 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
         if at == SERIAL_NUMBER {
             return put(buf, &self.serial_number.to_le_bytes());
         }
+        #[cfg(feature = "read-back")]
+        if at == Address::new(SOFTWARE_VERSION, 0) {
+            if let Some(version) = self.stored_version.text() {
+                return put(buf, version);
+            }
+        }
         if let Some(read) = self.config.device.read(at, buf) {
             return read;
         }
@@ -265,6 +384,16 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
         }
         match (at.index, data) {
             (PROGRAM_CONTROL, &[value]) => self.command(at.sub, ProgramControl::try_from(value)?),
+            #[cfg(feature = "password")]
+            (ENABLE_FLASH, password) => {
+                self.lock.open(password, self.now)?;
+                self.download.unlock(at.sub, true)
+            }
+            #[cfg(feature = "password")]
+            (UNLOCK, password) => {
+                self.lock.open(password, self.now)?;
+                (1..=PROGRAMS as u8).try_for_each(|program| self.download.unlock(program, false))
+            }
             _ => Err(AbortCode::UNSUPPORTED_ACCESS),
         }
     }
@@ -290,6 +419,20 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
 
     fn download_cancel(&mut self, _at: Address) {
         self.download.block_cancel();
+    }
+
+    #[cfg(feature = "read-back")]
+    fn upload_start(&mut self, at: Address) -> Result<Option<u32>, AbortCode> {
+        self.download.stored(at.sub).map(|stored| Some(stored.size))
+    }
+
+    #[cfg(feature = "read-back")]
+    fn upload_data(&mut self, at: Address, offset: u32, buf: &mut [u8]) -> Result<usize, AbortCode> {
+        let stored = self.download.stored(at.sub)?;
+        let rest = stored.size.saturating_sub(offset) as usize;
+        let len = rest.min(buf.len());
+        self.flash.read(stored.base + offset, &mut buf[..len]);
+        Ok(len)
     }
 
     #[cfg(feature = "emcy")]

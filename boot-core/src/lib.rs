@@ -20,7 +20,10 @@ pub mod download;
 pub mod flash;
 pub mod node;
 pub mod parameters;
+pub mod profile;
 pub mod program;
+#[cfg(feature = "read-back")]
+mod stored_version;
 
 /// Frames, node and transfers, in which the core speaks: a firmware that uses this crate needs no other for them.
 pub use canopen;

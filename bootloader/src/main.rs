@@ -40,13 +40,14 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
 
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]
 mod app {
-    use boot_core::bootloader::{self, entries, entry_count, Bootloader};
+    use boot_core::bootloader::{self, entries_with, entry_count_with, Bootloader};
     use boot_core::canopen::bit_rate::Heard;
     use boot_core::canopen::device::Device;
     use boot_core::canopen::line::{Confinement, Status, CONTROLLER_OVERRUN, QUEUE_OVERRUN};
     use boot_core::canopen::node::{self, NmtPolicy};
     use boot_core::canopen::od::Entry;
-    use boot_core::canopen::program::{ProgramControl, BOOTLOADER_DEVICE_TYPE};
+    use boot_core::canopen::program::ProgramControl;
+    use boot_core::canopen::sdo::server::Config as SdoConfig;
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant};
     use boot_core::download::{Policy, Step};
@@ -62,7 +63,7 @@ mod app {
     use super::{product, start, Mono};
     use crate::flash::FlashController;
     use crate::log::{self, log};
-    use crate::product::RESCUE_WINDOW_MS;
+    use crate::product::{PROFILE, RESCUE_WINDOW_MS};
     use crate::ram_vectors;
     use crate::watchdog::{self, Task, Watchdog};
     use rtic_monotonics::fugit::ExtU32;
@@ -88,12 +89,13 @@ mod app {
 
     /// Programs of the layout, each a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
     const PROGRAMS: usize = LAYOUT.programs.len();
-    static ENTRIES: [Entry; entry_count(PROGRAMS as u8)] = entries(PROGRAMS as u8);
+    const ENTRY_COUNT: usize = entry_count_with(PROGRAMS as u8, PROFILE.extras);
+    static ENTRIES: [Entry; ENTRY_COUNT] = entries_with(PROGRAMS as u8, PROFILE.extras);
 
     static CONFIG: bootloader::Config = bootloader::Config {
         entries: &ENTRIES,
         device: Device {
-            device_type: BOOTLOADER_DEVICE_TYPE,
+            device_type: PROFILE.device_type,
             name: IDENTITY.device_name,
             hardware_version: IDENTITY.hardware_version,
             software_version: concat!("coboot ", env!("CARGO_PKG_VERSION")),
@@ -103,10 +105,12 @@ mod app {
             revision: IDENTITY.revision,
             serial_number: 0,
         },
+        node_id: PROFILE.node_id,
         layout: LAYOUT,
         supports: product::supports,
         boot_up_emergency: BOOT_UP_EMERGENCY,
-        download: Policy { identity: Some((IDENTITY.vendor_id, IDENTITY.product_code)), ..Policy::DEFAULT },
+        download: Policy { identity: Some((IDENTITY.vendor_id, IDENTITY.product_code)), ..PROFILE.download },
+        password: PROFILE.password,
     };
 
     #[shared]
@@ -150,6 +154,7 @@ mod app {
             node: node::Config {
                 heartbeat_ms: HEARTBEAT_MS,
                 nmt: NmtPolicy::StayPreOperational,
+                sdo: SdoConfig { unknown_request: PROFILE.unknown_request, ..SdoConfig::DEFAULT },
                 ..node::Config::default()
             },
             ..slave::Config::default()
@@ -167,7 +172,7 @@ mod app {
             // Acknowledged by the application; what becomes of it is in 1F57h.
             let _ = bootloader.command(program, ProgramControl::Clear);
         }
-        let slave = Slave::new(bootloader.lss_address(), node.id, node.bit_rate, slave_config);
+        let slave = Slave::new(bootloader.lss_address(), bootloader.node_id(), node.bit_rate, slave_config);
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();
         log!("stayed in the bootloader; why", start::stay_reason().into());
@@ -238,6 +243,8 @@ mod app {
         }
         let status = can.lock(status);
         bootloader.lock(|bootloader| {
+            #[cfg(feature = "password")]
+            bootloader.set_time(now);
             slave.observe(status, now, bootloader);
             // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
             carry_out(slave, &mut can, now, bootloader);

@@ -7,11 +7,23 @@ use boot_core::canopen::{BitRate, NodeId};
 use boot_core::decision::Policy;
 use boot_core::node::NodeParameters;
 use boot_core::parameters::Journal;
+use boot_core::profile::Profile;
 use bsp::can::BitTiming;
 use bsp::{BIT_RATE, CAN_CLOCK, LAYOUT, NODE_ID};
 use shared_abi::warm_start::Cell;
 
 use crate::flash::FlashController;
+
+/// Which dialect it speaks where they contradict each other.
+pub const PROFILE: Profile = if cfg!(feature = "profile-paulus") {
+    Profile::PAULUS
+} else if cfg!(feature = "profile-esacademy") {
+    Profile::ESACADEMY
+} else if cfg!(feature = "profile-lift") {
+    Profile::LIFT
+} else {
+    Profile::STANDARD
+};
 
 /// Version of the bootloader: major in the upper half, minor in the lower.
 pub const VERSION: u32 = 0x0000_0001;
@@ -64,7 +76,8 @@ pub const NO_NODE_ID: u8 = 255;
 
 /// Node-ID and bit rate in force from this reset on.
 pub fn node_parameters(parameters: &Parameters, flash: &FlashController) -> NodeParameters {
-    NodeParameters::load(parameters, flash, BOARD_NODE, supports)
+    let default = PROFILE.default_node.map(|(id, bit_rate)| NodeParameters { id: Some(id), bit_rate });
+    NodeParameters::load(parameters, flash, default.unwrap_or(BOARD_NODE), supports)
 }
 
 /// Whether the board's CAN controller can run at this bit rate.

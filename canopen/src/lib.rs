@@ -18,6 +18,7 @@
 //! | [`bit_rate`] | the bit rates of CANopen, and how to find out one |
 //! | [`line`](mod@line) | what the CAN controller tells: error passive, bus-off, frames lost |
 //! | [`slave`] | a device on the bus: node, LSS and line tied together |
+//! | [`password`] | a password in front of something, counted and slowed down |
 //! | [`program`] | program download: the words of CiA 302-3 |
 #![no_std]
 #![forbid(unsafe_code)]
@@ -36,6 +37,7 @@ pub mod lss;
 pub mod nmt;
 pub mod node;
 pub mod od;
+pub mod password;
 pub mod program;
 pub mod sdo;
 pub mod slave;

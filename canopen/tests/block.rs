@@ -23,7 +23,7 @@ struct Bench {
 
 impl Bench {
     fn new(blksize: u8) -> Self {
-        let config = ServerConfig { timeout_ms: 1000, repeat_ms: 300, blksize };
+        let config = ServerConfig { timeout_ms: 1000, repeat_ms: 300, blksize, ..ServerConfig::DEFAULT };
         Self { server: SdoServer::new(node(), config), device: Device::default(), now: 0 }
     }
 

@@ -10,6 +10,7 @@ use std::time::Duration;
 use boot_core::bootloader::{self, Bootloader};
 use boot_core::canopen::node::{self, NmtPolicy};
 use boot_core::canopen::od::Entry;
+use boot_core::canopen::program::ProgramControl;
 use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
 use boot_core::canopen::{BitRate, Frame, Instant, NodeId};
 use boot_core::decision::{decide, BootDecision, Circumstances, Policy, StayReason};
@@ -143,6 +144,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         let mut more = false;
         match &mut self.life {
             Life::Bootloader(running) => {
+                running.device.set_time(now);
                 more = running.device.step() == Step::Again;
                 // What is finished is in the file before anybody is told of it.
                 let finished = !running.device.busy();
@@ -153,13 +155,14 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                 if let Some(request) = running.device.take_leave() {
                     running.leaving = Some(Leaving { request: Some(request), at: None });
                 }
-                leave = running.talk(now, send);
+                let finishing = running.device.is_finishing();
+                leave = running.talk(now, !finishing, send);
             }
             Life::StandIn(running, _) => {
                 if running.device.is_called_back() && running.leaving.is_none() {
                     running.leaving = Some(Leaving { request: Some(BootRequest::Stay), at: None });
                 }
-                leave = running.talk(now, send);
+                leave = running.talk(now, true, send);
             }
             Life::Silent(_) | Life::None => return Ok(false),
         }
@@ -193,9 +196,14 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         let verified = |number| verify(&flash, &journal, config.layout, number);
         match decide(&circumstances, &POLICY, verified) {
             BootDecision::Stay(reason) => {
-                let device =
+                let mut device =
                     Bootloader::new(config, serial_number, node, reason.code(), journal, flash, buffer);
+                if let Some(BootRequest::Clear(program)) = request {
+                    // Acknowledged already; what becomes of it is in 1F57h.
+                    let _ = device.command(program, ProgramControl::Clear);
+                }
                 let address = device.lss_address();
+                let node = NodeParameters { id: device.node_id(), ..node };
                 let slave = slave(address, node, config.device.heartbeat_ms, NmtPolicy::StayPreOperational);
                 self.life = Life::Bootloader(Box::new(Running { device, slave, leaving: None }));
                 Event::Bootloader { node: node.id, reason }
@@ -247,7 +255,12 @@ impl<D: SlaveDevice> Running<D> {
     }
 
     /// Sends what there is to send. The request with which the device resets, once it is time.
-    fn talk(&mut self, now: Instant, send: &mut impl FnMut(Frame)) -> Option<Option<BootRequest>> {
+    fn talk(
+        &mut self,
+        now: Instant,
+        may_leave: bool,
+        send: &mut impl FnMut(Frame),
+    ) -> Option<Option<BootRequest>> {
         if let Some(Leaving { request, at: Some(at) }) = self.leaving {
             return now.has_reached(at).then_some(request);
         }
@@ -258,7 +271,7 @@ impl<D: SlaveDevice> Running<D> {
                 Output::Join(_) | Output::Listen(_) | Output::ComeBack | Output::Accept(_) => {}
             }
         }
-        if let Some(leaving) = self.leaving.as_mut().filter(|_| self.slave.is_idle()) {
+        if let Some(leaving) = self.leaving.as_mut().filter(|_| may_leave && self.slave.is_idle()) {
             leaving.at = Some(now + FAREWELL_MS);
         }
         None

@@ -7,13 +7,13 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use boot_core::bootloader::{self, entries, entry_count};
+use boot_core::bootloader::{self, entries_with, entry_count_with, Extras};
 use boot_core::canopen::device;
 use boot_core::canopen::od::Entry;
-use boot_core::canopen::program::BOOTLOADER_DEVICE_TYPE;
 use boot_core::canopen::{BitRate, Instant, NodeId};
 use boot_core::download::Policy;
 use boot_core::node::NodeParameters;
+use boot_core::profile::Profile;
 use clap::{Parser, ValueEnum};
 use coboot_node::device::{supports, Device, Event, Setup, BUFFER};
 use coboot_node::file_flash::{FileFlash, Speed};
@@ -85,6 +85,10 @@ struct Args {
     #[arg(long, value_enum, default_value = "typical")]
     flash: FlashSpeed,
 
+    /// What the nodes speak where dialects contradict each other
+    #[arg(long, value_enum, default_value = "standard")]
+    profile: Dialect,
+
     /// The nodes stay in the bootloader whatever program they have, as with the entry strap set
     #[arg(long)]
     stay: bool,
@@ -92,6 +96,30 @@ struct Args {
     /// For a program that was started something answers what a host asks a running application for
     #[arg(long)]
     stand_in: bool,
+}
+
+/// The dialects of docs/dialects.md.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Dialect {
+    /// Block files, raw images and Intel HEX, as the firmware is built by default
+    Standard,
+    /// port's Paulus
+    Paulus,
+    /// The boot loader of ESAcademy: 7F50h opens 1F50h
+    Esacademy,
+    /// CiA 417 lifts: 6005h opens 1F50h, node-ID 126
+    Lift,
+}
+
+impl From<Dialect> for Profile {
+    fn from(dialect: Dialect) -> Self {
+        match dialect {
+            Dialect::Standard => Self::STANDARD,
+            Dialect::Paulus => Self::PAULUS,
+            Dialect::Esacademy => Self::ESACADEMY,
+            Dialect::Lift => Self::LIFT,
+        }
+    }
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -129,8 +157,8 @@ fn number(text: &str) -> Result<u32, String> {
 fn main() -> ExitCode {
     let args = Args::parse();
     let result = match args.board.programs.len() {
-        1 => run::<1>(&args, &entries::<{ entry_count(1) }>(1)),
-        2 => run::<2>(&args, &entries::<{ entry_count(2) }>(2)),
+        1 => run::<1>(&args),
+        2 => run::<2>(&args),
         programs => Err(format!("a board with {programs} programs is not known here").into()),
     };
     match result {
@@ -143,11 +171,28 @@ fn main() -> ExitCode {
     }
 }
 
-fn run<const PROGRAMS: usize>(
-    args: &Args,
-    entries: &[Entry],
-) -> Result<std::convert::Infallible, Box<dyn Error>> {
-    let setups = setups(args, entries, PROGRAMS as u8)?;
+/// The object dictionary of a device with so many programs.
+fn entries(programs: usize, extras: Extras) -> &'static [Entry] {
+    macro_rules! one_of {
+        ($($programs:literal $extras:expr),*) => {
+            match (programs, extras) {
+                $((_, _) if programs == $programs && extras == $extras => {
+                    const LEN: usize = entry_count_with($programs, $extras);
+                    static ENTRIES: [Entry; LEN] = entries_with($programs, $extras);
+                    &ENTRIES
+                })*
+                _ => unreachable!("one or two programs, and one of the profiles"),
+            }
+        };
+    }
+    one_of!(
+        1 Profile::STANDARD.extras, 1 Profile::ESACADEMY.extras, 1 Profile::LIFT.extras,
+        2 Profile::STANDARD.extras, 2 Profile::ESACADEMY.extras, 2 Profile::LIFT.extras
+    )
+}
+
+fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, Box<dyn Error>> {
+    let setups = setups(args, PROGRAMS)?;
     let mut flashes = Vec::new();
     for setup in &setups {
         let path = args.folder.join(format!("{}.flash", setup.serial_number));
@@ -199,11 +244,12 @@ fn run<const PROGRAMS: usize>(
 }
 
 /// What the nodes are; lives as long as the process.
-fn setups(args: &Args, entries: &[Entry], programs: u8) -> Result<Vec<Setup>, Box<dyn Error>> {
+fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
+    let profile: Profile = args.profile.into();
     let config: &'static bootloader::Config = Box::leak(Box::new(bootloader::Config {
-        entries: entries.to_vec().leak(),
+        entries: entries(programs, profile.extras),
         device: device::Device {
-            device_type: BOOTLOADER_DEVICE_TYPE,
+            device_type: profile.device_type,
             name: "coboot-node",
             hardware_version: "none",
             software_version: concat!("coboot ", env!("CARGO_PKG_VERSION")),
@@ -213,15 +259,18 @@ fn setups(args: &Args, entries: &[Entry], programs: u8) -> Result<Vec<Setup>, Bo
             revision: args.revision,
             serial_number: 0,
         },
+        node_id: profile.node_id,
         layout: args.board,
         supports,
         boot_up_emergency: true,
         download: Policy {
             identity: Some((args.vendor_id, args.product_code)).filter(|identity| *identity != (0, 0)),
-            ..Policy::DEFAULT
+            ..profile.download
         },
+        password: profile.password,
     }));
-    let stand_in: Option<&'static [Entry]> = args.stand_in.then(|| &*Vec::leak(StandIn::entries(programs)));
+    let stand_in: Option<&'static [Entry]> =
+        args.stand_in.then(|| &*Vec::leak(StandIn::entries(programs as u8)));
     let setup = |n: u8| -> Option<Setup> {
         let id = match args.unconfigured {
             true => None,

@@ -6,6 +6,7 @@
 //! | [`layout`] | **the numbers** of each board: who owns which address |
 //! | [`warm_start`] | the last RAM cell: what the application asks of the bootloader across a reset |
 //! | [`handoff`] | what the bootloader tells the application about how it came up |
+//! | [`label`] | what a program image says of itself: whom it is for |
 //! | [`vectors`] | the proof that a vector table may be jumped to, and the jump |
 //! | [`callgate`] | the bootloader's services for the application, at a fixed address |
 //! | `reentry` | the way back from an application into its bootloader (on the target) |
@@ -20,6 +21,7 @@ pub mod block_file;
 pub mod callgate;
 pub mod geometry;
 pub mod handoff;
+pub mod label;
 pub mod layout;
 #[cfg(target_arch = "arm")]
 pub mod reentry;

@@ -29,6 +29,8 @@ use shared_abi::block_file::{
     NUMBER_CONTROL, NUMBER_LAST,
 };
 use shared_abi::geometry::Region;
+#[cfg(feature = "streams")]
+use shared_abi::label;
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
@@ -99,6 +101,15 @@ pub struct Policy {
     pub reset_starts: bool,
     /// Whether a valid raw image or Intel HEX starts by itself when it is complete.
     pub starts_by_itself: bool,
+    /// Whether a raw image or Intel HEX has to carry a label (`shared_abi::label`). A label that it carries has to fit in any
+    /// case.
+    pub wants_label: bool,
+    /// The number of a program that is none, but data of the application: any bytes, never started.
+    pub data: Option<u8>,
+    /// Whether 1F50h takes nothing before a password has come.
+    pub locked: bool,
+    /// Whether 1F50h gives back what was stored.
+    pub read_back: bool,
     /// Bytes of flash that one step of a CRC covers: the longest that other work of the same priority is kept
     /// waiting.
     pub crc_step: u32,
@@ -114,6 +125,10 @@ impl Policy {
         valid_without_signature: true,
         reset_starts: false,
         starts_by_itself: false,
+        wants_label: false,
+        data: None,
+        locked: false,
+        read_back: false,
         crc_step: 1024,
     };
 }
@@ -146,6 +161,8 @@ struct Program {
     version: u32,
     /// A raw image or Intel HEX came last, completely, and no command since.
     streamed: bool,
+    /// A password is missing.
+    locked: bool,
 }
 
 /// How far the download of a program is.
@@ -285,6 +302,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 session: Session::Idle,
                 version: 0,
                 streamed: false,
+                locked: policy.locked,
             }
         });
         Self {
@@ -394,6 +412,54 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         }
     }
 
+    /// A password came: 1F50h takes data from now on, and CLEAR is as good as given. `at_once`: the old program is void now, and not
+    /// only when there is another one.
+    ///
+    /// # Errors
+    /// If other work goes on.
+    #[cfg(feature = "password")]
+    pub fn unlock(&mut self, program: u8, at_once: bool) -> Result<(), AbortCode> {
+        let index = self.index(program).ok_or(AbortCode::NO_SUB_INDEX)?;
+        if self.leave.is_some() || self.expected.is_some() || !self.is_downloading() {
+            return Err(self.refuse(program, untimely(FlashError::Busy)));
+        }
+        let state = &mut self.programs[index];
+        state.locked = false;
+        state.error = None;
+        state.streamed = false;
+        state.session = Session::Cleared { just: false };
+        self.reception = Reception::Idle;
+        self.break_off();
+        if at_once && self.work.is_none() {
+            self.work = Some(self.invalidate(program, false));
+        }
+        Ok(())
+    }
+
+    /// 1F50h is about to be read back: gives the size of what is stored.
+    ///
+    /// # Errors
+    /// The abort that answers it.
+    #[cfg(feature = "read-back")]
+    pub fn stored(&self, program: u8) -> Result<Region, AbortCode> {
+        let index = self.index(program).ok_or(AbortCode::NO_SUB_INDEX)?;
+        if !self.policy.read_back {
+            return Err(AbortCode::WRITE_ONLY);
+        }
+        // While it works the flash cannot be read.
+        if self.programs[index].locked || self.busy() {
+            return Err(AbortCode::DEVICE_STATE);
+        }
+        self.installed(program).map(|(place, _)| place).ok_or(AbortCode::NO_DATA)
+    }
+
+    /// Where a program is stored, and its CRC.
+    #[cfg(feature = "read-back")]
+    pub(crate) fn installed(&self, program: u8) -> Option<(Region, u32)> {
+        let record = self.programs[self.index(program)?].record?;
+        Some((Region::new(self.region(program).base, record.size), record.crc))
+    }
+
     /// 1F51h: a command. It is judged and acknowledged now and carried out by [`Downloader::step`].
     ///
     /// # Errors
@@ -422,13 +488,16 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         if self.leave.is_some() || (self.busy() && !broken_off) {
             return Err(self.refuse(program, untimely(FlashError::Busy)));
         }
-        if matches!(command, Clear | SetSignature | ClrSignature) && !(self.policy.allowed)() {
+        let changes = matches!(command, Clear | SetSignature | ClrSignature);
+        if changes && (self.programs[index].locked || !(self.policy.allowed)()) {
             return Err(self.refuse(program, untimely(FlashError::NoAccess)));
         }
         let state = &mut self.programs[index];
         state.error = None;
         state.streamed = false;
-        match (command, state.record) {
+        // Data are never started.
+        let record = state.record.filter(|_| self.policy.data != Some(program));
+        match (command, record) {
             (Clear, _) => {
                 let again = state.session == Session::Cleared { just: true };
                 state.session = Session::Cleared { just: true };
@@ -499,6 +568,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             || !self.has_room()
         {
             return Err(self.refuse(program, untimely(FlashError::Busy)));
+        }
+        if self.index(program).is_some_and(|index| self.programs[index].locked) {
+            return Err(self.refuse(program, untimely(FlashError::NoAccess)));
         }
         if let Some(size) = size {
             if !cfg!(feature = "streams") && size as usize > self.largest() {
@@ -649,15 +721,14 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     self.programs[index].identification = crc;
                     self.programs[index].session = Session::Idle;
                 }
-                let version = self.index(program).map_or(0, |index| self.programs[index].version);
-                let plausible = check_vectors(flash, self.region(program), self.layout).is_ok();
-                if expected.crc.is_none_or(|told| told == crc) && plausible {
+                let sound = self.check_stored(flash, program, &expected, crc);
+                if let Ok(version) = sound {
                     let signed = expected.crc.is_none() && self.policy.valid_without_signature;
                     let record = ProgramRecord { size: expected.size, crc, signed, version };
                     self.work = Some(self.store_record(program, record));
                     return Step::Again;
                 }
-                (program, Poll::Ready(Err(FlashError::NoValidProgram)))
+                (program, Poll::Ready(sound.map(drop)))
             }
             Work::Record { program, record } => {
                 let outcome = self.parameters.poll(flash).map_err(|_| FlashError::NvData);
@@ -680,6 +751,35 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         };
         self.end(program, outcome);
         Step::Again
+    }
+
+    /// What is in flash, against what it should be; gives its version.
+    fn check_stored<F: Flash>(
+        &self,
+        flash: &F,
+        program: u8,
+        expected: &Expected,
+        crc: u32,
+    ) -> Result<u32, FlashError> {
+        let region = self.region(program);
+        let version = self.index(program).map_or(0, |index| self.programs[index].version);
+        if self.policy.data == Some(program) {
+            return Ok(version);
+        }
+        if expected.crc.is_some_and(|told| told != crc) || check_vectors(flash, region, self.layout).is_err()
+        {
+            return Err(FlashError::NoValidProgram);
+        }
+        #[cfg(feature = "streams")]
+        if expected.crc.is_none() {
+            let mut label = [0; label::SIZE];
+            // Behind the program's end is nothing of it.
+            if expected.size >= label::OFFSET + label::SIZE as u32 {
+                flash.read(region.base + label::OFFSET, &mut label);
+            }
+            return self.check_label(program, &label).map_err(|Refusal(error, _)| error);
+        }
+        Ok(version)
     }
 
     /// A piece of work is over.
@@ -782,10 +882,14 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 state.error = Some(error);
             }
         }
-        self.block_cancel();
-        if error == FlashError::Crc {
+        #[cfg(feature = "streams")]
+        let streaming = matches!(self.reception, Reception::Unknown { .. } | Reception::Stream { .. });
+        #[cfg(not(feature = "streams"))]
+        let streaming = false;
+        if error == FlashError::Crc || streaming {
             self.outcome = Some((program, Err(error)));
         }
+        self.block_cancel();
         abort
     }
 

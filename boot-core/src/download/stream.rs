@@ -7,6 +7,8 @@
 #[cfg(feature = "intel-hex")]
 use super::ihex::{Event, Hex};
 use super::*;
+use shared_abi::block_file::Identity;
+use shared_abi::label::Label;
 
 /// Data of a piece: so long that the flash is kept busy, so short that a small queue holds some.
 const PIECE: usize = 1024;
@@ -64,6 +66,13 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let region = self.region(program);
         let stream = |format, size| Stream { format, next: region.base, end: region.base, size };
         let stream = match u32::from_le_bytes(first) {
+            #[cfg(feature = "raw-image")]
+            _ if self.policy.data == Some(program) => {
+                if size.is_some_and(|size| size > region.size) {
+                    return Err(Refusal(FlashError::Address, AbortCode::LENGTH_TOO_HIGH));
+                }
+                stream(Format::Raw, size.unwrap_or(0))
+            }
             #[cfg(feature = "intel-hex")]
             _ if first[0] == b':' && !self.has_begun(program) => stream(Format::Hex(Hex::new()), 0),
             _ if len < first.len() => return Ok(()),
@@ -151,7 +160,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             return Err(unfit(FlashError::Format));
         }
         let size = stream.end - self.region(program).base;
-        if size < SMALLEST_PROGRAM {
+        if size < if self.policy.data == Some(program) { 1 } else { SMALLEST_PROGRAM } {
             return Err(unfit(FlashError::Format));
         }
         self.close(program, &stream)?;
@@ -192,12 +201,16 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         if !self.has_begun(program) {
             let header = Header::parse(&self.queue.of_open(0));
             // A HEX file may begin anywhere; then its vectors are seen when all is there.
-            if header.flash_address == region.base && size >= SMALLEST_PROGRAM as usize {
+            let is_start = header.flash_address == region.base && self.policy.data != Some(program);
+            if is_start && size >= SMALLEST_PROGRAM as usize {
                 let [stack, reset] =
                     [0, 4].map(|at| u32::from_le_bytes(self.queue.of_open(HEADER_SIZE + at)));
                 if VectorTable::check([stack, reset], region, self.layout).is_err() {
                     return Err(unfit(FlashError::Format));
                 }
+            }
+            if is_start && size >= label::OFFSET as usize + label::SIZE {
+                self.check_label(program, &self.queue.of_open(HEADER_SIZE + label::OFFSET as usize))?;
             }
             self.open_session(program, stream.size);
         }
@@ -208,6 +221,17 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
         self.queue.commit();
         Ok(())
+    }
+
+    /// Whether a program is for this device, by its label; gives its version, 0 where there is no label.
+    pub(super) fn check_label(&self, program: u8, bytes: &[u8; label::SIZE]) -> Result<u32, Refusal> {
+        let Some(label) = Label::parse(bytes) else {
+            return if self.policy.wants_label { Err(unfit(FlashError::Format)) } else { Ok(0) };
+        };
+        let Label { vendor_id, product_code, version, .. } = label;
+        let identity = Identity { app_size: 0, vendor_id, product_code };
+        self.check_identity(program, &Control::Dated { identity, version, date: 0 })?;
+        Ok(version)
     }
 
     /// Whether a piece joined the queue: the old program is gone then.

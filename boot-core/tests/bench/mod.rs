@@ -44,10 +44,12 @@ pub static ENTRIES: [Entry; entry_count(1)] = entries(1);
 pub const CONFIG: Config = Config {
     entries: &ENTRIES,
     device: DEVICE,
+    node_id: None,
     layout: LAYOUT_REF,
     supports: |rate| rate != BitRate::K800,
     boot_up_emergency: false,
     download: Policy::DEFAULT,
+    password: b"",
 };
 
 pub fn node() -> NodeParameters {

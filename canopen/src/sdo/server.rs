@@ -35,11 +35,14 @@ pub struct Config {
     pub repeat_ms: u32,
     /// Segments of a sub-block of a block download: at most 127, and no more than the receive path can queue.
     pub blksize: u8,
+    /// The abort for a request that is none of CiA 301's, or not of this moment.
+    pub unknown_request: AbortCode,
 }
 
 impl Config {
-    /// Two seconds, half a second, 127 segments.
-    pub const DEFAULT: Self = Self { timeout_ms: 2000, repeat_ms: 500, blksize: BLKSIZE_MAX };
+    /// Two seconds, half a second, 127 segments, 05040001h.
+    pub const DEFAULT: Self =
+        Self { timeout_ms: 2000, repeat_ms: 500, blksize: BLKSIZE_MAX, unknown_request: AbortCode::COMMAND };
 }
 
 impl Default for Config {
@@ -320,7 +323,7 @@ impl SdoServer {
                 self.reset(objects);
                 return Ok(None);
             }
-            _ => return Err(AbortCode::COMMAND),
+            _ => return Err(self.config.unknown_request),
         };
         Ok(Some(answer))
     }

@@ -56,6 +56,8 @@ const CONFIG: Config = Config {
     },
     layout: &LAYOUT,
     supports: |_| true,
+    node_id: None,
+    password: b"",
     boot_up_emergency: false,
     download: Policy { identity: Some((VENDOR_ID, PRODUCT_CODE)), ..Policy::DEFAULT },
 };

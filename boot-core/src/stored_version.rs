@@ -1,0 +1,68 @@
+//! The version that a stored program tells of itself: the text behind `$CANopenSoftwareVersion` in its image (CiA 814-1 clause 6.5).
+//!
+//! The image is searched in steps while the flash has nothing to do, so that 100Ah is answered at once and without the flash.
+
+use shared_abi::geometry::Region;
+
+use crate::download::Step;
+use crate::flash::Flash;
+
+/// What stands in front of the version, its NUL included.
+const MARK: &[u8] = b"$CANopenSoftwareVersion\0";
+/// The longest version that is shown.
+const LONGEST: usize = 48;
+/// Bytes that a step looks at.
+const STEP: u32 = 512;
+
+/// The search, or what it found.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct StoredVersion {
+    /// What was searched, or is being, and its CRC: one stored anew is another one.
+    image: Option<(Region, u32)>,
+    /// Offset of the next byte to look at.
+    at: u32,
+    text: [u8; LONGEST],
+    len: usize,
+}
+
+impl StoredVersion {
+    pub(crate) const fn new() -> Self {
+        Self { image: None, at: 0, text: [0; LONGEST], len: 0 }
+    }
+
+    /// The version; `None` where none was found.
+    pub(crate) fn text(&self) -> Option<&[u8]> {
+        self.text.get(..self.len).filter(|text| !text.is_empty())
+    }
+
+    /// Carries the search on. The flash must be idle.
+    pub(crate) fn step<F: Flash>(&mut self, flash: &F, image: Option<(Region, u32)>) -> Step {
+        if self.image != image {
+            *self = Self { image, ..Self::new() };
+        }
+        let Some((image, _)) = image.filter(|(image, _)| self.at < image.size) else { return Step::Idle };
+        let end = (self.at + STEP).min(image.size);
+        while self.at < end {
+            let mut mark = [0; MARK.len()];
+            // Most bytes are no `$`.
+            flash.read(image.base + self.at, &mut mark[..1]);
+            if mark[0] == MARK[0] {
+                flash.read(image.base + self.at, &mut mark);
+                if mark == MARK {
+                    self.take(flash, image, self.at + MARK.len() as u32);
+                    self.at = image.size;
+                    return Step::Idle;
+                }
+            }
+            self.at += 1;
+        }
+        Step::Again
+    }
+
+    fn take<F: Flash>(&mut self, flash: &F, image: Region, at: u32) {
+        let rest = image.size.saturating_sub(at) as usize;
+        let text = &mut self.text[..rest.min(LONGEST)];
+        flash.read(image.base + at, text);
+        self.len = text.iter().position(|byte| *byte == 0).unwrap_or(text.len());
+    }
+}

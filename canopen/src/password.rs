@@ -1,0 +1,98 @@
+//! A password in front of something, counted and slowed down.
+
+use crate::sdo::AbortCode;
+use crate::time::Instant;
+
+/// How long nobody may try again behind the first wrong password, in milliseconds. It doubles with each further one.
+pub const FIRST_DELAY_MS: u32 = 500;
+/// Wrong passwords behind which the delay grows no more: half a minute then.
+const MOST_FAILURES: u32 = 6;
+
+/// The lock and who has tried to open it.
+#[derive(Clone, Copy, Debug)]
+pub struct Lock {
+    password: &'static [u8],
+    /// Wrong passwords since the last right one.
+    failures: u32,
+    /// Nobody may try before.
+    closed_until: Option<Instant>,
+}
+
+impl Lock {
+    /// Opens to this password.
+    #[must_use]
+    pub const fn new(password: &'static [u8]) -> Self {
+        Self { password, failures: 0, closed_until: None }
+    }
+
+    /// Wrong passwords since the last right one.
+    #[must_use]
+    pub const fn failures(&self) -> u32 {
+        self.failures
+    }
+
+    /// Whether nobody may try at present; to be asked at least every few weeks. Who restarts the device to get rid of that waits until it is over.
+    #[must_use]
+    pub fn is_waiting(&mut self, now: Instant) -> bool {
+        // Forgotten when it is over: instants wrap.
+        self.closed_until = self.closed_until.filter(|until| !now.has_reached(*until));
+        self.closed_until.is_some()
+    }
+
+    /// Tries a password.
+    ///
+    /// # Errors
+    /// [`AbortCode::INVALID_VALUE`] for a wrong one; [`AbortCode::DEVICE_STATE`], whatever it is, for one that comes too early.
+    pub fn open(&mut self, given: &[u8], now: Instant) -> Result<(), AbortCode> {
+        if self.is_waiting(now) {
+            return Err(AbortCode::DEVICE_STATE);
+        }
+        // All of it is looked at, however early it differs: the time that it takes tells nothing.
+        let differs = given.iter().zip(self.password).fold(0, |sum, (a, b)| sum | (a ^ b));
+        if differs == 0 && given.len() == self.password.len() {
+            self.failures = 0;
+            return Ok(());
+        }
+        self.closed_until = Some(now + (FIRST_DELAY_MS << self.failures.min(MOST_FAILURES)));
+        self.failures = self.failures.saturating_add(1);
+        Err(AbortCode::INVALID_VALUE)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WRONG: Result<(), AbortCode> = Err(AbortCode(0x0609_0030));
+    const TOO_EARLY: Result<(), AbortCode> = Err(AbortCode(0x0800_0022));
+
+    #[test]
+    fn the_right_password_opens_and_others_do_not() {
+        let mut now = 0;
+        for given in [&b""[..], b"INI", b"INIT!", b"INIU", b"JNIT"] {
+            let mut lock = Lock::new(b"INIT");
+            now += 100_000;
+            assert_eq!(lock.open(given, Instant::from_millis(now)), WRONG, "{given:?}");
+            assert_eq!(lock.failures(), 1);
+        }
+        assert_eq!(Lock::new(b"INIT").open(b"INIT", Instant::from_millis(0)), Ok(()));
+    }
+
+    /// Half a second, one, two … half a minute; within that not even the right one opens.
+    #[test]
+    fn wrong_ones_are_slowed_down() {
+        let mut lock = Lock::new(b"INIT");
+        let mut now = Instant::from_millis(5);
+        for delay in [500, 1000, 2000, 4000, 8000, 16_000, 32_000, 32_000, 32_000] {
+            assert_eq!(lock.open(b"", now), WRONG);
+            assert!(lock.is_waiting(now + (delay - 1)));
+            assert_eq!(lock.open(b"INIT", now + (delay - 1)), TOO_EARLY);
+            now = now + delay;
+            assert!(!lock.is_waiting(now));
+        }
+        assert_eq!(lock.failures(), 9);
+        assert_eq!(lock.open(b"INIT", now), Ok(()));
+        assert_eq!(lock.open(b"", now), WRONG, "and counting begins anew");
+        assert!(!lock.is_waiting(now + 500));
+    }
+}

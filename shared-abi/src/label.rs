@@ -1,0 +1,93 @@
+//! What a program image says of itself, so that the bootloader can refuse one that is for another device before it touches the one
+//! that is there: vendor-ID, product code and version at a fixed place behind the vector table.
+//!
+//! A block file tells the same in its control block; this is for a raw image and Intel HEX, which have none.
+
+use crate::check_word;
+
+/// Tells a label, layout version 1 ("CBL1" read as little-endian bytes).
+pub const MAGIC: u32 = u32::from_le_bytes(*b"CBL1");
+/// Where it lies, from the start of the program: the last 32 bytes of the first 512, behind the vectors of every STM32F4.
+pub const OFFSET: u32 = 0x1E0;
+/// Bytes of a label.
+pub const SIZE: usize = 32;
+
+/// The label as it lies in flash: 32 bytes, little-endian.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Label {
+    /// [`MAGIC`].
+    pub magic: u32,
+    /// Vendor-ID of the devices that it is for (1018h/1).
+    pub vendor_id: u32,
+    /// Product code of the devices that it is for (1018h/2).
+    pub product_code: u32,
+    /// Version of the program, its maker's.
+    pub version: u32,
+    /// 0.
+    pub reserved: [u32; 3],
+    /// [`check_word`] over the seven words before.
+    pub check: u32,
+}
+
+impl Label {
+    /// The label of a program.
+    #[must_use]
+    pub const fn new(vendor_id: u32, product_code: u32, version: u32) -> Self {
+        let check = check_word(&[MAGIC, vendor_id, product_code, version, 0, 0, 0]);
+        Self { magic: MAGIC, vendor_id, product_code, version, reserved: [0; 3], check }
+    }
+
+    /// The label in these bytes; `None` where there is none, or one that is damaged.
+    #[must_use]
+    pub fn parse(bytes: &[u8; SIZE]) -> Option<Self> {
+        let word = |i: usize| {
+            let at = 4 * i;
+            u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
+        };
+        let label = Self::new(word(1), word(2), word(3));
+        let found = Self { magic: word(0), reserved: [word(4), word(5), word(6)], check: word(7), ..label };
+        (found == label).then_some(label)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::layout::BOARDS;
+
+    fn bytes(label: &Label) -> [u8; SIZE] {
+        let [a, b, c] = label.reserved;
+        let words = [label.magic, label.vendor_id, label.product_code, label.version, a, b, c, label.check];
+        let mut bytes = [0; SIZE];
+        for (place, word) in bytes.chunks_mut(4).zip(words) {
+            place.copy_from_slice(&word.to_le_bytes());
+        }
+        bytes
+    }
+
+    #[test]
+    fn a_label_is_read_as_it_was_made_and_not_when_a_bit_is_wrong() {
+        let label = Label::new(0x11, 0x22, 0x33);
+        assert_eq!(core::mem::size_of::<Label>(), SIZE);
+        assert_eq!(
+            bytes(&label)[..16],
+            [b'C', b'B', b'L', b'1', 0x11, 0, 0, 0, 0x22, 0, 0, 0, 0x33, 0, 0, 0]
+        );
+        assert_eq!(Label::parse(&bytes(&label)), Some(label));
+        for bit in 0..8 * SIZE {
+            let mut damaged = bytes(&label);
+            damaged[bit / 8] ^= 1 << (bit % 8);
+            assert_eq!(Label::parse(&damaged), None, "bit {bit}");
+        }
+        assert_eq!(Label::parse(&[0; SIZE]), None);
+        assert_eq!(Label::parse(&[0xFF; SIZE]), None);
+    }
+
+    #[test]
+    fn it_lies_behind_the_vectors_of_every_chip() {
+        for board in BOARDS {
+            assert!(board.chip.vector_table_size() <= OFFSET, "{}", board.board);
+        }
+    }
+}
