@@ -6,6 +6,8 @@ use canopen::device;
 use canopen::emcy;
 use canopen::od::{concat, Access, DataType, Entry};
 use canopen::program::{FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID};
+#[cfg(feature = "lift")]
+use canopen::program::{UNLOCK, UNLOCK_FIRMWARE};
 
 /// What coboot needs of an application: keep these when you add your own.
 const PROGRAM_ENTRIES: [Entry; 6] = [
@@ -30,7 +32,19 @@ const SHOW_ENTRIES: [Entry; 2] = [
 ];
 
 /// The object dictionary.
-pub static ENTRIES: [Entry; 25] = concat(
+#[cfg(not(feature = "lift"))]
+pub static ENTRIES: [Entry; 25] = COMMON;
+/// The object dictionary, with the password of a lift device.
+#[cfg(feature = "lift")]
+pub static ENTRIES: [Entry; 27] = concat(
+    COMMON,
+    [
+        Entry::record(UNLOCK, "Lock/unlock parameters", UNLOCK_FIRMWARE),
+        Entry::sub(UNLOCK, UNLOCK_FIRMWARE, "Firmware update", DataType::VisibleString, Access::Wo),
+    ],
+);
+
+const COMMON: [Entry; 25] = concat(
     concat::<17, 6, 23>(concat::<11, 6, 17>(device::ENTRIES, emcy::ENTRIES), PROGRAM_ENTRIES),
     SHOW_ENTRIES,
 );

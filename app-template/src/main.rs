@@ -39,8 +39,6 @@ mod app {
     use rtic_monotonics::Monotonic;
 
     use super::Mono;
-    use shared_abi::warm_start::BootRequest;
-
     use crate::coboot::{self, Departure, Way};
     use crate::objects::{Application, HEARTBEAT_MS};
 
@@ -132,13 +130,15 @@ mod app {
         if departure.proceed(slave.is_idle() && can.lock(|can| can.is_idle()), now) {
             return;
         }
+        #[cfg(feature = "lift")]
+        application.set_time(now);
         let status = can.lock(status);
         slave.observe(status, now, application);
         // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
         carry_out(slave, &mut can, now, application);
         while let Some(frame) = to_handle.dequeue() {
             if slave.handle(&frame, now, application) {
-                *departure = Departure::Answering(Way::SystemReset, BootRequest::PowerOn);
+                *departure = Departure::Answering(Way::SystemReset, application.reset_request());
             }
             carry_out(slave, &mut can, now, application);
         }

@@ -11,9 +11,14 @@ use canopen::od::{put, Address, Entry, Objects};
 use canopen::program::{
     FlashStatus, ProgramControl, ProgramState, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID,
 };
+#[cfg(feature = "lift")]
+use canopen::program::UNLOCK;
 use canopen::slave::SlaveDevice;
+#[cfg(feature = "lift")]
+use canopen::{password::Lock, Instant};
 use canopen::{AbortCode, BitRate, NodeId};
 use shared_abi::callgate::PROGRAM_SIGNED;
+use shared_abi::label::Label;
 use shared_abi::warm_start::BootRequest;
 
 use crate::coboot::{self, Start, Way};
@@ -26,6 +31,27 @@ pub const HEARTBEAT_MS: u16 = 500;
 /// 100Ah.
 const SOFTWARE_VERSION: &str = if cfg!(feature = "version-2") { "2.0.0" } else { "1.0.0" };
 
+/// Whom this image is for, at the place where the bootloader looks before it takes a raw image or HEX file.
+#[used]
+#[link_section = ".label"]
+static LABEL: Label = Label::new(
+    IDENTITY.vendor_id,
+    IDENTITY.product_code,
+    if cfg!(feature = "version-2") { 2 } else { 1 },
+);
+
+/// 100Ah as update tools find it in the image (CiA 814-1 clause 6.5).
+#[used]
+static MARKED_VERSION: [u8; 30] = *if cfg!(feature = "version-2") {
+    b"$CANopenSoftwareVersion\x002.0.0\0"
+} else {
+    b"$CANopenSoftwareVersion\x001.0.0\0"
+};
+
+/// The password that arms the change into the bootloader in a lift, and opens 1F50h there: choose your own.
+#[cfg(feature = "lift")]
+const PASSWORD: &[u8] = b"coboot";
+
 /// The application's state, as far as the bus sees it.
 pub struct Application {
     device: Device,
@@ -35,6 +61,13 @@ pub struct Application {
     /// The way back into the bootloader (2000h).
     way: Way,
     leave_for: Option<BootRequest>,
+    #[cfg(feature = "lift")]
+    lock: Lock,
+    /// The time that was told last.
+    #[cfg(feature = "lift")]
+    now: Instant,
+    /// The password came: 1F51h = 2 and NMT reset node lead into the bootloader.
+    armed: bool,
     emcy: Emcy,
     /// Node-ID in force.
     id: Option<NodeId>,
@@ -62,6 +95,11 @@ impl Application {
             program: start.program,
             way: Way::default(),
             leave_for: None,
+            #[cfg(feature = "lift")]
+            lock: Lock::new(PASSWORD),
+            #[cfg(feature = "lift")]
+            now: Instant::from_millis(0),
+            armed: false,
             bit_rate: start.bit_rate,
             emcy: Emcy::new(),
             id: start.node_id,
@@ -78,6 +116,23 @@ impl Application {
         self.leave_for.take().map(|request| (self.way, request))
     }
 
+    /// With which request the device restarts when the NMT master says so.
+    pub fn reset_request(&self) -> BootRequest {
+        if self.armed {
+            BootRequest::Stay
+        } else {
+            BootRequest::PowerOn
+        }
+    }
+
+    /// Tells the time: at least every few milliseconds.
+    #[cfg(feature = "lift")]
+    pub fn set_time(&mut self, now: Instant) {
+        self.now = now;
+        // Asked at least now and then, as it wants.
+        let _ = self.lock.is_waiting(now);
+    }
+
     /// The 1F51h callback. It runs before the SDO answer is sent, so it only notes what is to be done: `main`
     /// waits until
     /// the answer is on the bus, then leaves.
@@ -85,6 +140,8 @@ impl Application {
         self.leave_for = Some(match command {
             // While a program is stopped the bootloader runs.
             ProgramControl::StartBootloader | ProgramControl::Stop => BootRequest::Stay,
+            // CiA 814-1 clause 6.3: the tool has written the password and wants the bootloader.
+            ProgramControl::ResetStat if self.armed => BootRequest::Stay,
             // CiA 302-3 calls it "reset program", which starts it anew.
             ProgramControl::ResetStat => BootRequest::Start(self.program),
             // The bootloader carries it out.
@@ -131,6 +188,12 @@ impl Objects for Application {
         }
         match (at.index, data) {
             (PROGRAM_CONTROL, &[value]) => self.program_control(ProgramControl::try_from(value)?),
+            #[cfg(feature = "lift")]
+            (UNLOCK, password) => {
+                self.lock.open(password, self.now)?;
+                self.armed = true;
+                Ok(())
+            }
             (WAY_BACK, &[value]) => {
                 self.way = Way::from_number(value).ok_or(AbortCode::INVALID_VALUE)?;
                 Ok(())

@@ -7,7 +7,7 @@
 use core::fmt;
 
 use crate::geometry::{Geometry, Region};
-use crate::{callgate, handoff, warm_start};
+use crate::{callgate, handoff, label, warm_start};
 
 pub mod nucleo_f446re;
 pub mod stm32f407g_disc1;
@@ -200,6 +200,8 @@ impl fmt::Display for LinkerScript<'_> {
         for (symbol, value) in [
             ("__vector_table_alignment", layout.chip.vector_table_alignment()),
             ("__vector_table_size", layout.chip.vector_table_size()),
+            ("__label", flash.base + label::OFFSET),
+            ("__label_end", flash.base + label::OFFSET + label::SIZE as u32),
             ("__callgate_table", layout.callgate()),
             ("__callgate_table_size", callgate::TABLE_SIZE),
             ("__handoff", layout.handoff.base),

@@ -17,6 +17,14 @@ pub const BOOTLOADER_MINIMAL: &str = "bootloader-minimal.elf";
 pub const BOOTLOADER_RESCUE: &str = "bootloader-rescue.elf";
 /// The standard one that tells a debug probe what it does.
 pub const BOOTLOADER_LOG: &str = "bootloader-log.elf";
+/// The one for masters that know Paulus, and the one for those that know the boot loader of ESAcademy.
+pub const BOOTLOADER_PAULUS: &str = "bootloader-paulus.elf";
+/// See [`BOOTLOADER_PAULUS`].
+pub const BOOTLOADER_ESACADEMY: &str = "bootloader-esacademy.elf";
+/// The one of a lift, whose second program is a set of parameters.
+pub const BOOTLOADER_LIFT: &str = "bootloader-lift.elf";
+/// The application of a lift, in two versions.
+pub const APP_LIFT: [&str; 2] = ["app-lift.elf", "app-lift-v2.elf"];
 /// Version 1 of the application.
 pub const APP_V1: &str = "app-v1.elf";
 /// Version 2 of the application.

@@ -56,6 +56,11 @@ pub fn images(board: &Layout) -> Outcome<Images> {
     image(&minimal, "bootloader-minimal.elf", board.bootloader)?;
     let rescue = Build { board, package: "bootloader", features: "standard,rescue-window" };
     image(&rescue, "bootloader-rescue.elf", board.bootloader)?;
+    for dialect in ["paulus", "esacademy"] {
+        let features = format!("profile-{dialect}");
+        let dialect = format!("bootloader-{dialect}.elf");
+        image(&Build { board, package: "bootloader", features: &features }, &dialect, board.bootloader)?;
+    }
     let log = Build { board, package: "bootloader", features: LOG };
     let log = image(&log, "bootloader-log.elf", board.bootloader)?;
     let program = board.programs[0];
@@ -65,6 +70,11 @@ pub fn images(board: &Layout) -> Outcome<Images> {
     if let Some(second) = board.programs.get(1) {
         let features = "version-2,program-2";
         image(&Build { board, package: "app-template", features }, "app-program-2.elf", *second)?;
+        // The second program's place takes the set of parameters.
+        let lift = Build { board, package: "bootloader", features: "profile-lift" };
+        image(&lift, "bootloader-lift.elf", board.bootloader)?;
+        image(&Build { board, package: "app-template", features: "lift" }, "app-lift.elf", program)?;
+        image(&Build { board, package: "app-template", features: "lift,version-2" }, "app-lift-v2.elf", program)?;
     }
     Ok(Images { dir: workspace::firmware_dir(board), bootloader, log })
 }
