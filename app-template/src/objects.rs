@@ -8,11 +8,11 @@ use canopen::emcy::Emcy;
 use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Address, Entry, Objects};
+#[cfg(feature = "lift")]
+use canopen::program::UNLOCK;
 use canopen::program::{
     FlashStatus, ProgramControl, ProgramState, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID,
 };
-#[cfg(feature = "lift")]
-use canopen::program::UNLOCK;
 use canopen::slave::SlaveDevice;
 #[cfg(feature = "lift")]
 use canopen::{password::Lock, Instant};
@@ -34,11 +34,8 @@ const SOFTWARE_VERSION: &str = if cfg!(feature = "version-2") { "2.0.0" } else {
 /// Whom this image is for, at the place where the bootloader looks before it takes a raw image or HEX file.
 #[used]
 #[link_section = ".label"]
-static LABEL: Label = Label::new(
-    IDENTITY.vendor_id,
-    IDENTITY.product_code,
-    if cfg!(feature = "version-2") { 2 } else { 1 },
-);
+static LABEL: Label =
+    Label::new(IDENTITY.vendor_id, IDENTITY.product_code, if cfg!(feature = "version-2") { 2 } else { 1 });
 
 /// 100Ah as update tools find it in the image (CiA 814-1 clause 6.5).
 #[used]

@@ -370,7 +370,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
             return read;
         }
         match at.index {
-            PROGRAM_CONTROL => put(buf, &[self.download.state(at.sub) as u8]),
+            PROGRAM_CONTROL => put(buf, &[self.download.control(at.sub) as u8]),
             PROGRAM_ID => put(buf, &self.download.identification(at.sub).to_le_bytes()),
             FLASH_STATUS => put(buf, &self.download.status(at.sub).to_word().to_le_bytes()),
             _ => Err(AbortCode::NO_DATA),

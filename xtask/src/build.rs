@@ -74,7 +74,11 @@ pub fn images(board: &Layout) -> Outcome<Images> {
         let lift = Build { board, package: "bootloader", features: "profile-lift" };
         image(&lift, "bootloader-lift.elf", board.bootloader)?;
         image(&Build { board, package: "app-template", features: "lift" }, "app-lift.elf", program)?;
-        image(&Build { board, package: "app-template", features: "lift,version-2" }, "app-lift-v2.elf", program)?;
+        image(
+            &Build { board, package: "app-template", features: "lift,version-2" },
+            "app-lift-v2.elf",
+            program,
+        )?;
     }
     Ok(Images { dir: workspace::firmware_dir(board), bootloader, log })
 }

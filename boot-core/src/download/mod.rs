@@ -331,13 +331,13 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// Whether sub-index `program` of 1F50h, 1F51h, 1F56h and 1F57h exists.
     #[must_use]
     pub fn has(&self, program: u8) -> bool {
-        self.index(program).is_some()
+        self.state_of(program).is_some()
     }
 
     /// 1F57h. Busy while a command of this program is carried out, or while no further block can be taken.
     #[must_use]
     pub fn status(&self, program: u8) -> FlashStatus {
-        let error = self.index(program).and_then(|i| self.programs[i].error);
+        let error = self.state_of(program).and_then(|state| state.error);
         let busy = match self.work {
             Some(
                 Work::Invalidate { program: of, all: true, .. }
@@ -358,8 +358,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
 
     /// 1F51h: no program runs, whether or not there is one.
     #[must_use]
-    pub fn state(&self, program: u8) -> ProgramState {
-        match self.index(program).and_then(|index| self.programs[index].record) {
+    pub fn control(&self, program: u8) -> ProgramState {
+        match self.state_of(program).and_then(|state| state.record) {
             Some(_) => ProgramState::Stopped,
             None => ProgramState::Absent,
         }
@@ -368,7 +368,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// 1F56h: the CRC over the program, 0 where there is none.
     #[must_use]
     pub fn identification(&self, program: u8) -> u32 {
-        self.index(program).map_or(0, |i| self.programs[i].identification)
+        self.state_of(program).map_or(0, |state| state.identification)
     }
 
     /// Whether there is work for [`Downloader::step`].
@@ -419,11 +419,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// If other work goes on.
     #[cfg(feature = "password")]
     pub fn unlock(&mut self, program: u8, at_once: bool) -> Result<(), AbortCode> {
-        let index = self.index(program).ok_or(AbortCode::NO_SUB_INDEX)?;
         if self.leave.is_some() || self.expected.is_some() || !self.is_downloading() {
             return Err(self.refuse(program, untimely(FlashError::Busy)));
         }
-        let state = &mut self.programs[index];
+        let state = self.state(program).ok_or(AbortCode::NO_SUB_INDEX)?;
         state.locked = false;
         state.error = None;
         state.streamed = false;
@@ -442,12 +441,12 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// The abort that answers it.
     #[cfg(feature = "read-back")]
     pub fn stored(&self, program: u8) -> Result<Region, AbortCode> {
-        let index = self.index(program).ok_or(AbortCode::NO_SUB_INDEX)?;
+        let state = self.state_of(program).ok_or(AbortCode::NO_SUB_INDEX)?;
         if !self.policy.read_back {
             return Err(AbortCode::WRITE_ONLY);
         }
         // While it works the flash cannot be read.
-        if self.programs[index].locked || self.busy() {
+        if state.locked || self.busy() {
             return Err(AbortCode::DEVICE_STATE);
         }
         self.installed(program).map(|(place, _)| place).ok_or(AbortCode::NO_DATA)
@@ -456,7 +455,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// Where a program is stored, and its CRC.
     #[cfg(feature = "read-back")]
     pub(crate) fn installed(&self, program: u8) -> Option<(Region, u32)> {
-        let record = self.programs[self.index(program)?].record?;
+        let record = self.state_of(program)?.record?;
         Some((Region::new(self.region(program).base, record.size), record.crc))
     }
 
@@ -467,7 +466,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     pub fn command(&mut self, program: u8, command: ProgramControl) -> Result<(), AbortCode> {
         use ProgramControl::{Clear, ClrSignature, ResetStat, SetSignature, Start, StartBootloader, Stop};
 
-        let index = self.index(program).ok_or(AbortCode::NO_SUB_INDEX)?;
+        let &Program { streamed, locked, .. } = self.state_of(program).ok_or(AbortCode::NO_SUB_INDEX)?;
         if matches!(command, Stop | StartBootloader) {
             // No program runs, and the bootloader does: both are so already.
             return Ok(());
@@ -475,7 +474,6 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         // A new beginning does not wait for the end of the old one.
         let broken_off =
             command == Clear && self.owner == program && self.expected.is_none() && self.is_downloading();
-        let streamed = self.programs[index].streamed;
         // Who sends a program in one go means by 2 what CiA 302-3 says: reset the program, which starts it.
         let command = match command {
             ResetStat if streamed || self.policy.reset_starts => Start,
@@ -489,14 +487,15 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             return Err(self.refuse(program, untimely(FlashError::Busy)));
         }
         let changes = matches!(command, Clear | SetSignature | ClrSignature);
-        if changes && (self.programs[index].locked || !(self.policy.allowed)()) {
+        if changes && (locked || !(self.policy.allowed)()) {
             return Err(self.refuse(program, untimely(FlashError::NoAccess)));
         }
-        let state = &mut self.programs[index];
+        let data = self.policy.data;
+        let state = self.state(program).ok_or(AbortCode::NO_SUB_INDEX)?;
         state.error = None;
         state.streamed = false;
         // Data are never started.
-        let record = state.record.filter(|_| self.policy.data != Some(program));
+        let record = state.record.filter(|_| data != Some(program));
         match (command, record) {
             (Clear, _) => {
                 let again = state.session == Session::Cleared { just: true };
@@ -559,7 +558,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// # Errors
     /// The abort that answers it.
     pub fn block_start(&mut self, program: u8, size: Option<u32>) -> Result<(), AbortCode> {
-        self.index(program).ok_or(AbortCode::NO_SUB_INDEX)?;
+        if !self.has(program) {
+            return Err(AbortCode::NO_SUB_INDEX);
+        }
         let others = self.owner != program && self.busy();
         if self.leave.is_some()
             || self.expected.is_some()
@@ -569,7 +570,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         {
             return Err(self.refuse(program, untimely(FlashError::Busy)));
         }
-        if self.index(program).is_some_and(|index| self.programs[index].locked) {
+        if self.state_of(program).is_some_and(|state| state.locked) {
             return Err(self.refuse(program, untimely(FlashError::NoAccess)));
         }
         if let Some(size) = size {
@@ -585,8 +586,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         if let Some(Session::Cleared { just }) = self.session(program) {
             *just = false;
         }
-        if let Some(index) = self.index(program) {
-            self.programs[index].streamed = false;
+        if let Some(state) = self.state(program) {
+            state.streamed = false;
         }
         self.owner = program;
         self.queue.forget();
@@ -641,8 +642,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         };
         outcome.map_err(|refusal| self.refuse(program, refusal))?;
         self.reception = Reception::Idle;
-        if let Some(index) = self.index(program) {
-            self.programs[index].error = None;
+        if let Some(state) = self.state(program) {
+            state.error = None;
         }
         Ok(())
     }
@@ -677,9 +678,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 let (program, all) = (*program, *all);
                 let outcome = self.parameters.poll(flash);
                 if let Poll::Ready(Ok(())) = outcome {
-                    if let Some(index) = self.index(program) {
-                        self.programs[index].record = None;
-                        self.programs[index].identification = 0;
+                    if let Some(state) = self.state(program) {
+                        state.record = None;
+                        state.identification = 0;
                     }
                     if all {
                         let eraser = SectorEraser::new(self.region(program));
@@ -717,9 +718,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     self.work = Some(work);
                     return Step::Again;
                 };
-                if let Some(index) = self.index(program) {
-                    self.programs[index].identification = crc;
-                    self.programs[index].session = Session::Idle;
+                if let Some(state) = self.state(program) {
+                    state.identification = crc;
+                    state.session = Session::Idle;
                 }
                 let sound = self.check_stored(flash, program, &expected, crc);
                 if let Ok(version) = sound {
@@ -733,8 +734,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             Work::Record { program, record } => {
                 let outcome = self.parameters.poll(flash).map_err(|_| FlashError::NvData);
                 if outcome == Poll::Ready(Ok(())) {
-                    if let Some(index) = self.index(*program) {
-                        self.programs[index].record = Some(*record);
+                    if let Some(state) = self.state(*program) {
+                        state.record = Some(*record);
                     }
                 }
                 (*program, outcome)
@@ -762,7 +763,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         crc: u32,
     ) -> Result<u32, FlashError> {
         let region = self.region(program);
-        let version = self.index(program).map_or(0, |index| self.programs[index].version);
+        let version = self.state_of(program).map_or(0, |state| state.version);
         if self.policy.data == Some(program) {
             return Ok(version);
         }
@@ -784,8 +785,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
 
     /// A piece of work is over.
     fn end(&mut self, program: u8, outcome: Result<(), FlashError>) {
-        if let Some(index) = self.index(program) {
-            let state = &mut self.programs[index];
+        if let Some(state) = self.state(program) {
             state.error = outcome.err();
             if outcome.is_err() {
                 state.streamed = false;
@@ -798,10 +798,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             }
         }
         let start = core::mem::take(&mut self.start_verified);
-        if let (true, Ok(()), Some(index)) = (start, outcome, self.index(program)) {
-            if let Some(record) = self.programs[index].record {
-                self.start(program, record);
-            }
+        let record = self.state_of(program).and_then(|state| state.record);
+        if let (true, Ok(()), Some(record)) = (start, outcome, record) {
+            self.start(program, record);
         }
         self.outcome = Some((program, outcome));
     }
@@ -861,23 +860,27 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         }
     }
 
-    fn index(&self, program: u8) -> Option<usize> {
-        let index = usize::from(program).checked_sub(1)?;
-        (index < PROGRAMS).then_some(index)
+    /// A program, if there is one of this number.
+    fn state_of(&self, program: u8) -> Option<&Program> {
+        self.programs.get(usize::from(program).checked_sub(1)?)
+    }
+
+    /// See [`state_of`](Self::state_of).
+    fn state(&mut self, program: u8) -> Option<&mut Program> {
+        self.programs.get_mut(usize::from(program).checked_sub(1)?)
     }
 
     fn session_of(&self, program: u8) -> Option<Session> {
-        self.index(program).map(|index| self.programs[index].session)
+        self.state_of(program).map(|state| state.session)
     }
 
     fn session(&mut self, program: u8) -> Option<&mut Session> {
-        self.index(program).map(|index| &mut self.programs[index].session)
+        self.state(program).map(|state| &mut state.session)
     }
 
     /// Ends a reception and shows why. The error that ended a session stays to be seen.
     fn refuse(&mut self, program: u8, Refusal(error, abort): Refusal) -> AbortCode {
-        if let Some(index) = self.index(program) {
-            let state = &mut self.programs[index];
+        if let Some(state) = self.state(program) {
             if state.session != Session::Failed || state.error.is_none() {
                 state.error = Some(error);
             }
@@ -914,8 +917,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
 
     /// What the first twelve bytes tell: refuses before the rest is sent.
     fn judge_header(&self, program: u8, header: Header) -> Result<(), Refusal> {
-        let Some(index) = self.index(program) else { return Err(unfit(FlashError::Unspecified)) };
-        let state = &self.programs[index];
+        let Some(state) = self.state_of(program) else { return Err(unfit(FlashError::Unspecified)) };
         if header.size as usize > self.largest() - FRAMING {
             return Err(Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH));
         }
@@ -935,8 +937,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
 
     /// Whether the download of a program may begin.
     fn may_begin(&self, program: u8) -> Result<(), Refusal> {
-        let Some(index) = self.index(program) else { return Err(unfit(FlashError::Unspecified)) };
-        let state = &self.programs[index];
+        let Some(state) = self.state_of(program) else { return Err(unfit(FlashError::Unspecified)) };
         match state.session {
             Session::Idle if state.record.is_some() => Err(untimely(FlashError::NotCleared)),
             Session::Idle | Session::Cleared { .. } if (self.policy.allowed)() => Ok(()),
@@ -999,7 +1000,6 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         if computed != u32::from_le_bytes(self.queue.of_open(data_end)) {
             return Err(unfit(FlashError::Crc));
         }
-        let Some(index) = self.index(program) else { return Err(unfit(FlashError::Unspecified)) };
         let region = self.region(program);
         match header.number {
             NUMBER_CONTROL => {
@@ -1007,8 +1007,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 let control = data.get(..header.size as usize).and_then(Control::parse);
                 let control = control.ok_or(unfit(FlashError::Format))?;
                 let app_size = self.check_identity(program, &control)?;
-                self.programs[index].version =
-                    if let Control::Dated { version, .. } = control { version } else { 0 };
+                let told = if let Control::Dated { version, .. } = control { version } else { 0 };
+                if let Some(state) = self.state(program) {
+                    state.version = told;
+                }
                 self.queue.forget();
                 self.open_session(program, app_size);
             }
@@ -1027,7 +1029,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             }
             number => {
                 self.queue.commit();
-                if let Session::Open { next, .. } = &mut self.programs[index].session {
+                if let Some(Session::Open { next, .. }) = self.session(program) {
                     *next = number.wrapping_add(1);
                 }
             }

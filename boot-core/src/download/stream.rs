@@ -166,8 +166,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         self.close(program, &stream)?;
         self.expect(program, Expected { size, crc: None });
         self.start_verified = self.policy.starts_by_itself;
-        if let Some(index) = self.index(program) {
-            self.programs[index].streamed = true;
+        if let Some(state) = self.state(program) {
+            state.streamed = true;
         }
         Ok(())
     }
@@ -242,10 +242,13 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// What is left of a stream that ends before its end: half a program, if any.
     pub(super) fn break_stream(&mut self) {
         let Reception::Stream { program, .. } = self.reception else { return };
-        if let (true, Some(index)) = (self.has_begun(program), self.index(program)) {
-            self.programs[index].session = Session::Failed;
-            self.programs[index].error.get_or_insert(FlashError::Format);
-            self.break_off();
+        if !self.has_begun(program) {
+            return;
         }
+        if let Some(state) = self.state(program) {
+            state.session = Session::Failed;
+            state.error.get_or_insert(FlashError::Format);
+        }
+        self.break_off();
     }
 }
