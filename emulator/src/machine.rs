@@ -15,6 +15,7 @@ use crate::bxcan::BxCan;
 use crate::cpu::{Cpu, Entry, Exit};
 use crate::periph::flash::Noise;
 pub use crate::periph::flash::{Cut, FlashCut, FlashTimes};
+pub use crate::periph::usart::Usart;
 use crate::peripheral::Peripheral;
 use crate::time::{Span, Time};
 pub use chip::Counters;
@@ -218,6 +219,9 @@ impl Machine {
             chip.flash.lose_power(seed);
             // Off, CAN1 is recessive: as behind a reset.
             crate::peripheral::Peripheral::reset(&mut chip.can1);
+            for usart in &mut chip.usarts {
+                usart.lose_power();
+            }
         }
     }
 
@@ -435,6 +439,16 @@ impl Machine {
     pub fn can_mut(&mut self, n: usize) -> &mut BxCan {
         assert_eq!(n, 0, "CAN2 is not modelled");
         &mut self.cpu.chip_mut().can1
+    }
+
+    /// The USART with this name (`"USART2"`); `None` where the chip has no such one.
+    pub fn usart_mut(&mut self, name: &str) -> Option<&mut Usart> {
+        self.cpu.chip_mut().usarts.iter_mut().find(|usart| usart.instance().name == name)
+    }
+
+    /// All its USARTs.
+    pub fn usarts_mut(&mut self) -> &mut [Usart] {
+        &mut self.cpu.chip_mut().usarts
     }
 
     /// The flash array.

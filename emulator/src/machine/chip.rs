@@ -19,6 +19,7 @@ use crate::periph::iwdg::Iwdg;
 use crate::periph::pwr::Pwr;
 use crate::periph::rcc::{self, Clocks, Rcc, HSI_HZ};
 use crate::periph::syscfg::Syscfg;
+use crate::periph::usart::{self, Usart};
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::Time;
 
@@ -57,6 +58,7 @@ enum Block {
     Pwr,
     Syscfg,
     Can1,
+    Usart(usize),
 }
 
 /// Where in RAM a piece of code goes.
@@ -83,10 +85,16 @@ enum Place {
 type ClockEnable = Option<(u32, u32)>;
 
 /// Start, block, and its clock.
-const BLOCKS: [(u32, Block, ClockEnable); 18] = [
+const BLOCKS: [(u32, Block, ClockEnable); 24] = [
     (0x4000_3000, Block::Iwdg, None),
+    (0x4000_4400, Block::Usart(1), Some((rcc::APB1ENR, 17))),
+    (0x4000_4800, Block::Usart(2), Some((rcc::APB1ENR, 18))),
+    (0x4000_4C00, Block::Usart(3), Some((rcc::APB1ENR, 19))),
+    (0x4000_5000, Block::Usart(4), Some((rcc::APB1ENR, 20))),
     (0x4000_6400, Block::Can1, Some((rcc::APB1ENR, 25))),
     (0x4000_7000, Block::Pwr, Some((rcc::APB1ENR, 28))),
+    (0x4001_1000, Block::Usart(0), Some((rcc::APB2ENR, 4))),
+    (0x4001_1400, Block::Usart(5), Some((rcc::APB2ENR, 5))),
     (0x4001_3800, Block::Syscfg, Some((rcc::APB2ENR, 14))),
     (0x4002_0000, Block::Gpio(0), Some((rcc::AHB1ENR, 0))),
     (0x4002_0400, Block::Gpio(1), Some((rcc::AHB1ENR, 1))),
@@ -108,7 +116,7 @@ const BLOCK_SIZE: u32 = 0x400;
 const RCC_CFGR: u32 = 0x4002_3808;
 
 /// Names of blocks that are not modelled, for reports (RM0090 table 1).
-const UNMODELLED: [(u32, &str); 44] = [
+const UNMODELLED: [(u32, &str); 38] = [
     (0x4000_0000, "TIM2"),
     (0x4000_0400, "TIM3"),
     (0x4000_0800, "TIM4"),
@@ -124,10 +132,6 @@ const UNMODELLED: [(u32, &str); 44] = [
     (0x4000_3800, "SPI2"),
     (0x4000_3C00, "SPI3"),
     (0x4000_4000, "I2S3ext"),
-    (0x4000_4400, "USART2"),
-    (0x4000_4800, "USART3"),
-    (0x4000_4C00, "UART4"),
-    (0x4000_5000, "UART5"),
     (0x4000_5400, "I2C1"),
     (0x4000_5800, "I2C2"),
     (0x4000_5C00, "I2C3"),
@@ -135,8 +139,6 @@ const UNMODELLED: [(u32, &str); 44] = [
     (0x4000_7400, "DAC"),
     (0x4001_0000, "TIM1"),
     (0x4001_0400, "TIM8"),
-    (0x4001_1000, "USART1"),
-    (0x4001_1400, "USART6"),
     (0x4001_2000, "ADC"),
     (0x4001_2C00, "SDIO"),
     (0x4001_3000, "SPI1"),
@@ -197,6 +199,8 @@ pub struct Chip {
     pub gpio: Vec<Gpio>,
     /// CAN1.
     pub can1: BxCan,
+    /// The USARTs, as in [`usart::INSTANCES`].
+    pub usarts: [Usart; 6],
     pwr: Pwr,
     crc: Crc,
     syscfg: Syscfg,
@@ -275,6 +279,7 @@ impl Chip {
             iwdg: Iwdg::default(),
             gpio: ('A'..='K').take(variant.ports).map(Gpio::new).collect(),
             can1: BxCan::new(),
+            usarts: usart::INSTANCES.each_ref().map(Usart::new),
             pwr: Pwr::new(variant),
             crc: Crc::default(),
             syscfg: Syscfg::default(),
@@ -330,6 +335,10 @@ impl Chip {
         for port in &mut self.gpio {
             port.reset();
         }
+        for usart in &mut self.usarts {
+            usart.reset();
+        }
+        self.wire_usarts();
         let option_bytes = self.flash.option_bytes();
         self.options.bytes_mut()[..option_bytes.len()].copy_from_slice(&option_bytes);
         self.apply_clocks();
@@ -365,6 +374,26 @@ impl Chip {
         self.scs.systick.set_clock(self.clocks.hclk.into(), now);
         let can_clocked = self.rcc.plain(rcc::APB1ENR) & 1 << 25 != 0;
         self.can1.set_clock(if can_clocked { self.clocks.pclk1 } else { 0 });
+        for (_, block, enable) in BLOCKS {
+            let Block::Usart(index) = block else { continue };
+            let clocked = self.has_clock(enable);
+            let usart = &mut self.usarts[index];
+            let clock = if usart.instance().apb2 { self.clocks.pclk2 } else { self.clocks.pclk1 };
+            usart.set_clock(if clocked { clock } else { 0 });
+        }
+    }
+
+    /// Looks which pins the program has given to the USARTs.
+    fn wire_usarts(&mut self) {
+        let Self { gpio, usarts, .. } = self;
+        let is_given = |&(port, pin, function): &(char, u8, u8)| {
+            let port = gpio.get(port as usize - 'A' as usize);
+            port.is_some_and(|port| port.alternate(pin) == Some(function))
+        };
+        for usart in usarts {
+            let usart::Instance { tx, rx, .. } = usart.instance();
+            usart.set_wired(tx.iter().any(is_given), rx.iter().any(is_given));
+        }
     }
 
     /// Reports a clock tree that the chip cannot follow. The model runs on; silicon would read rubbish or hang.
@@ -412,6 +441,9 @@ impl Chip {
         self.settle_flash();
         self.iwdg.advance(now);
         self.can1.advance(now);
+        for usart in &mut self.usarts {
+            usart.advance(now);
+        }
         if self.iwdg.has_expired() {
             self.reset_request = Some(ResetCause::IndependentWatchdog);
             self.leave = true;
@@ -427,6 +459,9 @@ impl Chip {
         lines.clear();
         self.flash.interrupts(&mut lines);
         self.can1.interrupts(&mut lines);
+        for usart in &self.usarts {
+            usart.interrupts(&mut lines);
+        }
         self.scs.exceptions.set_levels(&lines);
         self.lines = lines;
         self.check_exceptions = self.scs.exceptions.any_pending();
@@ -454,6 +489,7 @@ impl Chip {
             self.scs.systick.next_event(),
         ]
         .into_iter()
+        .chain(self.usarts.iter().map(Peripheral::next_event))
         .flatten()
         .min()
     }
@@ -499,7 +535,7 @@ impl Chip {
             // The bus matrix reads the word, changes the bit, writes the word (PM0214 section 2.2.5).
             let (word, bit) = bit_band(PERIPHERALS.base, address - PERIPHERAL_ALIAS.base);
             self.change_word(word, 1 << bit, (value & 1) << bit)
-        } else if size == 4 {
+        } else if size == 4 || address & 3 == 0 && self.takes_halves(address) {
             self.store_word(address, value)
         } else {
             let shift = 8 * (address & 3);
@@ -509,6 +545,11 @@ impl Chip {
             self.complain(Access::Write, address, size, value, unmodelled);
         }
         self.after_write();
+    }
+
+    /// Whether a register is one of those that a half-word is all of, so that writing it reads nothing.
+    fn takes_halves(&self, address: u32) -> bool {
+        matches!(self.place(address), Place::Block { block: Block::Usart(_), .. })
     }
 
     fn change_word(&mut self, address: u32, mask: u32, value: u32) -> Result<(), Unmodelled> {
@@ -560,6 +601,7 @@ impl Chip {
             Block::Pwr => &mut self.pwr,
             Block::Syscfg => &mut self.syscfg,
             Block::Can1 => &mut self.can1,
+            Block::Usart(index) => &mut self.usarts[index],
         }
     }
 
@@ -642,7 +684,7 @@ impl Chip {
             Block::Rcc => {
                 self.reset_blocks(resets_before);
                 let changed = self.rcc.clocks() != self.clocks;
-                if changed || offset == rcc::APB1ENR {
+                if changed || offset == rcc::APB1ENR || offset == rcc::APB2ENR {
                     self.apply_clocks();
                     self.leave = true;
                 }
@@ -658,6 +700,7 @@ impl Chip {
                 }
                 self.settle_flash();
             }
+            Block::Gpio(_) => self.wire_usarts(),
             Block::Can1 if self.can1.wants_attention() => {
                 self.attention = true;
                 self.leave = true;

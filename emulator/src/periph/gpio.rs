@@ -27,6 +27,7 @@ pub struct Gpio {
 
 const INPUT: u32 = 0;
 const OUTPUT: u32 = 1;
+const ALTERNATE: u32 = 2;
 
 impl Gpio {
     /// Port `port`, one of `'A'` to `'K'`.
@@ -103,6 +104,14 @@ impl Gpio {
     #[must_use]
     pub fn is_input(&self, pin: u8) -> bool {
         Self::field(self.moder, pin) == INPUT
+    }
+
+    /// The alternate function that the program has given `pin`, if it has (section 8.4.9).
+    #[must_use]
+    pub fn alternate(&self, pin: u8) -> Option<u8> {
+        let pin = pin & 15;
+        let function = self.afr[usize::from(pin / 8)] >> (4 * u32::from(pin % 8)) & 0xF;
+        (Self::field(self.moder, pin) == ALTERNATE).then_some(function as u8)
     }
 
     fn idr(&self) -> u32 {
@@ -198,6 +207,17 @@ mod tests {
         assert_eq!(port.read(0x10, Time(0)), Ok(1 << 5 | 1 << 3));
         port.reset();
         assert_eq!(port.read(0x10, Time(0)), Ok(1 << 5), "the outside does not know of a reset");
+    }
+
+    /// Section 8.4: MODER 10b, and four bits a pin in AFRL and AFRH.
+    #[test]
+    fn an_alternate_function_is_one_where_the_mode_says_so() {
+        let mut port = Gpio::new('C');
+        port.write(0x20, 7 << 8, Time(0)).unwrap();
+        port.write(0x24, 8 << 16, Time(0)).unwrap();
+        assert_eq!(port.alternate(2), None);
+        port.write(0x00, 2 << 4 | 2 << 24, Time(0)).unwrap();
+        assert_eq!([2, 12, 3].map(|pin| port.alternate(pin)), [Some(7), Some(8), None]);
     }
 
     #[test]

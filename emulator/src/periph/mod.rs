@@ -7,3 +7,4 @@ pub mod iwdg;
 pub mod pwr;
 pub mod rcc;
 pub mod syscfg;
+pub mod usart;
