@@ -34,6 +34,10 @@ fn main() {
     println!("cargo:rustc-link-arg-bins=--nmagic");
     // Functions that compile to the same code are one.
     println!("cargo:rustc-link-arg-bins=--icf=all");
+    if template == "bootloader.x" && has("LOG_DEFMT") {
+        // The words of `defmt`, which are in the ELF file and not on the chip.
+        println!("cargo:rustc-link-arg-bins=-Tdefmt.x");
+    }
     match template {
         "resident.x" => println!("cargo:rustc-link-arg-bins=--oformat=binary"),
         "bootloader.x" => resident(&package, &out),

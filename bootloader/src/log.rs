@@ -1,94 +1,60 @@
-//! A few words for whoever ports the bootloader (SYS TEC manual L-1112d_10, 4.7): over RTT, which any debug probe's viewer shows.
-//! They are there with the feature `log-rtt` alone.
+//! A few words for whoever ports the bootloader (SYS TEC manual L-1112d_10, 4.7). They are there with these features alone:
 //!
-//! RTT is a ring buffer in RAM that the probe finds by its first bytes and reads while the program runs. A line that finds no
-//! room is left out: nobody waits for a probe.
+//! | feature | what a line is | where it goes |
+//! |---|---|---|
+//! | `log-rtt` | text | to a debug probe, over RTT |
+//! | `log-defmt` | a frame of `defmt`, whose words stay in the ELF file | to a debug probe, over RTT |
+//! | `log-uart` | text | out of the board's UART |
+//!
+//! A line that finds no room where it goes is left out: nobody waits for who reads it.
 
-use core::sync::atomic::{AtomicPtr, AtomicU32, AtomicU8, Ordering};
+#[cfg(feature = "log-defmt")]
+mod logger;
+#[cfg(any(feature = "log-rtt", feature = "log-defmt"))]
+mod rtt;
+#[cfg(feature = "log-uart")]
+pub mod uart;
+
+use core::sync::atomic::{AtomicU32, Ordering};
 
 use boot_core::canopen::od::{Address, Objects};
 use boot_core::canopen::program::{FLASH_STATUS, PROGRAM_CONTROL};
 use boot_core::canopen::Frame;
 
+#[cfg(all(feature = "log-rtt", feature = "log-defmt"))]
+compile_error!("log-rtt and log-defmt both write to the one RTT buffer: choose one of them");
+
 /// Whether anything is said.
-pub const ON: bool = cfg!(feature = "log-rtt");
+pub const ON: bool = cfg!(any(feature = "log-rtt", feature = "log-uart", feature = "log-defmt"));
 
 /// Says something, and a number that goes with it.
 macro_rules! log {
     ($words:literal, $number:expr) => {
         if $crate::log::ON {
-            $crate::log::line($words, $number)
+            let number: u32 = $number;
+            #[cfg(feature = "log-defmt")]
+            defmt::println!("{=istr} {=u32:08X}", defmt::intern!($words), number);
+            $crate::log::line($words, number)
         }
     };
 }
 pub(crate) use log;
 
-/// SEGGER's control block with one buffer up and none down (UM08001 section 16.4).
-#[repr(C)]
-struct ControlBlock {
-    id: [AtomicU32; 4],
-    up_buffers: AtomicU32,
-    down_buffers: AtomicU32,
-    name: AtomicPtr<u8>,
-    buffer: AtomicPtr<u8>,
-    size: AtomicU32,
-    /// Where the next byte goes; ours.
-    written: AtomicU32,
-    /// Where the probe reads next; the probe's.
-    read: AtomicU32,
-    /// 0: what finds no room is left out.
-    flags: AtomicU32,
-}
-
-const SIZE: u32 = 1024;
-static BUFFER: [AtomicU8; SIZE as usize] = [const { AtomicU8::new(0) }; SIZE as usize];
-
-/// The name by which a viewer may find it in the ELF file.
-#[export_name = "_SEGGER_RTT"]
-static CONTROL: ControlBlock = ControlBlock {
-    id: [const { AtomicU32::new(0) }; 4],
-    up_buffers: AtomicU32::new(0),
-    down_buffers: AtomicU32::new(0),
-    name: AtomicPtr::new(core::ptr::null_mut()),
-    buffer: AtomicPtr::new(core::ptr::null_mut()),
-    size: AtomicU32::new(0),
-    written: AtomicU32::new(0),
-    read: AtomicU32::new(0),
-    flags: AtomicU32::new(0),
-};
-
-/// Makes the block known. The first bytes come last: a probe may look at any time, and must not find them anywhere else.
-fn open() {
-    CONTROL.up_buffers.store(1, Ordering::Relaxed);
-    CONTROL.name.store(c"log".as_ptr().cast_mut().cast(), Ordering::Relaxed);
-    CONTROL.buffer.store(BUFFER.as_ptr().cast_mut().cast(), Ordering::Relaxed);
-    CONTROL.size.store(SIZE, Ordering::Relaxed);
-    for (word, text) in CONTROL.id.iter().zip([*b"SEGG", *b"ER R", *b"TT\0\0"]) {
-        word.store(u32::from_le_bytes(text), Ordering::Release);
-    }
-}
-
-/// Writes a line, if there is room for it.
-pub fn line(words: &str, number: u32) {
+/// Writes a line to wherever text goes.
+pub fn line(words: &'static str, number: u32) {
     const DIGITS: &[u8; 16] = b"0123456789ABCDEF";
-    let digits = (0..8).rev().map(|digit| DIGITS[(number >> (4 * digit) & 0xF) as usize]);
+    let digits = (0..8).rev().map(move |digit| DIGITS[(number >> (4 * digit) & 0xF) as usize]);
+    let line = words.bytes().chain([b' ']).chain(digits).chain(*b"\r\n");
+    #[cfg(feature = "log-rtt")]
     // One line behind the other, whoever writes.
     cortex_m::interrupt::free(|_| {
-        if CONTROL.size.load(Ordering::Relaxed) == 0 {
-            open();
-        }
-        let mut at = CONTROL.written.load(Ordering::Relaxed);
-        let used = at.wrapping_sub(CONTROL.read.load(Ordering::Acquire)) % SIZE;
-        // Number, blank and end of line; and a full ring would look like an empty one.
-        if used as usize + words.len() + 11 >= SIZE as usize {
-            return;
-        }
-        for byte in words.bytes().chain([b' ']).chain(digits).chain(*b"\r\n") {
-            BUFFER[(at % SIZE) as usize].store(byte, Ordering::Relaxed);
-            at = (at + 1) % SIZE;
-        }
-        CONTROL.written.store(at, Ordering::Release);
+        let mut message = rtt::Message::begin();
+        message.put(line.clone());
+        message.end();
     });
+    #[cfg(feature = "log-uart")]
+    uart::write(line.clone());
+    let _ = line;
 }
 
 /// A frame came in: says which command it is, if it is one. (A segment of a block transfer may look like one.)

@@ -9,7 +9,7 @@
 //! | `flash.rs` | the flash controller and the CRC unit | registers |
 //! | `ram_vectors.rs` | the vector table in RAM | one copy |
 //! | `watchdog.rs` | feeds the watchdog when all tasks are alive | no |
-//! | `log.rs` | a few words over RTT (feature `log-rtt`) | no |
+//! | `log.rs`, `log/` | a few words for whoever ports it (features `log-…`) | interrupts |
 //! | `memory.rs` | `memcpy` and its kin, small | assembly |
 //!
 //! What the bootloader *is* stands in `boot-core` and `canopen`.
@@ -146,6 +146,8 @@ mod app {
         // SAFETY: the device's own are not used beside it.
         let flash = unsafe { FlashController::steal(Some(&cx.device.RCC)) };
         let board = bsp::init(&mut cx.device.RCC.constrain(), cx.device.CAN1);
+        #[cfg(feature = "log-uart")]
+        log::uart::open(board.uart);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
         let parameters = product::parameters(&flash);

@@ -16,6 +16,9 @@ pub struct Board {
     pub can: CanController,
     /// The LED.
     pub led: Led,
+    /// The UART with its pins; on, at `UART_BIT_RATE`.
+    #[cfg(feature = "uart")]
+    pub uart: crate::uart::Port<crate::UartController>,
 }
 
 /// The clocks as the HAL knows them, for the HAL's drivers. From the state after a reset.

@@ -11,16 +11,17 @@ pub mod can;
 pub mod clock;
 #[cfg(target_arch = "arm")]
 mod drivers;
+pub mod uart;
 #[cfg(target_arch = "arm")]
 pub mod watchdog;
 
-/// A GPIO port, for the `init` of a board. The board file alone knows which ports that is about, so no caller hands them over;
+/// A GPIO port or a UART, for the `init` of a board. The board file alone knows which that is about, so no caller hands them over;
 /// that it is asked for once is shown by the CAN controller, which exists once.
 #[cfg(target_arch = "arm")]
 macro_rules! take_port {
     ($port:ident, $can:ident) => {{
         let _: &pac::CAN1 = &$can;
-        // SAFETY: the pins of a board are set up by its `init` alone, and that takes the only CAN controller.
+        // SAFETY: the pins of a board and its UART are set up by its `init` alone, and that takes the only CAN controller.
         unsafe { pac::$port::steal() }
     }};
 }

@@ -44,10 +44,13 @@ pub const CLOCK_TREE: ClockTree = ClockTree {
 /// The blue button B1 on PC13, low when pressed; the board pulls it up (UM1724).
 pub const ENTRY_STRAP: (char, u8, bool) = ('C', 13, false);
 
+/// Bit rate of the UART, in bit/s.
+pub const UART_BIT_RATE: u32 = 115_200;
+
 #[cfg(target_arch = "arm")]
 pub use pins::*;
 
-/// LED and CAN controller, by the types that the HAL has for pins.
+/// LED, CAN controller and UART, by the types that the HAL has for pins.
 #[cfg(target_arch = "arm")]
 mod pins {
     use stm32f4xx_hal::can::CanExt;
@@ -55,10 +58,16 @@ mod pins {
     use stm32f4xx_hal::pac;
     use stm32f4xx_hal::rcc::Rcc;
 
+    #[cfg(feature = "uart")]
+    use crate::uart::Port;
     use crate::Board;
 
     /// The LED that shows life: LD2, green, high is on.
     pub type Led = Pin<'A', 5, Output>;
+
+    /// The UART, which is set up with the feature `uart` alone:
+    /// on PA2 and PA3, which the ST-LINK makes a serial port of the host (UM1724).
+    pub type UartController = pac::USART2;
 
     /// Sets the pins up.
     #[must_use]
@@ -66,8 +75,15 @@ mod pins {
         let gpioa = take_port!(GPIOA, can1).split(rcc);
         let gpiob = take_port!(GPIOB, can1).split(rcc);
         let led = gpioa.pa5.into_push_pull_output();
+        #[cfg(feature = "uart")]
+        let uart = Port::new(take_port!(USART2, can1), (gpioa.pa2, gpioa.pa3), rcc);
         // AF9: CAN1_RX is PB8, CAN1_TX is PB9 (DS10693, alternate functions; the HAL's table has the same).
         let can = can1.can((gpiob.pb9, gpiob.pb8), rcc);
-        Board { can, led }
+        Board {
+            can,
+            led,
+            #[cfg(feature = "uart")]
+            uart,
+        }
     }
 }

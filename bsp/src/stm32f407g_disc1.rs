@@ -44,10 +44,13 @@ pub const CLOCK_TREE: ClockTree = ClockTree {
 /// The blue button B1 on PA0, high when pressed (UM1472 section 6.4).
 pub const ENTRY_STRAP: (char, u8, bool) = ('A', 0, true);
 
+/// Bit rate of the UART, in bit/s.
+pub const UART_BIT_RATE: u32 = 115_200;
+
 #[cfg(target_arch = "arm")]
 pub use pins::*;
 
-/// LED and CAN controller, by the types that the HAL has for pins.
+/// LED, CAN controller and UART, by the types that the HAL has for pins.
 #[cfg(target_arch = "arm")]
 mod pins {
     use stm32f4xx_hal::can::CanExt;
@@ -55,17 +58,32 @@ mod pins {
     use stm32f4xx_hal::pac;
     use stm32f4xx_hal::rcc::Rcc;
 
+    #[cfg(feature = "uart")]
+    use crate::uart::Port;
     use crate::Board;
 
     /// The LED that shows life: LD4, green, high is on.
     pub type Led = Pin<'D', 12, Output>;
+
+    /// The UART, which is set up with the feature `uart` alone:
+    /// on PA2 and PA3, which are free on this board (UM1472).
+    pub type UartController = pac::USART2;
 
     /// Sets the pins up.
     #[must_use]
     pub fn init(rcc: &mut Rcc, can1: pac::CAN1) -> Board {
         let gpiod = take_port!(GPIOD, can1).split(rcc);
         let led = gpiod.pd12.into_push_pull_output();
+        #[cfg(feature = "uart")]
+        let gpioa = take_port!(GPIOA, can1).split(rcc);
+        #[cfg(feature = "uart")]
+        let uart = Port::new(take_port!(USART2, can1), (gpioa.pa2, gpioa.pa3), rcc);
         let can = can1.can((gpiod.pd1, gpiod.pd0), rcc);
-        Board { can, led }
+        Board {
+            can,
+            led,
+            #[cfg(feature = "uart")]
+            uart,
+        }
     }
 }

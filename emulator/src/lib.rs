@@ -5,6 +5,7 @@ pub mod bxcan;
 pub mod candump;
 pub mod cortex;
 pub mod cpu;
+pub mod defmt;
 pub mod frame;
 pub mod machine;
 pub mod pacing;

@@ -2,6 +2,7 @@
 
 use shared_abi::geometry::Region;
 
+use crate::defmt::Decoder;
 use crate::machine::Machine;
 
 /// How a control block begins.
@@ -9,6 +10,7 @@ const ID: &[u8; 16] = b"SEGGER RTT\0\0\0\0\0\0";
 /// Number of buffers up behind it.
 const UP_BUFFERS: u32 = 16;
 /// The first buffer's description: name, memory, size, the program's offset, the probe's offset.
+const NAME: u32 = 24;
 const MEMORY: u32 = 28;
 const SIZE: u32 = 32;
 const WRITTEN: u32 = 36;
@@ -18,25 +20,44 @@ const LARGEST: u32 = 64 * 1024;
 /// A line is cut here, if the program does not end it.
 const LONGEST_LINE: usize = 256;
 
+/// The name of a buffer that holds frames of `defmt` and no text.
+const FRAMES: &[u8; 6] = b"defmt\0";
+
 /// Reads the first buffer of a board's control block.
-#[derive(Debug, Default)]
+#[derive(Default)]
 pub struct Reader {
     /// Where the block was last.
     block: Option<u32>,
     /// What was read of a line that is not complete.
     line: Vec<u8>,
+    /// What explains frames of `defmt`.
+    decoder: Option<Decoder>,
 }
 
 impl Reader {
+    /// A reader that decodes frames of `defmt`, too, if the program tells by them.
+    #[must_use]
+    pub fn with(decoder: Option<Decoder>) -> Self {
+        Self { decoder, ..Self::default() }
+    }
+
     /// The lines that the program has written since the last time. `sram` is where the block is looked for. A block of noise gives
     /// nothing.
     pub fn lines(&mut self, machine: &mut Machine, sram: Region) -> Vec<String> {
         let is_there = |block: &u32| read::<16>(machine, *block).as_ref() == Some(ID);
         // A reset may have brought another program.
         self.block = self.block.filter(is_there).or_else(|| find(machine, sram));
-        let news = self.block.and_then(|block| take(machine, block)).unwrap_or_default();
+        let Some(block) = self.block else { return Vec::new() };
+        let news = take(machine, block).unwrap_or_default();
+        match &mut self.decoder {
+            Some(decoder) if holds_frames(machine, block) => decoder.messages(&news),
+            _ => self.text(&news),
+        }
+    }
+
+    fn text(&mut self, news: &[u8]) -> Vec<String> {
         let mut lines = Vec::new();
-        for byte in news {
+        for &byte in news {
             if byte != b'\n' && self.line.len() < LONGEST_LINE {
                 self.line.push(byte);
                 continue;
@@ -66,6 +87,11 @@ fn find(machine: &Machine, sram: Region) -> Option<u32> {
         from += 4;
     }
     None
+}
+
+fn holds_frames(machine: &Machine, block: u32) -> bool {
+    let name = block.checked_add(NAME).and_then(|at| read::<4>(machine, at)).map(u32::from_le_bytes);
+    name.and_then(|name| read(machine, name)).as_ref() == Some(FRAMES)
 }
 
 /// Takes what lies between the two offsets, and moves the probe's one.

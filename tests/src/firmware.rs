@@ -15,8 +15,6 @@ pub const BOOTLOADER_COMPLETE: &str = "bootloader-complete.elf";
 pub const BOOTLOADER_MINIMAL: &str = "bootloader-minimal.elf";
 /// The standard one with a rescue window of half a second.
 pub const BOOTLOADER_RESCUE: &str = "bootloader-rescue.elf";
-/// The standard one that tells a debug probe what it does.
-pub const BOOTLOADER_LOG: &str = "bootloader-log.elf";
 /// The one for masters that know Paulus, and the one for those that know the boot loader of ESAcademy.
 pub const BOOTLOADER_PAULUS: &str = "bootloader-paulus.elf";
 /// See [`BOOTLOADER_PAULUS`].
@@ -25,6 +23,12 @@ pub const BOOTLOADER_ESACADEMY: &str = "bootloader-esacademy.elf";
 pub const BOOTLOADER_LIFT: &str = "bootloader-lift.elf";
 /// The application of a lift, in two versions.
 pub const APP_LIFT: [&str; 2] = ["app-lift.elf", "app-lift-v2.elf"];
+/// One that tells a debug probe what it does, as text.
+pub const BOOTLOADER_LOG_RTT: &str = "bootloader-log-rtt.elf";
+/// The same by `defmt`.
+pub const BOOTLOADER_LOG_DEFMT: &str = "bootloader-log-defmt.elf";
+/// The same as text, out of the board's UART.
+pub const BOOTLOADER_LOG_UART: &str = "bootloader-log-uart.elf";
 /// Version 1 of the application.
 pub const APP_V1: &str = "app-v1.elf";
 /// Version 2 of the application.

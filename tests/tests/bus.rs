@@ -151,7 +151,7 @@ fn foreign(n: usize) -> Frame {
 fn sdo_trace(records: &[Record], from: Time) -> Vec<(u32, Vec<u8>)> {
     let of_channel = |record: &&Record| {
         let id = record.frame.raw_id();
-        record.start >= from && !record.frame.is_extended() && (id == REQUEST.into() || id == RESPONSE)
+        record.start >= from && !record.frame.is_extended() && (id == u32::from(REQUEST) || id == RESPONSE)
     };
     let frames =
         records.iter().filter(of_channel).inspect(|record| assert_eq!(record.outcome, Outcome::Good));
@@ -188,8 +188,9 @@ fn a_bus_full_of_foreign_frames_costs_no_sdo_frame() {
         assert!(pair[1].start - pair[0].end <= INTERMISSION, "a gap on the bus behind {:?}", pair[0]);
     }
     assert_eq!(sdo_trace(&records, from), expected);
-    let requests =
-        loaded.iter().filter(|record| !record.frame.is_extended() && record.frame.raw_id() == REQUEST.into());
+    let requests = loaded
+        .iter()
+        .filter(|record| !record.frame.is_extended() && record.frame.raw_id() == u32::from(REQUEST));
     let requests = requests.count() as u64;
     assert!(
         interrupts <= requests,
@@ -252,7 +253,7 @@ fn a_burst_of_127_segments_back_to_back_at_1_mbit_is_taken_without_loss() {
         let records = bench.records();
         let burst: Vec<&Record> = records
             .iter()
-            .filter(|record| record.start >= sent && record.frame.raw_id() == REQUEST.into())
+            .filter(|record| record.start >= sent && record.frame.raw_id() == u32::from(REQUEST))
             .collect();
         assert_eq!(burst.len(), 127);
         for pair in burst.windows(2) {

@@ -1,63 +1,175 @@
-//! What the bootloader tells a debug probe, and that a release tells nothing.
+//! What the bootloader tells whoever ports it, by each of its ways, and that a release tells nothing.
 
 use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
+use coflash::flash::{flash, FlashOptions};
+use emulator::defmt::Decoder;
+use emulator::machine::Machine;
+use emulator::periph::usart::Character;
+use emulator::peripheral::Peripheral;
 use emulator::rtt::Reader;
-use object::{Object, ObjectSymbol};
+use object::{Object, ObjectSection, ObjectSymbol};
 
-fn told(bench: &mut Bench, reader: &mut Reader) -> Vec<String> {
-    reader.lines(bench.machine(), firmware::board().chip.sram)
+/// Who reads it.
+enum Listener {
+    /// A debug probe.
+    Probe(Reader),
+    /// A terminal: what of a line it has.
+    Terminal(Vec<u8>),
+}
+
+impl Listener {
+    fn told(&mut self, bench: &mut Bench) -> Vec<String> {
+        match self {
+            Self::Probe(reader) => reader.lines(bench.machine(), firmware::board().chip.sram),
+            Self::Terminal(line) => {
+                line.extend(heard(bench.machine()).iter().map(|character| character.byte));
+                let text = std::mem::take(line);
+                let text = String::from_utf8(text).expect("text");
+                let mut lines: Vec<_> = text.split_inclusive("\r\n").map(str::to_owned).collect();
+                if let Some(part) = lines.pop_if(|line| !line.ends_with("\r\n")) {
+                    *line = part.into_bytes();
+                }
+                lines.iter().map(|line| line.trim_end().to_owned()).collect()
+            }
+        }
+    }
+}
+
+/// What has come out of the board's UARTs; a terminal at 115 200 bit/s reads what is 2 % off at most.
+fn heard(machine: &mut Machine) -> Vec<Character> {
+    let usarts = machine.usarts_mut().iter_mut();
+    let heard: Vec<_> = usarts.flat_map(|usart| usart.take_heard()).collect();
+    assert!(heard.iter().all(|character| character.bit_rate.abs_diff(115_200) < 2_304), "{heard:?}");
+    heard
+}
+
+fn decoder(image: &str) -> Decoder {
+    Decoder::of_elf(&firmware::elf(image)).expect("words that are understood").expect("words")
+}
+
+/// The images that tell, with who listens to each.
+fn ways() -> [(&'static str, Listener); 3] {
+    [
+        (firmware::BOOTLOADER_LOG_RTT, Listener::Probe(Reader::default())),
+        (
+            firmware::BOOTLOADER_LOG_DEFMT,
+            Listener::Probe(Reader::with(Some(decoder(firmware::BOOTLOADER_LOG_DEFMT)))),
+        ),
+        (firmware::BOOTLOADER_LOG_UART, Listener::Terminal(Vec::new())),
+    ]
 }
 
 /// Codes from docs/protocol.md: 6 no valid program; 02 NOVALPROG; 06090030h an unknown command, and request 5 as after a power-on.
 #[test]
-fn a_probe_is_told_why_it_stayed_what_it_refuses_and_that_it_leaves() {
-    let mut bench = Bench::of_image(firmware::BOOTLOADER_LOG);
-    let mut reader = Reader::default();
-    bench.power_on();
-    bench.await_boot_up(100);
-    bench.run_ms(5);
-    assert_eq!(
-        told(&mut bench, &mut reader),
-        ["stayed in the bootloader; why 00000006", "emergency; code and detail FF000042"]
-    );
+fn it_tells_why_it_stayed_what_it_refuses_and_that_it_leaves() {
+    for (image, mut listener) in ways() {
+        println!("{image}");
+        let mut bench = Bench::of_image(image);
+        bench.power_on();
+        bench.await_boot_up(100);
+        bench.run_ms(10);
+        assert_eq!(
+            listener.told(&mut bench),
+            ["stayed in the bootloader; why 00000006", "emergency; code and detail FF000042"]
+        );
 
-    bench.session().command(1, ProgramControl::Start).unwrap();
-    bench.run_ms(5);
-    assert_eq!(
-        told(&mut bench, &mut reader),
-        ["1F51h; program and command 00000101", "1F57h; program and status 00010002"]
-    );
+        bench.session().command(1, ProgramControl::Start).unwrap();
+        bench.run_ms(10);
+        assert_eq!(
+            listener.told(&mut bench),
+            ["1F51h; program and command 00000101", "1F57h; program and status 00010002"]
+        );
 
-    // 1F51h/1 = 7Fh (CiA 301 section 7.2.4.3.3: expedited, one byte).
-    bench.post(0x600 + u16::from(NODE), &[0x2F, 0x51, 0x1F, 0x01, 0x7F, 0, 0, 0]);
-    bench.run_ms(10);
-    assert_eq!(
-        told(&mut bench, &mut reader),
-        ["1F51h; program and command 0000017F", "refused; abort code 06090030"]
-    );
+        // 1F51h/1 = 7Fh (CiA 301 section 7.2.4.3.3: expedited, one byte).
+        bench.post(0x600 + u16::from(NODE), &[0x2F, 0x51, 0x1F, 0x01, 0x7F, 0, 0, 0]);
+        bench.run_ms(10);
+        assert_eq!(
+            listener.told(&mut bench),
+            ["1F51h; program and command 0000017F", "refused; abort code 06090030"]
+        );
 
-    // NMT: reset node.
-    bench.post(0x000, &[0x81, 0]);
-    bench.run_ms(10);
-    assert_eq!(told(&mut bench, &mut reader), ["leaving; request 00000005"]);
-    bench.assert_nothing_unmodelled();
+        // NMT: reset node.
+        bench.post(0x000, &[0x81, 0]);
+        bench.run_ms(10);
+        assert_eq!(listener.told(&mut bench), ["leaving; request 00000005"]);
+        bench.assert_nothing_unmodelled();
+    }
 }
 
-/// Without a probe nobody takes the lines away: what finds no room is left out, and the device goes on.
+/// Without a probe nobody takes the lines away, and a UART is slower than the bus: what finds no room is left out, and the device goes on.
 #[test]
-fn nobody_waits_for_a_probe() {
-    let mut bench = Bench::of_image(firmware::BOOTLOADER_LOG);
+fn nobody_waits_for_who_reads_it() {
+    for (image, mut listener) in ways() {
+        println!("{image}");
+        let mut bench = Bench::of_image(image);
+        bench.power_on();
+        bench.await_boot_up(100);
+        bench.set_host_bit_rate(125_000);
+        for _ in 0..100 {
+            // Two lines of some 40 characters, which a UART needs 7 ms for.
+            bench.post(0x600 + u16::from(NODE), &[0x2F, 0x51, 0x1F, 0x01, 0x7F, 0, 0, 0]);
+            bench.run_ms(2);
+        }
+        bench.run_ms(200);
+        let lines = listener.told(&mut bench);
+        // 202 were said; a kibibyte of text holds some 25 of them, of frames 150.
+        assert!((20..190).contains(&lines.len()), "{}", lines.len());
+        // None of them is cut.
+        let whole = |line: &String| {
+            line.len() > 9 && line.split_at(line.len() - 9).1.bytes().skip(1).all(|c| c.is_ascii_hexdigit())
+        };
+        assert!(lines.iter().all(whole), "{lines:?}");
+        assert!(lines.iter().any(|line| line == "refused; abort code 06090030"), "{lines:?}");
+        bench.session().command(1, ProgramControl::ResetStat).unwrap();
+    }
+}
+
+/// The UART is served from RAM: what is said while a sector is erased is on the line at once, and the erase holds nothing up.
+#[test]
+fn the_uart_speaks_while_the_flash_erases() {
+    let mut bench = Bench::of_image(firmware::BOOTLOADER_LOG_UART);
     bench.power_on();
     bench.await_boot_up(100);
-    for _ in 0..100 {
-        bench.session().command(1, ProgramControl::Start).unwrap();
+    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
+        .unwrap();
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up(1000);
+    // Twice in a row: erase everything at once.
+    bench.session().command(1, ProgramControl::Clear).unwrap();
+    bench.session().command(1, ProgramControl::Clear).unwrap();
+    bench.run_ms(50);
+    heard(bench.machine());
+    let mut terminal = Listener::Terminal(Vec::new());
+    for _ in 0..20 {
+        bench.post(0x600 + u16::from(NODE), &[0x2F, 0x51, 0x1F, 0x01, 0x7F, 0, 0, 0]);
+        // Two frames at 125 kbit/s, 2 ms; 67 characters, 5.9 ms.
+        bench.run_ms(9);
+        assert_eq!(
+            terminal.told(&mut bench),
+            ["1F51h; program and command 0000017F", "refused; abort code 06090030"]
+        );
     }
-    let lines = told(&mut bench, &mut Reader::default());
-    // A kibibyte of them, and none of them cut.
-    assert!((20..40).contains(&lines.len()), "{}", lines.len());
-    assert!(lines.iter().all(|line| line.len() > 9 && line.as_bytes()[line.len() - 9] == b' '), "{lines:?}");
+    assert!(bench.session().status(1).unwrap().busy, "the erase must have lasted");
+    assert_eq!(bench.machine().counters().flash_stalls, 0);
+}
+
+/// A viewer that is given the wrong ELF file, or gets into the middle of a frame.
+#[test]
+fn frames_that_mean_nothing_are_told_as_such() {
+    let mut decoder = decoder(firmware::BOOTLOADER_LOG_DEFMT);
+    for index in 0..=u16::MAX {
+        let [low, high] = index.to_le_bytes();
+        for frame in [&[low, high, 0][..], &[low, high, 0x7F, 0], &[low, 1, high, 0xFF, 0x80, 0]] {
+            decoder.messages(frame);
+        }
+    }
+    let told = decoder.messages(&[0xFF, 0xFF, 0xFF, 0]);
+    assert_eq!(told, ["a frame of defmt that this program's ELF file does not explain"]);
+    assert!(decoder.messages(&vec![0x55; 100_000]).is_empty());
+    assert!(Decoder::of_elf(&firmware::elf(firmware::BOOTLOADER)).unwrap().is_none());
+    assert!(Decoder::of_elf(b"no ELF file").is_err());
 }
 
 #[test]
@@ -66,11 +178,22 @@ fn a_release_has_nothing_of_it() {
         let bytes = firmware::elf(image);
         let elf = object::File::parse(&bytes[..]).expect("an ELF of ours");
         let symbol = elf.symbols().any(|symbol| symbol.name() == Ok("_SEGGER_RTT"));
+        let frames =
+            elf.sections().any(|section| section.name().is_ok_and(|name| name.starts_with(".defmt")));
         let words = bytes.windows(14).any(|part| part == b"leaving; reque");
-        (symbol, words)
+        (symbol, frames, words)
     };
-    assert_eq!(has(firmware::BOOTLOADER_LOG), (true, true));
+    assert_eq!(has(firmware::BOOTLOADER_LOG_RTT), (true, false, true));
+    assert_eq!(has(firmware::BOOTLOADER_LOG_UART), (false, false, true));
+    assert_eq!(has(firmware::BOOTLOADER_LOG_DEFMT), (true, true, true));
     for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_COMPLETE, firmware::BOOTLOADER_MINIMAL] {
-        assert_eq!(has(image), (false, false), "{image}");
+        assert_eq!(has(image), (false, false, false), "{image}");
+        let mut bench = Bench::of_image(image);
+        bench.power_on();
+        bench.await_boot_up(100);
+        bench.session().command(1, ProgramControl::Start).unwrap();
+        bench.run_ms(20);
+        let touched = bench.machine().usarts_mut().iter().find(|usart| usart.accesses() > 0);
+        assert!(touched.is_none(), "{image} uses {}", touched.unwrap().name());
     }
 }

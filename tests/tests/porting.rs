@@ -110,6 +110,11 @@ fn a_board_is_made_as_the_guide_says() {
         (10, "gpiod.pd12.into_push_pull_output();", "gpioa.pa5.into_push_pull_output();"),
         (
             11,
+            "        #[cfg(feature = \"uart\")]\n        let gpioa = take_port!(GPIOA, can1).split(rcc);\n",
+            "",
+        ),
+        (
+            12,
             "can1.can((gpiod.pd1, gpiod.pd0), rcc)",
             "{\n            let gpiob = take_port!(GPIOB, can1).split(rcc);\n            \
              can1.can((gpiob.pb9, gpiob.pb8), rcc)\n        }",
@@ -262,6 +267,22 @@ const MISTAKES: &[Mistake] = &[
         by: By::Drivers,
         says: "can1::Tx: From<stm32f4xx_hal::gpio::Pin<'B', 7>>",
     },
+    // DS10693, alternate functions: PA4 is the clock of USART2.
+    Mistake {
+        file: BOARD,
+        right: "(gpioa.pa2, gpioa.pa3)",
+        wrong: "(gpioa.pa4, gpioa.pa3)",
+        by: By::Drivers,
+        says: "usart2::Tx: From<stm32f4xx_hal::gpio::Pin<'A', 4>>",
+    },
+    // 40 MHz and 16 cycles a bit at least.
+    Mistake {
+        file: BOARD,
+        right: "UART_BIT_RATE: u32 = 115_200",
+        wrong: "UART_BIT_RATE: u32 = 3_000_000",
+        by: By::Drivers,
+        says: "board: the clock of the UART cannot make UART_BIT_RATE",
+    },
     Mistake {
         file: "bsp/Cargo.toml",
         right: "stm32f4xx-hal/stm32f446",
@@ -279,7 +300,10 @@ fn a_mistake_in_a_port_fails_the_build_and_is_named() {
     let look = |by: By| match by {
         By::Layout => copy.cargo(&["check", "-p", "shared-abi"]),
         By::Board => copy.cargo(&["check", "-p", "bsp", board]),
-        By::Drivers => copy.cargo(&[&["check", "-p", "bsp", board][..], &triple].concat()),
+        By::Drivers => {
+            let features = format!("{board},uart");
+            copy.cargo(&[&["check", "-p", "bsp", &features][..], &triple].concat())
+        }
         By::Image => {
             let words = ["build", "-p", "bootloader", "--no-default-features", board];
             copy.cargo(&[&words[..], &triple].concat())

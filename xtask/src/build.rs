@@ -17,9 +17,10 @@ pub const HELP: &str = "\
 usage: cargo xtask build [--board BOARD] [--yes]
 
 Builds the bootloader, standard, with every option, without any, with a rescue window and with words
-for a debug probe, both versions of the application and the one in C, and puts them into
+for whoever ports it, both versions of the application and the one in C, and puts them into
 target/firmware/BOARD/ as bootloader.elf, bootloader-complete.elf, bootloader-minimal.elf,
-bootloader-rescue.elf, bootloader-log.elf, app-v1.elf, app-v2.elf and app-c.elf; for a board with room for two programs also app-program-2.elf and app-c-program-2.elf.
+bootloader-rescue.elf, bootloader-log-rtt.elf, -log-defmt.elf and -log-uart.elf, app-v1.elf, app-v2.elf
+and app-c.elf; for a board with room for two programs also app-program-2.elf and app-c-program-2.elf.
 
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -31,8 +32,8 @@ pub struct Images {
     pub dir: PathBuf,
     /// The bootloader among them.
     pub bootloader: PathBuf,
-    /// The one that tells a debug probe what it does.
-    pub log: PathBuf,
+    /// Those that tell what they do, by their places in [`LOGS`].
+    pub logs: Vec<PathBuf>,
 }
 
 pub fn run(mut args: Args) -> Outcome {
@@ -61,8 +62,11 @@ pub fn images(board: &Layout) -> Outcome<Images> {
         let dialect = format!("bootloader-{dialect}.elf");
         image(&Build { board, package: "bootloader", features: &features }, &dialect, board.bootloader)?;
     }
-    let log = Build { board, package: "bootloader", features: LOG };
-    let log = image(&log, "bootloader-log.elf", board.bootloader)?;
+    let logs = LOGS.iter().map(|(way, features)| {
+        let log = Build { board, package: "bootloader", features };
+        image(&log, &format!("bootloader-log-{way}.elf"), board.bootloader)
+    });
+    let logs = logs.collect::<Outcome<_>>()?;
     let program = board.programs[0];
     // Version 1 is the template as it stands.
     image(&Build { board, package: "app-template", features: "" }, "app-v1.elf", program)?;
@@ -80,7 +84,7 @@ pub fn images(board: &Layout) -> Outcome<Images> {
             program,
         )?;
     }
-    Ok(Images { dir: workspace::firmware_dir(board), bootloader, log })
+    Ok(Images { dir: workspace::firmware_dir(board), bootloader, logs })
 }
 
 /// Builds the application in C for each program of a board. A board that app-c/boards does not know has none.
@@ -166,8 +170,10 @@ pub fn bootloader(board: &Layout) -> Outcome<PathBuf> {
 pub const OPTIONAL: [&str; 4] = ["auto-bit-rate", "block-upload", "emcy", "lss"];
 /// Those of them that a product usually has: this bootloader is the one that is measured against the budget.
 pub const STANDARD: &str = "standard";
-/// The standard one, with words for a debug probe.
-pub const LOG: &str = "standard,log-rtt";
+/// Bootloaders with words for whoever ports them, by the way that they take. The standard one and its words would not fit: these do
+/// without the dialects.
+pub const LOGS: [(&str, &str); 3] =
+    [("rtt", "emcy,lss,log-rtt"), ("defmt", "emcy,lss,log-defmt"), ("uart", "emcy,lss,log-uart")];
 /// All of them.
 pub const COMPLETE: &str = "complete";
 

@@ -5,12 +5,13 @@ use crate::setup::{Part, Setup};
 use crate::{build, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask emulate [--board BOARD] [--log] [--yes] [OPTIONS]
+usage: cargo xtask emulate [--board BOARD] [--log[=WAY]] [--yes] [OPTIONS]
 
 Sets the machine up, builds the firmware and runs the emulated board with the bootloader in its flash.
 
   --board BOARD   the board (default: stm32f407g-disc1)
-  --log           the bootloader that tells a debug probe what it does, and what it tells
+  --log[=WAY]     the bootloader that tells what it does, and what it tells. WAY: rtt (text for a debug
+                  probe; the default), defmt (the same by defmt), uart (text out of the board's UART)
   --yes           installs what is missing with sudo
   OPTIONS         go to the emulator; `cargo xtask emulate -- --help` lists them. Among them:
                   --socketcand 127.0.0.1:29536    where other programs reach the bus
@@ -21,7 +22,7 @@ Sets the machine up, builds the firmware and runs the emulated board with the bo
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
-    let log = args.flag("--log");
+    let log = log(&mut args)?;
     let setup = Setup::from(&mut args);
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
     let images = build::images(board)?;
@@ -30,8 +31,37 @@ pub fn run(mut args: Args) -> Outcome {
     let mut emulator = process::cargo("run");
     emulator.args(["--package", "emulator", "--bin", "emulate", "--", "--board", board.board]);
     if !options.iter().any(|word| word == "--bootloader" || word.starts_with("--bootloader=")) {
-        emulator.arg("--bootloader").arg(if log { &images.log } else { &images.bootloader });
+        emulator.arg("--bootloader").arg(log.map_or(&images.bootloader, |way| &images.logs[way]));
     }
     emulator.args(options.iter().filter(|word| *word != "--"));
     process::run(&mut emulator)
+}
+
+/// The bootloader that is asked for, as a place in [`build::LOGS`].
+fn log(args: &mut Args) -> Outcome<Option<usize>> {
+    if args.flag("--log") {
+        return Ok(Some(0));
+    }
+    let Some(wanted) = args.value("--log")? else { return Ok(None) };
+    let ways = build::LOGS.map(|(way, _)| way);
+    let found = ways.iter().position(|way| *way == wanted);
+    found.map(Some).ok_or_else(|| format!("--log={wanted} is no way; there are {}.", ways.join(", ")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn asked(words: &str) -> Outcome<Option<usize>> {
+        log(&mut Args::new(words.split_whitespace().map(str::to_owned)))
+    }
+
+    #[test]
+    fn the_ways_of_the_log() {
+        assert_eq!(asked(""), Ok(None));
+        assert_eq!(asked("--log --verbose"), Ok(Some(0)));
+        assert_eq!(asked("--log=uart").map(|way| build::LOGS[way.unwrap()].1), Ok("emcy,lss,log-uart"));
+        assert_eq!(asked("--log=defmt").map(|way| build::LOGS[way.unwrap()].1), Ok("emcy,lss,log-defmt"));
+        assert!(asked("--log=smoke").unwrap_err().contains("rtt, defmt, uart"));
+    }
 }

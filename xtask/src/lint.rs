@@ -20,7 +20,6 @@ const FIRMWARE: &[(&str, &str)] = &[
     ("bootloader", ""),
     ("bootloader", build::STANDARD),
     ("bootloader", build::COMPLETE),
-    ("bootloader", build::LOG),
     ("app-template", ""),
     ("app-template", "version-2"),
 ];
@@ -42,7 +41,8 @@ pub fn run(mut args: Args) -> Outcome {
         problems.extend(process::run(&mut clippy).err());
     };
     clippy(&["--all-targets", "--keep-going"].map(str::to_owned));
-    for (package, features) in FIRMWARE {
+    let logs = build::LOGS.iter().map(|(_, features)| ("bootloader", *features));
+    for (package, features) in FIRMWARE.iter().copied().chain(logs) {
         clippy(&build::firmware_args(package, board, features));
     }
     let mut resident = build::firmware_args("bootloader", board, "standard,resident");

@@ -217,7 +217,8 @@ const STEPS: &[(&str, &str)] = &[
     ("pub const CLOCK_TREE", "Step 8: crystal (or a clock, with hse_bypass) and PLL. APB1 at 40 MHz makes each bit rate of CiA 301."),
     ("pub const ENTRY_STRAP", "Step 9: the pin that keeps the device in the bootloader, and the level that does."),
     ("    pub type Led", "Step 10: the LED: its pin here and in `init`."),
-    ("        let can = can1.can(", "Step 11: the CAN pins, transmit and receive. The build fails for pins that the chip cannot use for CAN1."),
+    ("    pub type UartController", "Step 11: the UART for words while you port: which it is here, its pins in `init`, where each port is taken once."),
+    ("        let can = can1.can(", "Step 12: the CAN pins, transmit and receive. The build fails for pins that the chip cannot use for CAN1."),
 ];
 
 /// What stands in a board's header for C, and the step that it belongs to.
@@ -318,7 +319,7 @@ mod tests {
                 );
             }
             let board = &changes[8].text;
-            for step in 5..=11 {
+            for step in 5..=12 {
                 assert_eq!(
                     board.matches(&format!("// Step {step}: ")).count(),
                     1,

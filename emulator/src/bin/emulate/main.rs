@@ -3,6 +3,7 @@
 mod words;
 
 use std::cell::RefCell;
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
@@ -16,8 +17,10 @@ use anyhow::{bail, Context, Result};
 use clap::Parser;
 use emulator::bus::Outcome;
 use emulator::candump::{Handle, Lines};
+use emulator::defmt::Decoder;
 use emulator::machine::{FlashTimes, Machine, Options, ResetCause, Stop};
 use emulator::pacing::{Pacer, Speed};
+use emulator::periph::usart::Character;
 use emulator::rtt;
 use emulator::socketcand::Server;
 use emulator::time::{Span, Time};
@@ -223,6 +226,20 @@ fn load(machine: &mut Machine, path: &Path) -> Result<()> {
     Ok(())
 }
 
+/// What explains the frames of `defmt` in the images, if one has any.
+fn decoder(args: &Args) -> Result<Option<Decoder>> {
+    for path in images(args).filter(|path| path.exists()) {
+        let bytes = read_image(path)?;
+        if bytes.starts_with(b"\x7FELF") {
+            let decoder = Decoder::of_elf(&bytes).map_err(anyhow::Error::msg);
+            if let Some(decoder) = decoder.with_context(|| format!("{}", path.display()))? {
+                return Ok(Some(decoder));
+            }
+        }
+    }
+    Ok(None)
+}
+
 /// The boards, the bus, and who listens.
 struct Bench {
     world: World,
@@ -242,6 +259,32 @@ struct Watched {
     log: rtt::Reader,
     /// When its RAM is looked at next.
     look: Time,
+    /// What has come out of its USARTs of lines that are not complete, by name and bit rate.
+    serial: BTreeMap<(&'static str, u32), Vec<u8>>,
+}
+
+/// A line that comes out of a USART is cut here, if the program does not end it.
+const LONGEST_LINE: usize = 256;
+
+impl Watched {
+    /// What its USARTs have said since the last time, with the time of its end and in words.
+    fn serial(&mut self, machine: &mut Machine) -> Vec<(Time, String)> {
+        let mut said = Vec::new();
+        for usart in machine.usarts_mut() {
+            let name = usart.instance().name;
+            for Character { end, byte, bit_rate } in usart.take_heard() {
+                let line = self.serial.entry((name, bit_rate)).or_default();
+                if byte != b'\n' && line.len() < LONGEST_LINE {
+                    line.push(byte);
+                    continue;
+                }
+                let text = String::from_utf8_lossy(line).trim_end().escape_default().to_string();
+                line.clear();
+                said.push((end, format!("{name} ({bit_rate} bit/s): {text}")));
+            }
+        }
+        said
+    }
 }
 
 /// How often a board's RAM is looked at for what it tells a debug probe.
@@ -277,8 +320,9 @@ impl Bench {
                 id: world.add_machine(machine),
                 shown: 0,
                 sram: args.board.chip.sram,
-                log: rtt::Reader::default(),
+                log: rtt::Reader::with(decoder(args)?),
                 look: Time(0),
+                serial: BTreeMap::new(),
             });
         }
         let port = world.add_host_port(args.bit_rate);
@@ -389,6 +433,12 @@ impl Bench {
             lines.extend(new.iter().map(|report| (report.time, format!("{name}: {}", unmodelled(report)))));
             board.shown = reports.len();
             let now = self.world.now();
+            lines.extend(
+                board
+                    .serial(self.world.machine_mut(board.id))
+                    .into_iter()
+                    .map(|(at, line)| (at, format!("{name}: {line}"))),
+            );
             if now >= board.look {
                 board.look = now + LOOK;
                 let told = board.log.lines(self.world.machine_mut(board.id), board.sram);

@@ -1,0 +1,85 @@
+//! What `defmt` writes to: the ring that a debug probe reads, a frame at a time.
+
+use core::cell::UnsafeCell;
+
+use cortex_m::{interrupt, register::primask};
+use defmt::Encoder;
+
+use super::rtt::Message;
+
+#[defmt::global_logger]
+struct Logger;
+
+struct State {
+    encoder: Encoder,
+    message: Option<Message>,
+    /// Interrupts were on when the frame began.
+    interrupts: bool,
+}
+
+struct Guarded(UnsafeCell<State>);
+
+// SAFETY: used between `acquire` and `release` alone, with interrupts off, on a chip with one core.
+unsafe impl Sync for Guarded {}
+
+static STATE: Guarded =
+    Guarded(UnsafeCell::new(State { encoder: Encoder::new(), message: None, interrupts: false }));
+
+/// Does something with the state.
+///
+/// # Safety
+/// Interrupts are off, and stay so.
+unsafe fn with<T>(act: impl FnOnce(&mut State) -> T) -> T {
+    // SAFETY: interrupts are off, as the caller vouches for, so nobody else is here.
+    act(unsafe { &mut *STATE.0.get() })
+}
+
+// SAFETY: between `acquire` and `release` interrupts are off, so there is one frame at a time; what `defmt` formats has no
+// formatters of ours that would log themselves.
+unsafe impl defmt::Logger for Logger {
+    fn acquire() {
+        let interrupts = primask::read().is_active();
+        interrupt::disable();
+        // SAFETY: interrupts are off.
+        unsafe {
+            with(|state| {
+                let mut message = Message::begin();
+                state.encoder.start_frame(|bytes| message.put(bytes.iter().copied()));
+                state.message = Some(message);
+                state.interrupts = interrupts;
+            });
+        }
+    }
+
+    unsafe fn flush() {
+        // Who reads it does so when they like.
+    }
+
+    unsafe fn release() {
+        // SAFETY: `acquire` has switched the interrupts off.
+        let interrupts = unsafe {
+            with(|state| {
+                if let Some(mut message) = state.message.take() {
+                    state.encoder.end_frame(|bytes| message.put(bytes.iter().copied()));
+                    message.end();
+                }
+                state.interrupts
+            })
+        };
+        if interrupts {
+            // SAFETY: they were on before `acquire`.
+            unsafe { interrupt::enable() };
+        }
+    }
+
+    unsafe fn write(bytes: &[u8]) {
+        // SAFETY: `acquire` has switched the interrupts off.
+        unsafe {
+            with(|state| {
+                if let Some(message) = &mut state.message {
+                    state.encoder.write(bytes, |bytes| message.put(bytes.iter().copied()));
+                }
+            });
+        }
+    }
+}
