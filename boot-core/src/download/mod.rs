@@ -166,7 +166,8 @@ struct Program {
 }
 
 /// How far the download of a program is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+// Not to be compared as a whole, which costs 140 bytes of flash: `matches!` looks at what is asked for.
+#[derive(Clone, Copy, Debug)]
 enum Session {
     /// No block was taken yet.
     Idle,
@@ -498,7 +499,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         let record = state.record.filter(|_| data != Some(program));
         match (command, record) {
             (Clear, _) => {
-                let again = state.session == Session::Cleared { just: true };
+                let again = matches!(state.session, Session::Cleared { just: true });
                 state.session = Session::Cleared { just: true };
                 self.reception = Reception::Idle;
                 self.break_off();
@@ -789,7 +790,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             state.error = outcome.err();
             if outcome.is_err() {
                 state.streamed = false;
-                if state.session != Session::Idle {
+                if !matches!(state.session, Session::Idle) {
                     state.session = Session::Failed;
                 }
                 self.queue.clear();
@@ -881,7 +882,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// Ends a reception and shows why. The error that ended a session stays to be seen.
     fn refuse(&mut self, program: u8, Refusal(error, abort): Refusal) -> AbortCode {
         if let Some(state) = self.state(program) {
-            if state.session != Session::Failed || state.error.is_none() {
+            if !matches!(state.session, Session::Failed) || state.error.is_none() {
                 state.error = Some(error);
             }
         }
