@@ -145,8 +145,8 @@ const PROGRAM_OBJECTS: [(u16, &str, Entry); 4] = [
     (
         PROGRAM_CONTROL,
         "Program control",
-        Entry::sub(PROGRAM_CONTROL, 1, "Program control of a program", DataType::Unsigned8, Access::Rw)
-            .default(0),
+        // Without a default value, which a configuration tool might write: what is read is a state, what is written a command.
+        Entry::sub(PROGRAM_CONTROL, 1, "Program control of a program", DataType::Unsigned8, Access::Rw),
     ),
     (
         PROGRAM_ID,
