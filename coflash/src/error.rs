@@ -8,6 +8,7 @@ use canopen::sdo::AbortCode;
 use canopen::NodeId;
 
 use crate::adapter::AdapterError;
+use crate::dialect::Dialect;
 use crate::lss::LssDoing;
 use crate::session::{DeviceType, Doing};
 
@@ -89,6 +90,23 @@ pub enum Error {
         device: u32,
         /// What the file says.
         file: u32,
+    },
+    /// The device's dialect has no such thing.
+    NotInDialect {
+        /// The dialect.
+        dialect: Dialect,
+        /// What is missing, as a sentence.
+        what: &'static str,
+    },
+    /// The device is locked, and no password was given.
+    NoPassword {
+        /// Which device.
+        node: NodeId,
+    },
+    /// Another device has the node-ID that this one's bootloader takes.
+    Occupied {
+        /// The node-ID.
+        node: NodeId,
     },
     /// A layer setting service failed.
     Lss {
@@ -173,6 +191,8 @@ impl Error {
             Self::NoAnswer { .. } => 0x6000_0013,
             Self::Lss { failure: LssFailure::NoAnswer, .. } => 0x6000_0013,
             Self::Lss { failure: LssFailure::None, .. } => 0x6000_0017,
+            Self::NotInDialect { .. } | Self::NoPassword { .. } => 0x6000_0018,
+            Self::Occupied { .. } => 0x6000_0010,
             Self::Lss { failure: LssFailure::Refused { code, .. }, .. } => 0x6000_0200 + *code as u32,
             Self::StartFailed { .. } => 0x6000_0014,
             Self::Busy { .. } => 0x6000_0016,
@@ -190,7 +210,13 @@ impl Error {
                 "check that node {node} is the right one, that the device has power, that both sides use the same bit \
                  rate and that the bus is terminated; a slow device may need a longer --sdo-timeout"
             ),
+            Self::Refused { doing: Doing::Unlock, code, .. } => unlock_advice(*code).to_string(),
             Self::Refused { code, .. } => refusal_advice(*code).to_string(),
+            Self::NotInDialect { .. } => "leave that out, or name another dialect by --dialect".to_string(),
+            Self::NoPassword { .. } => "give the device's password by --unlock; its maker knows it".to_string(),
+            Self::Occupied { node } => format!(
+                "finish the update of the device that is node {node} now, or switch that off, and run the command again"
+            ),
             Self::Protocol { .. } => "look for a second tool or a second device with this node-ID on the bus; a longer \
                                       --sdo-timeout helps against answers that come late"
                 .to_string(),
@@ -292,6 +318,15 @@ fn failure_advice(error: FlashError) -> &'static str {
     }
 }
 
+fn unlock_advice(code: AbortCode) -> &'static str {
+    match code {
+        AbortCode::NO_OBJECT | AbortCode::NO_SUB_INDEX => {
+            "the device knows no password: check --dialect, or leave that out"
+        }
+        _ => "check the password: its maker knows it; after a wrong one a device may take its time, or want a reset",
+    }
+}
+
 fn refusal_advice(code: AbortCode) -> &'static str {
     match code {
         AbortCode::NO_OBJECT => "the device has no such object: is it a device with this bootloader?",
@@ -346,6 +381,11 @@ impl fmt::Display for Error {
             }
             Self::WrongCrc { device, file } => {
                 write!(f, "the program in the device has CRC {device:08X}h, that of the file {file:08X}h")
+            }
+            Self::NotInDialect { dialect, what } => write!(f, "in the dialect {}: {what}", dialect.name()),
+            Self::NoPassword { node } => write!(f, "node {node} is locked, and no password was given"),
+            Self::Occupied { node } => {
+                write!(f, "node {node} answers already: another device is in its bootloader")
             }
             Self::Lss { doing, failure: LssFailure::NoAnswer } => {
                 write!(f, "no device answers ({})", doing.words())

@@ -7,12 +7,14 @@ use std::fmt;
 use std::time::Duration;
 
 use canopen::program::{self, FlashError, ProgramControl};
-use canopen::{AbortCode, Address};
+use canopen::{AbortCode, Address, NodeId};
 use shared_abi::block_file::Control;
 
 use crate::block_file::{Block, BlockFile};
+use crate::dialect::{self, Dialect, Password};
 use crate::error::{Error, Mismatch};
-use crate::session::{DeviceType, Doing, Session, Transfers};
+use crate::info::absent;
+use crate::session::{DeviceType, Doing, Session, Timing, Transfers};
 
 /// What to do beyond the download itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -29,6 +31,12 @@ pub struct FlashOptions {
     pub start: bool,
     /// Compare the CRC once more at the very end: the one that the program itself tells when it runs.
     pub verify: bool,
+    /// The dialect that the device speaks; `None` to find it out.
+    pub dialect: Option<Dialect>,
+    /// What opens the device, in dialects that ask for it.
+    pub unlock: Option<Password>,
+    /// Whether the session can follow a device to another node-ID, which lifts need. One of several at once cannot.
+    pub follow: bool,
 }
 
 /// The device that a program is for: what 1018h/1 and 1018h/2 have to read.
@@ -55,7 +63,17 @@ impl Target {
 
 impl Default for FlashOptions {
     fn default() -> Self {
-        Self { program: 1, repeats: 3, check_target: None, trial_run: false, start: true, verify: false }
+        Self {
+            program: 1,
+            repeats: 3,
+            check_target: None,
+            trial_run: false,
+            start: true,
+            verify: false,
+            dialect: None,
+            unlock: None,
+            follow: true,
+        }
     }
 }
 
@@ -70,6 +88,12 @@ pub enum Event {
     CallingBack,
     /// Step 3 has worked.
     InBootloader,
+    /// The bootloader speaks this dialect.
+    Speaks(Dialect),
+    /// The password was right.
+    Unlocked,
+    /// The device goes on under another node-ID.
+    Moved(NodeId),
     /// Step 4: the program is being erased.
     Erasing,
     /// Step 5: it is erased.
@@ -88,6 +112,15 @@ pub enum Event {
     Repeating {
         /// Its number.
         block: u32,
+        /// How often it has been sent again, this time included.
+        repeat: u32,
+        /// How often it may be.
+        of: u32,
+        /// Why.
+        why: RepeatReason,
+    },
+    /// The whole program is sent again.
+    Again {
         /// How often it has been sent again, this time included.
         repeat: u32,
         /// How often it may be.
@@ -128,6 +161,8 @@ pub enum DeviceState {
     Called,
     /// The erasure was begun: there is no program, or an incomplete one.
     Erased,
+    /// The new program is in, in a dialect without signatures.
+    Written,
     /// The new program is in and right, but not signed.
     Unsigned,
     /// The new program is in and signed.
@@ -144,6 +179,7 @@ impl fmt::Display for DeviceState {
             Self::Erased => {
                 "it has no complete program and stays in the bootloader, ready for the next attempt"
             }
+            Self::Written => "the new program is in it: it starts after a reset",
             Self::Unsigned => {
                 "the new program is in it but not signed: after a reset the bootloader waits for the next attempt"
             }
@@ -164,6 +200,9 @@ impl fmt::Display for Event {
             }
             Self::CallingBack => f.write_str("calling the application back to the bootloader"),
             Self::InBootloader => f.write_str("the bootloader is running"),
+            Self::Speaks(dialect) => write!(f, "its dialect: {dialect}"),
+            Self::Unlocked => f.write_str("unlocked"),
+            Self::Moved(node) => write!(f, "it answers as node {node} now"),
             Self::Erasing => f.write_str("telling it to erase the old program"),
             Self::Erased { took } if *took < PUT_OFF => {
                 f.write_str("it will, with the first block that it finds good")
@@ -172,6 +211,9 @@ impl fmt::Display for Event {
             Self::Progress { done, total } => write!(f, "{done} of {total} bytes"),
             Self::Repeating { block, repeat, of, why } => {
                 write!(f, "sending block {block} again, {repeat} of {of}: {why}")
+            }
+            Self::Again { repeat, of, why } => {
+                write!(f, "sending the program again, {repeat} of {of}: {why}")
             }
             Self::Verified { crc } => write!(f, "verified: CRC {crc:08X}h"),
             Self::TrialStarting => f.write_str("starting the program for a trial"),
@@ -226,6 +268,8 @@ pub struct Report {
     pub transfers: Transfers,
     /// What runs now, if the program was started.
     pub running: Option<DeviceType>,
+    /// The dialect that the device speaks.
+    pub dialect: Dialect,
 }
 
 /// How often an application is asked to go back to the bootloader.
@@ -268,11 +312,48 @@ fn procedure(
         check_target(session, target)?;
         tell(Event::TargetRight(target));
     }
-    if !running.is_bootloader() {
-        *state = DeviceState::Called;
-        tell(Event::CallingBack);
-        call_back(session, number)?;
-        tell(Event::InBootloader);
+    let original = session.node();
+    let dialect = enter(session, running, options, state, tell)?;
+    let content = dialect.content(file);
+    if let Some(content) = content {
+        if options.trial_run {
+            return Err(Error::NotInDialect { dialect, what: "there are no signatures, so no trial either" });
+        }
+        *state = DeviceState::Erased;
+        let transfer_began = session.now();
+        let repeats = dialect::send(session, dialect, &content, options, tell)?;
+        let transfer = session.now().saturating_sub(transfer_began);
+        *state = DeviceState::Written;
+        // What 1F56h reads is a CRC in this bootloader and its like; elsewhere it is whatever its maker took.
+        if dialect::knows_crc(session)? {
+            verify(session, number, file.program_crc(), tell)?;
+        }
+        let running = if options.start {
+            tell(Event::Starting);
+            let running = dialect::start(session, dialect, original, number)?;
+            tell(Event::Started(running));
+            Some(running)
+        } else {
+            None
+        };
+        if options.verify {
+            let crc = file.program_crc();
+            compare_crc(session, number, crc)?;
+            tell(Event::VerifiedAgain { crc });
+        }
+        let took = session.now().saturating_sub(began);
+        let (program_size, program_crc) = (file.program_size(), file.program_crc());
+        let transfers = session.transfers();
+        return Ok(Report {
+            program_size,
+            program_crc,
+            repeats,
+            took,
+            transfer,
+            transfers,
+            running,
+            dialect,
+        });
     }
     let before = std::mem::replace(state, DeviceState::Erased);
     erase(session, number, tell)?;
@@ -314,7 +395,56 @@ fn procedure(
     }
     let took = session.now().saturating_sub(began);
     let (program_size, program_crc) = (file.program_size(), file.program_crc());
-    Ok(Report { program_size, program_crc, repeats, took, transfer, transfers: session.transfers(), running })
+    let transfers = session.transfers();
+    Ok(Report { program_size, program_crc, repeats, took, transfer, transfers, running, dialect })
+}
+
+/// Step 3 in whatever dialect: afterwards the bootloader is running, and what it speaks is known.
+fn enter(
+    session: &mut Session<'_>,
+    running: DeviceType,
+    options: &FlashOptions,
+    state: &mut DeviceState,
+    tell: &mut dyn FnMut(Event),
+) -> Result<Dialect, Error> {
+    let number = options.program;
+    let found = match options.dialect {
+        Some(dialect) => dialect,
+        None => dialect::recognise(session, running, number)?,
+    };
+    let mut dialect = found;
+    match found {
+        Dialect::Lift if !options.follow => {
+            let what = "the bootloaders share a node-ID: update the devices one after the other";
+            return Err(Error::NotInDialect { dialect, what });
+        }
+        Dialect::Lift => {
+            tell(Event::Speaks(dialect));
+            dialect::enter_lift(session, running, number, options.unlock, &mut |event| {
+                if event == Event::CallingBack {
+                    *state = DeviceState::Called;
+                }
+                tell(event);
+            })?;
+            return Ok(dialect);
+        }
+        _ if running.is_bootloader() => {}
+        Dialect::Raw | Dialect::Hex => {
+            *state = DeviceState::Called;
+            dialect::stop_program(session, number, tell)?;
+        }
+        Dialect::Block | Dialect::EsAcademy => {
+            *state = DeviceState::Called;
+            tell(Event::CallingBack);
+            let running = call_back(session, number)?;
+            tell(Event::InBootloader);
+            if options.dialect.is_none() {
+                dialect = Dialect::of_bootloader(running, session.node()).unwrap_or(found);
+            }
+        }
+    }
+    tell(Event::Speaks(dialect));
+    Ok(dialect)
 }
 
 /// Compares the device's identity with that of the file's target. Bootloader and application have the same one.
@@ -375,9 +505,11 @@ pub fn find(session: &mut Session<'_>) -> Result<DeviceType, Error> {
 
 /// Steps 3 and 12, 13: asks the application to go back to the bootloader and waits until it has.
 ///
+/// Gives what the bootloader says it is.
+///
 /// # Errors
 /// [`Error::NoBootloader`].
-pub fn call_back(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
+pub fn call_back(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Error> {
     let node = session.node();
     let mut seen = None;
     for _ in 0..CALLS {
@@ -391,8 +523,8 @@ pub fn call_back(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
             Err(error) => return Err(error),
         }
         seen = settle(session, |running| running.is_bootloader())?;
-        if seen.is_some_and(DeviceType::is_bootloader) {
-            return Ok(());
+        if let Some(running) = seen.filter(|running| running.is_bootloader()) {
+            return Ok(running);
         }
     }
     Err(Error::NoBootloader { node, running: seen, code: None })
@@ -424,6 +556,26 @@ pub fn erase(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event))
     tell(Event::Erasing);
     let began = session.now();
     execute(session, number, ProgramControl::Clear)?;
+    tell(Event::Erased { took: session.now().saturating_sub(began) });
+    Ok(())
+}
+
+/// Steps 4 and 5 on a device that may have no 1F57h to tell how it goes, and may answer when it has erased.
+pub(crate) fn erase_patiently(
+    session: &mut Session<'_>,
+    number: u8,
+    tell: &mut dyn FnMut(Event),
+) -> Result<(), Error> {
+    match session.status(number) {
+        Err(Error::Refused { code, .. }) if absent(code) => {}
+        Err(error @ Error::Refused { .. }) => return Err(error),
+        _ => return erase(session, number, tell),
+    }
+    tell(Event::Erasing);
+    let began = session.now();
+    let node = session.node();
+    let patient = Timing { sdo: session.timing().command, ..*session.timing() };
+    session.with(node, patient).command(number, ProgramControl::Clear)?;
     tell(Event::Erased { took: session.now().saturating_sub(began) });
     Ok(())
 }
@@ -549,26 +701,16 @@ fn send_block(
             return Err(error);
         }
         let status = session.await_idle(options.program, doing)?;
-        let failed = |error, code| Err(Error::Failed { doing, error, detail: status.detail, code });
-        let (why, otherwise) = match (sent, status.error) {
-            (Ok(()), None) => return Ok(repeat),
-            // It had arrived, and the bootloader waits for the next one. Should that not be so, the next one and at the
-            // latest the program's CRC will tell.
-            (_, Some(FlashError::Sequence)) if in_doubt => return Ok(repeat),
-            (Err(Error::Refused { code, .. }), Some(error)) => (repeatable(error), failed(error, Some(code))),
-            (_, Some(error)) => (repeatable(error), failed(error, None)),
-            (Err(error @ Error::Refused { code, .. }), None) => {
-                let broken = matches!(
-                    code,
-                    AbortCode::TOGGLE | AbortCode::TIMEOUT | AbortCode::COMMAND | AbortCode::CRC
-                );
-                (broken.then_some(RepeatReason::Broken(code)), Err(error))
-            }
-            (Err(error), None) => {
-                in_doubt = true;
-                (Some(RepeatReason::NoAnswer), Err(error))
-            }
+        // It had arrived, and the bootloader waits for the next one. Should that not be so, the next one and at the
+        // latest the program's CRC will tell.
+        if in_doubt && status.error == Some(FlashError::Sequence) {
+            return Ok(repeat);
+        }
+        let (why, error) = match judge(sent, status.error.map(|error| (error, status.detail)), doing) {
+            Judgement::Good => return Ok(repeat),
+            Judgement::Bad { why, error } => (why, error),
         };
+        in_doubt |= why == Some(RepeatReason::NoAnswer);
         match why {
             Some(why) if repeat < options.repeats => {
                 repeat += 1;
@@ -578,9 +720,43 @@ fn send_block(
                 }
                 tell(Event::Repeating { block, repeat, of: options.repeats, why });
             }
-            _ => return otherwise,
+            _ => return Err(error),
         }
     }
+}
+
+/// What came of a download.
+pub(crate) enum Judgement {
+    /// It arrived, and the device is content.
+    Good,
+    /// It did not, or it is not.
+    Bad {
+        /// Why sending it again may help, if it may.
+        why: Option<RepeatReason>,
+        /// What it is called if it is not sent again.
+        error: Error,
+    },
+}
+
+/// Judges a download by its outcome and by what the device's status says, with its detail.
+pub(crate) fn judge(sent: Result<(), Error>, status: Option<(FlashError, u16)>, doing: Doing) -> Judgement {
+    let (why, error) = match (sent, status) {
+        (Ok(()), None) => return Judgement::Good,
+        (sent, Some((error, detail))) => {
+            let code = match sent {
+                Err(Error::Refused { code, .. }) => Some(code),
+                _ => None,
+            };
+            (repeatable(error), Error::Failed { doing, error, detail, code })
+        }
+        (Err(error @ Error::Refused { code, .. }), None) => {
+            let broken =
+                matches!(code, AbortCode::TOGGLE | AbortCode::TIMEOUT | AbortCode::COMMAND | AbortCode::CRC);
+            (broken.then_some(RepeatReason::Broken(code)), error)
+        }
+        (Err(error), None) => (Some(RepeatReason::NoAnswer), error),
+    };
+    Judgement::Bad { why, error }
 }
 
 /// Whether sending a block again can help against this error.
@@ -641,4 +817,14 @@ pub fn start(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Error>
         Some(running) => Err(failed(Some(running), session.status(number).ok())),
         None => Err(failed(None, None)),
     }
+}
+
+/// Waits for an application, `time` at most; gives what it says it is.
+pub(crate) fn await_application(
+    session: &mut Session<'_>,
+    time: Duration,
+) -> Result<Option<DeviceType>, Error> {
+    let (node, timing) = (session.node(), Timing { boot: time, ..*session.timing() });
+    let seen = settle(&mut session.with(node, timing), |running| !running.is_bootloader())?;
+    Ok(seen.filter(|running| !running.is_bootloader()))
 }

@@ -5,6 +5,7 @@ use std::fmt;
 use canopen::program::{self, FlashStatus, ProgramState};
 use canopen::{AbortCode, Address};
 
+use crate::dialect::{self, Dialect};
 use crate::error::Error;
 use crate::flash::find;
 use crate::session::{DeviceType, Session};
@@ -26,6 +27,8 @@ pub struct DeviceInfo {
     pub software_version: Option<String>,
     /// 1018h/1 to 4: vendor-ID, product code, revision, serial number.
     pub identity: [Option<u32>; 4],
+    /// What its bootloader speaks, as far as that can be seen; `None` for a device without programs.
+    pub dialect: Option<Dialect>,
     /// Its programs, from number 1 on.
     pub programs: Vec<ProgramInfo>,
 }
@@ -65,6 +68,10 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
     for number in 1..=count {
         programs.push(program_info(session, number)?);
     }
+    let dialect = match count {
+        0 => Dialect::of_bootloader(device_type, session.node()),
+        _ => Some(dialect::recognise(session, device_type, 1)?),
+    };
     Ok(DeviceInfo {
         node: session.node(),
         device_type,
@@ -73,6 +80,7 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
         hardware_version,
         software_version,
         identity,
+        dialect,
         programs,
     })
 }
@@ -90,7 +98,7 @@ pub fn program_info(session: &mut Session<'_>, program: u8) -> Result<ProgramInf
 }
 
 /// Makes the absence of an object a value.
-fn optional<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
+pub(crate) fn optional<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
     match read {
         Ok(value) => Ok(Some(value)),
         Err(Error::Refused { code, .. }) if absent(code) => Ok(None),
@@ -98,7 +106,7 @@ fn optional<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
     }
 }
 
-fn absent(code: AbortCode) -> bool {
+pub(crate) fn absent(code: AbortCode) -> bool {
     matches!(
         code,
         AbortCode::NO_OBJECT
@@ -132,6 +140,7 @@ impl fmt::Display for DeviceInfo {
                     Some(bits) => format!("{bits:02X}h"),
                 },
             ),
+            ("dialect", self.dialect.map_or(ABSENT.to_string(), |dialect| dialect.to_string())),
         ] {
             writeln!(f, "  {name:<17} {value}")?;
         }

@@ -10,6 +10,7 @@
 //! | [`adapter`] | ways to a CAN bus, chosen by URL |
 //! | [`session`] | SDO with one node: values, commands, status |
 //! | [`flash`] | the update procedure, with its steps as events |
+//! | [`dialect`] | what different bootloaders make of the same objects |
 //! | [`job`] | a file that says which devices get what |
 //! | [`many`] | the same for many devices at once |
 //! | [`hub`] | several conversations over one adapter |
@@ -51,6 +52,7 @@ pub mod config;
 pub mod convert;
 pub mod decode;
 pub mod diagnose;
+pub mod dialect;
 pub mod error;
 pub mod flash;
 pub mod hub;

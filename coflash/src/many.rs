@@ -64,7 +64,8 @@ pub fn flash_many(
             session.cancel_by(cancelled);
             session.transfer_by(transfers);
             let mut left = DeviceState::Untouched;
-            let result = flash(&mut session, &job.file, &job.options, &mut |event| {
+            let options = FlashOptions { follow: false, ..job.options };
+            let result = flash(&mut session, &job.file, &options, &mut |event| {
                 if let Event::Left(state) = event {
                     left = state;
                 }

@@ -5,7 +5,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
-use canopen::program::{self, FlashStatus, ProgramControl, BOOTLOADER_DEVICE_TYPE};
+use canopen::nmt::NmtCommand;
+use canopen::program::{
+    self, FlashStatus, ProgramControl, BOOTLOADER_DEVICE_TYPE, ESACADEMY_DEVICE_TYPE, LIFT_DEVICE_TYPE,
+};
 use canopen::sdo::client::{Block, Buffer, Config, Sink};
 use canopen::sdo::{Download, SdoError, Step, Transfer, Upload};
 use canopen::{AbortCode, Address, CobId, Frame, Instant, NodeId};
@@ -54,6 +57,12 @@ pub enum Doing {
     Command(ProgramControl),
     /// Writing a block of the program.
     Block(u32),
+    /// Writing the whole program at once.
+    Program,
+    /// Writing the password of a device that is locked.
+    Unlock,
+    /// Telling the bootloader to restart into the program.
+    Restart,
 }
 
 impl fmt::Display for Doing {
@@ -63,6 +72,9 @@ impl fmt::Display for Doing {
             Self::Write(at) => write!(f, "writing {at}"),
             Self::Block(u32::MAX) => f.write_str("writing the last block"),
             Self::Block(number) => write!(f, "writing block {number}"),
+            Self::Program => f.write_str("writing the program"),
+            Self::Unlock => f.write_str("unlocking the device"),
+            Self::Restart => f.write_str("restarting the program"),
             Self::Command(command) => f.write_str(match command {
                 ProgramControl::Stop => "stopping the program",
                 ProgramControl::Start => "starting the program",
@@ -147,6 +159,18 @@ impl<'a> Session<'a> {
     /// A conversation with `node`. Nothing is sent yet.
     pub fn new(adapter: &'a mut dyn Adapter, node: NodeId, timing: Timing) -> Self {
         Self { adapter, node, timing, transfers: Transfers::default(), cancelled: None }
+    }
+
+    /// The same conversation with another node, or with other patience, for a while.
+    #[must_use]
+    pub fn with(&mut self, node: NodeId, timing: Timing) -> Session<'_> {
+        let (transfers, cancelled) = (self.transfers, self.cancelled.clone());
+        Session { adapter: &mut *self.adapter, node, timing, transfers, cancelled }
+    }
+
+    /// Goes on with another node.
+    pub fn talk_to(&mut self, node: NodeId) {
+        self.node = node;
     }
 
     /// Ends with [`Error::Cancelled`] as soon as `flag` is set: a transfer under way is aborted.
@@ -380,6 +404,29 @@ impl<'a> Session<'a> {
         self.listen(time, |frame| *frame == boot_up)
     }
 
+    /// Waits for the boot-up message of any other node, `time` at most; gives which one it was.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn await_boot_up_of_another(&mut self, time: Duration) -> Result<Option<NodeId>, Error> {
+        let (this, mut other) = (self.node, None);
+        self.listen(time, |frame| {
+            let of = |node: &NodeId| *frame == Frame::of(CobId::heartbeat(*node), &[0]);
+            other = (1..=127).filter_map(NodeId::new).filter(|node| *node != this).find(of);
+            other.is_some()
+        })?;
+        Ok(other)
+    }
+
+    /// Tells the node by network management to restart (NMT reset node); it gives no answer.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`].
+    pub fn reset_node(&mut self) -> Result<(), Error> {
+        let command = [NmtCommand::ResetNode as u8, self.node.get()];
+        Ok(self.adapter.send(&Frame::of(CobId::NMT, &command))?)
+    }
+
     /// Receives until `enough` says so, `time` at most; tells whether it did.
     fn listen(&mut self, time: Duration, mut enough: impl FnMut(&Frame) -> bool) -> Result<bool, Error> {
         let deadline = self.now() + time;
@@ -486,10 +533,10 @@ impl<'a> Session<'a> {
 pub struct DeviceType(pub u32);
 
 impl DeviceType {
-    /// Whether it is the bootloader's; everything else is an application's.
+    /// Whether it is that of a bootloader, of one dialect or the other; everything else is an application's.
     #[must_use]
     pub const fn is_bootloader(self) -> bool {
-        self.0 == BOOTLOADER_DEVICE_TYPE
+        matches!(self.0, BOOTLOADER_DEVICE_TYPE | LIFT_DEVICE_TYPE | ESACADEMY_DEVICE_TYPE)
     }
 }
 

@@ -88,16 +88,17 @@ fn the_whole_procedure_from_a_running_application() {
         .collect();
     assert_eq!(words[0], "found an application (device type 00020192h)");
     assert_eq!(
-        words[1..4],
+        words[1..5],
         [
             "calling the application back to the bootloader",
             "the bootloader is running",
+            "its dialect: block (block files, as SYS TEC has it)",
             "telling it to erase the old program"
         ]
     );
-    assert_eq!(words[4][..9], *"erased in");
+    assert_eq!(words[5][..9], *"erased in");
     assert_eq!(
-        words[6..],
+        words[7..],
         [
             "signed: the program starts by itself from now on",
             "starting the program",
@@ -614,6 +615,7 @@ node 5: an application (device type 00020192h)
   revision          not told
   serial number     not told
   error register    00h (no error)
+  dialect           block (block files, as SYS TEC has it)
   program 1
     state           running
     CRC             00000000h

@@ -18,6 +18,7 @@ use serde_json::{json, Value};
 
 use super::convert::Labels;
 use super::device::{cancelled, Patience};
+use super::dialect::Access;
 use super::file::{warn_left_out, Source};
 use super::legacy::Legacy;
 use super::many::{document, summary, write_report, Board, Outcome};
@@ -30,6 +31,8 @@ use super::Context;
 ///
 /// Takes a block file, or any other firmware file and converts it on the fly. The file is read and checked completely
 /// before a device is touched. An update that was interrupted can be started again at once.
+///
+/// Devices with bootloaders of other makers are told apart by themselves, or by --dialect.
 ///
 /// With several nodes, or a job file, the devices are updated at the same time; a failure of one does not stop the others.
 ///
@@ -93,6 +96,9 @@ pub(super) struct Flash {
     /// How often one block is sent again after a CRC error or a broken transfer.
     #[arg(long, value_name = "TIMES", value_parser = number, default_value = "3")]
     block_repeats: u32,
+
+    #[command(flatten)]
+    access: Access,
 
     #[command(flatten)]
     legacy: Legacy,
@@ -198,6 +204,9 @@ impl Flash {
             trial_run: settings.trial_run.unwrap_or(self.trial_run),
             start: settings.start.unwrap_or(!self.no_start),
             verify: settings.verify.unwrap_or(self.verify),
+            dialect: self.access.dialect(),
+            unlock: self.access.unlock(),
+            ..FlashOptions::default()
         })
     }
 
@@ -334,6 +343,7 @@ pub(super) fn value(report: &Report) -> Value {
             Transfers::Segments => "segments",
         },
         "running": report.running.map(|running| running.0),
+        "dialect": report.dialect.name(),
     })
 }
 
@@ -343,6 +353,7 @@ pub(super) fn state_word(state: DeviceState) -> &'static str {
         DeviceState::Untouched => "untouched",
         DeviceState::Called => "called",
         DeviceState::Erased => "erased",
+        DeviceState::Written => "written",
         DeviceState::Unsigned => "unsigned",
         DeviceState::Signed => "signed",
     }

@@ -2,6 +2,7 @@
 
 use canopen::program::FlashStatus;
 use clap::Args;
+use coflash::dialect::Dialect;
 use coflash::info::{info, DeviceInfo};
 use serde_json::{json, Value};
 
@@ -54,6 +55,7 @@ pub(super) fn value(info: &DeviceInfo) -> Value {
         "product_code": product_code,
         "revision": revision,
         "serial_number": serial_number,
+        "dialect": info.dialect.map(Dialect::name),
         "programs": programs,
     })
 }

@@ -11,6 +11,7 @@ use self::output::{Failure, Output, EXIT_CODES};
 mod config;
 mod convert;
 mod device;
+mod dialect;
 mod file;
 mod flash;
 mod generate;

@@ -282,6 +282,7 @@ impl From<Error> for Failure {
             Error::Adapter(AdapterError::Url { .. }) => Exit::Usage,
             Error::Adapter(_) => Exit::Adapter,
             Error::Cancelled => Exit::Cancelled,
+            Error::NotInDialect { .. } | Error::NoPassword { .. } => Exit::Usage,
             Error::NoAnswer { .. } | Error::Lss { failure: LssFailure::NoAnswer, .. } => Exit::NoAnswer,
             Error::Refused { .. }
             | Error::Protocol { .. }
@@ -290,7 +291,7 @@ impl From<Error> for Failure {
             | Error::WrongCrc { .. }
             | Error::WrongTarget { .. }
             | Error::Lss { .. } => Exit::Device,
-            Error::NoBootloader { .. } | Error::StartFailed { .. } => Exit::NoStart,
+            Error::NoBootloader { .. } | Error::Occupied { .. } | Error::StartFailed { .. } => Exit::NoStart,
         };
         Self::new(exit, Some(error.number()), error.to_string(), Some(error.advice()))
     }

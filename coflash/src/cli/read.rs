@@ -4,13 +4,18 @@ use std::path::PathBuf;
 
 use canopen::Address;
 use clap::{Args, ValueEnum};
+use coflash::dialect::{read_locked, Dialect};
 use serde_json::json;
 
 use super::device::Device;
+use super::dialect::Access;
 use super::output::Failure;
 use super::Context;
 
 /// Reads an object, or a program where the device allows it (1F50/1).
+///
+/// With --unlock a lift device is brought into its bootloader, unlocked there and restarted afterwards, so that its program
+/// (1F50/1) and its parameter set (1F50/2) can be saved.
 #[derive(Debug, Args)]
 pub(super) struct Read {
     /// The object: hexadecimal index and, behind a slash, decimal sub-index: 1018/4, or 100A for sub-index 0.
@@ -19,6 +24,9 @@ pub(super) struct Read {
 
     #[command(flatten)]
     device: Device,
+
+    #[command(flatten)]
+    access: Access,
 
     /// How to show the value.
     #[arg(long = "as", value_name = "KIND", default_value = "auto", value_enum)]
@@ -45,10 +53,15 @@ impl Read {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let mut adapter = context.open()?;
         let mut session = self.device.session(&mut *adapter)?;
-        let bytes = session
-            .upload(self.object, &mut |_| {})
-            .map_err(|error| Failure::diagnosed(error, &mut session))?;
         let (node, object) = (session.node(), self.object);
+        let (dialect, unlock) = (self.access.dialect(), self.access.unlock());
+        let bytes = match (dialect, unlock) {
+            (None | Some(Dialect::Block | Dialect::Raw | Dialect::Hex), None) => {
+                session.upload(object, &mut |_| {})
+            }
+            _ => read_locked(&mut session, object, dialect, unlock, &mut |event| context.out.detail(event)),
+        }
+        .map_err(|error| Failure::diagnosed(error, &mut session))?;
         if let Some(path) = &self.output {
             std::fs::write(path, &bytes).map_err(|error| {
                 Failure::system(format!("{}: cannot be written: {error}", path.display()))

@@ -45,6 +45,23 @@ pub enum Blocks {
     Ignored,
 }
 
+/// Objects of another maker in front of those that the fake has.
+pub trait Maker: Send {
+    /// What an object reads while this runs; `None` for the fake's own.
+    fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>>;
+    /// What comes of a value that is written.
+    fn write(&mut self, at: (u16, u8), data: &[u8], running: u32) -> Option<Result<Deed, u32>>;
+    /// What NMT reset node restarts into: node-ID and device type.
+    fn reset(&mut self, running: u32) -> Option<(u8, u32)>;
+}
+
+/// What a device does when it has answered.
+pub enum Deed {
+    Nothing,
+    /// It restarts as this node, into what has this device type.
+    Restart(u8, u32),
+}
+
 type Script<T> = Box<dyn FnMut(T) -> Outcome + Send>;
 
 pub struct Fake {
@@ -95,6 +112,9 @@ pub struct Fake {
     upload: Option<(Vec<u8>, u8)>,
     outbox: VecDeque<(Duration, Frame)>,
     pub sent: Vec<Frame>,
+    /// The maker, if it is another one.
+    pub maker: Option<Box<dyn Maker>>,
+    next_node: u8,
 }
 
 struct Download {
@@ -141,6 +161,8 @@ impl Fake {
             upload: None,
             outbox: VecDeque::new(),
             sent: Vec::new(),
+            maker: None,
+            next_node: NODE,
         }
     }
 
@@ -186,6 +208,9 @@ impl Fake {
         }
         if let Some((at, next)) = self.restart.filter(|(at, _)| *at <= self.now) {
             (self.restart, self.running) = (None, next);
+            if self.maker.is_some() {
+                self.node = self.next_node;
+            }
             if next.is_some() {
                 let id = CobId::new(0x700 + u16::from(self.node)).unwrap();
                 self.outbox.push_back((at, Frame::of(id, &[0])));
@@ -346,7 +371,11 @@ impl Fake {
         }
     }
 
-    fn value(&self, at: (u16, u8)) -> Result<Vec<u8>, u32> {
+    fn value(&mut self, at: (u16, u8)) -> Result<Vec<u8>, u32> {
+        let running = self.running.unwrap();
+        if let Some(value) = self.maker.as_mut().and_then(|maker| maker.value(at, running)) {
+            return value;
+        }
         let number = |value: u32| Ok(value.to_le_bytes().to_vec());
         match at {
             (0x1000, 0) => number(self.running.unwrap()),
@@ -371,6 +400,21 @@ impl Fake {
     }
 
     fn write(&mut self, at: (u16, u8), data: Vec<u8>, answer: [u8; 8]) {
+        let running = self.running.unwrap();
+        if let Some(deed) = self.maker.as_mut().and_then(|maker| maker.write(at, &data, running)) {
+            self.log.push(format!("{}: {:04X}/{}, {} bytes", self.node, at.0, at.1, data.len()));
+            match deed {
+                Err(code) => self.abort(at, code),
+                Ok(deed) => {
+                    self.answer(answer);
+                    if let Deed::Restart(node, next) = deed {
+                        self.next_node = node;
+                        self.restart_into(Some(next));
+                    }
+                }
+            }
+            return;
+        }
         let outcome = match at {
             (0x1F51, 1) => {
                 self.log.push(format!("command {:02X}", data[0]));
@@ -473,7 +517,14 @@ impl Adapter for Fake {
             match frame.exactly().copied() {
                 Some([command @ (0x81 | 0x82), node]) if node == 0 || node == self.node => {
                     self.log.push(format!("nmt {command:02X}"));
-                    self.restart_into(self.running);
+                    let running = self.running.unwrap();
+                    match self.maker.as_mut().and_then(|maker| maker.reset(running)) {
+                        Some((node, next)) => {
+                            self.next_node = node;
+                            self.restart_into(Some(next));
+                        }
+                        None => self.restart_into(self.running),
+                    }
                 }
                 _ => {}
             }
