@@ -5,9 +5,7 @@
 use canopen::device;
 use canopen::emcy;
 use canopen::od::{concat, Access, DataType, Entry};
-use canopen::program::{FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID};
-#[cfg(feature = "lift")]
-use canopen::program::{UNLOCK, UNLOCK_FIRMWARE};
+use canopen::program::{FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID, UNLOCK, UNLOCK_FIRMWARE};
 
 /// What coboot needs of an application: keep these when you add your own.
 const PROGRAM_ENTRIES: [Entry; 6] = [
@@ -32,11 +30,10 @@ const SHOW_ENTRIES: [Entry; 2] = [
 ];
 
 /// The object dictionary.
-#[cfg(not(feature = "lift"))]
 pub static ENTRIES: [Entry; 25] = COMMON;
-/// The object dictionary, with the password of a lift device.
-#[cfg(feature = "lift")]
-pub static ENTRIES: [Entry; 27] = concat(
+
+/// The object dictionary of a lift device: with a password.
+pub static LIFT_ENTRIES: [Entry; 27] = concat(
     COMMON,
     [
         Entry::record(UNLOCK, "Lock/unlock parameters", UNLOCK_FIRMWARE),

@@ -22,7 +22,7 @@ use shared_abi::label::Label;
 use shared_abi::warm_start::BootRequest;
 
 use crate::coboot::{self, Start, Way};
-use crate::entries::{CONFIRMATION, ENTRIES, WAY_BACK};
+use crate::entries::{CONFIRMATION, ENTRIES, LIFT_ENTRIES, WAY_BACK};
 
 /// 1000h: no standardised profile. Anything but the bootloader's 10000000h tells a host that the application runs.
 const DEVICE_TYPE: u32 = 0;
@@ -156,7 +156,11 @@ impl Application {
 
 impl Objects for Application {
     fn entries(&self) -> &'static [Entry] {
-        &ENTRIES
+        if cfg!(feature = "lift") {
+            &LIFT_ENTRIES
+        } else {
+            &ENTRIES
+        }
     }
 
     fn read(&mut self, at: Address, buf: &mut [u8]) -> Result<usize, AbortCode> {

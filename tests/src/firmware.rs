@@ -5,6 +5,7 @@ use std::{env, fs};
 
 use coflash::block_file::BlockFile;
 use coflash::convert::{blocks_of, Options, Region};
+use coflash::read::{read, Firmware};
 use shared_abi::layout::{self, Layout};
 
 /// The images by the names that `cargo xtask build` gives them.
@@ -79,6 +80,25 @@ pub fn blocks(name: &str) -> BlockFile {
     let image = coflash::read::load(&dir().join(name), None, None).expect("an ELF of ours");
     let options = Options { region: Region::Strict(board().programs[0].into()), ..Options::default() };
     blocks_of(image, &options).expect("it lies in the program's flash").file
+}
+
+/// An application as a raw image: its bytes from the start of the first program on, gaps FFh.
+///
+/// # Panics
+/// If it was not built, or does not begin there.
+#[must_use]
+pub fn raw(name: &str) -> Vec<u8> {
+    let Firmware::Image(image) = read(&elf(name), None, None).expect("an ELF of ours") else {
+        panic!("an ELF is no block file");
+    };
+    let base = board().programs[0].base;
+    let mut bytes = Vec::new();
+    for (address, data) in image.segments() {
+        let at = (address - base) as usize;
+        bytes.resize(bytes.len().max(at + data.len()), 0xFF);
+        bytes[at..at + data.len()].copy_from_slice(&data);
+    }
+    bytes
 }
 
 /// The bytes of an image.

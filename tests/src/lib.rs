@@ -7,4 +7,5 @@ pub mod endpoint;
 pub mod firmware;
 pub mod ihex;
 pub mod powercut;
+pub mod script;
 pub mod throughput;

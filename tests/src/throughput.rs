@@ -8,7 +8,7 @@ use canopen::{Address, BitRate, NodeId};
 use coflash::block_file::BlockFile;
 use coflash::convert::{blocks_of, Label, Options, Region};
 use coflash::flash::{flash, Event, FlashOptions};
-use coflash::read::{read, Firmware, Format};
+use coflash::read::{read, Format};
 use coflash::session::{Doing, Session, Timing};
 use emulator::frame::Frame;
 
@@ -150,17 +150,10 @@ pub fn load(rate: BitRate, kib: u32, block_size: usize) -> Load {
 /// If it was not built.
 #[must_use]
 pub fn program(kib: u32) -> Vec<u8> {
-    let base = firmware::board().programs[0].base;
-    let elf = firmware::elf(firmware::APP_V1);
-    let Firmware::Image(image) = read(&elf, None, None).expect("an ELF of ours") else {
-        panic!("an ELF is no block file");
-    };
+    let image = firmware::raw(firmware::APP_V1);
     let mut bytes: Vec<u8> =
         (0..kib * 1024).map(|i| (i.wrapping_mul(2_654_435_761).rotate_left(9) >> 24) as u8).collect();
-    for (address, data) in image.segments() {
-        let at = (address - base) as usize;
-        bytes[at..at + data.len()].copy_from_slice(&data);
-    }
+    bytes[..image.len()].copy_from_slice(&image);
     bytes
 }
 

@@ -55,7 +55,7 @@ pub fn images(board: &Layout) -> Outcome<Images> {
     image(&complete, "bootloader-complete.elf", board.bootloader)?;
     let minimal = Build { board, package: "bootloader", features: "" };
     image(&minimal, "bootloader-minimal.elf", board.bootloader)?;
-    let rescue = Build { board, package: "bootloader", features: "standard,rescue-window" };
+    let rescue = Build { board, package: "bootloader", features: RESCUE };
     image(&rescue, "bootloader-rescue.elf", board.bootloader)?;
     for dialect in ["paulus", "esacademy"] {
         let features = format!("profile-{dialect}");
@@ -170,6 +170,8 @@ pub fn bootloader(board: &Layout) -> Outcome<PathBuf> {
 pub const OPTIONAL: [&str; 4] = ["auto-bit-rate", "block-upload", "emcy", "lss"];
 /// Those of them that a product usually has: this bootloader is the one that is measured against the budget.
 pub const STANDARD: &str = "standard";
+/// With a rescue window. Beside everything that is standard there is no room for it.
+const RESCUE: &str = "emcy,lss,raw-image,rescue-window";
 /// Bootloaders with words for whoever ports them, by the way that they take. The standard one and its words would not fit: these do
 /// without the dialects.
 pub const LOGS: [(&str, &str); 3] =
