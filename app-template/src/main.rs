@@ -26,8 +26,8 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
 
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]
 mod app {
-    use bsp::can::{BitTiming, Errors, Mode, Port};
-    use bsp::{pac, CanController, CAN_CLOCK, LAYOUT};
+    use bsp::can::{BitTiming, Errors, Mode};
+    use bsp::{pac, CanPort, CAN_CLOCK, LAYOUT};
     use canopen::bit_rate::Heard;
     use canopen::line::{Confinement, Status, CONTROLLER_OVERRUN, QUEUE_OVERRUN};
     use canopen::node::{self, NmtPolicy};
@@ -49,7 +49,7 @@ mod app {
 
     #[shared]
     struct Shared {
-        can: Port<CanController>,
+        can: CanPort,
     }
 
     #[local]
@@ -66,6 +66,10 @@ mod app {
     fn init(cx: init::Context) -> (Shared, Local) {
         let mut rcc = bsp::clocks(cx.device.RCC);
         let board = bsp::init(&mut rcc, cx.device.CAN1);
+        #[cfg(not(feature = "virtual-can"))]
+        let can = CanPort::new(board.can);
+        #[cfg(feature = "virtual-can")]
+        let can = CanPort::new(board.uart);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
         // Same node-ID and bit rate as the bootloader: whoever talked to it goes on talking to this.
@@ -82,7 +86,7 @@ mod app {
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();
         (
-            Shared { can: Port::new(board.can) },
+            Shared { can },
             Local {
                 received,
                 to_handle,
@@ -150,7 +154,7 @@ mod app {
     /// Does what the slave says, until it says nothing.
     fn carry_out(
         slave: &mut Slave,
-        can: &mut impl Mutex<T = Port<CanController>>,
+        can: &mut impl Mutex<T = CanPort>,
         now: Instant,
         device: &mut impl SlaveDevice,
     ) {
@@ -165,7 +169,7 @@ mod app {
         }
     }
 
-    fn configure(can: &mut impl Mutex<T = Port<CanController>>, rate: BitRate, mode: Mode) {
+    fn configure(can: &mut impl Mutex<T = CanPort>, rate: BitRate, mode: Mode) {
         // Another rate is asked for by nobody: `coboot::supports` says so.
         if let Some(timing) = BitTiming::new(CAN_CLOCK, rate.or_zero()) {
             can.lock(|can| can.configure(timing, mode));
@@ -173,7 +177,7 @@ mod app {
     }
 
     /// What the slave wants to know of its line.
-    fn status(can: &mut Port<CanController>) -> Status {
+    fn status(can: &mut CanPort) -> Status {
         let errors = can.errors();
         let lost = can.take_lost();
         Status {

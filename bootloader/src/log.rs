@@ -24,6 +24,9 @@ use boot_core::canopen::Frame;
 #[cfg(all(feature = "log-rtt", feature = "log-defmt"))]
 compile_error!("log-rtt and log-defmt both write to the one RTT buffer: choose one of them");
 
+#[cfg(all(feature = "log-uart", feature = "virtual-can"))]
+compile_error!("log-uart and virtual-can both take the one UART: choose one of them");
+
 /// Whether anything is said.
 pub const ON: bool = cfg!(any(feature = "log-rtt", feature = "log-uart", feature = "log-defmt"));
 

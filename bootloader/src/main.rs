@@ -51,10 +51,10 @@ mod app {
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant};
     use boot_core::download::{Policy, Step};
-    use bsp::can::{Errors, Mode, Port};
+    use bsp::can::{Errors, Mode};
     use bsp::clock::Source;
     use bsp::hal::rcc::RccExt;
-    use bsp::{pac, CanController, CLOCK_TREE, IDENTITY, LAYOUT};
+    use bsp::{pac, CanPort, CLOCK_TREE, IDENTITY, LAYOUT};
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
     use rtic::Mutex;
@@ -115,7 +115,7 @@ mod app {
 
     #[shared]
     struct Shared {
-        can: Port<CanController>,
+        can: CanPort,
         bootloader: Bootloader<'static, FlashController, product::Parameters, PROGRAMS>,
     }
 
@@ -178,8 +178,12 @@ mod app {
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();
         log!("stayed in the bootloader; why", start::stay_reason().into());
+        #[cfg(not(feature = "virtual-can"))]
+        let can = CanPort::new(board.can);
+        #[cfg(feature = "virtual-can")]
+        let can = CanPort::new(board.uart);
         (
-            Shared { can: Port::new(board.can), bootloader },
+            Shared { can, bootloader },
             Local {
                 received,
                 to_handle,
@@ -284,7 +288,7 @@ mod app {
     /// Does what the slave says, until it says nothing.
     fn carry_out(
         slave: &mut Slave,
-        can: &mut impl Mutex<T = Port<CanController>>,
+        can: &mut impl Mutex<T = CanPort>,
         now: Instant,
         device: &mut impl SlaveDevice,
     ) {
@@ -302,7 +306,7 @@ mod app {
         }
     }
 
-    fn configure(can: &mut impl Mutex<T = Port<CanController>>, rate: BitRate, mode: Mode) {
+    fn configure(can: &mut impl Mutex<T = CanPort>, rate: BitRate, mode: Mode) {
         // Another rate is asked for by nobody: `product::supports` says so.
         if let Some(Some(timing)) = product::TIMINGS.get(rate as usize) {
             can.lock(|can| can.configure(*timing, mode));
@@ -310,7 +314,7 @@ mod app {
     }
 
     /// What the slave wants to know of its line.
-    fn status(can: &mut Port<CanController>) -> Status {
+    fn status(can: &mut CanPort) -> Status {
         let errors = can.errors();
         let lost = can.take_lost();
         Status {

@@ -10,7 +10,7 @@ const ENTRIES: usize = 128;
 #[repr(C, align(512))]
 struct Vectors(UnsafeCell<[u32; ENTRIES]>);
 
-// SAFETY: written by `relocate` and `handle` alone, whole words while nothing can use them; the core reads it otherwise.
+// SAFETY: written once, by `relocate`, before interrupts are on; only the core reads it afterwards.
 unsafe impl Sync for Vectors {}
 
 #[link_section = ".ram_vectors"]
@@ -36,15 +36,4 @@ pub fn relocate(scb: &mut SCB) {
     }
     cortex_m::asm::dsb();
     cortex_m::asm::isb();
-}
-
-/// Makes a function the handler of an interrupt that no task is bound to, before it is unmasked.
-#[cfg(feature = "log-uart")]
-pub fn handle(interrupt: bsp::pac::Interrupt, handler: extern "C" fn()) {
-    let entry = 16 + interrupt as usize;
-    if entry < ENTRIES {
-        // SAFETY: an entry of the table, of an interrupt that is masked.
-        unsafe { VECTORS.0.get().cast::<u32>().add(entry).write_volatile(handler as usize as u32) };
-    }
-    cortex_m::asm::dsb();
 }

@@ -11,7 +11,13 @@ pub mod can;
 pub mod clock;
 #[cfg(target_arch = "arm")]
 mod drivers;
+#[cfg(any(test, feature = "uart", not(target_arch = "arm")))]
+pub mod ring;
+#[cfg(any(test, feature = "virtual-can", not(target_arch = "arm")))]
+pub mod slcan;
 pub mod uart;
+#[cfg(all(target_arch = "arm", feature = "virtual-can"))]
+pub mod virtual_can;
 #[cfg(target_arch = "arm")]
 pub mod watchdog;
 
@@ -24,6 +30,22 @@ macro_rules! take_port {
         // SAFETY: the pins of a board and its UART are set up by its `init` alone, and that takes the only CAN controller.
         unsafe { pac::$port::steal() }
     }};
+}
+
+/// The USART that a board talks through; its interrupt has the same name.
+#[cfg(target_arch = "arm")]
+macro_rules! uart {
+    ($(#[$doc:meta])* $usart:ident) => {
+        $(#[$doc])*
+        pub type UartController = pac::$usart;
+
+        #[cfg(feature = "uart")]
+        #[no_mangle]
+        #[allow(non_snake_case)]
+        extern "C" fn $usart() {
+            crate::uart::interrupted();
+        }
+    };
 }
 
 #[cfg(any(feature = "board-stm32f407g-disc1", feature = "board-stm32f407g-disc1-two"))]
@@ -58,6 +80,12 @@ const _: () = assert!(
 
 #[cfg(target_arch = "arm")]
 pub use drivers::{clocks, entry_strap, Board, CanController};
+/// What frames go through: the CAN controller, or the UART in its place.
+#[cfg(all(target_arch = "arm", not(feature = "virtual-can")))]
+pub type CanPort = can::Port<CanController>;
+/// What frames go through: the CAN controller, or the UART in its place.
+#[cfg(all(target_arch = "arm", feature = "virtual-can"))]
+pub type CanPort = virtual_can::Port;
 #[cfg(target_arch = "arm")]
 pub use stm32f4xx_hal as hal;
 #[cfg(target_arch = "arm")]

@@ -65,9 +65,11 @@ mod pins {
     /// The LED that shows life: LD2, green, high is on.
     pub type Led = Pin<'A', 5, Output>;
 
-    /// The UART, which is set up with the feature `uart` alone:
-    /// on PA2 and PA3, which the ST-LINK makes a serial port of the host (UM1724).
-    pub type UartController = pac::USART2;
+    uart! {
+        /// The UART, on PA2 and PA3, which the ST-LINK makes a serial port of the host (UM1724).
+        /// It is set up with the feature `uart` alone.
+        USART2
+    }
 
     /// Sets the pins up.
     #[must_use]

@@ -65,9 +65,11 @@ mod pins {
     /// The LED that shows life: LD4, green, high is on.
     pub type Led = Pin<'D', 12, Output>;
 
-    /// The UART, which is set up with the feature `uart` alone:
-    /// on PA2 and PA3, which are free on this board (UM1472).
-    pub type UartController = pac::USART2;
+    uart! {
+        /// The UART, on PA2 and PA3, which are free on this board (UM1472).
+        /// It is set up with the feature `uart` alone.
+        USART2
+    }
 
     /// Sets the pins up.
     #[must_use]

@@ -65,9 +65,11 @@ mod pins {
     /// The LED that shows life: LD3, green, high is on.
     pub type Led = Pin<'G', 13, Output>;
 
-    /// The UART, which is set up with the feature `uart` alone:
-    /// on PA9 and PA10, which the ST-LINK makes a serial port of the host (UM1670).
-    pub type UartController = pac::USART1;
+    uart! {
+        /// The UART, on PA9 and PA10, which the ST-LINK makes a serial port of the host (UM1670).
+        /// It is set up with the feature `uart` alone.
+        USART1
+    }
 
     /// Sets the pins up.
     #[must_use]

@@ -21,6 +21,10 @@ pub use drivers::*;
 
 #[cfg(all(target_arch = "arm", feature = "uart"))]
 mod drivers {
+    use core::cell::Cell;
+
+    use cortex_m::interrupt::{self, Mutex};
+    use cortex_m::peripheral::NVIC;
     use stm32f4xx_hal::gpio::PushPull;
     use stm32f4xx_hal::pac::{self, usart1};
     use stm32f4xx_hal::rcc::Rcc;
@@ -103,14 +107,71 @@ mod drivers {
             self.usart.sr().read().txe().bit_is_set()
         }
 
+        /// Whether all that was sent is on the line.
+        #[must_use]
+        pub fn is_silent(&self) -> bool {
+            self.usart.sr().read().tc().bit_is_set()
+        }
+
         /// Sends a byte. To be called only when there is room; the byte before would be lost.
         pub fn send(&mut self, byte: u8) {
             self.usart.dr().write(|w| w.dr().set(byte.into()));
         }
 
-        /// Has the interrupt come when there is room, or not.
-        pub fn call_for_more(&mut self, wanted: bool) {
-            self.usart.cr1().modify(|_, w| w.txeie().bit(wanted));
+        /// What has come: nothing, a byte, or one that cannot be read.
+        pub fn receive(&mut self) -> Option<Received> {
+            let status = self.usart.sr().read();
+            if status.rxne().bit_is_clear() && status.ore().bit_is_clear() {
+                return None;
+            }
+            // Behind the status, this clears the flags of errors, too (section 30.6.1).
+            let byte = self.usart.dr().read().dr().bits() as u8;
+            let readable =
+                status.rxne().bit_is_set() && status.fe().bit_is_clear() && status.nf().bit_is_clear();
+            Some(Received { byte: readable.then_some(byte), overrun: status.ore().bit_is_set() })
+        }
+
+        /// Has the interrupt come when there is room.
+        pub fn call_for_more(&mut self) {
+            // It switches that off by itself, and may come in between.
+            interrupt::free(|_| self.usart.cr1().modify(|_, w| w.txeie().enabled()));
+        }
+
+        /// Has it come no more for that. From the interrupt itself.
+        pub fn stop_calling(&mut self) {
+            self.usart.cr1().modify(|_, w| w.txeie().disabled());
+        }
+
+        /// Has the interrupt come when a byte has come.
+        pub fn call_for_bytes(&mut self) {
+            interrupt::free(|_| self.usart.cr1().modify(|_, w| w.rxneie().enabled()));
+        }
+    }
+
+    /// Something that has come.
+    #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+    pub struct Received {
+        /// The byte; `None` for one that cannot be read.
+        pub byte: Option<u8>,
+        /// Behind it, others were lost.
+        pub overrun: bool,
+    }
+
+    type Handler = Option<fn()>;
+    /// Who does what there is to do.
+    static HANDLER: Mutex<Cell<Handler>> = Mutex::new(Cell::new(None));
+
+    /// Lets the interrupt of the board's UART come, before all others, and has a function do what there is to do.
+    pub fn on_interrupt(handler: fn()) {
+        interrupt::free(|cs| HANDLER.borrow(cs).set(Some(handler)));
+        // SAFETY: nothing is masked in order to be alone with what the handler works with.
+        unsafe { NVIC::unmask(<crate::UartController as Controller>::INTERRUPT) };
+    }
+
+    /// What the UART's vector points to.
+    pub fn interrupted() {
+        if let Some(handler) = interrupt::free(|cs| HANDLER.borrow(cs).get()) {
+            handler();
         }
     }
 }
@@ -119,7 +180,7 @@ mod drivers {
 mod tests {
     use super::divider;
 
-    /// RM0090 table 142 (42 MHz, 16 samples a bit): USARTDIV 22.8125 for 115.2 kbit/s, 273.4375 for 9.6, 2.875 for 921.6 (0.93 % off).
+    /// RM0090 section 30.3.4 (42 MHz, 16 samples a bit): USARTDIV 22.8125 for 115.2 kbit/s, 273.4375 for 9.6, 2.875 for 921.6 (0.93 % off).
     #[test]
     fn dividers_of_the_manual() {
         assert_eq!(divider(42_000_000, 115_200), Some(365));

@@ -12,6 +12,7 @@ pub mod pacing;
 pub mod periph;
 pub mod peripheral;
 pub mod rtt;
+pub mod serial;
 pub mod socketcand;
 pub mod time;
 pub mod world;

@@ -10,7 +10,7 @@ use coflash::adapter::{Adapter, AdapterError};
 use coflash::session::{Session, Timing};
 use emulator::bus::{Outcome, Record};
 use emulator::frame::Frame;
-use emulator::machine::{Machine, Options, Stop};
+use emulator::machine::{Machine, Options, Stop, Usart};
 use emulator::socketcand::Server;
 use emulator::time::{Span, Time};
 use emulator::world::{MachineId, PortId, World};
@@ -104,6 +104,15 @@ impl Bench {
     /// The board, or the first of several.
     pub fn machine(&mut self) -> &mut Machine {
         self.world.machine_mut(self.device)
+    }
+
+    /// The USART that the first board's firmware uses.
+    ///
+    /// # Panics
+    /// If it uses none.
+    pub fn usart(&mut self) -> &mut Usart {
+        let mut usarts = self.machine().usarts_mut().iter_mut();
+        usarts.find(|usart| usart.accesses() > 0).expect("firmware that uses a USART")
     }
 
     /// All boards, as [`World::machine_mut`] names them.

@@ -1,9 +1,11 @@
-//! The bench for other programs: they reach its bus through the socketcand endpoint, in real time.
+//! The bench for other programs: they reach its bus through the socketcand endpoint, or the board's UART through a terminal, in real
+//! time.
 
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use emulator::pacing::{Pacer, Speed};
+use emulator::serial::Serial;
 use emulator::socketcand::Server;
 
 use crate::bench::Bench;
@@ -16,6 +18,7 @@ pub struct Endpoint {
     /// The bench.
     pub bench: Bench,
     server: Server,
+    serial: Option<Serial>,
 }
 
 impl Endpoint {
@@ -26,7 +29,19 @@ impl Endpoint {
     #[must_use]
     pub fn new(bench: Bench) -> Self {
         let server = Server::bind("127.0.0.1:0", "can0").expect("a free port");
-        Self { bench, server }
+        Self { bench, server, serial: None }
+    }
+
+    /// The same, for a board that speaks through its UART: that is at a pseudo-terminal.
+    ///
+    /// # Panics
+    /// If the system gives none.
+    #[cfg(unix)]
+    #[must_use]
+    pub fn serial(mut bench: Bench) -> Self {
+        let usart = bench.usart().instance().name;
+        let serial = Serial::terminal(usart).expect("a pseudo-terminal");
+        Self { serial: Some(serial), ..Self::new(bench) }
     }
 
     /// `HOST:PORT` of the endpoint.
@@ -38,7 +53,10 @@ impl Endpoint {
     /// Its URL for coflash.
     #[must_use]
     pub fn url(&self) -> String {
-        format!("socketcand://{}/can0", self.address())
+        match &self.serial {
+            Some(serial) => format!("slcan:{}@125k", serial.place()),
+            None => format!("socketcand://{}/can0", self.address()),
+        }
     }
 
     /// Runs a program while the board lives on, until it ends.
@@ -67,7 +85,10 @@ impl Endpoint {
             if target <= self.bench.time() {
                 self.server.wait(Duration::from_micros(500));
             }
-            let delivered = self.bench.serve(&mut self.server, target);
+            let mut delivered = self.bench.serve(&mut self.server, target);
+            if let Some(serial) = &mut self.serial {
+                delivered += serial.exchange(self.bench.machine());
+            }
             if delivered > 0 {
                 pacer.delivered(Instant::now());
             }

@@ -30,6 +30,10 @@ pub const BOOTLOADER_LOG_RTT: &str = "bootloader-log-rtt.elf";
 pub const BOOTLOADER_LOG_DEFMT: &str = "bootloader-log-defmt.elf";
 /// The same as text, out of the board's UART.
 pub const BOOTLOADER_LOG_UART: &str = "bootloader-log-uart.elf";
+/// The one that speaks CAN over the board's UART.
+pub const BOOTLOADER_VIRTUAL_CAN: &str = "bootloader-virtual-can.elf";
+/// The application for it.
+pub const APP_VIRTUAL_CAN: &str = "app-virtual-can.elf";
 /// Version 1 of the application.
 pub const APP_V1: &str = "app-v1.elf";
 /// Version 2 of the application.

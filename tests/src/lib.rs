@@ -8,4 +8,5 @@ pub mod firmware;
 pub mod ihex;
 pub mod powercut;
 pub mod script;
+pub mod serial;
 pub mod throughput;

@@ -16,11 +16,11 @@ use crate::{process, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask build [--board BOARD] [--yes]
 
-Builds the bootloader, standard, with every option, without any, with a rescue window and with words
-for whoever ports it, both versions of the application and the one in C, and puts them into
-target/firmware/BOARD/ as bootloader.elf, bootloader-complete.elf, bootloader-minimal.elf,
-bootloader-rescue.elf, bootloader-log-rtt.elf, -log-defmt.elf and -log-uart.elf, app-v1.elf, app-v2.elf
-and app-c.elf; for a board with room for two programs also app-program-2.elf and app-c-program-2.elf.
+Builds the bootloader, standard, with every option, without any, with a rescue window, with words for
+whoever ports it and with CAN over UART, both versions of the application, the one for CAN over UART and
+the one in C, and puts them into target/firmware/BOARD/ as bootloader.elf, bootloader-complete.elf,
+bootloader-minimal.elf, bootloader-rescue.elf, bootloader-log-rtt.elf, -log-defmt.elf and -log-uart.elf,
+bootloader-virtual-can.elf, app-v1.elf, app-v2.elf, app-virtual-can.elf and app-c.elf; for a board with room for two programs also app-program-2.elf and app-c-program-2.elf.
 
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -34,6 +34,8 @@ pub struct Images {
     pub bootloader: PathBuf,
     /// Those that tell what they do, by their places in [`LOGS`].
     pub logs: Vec<PathBuf>,
+    /// The one that speaks CAN over the UART.
+    pub virtual_can: PathBuf,
 }
 
 pub fn run(mut args: Args) -> Outcome {
@@ -67,10 +69,14 @@ pub fn images(board: &Layout) -> Outcome<Images> {
         image(&log, &format!("bootloader-log-{way}.elf"), board.bootloader)
     });
     let logs = logs.collect::<Outcome<_>>()?;
+    let virtual_can = Build { board, package: "bootloader", features: VIRTUAL_CAN };
+    let virtual_can = image(&virtual_can, "bootloader-virtual-can.elf", board.bootloader)?;
     let program = board.programs[0];
     // Version 1 is the template as it stands.
     image(&Build { board, package: "app-template", features: "" }, "app-v1.elf", program)?;
     image(&Build { board, package: "app-template", features: "version-2" }, "app-v2.elf", program)?;
+    let application = Build { board, package: "app-template", features: "virtual-can" };
+    image(&application, "app-virtual-can.elf", program)?;
     if let Some(second) = board.programs.get(1) {
         let features = "version-2,program-2";
         image(&Build { board, package: "app-template", features }, "app-program-2.elf", *second)?;
@@ -84,7 +90,7 @@ pub fn images(board: &Layout) -> Outcome<Images> {
             program,
         )?;
     }
-    Ok(Images { dir: workspace::firmware_dir(board), bootloader, logs })
+    Ok(Images { dir: workspace::firmware_dir(board), bootloader, logs, virtual_can })
 }
 
 /// Builds the application in C for each program of a board. A board that app-c/boards does not know has none.
@@ -176,6 +182,8 @@ const RESCUE: &str = "emcy,lss,raw-image,rescue-window";
 /// without the dialects.
 pub const LOGS: [(&str, &str); 3] =
     [("rtt", "emcy,lss,log-rtt"), ("defmt", "emcy,lss,log-defmt"), ("uart", "emcy,lss,log-uart")];
+/// A bootloader that speaks CAN over the UART, without the dialects as there is no room for them.
+pub const VIRTUAL_CAN: &str = "emcy,lss,virtual-can";
 /// All of them.
 pub const COMPLETE: &str = "complete";
 

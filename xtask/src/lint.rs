@@ -21,7 +21,9 @@ const FIRMWARE: &[(&str, &str)] = &[
     ("bootloader", build::STANDARD),
     ("bootloader", build::COMPLETE),
     ("app-template", ""),
+    ("bootloader", build::VIRTUAL_CAN),
     ("app-template", "version-2"),
+    ("app-template", "virtual-can"),
 ];
 
 pub fn run(mut args: Args) -> Outcome {

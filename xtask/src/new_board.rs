@@ -126,7 +126,7 @@ fn changes(
     change("emulator/src/bin/emulate/main.rs", &|text| {
         let constant = constant(chip);
         let line = format!(
-            "    Board {{ name: \"{name}\", chip: &{constant}, hse_hz: 8_000_000, pulled_up: &[] }},\n"
+            "    Board {{ name: \"{name}\", chip: &{constant}, hse_hz: 8_000_000, pulled_up: &[], usart: \"USART2\" }},\n"
         );
         before(text, "const BOARDS", "];", &line)
     })?;
@@ -217,7 +217,7 @@ const STEPS: &[(&str, &str)] = &[
     ("pub const CLOCK_TREE", "Step 8: crystal (or a clock, with hse_bypass) and PLL. APB1 at 40 MHz makes each bit rate of CiA 301."),
     ("pub const ENTRY_STRAP", "Step 9: the pin that keeps the device in the bootloader, and the level that does."),
     ("    pub type Led", "Step 10: the LED: its pin here and in `init`."),
-    ("    pub type UartController", "Step 11: the UART for words while you port: which it is here, its pins in `init`, where each port is taken once."),
+    ("    uart! {", "Step 11: the UART for words while you port: which it is here, its pins in `init`, where each port is taken once."),
     ("        let can = can1.can(", "Step 12: the CAN pins, transmit and receive. The build fails for pins that the chip cannot use for CAN1."),
 ];
 

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use canopen::Frame;
 
-mod slcan;
+pub mod slcan;
 #[cfg(target_os = "linux")]
 mod socketcan;
 pub mod socketcand;

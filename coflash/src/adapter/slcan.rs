@@ -26,6 +26,11 @@ pub trait Line: Read + Write {
     /// # Errors
     /// The line is gone.
     fn set_timeout(&mut self, timeout: Duration) -> io::Result<()>;
+
+    /// The time, by the clock that the line's other end lives by.
+    fn now(&self) -> Instant {
+        Instant::now()
+    }
 }
 
 impl Line for TcpStream {
@@ -114,13 +119,13 @@ impl<L: Line> Slcan<L> {
 
     /// The adapter at the other end of `line`, whose bus is open already.
     pub fn opened(line: L, name: String) -> Self {
-        Self { line, name, opened: Instant::now(), partial: Vec::new(), rest: Vec::new() }
+        Self { opened: line.now(), line, name, partial: Vec::new(), rest: Vec::new() }
     }
 
     /// Gives a command and waits for the answer, if one comes.
     fn command(&mut self, text: &str, what: &str) -> Result<(), AdapterError> {
         self.say(text)?;
-        let deadline = Instant::now() + ANSWER;
+        let deadline = self.line.now() + ANSWER;
         loop {
             match self.message(deadline)? {
                 Some(Message::Refused) => return Err(self.unexpected(format!("it refuses {what}"))),
@@ -134,9 +139,9 @@ impl<L: Line> Slcan<L> {
 
     /// Reads what comes until nothing does.
     fn settle(&mut self) -> Result<(), AdapterError> {
-        let end = Instant::now() + ANSWER;
-        while Instant::now() < end {
-            let quiet = Instant::now() + Duration::from_millis(50);
+        let end = self.line.now() + ANSWER;
+        while self.line.now() < end {
+            let quiet = self.line.now() + Duration::from_millis(50);
             if self.message(quiet.min(end))?.is_none() {
                 break;
             }
@@ -155,7 +160,7 @@ impl<L: Line> Slcan<L> {
             if let Some(message) = self.take()? {
                 return Ok(Some(message));
             }
-            let left = deadline.saturating_duration_since(Instant::now());
+            let left = deadline.saturating_duration_since(self.line.now());
             let mut bytes = [0; 4096];
             // What is there already is taken even when the time is over.
             let read = self.line.set_timeout(left).and_then(|()| self.line.read(&mut bytes));
@@ -167,7 +172,7 @@ impl<L: Line> Slcan<L> {
                 Ok(len) => self.rest.extend_from_slice(&bytes[..len]),
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
                 Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {
-                    if deadline <= Instant::now() {
+                    if deadline <= self.line.now() {
                         return Ok(None);
                     }
                 }
@@ -225,7 +230,7 @@ impl<L: Line> Adapter for Slcan<L> {
     }
 
     fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-        let deadline = Instant::now() + timeout;
+        let deadline = self.line.now() + timeout;
         while let Some(message) = self.message(deadline)? {
             // Acknowledgements of what was sent (z, Z, empty) are not for us. A frame that the adapter refused is lost as
             // one may be lost on the bus: it will be missed and repeated.
@@ -234,7 +239,7 @@ impl<L: Line> Adapter for Slcan<L> {
                     return Ok(Some(frame));
                 }
             }
-            if Instant::now() >= deadline {
+            if self.line.now() >= deadline {
                 break;
             }
         }
@@ -242,7 +247,7 @@ impl<L: Line> Adapter for Slcan<L> {
     }
 
     fn now(&self) -> Duration {
-        self.opened.elapsed()
+        self.line.now().saturating_duration_since(self.opened)
     }
 }
 

@@ -476,7 +476,7 @@ impl Peripheral for Usart {
         out.into_iter().chain(come_in).min()
     }
 
-    /// Section 30.4, table 148. An overrun interrupts by itself with DMA alone, and with RXNEIE.
+    /// Section 30.4. An overrun interrupts by itself with DMA alone, and with RXNEIE.
     fn interrupts(&self, active: &mut Vec<u16>) {
         let asked = [(cr1::TXEIE, sr::TXE), (cr1::TCIE, sr::TC), (cr1::RXNEIE, sr::RXNE | sr::ORE)];
         if asked.iter().any(|&(enable, flags)| self.cr1 & enable != 0 && self.flags & flags != 0) {
@@ -506,7 +506,7 @@ mod tests {
     const CR1: u32 = 0x0C;
     const MICRO: u64 = 1_000_000;
 
-    /// On, both ways, at 42 MHz and 22.8125 × 16 cycles a bit: 115 068 bit/s, 0.11 % from 115 200 (section 30.3.4, table 142).
+    /// On, both ways, at 42 MHz and 22.8125 × 16 cycles a bit: 115 068 bit/s, 0.11 % from 115 200 (section 30.3.4).
     fn on(enable: u32) -> Usart {
         let mut usart = Usart::new(&INSTANCES[1]);
         usart.set_clock(42_000_000);

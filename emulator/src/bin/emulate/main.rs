@@ -22,6 +22,7 @@ use emulator::machine::{FlashTimes, Machine, Options, ResetCause, Stop};
 use emulator::pacing::{Pacer, Speed};
 use emulator::periph::usart::Character;
 use emulator::rtt;
+use emulator::serial::Serial;
 use emulator::socketcand::Server;
 use emulator::time::{Span, Time};
 use emulator::world::{MachineId, World};
@@ -53,6 +54,11 @@ struct Args {
     /// Serve the bus `can0` to socketcand clients at this address, for example 127.0.0.1:29536
     #[arg(long, value_name = "HOST:PORT")]
     socketcand: Option<String>,
+
+    /// Serve the board's UART to a client, as a pseudo-terminal (`pty`) or over TCP at this address. Without it, what comes out of
+    /// a UART is shown as text
+    #[arg(long, value_name = "pty|HOST:PORT", conflicts_with = "node_count")]
+    serial: Option<String>,
 
     /// Bit rate of the adapter that clients talk through, in bit/s
     #[arg(long, default_value_t = 125_000, value_parser = clap::value_parser!(u32).range(1_000..=1_000_000))]
@@ -93,21 +99,47 @@ struct Args {
     run_for: Option<Time>,
 }
 
-/// What is known of a board here: its chip, its crystal, and pins that a resistor pulls up.
+/// What is known of a board here: its chip, its crystal, pins that a resistor pulls up, its serial port.
 #[derive(Debug)]
 struct Board {
     name: &'static str,
     chip: &'static Geometry,
     hse_hz: u32,
     pulled_up: &'static [(char, u8)],
+    /// The USART that is led out.
+    usart: &'static str,
 }
 
 const BOARDS: &[Board] = &[
-    Board { name: "stm32f407g-disc1", chip: &STM32F407VG, hse_hz: 8_000_000, pulled_up: &[] },
-    Board { name: "stm32f407g-disc1-two", chip: &STM32F407VG, hse_hz: 8_000_000, pulled_up: &[] },
+    Board {
+        name: "stm32f407g-disc1",
+        chip: &STM32F407VG,
+        hse_hz: 8_000_000,
+        pulled_up: &[],
+        usart: "USART2",
+    },
+    Board {
+        name: "stm32f407g-disc1-two",
+        chip: &STM32F407VG,
+        hse_hz: 8_000_000,
+        pulled_up: &[],
+        usart: "USART2",
+    },
     // B1 (UM1724).
-    Board { name: "nucleo-f446re", chip: &STM32F446RE, hse_hz: 8_000_000, pulled_up: &[('C', 13)] },
-    Board { name: "stm32f429i-disc1", chip: &STM32F429ZI, hse_hz: 8_000_000, pulled_up: &[] },
+    Board {
+        name: "nucleo-f446re",
+        chip: &STM32F446RE,
+        hse_hz: 8_000_000,
+        pulled_up: &[('C', 13)],
+        usart: "USART2",
+    },
+    Board {
+        name: "stm32f429i-disc1",
+        chip: &STM32F429ZI,
+        hse_hz: 8_000_000,
+        pulled_up: &[],
+        usart: "USART1",
+    },
 ];
 
 fn board(name: &str) -> Result<&'static Board, String> {
@@ -246,6 +278,7 @@ struct Bench {
     boards: Vec<Watched>,
     port: emulator::world::PortId,
     server: Option<Server>,
+    serial: Option<Serial>,
     trace: Option<(PathBuf, Handle<BufWriter<File>>)>,
     /// What was to be said and when, not printed yet.
     said: Rc<RefCell<Vec<(Time, String)>>>,
@@ -348,7 +381,7 @@ impl Bench {
             let mut said = telling.borrow_mut();
             said.extend(frame.into_iter().chain(text).map(|text| (record.end, text)));
         });
-        Ok(Self { world, boards, port, server: None, trace, said })
+        Ok(Self { world, boards, port, server: None, serial: None, trace, said })
     }
 
     fn listen(&mut self, args: &Args) -> Result<()> {
@@ -358,6 +391,18 @@ impl Bench {
             })?;
             say(&format!("clients reach the bus at socketcand://{}/can0", server.address()))?;
             self.server = Some(server);
+        }
+        if let Some(place) = &args.serial {
+            let usart = args.board.usart;
+            let serial = match place.as_str() {
+                #[cfg(unix)]
+                "pty" => Serial::terminal(usart).context("a pseudo-terminal")?,
+                address => {
+                    Serial::listen(usart, address).with_context(|| format!("cannot listen at {address}"))?
+                }
+            };
+            say(&format!("{usart} is at {}", serial.place()))?;
+            self.serial = Some(serial);
         }
         Ok(())
     }
@@ -405,6 +450,11 @@ impl Bench {
 
     /// Lets the clients take part.
     fn exchange(&mut self, pacer: &mut Pacer) {
+        if let Some(serial) = &mut self.serial {
+            if serial.exchange(self.world.machine_mut(self.boards[0].id)) > 0 {
+                pacer.delivered(Instant::now());
+            }
+        }
         let Some(server) = &mut self.server else {
             // Nobody wants the frames.
             while self.world.receive(self.port).is_some() {}

@@ -1,0 +1,195 @@
+//! CAN over UART: the bootloader and the application that talk through the board's serial port, to `coflash` and its adapter.
+
+use std::time::Duration;
+use std::{env, process::Command};
+
+use canopen::program::ProgramControl;
+use canopen::{Address, NodeId};
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::endpoint::Endpoint;
+use coboot_tests::firmware;
+use coboot_tests::serial::SerialLine;
+use coflash::adapter::slcan::Slcan;
+use coflash::adapter::Adapter;
+use coflash::flash::{flash, FlashOptions};
+use coflash::session::{Session, Timing};
+
+/// A board in its bootloader, with nothing installed.
+fn empty_board() -> Bench {
+    let mut bench = Bench::of_image(firmware::BOOTLOADER_VIRTUAL_CAN);
+    bench.power_on();
+    bench.run_ms(50);
+    bench
+}
+
+/// What the board has said on its line, and when the last of it was.
+fn said(bench: &mut Bench) -> String {
+    String::from_utf8(bench.usart().take_heard().iter().map(|character| character.byte).collect())
+        .expect("ASCII")
+}
+
+/// Says text to the board and gives what it says within the next `ms`.
+fn ask(bench: &mut Bench, text: &[u8], ms: u64) -> String {
+    let now = bench.time();
+    assert_eq!(bench.usart().hear(text, now), text.len());
+    bench.run_ms(ms);
+    said(bench)
+}
+
+fn adapter(bench: &mut Bench) -> Slcan<SerialLine<'_>> {
+    Slcan::open(SerialLine::new(bench), "the board's line".into(), Some(125_000)).expect("it opens")
+}
+
+fn session(adapter: &mut dyn Adapter) -> Session<'_> {
+    Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default())
+}
+
+/// Boot-up and emergency (docs/protocol.md) in the text of the CAN232's manual, and an SDO upload of 1000h (CiA 301 section
+/// 7.2.4.3.5), all by hand: 10000000h is the bootloader's device type.
+#[test]
+fn the_text_on_the_line() {
+    let mut bench = empty_board();
+    let told = said(&mut bench);
+    assert_eq!(told, "t701100\rt081800FF00424F4F5406\r");
+    assert_eq!(ask(&mut bench, b"C\rS4\rO\r", 20), "\r\r\r");
+    assert_eq!(ask(&mut bench, b"t60184000100000000000\r", 20), "z\rt58184300100000000010\r");
+    // Somebody else's, network management for nobody here, a remote frame and 29 bits: acknowledged, as by any node of a bus.
+    assert_eq!(
+        ask(&mut bench, b"t60284000100000000000\rt00028105\rr6010\rT0000060184000100000000000\r", 30),
+        "z\rz\rz\rZ\r"
+    );
+    // Closed, it hears nothing and says nothing; heartbeats come every second.
+    assert_eq!(ask(&mut bench, b"C\rt60184000100000000000\r", 2500), "\r\x07");
+    assert_eq!(ask(&mut bench, b"O\r", 2000).matches("t70117F\r").count(), 2);
+    bench.assert_nothing_unmodelled();
+}
+
+/// The main job over the line: install, verify, start, call back, update; and nothing on the CAN bus meanwhile.
+#[test]
+fn coflash_updates_the_device_through_its_serial_port() {
+    let mut bench = empty_board();
+    let blocks = firmware::blocks(firmware::APP_VIRTUAL_CAN);
+    let options = FlashOptions { verify: true, ..FlashOptions::default() };
+    let mut adapter = adapter(&mut bench);
+    for round in 0..2 {
+        let mut session = session(&mut adapter);
+        flash(&mut session, &blocks, &options, &mut |_| {})
+            .unwrap_or_else(|error| panic!("{round}: {error}"));
+        assert!(!session.device_type().unwrap().unwrap().is_bootloader(), "the application runs");
+        assert_eq!(session.read_number(Address::new(0x1F51, 1)).unwrap(), 1);
+        // The second time it is the application that is called back.
+    }
+    let mut session = session(&mut adapter);
+    session.command(1, ProgramControl::StartBootloader).unwrap();
+    assert!(session.await_boot_up(Duration::from_secs(1)).unwrap());
+    assert!(session.device_type().unwrap().unwrap().is_bootloader());
+    session.command(1, ProgramControl::Clear).unwrap();
+    session.command(1, ProgramControl::Clear).unwrap();
+    assert!(session.status(1).unwrap().busy);
+    drop(adapter);
+    assert!(bench.records().is_empty(), "something was on the CAN bus");
+    assert_eq!(bench.machine().counters().flash_stalls, 0, "the line is served from RAM");
+    bench.assert_nothing_unmodelled();
+}
+
+/// Asks for 1F57h/1 by hand; whether it is answered within 10 ms: 2.3 ms for the question on the line, 2 for the answer.
+fn is_answered(bench: &mut Bench) -> bool {
+    ask(bench, b"t601840571F0100000000\r", 10).contains("t581843571F01")
+}
+
+/// What nobody should send: it is refused line by line, the device stays reachable, and its heartbeats come.
+#[test]
+fn noise_on_the_line_costs_nothing_but_itself() {
+    let mut bench = empty_board();
+    said(&mut bench);
+    let mut state = 0x0123_4567_89AB_CDEF_u64;
+    let noise: Vec<u8> = std::iter::repeat_with(|| {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 56) as u8
+    })
+    // Not that it closes the channel by chance.
+    .filter(|byte| *byte != b'C')
+    .take(40_000)
+    .collect();
+    // 40 000 characters take 3.5 s.
+    let told = ask(&mut bench, &noise, 3600);
+    assert!(told.matches('\x07').count() > 100, "{} refusals", told.matches('\x07').count());
+    assert!((3..=4).contains(&told.matches("t70117F\r").count()), "{told:?}");
+    ask(&mut bench, b"\r", 10);
+    assert!(is_answered(&mut bench));
+    // A host that wants answers to more than the line can carry: twice as many as it says. The device's own are among them.
+    let flood = b"V\r".repeat(15_000);
+    let told = ask(&mut bench, &flood, 2700);
+    assert!((2..=3).contains(&told.matches("t70117F\r").count()), "heartbeats in a flood");
+    bench.run_ms(100);
+    assert!(is_answered(&mut bench));
+    // Half a line, and the host starts anew.
+    assert_eq!(ask(&mut bench, b"t60184057\r", 10), "\x07");
+    assert!(is_answered(&mut bench));
+    assert_eq!(ask(&mut bench, &[b'x'; 3000], 300).trim_matches(|c: char| c != '\x07'), "");
+    assert_eq!(ask(&mut bench, b"\r", 5), "\x07");
+    assert!(is_answered(&mut bench));
+    bench.assert_nothing_unmodelled();
+}
+
+/// The host's terminal runs at another bit rate: nothing of it is taken for a frame, an emergency tells that something was lost
+/// (8110h, controller overrun), and the right one is understood at once.
+#[test]
+fn another_bit_rate_is_noticed() {
+    let mut bench = empty_board();
+    said(&mut bench);
+    bench.usart().set_outside_bit_rate(38_400);
+    let told = ask(&mut bench, b"t60182F511F018000000000\rt60182F511F018000000000\r", 50);
+    assert!(told.contains("t08181081110000200000\r"), "{told:?}");
+    assert!(!told.contains("t5818"), "{told:?}");
+    bench.usart().set_outside_bit_rate(115_200);
+    ask(&mut bench, b"\r", 10);
+    assert!(ask(&mut bench, b"F\r", 10).contains("F08\r"));
+    assert!(is_answered(&mut bench));
+}
+
+/// While all of the program's flash is erased, each SDO is answered as soon as the line allows.
+#[test]
+fn never_silent_during_an_erase() {
+    let mut bench = empty_board();
+    let mut adapter = adapter(&mut bench);
+    let blocks = firmware::blocks(firmware::APP_VIRTUAL_CAN);
+    let mut session_ = session(&mut adapter);
+    flash(&mut session_, &blocks, &FlashOptions { start: false, ..FlashOptions::default() }, &mut |_| {})
+        .unwrap();
+    session_.command(1, ProgramControl::Clear).unwrap();
+    session_.command(1, ProgramControl::Clear).unwrap();
+    drop(adapter);
+    // The adapter has closed the channel as it went.
+    assert_eq!(ask(&mut bench, b"O\r", 10), "\r\r");
+    let answers = (0..100).filter(|_| is_answered(&mut bench)).count();
+    assert_eq!(answers, 100);
+    assert!(
+        ask(&mut bench, b"t601840571F0100000000\r", 10).contains("t581843571F0101"),
+        "the erase must have lasted"
+    );
+    assert_eq!(bench.machine().counters().flash_stalls, 0);
+}
+
+/// The command line, in real time, by a terminal that it takes for a serial port.
+#[test]
+fn the_coflash_command_finds_the_device_at_its_serial_port() {
+    let coflash = env::var_os("COBOOT_COFLASH")
+        .unwrap_or_else(|| panic!("COBOOT_COFLASH is not set: run the tests by `cargo xtask test`"));
+    let mut endpoint = Endpoint::serial(empty_board());
+    let url = endpoint.url();
+    let output = endpoint.run(Command::new(coflash).args(["--bus", &url, "info"]));
+    let told =
+        format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{told}");
+    assert!(told.contains("the bootloader") && told.contains(bsp::IDENTITY.device_name), "{told}");
+}
+
+#[test]
+fn a_release_has_nothing_of_it() {
+    let has = |image| firmware::elf(image).windows(5).any(|part| part == b"V1013");
+    assert!(has(firmware::BOOTLOADER_VIRTUAL_CAN) && has(firmware::APP_VIRTUAL_CAN));
+    for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_COMPLETE, firmware::APP_V1] {
+        assert!(!has(image), "{image}");
+    }
+}
