@@ -21,7 +21,8 @@ use canopen::{AbortCode, Address, NodeId};
 use crate::block_file::BlockFile;
 use crate::error::Error;
 use crate::flash::{
-    await_application, call_back, erase_patiently, find, judge, Event, FlashOptions, Judgement, RepeatReason,
+    await_application, call_back, erase_patiently, find, judge, DeviceState, Event, FlashOptions, Judgement,
+    RepeatReason,
 };
 use crate::info::{absent, optional};
 use crate::session::{DeviceType, Doing, Session, Timing, Transfers};
@@ -356,13 +357,21 @@ pub(crate) fn send(
     dialect: Dialect,
     content: &[u8],
     options: &FlashOptions,
+    state: &mut DeviceState,
     tell: &mut dyn FnMut(Event),
 ) -> Result<u32, Error> {
     let at = Address::new(program::PROGRAM_DATA, options.program);
     let total = content.len();
     let mut repeat = 0;
     loop {
-        prepare(session, dialect, options, tell)?;
+        let before = std::mem::replace(state, DeviceState::Erased);
+        if let Err(error) = prepare(session, dialect, options, tell) {
+            // A password that is refused erases nothing.
+            if matches!(error, Error::Refused { doing: Doing::Unlock, .. } | Error::NotInDialect { .. }) {
+                *state = before;
+            }
+            return Err(error);
+        }
         tell(Event::Progress { done: 0, total });
         let slow = Timing { sdo: SLOW_SEGMENT.max(session.timing().sdo), ..*session.timing() };
         let node = session.node();

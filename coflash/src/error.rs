@@ -323,7 +323,10 @@ fn unlock_advice(code: AbortCode) -> &'static str {
         AbortCode::NO_OBJECT | AbortCode::NO_SUB_INDEX => {
             "the device knows no password: check --dialect, or leave that out"
         }
-        _ => "check the password: its maker knows it; after a wrong one a device may take its time, or want a reset",
+        AbortCode::DEVICE_STATE => {
+            "after a wrong password a device takes none for a while: try the right one again in half a minute"
+        }
+        _ => "check the password: the device's maker knows it; after some wrong ones it may take none for a while",
     }
 }
 

@@ -319,9 +319,8 @@ fn procedure(
         if options.trial_run {
             return Err(Error::NotInDialect { dialect, what: "there are no signatures, so no trial either" });
         }
-        *state = DeviceState::Erased;
         let transfer_began = session.now();
-        let repeats = dialect::send(session, dialect, &content, options, tell)?;
+        let repeats = dialect::send(session, dialect, &content, options, state, tell)?;
         let transfer = session.now().saturating_sub(transfer_began);
         *state = DeviceState::Written;
         // What 1F56h reads is a CRC in this bootloader and its like; elsewhere it is whatever its maker took.

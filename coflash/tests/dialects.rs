@@ -371,8 +371,9 @@ fn esacademy_says_what_went_wrong_by_the_error_register_alone() {
 
     for password in [[1, 2, 3, 4], [0x49, 0x4E, 0x49, 0x54]] {
         let (mut fake, _) = EsAcademy::fake(|device| device.password = Some(password));
-        let (result, ..) = run_at(&mut fake, 64, &FlashOptions::default());
+        let (result, events, _) = run_at(&mut fake, 64, &FlashOptions::default());
         assert!(matches!(result, Err(Error::Refused { doing: Doing::Unlock, .. })), "{result:?}");
+        assert_eq!(events.last(), Some(&Event::Left(DeviceState::Untouched)));
     }
     let (mut fake, _) = EsAcademy::fake(|_| {});
     let (result, ..) = run_at(&mut fake, 64, &locked("no number"));

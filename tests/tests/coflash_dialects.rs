@@ -1,0 +1,148 @@
+//! `coflash` finds out what the firmware speaks, and updates it so: images and Intel HEX into the standard bootloader, the profiles of
+//! ESAcademy and lifts.
+
+use canopen::Address;
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::firmware;
+use coflash::block_file::BlockFile;
+use coflash::convert::{blocks_of, Options, Region};
+use coflash::dialect::{read_locked, recognise, Dialect, Password};
+use coflash::error::Error;
+use coflash::flash::{flash, DeviceState, Event, FlashOptions, Report};
+use coflash::read::read;
+use coflash::session::Doing;
+use shared_abi::layout::stm32f407g_disc1_two;
+
+const VERSION: Address = Address::new(0x100A, 0);
+
+const ESACADEMY: &str = "bootloader-esacademy.elf";
+/// The profile's node-ID.
+const ESACADEMY_NODE: u8 = 64;
+
+const LIFT: &str = "bootloader-lift.elf";
+const APP_LIFT: &str = "app-lift.elf";
+const APP_LIFT_V2: &str = "app-lift-v2.elf";
+/// The node-ID of every lift bootloader (CiA 814-1 clause 5).
+const LIFT_NODE: u8 = 126;
+/// What the firmware of this repository has for a password.
+const PASSWORD: &str = "coboot";
+
+/// For so long the firmware takes no password behind the first wrong one, and some more; in ms.
+const PENALTY_MS: u64 = 600;
+
+fn update(
+    bench: &mut Bench,
+    node: u8,
+    blocks: &BlockFile,
+    options: &FlashOptions,
+) -> (Result<Report, Error>, Vec<Event>) {
+    let mut events = Vec::new();
+    let result = flash(&mut bench.session_with(node), blocks, options, &mut |event| events.push(event));
+    (result, events)
+}
+
+fn version(bench: &mut Bench, node: u8) -> String {
+    bench.session_with(node).read_text(VERSION).unwrap()
+}
+
+fn power_cycle(bench: &mut Bench, node: u8) {
+    bench.power_off();
+    bench.run_ms(100);
+    bench.power_on();
+    bench.await_boot_up_of(node, 1000);
+}
+
+#[test]
+fn images_and_intel_hex_update_the_standard_firmware() {
+    for dialect in [Dialect::Raw, Dialect::Hex] {
+        let mut bench = Bench::new();
+        bench.power_on();
+        bench.await_boot_up(100);
+        let options = FlashOptions { dialect: Some(dialect), verify: true, ..FlashOptions::default() };
+        // Into an empty device, and into one whose application runs.
+        for (image, expected) in [(firmware::APP_V1, "1.0.0"), (firmware::APP_V2, "2.0.0")] {
+            let blocks = firmware::blocks(image);
+            let (result, events) = update(&mut bench, NODE, &blocks, &options);
+            let report = result.unwrap();
+            assert_eq!((report.dialect, report.repeats), (dialect, 0));
+            assert!(events.contains(&Event::Verified { crc: blocks.program_crc() }), "{events:?}");
+            assert!(!events.contains(&Event::Signed), "{events:?}");
+            assert_eq!(version(&mut bench, NODE), expected);
+            let program = firmware::board().programs[0].base - firmware::board().chip.flash.base;
+            let stored = &bench.machine().flash()[program as usize..][..report.program_size as usize];
+            assert_eq!(stored, blocks.flash_image());
+        }
+        power_cycle(&mut bench, NODE);
+        assert_eq!(version(&mut bench, NODE), "2.0.0", "it is valid without a signature");
+        bench.assert_nothing_unmodelled();
+    }
+}
+
+#[test]
+fn the_profile_of_esacademy_is_recognised_and_updated() {
+    let mut bench = Bench::of_image(ESACADEMY);
+    bench.power_on();
+    bench.await_boot_up_of(ESACADEMY_NODE, 100);
+    // "Wrong" instead of "INIT".
+    let wrong = FlashOptions { unlock: Password::new("0x57726F6E"), ..FlashOptions::default() };
+    let (result, events) = update(&mut bench, ESACADEMY_NODE, &firmware::blocks(firmware::APP_V1), &wrong);
+    assert!(matches!(result, Err(Error::Refused { doing: Doing::Unlock, .. })), "{result:?}");
+    assert_eq!(events.last(), Some(&Event::Left(DeviceState::Untouched)));
+    // The next attempt has to wait.
+    bench.run_ms(PENALTY_MS);
+
+    for (image, expected) in [(firmware::APP_V1, "1.0.0"), (firmware::APP_V2, "2.0.0")] {
+        let (result, events) =
+            update(&mut bench, ESACADEMY_NODE, &firmware::blocks(image), &FlashOptions::default());
+        let report = result.unwrap_or_else(|error| panic!("{error}: {events:?}"));
+        assert_eq!(report.dialect, Dialect::EsAcademy);
+        assert!(events.contains(&Event::Unlocked), "{events:?}");
+        assert_eq!(version(&mut bench, ESACADEMY_NODE), expected);
+    }
+    power_cycle(&mut bench, ESACADEMY_NODE);
+    assert_eq!(version(&mut bench, ESACADEMY_NODE), "2.0.0");
+    bench.assert_nothing_unmodelled();
+}
+
+/// A lift bootloader needs a board with room for its set of parameters.
+#[test]
+fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
+    let layout = &stm32f407g_disc1_two::LAYOUT;
+    if firmware::board().chip != layout.chip {
+        // The bench is that of another chip.
+        return;
+    }
+    let blocks = |name: &str| {
+        let elf = firmware::elf(&firmware::of_board(layout.board, name));
+        let options = Options { region: Region::Strict(layout.programs[0].into()), ..Options::default() };
+        blocks_of(read(&elf, None, None).unwrap(), &options).unwrap().file
+    };
+    let mut bench = Bench::of_image(&firmware::of_board(layout.board, LIFT));
+    bench.power_on();
+    bench.await_boot_up_of(LIFT_NODE, 1000);
+    let options = FlashOptions { unlock: Password::new(PASSWORD), ..FlashOptions::default() };
+    // A device without a program is in its bootloader, and nobody knows its own node-ID.
+    for (from, image, expected) in [(LIFT_NODE, APP_LIFT, "1.0.0"), (NODE, APP_LIFT_V2, "2.0.0")] {
+        let (result, events) = update(&mut bench, from, &blocks(image), &options);
+        let report = result.unwrap_or_else(|error| panic!("{error}: {events:?}"));
+        assert_eq!(report.dialect, Dialect::Lift);
+        assert!(report.running.is_some_and(|running| !running.is_bootloader()));
+        assert!(version(&mut bench, NODE).contains(expected), "{}", version(&mut bench, NODE));
+    }
+    let mut session = bench.session_with(NODE);
+    let running = session.device_type().unwrap().unwrap();
+    assert_eq!(recognise(&mut session, running, 1).unwrap(), Dialect::Lift);
+
+    let program = Address::new(0x1F50, 1);
+    let stored = read_locked(&mut session, program, None, Password::new(PASSWORD), &mut |_| {}).unwrap();
+    assert_eq!(stored, blocks(APP_LIFT_V2).flash_image());
+    bench.await_boot_up(2000);
+    assert!(version(&mut bench, NODE).contains("2.0.0"), "it runs again");
+
+    let wrong = FlashOptions { unlock: Password::new("Coboot"), ..FlashOptions::default() };
+    let (result, events) = update(&mut bench, NODE, &blocks(APP_LIFT), &wrong);
+    assert!(matches!(result, Err(Error::Refused { doing: Doing::Unlock, .. })), "{result:?}");
+    assert_eq!(events.last(), Some(&Event::Left(DeviceState::Untouched)));
+    assert!(version(&mut bench, NODE).contains("2.0.0"), "it goes on");
+    bench.assert_nothing_unmodelled();
+}
