@@ -106,7 +106,16 @@ const LEC: u32 = 7 << 4;
 pub struct Port<I: MasterInstance> {
     can: Can<I>,
     waiting: Option<bxcan::Frame>,
+    /// A boot-up is on its way, which nothing may overtake, whatever its priority.
+    boot_up: bool,
     lost: Lost,
+}
+
+/// Whether this is what a node says first (CiA 301 section 7.2.8.3.3): a state of 0 on 700h + node-ID.
+fn is_boot_up(frame: &bxcan::Frame) -> bool {
+    let boot_up = |data: &bxcan::Data| data[..] == [0];
+    matches!(frame.id(), bxcan::Id::Standard(id) if id.as_raw() & 0x780 == 0x700)
+        && frame.data().is_some_and(boot_up)
 }
 
 /// Where frames were lost.
@@ -124,7 +133,7 @@ impl<I: MasterInstance> Port<I> {
     pub fn new(controller: I) -> Self {
         let mut can = Can::builder(controller).leave_disabled();
         can.enable_interrupts(Interrupts::FIFO0_MESSAGE_PENDING | Interrupts::TRANSMIT_MAILBOX_EMPTY);
-        Self { can, waiting: None, lost: Lost::default() }
+        Self { can, waiting: None, boot_up: false, lost: Lost::default() }
     }
 
     /// Sets bit timing and mode, and joins the bus with empty mailboxes.
@@ -193,7 +202,8 @@ impl<I: MasterInstance> Port<I> {
         if let Some(frame) = self.waiting.take() {
             self.put(frame);
         }
-        self.waiting.is_none()
+        self.boot_up &= !self.can.is_transmitter_idle();
+        self.waiting.is_none() && !self.boot_up
     }
 
     /// Sends a frame. To be called only when there is room; a frame that still waits would be lost.
@@ -201,6 +211,7 @@ impl<I: MasterInstance> Port<I> {
     /// Frames of one identifier leave in order: the mailboxes take the second only when the first is on its way.
     pub fn send<F: Frame>(&mut self, frame: &F) {
         if let Some(frame) = convert(frame) {
+            self.boot_up = is_boot_up(&frame);
             self.put(frame);
         }
     }

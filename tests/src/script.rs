@@ -72,7 +72,8 @@ impl Player<'_> {
                 self.node = (id - 0x600) as u8;
             }
             self.seen = self.bench.time();
-            let data: Vec<u8> = bytes.into_iter().map(|byte| byte.expect("the master knows what it sends")).collect();
+            let data: Vec<u8> =
+                bytes.into_iter().map(|byte| byte.expect("the master knows what it sends")).collect();
             self.bench.post(id, &data);
         } else {
             self.expect(id.into(), &bytes, place);
@@ -118,6 +119,7 @@ impl Player<'_> {
             ["@power"] => {
                 self.bench.power_off();
                 self.bench.run_ms(100);
+                self.seen = self.bench.time();
                 self.bench.power_on();
             }
             _ => panic!("{place}: nobody knows what that is"),
