@@ -277,3 +277,81 @@ fn frames_of_others_are_passed_over() {
     assert!(noise.join().unwrap() > 10);
     assert_eq!(folder.read("1.flash")[0x1_0000..0x4_2000], program(0xA5));
 }
+
+/// Images and Intel HEX, and the dialects in which nodes contradict the standard one; coflash says which one it is.
+#[test]
+fn dialects_are_found_out_or_named() {
+    let folder = folder("dialects");
+    let stand_in = ["--node", "5", "--flash", "instant", "--stand-in"];
+    {
+        let nodes = Nodes::start(&folder, &stand_in);
+        let coflash = Coflash::new(&folder, &nodes);
+        assert_eq!(coflash.json(&["info", "-N", "5"])["dialect"], "block");
+        for dialect in ["raw", "hex"] {
+            let done = coflash.json(&[FLASH, &["-N", "5", "--dialect", dialect, "--verify"]].concat());
+            assert_eq!(done["dialect"], dialect);
+            assert_eq!(done["running"], 0, "{done}");
+        }
+        assert_eq!(folder.read("1.flash")[0x1_0000..][..200 * 1024], program(0xA5));
+        // There is no signature to be tried without.
+        let refused = coflash.run(&[FLASH, &["-N", "5", "--dialect", "raw", "--trial-run"]].concat());
+        assert_eq!(refused.exit, 2, "{}", refused.err);
+        assert!(refused.err.contains("in the dialect raw"), "{}", refused.err);
+    }
+    let nodes =
+        Nodes::start(&folder, &[&stand_in[..], &["--serial", "2", "--profile", "esacademy"]].concat());
+    let coflash = Coflash::new(&folder, &nodes);
+    assert_eq!(coflash.json(&["info", "-N", "5"])["dialect"], "esacademy");
+    let refused = coflash.run(&[FLASH, &["-N", "5", "--unlock", "OPEN"]].concat());
+    assert_eq!(refused.exit, 6, "{}", refused.err);
+    assert!(
+        refused.err.contains("password") && refused.err.contains("nothing was changed"),
+        "{}",
+        refused.err
+    );
+    // For half a second it takes none.
+    std::thread::sleep(Duration::from_millis(700));
+    let done = coflash.json(&[FLASH, &["-N", "5", "--unlock", "INIT"]].concat());
+    assert_eq!((&done["dialect"], &done["running"]), (&json!("esacademy"), &json!(0)));
+    // The password would have erased what is to be read.
+    let refused = coflash.run(&["read", "1F50/1", "-N", "5", "--dialect", "esacademy", "--unlock", "INIT"]);
+    assert_eq!(refused.exit, 2, "{}", refused.err);
+}
+
+/// The program with the label that a lift wants, for vendor-ID and product code 0: its check word is the ABI's fold over the seven words
+/// before, written again.
+fn labelled() -> Vec<u8> {
+    let mut words = [0_u32; 7];
+    words[0] = u32::from_le_bytes(*b"CBL1");
+    let fold = words
+        .iter()
+        .fold(0xC0B0_07A5_u32, |fold, word| (fold.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B1));
+    let mut image = program(0xA5);
+    for (place, word) in image[0x1E0..0x200].chunks_mut(4).zip(words.into_iter().chain([!fold])) {
+        place.copy_from_slice(&word.to_le_bytes());
+    }
+    image
+}
+
+/// A lift's bootloader has one node-ID, whatever the device has; its program can be saved.
+#[test]
+fn a_lift_is_updated_and_saved() {
+    let folder = folder("lift");
+    let two = ["--board", "stm32f407g-disc1-two"];
+    let options = ["--node", "5", "--flash", "instant", "--stand-in", "--stay", "--profile", "lift"];
+    let nodes = Nodes::start(&folder, &[&options[..], &two].concat());
+    let coflash = Coflash::new(&folder, &nodes);
+    let on = ["-N", "126", "--unlock", "coboot"];
+    assert_eq!(coflash.json(&["info", "-N", "126"])["dialect"], "lift");
+    let locked = coflash.run(&["read", "1F50/1", "-N", "126"]);
+    assert_eq!(locked.exit, 6, "{}", locked.err);
+    let without = coflash.run(&[&["flash", "program.bin", "-I", "binary", "-N", "126"][..], &two].concat());
+    assert_eq!(without.exit, 2, "{}", without.err);
+    assert!(without.err.contains("--unlock"), "{}", without.err);
+    let image = labelled();
+    folder.write("lift.bin", &image);
+    let flash = ["flash", "lift.bin", "-I", "binary", "--no-start"];
+    assert_eq!(coflash.json(&[&flash[..], &two, &on].concat())["dialect"], "lift");
+    coflash.done(&[&["read", "1F50/1", "-o", "saved.bin"][..], &on].concat());
+    assert_eq!(folder.read("saved.bin"), image);
+}
