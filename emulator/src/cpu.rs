@@ -16,7 +16,10 @@ mod accesses;
 use unicorn_engine::unicorn_const::{uc_error, Arch, HookType, MemType, Mode, Prot, TlbEntry, TlbType};
 use unicorn_engine::{ArmCpuModel, RegisterARM, Unicorn};
 
-use crate::cortex::exceptions::{Masks, BUS_FAULT, HARD_FAULT, MEM_MANAGE, NMI, SV_CALL, USAGE_FAULT};
+use crate::cortex::debug::{DFSR_BKPT, DFSR_HALTED};
+use crate::cortex::exceptions::{
+    Masks, BUS_FAULT, DEBUG_MONITOR, HARD_FAULT, MEM_MANAGE, NMI, SV_CALL, USAGE_FAULT,
+};
 use crate::cortex::scs::{cfsr, hfsr};
 use crate::machine::chip::{
     Chip, BOOT_ALIAS, OPTION_PAGE, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS, PRIVATE, SRAM_ALIAS,
@@ -69,6 +72,8 @@ pub enum Exit {
     ExceptionReturn(u32),
     /// The program wanted flash that is busy.
     FlashBusy,
+    /// The next instruction has a breakpoint, or is one.
+    Breakpoint,
     /// A fault.
     Fault(Fault),
 }
@@ -121,6 +126,8 @@ struct Notes {
     masks: Option<Masks>,
     /// An instruction of the FPU that is switched off lies in the block, at this address.
     fpu_instruction: Option<u32>,
+    /// One instruction is wanted, and nothing may hold it up.
+    single: bool,
     /// Blocks looked at.
     blocks: Blocks,
     /// Pages of RAM that code was fetched from.
@@ -487,6 +494,12 @@ impl Cpu {
         self.chip_mut().leave = false;
         let masks = self.is_unprivileged().then(|| self.privileged(|cpu| cpu.masks()));
         self.uc.get_data_mut().notes.masks = masks;
+        if self.has_breakpoint(self.pc()) {
+            return Exit::Breakpoint;
+        }
+        if self.steps() {
+            return self.step();
+        }
         let exit = self.enter(None);
         let Some(address) = self.uc.get_data_mut().notes.fpu_instruction.take() else { return exit };
         // The FPU is off: run up to its instruction, which faults.
@@ -502,16 +515,88 @@ impl Cpu {
     }
 
     fn enter(&mut self, until: Option<u32>) -> Exit {
-        if let Some(until) = until {
-            let _ = self.uc.ctl_set_exits(&[u64::from(until)]);
+        let exits: Vec<u64> = self.chip().scs.debug.breakpoints().chain(until).map(u64::from).collect();
+        if !exits.is_empty() {
+            let _ = self.uc.ctl_set_exits(&exits);
         }
-        let thumb = self.register(RegisterARM::XPSR) & XPSR_T != 0;
-        let begin = self.pc() | u32::from(thumb);
-        let result = self.uc.emu_start(u64::from(begin), 0, 0, 0);
-        if until.is_some() {
+        let result = self.start(0);
+        if !exits.is_empty() {
             let _ = self.uc.ctl_set_exits(&[]);
         }
-        self.why(result)
+        match self.why(result) {
+            // It came to a breakpoint, which is seen when it wants to go on.
+            Exit::WaitForInterrupt
+                if self.has_breakpoint(self.pc()) && self.last_hint(self.pc()) != Some(Hint::Wfi) =>
+            {
+                Exit::Slice
+            }
+            exit => exit,
+        }
+    }
+
+    /// Runs from where the CPU stands; so many instructions, or with 0 any number.
+    fn start(&mut self, count: usize) -> Result<(), uc_error> {
+        let thumb = self.register(RegisterARM::XPSR) & XPSR_T != 0;
+        let begin = self.pc() | u32::from(thumb);
+        self.uc.emu_start(u64::from(begin), 0, 0, count)
+    }
+
+    fn has_breakpoint(&self, address: u32) -> bool {
+        self.chip().scs.debug.breakpoints().any(|breakpoint| breakpoint == address)
+    }
+
+    /// Whether the DebugMonitor exception follows the next instruction (DDI 0403E C1.5.1).
+    fn steps(&mut self) -> bool {
+        self.chip().scs.debug.steps() && self.can_monitor()
+    }
+
+    /// Whether the DebugMonitor exception can be taken now.
+    fn can_monitor(&mut self) -> bool {
+        let masks = self.privileged(|cpu| cpu.masks());
+        let exceptions = &self.chip().scs.exceptions;
+        exceptions.is_enabled(DEBUG_MONITOR)
+            && exceptions.group_priority(DEBUG_MONITOR) < exceptions.execution_priority(masks)
+    }
+
+    /// Carries out one instruction, which the DebugMonitor exception follows.
+    fn step(&mut self) -> Exit {
+        let chip = self.chip_mut();
+        let (cycles, instructions) = (chip.clock.cycles, chip.counters.instructions);
+        chip.block = (0, 0);
+        // Code that was translated without being counted would run on.
+        let _ = self.uc.ctl_flush_tb();
+        self.uc.get_data_mut().notes.single = true;
+        let result = self.start(1);
+        let exit = self.why(result);
+        let _ = self.uc.ctl_flush_tb();
+        self.uc.get_data_mut().notes.single = false;
+        let chip = self.chip_mut();
+        if matches!(exit, Exit::FlashBusy | Exit::Fault(_)) {
+            return exit;
+        }
+        chip.clock.cycles = cycles + 1;
+        chip.counters.instructions = instructions + 1;
+        chip.scs.debug.note(DFSR_HALTED);
+        chip.scs.exceptions.pend(DEBUG_MONITOR);
+        chip.check_exceptions = true;
+        match exit {
+            Exit::SupervisorCall | Exit::ExceptionReturn(_) | Exit::Breakpoint => exit,
+            // Who steps does not sleep.
+            _ => Exit::Slice,
+        }
+    }
+
+    /// A breakpoint: the DebugMonitor exception if it can be taken, and a HardFault otherwise (DDI 0403E section C1).
+    pub fn breakpoint(&mut self) -> Entry {
+        let monitors = self.can_monitor();
+        self.chip_mut().scs.debug.note(DFSR_BKPT);
+        if !monitors {
+            return self.take_fault(Fault::Hard(hfsr::DEBUGEVT));
+        }
+        match self.enter_exception(DEBUG_MONITOR) {
+            Entry::Failed(fault) => self.take_fault(fault),
+            entry => entry,
+        }
     }
 
     fn drop_stale(&mut self) {
@@ -524,6 +609,9 @@ impl Cpu {
         }
         if std::mem::take(&mut self.chip_mut().flush_tlb) {
             let _ = self.uc.ctl_flush_tlb();
+        }
+        if std::mem::take(&mut self.chip_mut().breakpoints_changed) {
+            let _ = self.uc.ctl_flush_tb();
         }
     }
 
@@ -562,7 +650,7 @@ impl Cpu {
         match exception {
             Some(EXCP_SWI) => Exit::SupervisorCall,
             Some(EXCP_EXCEPTION_EXIT) => Exit::ExceptionReturn(pc | 1),
-            Some(EXCP_BKPT) => Exit::Fault(Fault::Hard(hfsr::DEBUGEVT)),
+            Some(EXCP_BKPT) => Exit::Breakpoint,
             Some(EXCP_DATA_ABORT) => {
                 self.uncharge(pc);
                 Exit::Fault(Fault::usage(cfsr::UNALIGNED))
@@ -897,12 +985,17 @@ fn stop(uc: &mut Unicorn<'_, State>) {
 fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
     let state = uc.get_data_mut();
     let chip = &mut state.chip;
-    if chip.leave || chip.clock.cycles >= chip.slice_end {
+    let single = state.notes.single;
+    if !single && (chip.leave || chip.clock.cycles >= chip.slice_end) {
         return stop(uc);
     }
     if is_flash(chip, address) && is_flash_busy(chip) {
         state.notes.flash_busy = true;
         return stop(uc);
+    }
+    if single {
+        chip.block = (address, size);
+        return;
     }
     if chip.check_exceptions {
         let masks = state.notes.masks.unwrap_or_else(|| masks(uc));

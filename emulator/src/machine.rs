@@ -389,6 +389,7 @@ impl Machine {
                 chip.counters.flash_stalls += 1;
                 Entry::Taken
             }
+            Exit::Breakpoint => self.cpu.breakpoint(),
             Exit::Fault(fault) => self.cpu.take_fault(fault),
         }
     }
@@ -430,6 +431,12 @@ impl Machine {
     /// For a sector of a second bank, whose option bytes are not modelled.
     pub fn protect_sector(&mut self, number: u8, protected: bool) {
         self.cpu.chip_mut().flash.protect_sector(number, protected);
+    }
+
+    /// Sets the option byte RDP as a debug probe does: AAh no read-out protection, CCh level 2, anything else level 1. The model
+    /// tells it in its registers and does nothing about it.
+    pub fn set_read_protection(&mut self, rdp: u8) {
+        self.cpu.chip_mut().flash.preset_read_protection(rdp);
     }
 
     /// CAN controller `n`; 0 is CAN1, the only one.

@@ -12,6 +12,8 @@ pub const BUS_FAULT: u16 = 5;
 pub const USAGE_FAULT: u16 = 6;
 /// SVCall.
 pub const SV_CALL: u16 = 11;
+/// DebugMonitor.
+pub const DEBUG_MONITOR: u16 = 12;
 /// PendSV.
 pub const PEND_SV: u16 = 14;
 /// SysTick.

@@ -1,8 +1,10 @@
 //! The system control space: NVIC and SCB registers (PM0214 sections 4.3 and 4.4), SysTick's registers, the FPU's
 //! access control (section 4.6), and the cycle counter of the DWT.
 
+use super::debug::Debug;
 use super::exceptions::{
-    Exceptions, LineSet, BUS_FAULT, FIRST_LINE, MEM_MANAGE, NMI, PEND_SV, SV_CALL, SYS_TICK, USAGE_FAULT,
+    Exceptions, LineSet, BUS_FAULT, DEBUG_MONITOR, FIRST_LINE, MEM_MANAGE, NMI, PEND_SV, SV_CALL, SYS_TICK,
+    USAGE_FAULT,
 };
 use super::systick::SysTick;
 use crate::peripheral::Unmodelled;
@@ -59,7 +61,6 @@ const CCR_TRAPS: u32 = 0b11 << 3;
 const CCR_RESET: u32 = 1 << 9;
 const CPACR_MASK: u32 = 0xF << 20;
 const FPCCR_RESET: u32 = 0xC000_0000;
-const DEMCR_TRCENA: u32 = 1 << 24;
 
 /// What a write asks of the machine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -70,6 +71,8 @@ pub enum Effect {
     SystemReset,
     /// What the FPU allows may have changed.
     FpuAccess,
+    /// Whether code runs step by step may have changed.
+    Stepping,
 }
 
 /// The registers from E000_E000 to E000_EFFF.
@@ -87,6 +90,8 @@ pub struct Scs {
     pub hfsr: u32,
     /// Address of the last precise bus fault.
     pub bfar: u32,
+    /// Breakpoints and the debug monitor.
+    pub debug: Debug,
     scr: u32,
     ccr: u32,
     cpacr: u32,
@@ -94,7 +99,6 @@ pub struct Scs {
     fpccr: u32,
     fpcar: u32,
     fpdscr: u32,
-    demcr: u32,
     dwt_ctrl: u32,
     /// CYCCNT = cycles - this.
     cyccnt_base: u64,
@@ -113,6 +117,7 @@ impl Scs {
             cfsr: 0,
             hfsr: 0,
             bfar: 0,
+            debug: Debug::default(),
             scr: 0,
             ccr: CCR_RESET,
             cpacr: 0,
@@ -120,7 +125,6 @@ impl Scs {
             fpccr: FPCCR_RESET,
             fpcar: 0,
             fpdscr: 0,
-            demcr: 0,
             dwt_ctrl: 0,
             cyccnt_base: 0,
             ipsr: 0,
@@ -176,7 +180,8 @@ impl Scs {
             0xD24 => self.shcsr(),
             0xD28 => self.cfsr,
             0xD2C => self.hfsr,
-            0xD30 | 0xD3C => 0,
+            0xD30 => self.debug.read_dfsr(),
+            0xD3C => 0,
             0xD34 => self.mmfar,
             0xD38 => self.bfar,
             // Processor features: Thumb-2, two-stack programmers' model.
@@ -196,7 +201,8 @@ impl Scs {
             0xD90 => 0x0000_0800,
             0xD94 => 0,
             0xDF0 => 0,
-            0xDFC => self.demcr,
+            0xDF8 => self.debug.dcrdr,
+            0xDFC => self.debug.read_demcr(self.exceptions.is_pending(DEBUG_MONITOR)),
             0xF34 => self.fpccr,
             0xF38 => self.fpcar,
             0xF3C => self.fpdscr,
@@ -238,7 +244,8 @@ impl Scs {
             0xD24 => self.write_shcsr(value),
             0xD28 => self.cfsr &= !value,
             0xD2C => self.hfsr &= !value,
-            0xD30 | 0xD3C => {}
+            0xD30 => self.debug.write_dfsr(value),
+            0xD3C => {}
             0xD34 => self.mmfar = value,
             0xD38 => self.bfar = value,
             0xD88 => {
@@ -247,7 +254,16 @@ impl Scs {
             }
             0xD94 if value == 0 => {}
             0xD94 => return Err(Unmodelled("the MPU is switched on; it is not modelled".into())),
-            0xDFC => self.demcr = value & DEMCR_TRCENA,
+            0xDF8 => self.debug.dcrdr = value,
+            0xDFC => {
+                if self.debug.write_demcr(value) {
+                    self.exceptions.pend(DEBUG_MONITOR);
+                } else {
+                    self.exceptions.unpend(DEBUG_MONITOR);
+                }
+                self.exceptions.set_enabled(DEBUG_MONITOR, self.debug.monitors());
+                return Ok(Effect::Stepping);
+            }
             0xF00 => self.exceptions.pend(FIRST_LINE + u16::try_from(value & 0x1FF).unwrap_or(0)),
             // Lazy stacking is not visible to a program: the whole frame is stacked at once.
             0xF34 => self.fpccr = value & FPCCR_RESET,
@@ -358,8 +374,15 @@ impl Scs {
     }
 
     /// The bits of SHCSR: (bit, exception, what of it).
-    const SHCSR_ACTIVE: [(u32, u16); 6] =
-        [(0, MEM_MANAGE), (1, BUS_FAULT), (3, USAGE_FAULT), (7, SV_CALL), (10, PEND_SV), (11, SYS_TICK)];
+    const SHCSR_ACTIVE: [(u32, u16); 7] = [
+        (0, MEM_MANAGE),
+        (1, BUS_FAULT),
+        (3, USAGE_FAULT),
+        (7, SV_CALL),
+        (8, DEBUG_MONITOR),
+        (10, PEND_SV),
+        (11, SYS_TICK),
+    ];
     const SHCSR_PENDING: [(u32, u16); 4] =
         [(12, USAGE_FAULT), (13, MEM_MANAGE), (14, BUS_FAULT), (15, SV_CALL)];
     const SHCSR_ENABLED: [(u32, u16); 3] = [(16, MEM_MANAGE), (17, BUS_FAULT), (18, USAGE_FAULT)];

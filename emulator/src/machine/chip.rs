@@ -10,6 +10,7 @@ use super::report::{Access, Report, Reports};
 use super::variant::{self, Variant};
 use super::{Options, ResetCause};
 use crate::bxcan::BxCan;
+use crate::cortex::debug::Debug;
 use crate::cortex::exceptions::SYS_TICK;
 use crate::cortex::scs::{Effect, Scs};
 use crate::periph::crc::Crc;
@@ -35,10 +36,11 @@ pub const OPTION_PAGE: Region = Region::new(0x1FFF_C000, PAGE);
 pub const PERIPHERALS: Region = Region::new(0x4000_0000, 0x0008_0000);
 /// AHB2: USB OTG FS, DCMI, crypto, RNG.
 pub const PERIPHERALS_AHB2: Region = Region::new(0x5000_0000, 0x0006_1000);
-/// Private peripheral bus: DWT, system control space, DBGMCU.
+/// Private peripheral bus: DWT, FPB, system control space, DBGMCU.
 pub const PRIVATE: Region = Region::new(0xE000_0000, 0x0010_0000);
 const ITM: u32 = 0xE000_0000;
 const DWT: u32 = 0xE000_1000;
+const FPB: u32 = 0xE000_2000;
 const SCS: u32 = 0xE000_E000;
 const DBGMCU: u32 = 0xE004_2000;
 
@@ -76,6 +78,7 @@ enum Place {
     Block { block: Block, offset: u32, enable: ClockEnable },
     Scs(u32),
     Dwt(u32),
+    Fpb(u32),
     Dbgmcu(u32),
     Itm,
     Nobody,
@@ -243,6 +246,8 @@ pub struct Chip {
     pub flush_tlb: bool,
     /// That was done for the operation that runs.
     guarded: bool,
+    /// Translations go on where code has to stop now, or stop where it has not any more.
+    pub breakpoints_changed: bool,
     /// The block that runs: address and length in bytes.
     pub block: (u32, u32),
     /// Code that is watched.
@@ -312,6 +317,7 @@ impl Chip {
             stale: Vec::new(),
             flush_tlb: false,
             guarded: false,
+            breakpoints_changed: false,
             block: (0, 0),
             watch: None,
             lines: Vec::new(),
@@ -342,7 +348,13 @@ impl Chip {
         let option_bytes = self.flash.option_bytes();
         self.options.bytes_mut()[..option_bytes.len()].copy_from_slice(&option_bytes);
         self.apply_clocks();
+        let debug = match cause {
+            ResetCause::PowerOn => Debug::default(),
+            _ => self.scs.debug.after_reset(),
+        };
         self.scs = Scs::new(self.geometry.interrupts, self.clock.hz());
+        self.scs.debug = debug;
+        self.breakpoints_changed = true;
         self.leave = false;
         self.check_exceptions = false;
         self.reset_request = None;
@@ -586,6 +598,7 @@ impl Chip {
         block
             .or_else(|| within(SCS, PAGE).map(Place::Scs))
             .or_else(|| within(DWT, PAGE).map(Place::Dwt))
+            .or_else(|| within(FPB, PAGE).map(Place::Fpb))
             .or_else(|| within(DBGMCU, 0x10).map(Place::Dbgmcu))
             .or_else(|| within(ITM, PAGE).map(|_| Place::Itm))
             .unwrap_or(Place::Nobody)
@@ -636,6 +649,7 @@ impl Chip {
                 self.scs.read(offset, now)
             }
             Place::Dwt(offset) => self.scs.read_dwt(offset, self.clock.cycles),
+            Place::Fpb(offset) => self.scs.debug.read_fpb(offset),
             Place::Dbgmcu(0) => Ok(self.variant.idcode),
             Place::Dbgmcu(offset) => Ok(self.dbgmcu[offset as usize / 4 - 1]),
             // Stimulus ports that nobody listens to are ready.
@@ -668,6 +682,11 @@ impl Chip {
             }
             Place::Scs(offset) => self.store_scs(offset, value, now),
             Place::Dwt(offset) => self.scs.write_dwt(offset, value, self.clock.cycles),
+            Place::Fpb(offset) => {
+                self.breakpoints_changed = true;
+                self.leave = true;
+                self.scs.debug.write_fpb(offset, value)
+            }
             Place::Dbgmcu(0) | Place::Itm => Ok(()),
             Place::Dbgmcu(offset) => {
                 self.dbgmcu[offset as usize / 4 - 1] = value;
@@ -734,7 +753,7 @@ impl Chip {
         }
         match self.scs.write(offset, value, now)? {
             Effect::None => {}
-            Effect::FpuAccess => self.leave = true,
+            Effect::FpuAccess | Effect::Stepping => self.leave = true,
             Effect::SystemReset => {
                 self.reset_request = Some(ResetCause::Software);
                 self.leave = true;

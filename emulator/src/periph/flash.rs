@@ -248,6 +248,13 @@ impl Flash {
         self.changed.push((offset, u32::try_from(bytes.len()).unwrap_or(u32::MAX)));
     }
 
+    /// Sets the option byte RDP as a debug probe does: AAh no read-out protection, CCh level 2, anything else level 1.
+    pub fn preset_read_protection(&mut self, rdp: u8) {
+        for options in [&mut self.options, &mut self.options_written] {
+            *options = *options & !0xFF00 | u32::from(rdp) << 8;
+        }
+    }
+
     /// The power fails now: what runs is torn. `seed` chooses how.
     pub fn lose_power(&mut self, seed: u64) {
         if let Some(running) = self.running.take() {

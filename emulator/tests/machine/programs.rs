@@ -1049,3 +1049,78 @@ pub const CALLS_WHAT_IT_HAS_READ: Program = Program {
         0x0000, 0x0801,      // 210  .word 0x08010000
     ],
 };
+
+/// Sets a breakpoint, comes to it, and then to a BKPT. What DEMCR is given is taken from 2000_0100h, the comparator from 2000_0104h
+/// (0: neither it nor the unit is touched), whether PRIMASK is set from 2000_0108h. Each DebugMonitor logs the PC that was stacked
+/// and DFSR, from 2000_0200h on, turns the breakpoint off, skips a BKPT, and asks for as many steps as 2000_010Ch says. A HardFault
+/// logs the PC, HFSR and DFSR there, and stays.
+pub const BREAKPOINTS: Program = Program {
+    base: 0x0800_0200,
+    vectors: &[(3, 0x0800_0279), (12, 0x0800_0241)],
+    code: &[
+        0xF04F, 0x5400,      // 200 mov.w r4, #536870912
+        0xF504, 0x7700,      // 204 add.w r7, r4, #512
+        0x4D1F,              // 208 ldr r5, [pc, #124]
+        0x4E20,              // 20A ldr r6, [pc, #128]
+        0xF8D4, 0x0100,      // 20C ldr.w r0, [r4, #256]
+        0x6028,              // 210 str r0, [r5, #0]
+        0xF8D4, 0x0104,      // 212 ldr.w r0, [r4, #260]
+        0xB110,              // 216 cbz r0, 800021e
+        0x60B0,              // 218 str r0, [r6, #8]
+        0x2003,              // 21A movs r0, #3
+        0x6030,              // 21C str r0, [r6, #0]
+        0xF8D4, 0x0108,      // 21E ldr.w r0, [r4, #264]
+        0xB100,              // 222 cbz r0, 8000226
+        0xB672,              // 224 cpsid i
+        0x2100,              // 226 movs r1, #0
+        0xF3BF, 0x8F6F,      // 228 isb sy
+        0x3101,              // 22C target:  adds r1, #1
+        0xE000,              // 22E b.n 8000232
+        0x3120,              // 230 adds r1, #32
+        0x6021,              // 232 str r1, [r4, #0]
+        0x3110,              // 234 adds r1, #16
+        0x6061,              // 236 str r1, [r4, #4]
+        0xBE07,              // 238 bkpt 0x0007
+        0x60A1,              // 23A str r1, [r4, #8]
+        0xBF30,              // 23C wfi
+        0xE7FD,              // 23E b.n 800023c
+        0x9806,              // 240 monitor:  ldr r0, [sp, #24]
+        0x6038,              // 242 str r0, [r7, #0]
+        0x4A12,              // 244 ldr r2, [pc, #72]
+        0x6810,              // 246 ldr r0, [r2, #0]
+        0x6078,              // 248 str r0, [r7, #4]
+        0x6010,              // 24A str r0, [r2, #0]
+        0x3708,              // 24C adds r7, #8
+        0x2002,              // 24E movs r0, #2
+        0x6030,              // 250 str r0, [r6, #0]
+        0x9806,              // 252 ldr r0, [sp, #24]
+        0x8800,              // 254 ldrh r0, [r0, #0]
+        0x0A00,              // 256 lsrs r0, r0, #8
+        0x28BE,              // 258 cmp r0, #190
+        0xD102,              // 25A bne.n 8000262
+        0x9806,              // 25C ldr r0, [sp, #24]
+        0x3002,              // 25E adds r0, #2
+        0x9006,              // 260 str r0, [sp, #24]
+        0x480C,              // 262 ldr r0, [pc, #48]
+        0xF8D4, 0x310C,      // 264 ldr.w r3, [r4, #268]
+        0xB123,              // 268 cbz r3, 8000274
+        0x3B01,              // 26A subs r3, #1
+        0xF8C4, 0x310C,      // 26C str.w r3, [r4, #268]
+        0xF440, 0x2080,      // 270 orr.w r0, r0, #262144
+        0x6028,              // 274 str r0, [r5, #0]
+        0x4770,              // 276 bx lr
+        0x9806,              // 278 fault:  ldr r0, [sp, #24]
+        0x6038,              // 27A str r0, [r7, #0]
+        0x4A06,              // 27C ldr r2, [pc, #24]
+        0x6810,              // 27E ldr r0, [r2, #0]
+        0x6078,              // 280 str r0, [r7, #4]
+        0x6850,              // 282 ldr r0, [r2, #4]
+        0x60B8,              // 284 str r0, [r7, #8]
+        0xE7FE,              // 286 b.n 8000286
+        0xEDFC, 0xE000,      // 288 .word 0xe000edfc
+        0x2000, 0xE000,      // 28C .word 0xe0002000
+        0xED30, 0xE000,      // 290 .word 0xe000ed30
+        0x0000, 0x0101,      // 294 .word 0x01010000
+        0xED2C, 0xE000,      // 298 .word 0xe000ed2c
+    ],
+};
