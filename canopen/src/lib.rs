@@ -13,6 +13,7 @@
 //! | [`nmt`], [`heartbeat`] | network management of a slave, heartbeat producer |
 //! | [`node`] | NMT, heartbeat, emergencies and SDO server of one node-ID |
 //! | [`device`] | the objects that every device has |
+//! | `debugger` | the debugger interface, 1025h (feature `debugger`) |
 //! | `emcy` | emergency producer, 1001h, 1003h, 1014h (feature `emcy`) |
 //! | [`lss`] | layer setting services: node-ID and bit rate over the bus |
 //! | [`bit_rate`] | the bit rates of CANopen, and how to find out one |
@@ -27,6 +28,8 @@
 extern crate alloc;
 
 pub mod bit_rate;
+#[cfg(feature = "debugger")]
+pub mod debugger;
 pub mod device;
 #[cfg(feature = "emcy")]
 pub mod emcy;

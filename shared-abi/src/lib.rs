@@ -4,6 +4,7 @@
 //! |---|---|
 //! | [`geometry`] | the silicon: flash sectors, RAM, number of interrupts |
 //! | [`layout`] | **the numbers** of each board: who owns which address |
+//! | [`memory_map`] | which addresses of a chip may be touched blindly |
 //! | [`warm_start`] | the last RAM cell: what the application asks of the bootloader across a reset |
 //! | [`handoff`] | what the bootloader tells the application about how it came up |
 //! | [`label`] | what a program image says of itself: whom it is for |
@@ -23,6 +24,7 @@ pub mod geometry;
 pub mod handoff;
 pub mod label;
 pub mod layout;
+pub mod memory_map;
 #[cfg(target_arch = "arm")]
 pub mod reentry;
 #[cfg(target_arch = "arm")]

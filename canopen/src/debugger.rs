@@ -1,0 +1,473 @@
+//! The debugger interface, object 1025h (ESAcademy "CANopen compliant bootloader and debugger cores"; feature `debugger`).
+//!
+//! **Whoever reaches the bus reads and writes the memory of a device that has this.** It is for the bench, never for a
+//! device that leaves it.
+//!
+//! | sub-index | |
+//! |---|---|
+//! | 1 | command, 8 bytes: 0 read or 1 write, reserved, number of bytes (16 bits), address (32 bits) |
+//! | 2 | status: 0 done, 1 done and there are data, 2 refused or failed, FFh waits for data (CiA 301, 1025h) |
+//! | 4 | data: a domain of exactly that number of bytes |
+//!
+//! Sub-index 3, the reply of CiA 301, does not exist, as in that document. A command is good for any number of reads or
+//! writes of its data, until the next one.
+//!
+//! | the client | abort |
+//! |---|---|
+//! | sends a command that has not 8 bytes | 06070012h, 06070013h |
+//! | sends an unknown one, one for no bytes, or one for bytes that must not be touched | 06090030h |
+//! | sends more or fewer data than its command said | 06070012h, 06070013h |
+//! | asks for data without a command to read | 08000024h |
+//! | sends data without a command to write | 08000022h |
+//! | does anything of it to a device whose memory is locked | 08000022h |
+//!
+//! A device composes [`ENTRIES`] into its table, keeps a [`Debugger`] beside its own state and hands
+//! [`Debugger::attach`] to its slave in place of itself. When the program stops, it says so by [`Debugger::stopped`].
+
+use core::task::Poll;
+
+use crate::bit_rate::BitRate;
+use crate::frame::NodeId;
+use crate::line::LineEvent;
+use crate::lss::{LssDevice, StoreError};
+use crate::od::{put, Access, Address, DataType, Entry, Objects};
+use crate::program::ERROR_REGISTER;
+use crate::sdo::AbortCode;
+use crate::slave::SlaveDevice;
+
+/// The object.
+pub const DEBUGGER: u16 = 0x1025;
+/// Its command.
+pub const COMMAND: Address = Address::new(DEBUGGER, 1);
+/// What became of the command.
+pub const STATUS: Address = Address::new(DEBUGGER, 2);
+/// The bytes of the memory.
+pub const DATA: Address = Address::new(DEBUGGER, 4);
+
+/// 1025h.
+pub const ENTRIES: [Entry; 4] = [
+    Entry::record(DEBUGGER, "OS debugger interface", 4),
+    Entry::sub(DEBUGGER, COMMAND.sub, "Command", DataType::OctetString, Access::Wo),
+    Entry::sub(DEBUGGER, STATUS.sub, "Status", DataType::Unsigned8, Access::Ro).default(0),
+    Entry::sub(DEBUGGER, DATA.sub, "Data", DataType::Domain, Access::Rw),
+];
+
+/// Values of the status (CiA 301, objects 1023h and 1025h).
+pub mod status {
+    /// The last command is done, without an error.
+    pub const DONE: u8 = 0;
+    /// The same, and there are data.
+    pub const REPLY: u8 = 1;
+    /// The last command was refused, or its data were.
+    pub const ERROR: u8 = 2;
+    /// The command waits for its data.
+    pub const EXECUTING: u8 = 0xFF;
+}
+
+/// The error code of the emergency that tells of a stop: user software (CiA 301 table 26).
+pub const USER_SOFTWARE: u16 = 0x6200;
+
+/// Why the program stopped: the first of the five bytes of that emergency; the address follows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Stop {
+    /// A code breakpoint: the instruction at the address is the next one.
+    Breakpoint = 1,
+    /// A single step is done; the instruction at the address is the next one. (From 80h on, the types are our own.)
+    Step = 0x80,
+    /// The breakpoint at the address lies in code that cannot be stopped: breakpoints are off, and the program runs on.
+    OutOfReach = 0x81,
+}
+
+impl Stop {
+    /// The stop of this number.
+    #[must_use]
+    pub const fn from_number(number: u8) -> Option<Self> {
+        match number {
+            1 => Some(Self::Breakpoint),
+            0x80 => Some(Self::Step),
+            0x81 => Some(Self::OutOfReach),
+            _ => None,
+        }
+    }
+}
+
+/// What is done to memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// It is read.
+    Read,
+    /// It is written.
+    Write,
+}
+
+/// What the interface is asked to do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Command {
+    /// What to do.
+    pub kind: Kind,
+    /// Where it begins.
+    pub address: u32,
+    /// How many bytes.
+    pub len: u16,
+}
+
+impl Command {
+    /// Takes the eight bytes apart; `None` for what is neither a read nor a write.
+    #[must_use]
+    pub const fn parse(bytes: [u8; 8]) -> Option<Self> {
+        let [kind, _reserved, len_low, len_high, a, b, c, d] = bytes;
+        let kind = match kind {
+            0 => Kind::Read,
+            1 => Kind::Write,
+            _ => return None,
+        };
+        Some(Self {
+            kind,
+            address: u32::from_le_bytes([a, b, c, d]),
+            len: u16::from_le_bytes([len_low, len_high]),
+        })
+    }
+
+    /// The eight bytes.
+    #[must_use]
+    pub const fn emit(&self) -> [u8; 8] {
+        let kind = match self.kind {
+            Kind::Read => 0,
+            Kind::Write => 1,
+        };
+        let [len_low, len_high] = self.len.to_le_bytes();
+        let [a, b, c, d] = self.address.to_le_bytes();
+        [kind, 0, len_low, len_high, a, b, c, d]
+    }
+}
+
+/// The memory behind the interface.
+///
+/// It is asked for pieces of at most [`PIECE`] bytes of what it has allowed, each a multiple of `PIECE` behind the
+/// command's address.
+pub trait Memory {
+    /// Whether the device keeps its memory to itself.
+    fn is_locked(&mut self) -> bool;
+
+    /// Whether all of these bytes may be touched. Any address and any length may come.
+    fn allows(&mut self, command: &Command) -> bool;
+
+    /// Reads.
+    ///
+    /// # Errors
+    /// The abort that the client gets, if they cannot be read at present.
+    fn read(&mut self, address: u32, bytes: &mut [u8]) -> Result<(), AbortCode>;
+
+    /// Writes.
+    ///
+    /// # Errors
+    /// The abort that the client gets, if they cannot be written at present.
+    fn write(&mut self, address: u32, bytes: &[u8]) -> Result<(), AbortCode>;
+}
+
+/// Bytes that are read or written at once. A longer read or write is carried out piece by piece while it is
+/// transferred; of a shorter write nothing is done before all of it is there.
+pub const PIECE: usize = 128;
+
+/// The state of the interface.
+#[derive(Debug)]
+pub struct Debugger<M> {
+    memory: M,
+    state: State,
+    status: u8,
+    piece: [u8; PIECE],
+    stop: Option<(Stop, u32)>,
+}
+
+/// What the last command was, and how far its data are.
+#[derive(Clone, Copy, Debug)]
+enum State {
+    Idle,
+    /// `held` is the offset of the piece that is in the buffer.
+    Reading {
+        address: u32,
+        len: u32,
+        held: u32,
+    },
+    Writing {
+        address: u32,
+        len: u32,
+        received: u32,
+    },
+}
+
+impl<M: Memory> Debugger<M> {
+    /// The interface to this memory.
+    pub const fn new(memory: M) -> Self {
+        Self { memory, state: State::Idle, status: status::DONE, piece: [0; PIECE], stop: None }
+    }
+
+    /// The memory behind it.
+    pub fn memory(&mut self) -> &mut M {
+        &mut self.memory
+    }
+
+    /// The program has stopped at this address. It is told by an emergency; the latest stop counts.
+    pub fn stopped(&mut self, stop: Stop, address: u32) {
+        self.stop = Some((stop, address));
+    }
+
+    /// The device with this interface in front of it: what its slave talks to.
+    pub fn attach<'a, D>(&'a mut self, device: &'a mut D) -> Debugged<'a, D, M> {
+        Debugged { device, debugger: self }
+    }
+
+    fn locked(&mut self) -> Result<(), AbortCode> {
+        if self.memory.is_locked() {
+            Err(AbortCode::DEVICE_STATE)
+        } else {
+            Ok(())
+        }
+    }
+
+    /// Keeps the status up to date with what became of something.
+    fn noted<T>(&mut self, outcome: Result<T, AbortCode>) -> Result<T, AbortCode> {
+        if outcome.is_err() {
+            self.status = status::ERROR;
+        }
+        outcome
+    }
+
+    fn command(&mut self, bytes: &[u8]) -> Result<(), AbortCode> {
+        self.state = State::Idle;
+        self.locked()?;
+        let bytes: [u8; 8] = bytes.try_into().map_err(|_| {
+            if bytes.len() > 8 {
+                AbortCode::LENGTH_TOO_HIGH
+            } else {
+                AbortCode::LENGTH_TOO_LOW
+            }
+        })?;
+        let command = Command::parse(bytes).ok_or(AbortCode::INVALID_VALUE)?;
+        if command.len == 0 || !self.memory.allows(&command) {
+            return Err(AbortCode::INVALID_VALUE);
+        }
+        let Command { address, .. } = command;
+        let len = u32::from(command.len);
+        (self.state, self.status) = match command.kind {
+            Kind::Read => (State::Reading { address, len, held: 0 }, status::REPLY),
+            Kind::Write => (State::Writing { address, len, received: 0 }, status::EXECUTING),
+        };
+        Ok(())
+    }
+
+    fn upload_start(&mut self) -> Result<u32, AbortCode> {
+        self.locked()?;
+        let State::Reading { len, .. } = self.state else { return Err(AbortCode::NO_DATA) };
+        self.fetch(0)?;
+        self.status = status::REPLY;
+        Ok(len)
+    }
+
+    /// Reads the piece at this offset.
+    fn fetch(&mut self, offset: u32) -> Result<(), AbortCode> {
+        let State::Reading { address, len, held } = &mut self.state else { return Err(AbortCode::NO_DATA) };
+        let left = (*len - offset) as usize;
+        self.memory.read(address.wrapping_add(offset), &mut self.piece[..left.min(PIECE)])?;
+        *held = offset;
+        Ok(())
+    }
+
+    fn upload_data(&mut self, offset: u32, buf: &mut [u8]) -> Result<usize, AbortCode> {
+        let mut done = 0;
+        while done < buf.len() {
+            let State::Reading { len, held, .. } = self.state else { return Err(AbortCode::NO_DATA) };
+            let at = offset.saturating_add(done as u32);
+            if at >= len {
+                break;
+            }
+            let within = at % PIECE as u32;
+            if at - within != held {
+                self.fetch(at - within)?;
+            }
+            let count = (buf.len() - done).min((len - at) as usize).min(PIECE - within as usize);
+            buf[done..done + count].copy_from_slice(&self.piece[within as usize..][..count]);
+            done += count;
+        }
+        Ok(done)
+    }
+
+    fn download_start(&mut self, size: Option<u32>) -> Result<(), AbortCode> {
+        self.locked()?;
+        let State::Writing { len, received, .. } = &mut self.state else {
+            return Err(AbortCode::DEVICE_STATE);
+        };
+        *received = 0;
+        let len = *len;
+        size.map_or(Ok(()), |size| matches(size, len))?;
+        self.status = status::EXECUTING;
+        Ok(())
+    }
+
+    fn download_data(&mut self, data: &[u8]) -> Result<(), AbortCode> {
+        for &byte in data {
+            let State::Writing { len, received, .. } = self.state else {
+                return Err(AbortCode::DEVICE_STATE);
+            };
+            if received == len {
+                return Err(AbortCode::LENGTH_TOO_HIGH);
+            }
+            // Only now, when it is known that more follows.
+            if received > 0 && received.is_multiple_of(PIECE as u32) {
+                self.flush()?;
+            }
+            self.piece[received as usize % PIECE] = byte;
+            if let State::Writing { received, .. } = &mut self.state {
+                *received += 1;
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes the piece that is in the buffer.
+    fn flush(&mut self) -> Result<(), AbortCode> {
+        let State::Writing { address, received, .. } = self.state else {
+            return Err(AbortCode::DEVICE_STATE);
+        };
+        let Some(last) = received.checked_sub(1) else { return Ok(()) };
+        let offset = last - last % PIECE as u32;
+        self.memory.write(address.wrapping_add(offset), &self.piece[..(received - offset) as usize])
+    }
+
+    fn download_end(&mut self) -> Result<(), AbortCode> {
+        let State::Writing { len, received, .. } = self.state else { return Err(AbortCode::DEVICE_STATE) };
+        matches(received, len)?;
+        self.flush()?;
+        self.status = status::DONE;
+        Ok(())
+    }
+}
+
+fn matches(size: u32, len: u32) -> Result<(), AbortCode> {
+    match size {
+        _ if size > len => Err(AbortCode::LENGTH_TOO_HIGH),
+        _ if size < len => Err(AbortCode::LENGTH_TOO_LOW),
+        _ => Ok(()),
+    }
+}
+
+/// A device with the debugger interface in front of it.
+#[derive(Debug)]
+pub struct Debugged<'a, D, M> {
+    device: &'a mut D,
+    debugger: &'a mut Debugger<M>,
+}
+
+impl<D: Objects, M: Memory> Objects for Debugged<'_, D, M> {
+    /// The device's, which [`ENTRIES`] are part of.
+    fn entries(&self) -> &'static [Entry] {
+        self.device.entries()
+    }
+
+    fn read(&mut self, at: Address, buf: &mut [u8]) -> Result<usize, AbortCode> {
+        if at == STATUS {
+            put(buf, &[self.debugger.status])
+        } else {
+            self.device.read(at, buf)
+        }
+    }
+
+    fn write(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
+        if at != COMMAND {
+            return self.device.write(at, data);
+        }
+        let outcome = self.debugger.command(data);
+        self.debugger.noted(outcome)
+    }
+
+    fn download_start(&mut self, at: Address, size: Option<u32>) -> Result<(), AbortCode> {
+        if at != DATA {
+            return self.device.download_start(at, size);
+        }
+        let outcome = self.debugger.download_start(size);
+        self.debugger.noted(outcome)
+    }
+
+    fn download_space(&mut self, at: Address, held: bool) -> usize {
+        if at == DATA {
+            usize::MAX
+        } else {
+            self.device.download_space(at, held)
+        }
+    }
+
+    fn download_data(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
+        if at != DATA {
+            return self.device.download_data(at, data);
+        }
+        let outcome = self.debugger.download_data(data);
+        self.debugger.noted(outcome)
+    }
+
+    fn download_end(&mut self, at: Address) -> Result<(), AbortCode> {
+        if at != DATA {
+            return self.device.download_end(at);
+        }
+        let outcome = self.debugger.download_end();
+        self.debugger.noted(outcome)
+    }
+
+    fn download_cancel(&mut self, at: Address) {
+        if at == DATA {
+            self.debugger.status = status::ERROR;
+        } else {
+            self.device.download_cancel(at);
+        }
+    }
+
+    fn next_emergency(&mut self) -> Option<[u8; 8]> {
+        let Some((stop, address)) = self.debugger.stop.take() else { return self.device.next_emergency() };
+        // A stop is no error of the device: its error register is told as it is.
+        let mut register = [0];
+        let _ = self.device.read(Address::new(ERROR_REGISTER, 0), &mut register);
+        let [low, high] = USER_SOFTWARE.to_le_bytes();
+        let [a, b, c, d] = address.to_le_bytes();
+        Some([low, high, register[0], stop as u8, a, b, c, d])
+    }
+
+    fn upload_start(&mut self, at: Address) -> Result<Option<u32>, AbortCode> {
+        if at != DATA {
+            return self.device.upload_start(at);
+        }
+        let outcome = self.debugger.upload_start();
+        self.debugger.noted(outcome).map(Some)
+    }
+
+    fn upload_data(&mut self, at: Address, offset: u32, buf: &mut [u8]) -> Result<usize, AbortCode> {
+        if at != DATA {
+            return self.device.upload_data(at, offset, buf);
+        }
+        let outcome = self.debugger.upload_data(offset, buf);
+        self.debugger.noted(outcome)
+    }
+}
+
+impl<D: LssDevice, M> LssDevice for Debugged<'_, D, M> {
+    fn supports(&mut self, rate: BitRate) -> bool {
+        self.device.supports(rate)
+    }
+
+    fn store(&mut self, node: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {
+        self.device.store(node, rate)
+    }
+
+    fn stored(&mut self) -> Poll<Result<(), StoreError>> {
+        self.device.stored()
+    }
+}
+
+impl<D: SlaveDevice, M: Memory> SlaveDevice for Debugged<'_, D, M> {
+    fn line_event(&mut self, event: LineEvent) {
+        self.device.line_event(event);
+    }
+
+    fn node_id_changed(&mut self, id: Option<NodeId>) {
+        self.device.node_id_changed(id);
+    }
+}
