@@ -211,6 +211,11 @@ impl Error {
                  rate and that the bus is terminated; a slow device may need a longer --sdo-timeout"
             ),
             Self::Refused { doing: Doing::Unlock, code, .. } => unlock_advice(*code).to_string(),
+            Self::Refused { doing: Doing::Read(at) | Doing::Write(at), code, .. }
+                if at.index == canopen::debugger::DEBUGGER =>
+            {
+                debugger_advice(*code).to_string()
+            }
             Self::Refused { code, .. } => refusal_advice(*code).to_string(),
             Self::NotInDialect { .. } => "leave that out, or name another dialect by --dialect".to_string(),
             Self::NoPassword { .. } => "give the device's password by --unlock; its maker knows it".to_string(),
@@ -341,6 +346,25 @@ fn refusal_advice(code: AbortCode) -> &'static str {
             "frames were lost, or a second tool is at work on the device: check the bus and run the command again"
         }
         _ => "run the command again; if it happens again, the abort code tells what the device objects to",
+    }
+}
+
+/// What to do about a refusal of the debugger interface, 1025h.
+fn debugger_advice(code: AbortCode) -> &'static str {
+    match code {
+        AbortCode::NO_OBJECT => {
+            "the device has no debugger interface, as no product has; on the bench, build its firmware with the feature \
+             `debugger` (docs/debugger.md)"
+        }
+        AbortCode::INVALID_VALUE => {
+            "these bytes must not be touched: nothing is there, or it is flash that is to be written, or part of a register \
+             (docs/debugger.md)"
+        }
+        AbortCode::DEVICE_STATE => {
+            "the device is secured: its read-out protection (RDP) has to be taken away first, which erases it"
+        }
+        AbortCode::LOCAL_CONTROL => "the flash is busy: try again when the erasing is over",
+        code => refusal_advice(code),
     }
 }
 

@@ -50,6 +50,7 @@ pub mod block_file;
 pub mod candump;
 pub mod config;
 pub mod convert;
+pub mod debugger;
 pub mod decode;
 pub mod diagnose;
 pub mod dialect;

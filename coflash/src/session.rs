@@ -395,6 +395,18 @@ impl<'a> Session<'a> {
         .map(|_| ())
     }
 
+    /// Listens to everything on the bus until `enough` says so, `time` at most; tells whether it did.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn hear_until(
+        &mut self,
+        time: Duration,
+        enough: &mut dyn FnMut(&Frame) -> bool,
+    ) -> Result<bool, Error> {
+        self.listen(time, enough)
+    }
+
     /// Waits for the node's boot-up message, `time` at most; tells whether it came.
     ///
     /// # Errors

@@ -10,6 +10,7 @@ use self::output::{Failure, Output, EXIT_CODES};
 
 mod config;
 mod convert;
+mod debug;
 mod device;
 mod dialect;
 mod file;
@@ -73,6 +74,7 @@ enum Command {
     Reset(reset::Reset),
     Read(read::Read),
     Lss(lss::Lss),
+    Debug(debug::Debug),
     Monitor(monitor::Monitor),
     Shell(shell::Shell),
     Completions(generate::Completions),
@@ -96,6 +98,7 @@ impl Command {
             Self::Reset(reset) => reset.run(context),
             Self::Read(read) => read.run(context),
             Self::Lss(lss) => lss.run(context),
+            Self::Debug(debug) => debug.run(context),
             Self::Monitor(monitor) => monitor.run(context),
             Self::Shell(shell) => shell.run(context),
             Self::Completions(completions) => completions.run(),
