@@ -12,6 +12,8 @@ use shared_abi::layout::Layout;
 use shared_abi::reentry;
 use shared_abi::warm_start::{BootRequest, WarmStart};
 
+use crate::debugger;
+
 /// How long the device stays after the answer to 80h is on the bus, in ms: at least 10 (SYS TEC manual L-1112d_10,
 /// 4.5), and one
 /// that may be almost over.
@@ -162,6 +164,7 @@ static LEAVING: AtomicU32 = AtomicU32::new(0);
 fn leave_by_idle(way: Way, request: BootRequest) {
     let WarmStart { request, argument, .. } = WarmStart::new(request);
     LEAVING.store((way as u32 + 1) | request << 8 | argument << 16, Ordering::Relaxed);
+    debugger::let_go();
 }
 
 /// To be called by `idle` whenever it wakes. Does not return if the device is to leave.

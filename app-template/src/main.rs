@@ -6,10 +6,15 @@
 //! | `entries.rs` | the table of the object dictionary: add your objects; keep 1F51h, 1F56h and 1F57h |
 //! | `objects.rs` | the values behind it, with the 1F51h callback |
 //! | `coboot.rs` | everything between application and bootloader: keep it as it is |
+//! | `debugger.rs` | the debugger interface (feature `debugger`): never in a product |
+//!
+//! Priorities: 4 and 3 serve the bus, 1 and `idle` are the application's. 2 is left free for the debugger, which stops what is
+//! below it and nothing else.
 #![no_std]
 #![no_main]
 
 mod coboot;
+mod debugger;
 mod entries;
 mod objects;
 
@@ -19,6 +24,7 @@ use rtic_monotonics::systick::prelude::*;
 systick_monotonic!(Mono, 1_000);
 
 /// A fault or a panic (which ends in one) starts the device again; what runs then is the bootloader's decision.
+#[cfg(not(feature = "debugger"))]
 #[cortex_m_rt::exception]
 unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
     cortex_m::peripheral::SCB::sys_reset()
@@ -40,6 +46,7 @@ mod app {
 
     use super::Mono;
     use crate::coboot::{self, Departure, Way};
+    use crate::debugger::{self, Debugger};
     use crate::objects::{Application, HEARTBEAT_MS};
 
     /// Frames that may wait for the protocol task.
@@ -58,6 +65,7 @@ mod app {
         to_handle: Consumer<'static, Frame>,
         slave: Slave,
         application: Application,
+        debugger: Debugger,
         departure: Departure,
         led: bsp::Led,
     }
@@ -92,6 +100,7 @@ mod app {
                 to_handle,
                 slave: Slave::new(application.lss_address(), start.node_id, start.bit_rate, config),
                 application,
+                debugger: Debugger::start(),
                 departure: Departure::Staying,
                 led: board.led,
             },
@@ -107,7 +116,7 @@ mod app {
     }
 
     /// Empties the controller's FIFO: three frames deep, so nothing may hold this task up.
-    #[task(binds = CAN1_RX0, shared = [can], local = [received], priority = 3)]
+    #[task(binds = CAN1_RX0, shared = [can], local = [received], priority = 4)]
     fn can_rx(mut cx: can_rx::Context) {
         cx.shared.can.lock(|can| {
             while let Some(frame) = can.receive() {
@@ -124,27 +133,32 @@ mod app {
     #[task(
         binds = CAN1_TX,
         shared = [can],
-        local = [to_handle, slave, application, departure],
-        priority = 2
+        local = [to_handle, slave, application, debugger, departure],
+        priority = 3
     )]
     fn protocol(cx: protocol::Context) {
         let now = Instant::from_millis(Mono::now().ticks());
         let protocol::SharedResources { mut can, .. } = cx.shared;
-        let protocol::LocalResources { to_handle, slave, application, departure, .. } = cx.local;
+        let protocol::LocalResources { to_handle, slave, application, debugger, departure, .. } = cx.local;
         if departure.proceed(slave.is_idle() && can.lock(|can| can.is_idle()), now) {
             return;
         }
         #[cfg(feature = "lift")]
         application.set_time(now);
         let status = can.lock(status);
-        slave.observe(status, now, application);
+        let device = debugger.attach(application);
+        #[cfg(feature = "debugger")]
+        let device = &mut { device };
+        slave.observe(status, now, device);
         // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
-        carry_out(slave, &mut can, now, application);
+        carry_out(slave, &mut can, now, device);
+        let mut reset = false;
         while let Some(frame) = to_handle.dequeue() {
-            if slave.handle(&frame, now, application) {
-                *departure = Departure::Answering(Way::SystemReset, application.reset_request());
-            }
-            carry_out(slave, &mut can, now, application);
+            reset |= slave.handle(&frame, now, device);
+            carry_out(slave, &mut can, now, device);
+        }
+        if reset {
+            *departure = Departure::Answering(Way::SystemReset, application.reset_request());
         }
         if let Some((way, request)) = application.take_leave() {
             *departure = Departure::Answering(way, request);
@@ -205,6 +219,7 @@ mod app {
             rtic::pend(pac::Interrupt::CAN1_TX);
             if ticks.is_multiple_of(500 / TICK_MS) {
                 cx.local.led.toggle();
+                debugger::example();
             }
             ticks = ticks.wrapping_add(1);
             Mono::delay(TICK_MS.millis()).await;

@@ -22,7 +22,8 @@ use shared_abi::label::Label;
 use shared_abi::warm_start::BootRequest;
 
 use crate::coboot::{self, Start, Way};
-use crate::entries::{CONFIRMATION, ENTRIES, LIFT_ENTRIES, WAY_BACK};
+use crate::debugger::{ENTRIES, LIFT_ENTRIES};
+use crate::entries::{CONFIRMATION, WAY_BACK};
 
 /// 1000h: no standardised profile. Anything but the bootloader's 10000000h tells a host that the application runs.
 const DEVICE_TYPE: u32 = 0;

@@ -10,12 +10,14 @@
 //! | `ram_vectors.rs` | the vector table in RAM | one copy |
 //! | `watchdog.rs` | feeds the watchdog when all tasks are alive | no |
 //! | `log.rs`, `log/` | a few words for whoever ports it (features `log-…`) | interrupts |
+//! | `debugger.rs` | the debugger interface (feature `debugger`) | no |
 //! | `memory.rs` | `memcpy` and its kin, small | assembly |
 //!
 //! What the bootloader *is* stands in `boot-core` and `canopen`.
 #![no_std]
 #![no_main]
 
+mod debugger;
 mod flash;
 mod log;
 mod memory;
@@ -45,7 +47,7 @@ mod app {
     use boot_core::canopen::device::Device;
     use boot_core::canopen::line::{Confinement, Status, CONTROLLER_OVERRUN, QUEUE_OVERRUN};
     use boot_core::canopen::node::{self, NmtPolicy};
-    use boot_core::canopen::od::Entry;
+    use boot_core::canopen::od::{concat, Entry};
     use boot_core::canopen::program::ProgramControl;
     use boot_core::canopen::sdo::server::Config as SdoConfig;
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
@@ -61,6 +63,7 @@ mod app {
     use shared_abi::warm_start::{BootRequest, WarmStart};
 
     use super::{product, start, Mono};
+    use crate::debugger::{self, Debugger};
     use crate::flash::FlashController;
     use crate::log::{self, log};
     use crate::product::{PROFILE, RESCUE_WINDOW_MS};
@@ -90,7 +93,8 @@ mod app {
     /// Programs of the layout, each a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
     const PROGRAMS: usize = LAYOUT.programs.len();
     const ENTRY_COUNT: usize = entry_count_with(PROGRAMS as u8, PROFILE.extras);
-    static ENTRIES: [Entry; ENTRY_COUNT] = entries_with(PROGRAMS as u8, PROFILE.extras);
+    const OWN_ENTRIES: [Entry; ENTRY_COUNT] = entries_with(PROGRAMS as u8, PROFILE.extras);
+    static ENTRIES: [Entry; ENTRY_COUNT + debugger::ENTRIES.len()] = concat(OWN_ENTRIES, debugger::ENTRIES);
 
     static CONFIG: bootloader::Config = bootloader::Config {
         entries: &ENTRIES,
@@ -124,6 +128,7 @@ mod app {
         received: Producer<'static, Frame>,
         to_handle: Consumer<'static, Frame>,
         slave: Slave,
+        debugger: Debugger,
         leaving: Leaving,
         /// The program that starts at the end of the rescue window.
         waiting: Option<u8>,
@@ -188,6 +193,7 @@ mod app {
                 received,
                 to_handle,
                 slave,
+                debugger: Debugger::new(),
                 waiting: start::program_in_waiting(),
                 leaving: Leaving { wanted: false, request: BootRequest::PowerOn, at: None },
                 watchdog: Watchdog::new(cx.device.IWDG),
@@ -232,14 +238,14 @@ mod app {
     #[task(
         binds = CAN1_TX,
         shared = [can, bootloader],
-        local = [to_handle, slave, leaving, waiting],
+        local = [to_handle, slave, debugger, leaving, waiting],
         priority = 2
     )]
     fn protocol(cx: protocol::Context) {
         watchdog::check_in(Task::Protocol);
         let now = Instant::from_millis(Mono::now().ticks());
         let protocol::SharedResources { mut can, mut bootloader, .. } = cx.shared;
-        let protocol::LocalResources { to_handle, slave, leaving, waiting, .. } = cx.local;
+        let protocol::LocalResources { to_handle, slave, debugger, leaving, waiting, .. } = cx.local;
         if let Some(at) = leaving.at {
             // A frame that began now would be cut off by the reset.
             if now.has_reached(at) {
@@ -251,9 +257,12 @@ mod app {
         bootloader.lock(|bootloader| {
             #[cfg(feature = "password")]
             bootloader.set_time(now);
-            slave.observe(status, now, bootloader);
+            let device = debugger.attach(bootloader);
+            #[cfg(feature = "debugger")]
+            let device = &mut { device };
+            slave.observe(status, now, device);
             // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
-            carry_out(slave, &mut can, now, bootloader);
+            carry_out(slave, &mut can, now, device);
             while let Some(frame) = to_handle.dequeue() {
                 log::received(&frame);
                 // The filters let nothing in but network management and what is for this device, or for layer
@@ -261,10 +270,10 @@ mod app {
                 if RESCUE_WINDOW_MS.is_some() && frame.cob_id() != Some(CobId::NMT) {
                     *waiting = None;
                 }
-                if slave.handle(&frame, now, bootloader) {
+                if slave.handle(&frame, now, device) {
                     *leaving = Leaving { wanted: true, request: BootRequest::PowerOn, at: None };
                 }
-                carry_out(slave, &mut can, now, bootloader);
+                carry_out(slave, &mut can, now, device);
             }
             if let Some(request) = bootloader.take_leave() {
                 *leaving = Leaving { wanted: true, request, at: None };

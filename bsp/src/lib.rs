@@ -9,8 +9,12 @@
 
 pub mod can;
 pub mod clock;
+#[cfg(all(target_arch = "arm", feature = "debugger"))]
+pub mod debugger;
 #[cfg(target_arch = "arm")]
 mod drivers;
+#[cfg(all(target_arch = "arm", feature = "monitor"))]
+pub mod monitor;
 #[cfg(any(test, feature = "uart", not(target_arch = "arm")))]
 pub mod ring;
 #[cfg(any(test, feature = "virtual-can", not(target_arch = "arm")))]

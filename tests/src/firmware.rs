@@ -30,6 +30,8 @@ pub const BOOTLOADER_LOG_RTT: &str = "bootloader-log-rtt.elf";
 pub const BOOTLOADER_LOG_DEFMT: &str = "bootloader-log-defmt.elf";
 /// The same as text, out of the board's UART.
 pub const BOOTLOADER_LOG_UART: &str = "bootloader-log-uart.elf";
+/// One with the debugger interface, which no product has.
+pub const BOOTLOADER_DEBUGGER: &str = "bootloader-debugger.elf";
 /// The one that speaks CAN over the board's UART.
 pub const BOOTLOADER_VIRTUAL_CAN: &str = "bootloader-virtual-can.elf";
 /// The application for it.
@@ -38,6 +40,8 @@ pub const APP_VIRTUAL_CAN: &str = "app-virtual-can.elf";
 pub const APP_V1: &str = "app-v1.elf";
 /// Version 2 of the application.
 pub const APP_V2: &str = "app-v2.elf";
+/// Version 1 of the application with the debugger interface, which no product has.
+pub const APP_DEBUGGER: &str = "app-debugger.elf";
 /// Version 2 of the application at the place of the second program, on a board that has one.
 pub const PROGRAM_2: &str = "app-program-2.elf";
 /// The application in C, and the same one at the place of the second program.

@@ -21,6 +21,7 @@ whoever ports it and with CAN over UART, both versions of the application, the o
 the one in C, and puts them into target/firmware/BOARD/ as bootloader.elf, bootloader-complete.elf,
 bootloader-minimal.elf, bootloader-rescue.elf, bootloader-log-rtt.elf, -log-defmt.elf and -log-uart.elf,
 bootloader-virtual-can.elf, app-v1.elf, app-v2.elf, app-virtual-can.elf and app-c.elf; for a board with room for two programs also app-program-2.elf and app-c-program-2.elf.
+For the tests alone, bootloader-debugger.elf and app-debugger.elf have the debugger interface: never ship them.
 
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -69,12 +70,15 @@ pub fn images(board: &Layout) -> Outcome<Images> {
         image(&log, &format!("bootloader-log-{way}.elf"), board.bootloader)
     });
     let logs = logs.collect::<Outcome<_>>()?;
+    let debugger = Build { board, package: "bootloader", features: DEBUGGER };
+    image(&debugger, "bootloader-debugger.elf", board.bootloader)?;
     let virtual_can = Build { board, package: "bootloader", features: VIRTUAL_CAN };
     let virtual_can = image(&virtual_can, "bootloader-virtual-can.elf", board.bootloader)?;
     let program = board.programs[0];
     // Version 1 is the template as it stands.
     image(&Build { board, package: "app-template", features: "" }, "app-v1.elf", program)?;
     image(&Build { board, package: "app-template", features: "version-2" }, "app-v2.elf", program)?;
+    image(&Build { board, package: "app-template", features: "debugger" }, "app-debugger.elf", program)?;
     let application = Build { board, package: "app-template", features: "virtual-can" };
     image(&application, "app-virtual-can.elf", program)?;
     if let Some(second) = board.programs.get(1) {
@@ -182,6 +186,8 @@ const RESCUE: &str = "emcy,lss,raw-image,rescue-window";
 /// without the dialects.
 pub const LOGS: [(&str, &str); 3] =
     [("rtt", "emcy,lss,log-rtt"), ("defmt", "emcy,lss,log-defmt"), ("uart", "emcy,lss,log-uart")];
+/// The one with the debugger interface, for the tests: without the programs that come in one piece, or it would not fit.
+pub const DEBUGGER: &str = "emcy,lss,debugger";
 /// A bootloader that speaks CAN over the UART, without the dialects as there is no room for them.
 pub const VIRTUAL_CAN: &str = "emcy,lss,virtual-can";
 /// All of them.

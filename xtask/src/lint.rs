@@ -20,9 +20,11 @@ const FIRMWARE: &[(&str, &str)] = &[
     ("bootloader", ""),
     ("bootloader", build::STANDARD),
     ("bootloader", build::COMPLETE),
+    ("bootloader", build::DEBUGGER),
     ("app-template", ""),
     ("bootloader", build::VIRTUAL_CAN),
     ("app-template", "version-2"),
+    ("app-template", "debugger"),
     ("app-template", "virtual-can"),
 ];
 

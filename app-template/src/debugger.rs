@@ -1,0 +1,129 @@
+//! The debugger interface, 1025h, and breakpoints, with the feature `debugger` alone: **everybody on the bus reads and writes
+//! this device's memory, and stops its program**. Without the feature nothing of it is there.
+
+#[cfg(not(feature = "debugger"))]
+pub use off::*;
+#[cfg(feature = "debugger")]
+pub use on::*;
+
+#[cfg(not(feature = "debugger"))]
+mod off {
+    pub use crate::entries::{ENTRIES, LIFT_ENTRIES};
+
+    /// Nothing.
+    pub struct Debugger;
+
+    impl Debugger {
+        /// Nothing.
+        pub fn start() -> Self {
+            Self
+        }
+
+        /// The device as it is.
+        pub fn attach<'a, D>(&'a mut self, device: &'a mut D) -> &'a mut D {
+            device
+        }
+    }
+
+    /// Nothing.
+    pub fn let_go() {}
+
+    /// Nothing.
+    pub fn example() {}
+}
+
+#[cfg(feature = "debugger")]
+mod on {
+    use core::sync::atomic::{AtomicU32, Ordering};
+
+    use bsp::debugger::Refused;
+    use bsp::{monitor, pac, LAYOUT};
+    use canopen::debugger::{self, Command, Debugged, Kind, Memory, Stop};
+    use canopen::od::{concat, Entry};
+    use canopen::AbortCode;
+    use shared_abi::memory_map::{may_read, may_write};
+
+    use crate::entries;
+
+    /// The object dictionary, with 1025h.
+    pub static ENTRIES: [Entry; entries::ENTRIES.len() + debugger::ENTRIES.len()] =
+        concat(entries::ENTRIES, debugger::ENTRIES);
+    /// The one of a lift device, with 1025h.
+    pub static LIFT_ENTRIES: [Entry; entries::LIFT_ENTRIES.len() + debugger::ENTRIES.len()] =
+        concat(entries::LIFT_ENTRIES, debugger::ENTRIES);
+
+    /// Tasks of this priority can be stopped no more, those of 1 and `idle` can. The tasks that serve the bus have higher ones.
+    const PRIORITY: u8 = 2;
+
+    /// The interface.
+    pub struct Debugger(debugger::Debugger<Chip>);
+
+    impl Debugger {
+        /// The interface to this chip's memory; from now on breakpoints stop the program.
+        pub fn start() -> Self {
+            // As the core counts them: 0 is the most urgent, and there are the upper four bits.
+            monitor::arm((16 - PRIORITY) << 4, pac::Interrupt::CAN1_TX as u16);
+            Self(debugger::Debugger::new(Chip))
+        }
+
+        /// The device with the interface in front of it.
+        pub fn attach<'a, D>(&'a mut self, device: &'a mut D) -> Debugged<'a, D, Chip> {
+            if let Some((kind, address)) = monitor::take_stop() {
+                if let Some(stop) = Stop::from_number(kind) {
+                    self.0.stopped(stop, address);
+                }
+            }
+            self.0.attach(device)
+        }
+    }
+
+    /// The device is about to leave, which `idle` does: a program that is stopped goes on, and is stopped no more.
+    pub fn let_go() {
+        monitor::let_go();
+    }
+
+    /// Calls of [`example`].
+    #[unsafe(no_mangle)]
+    static DEBUGGER_EXAMPLE_CALLS: AtomicU32 = AtomicU32::new(0);
+
+    /// Something to stop at, every half a second, and something to look at.
+    #[unsafe(export_name = "debugger_example")]
+    #[inline(never)]
+    pub extern "C" fn example() {
+        // In two steps: an exclusive access that is stepped through never succeeds.
+        let calls = DEBUGGER_EXAMPLE_CALLS.load(Ordering::Relaxed);
+        DEBUGGER_EXAMPLE_CALLS.store(calls.wrapping_add(1), Ordering::Relaxed);
+    }
+
+    /// All of its memory.
+    pub struct Chip;
+
+    impl Memory for Chip {
+        fn is_locked(&mut self) -> bool {
+            bsp::debugger::is_locked()
+        }
+
+        fn allows(&mut self, command: &Command) -> bool {
+            let allowed = match command.kind {
+                Kind::Read => may_read,
+                Kind::Write => may_write,
+            };
+            allowed(LAYOUT.chip, command.address, command.len.into())
+        }
+
+        fn read(&mut self, address: u32, bytes: &mut [u8]) -> Result<(), AbortCode> {
+            bsp::debugger::read(address, bytes).map_err(abort)
+        }
+
+        fn write(&mut self, address: u32, bytes: &[u8]) -> Result<(), AbortCode> {
+            bsp::debugger::write(address, bytes).map_err(abort)
+        }
+    }
+
+    fn abort(refused: Refused) -> AbortCode {
+        match refused {
+            Refused::Address => AbortCode::INVALID_VALUE,
+            Refused::Busy => AbortCode::LOCAL_CONTROL,
+        }
+    }
+}

@@ -1,0 +1,97 @@
+//! The chip's memory for the debugger interface (feature `debugger`): any address may be asked for, none faults.
+
+use shared_abi::memory_map::{may_read, may_write};
+
+use crate::{pac, LAYOUT};
+
+/// Why memory is not touched.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Refused {
+    /// Something else lies there, or nothing (`shared_abi::memory_map`).
+    Address,
+    /// The flash is busy: reading it now would stop the CPU until that is over.
+    Busy,
+}
+
+/// Whether the chip's read-out protection is on, at whatever level (RM0090, embedded flash: read protection): `RDP` in `FLASH_OPTCR` is AAh
+/// where it is not.
+#[must_use]
+pub fn is_locked() -> bool {
+    const OPEN: u8 = 0xAA;
+    // SAFETY: reading this register changes nothing.
+    unsafe { pac::FLASH::steal() }.optcr().read().rdp().bits() != OPEN
+}
+
+/// Reads memory or registers; words by words where the address allows.
+///
+/// # Errors
+/// See [`Refused`]; nothing was touched then.
+pub fn read(address: u32, bytes: &mut [u8]) -> Result<(), Refused> {
+    if !may_read(LAYOUT.chip, address, bytes.len() as u32) {
+        return Err(Refused::Address);
+    }
+    // SAFETY: reading this register changes nothing.
+    let flash = unsafe { pac::FLASH::steal() };
+    if LAYOUT.chip.flash.contains(address, 1) && flash.sr().read().bsy().bit_is_set() {
+        return Err(Refused::Busy);
+    }
+    let mut at = address;
+    let mut rest = bytes;
+    while !rest.is_empty() {
+        let width = width(at, rest.len());
+        let (piece, behind) = rest.split_at_mut(width);
+        // SAFETY: the whole range can be read (`may_read`), and the address is aligned to the width. What such a read does to a
+        // peripheral is what whoever asked for it wants.
+        unsafe {
+            match width {
+                4 => piece.copy_from_slice(&(at as *const u32).read_volatile().to_le_bytes()),
+                2 => piece.copy_from_slice(&(at as *const u16).read_volatile().to_le_bytes()),
+                _ => piece.copy_from_slice(&[(at as *const u8).read_volatile()]),
+            }
+        }
+        at = at.wrapping_add(width as u32);
+        rest = behind;
+    }
+    Ok(())
+}
+
+/// Writes RAM or registers, as [`read`] reads.
+///
+/// # Errors
+/// [`Refused::Address`]; nothing was touched then.
+pub fn write(address: u32, bytes: &[u8]) -> Result<(), Refused> {
+    if !may_write(LAYOUT.chip, address, bytes.len() as u32) {
+        return Err(Refused::Address);
+    }
+    let mut at = address;
+    let mut rest = bytes;
+    while !rest.is_empty() {
+        let width = width(at, rest.len());
+        let (piece, behind) = rest.split_at(width);
+        // SAFETY: the whole range can be written (`may_write`), and the address is aligned to the width. **What that does to this
+        // program is beyond all promises**: a debugger may change any variable, stacks included. This is why the feature is
+        // never on in a product.
+        unsafe {
+            match *piece {
+                [a, b, c, d] => (at as *mut u32).write_volatile(u32::from_le_bytes([a, b, c, d])),
+                [a, b] => (at as *mut u16).write_volatile(u16::from_le_bytes([a, b])),
+                [a, ..] => (at as *mut u8).write_volatile(a),
+                [] => {}
+            }
+        }
+        at = at.wrapping_add(width as u32);
+        rest = behind;
+    }
+    Ok(())
+}
+
+/// The widest access that fits.
+const fn width(address: u32, len: usize) -> usize {
+    if address.is_multiple_of(4) && len >= 4 {
+        4
+    } else if address.is_multiple_of(2) && len >= 2 {
+        2
+    } else {
+        1
+    }
+}

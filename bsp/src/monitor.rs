@@ -1,0 +1,373 @@
+//! Stops the program at a breakpoint while the bus goes on (feature `monitor`): the DebugMonitor exception of the core
+//! (ARM DDI 0403E, section C1).
+//!
+//! The exception has a priority between that of the code to be debugged and that of the tasks that serve the bus. While
+//! its handler waits, those tasks pre-empt it as ever: SDO, heartbeats and the debugger interface itself stay alive, and so does
+//! every task of the application above it. The other side of it: **code of such a priority, code within a critical section and code
+//! that holds a lock of such a task cannot be stopped**. A breakpoint hit there turns all of them off, tells so, and the code runs on.
+//!
+//! The host works it by the core's own registers, through 1025h:
+//!
+//! | register | | |
+//! |---|---|---|
+//! | `FP_CTRL` E0002000h | 3 | breakpoints are on |
+//! | `FP_COMP0`–`5` E0002008h… | address, bits 31–30: 1 lower or 2 upper halfword, bit 0 on | a breakpoint |
+//! | `DEMCR` E000EDFCh | 01010000h | go on |
+//! | | 01050000h | one instruction, then stop again |
+//! | | 01030000h | stop now |
+//! | | bit 19 (`MON_REQ`) is 1 | the program is stopped |
+//! | `DCRDR` E000EDF8h | address of [`Saved`] | while it is stopped: its registers, to be read and changed |
+
+use core::arch::{asm, naked_asm};
+use core::sync::atomic::{compiler_fence, AtomicU32, Ordering};
+
+use crate::debugger;
+
+const FP_CTRL: u32 = 0xE000_2000;
+/// Code comparators 0 to 5; the Cortex-M4 has these six.
+const FP_COMP: u32 = 0xE000_2008;
+const COMPARATORS: u32 = 6;
+const HFSR: u32 = 0xE000_ED2C;
+const DFSR: u32 = 0xE000_ED30;
+const SHPR3: u32 = 0xE000_ED20;
+const DCRDR: u32 = 0xE000_EDF8;
+const DEMCR: u32 = 0xE000_EDFC;
+/// Interrupts are set pending here.
+const ISPR: u32 = 0xE000_E200;
+
+/// `FP_CTRL`: a write without the key is ignored.
+const KEY: u32 = 1 << 1;
+const ENABLE: u32 = 1 << 0;
+const HFSR_DEBUGEVT: u32 = 1 << 31;
+const HFSR_FORCED: u32 = 1 << 30;
+/// `DFSR`: a breakpoint; written with 1, it is cleared.
+const BKPT: u32 = 1 << 1;
+const DFSR_ALL: u32 = 0x1F;
+const MON_EN: u32 = 1 << 16;
+const MON_STEP: u32 = 1 << 18;
+/// The core makes no use of it; here it says that the program is stopped.
+const MON_REQ: u32 = 1 << 19;
+const TRCENA: u32 = 1 << 24;
+
+/// Types of a stop, as the emergency carries them (`canopen::debugger::Stop`).
+pub const BREAKPOINT: u8 = 1;
+/// See [`BREAKPOINT`]: a step is done, or somebody asked for the stop.
+pub const STEP: u8 = 0x80;
+/// See [`BREAKPOINT`]: in code that cannot be stopped.
+pub const OUT_OF_REACH: u8 = 0x81;
+
+/// What the core saves on the stack when it takes an exception.
+#[repr(C)]
+pub struct Frame {
+    /// R0 to R3, R12, LR.
+    pub registers: [u32; 6],
+    /// The next instruction.
+    pub pc: u32,
+    /// The flags; the number of the exception that the program is in.
+    pub xpsr: u32,
+}
+
+/// What the handler adds to it: this is what `DCRDR` points to.
+#[repr(C)]
+pub struct Saved {
+    /// Address of the [`Frame`]; the program's SP points behind it.
+    pub frame: *mut Frame,
+    /// R4 to R11.
+    pub registers: [u32; 8],
+    /// `EXC_RETURN`.
+    pub exc_return: u32,
+}
+
+/// A stop that nobody has told yet: type (0 for none) and address.
+static TYPE: AtomicU32 = AtomicU32::new(0);
+static ADDRESS: AtomicU32 = AtomicU32::new(0);
+/// The interrupt of the task that tells it.
+static TELLER: AtomicU32 = AtomicU32::new(0);
+
+fn load(register: u32) -> u32 {
+    // SAFETY: one of the registers above, or of code; reading any of them changes nothing.
+    unsafe { (register as *const u32).read_volatile() }
+}
+
+fn store(register: u32, value: u32) {
+    // SAFETY: one of the registers above. What they do to the flow of the program is what this module is for.
+    unsafe { (register as *mut u32).write_volatile(value) }
+}
+
+/// Changes `DEMCR`, which the task that serves 1025h writes, too.
+fn change_demcr(clear: u32, set: u32) {
+    let primask: u32;
+    // SAFETY: interrupts are off for two accesses, and then as they were.
+    unsafe {
+        asm!("mrs {}, PRIMASK", "cpsid i", out(reg) primask);
+        store(DEMCR, load(DEMCR) & !clear | set);
+        asm!("msr PRIMASK, {}", in(reg) primask);
+    }
+}
+
+/// Before anything else of the program, memory included: turns breakpoints off. They outlive a reset and the exception does not, so
+/// that one that is hit before [`arm`] would be a fault.
+///
+/// # Safety
+/// It is for the start-up of `cortex-m-rt` to call.
+#[unsafe(no_mangle)]
+#[unsafe(naked)]
+pub unsafe extern "C" fn __pre_init() {
+    // FP_CTRL: the key, and not enabled.
+    naked_asm!("movw r0, #0x2000", "movt r0, #0xE000", "movs r1, #2", "str r1, [r0]", "dsb", "isb", "bx lr")
+}
+
+/// Makes breakpoints stop the program, of which there are none yet, unless the chip's read-out protection is on. `priority` is the exception's, as the core has it
+/// (the upper four bits): more urgent (less) than that of the code to be stopped, less urgent than that of the tasks that serve
+/// the bus. A stop pends the interrupt of this number, to be told by [`take_stop`].
+pub fn arm(priority: u8, interrupt: u16) {
+    if debugger::is_locked() {
+        return;
+    }
+    TELLER.store(interrupt.into(), Ordering::Relaxed);
+    store(FP_CTRL, KEY);
+    for n in 0..COMPARATORS {
+        store(FP_COMP + 4 * n, 0);
+    }
+    store(DFSR, DFSR_ALL);
+    store(SHPR3, load(SHPR3) & !0xFF | u32::from(priority));
+    store(DEMCR, TRCENA | MON_EN);
+}
+
+/// A stop that is to be told, once: its type and its address.
+pub fn take_stop() -> Option<(u8, u32)> {
+    let kind = TYPE.load(Ordering::Acquire);
+    if kind == 0 {
+        return None;
+    }
+    TYPE.store(0, Ordering::Relaxed);
+    Some((kind as u8, ADDRESS.load(Ordering::Relaxed)))
+}
+
+/// A program that is stopped goes on, and nothing stops it any more.
+pub fn let_go() {
+    store(FP_CTRL, KEY);
+    change_demcr(MON_EN | MON_STEP | MON_REQ, 0);
+}
+
+fn tell(kind: u8, address: u32) {
+    ADDRESS.store(address, Ordering::Relaxed);
+    TYPE.store(kind.into(), Ordering::Release);
+    pend_teller();
+}
+
+fn pend_teller() {
+    let interrupt = TELLER.load(Ordering::Relaxed);
+    store(ISPR + 4 * (interrupt / 32), 1 << (interrupt % 32));
+}
+
+/// The exception's entry: completes what the core has saved to [`Saved`], and restores from there.
+///
+/// # Safety
+/// It is the core's to call.
+#[allow(non_snake_case)]
+#[unsafe(no_mangle)]
+#[unsafe(naked)]
+pub unsafe extern "C" fn DebugMonitor() {
+    naked_asm!(
+        "tst lr, #4",
+        "ite eq",
+        "mrseq r0, MSP",
+        "mrsne r0, PSP",
+        // Ten words: the stack stays aligned to 8 bytes.
+        "push {{r0, r4-r11, lr}}",
+        "mov r0, sp",
+        "bl {handler}",
+        "pop {{r0, r4-r11, pc}}",
+        handler = sym on_debug_event,
+    )
+}
+
+/// A fault's entry. One by a breakpoint in code that cannot be stopped is none; any other restarts the device.
+///
+/// # Safety
+/// It is the core's to call.
+#[allow(non_snake_case)]
+#[unsafe(no_mangle)]
+#[unsafe(naked)]
+pub unsafe extern "C" fn HardFault() {
+    naked_asm!(
+        "tst lr, #4",
+        "ite eq",
+        "mrseq r0, MSP",
+        "mrsne r0, PSP",
+        "push {{r4, lr}}",
+        "bl {handler}",
+        "pop {{r4, pc}}",
+        handler = sym on_fault,
+    )
+}
+
+unsafe extern "C" fn on_fault(frame: *const Frame) {
+    const AIRCR: u32 = 0xE000_ED0C;
+    const SYSTEM_RESET: u32 = 0x05FA_0004;
+    let by_breakpoint = load(HFSR) & HFSR_DEBUGEVT != 0 && load(FP_CTRL) & ENABLE != 0;
+    if !by_breakpoint {
+        store(AIRCR, SYSTEM_RESET);
+        loop {
+            compiler_fence(Ordering::SeqCst);
+        }
+    }
+    store(FP_CTRL, KEY);
+    store(HFSR, HFSR_DEBUGEVT | HFSR_FORCED);
+    store(DFSR, DFSR_ALL);
+    // SAFETY: a debug event did not come from a broken stack; what the entry passes is the frame on it.
+    tell(OUT_OF_REACH, unsafe { (*frame).pc });
+    synchronize();
+}
+
+unsafe extern "C" fn on_debug_event(saved: *mut Saved) {
+    // SAFETY: the entry has just built it on the stack, and the core the frame; both stay there until this returns. What the host
+    // changes in them through 1025h it changes while this waits: they are read and written by volatile accesses.
+    let pc = unsafe { &raw mut (*(&raw const (*saved).frame).read_volatile()).pc };
+    let cause = load(DFSR);
+    store(DFSR, DFSR_ALL);
+    if let Some(step) = Step::take() {
+        step.end();
+        if !step.asked && cause & BKPT == 0 {
+            synchronize();
+            return;
+        }
+    }
+    // SAFETY: see above.
+    let stopped_at = unsafe { pc.read_volatile() };
+    change_demcr(MON_STEP, MON_REQ);
+    store(DCRDR, saved as u32);
+    tell(if cause & BKPT != 0 { BREAKPOINT } else { STEP }, stopped_at);
+    while load(DEMCR) & MON_REQ != 0 {
+        // The tasks that serve the bus want to look at their deadlines; who does that otherwise may be what is stopped.
+        pend_teller();
+        // SAFETY: it waits for an interrupt; the one that was pended has come before.
+        unsafe { asm!("dsb", "isb", "wfi") };
+    }
+    // SAFETY: see above.
+    let next = unsafe { pc.read_volatile() };
+    let instruction = Instruction::at(next);
+    if next == stopped_at && instruction == Instruction::Breakpoint {
+        // One in the code itself: the next instruction is behind it.
+        // SAFETY: see above.
+        unsafe { pc.write_volatile(next + 2) };
+    } else {
+        let asked = load(DEMCR) & MON_STEP != 0;
+        let over = load(FP_CTRL) & ENABLE != 0 && has_breakpoint(next);
+        if asked || over {
+            Step { asked, over, mask: None }.begin(instruction);
+        }
+    }
+    synchronize();
+}
+
+/// One instruction is carried out alone.
+#[derive(Clone, Copy)]
+struct Step {
+    /// By the host, which wants to hear of its end.
+    asked: bool,
+    /// There is a breakpoint at it: all are off meanwhile.
+    over: bool,
+    /// The mask that was in force, if it was changed.
+    mask: Option<u8>,
+}
+
+/// The step that is under way, bit by bit: [`STEPS`], asked, over, changed the mask; the mask from bit 8 on.
+static STEP_STATE: AtomicU32 = AtomicU32::new(0);
+const STEPS: u32 = 1 << 0;
+const ASKED: u32 = 1 << 1;
+const OVER: u32 = 1 << 2;
+const MASKED: u32 = 1 << 3;
+
+impl Step {
+    fn take() -> Option<Self> {
+        let state = STEP_STATE.load(Ordering::Relaxed);
+        STEP_STATE.store(0, Ordering::Relaxed);
+        let mask = (state & MASKED != 0).then_some((state >> 8) as u8);
+        (state & STEPS != 0).then_some(Self { asked: state & ASKED != 0, over: state & OVER != 0, mask })
+    }
+
+    fn begin(mut self, instruction: Instruction) {
+        // Nothing else that can be stopped may come between: that would be stopped in its place. What changes the mask itself goes
+        // without.
+        let in_force = basepri();
+        let least = (load(SHPR3) as u8).saturating_add(PRIORITY_STEP);
+        if instruction != Instruction::SetsMask && (in_force == 0 || in_force > least) {
+            self.mask = Some(in_force);
+            set_basepri(least);
+        }
+        if self.over {
+            store(FP_CTRL, KEY);
+        }
+        let flag = |on, bit| if on { bit } else { 0 };
+        let mask = self.mask.map_or(0, |mask| MASKED | u32::from(mask) << 8);
+        STEP_STATE.store(STEPS | flag(self.asked, ASKED) | flag(self.over, OVER) | mask, Ordering::Relaxed);
+        change_demcr(0, MON_STEP);
+    }
+
+    fn end(self) {
+        change_demcr(MON_STEP, 0);
+        if let Some(mask) = self.mask {
+            set_basepri(mask);
+        }
+        if self.over {
+            store(FP_CTRL, KEY | ENABLE);
+        }
+    }
+}
+
+/// From one priority to the next: the chip has the upper four bits.
+const PRIORITY_STEP: u8 = 0x10;
+
+/// What is to be known of the instruction at a stop.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Instruction {
+    Breakpoint,
+    SetsMask,
+    Other,
+}
+
+impl Instruction {
+    fn at(pc: u32) -> Self {
+        let mut code = [0; 4];
+        if debugger::read(pc, &mut code).is_err() {
+            return Self::Other;
+        }
+        let [a, b, c, d] = code;
+        match (u16::from_le_bytes([a, b]), u16::from_le_bytes([c, d])) {
+            // BKPT (DDI 0403E section A7.7).
+            (0xBE00..=0xBEFF, _) => Self::Breakpoint,
+            // MSR to BASEPRI or BASEPRI_MAX (section B5.2).
+            (0xF380..=0xF38F, 0x8811 | 0x8812) => Self::SetsMask,
+            _ => Self::Other,
+        }
+    }
+}
+
+/// Whether a comparator stops at this address (DDI 0403E section C1.11).
+fn has_breakpoint(pc: u32) -> bool {
+    let half = if pc & 2 == 0 { 0b01 } else { 0b10 };
+    (0..COMPARATORS).map(|n| load(FP_COMP + 4 * n)).any(|comparator| {
+        let replace = comparator >> 30;
+        comparator & ENABLE != 0 && comparator & 0x1FFF_FFFC == pc & !3 && replace & half != 0
+    })
+}
+
+fn basepri() -> u8 {
+    let value: u32;
+    // SAFETY: it is read.
+    unsafe { asm!("mrs {}, BASEPRI", out(reg) value) };
+    value as u8
+}
+
+fn set_basepri(value: u8) {
+    // SAFETY: the handler's own priority is above every mask that is set here: what it masks waits anyway.
+    unsafe { asm!("msr BASEPRI, {}", in(reg) u32::from(value)) };
+}
+
+/// What was written takes effect before the next instruction of the program.
+fn synchronize() {
+    // SAFETY: barriers.
+    unsafe { asm!("dsb", "isb") };
+}
