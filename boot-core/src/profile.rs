@@ -72,6 +72,7 @@ impl Profile {
             wants_label: true,
             data: Some(2),
             read_back: true,
+            replaces: true,
             ..Policy::DEFAULT
         },
         ..Self::STANDARD

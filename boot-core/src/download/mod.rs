@@ -110,6 +110,8 @@ pub struct Policy {
     pub locked: bool,
     /// Whether 1F50h gives back what was stored.
     pub read_back: bool,
+    /// Whether a download takes the place of what is there, without CLEAR.
+    pub replaces: bool,
     /// Bytes of flash that one step of a CRC covers: the longest that other work of the same priority is kept
     /// waiting.
     pub crc_step: u32,
@@ -129,6 +131,7 @@ impl Policy {
         data: None,
         locked: false,
         read_back: false,
+        replaces: false,
         crc_step: 1024,
     };
 }
@@ -429,6 +432,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         state.streamed = false;
         state.session = Session::Cleared { just: false };
         self.reception = Reception::Idle;
+        self.owner = program;
         self.break_off();
         if at_once && self.work.is_none() {
             self.work = Some(self.invalidate(program, false));
@@ -578,7 +582,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             if !cfg!(feature = "streams") && size as usize > self.largest() {
                 return Err(self.refuse(program, Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH)));
             }
-            if (size as usize) < FRAMING {
+            if (size as usize) < FRAMING && self.policy.data != Some(program) {
                 return Err(self.refuse(program, Refusal(FlashError::Format, AbortCode::LENGTH_TOO_LOW)));
             }
         }
@@ -939,18 +943,24 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// Whether the download of a program may begin.
     fn may_begin(&self, program: u8) -> Result<(), Refusal> {
         let Some(state) = self.state_of(program) else { return Err(unfit(FlashError::Unspecified)) };
+        let replaces = self.policy.replaces;
         match state.session {
-            Session::Idle if state.record.is_some() => Err(untimely(FlashError::NotCleared)),
-            Session::Idle | Session::Cleared { .. } if (self.policy.allowed)() => Ok(()),
-            Session::Idle | Session::Cleared { .. } => Err(untimely(FlashError::NoAccess)),
-            Session::Open { .. } | Session::Failed => Err(untimely(FlashError::Sequence)),
+            Session::Idle if state.record.is_some() && !replaces => Err(untimely(FlashError::NotCleared)),
+            Session::Failed if !replaces => Err(untimely(FlashError::Sequence)),
+            Session::Open { .. } => Err(untimely(FlashError::Sequence)),
+            _ if (self.policy.allowed)() => Ok(()),
+            _ => Err(untimely(FlashError::NoAccess)),
         }
     }
 
     /// The download begins, of a program of this size; 0 where that is not known.
     fn open_session(&mut self, program: u8, size: u32) {
         let region = self.region(program);
+        let replaces = self.policy.replaces;
         let Some(session) = self.session(program) else { return };
+        if replaces && !matches!(*session, Session::Open { .. }) {
+            *session = Session::Cleared { just: false };
+        }
         let (erased, ahead) = match *session {
             // Known to be erased is nothing; what there are to be data for is erased ahead of them.
             Session::Cleared { .. } => (region.base, region.base + size.min(region.size)),
