@@ -64,6 +64,25 @@ fn python_canopen_identifies_flashes_and_starts_the_device() {
     endpoint.bench.assert_nothing_unmodelled();
 }
 
+/// A master with nothing of ours: a raw image in segments into an empty device, and in blocks into one that runs.
+#[test]
+fn python_canopen_updates_the_device_by_raw_images() {
+    let mut endpoint = endpoint();
+    for (image, way, version) in
+        [(firmware::APP_V1, None, "1.0.0"), (firmware::APP_V2, Some("--block"), "2.0.0")]
+    {
+        let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(image).with_extension("bin");
+        fs::write(&path, firmware::raw(image)).unwrap();
+        let mut python = python();
+        python.arg(script("image_client.py")).arg(endpoint.address()).arg(path).args(way);
+        let output = endpoint.run(&mut python);
+        assert!(output.status.success(), "{}", text(&output));
+        assert!(text(&output).contains("started; 1F56h is the same"), "{}", text(&output));
+        assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), version);
+    }
+    endpoint.bench.assert_nothing_unmodelled();
+}
+
 /// The command line that `cargo xtask test` has built.
 fn coflash() -> Command {
     let coflash = env::var_os("COBOOT_COFLASH")

@@ -177,7 +177,17 @@ pub fn bootloader(board: &Layout) -> Outcome<PathBuf> {
 }
 
 /// The bootloader's features that a product may go without.
-pub const OPTIONAL: [&str; 4] = ["auto-bit-rate", "block-upload", "emcy", "lss"];
+pub const OPTIONAL: [&str; 9] = [
+    "emcy",
+    "lss",
+    "raw-image",
+    "intel-hex",
+    "auto-bit-rate",
+    "block-upload",
+    "rescue-window",
+    "password",
+    "read-back",
+];
 /// Those of them that a product usually has: this bootloader is the one that is measured against the budget.
 pub const STANDARD: &str = "standard";
 /// With a rescue window. Beside everything that is standard there is no room for it.

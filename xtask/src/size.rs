@@ -23,9 +23,9 @@ it is over the budget.
   --yes           installs what is missing with sudo
 ";
 
-/// What the bootloader may take of its region, in bytes; the region itself is the hard limit. The aim is 24 KiB
+/// What the bootloader may take of its region, in bytes: all of it, which is the hard limit. The aim is 24 KiB
 /// (docs/adr/0007-resident-part.md).
-pub const BUDGET: u32 = 31 * 1024;
+pub const BUDGET: u32 = 32 * 1024;
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
@@ -121,19 +121,21 @@ impl Flash {
     }
 }
 
-/// What each optional feature costs: the flash of the complete bootloader less that of one without it.
+/// What each optional feature costs on top of a bootloader without any, and what whole dialects take.
 fn by_feature(board: &Layout) -> Outcome<String> {
     let used = |features: &[&str]| -> Outcome<u32> {
         Ok(Flash::of(&read(&build::bootloader_with(board, features)?)?, board.bootloader)?.used)
     };
-    let complete = used(&build::OPTIONAL)?;
-    let mut text = String::from("feature                          bytes\n");
+    let bare = used(&[])?;
+    let mut text = String::from("feature                          bytes, on top of none\n");
     for feature in build::OPTIONAL {
-        let others: Vec<_> = build::OPTIONAL.into_iter().filter(|other| *other != feature).collect();
-        let _ = writeln!(text, "{feature:<31} {:>6}", complete.saturating_sub(used(&others)?));
+        let _ = writeln!(text, "{feature:<31} {:>6}", used(&[feature])?.saturating_sub(bare));
     }
-    let _ = writeln!(text, "{:<31} {complete:>6}", "(with all of them)");
-    let _ = writeln!(text, "{:<31} {:>6}", "(without all of them)", used(&[])?);
+    let _ = writeln!(text, "\nbootloader                       bytes\n{:<31} {bare:>6}", "without features");
+    for features in [build::STANDARD, build::COMPLETE, "profile-paulus", "profile-esacademy", "profile-lift"]
+    {
+        let _ = writeln!(text, "{features:<31} {:>6}", used(&[features])?);
+    }
     Ok(text)
 }
 

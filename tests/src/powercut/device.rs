@@ -62,6 +62,11 @@ const CONFIG: Config = Config {
     download: Policy { identity: Some((VENDOR_ID, PRODUCT_CODE)), ..Policy::DEFAULT },
 };
 static SOUND: Config = CONFIG;
+/// A lift: program 2 is a set of parameters, and a download replaces what is there.
+static LIFT: Config = Config {
+    download: Policy { data: Some(2), replaces: true, read_back: true, ..CONFIG.download },
+    ..CONFIG
+};
 static HASTY: Config = Config { download: Policy { erase: Erase::AtOnce, ..CONFIG.download }, ..CONFIG };
 
 const DECISION: decision::Policy =
@@ -206,8 +211,16 @@ impl Device {
 
     /// Bootloader mode, with a host that talks to it.
     pub fn host<R>(&mut self, talk: impl FnOnce(&mut Host<'_, '_>) -> R) -> R {
+        self.host_of(if self.bug == Some(Bug::EraseBeforeCheck) { &HASTY } else { &SOUND }, talk)
+    }
+
+    /// The same for the bootloader of a lift.
+    pub fn host_of_lift<R>(&mut self, talk: impl FnOnce(&mut Host<'_, '_>) -> R) -> R {
+        self.host_of(&LIFT, talk)
+    }
+
+    fn host_of<R>(&mut self, config: &'static Config, talk: impl FnOnce(&mut Host<'_, '_>) -> R) -> R {
         let (parameters, node) = (self.parameters(), self.node());
-        let config = if self.bug == Some(Bug::EraseBeforeCheck) { &HASTY } else { &SOUND };
         let flash = Chip { flash: &mut self.flash, bug: self.bug };
         let mut buffer = [0; 256];
         talk(&mut Host { node: Bootloader::new(config, 0, node, 0, parameters, flash, &mut buffer) })

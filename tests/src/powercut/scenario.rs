@@ -167,6 +167,11 @@ fn update_at_once(device: &mut Device, data: Vec<u8>, tell: Tell<'_>) -> Result<
     Ok(())
 }
 
+/// Any bytes, but for the one that tells them apart.
+fn parameter_set(seed: u8) -> Vec<u8> {
+    (0..150_u8).map(|i| if i == 8 { seed } else { i.wrapping_mul(3) }).collect()
+}
+
 fn raw() -> Vec<u8> {
     image(1, NEW)
 }
@@ -363,6 +368,22 @@ pub const SCENARIOS: &[Scenario] = &[
         },
         recover: |_, _, _| Ok(()),
         end: || allowed(&[START_OLD]),
+    },
+    Scenario {
+        name: "parameter-set",
+        about: "another set of parameters in the place of one, in a lift",
+        prepare: |device| {
+            install(device, 1, OLD, true);
+            device.host_of_lift(|host| host.block(2, &parameter_set(OLD))).expect("a set of parameters");
+        },
+        act: |device, tell| {
+            tell(with_second(&[START_OLD], &[Some((OLD, true)), None, Some((NEW, true))]));
+            device.host_of_lift(|host| host.block(2, &parameter_set(NEW)))?;
+            tell(with_second(&[START_OLD], &[Some((NEW, true))]));
+            Ok(())
+        },
+        recover: |device, _, _| device.host_of_lift(|host| host.block(2, &parameter_set(NEW))),
+        end: || with_second(&[START_OLD], &[Some((NEW, true))]),
     },
     Scenario {
         name: "second-program",
