@@ -52,6 +52,9 @@ macro_rules! uart {
     };
 }
 
+#[cfg(target_arch = "arm")]
+use shared_abi::{geometry::Geometry, layout::Layout};
+
 #[cfg(any(feature = "board-stm32f407g-disc1", feature = "board-stm32f407g-disc1-two"))]
 #[path = "stm32f407g_disc1.rs"]
 mod board;
@@ -68,6 +71,14 @@ mod board;
 pub const SYSCLK: u32 = CLOCK_TREE.sysclk();
 /// Clock of the CAN controller, in Hz: that of APB1.
 pub const CAN_CLOCK: u32 = CLOCK_TREE.apb1_clock();
+
+/// Who owns which address on this board; on the chip without the names, which nothing there asks for.
+#[cfg(target_arch = "arm")]
+pub const LAYOUT: &Layout = {
+    const CHIP: Geometry = Geometry { chip: "", ..*board::LAYOUT.chip };
+    const NAMELESS: Layout = Layout { board: "", chip: &CHIP, ..*board::LAYOUT };
+    &NAMELESS
+};
 
 pub use board::*; // Not found, or found twice? Choose one board by its feature `board-…`.
 

@@ -60,7 +60,9 @@ pub fn images(board: &Layout) -> Outcome<Images> {
     image(&minimal, "bootloader-minimal.elf", board.bootloader)?;
     let rescue = Build { board, package: "bootloader", features: RESCUE };
     image(&rescue, "bootloader-rescue.elf", board.bootloader)?;
-    for dialect in ["paulus", "esacademy"] {
+    // Beside a second program there is no room for ESAcademy's password.
+    let dialects: &[&str] = if board.programs.len() == 1 { &["paulus", "esacademy"] } else { &["paulus"] };
+    for dialect in dialects {
         let features = format!("profile-{dialect}");
         let dialect = format!("bootloader-{dialect}.elf");
         image(&Build { board, package: "bootloader", features: &features }, &dialect, board.bootloader)?;

@@ -108,10 +108,15 @@ impl<'b> Queue<'b> {
 
     fn at<const N: usize>(&self, offset: usize) -> [u8; N] {
         let mut bytes = [0; N];
+        self.fill(offset, &mut bytes);
+        bytes
+    }
+
+    /// The work of `at` for every length: one copy of the code.
+    fn fill(&self, offset: usize, bytes: &mut [u8]) {
         for (i, byte) in bytes.iter_mut().enumerate() {
             *byte = self.byte(offset + i);
         }
-        bytes
     }
 
     /// Offsets are less than twice the ring.
