@@ -6,10 +6,12 @@ mod model;
 use std::fmt::Write as _;
 
 use bench::*;
+use boot_core::bootloader::{entries_with, entry_count_with, Config};
 use boot_core::download::Policy;
 use boot_core::flash::FlashFault;
-use canopen::od::Objects;
-use canopen::AbortCode;
+use boot_core::profile::Profile;
+use canopen::od::{Address, Entry, Objects};
+use canopen::{AbortCode, Instant};
 use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP};
 use proptest::prelude::*;
 use shared_abi::warm_start::BootRequest;
@@ -387,6 +389,50 @@ fn a_stream_cut_anywhere_leaves_the_old_the_new_or_no_program() {
         }
         assert!(seen.iter().all(|count| *count > 0), "old, new, none: {seen:?}");
     }
+}
+
+/// The ESAcademy profile: closed until the password came, and who is wrong waits, whatever he tries.
+#[test]
+fn a_password_opens_1f50_and_a_wrong_one_is_slowed_down() {
+    const ENABLE: Address = Address::new(0x7F50, 1);
+    static ENTRIES: [Entry; entry_count_with(1, Profile::ESACADEMY.extras)] =
+        entries_with(1, Profile::ESACADEMY.extras);
+    let policy = Profile::ESACADEMY.download;
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with_config(
+        &mut flash,
+        Config { entries: &ENTRIES, download: policy, password: Profile::ESACADEMY.password, ..CONFIG },
+        1024,
+    );
+    let image = program(600, 0x12);
+    for command in [CLEAR, SET_SIGNATURE, CLR_SIGNATURE] {
+        assert_eq!(bench.node.write(CONTROL, &[command]), Err(STATE));
+    }
+    assert_eq!(bench.stream(&image, None, 7), (Err(STATE), 0x84));
+    // "INIT" the wrong way round, half a second of silence, twice that after the second one.
+    let mut at = |ms: u32, password: &[u8; 4]| {
+        bench.node.set_time(Instant::from_millis(ms));
+        let answer = bench.node.write(ENABLE, password);
+        // A reset would let him try again at once.
+        (answer, bench.node.is_finishing())
+    };
+    assert_eq!(at(1000, b"INIT"), (Err(AbortCode(0x0609_0030)), true));
+    assert_eq!(at(1499, b"TINI"), (Err(STATE), true));
+    assert_eq!(at(1500, b"TINO"), (Err(AbortCode(0x0609_0030)), true));
+    assert_eq!(at(2499, b"TINI"), (Err(STATE), true));
+    assert_eq!(at(2500, b"TINI"), (Ok(()), false));
+    assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
+    assert_eq!(bench.node.take_leave(), Some(BootRequest::Start(1)), "by itself");
+    // The next password voids it at once.
+    let mut bench = Bench::with_config(
+        &mut flash,
+        Config { entries: &ENTRIES, download: policy, password: Profile::ESACADEMY.password, ..CONFIG },
+        1024,
+    );
+    assert_eq!(bench.read_state(), 0);
+    bench.node.write(ENABLE, b"TINI").unwrap();
+    bench.settle();
+    assert_eq!((bench.read_state(), bench.word(IDENTIFICATION)), (3, 0));
 }
 
 proptest! {

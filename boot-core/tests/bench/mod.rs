@@ -82,8 +82,12 @@ impl<'f> Bench<'f> {
     }
 
     pub fn with_buffer(flash: &'f mut ModelFlash, download: Policy, size: usize) -> Self {
+        Self::with_config(flash, Config { download, ..CONFIG }, size)
+    }
+
+    pub fn with_config(flash: &'f mut ModelFlash, config: Config, size: usize) -> Self {
         let buffer = Box::leak(vec![0; size].into_boxed_slice());
-        let config = Box::leak(Box::new(Config { download, ..CONFIG }));
+        let config = Box::leak(Box::new(config));
         let parameters = Journal::open(flash, LAYOUT.chip, LAYOUT.parameters);
         Self { node: Bootloader::new(config, 0, node(), 0, parameters, flash, buffer) }
     }
