@@ -163,3 +163,100 @@ impl Line {
 fn is_patient(error: &io::Error) -> bool {
     matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted | ErrorKind::TimedOut)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::time::{Duration, Instant};
+
+    use super::*;
+    use crate::machine::Options;
+    use crate::peripheral::Peripheral;
+    use crate::time::Time;
+    use shared_abi::geometry::STM32F407VG;
+
+    /// A board whose USART2 is on: 16 MHz, 139 cycles a bit.
+    fn board() -> Machine {
+        let mut machine = Machine::new(&STM32F407VG, Options::default()).unwrap();
+        machine.power_on(Time(0));
+        let usart = machine.usart_mut("USART2").unwrap();
+        usart.set_clock(16_000_000);
+        usart.set_wired(true, true);
+        usart.write(0x08, 139, Time(0)).unwrap();
+        usart.write(0x0C, 1 << 13 | 1 << 3 | 1 << 2, Time(0)).unwrap();
+        machine
+    }
+
+    fn say(machine: &mut Machine, byte: u8) {
+        let usart = machine.usart_mut("USART2").unwrap();
+        usart.write(0x04, byte.into(), Time(0)).unwrap();
+        usart.advance(Time(1_000_000_000));
+    }
+
+    /// Exchanges until something is true; the host's own line may take its time.
+    fn until(serial: &mut Serial, machine: &mut Machine, mut is_so: impl FnMut(&mut Machine) -> bool) {
+        let began = Instant::now();
+        while !is_so(machine) {
+            assert!(began.elapsed() < Duration::from_secs(20), "it never is");
+            serial.exchange(machine);
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    fn waiting(machine: &mut Machine) -> usize {
+        machine.usart_mut("USART2").unwrap().waiting()
+    }
+
+    #[test]
+    fn clients_come_and_go() {
+        let mut machine = board();
+        let mut serial = Serial::listen("USART2", "127.0.0.1:0").unwrap();
+        let address = serial.place().replace("tcp://", "");
+        // Nobody is there: what is said is lost, and nothing waits.
+        say(&mut machine, b'a');
+        assert_eq!(serial.exchange(&mut machine), 1);
+        for byte in [b'b', b'c'] {
+            let mut client = TcpStream::connect(&address).unwrap();
+            client.write_all(&[byte; 3]).unwrap();
+            let before = waiting(&mut machine);
+            until(&mut serial, &mut machine, |machine| waiting(machine) == before + 3);
+            say(&mut machine, byte);
+            serial.exchange(&mut machine);
+            let mut heard = [0];
+            client.read_exact(&mut heard).unwrap();
+            assert_eq!(heard, [byte]);
+        }
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_terminal_that_nobody_reads_holds_nothing_up() {
+        let mut machine = board();
+        let mut serial = Serial::terminal("USART2").unwrap();
+        for n in 0..40_000_u32 {
+            say(&mut machine, n as u8);
+            if n % 100 == 0 {
+                serial.exchange(&mut machine);
+            }
+        }
+        assert!(serial.unread.len() <= MOST_UNREAD);
+        let mut port = std::fs::OpenOptions::new().read(true).write(true).open(serial.place()).unwrap();
+        port.write_all(b"abc").unwrap();
+        until(&mut serial, &mut machine, |machine| waiting(machine) == 3);
+    }
+
+    #[test]
+    fn a_board_without_power_hears_nothing() {
+        let mut machine = board();
+        let mut serial = Serial::listen("USART2", "127.0.0.1:0").unwrap();
+        let mut client = TcpStream::connect(serial.place().replace("tcp://", "")).unwrap();
+        client.write_all(b"x").unwrap();
+        until(&mut serial, &mut machine, |machine| waiting(machine) == 1);
+        machine.power_off();
+        client.write_all(b"y").unwrap();
+        for _ in 0..20 {
+            serial.exchange(&mut machine);
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        assert_eq!(waiting(&mut machine), 0);
+    }
+}

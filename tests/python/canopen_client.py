@@ -6,6 +6,7 @@ by itself (SYS TEC manual L-1112d_10, chapter 3 figure 2), with zlib's CRC. It g
 compare the CRC, sign, start. One line per step; ends with 0 when all went well, else with 1.
 
     canopen_client.py 127.0.0.1:29536 app.blk
+    canopen_client.py slcan:/dev/ttyACM0 app.blk
 """
 
 import argparse
@@ -210,7 +211,7 @@ def flash(device, blocks, start):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("endpoint", metavar="HOST:PORT", help="a socketcand server")
+    parser.add_argument("endpoint", metavar="HOST:PORT", help="a socketcand server, or slcan:SERIAL-PORT")
     parser.add_argument("block_file", nargs="?", help="the program; without it the device is only identified")
     parser.add_argument("--channel", default="can0", help="the server's name for the bus (can0)")
     parser.add_argument("--node", type=lambda text: int(text, 0), default=1, help="node-ID (1)")
@@ -219,14 +220,19 @@ def main():
     parser.add_argument("--no-start", action="store_true", help="leaves the program signed, but not started")
     options = parser.parse_args()
     host, colon, port = options.endpoint.rpartition(":")
-    if not colon or not port.isdecimal():
+    if host == "slcan":
+        # Whatever the bit rate of the bus behind it; the default pause behind the opening is for boards that it resets.
+        bus = {"interface": "slcan", "channel": port, "bitrate": 125_000, "sleep_after_open": 0.1}
+    elif colon and port.isdecimal():
+        # tcp_tune sets TCP_NODELAY; without it every answer waits for the kernel's delayed ACK.
+        bus = {"interface": "socketcand", "host": host, "port": int(port), "channel": options.channel, "tcp_tune": True}
+    else:
         parser.error(f"{options.endpoint} is not HOST:PORT")
 
     network = canopen.Network()
     try:
         blocks = read_blocks(options.block_file) if options.block_file else None
-        # tcp_tune sets TCP_NODELAY; without it every answer waits for the kernel's delayed ACK.
-        network.connect(interface="socketcand", host=host, port=int(port), channel=options.channel, tcp_tune=True)
+        network.connect(**bus)
         node = network.add_node(options.node, object_dictionary())
         node.sdo.RESPONSE_TIMEOUT = options.timeout
         device = Device(node, options.patience)

@@ -1,7 +1,9 @@
 //! CAN over UART: the bootloader and the application that talk through the board's serial port, to `coflash` and its adapter.
 
+use std::path::PathBuf;
+use std::process::Command;
 use std::time::Duration;
-use std::{env, process::Command};
+use std::{env, fs};
 
 use canopen::program::ProgramControl;
 use canopen::{Address, NodeId};
@@ -183,6 +185,26 @@ fn the_coflash_command_finds_the_device_at_its_serial_port() {
         format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert!(output.status.success(), "{told}");
     assert!(told.contains("the bootloader") && told.contains(bsp::IDENTITY.device_name), "{told}");
+}
+
+/// python-can's adapter and python-canopen, neither of which knows that there is no box between: they install and start the application.
+#[test]
+fn python_canopen_flashes_the_device_through_its_serial_port() {
+    let python = env::var_os("COBOOT_PYTHON")
+        .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
+    let file =
+        PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(firmware::APP_VIRTUAL_CAN).with_extension("blk");
+    fs::write(&file, firmware::blocks(firmware::APP_VIRTUAL_CAN).emit()).unwrap();
+    let mut endpoint = Endpoint::serial(empty_board());
+    let port = endpoint.url().replace("@125k", "");
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/python/canopen_client.py");
+    let output = endpoint.run(Command::new(python).arg(script).arg(port).arg(file));
+    let told =
+        format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{told}");
+    assert!(told.contains("the application reports 1F51h = 01h and the same 1F56h"), "{told}");
+    assert!(endpoint.bench.records().is_empty(), "something was on the CAN bus");
+    endpoint.bench.assert_nothing_unmodelled();
 }
 
 #[test]
