@@ -162,7 +162,6 @@ mod app {
                 heartbeat_ms: HEARTBEAT_MS,
                 nmt: NmtPolicy::StayPreOperational,
                 sdo: SdoConfig { unknown_request: PROFILE.unknown_request, ..SdoConfig::DEFAULT },
-                ..node::Config::default()
             },
             ..slave::Config::default()
         };
