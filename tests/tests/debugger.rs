@@ -8,7 +8,7 @@ use canopen::debugger::Stop;
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;
-use coboot_tests::firmware;
+use coboot_tests::{firmware, script};
 use coflash::debugger::{Debugger, NoBreakpoint, Stopped};
 use coflash::error::Error;
 use coflash::flash::{flash, FlashOptions};
@@ -42,6 +42,8 @@ fn bootloader() -> Bench {
     let mut bench = Bench::of_image(firmware::BOOTLOADER_DEBUGGER);
     bench.power_on();
     bench.await_boot_up(100);
+    // The emergency behind the boot-up.
+    bench.run_ms(10);
     bench
 }
 
@@ -250,6 +252,18 @@ fn a_secured_device_tells_nothing() {
             assert_eq!(read(&mut bench, at, 4), before);
         }
     }
+}
+
+/// What the document says, frame by frame.
+#[test]
+fn the_scripts_of_the_document_are_played() {
+    for mut bench in [bootloader(), application()] {
+        script::play(&mut bench, "debugger-memory.candump");
+        bench.assert_nothing_unmodelled();
+    }
+    let mut bench = application();
+    script::play(&mut bench, "debugger-stop.candump");
+    bench.assert_nothing_unmodelled();
 }
 
 /// The standard images have no such object.

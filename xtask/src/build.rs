@@ -198,8 +198,9 @@ const RESCUE: &str = "emcy,lss,raw-image,rescue-window";
 /// without the dialects.
 pub const LOGS: [(&str, &str); 3] =
     [("rtt", "emcy,lss,log-rtt"), ("defmt", "emcy,lss,log-defmt"), ("uart", "emcy,lss,log-uart")];
-/// The one with the debugger interface, for the tests: without the programs that come in one piece, or it would not fit.
-pub const DEBUGGER: &str = "emcy,lss,debugger";
+/// The one with the debugger interface, for the tests: without programs that come in one piece and layer setting services, or it would
+/// not fit.
+pub const DEBUGGER: &str = "emcy,debugger";
 /// A bootloader that speaks CAN over the UART, without the dialects as there is no room for them.
 pub const VIRTUAL_CAN: &str = "emcy,lss,virtual-can";
 /// All of them.
