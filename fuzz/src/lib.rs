@@ -3,6 +3,9 @@
 /// The devices and the wire of `canopen`'s own tests.
 #[path = "../../canopen/tests/common/mod.rs"]
 pub mod device;
+/// The memory of `canopen`'s own tests of the debugger interface.
+#[path = "../../canopen/tests/memory/mod.rs"]
+pub mod memory;
 /// The strict flash of `boot-core`'s own tests.
 #[path = "../../boot-core/tests/model/mod.rs"]
 pub mod model;

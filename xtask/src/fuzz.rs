@@ -10,8 +10,8 @@ use crate::{process, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask fuzz [--seconds N] [--target NAME]
 
-Runs the fuzz targets of fuzz/: SDO server, SDO client, the wire between them, LSS, program download by
-blocks and in one piece,
+Runs the fuzz targets of fuzz/: SDO server, SDO client, the wire between them, LSS, debugger interface,
+program download by blocks and in one piece,
 parameter journal, firmware files, candump logs, the text of SLCAN and socketcand, job and
 configuration files. What they find in this run is built upon in the next one.
 
