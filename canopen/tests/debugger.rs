@@ -113,9 +113,19 @@ fn data_of_another_length_are_refused_and_nothing_is_written() {
         assert_eq!(target.ask([last, 9, 9, 9, 9, 9, 9, 0]), abort);
         assert_eq!(status(&mut target), 2);
     }
+    // Too much, told by nobody: what was a whole piece before it is not written either.
+    command(&mut target, Kind::Write, RAM, PIECE as u16).unwrap();
+    assert_eq!(target.ask([0x20, 0x25, 0x10, 0x04, 0, 0, 0, 0])[0], 0x60);
+    let answers: Vec<u8> = (0..19).map(|n| target.ask([(n % 2) << 4, 9, 9, 9, 9, 9, 9, 9])[0]).collect();
+    assert!(
+        answers[..18].iter().all(|answer| answer & 0xE0 == 0x20) && answers[18] == 0x80,
+        "{answers:02X?}"
+    );
     assert_eq!(target.model().ram, before);
     assert_eq!(target.model().touched, []);
-    // The command still stands.
+    // A command still stands.
+    command(&mut target, Kind::Write, RAM, 5).unwrap();
+    assert_eq!(write(&mut target, DATA, &[1; 6]), Err(AbortCode(0x0607_0012)));
     write(&mut target, DATA, &[7; 5]).unwrap();
     assert_eq!(target.model().ram[..6], [7, 7, 7, 7, 7, before[5]]);
     assert_eq!(status(&mut target), 0);
