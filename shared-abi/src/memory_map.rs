@@ -12,7 +12,7 @@
 //! USB, Ethernet, the camera, cryptography, random numbers and external memory: some of them stall the bus while they have no
 //! clock. The bit-band aliases and the alias of the flash at 0 are left out because they lead around this table.
 
-use crate::geometry::{Geometry, Region};
+use crate::geometry::{Geometry, Region, STM32F407VG, STM32F429ZI, STM32F446RE};
 
 /// One-time programmable bytes, unique ID and flash size (RM0090, embedded flash and device electronic signature).
 const SYSTEM: Region = Region::new(0x1FFF_7800, 0x224);
@@ -82,12 +82,16 @@ const F446: &[Region] = &[
     Region::new(0x4002_6000, 0x0800), // DMA1, DMA2
 ];
 
-/// The peripherals of a chip. A chip that is not listed has none: its memory can be looked at all the same.
-fn peripherals(chip: &Geometry) -> &'static [Region] {
-    match chip.chip {
-        "stm32f407vg" => F407,
-        "stm32f429zi" => F429,
-        "stm32f446re" => F446,
+/// The peripherals of a chip, which its number of interrupt lines tells: firmware does without the names. A chip that is not listed
+/// has none: its memory can be looked at all the same.
+const fn peripherals(chip: &Geometry) -> &'static [Region] {
+    const LINES_F407: u16 = STM32F407VG.interrupts;
+    const LINES_F429: u16 = STM32F429ZI.interrupts;
+    const LINES_F446: u16 = STM32F446RE.interrupts;
+    match chip.interrupts {
+        LINES_F407 => F407,
+        LINES_F429 => F429,
+        LINES_F446 => F446,
         _ => &[],
     }
 }
@@ -119,7 +123,7 @@ pub fn may_write(chip: &Geometry, address: u32, len: u32) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::{CHIPS, STM32F407VG, STM32F429ZI, STM32F446RE};
+    use crate::geometry::CHIPS;
 
     /// First and last word of what there is, and the words beside it (RM0090 tables 1 and 5).
     #[test]
@@ -188,6 +192,17 @@ mod tests {
             let [a, b, c] = [&STM32F407VG, &STM32F429ZI, &STM32F446RE].map(|chip| may_read(chip, address, 4));
             assert_eq!([a, b, c], on, "{address:08X}");
         }
+    }
+
+    /// The firmware's layout has none.
+    #[test]
+    fn a_chip_is_known_without_its_name() {
+        for chip in CHIPS {
+            let nameless = Geometry { chip: "", ..**chip };
+            assert!(may_read(&nameless, 0x4002_3800, 4) && may_write(&nameless, 0x4000_6400, 4));
+        }
+        let other = Geometry { interrupts: 1, ..STM32F407VG };
+        assert!(!may_read(&other, 0x4002_3800, 4) && may_read(&other, 0x0800_0000, 4));
     }
 
     #[test]
