@@ -15,9 +15,9 @@ pub mod debugger;
 mod drivers;
 #[cfg(all(target_arch = "arm", feature = "monitor"))]
 pub mod monitor;
-#[cfg(any(test, feature = "uart", not(target_arch = "arm")))]
+#[cfg(any(feature = "uart", not(target_arch = "arm")))]
 pub mod ring;
-#[cfg(any(test, feature = "virtual-can", not(target_arch = "arm")))]
+#[cfg(any(feature = "virtual-can", not(target_arch = "arm")))]
 pub mod slcan;
 pub mod uart;
 #[cfg(all(target_arch = "arm", feature = "virtual-can"))]

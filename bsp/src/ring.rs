@@ -1,6 +1,6 @@
 //! A ring of bytes between an interrupt and the rest of the program: one side puts, the other takes, and neither waits.
 
-use core::sync::atomic::{AtomicU8, AtomicUsize, Ordering};
+use core::sync::atomic::{AtomicBool, AtomicU8, AtomicUsize, Ordering};
 
 /// Room for `N` - 1 bytes: a full ring would look like an empty one.
 pub struct Ring<const N: usize> {
@@ -59,20 +59,56 @@ impl<const N: usize> Default for Ring<N> {
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::Ring;
+/// A byte in the place of those that are missing.
+pub const LOST: u8 = 0;
 
-    #[test]
-    fn bytes_come_out_as_they_went_in_and_one_too_many_is_refused() {
-        let ring: Ring<4> = Ring::new();
-        for round in 0..10 {
-            assert!(ring.is_empty() && ring.take().is_none());
-            assert_eq!([1, 2, 3, 4].map(|byte| ring.put(byte + round)), [true, true, true, false]);
-            assert_eq!((ring.len(), ring.room()), (3, 0));
-            assert_eq!(ring.take(), Some(1 + round));
-            assert!(ring.put(9) && !ring.put(9));
-            assert_eq!([(); 4].map(|()| ring.take()), [Some(2 + round), Some(3 + round), Some(9), None]);
+/// What comes from a line that loses bytes now and then, with a mark wherever some are missing.
+pub struct Inbox<const N: usize> {
+    ring: Ring<N>,
+    /// Bytes are missing behind the last one of the ring, and the mark is not there yet.
+    gap: AtomicBool,
+    lost: AtomicBool,
+}
+
+impl<const N: usize> Inbox<N> {
+    /// An empty one.
+    #[must_use]
+    pub const fn new() -> Self {
+        Self { ring: Ring::new(), gap: AtomicBool::new(false), lost: AtomicBool::new(false) }
+    }
+
+    /// A byte has come, or one that cannot be read; behind it, others may be missing.
+    pub fn come(&self, byte: Option<u8>, others_missing: bool) {
+        if self.gap.load(Ordering::Relaxed) && self.ring.room() >= 2 {
+            self.ring.put(LOST);
+            self.gap.store(false, Ordering::Relaxed);
         }
+        let fits = !self.gap.load(Ordering::Relaxed) && self.ring.put(byte.unwrap_or(LOST));
+        let gap = !fits || others_missing;
+        self.gap.store(gap, Ordering::Relaxed);
+        if gap || byte.is_none() {
+            self.lost.store(true, Ordering::Relaxed);
+        }
+    }
+
+    /// Takes a byte or a mark, if there is one.
+    pub fn take(&self) -> Option<u8> {
+        self.ring.take()
+    }
+
+    /// Whether it is time to take: half of the room is used.
+    pub fn is_pressing(&self) -> bool {
+        self.ring.len() > self.ring.room()
+    }
+
+    /// Whether something was lost since the question before.
+    pub fn take_lost(&self) -> bool {
+        self.lost.swap(false, Ordering::Relaxed)
+    }
+}
+
+impl<const N: usize> Default for Inbox<N> {
+    fn default() -> Self {
+        Self::new()
     }
 }

@@ -6,6 +6,8 @@
 
 use embedded_can::{ExtendedId, Frame, Id, StandardId};
 
+use crate::ring::LOST;
+
 /// The longest line of the protocol without its end: a data frame of eight bytes with an identifier of 29 bits.
 const LONGEST: usize = 1 + 8 + 1 + 16;
 /// The longest text of a frame, with its end.
@@ -15,8 +17,6 @@ pub const END: u8 = b'\r';
 /// BEL: a command is refused.
 const REFUSED: Answer = Answer::of(&[0x07]);
 const DONE: Answer = Answer::of(&[END]);
-/// A byte that stands in for those that were lost. No line with it in it is one.
-pub const LOST: u8 = 0;
 
 /// What the host hears to a line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

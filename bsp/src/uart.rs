@@ -175,23 +175,3 @@ mod drivers {
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::divider;
-
-    /// RM0090 section 30.3.4 (42 MHz, 16 samples a bit): USARTDIV 22.8125 for 115.2 kbit/s, 273.4375 for 9.6, 2.875 for 921.6 (0.93 % off).
-    #[test]
-    fn dividers_of_the_manual() {
-        assert_eq!(divider(42_000_000, 115_200), Some(365));
-        assert_eq!(divider(42_000_000, 9_600), Some(4375));
-        assert_eq!(divider(42_000_000, 921_600), Some(46));
-        assert_eq!(divider(16_000_000, 1_000_000), Some(16));
-        // 15 cycles a bit are too few, 2.8 % are too far off, 65 536 do not fit.
-        for (clock, rate) in
-            [(15_000_000, 1_000_000), (1_750_000, 100_000), (42_000_000, 600), (42_000_000, 0)]
-        {
-            assert_eq!(divider(clock, rate), None, "{clock} {rate}");
-        }
-    }
-}

@@ -1,24 +1,20 @@
 //! CAN over the board's UART, in the place of bxCAN (feature `virtual-can`): the device and, on the same two wires, an SLCAN adapter
 //! of its own. What a program does with it is what it does with [`can::Port`](crate::can::Port).
 
-use core::sync::atomic::{AtomicBool, Ordering};
-
 use cortex_m::peripheral::NVIC;
 use embedded_can::{Frame, Id};
 use stm32f4xx_hal::pac::Interrupt;
 
 use crate::can::{BitTiming, Errors, Lost, Mode};
-use crate::ring::Ring;
+use crate::ring::{Inbox, Ring};
 use crate::slcan::{self, Slcan, END, FRAME_TEXT};
 use crate::uart::{self, Received};
 use crate::UartController;
 
 /// Bytes from the host that wait: nine frames, so that a task may take a while.
-static RECEIVED: Ring<256> = Ring::new();
+static RECEIVED: Inbox<256> = Inbox::new();
 /// Bytes to the host.
 static TO_SEND: Ring<512> = Ring::new();
-/// Bytes from the host were lost.
-static OVERRUN: AtomicBool = AtomicBool::new(false);
 /// What answers leave free for frames: a host that asks and asks cannot silence the device.
 const FOR_FRAMES: usize = 4 * FRAME_TEXT;
 /// Identifiers that a slave wants to hear.
@@ -125,30 +121,18 @@ impl Port {
 
     /// Where something was lost since the question before.
     pub fn take_lost(&mut self) -> Lost {
-        let in_controller = OVERRUN.swap(false, Ordering::Relaxed);
-        Lost { in_controller, ..core::mem::take(&mut self.lost) }
+        Lost { in_controller: RECEIVED.take_lost(), ..core::mem::take(&mut self.lost) }
     }
 }
 
 /// The UART's interrupt: takes the byte that has come, sends the next one. It comes before all tasks, and tells them by the interrupts
 /// of the controller in whose place it is.
 fn serve() {
-    /// Something is missing in front of the next byte.
-    static GAP: AtomicBool = AtomicBool::new(false);
     // SAFETY: of the registers that it touches, the port changes the control register alone, and does so while this cannot come.
     let mut uart = unsafe { uart::Port::<UartController>::steal() };
     if let Some(Received { byte, overrun }) = uart.receive() {
-        // A mark in the place of what is missing, so that no line is taken for another.
-        if GAP.load(Ordering::Relaxed) && RECEIVED.room() >= 2 {
-            GAP.store(false, Ordering::Relaxed);
-            RECEIVED.put(slcan::LOST);
-        }
-        let fits = !GAP.load(Ordering::Relaxed) && RECEIVED.put(byte.unwrap_or(slcan::LOST));
-        if !fits || overrun || byte.is_none() {
-            OVERRUN.store(true, Ordering::Relaxed);
-        }
-        GAP.store(!fits || overrun, Ordering::Relaxed);
-        if byte == Some(END) || RECEIVED.room() < RECEIVED.len() {
+        RECEIVED.come(byte, overrun);
+        if byte == Some(END) || RECEIVED.is_pressing() {
             NVIC::pend(Interrupt::CAN1_RX0);
         }
     }

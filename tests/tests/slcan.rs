@@ -180,7 +180,7 @@ fn a_line_with_a_gap_is_refused() {
     let mut slcan = open();
     let (head, tail) = (&b"t60182"[..], &b"F511F0101000000\r"[..]);
     assert_eq!(say(&mut slcan, &[head, tail].concat()).1.len(), 1);
-    assert_eq!(say(&mut slcan, &[head, &[bsp::slcan::LOST], tail].concat()), ("\x07".to_owned(), vec![]));
+    assert_eq!(say(&mut slcan, &[head, &[bsp::ring::LOST], tail].concat()), ("\x07".to_owned(), vec![]));
     assert_eq!(say(&mut slcan, b"F\rF\r").0, "F08\rF00\r");
 }
 

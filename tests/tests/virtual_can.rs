@@ -174,6 +174,7 @@ fn never_silent_during_an_erase() {
 }
 
 /// The command line, in real time, by a terminal that it takes for a serial port.
+#[cfg(unix)]
 #[test]
 fn the_coflash_command_finds_the_device_at_its_serial_port() {
     let coflash = env::var_os("COBOOT_COFLASH")
@@ -188,6 +189,7 @@ fn the_coflash_command_finds_the_device_at_its_serial_port() {
 }
 
 /// python-can's adapter and python-canopen, neither of which knows that there is no box between: they install and start the application.
+#[cfg(unix)]
 #[test]
 fn python_canopen_flashes_the_device_through_its_serial_port() {
     let python = env::var_os("COBOOT_PYTHON")

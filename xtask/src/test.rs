@@ -82,8 +82,8 @@ pub fn run(mut args: Args) -> Outcome {
 }
 
 /// The test programs that every board goes through each time: what a port can get wrong shows in them.
-const MAIN_TESTS: [&str; 7] =
-    ["main_job", "device", "watchdog", "boot_time", "abi", "c_application", "handover"];
+const MAIN_TESTS: [&str; 9] =
+    ["main_job", "device", "watchdog", "boot_time", "abi", "c_application", "handover", "log", "virtual_can"];
 
 /// What has been tested so far, and what the tests need to know.
 struct Suite {
