@@ -9,7 +9,7 @@ use crate::{pac, LAYOUT};
 pub enum Refused {
     /// Something else lies there, or nothing (`shared_abi::memory_map`).
     Address,
-    /// The flash is busy: reading it now would stop the CPU until that is over.
+    /// The flash is busy: reading it now would stop the CPU until that is over. Or the CCM has no clock.
     Busy,
 }
 
@@ -30,9 +30,7 @@ pub fn read(address: u32, bytes: &mut [u8]) -> Result<(), Refused> {
     if !may_read(LAYOUT.chip, address, bytes.len() as u32) {
         return Err(Refused::Address);
     }
-    // SAFETY: reading this register changes nothing.
-    let flash = unsafe { pac::FLASH::steal() };
-    if LAYOUT.chip.flash.contains(address, 1) && flash.sr().read().bsy().bit_is_set() {
+    if is_busy(address) {
         return Err(Refused::Busy);
     }
     let mut at = address;
@@ -58,10 +56,13 @@ pub fn read(address: u32, bytes: &mut [u8]) -> Result<(), Refused> {
 /// Writes RAM or registers, as [`read`] reads.
 ///
 /// # Errors
-/// [`Refused::Address`]; nothing was touched then.
+/// See [`Refused`]; nothing was touched then.
 pub fn write(address: u32, bytes: &[u8]) -> Result<(), Refused> {
     if !may_write(LAYOUT.chip, address, bytes.len() as u32) {
         return Err(Refused::Address);
+    }
+    if is_busy(address) {
+        return Err(Refused::Busy);
     }
     let mut at = address;
     let mut rest = bytes;
@@ -83,6 +84,19 @@ pub fn write(address: u32, bytes: &[u8]) -> Result<(), Refused> {
         rest = behind;
     }
     Ok(())
+}
+
+/// Whether the memory at this address does not answer at present.
+fn is_busy(address: u32) -> bool {
+    /// `RCC_AHB1ENR.CCMDATARAMEN`, on after a reset (RM0090, RCC); a chip without CCM does not have it.
+    const CCM_CLOCK: u32 = 1 << 20;
+    // SAFETY: reading these registers changes nothing.
+    let (flash, rcc) = unsafe { (pac::FLASH::steal(), pac::RCC::steal()) };
+    if LAYOUT.chip.flash.contains(address, 1) {
+        flash.sr().read().bsy().bit_is_set()
+    } else {
+        LAYOUT.chip.ccm.contains(address, 1) && rcc.ahb1enr().read().bits() & CCM_CLOCK == 0
+    }
 }
 
 /// The widest access that fits.

@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 use std::fmt::Write as _;
 
+use canopen::debugger::{Stop, DEBUGGER, USER_SOFTWARE};
 use canopen::emcy::Emergency;
 use canopen::nmt::{parse_state_message, NmtState};
 use canopen::program::{self, FlashStatus, ProgramControl, BOOTLOADER_DEVICE_TYPE};
@@ -251,7 +252,13 @@ fn emergency(node: NodeId, frame: &Frame) -> String {
         0x4000..=0x4FFF => "temperature",
         0x5000..=0x50FF => "device hardware",
         0x6100..=0x61FF => "internal software",
-        0x6200..=0x62FF => "user software",
+        USER_SOFTWARE => match Stop::from_number(detail[0]) {
+            Some(Stop::Breakpoint) => "user software; from a debugger: stopped at a breakpoint",
+            Some(Stop::Step) => "user software; from a debugger: stopped",
+            Some(Stop::OutOfReach) => "user software; from a debugger: a breakpoint out of reach",
+            None => "user software",
+        },
+        0x6201..=0x62FF => "user software",
         0x6300..=0x63FF => "data set",
         0x6000..=0x6FFF => "device software",
         0x7000..=0x70FF => "additional modules",
@@ -344,6 +351,9 @@ fn object(at: Address) -> String {
         (program::DEVICE_NAME, _) => "device name",
         (program::HARDWARE_VERSION, _) => "hardware version",
         (program::SOFTWARE_VERSION, _) => "software version",
+        (DEBUGGER, 1) => "debugger command",
+        (DEBUGGER, 2) => "debugger status",
+        (DEBUGGER, 4) => "debugger data",
         (program::COB_ID_EMCY, _) => "COB-ID of EMCY",
         (program::HEARTBEAT_TIME, _) => "heartbeat time",
         (program::IDENTITY, 1) => "vendor-ID",

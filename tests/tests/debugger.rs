@@ -212,6 +212,41 @@ fn what_must_not_be_touched_is_refused_and_faults_nothing() {
     }
 }
 
+/// 08000021h, local control: the CPU would stand still until the sector is erased, or the memory has no clock.
+#[test]
+fn memory_that_does_not_answer_now_is_refused_now() {
+    let mut bench = bootloader();
+    let board = firmware::board();
+    // Twice, it is carried out at once.
+    for _ in 0..2 {
+        bench.session().command(1, canopen::program::ProgramControl::Clear).unwrap();
+    }
+    assert_eq!(command(&mut bench, 0, board.bootloader.base, 4), None);
+    let outcome = bench.session().upload(DATA, &mut |_| {}).map(|_| ());
+    assert_eq!(code(outcome), Some(0x0800_0021));
+    assert_eq!(read(&mut bench, board.handoff.base, 4).len(), 4, "RAM has nothing to do with it");
+    let status = bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
+    assert_eq!(status.to_word(), 0);
+    let expected = seen(&mut bench, board.bootloader.base, 4);
+    assert_eq!(read(&mut bench, board.bootloader.base, 4), expected);
+    // RCC_AHB1ENR bit 20 is the clock of the CCM, where there is one.
+    let ccm = board.chip.ccm;
+    if ccm.size == 0 {
+        return;
+    }
+    write(&mut bench, ccm.end() - 4, &[1, 2, 3, 4]);
+    let clocks = read_word(&mut bench, 0x4002_3830);
+    write_word(&mut bench, 0x4002_3830, clocks & !(1 << 20));
+    assert_eq!(command(&mut bench, 0, ccm.end() - 4, 4), None);
+    let outcome = bench.session().upload(DATA, &mut |_| {}).map(|_| ());
+    assert_eq!(code(outcome), Some(0x0800_0021));
+    assert_eq!(command(&mut bench, 1, ccm.end() - 4, 4), None);
+    let outcome = bench.session().write(DATA, &[9; 4], Doing::Write(DATA), &mut |_| {});
+    assert_eq!(code(outcome), Some(0x0800_0021));
+    write_word(&mut bench, 0x4002_3830, clocks);
+    assert_eq!(read(&mut bench, ccm.end() - 4, 4), [1, 2, 3, 4]);
+}
+
 #[test]
 fn data_of_another_length_are_refused() {
     let at = firmware::board().handoff.base;
