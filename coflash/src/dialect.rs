@@ -34,6 +34,8 @@ pub const ESACADEMY_PASSWORD: u32 = 0x494E_4954;
 const UNLOCK: [Address; 2] =
     [Address::new(program::UNLOCK, program::UNLOCK_FIRMWARE), Address::new(program::UNLOCK, 0)];
 
+/// The program of a lift; what else 1F50h holds are data, which are not started (CiA 814-1 clause 6.4).
+const LIFT_PROGRAM: u8 = 1;
 /// How long a lift bootloader may take to come up (CiA 814-1 clause 6.3).
 const LIFT_WAIT: Duration = Duration::from_secs(10);
 /// How often it is asked for meanwhile: a device that listens for the bit rate needs somebody who talks.
@@ -268,7 +270,6 @@ pub(crate) fn stop_program(
 pub fn enter_lift(
     session: &mut Session<'_>,
     running: DeviceType,
-    number: u8,
     password: Option<Password>,
     tell: &mut dyn FnMut(Event),
 ) -> Result<(), Error> {
@@ -283,7 +284,7 @@ pub fn enter_lift(
         unlock(session, password)?;
         tell(Event::Unlocked);
         tell(Event::CallingBack);
-        reset_program(session, number)?;
+        reset_program(session, LIFT_PROGRAM)?;
         session.talk_to(lift);
         await_lift(session)?;
         tell(Event::Moved(lift));
@@ -496,7 +497,7 @@ pub(crate) fn start(
             arrived(session, number)
         }
         Dialect::Lift => {
-            reset_program(session, number)?;
+            reset_program(session, LIFT_PROGRAM)?;
             if original == lift_node() {
                 let boot = session.timing().boot;
                 if let Some(node) = session.await_boot_up_of_another(boot)? {
@@ -532,11 +533,10 @@ pub fn read_locked(
     password: Option<Password>,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Vec<u8>, Error> {
-    const PROGRAM: u8 = 1;
     let running = find(session)?;
     let dialect = match dialect {
         Some(dialect) => dialect,
-        None => recognise(session, running, PROGRAM)?,
+        None => recognise(session, running, LIFT_PROGRAM)?,
     };
     let what = match dialect {
         Dialect::Lift => None,
@@ -547,10 +547,10 @@ pub fn read_locked(
         return Err(Error::NotInDialect { dialect, what });
     }
     let original = session.node();
-    enter_lift(session, running, PROGRAM, password, tell)?;
+    enter_lift(session, running, password, tell)?;
     let bytes = session.upload(at, &mut |_| {});
     if original != session.node() && !matches!(bytes, Err(Error::Adapter(_))) {
-        let restarted = reset_program(session, PROGRAM);
+        let restarted = reset_program(session, LIFT_PROGRAM);
         session.talk_to(original);
         restarted?;
     }

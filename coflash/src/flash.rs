@@ -419,7 +419,7 @@ fn enter(
         }
         Dialect::Lift => {
             tell(Event::Speaks(dialect));
-            dialect::enter_lift(session, running, number, options.unlock, &mut |event| {
+            dialect::enter_lift(session, running, options.unlock, &mut |event| {
                 if event == Event::CallingBack {
                     *state = DeviceState::Called;
                 }

@@ -9,7 +9,7 @@ use coflash::convert::{blocks_of, Options, Region};
 use coflash::dialect::{read_locked, recognise, Dialect, Password};
 use coflash::error::Error;
 use coflash::flash::{flash, DeviceState, Event, FlashOptions, Report};
-use coflash::read::read;
+use coflash::read::{read, Format};
 use coflash::session::Doing;
 use shared_abi::layout::stm32f407g_disc1_two;
 
@@ -138,6 +138,19 @@ fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
     assert_eq!(stored, blocks(APP_LIFT_V2).flash_image());
     bench.await_boot_up(2000);
     assert!(version(&mut bench, NODE).contains("2.0.0"), "it runs again");
+
+    // Its set of parameters (CiA 814-1 clause 6.4): any bytes, kept and given back.
+    let set: Vec<u8> = (0..3001_u32).map(|i| (i * i / 7) as u8).collect();
+    let raw = read(&set, Some(Format::Raw), Some(layout.programs[1].base)).unwrap();
+    let blocks_of_set = blocks_of(raw, &Options::default()).unwrap().file;
+    let second = FlashOptions { program: 2, ..options };
+    update(&mut bench, NODE, &blocks_of_set, &second).0.unwrap();
+    assert!(version(&mut bench, NODE).contains("2.0.0"), "the program goes on");
+    let mut session = bench.session_with(NODE);
+    let parameters = Address::new(0x1F50, 2);
+    let stored = read_locked(&mut session, parameters, None, Password::new(PASSWORD), &mut |_| {}).unwrap();
+    assert_eq!(stored, set);
+    bench.await_boot_up(2000);
 
     let wrong = FlashOptions { unlock: Password::new("Coboot"), ..FlashOptions::default() };
     let (result, events) = update(&mut bench, NODE, &blocks(APP_LIFT), &wrong);
