@@ -17,21 +17,19 @@ unsafe impl Sync for Vectors {}
 static VECTORS: Vectors = Vectors(UnsafeCell::new([0; ENTRIES]));
 
 extern "C" {
-    static __vector_table: u32;
-    static __vector_table_end: u32;
+    static __vector_table: [u32; ENTRIES];
 }
 
 /// Copies the table from flash to RAM and points the core to the copy.
 ///
 /// Call it once, with interrupts off.
 pub fn relocate(scb: &mut SCB) {
-    // SAFETY: the two symbols border the table that the linker script lays down; the chip's table has no more than
-    // `ENTRIES` entries (`min` holds even if it had); interrupts are off, so nothing reads the copy while it is made.
+    // SAFETY: the linker script lays the table down at the start of the flash, of which `ENTRIES` words can be read, and no chip's
+    // table is longer; what stands behind a shorter one is nobody's vector. Interrupts are off, so nothing reads the copy while it is
+    // made.
     unsafe {
-        let table = &raw const __vector_table;
-        let count = (&raw const __vector_table_end).offset_from_unsigned(table).min(ENTRIES);
-        let copy = VECTORS.0.get().cast::<u32>();
-        copy.copy_from_nonoverlapping(table, count);
+        let copy = VECTORS.0.get();
+        copy.copy_from_nonoverlapping(&raw const __vector_table, 1);
         scb.vtor.write(copy as u32);
     }
     cortex_m::asm::dsb();

@@ -36,13 +36,15 @@ pub fn entry_strap(rcc: &pac::RCC) -> bool {
     /// The ports lie behind one another (RM0090 and RM0390, register boundary addresses), and the switches of their clocks in the
     /// same order (RCC_AHB1ENR).
     const IDR: *const u32 = (0x4002_0010 + 0x400 * PORT) as *const u32;
-    // SAFETY: switches on the clock of a port that nobody uses before the board's `init`.
-    rcc.ahb1enr().modify(|r, w| unsafe { w.bits(r.bits() | 1 << PORT) });
-    // The clock needs two cycles before the first access: reading back waits that long.
-    let _ = rcc.ahb1enr().read();
+    let clocks = rcc.ahb1enr();
+    let before = clocks.read().bits();
+    // SAFETY: the clock of a port in addition to those that are on.
+    clocks.write(|w| unsafe { w.bits(before | 1 << PORT) });
+    // It needs two cycles before the first access: reading back waits that long.
+    let _ = clocks.read();
     // SAFETY: the inputs of a port that the chip has (`lib.rs` looks) are read, and nothing is changed.
     let inputs = unsafe { IDR.read_volatile() };
-    // SAFETY: and off again.
-    rcc.ahb1enr().modify(|r, w| unsafe { w.bits(r.bits() & !(1 << PORT)) });
+    // SAFETY: what it was.
+    clocks.write(|w| unsafe { w.bits(before) });
     (inputs & 1 << ENTRY_STRAP.1 != 0) == ENTRY_STRAP.2
 }
