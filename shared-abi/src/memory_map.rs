@@ -9,7 +9,7 @@
 //! | registers of the core, by words: DWT, FPB, system control space, DBGMCU | yes | yes |
 //!
 //! The registers of the flash are left out because a write to them could erase the bootloader. Left out altogether are
-//! USB, Ethernet, the camera, cryptography, random numbers and external memory: some of them stall the bus while they have no
+//! USB, Ethernet, the camera, cryptography, random numbers, DMA2D and external memory: some of them stall the bus while they have no
 //! clock. The bit-band aliases and the alias of the flash at 0 are left out because they lead around this table.
 
 use crate::geometry::{Geometry, Region, STM32F407VG, STM32F429ZI, STM32F446RE};

@@ -4,7 +4,7 @@
 use std::process::Command;
 use std::time::Duration;
 
-use canopen::debugger::Stop;
+use canopen::debugger::Stop as DebugStop;
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;
@@ -13,6 +13,7 @@ use coflash::debugger::{Debugger, NoBreakpoint, Stopped};
 use coflash::error::Error;
 use coflash::flash::{flash, FlashOptions};
 use coflash::session::Doing;
+use emulator::machine::{ResetCause, Stop};
 use emulator::time::Time;
 use object::{Object, ObjectSymbol};
 
@@ -500,6 +501,29 @@ fn a_breakpoint_out_of_reach_harms_nothing() {
     assert_eq!(bench.events(), [], "no reset");
 }
 
+/// A fault that is none of the debugger's restarts the device, as it does without it: here the program is sent where no code is.
+#[test]
+fn a_fault_restarts_the_device_as_ever() {
+    let mut bench = application();
+    let at = symbol("debugger_example");
+    let from = break_at(&mut bench, at);
+    assert_eq!(await_stop(&mut bench, from), stop_of_type(1, at));
+    let saved = read_word(&mut bench, DCRDR);
+    let frame = read_word(&mut bench, saved);
+    write_word(&mut bench, frame + 24, 0x6000_0000);
+    // Its answer does not get onto the bus any more.
+    assert_eq!(command(&mut bench, 1, DEMCR, 4), None);
+    let [a, b, c, d] = GO_ON.to_le_bytes();
+    bench.post(0x600 + u16::from(NODE), &[0x23, 0x25, 0x10, 0x04, a, b, c, d]);
+    bench.await_boot_up(1000);
+    let stops: Vec<Stop> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+    assert_eq!(stops, [Stop::Reset(ResetCause::Software)]);
+    assert!(!bench.session().device_type().unwrap().unwrap().is_bootloader());
+    let calls = symbol("DEBUGGER_EXAMPLE_CALLS");
+    bench.run_ms(2000);
+    assert!(read_word(&mut bench, calls) >= 2);
+}
+
 /// A stopped program is reset, goes back to the bootloader, and neither start stumbles over the breakpoint, which the core keeps over
 /// a reset.
 #[test]
@@ -554,7 +578,7 @@ fn the_host_library_sets_breakpoints_and_shows_registers() {
     // Set twice, it is one.
     debugger.break_at(at).unwrap().unwrap();
     assert_eq!(debugger.breakpoints().unwrap(), [at]);
-    let at_breakpoint = Some(Stopped { stop: Stop::Breakpoint, address: at });
+    let at_breakpoint = Some(Stopped { stop: DebugStop::Breakpoint, address: at });
     for round in 0..3 {
         assert_eq!(debugger.await_stop(second).unwrap(), at_breakpoint, "round {round}");
         let registers = debugger.registers().unwrap().unwrap();
@@ -564,7 +588,7 @@ fn the_host_library_sets_breakpoints_and_shows_registers() {
         assert!(board.ram.contains(registers.0[13], 4), "SP {:08X}", registers.0[13]);
         let counted = word(&mut debugger, calls);
         debugger.step().unwrap();
-        let Some(Stopped { stop: Stop::Step, address }) = debugger.await_stop(second).unwrap() else {
+        let Some(Stopped { stop: DebugStop::Step, address }) = debugger.await_stop(second).unwrap() else {
             panic!("no step");
         };
         assert!((at + 2..=at + 4).contains(&address), "{address:08X}");
@@ -584,10 +608,10 @@ fn the_host_library_sets_breakpoints_and_shows_registers() {
     debugger.go_on().unwrap();
     assert_eq!(debugger.await_stop(second).unwrap(), None);
     debugger.stop().unwrap();
-    assert!(matches!(debugger.await_stop(second).unwrap(), Some(Stopped { stop: Stop::Step, .. })));
+    assert!(matches!(debugger.await_stop(second).unwrap(), Some(Stopped { stop: DebugStop::Step, .. })));
     debugger.go_on().unwrap();
     debugger.break_at(out_of_reach).unwrap().unwrap();
-    let missed = Some(Stopped { stop: Stop::OutOfReach, address: out_of_reach });
+    let missed = Some(Stopped { stop: DebugStop::OutOfReach, address: out_of_reach });
     assert_eq!(debugger.await_stop(second).unwrap(), missed);
     // What was left behind does not come back with the next one.
     debugger.break_at(at).unwrap().unwrap();
