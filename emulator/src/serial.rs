@@ -143,7 +143,10 @@ impl Line {
         }
         match self {
             #[cfg(unix)]
-            Self::Terminal(terminal) => terminal.ours.write(bytes).unwrap_or(0),
+            // Writing waits for as long as not all of it finds room, and only that there is some is asked before: a byte at a time.
+            Self::Terminal(terminal) => {
+                bytes.iter().take_while(|byte| matches!(terminal.ours.write(&[**byte]), Ok(1))).count()
+            }
             Self::Tcp { client, .. } => {
                 let Some(stream) = client else { return bytes.len() };
                 match stream.write(bytes) {
