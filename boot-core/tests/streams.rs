@@ -280,6 +280,8 @@ fn what_is_seen_later_leaves_no_program_and_the_next_attempt_works() {
         assert_eq!(bench.read_state(), 3, "{what}");
         assert_eq!(bench.command(START), 2, "{what}: NOVALPROG");
         assert_eq!(bench.stream(&image, None, 7).0, Err(STATE), "{what}: CLEAR comes first");
+        // Nor do blocks go on where the stream ended.
+        assert_eq!(bench.block(&block(0, 0, &[0; 8])).0, Err(STATE), "{what}: CLEAR comes first");
         assert_eq!(bench.command(CLEAR), 0);
         assert_eq!(bench.stream(text.as_bytes(), None, 7), (Ok(()), 0), "{what}");
         assert_eq!(autostart(&flash), Ok(0x99), "{what}");
