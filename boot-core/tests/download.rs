@@ -13,7 +13,7 @@ use boot_core::program::{verify, Invalid};
 use canopen::od::{Address, Objects};
 use canopen::program::{FlashError, ProgramControl};
 use canopen::AbortCode;
-use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP};
+use model::{ModelFlash, CHIP};
 use shared_abi::block_file::Control;
 use shared_abi::geometry::Region;
 use shared_abi::warm_start::BootRequest;
@@ -284,47 +284,16 @@ fn faults_of_the_flash_are_told_and_clear_begins_anew() {
 /// and the update then completes.
 #[test]
 fn an_update_cut_anywhere_leaves_the_old_the_new_or_no_program() {
-    quiet_power_cuts();
     let (old, new) = (program(200, 0xA0), program(300, 0xB0));
     let mut installed = ModelFlash::new(&CHIP);
     let mut bench = Bench::new(&mut installed);
     bench.install(&old);
     assert_eq!(bench.command(SET_SIGNATURE), 0);
-    assert_eq!(autostart(&installed), Ok(0xA0));
-
-    let update = |flash: &mut ModelFlash| {
+    cut_at_every_operation(&installed, 0xA0, 0xB0, |flash| {
         let mut bench = Bench::new(flash);
         bench.install(&new);
         assert_eq!(bench.command(SET_SIGNATURE), 0);
-    };
-    let cells = installed.cells(CHIP.flash).to_vec();
-    let fresh = || {
-        let mut flash = ModelFlash::new(&CHIP);
-        flash.poke(CHIP.flash.base, &cells);
-        flash
-    };
-    let mut flash = fresh();
-    update(&mut flash);
-    let operations = flash.operations;
-    assert!(operations > 80, "{operations}");
-    let mut seen = [0; 3];
-    for operation in 1..=operations {
-        for cut in [Cut::Before, Cut::After, Cut::Torn(7), Cut::Torn(8)] {
-            let mut flash = fresh();
-            flash.cut = Some((operation, cut));
-            assert!(until_power_cut(|| update(&mut flash)));
-            flash.power_on();
-            match autostart(&flash) {
-                Ok(0xA0) => seen[0] += 1,
-                Ok(0xB0) => seen[1] += 1,
-                Err(_) => seen[2] += 1,
-                other => panic!("cut {cut:?} at operation {operation}: {other:?} would start"),
-            }
-            update(&mut flash);
-            assert_eq!(autostart(&flash), Ok(0xB0), "cut {cut:?} at operation {operation}");
-        }
-    }
-    assert!(seen.iter().all(|count| *count > 0), "old, new, none: {seen:?}");
+    });
 }
 
 /// Control block with identity: application size, vendor-ID, product code (SYS TEC manual, table 6).

@@ -12,7 +12,7 @@ use canopen::{AbortCode, BitRate, NodeId};
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
-use crate::model::{ModelFlash, CHIP};
+use crate::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP};
 
 pub const LAYOUT: Layout = Layout {
     board: "model",
@@ -261,4 +261,39 @@ pub fn autostart(flash: &ModelFlash) -> Result<u8, Invalid> {
     } else {
         Err(Invalid::Absent)
     }
+}
+
+/// An update of an installed program, cut at every operation: what starts afterwards is the old program or the new one (told by
+/// their seeds), whole, or nothing; and the update then completes.
+pub fn cut_at_every_operation(installed: &ModelFlash, old: u8, new: u8, update: impl Fn(&mut ModelFlash)) {
+    quiet_power_cuts();
+    let cells = installed.cells(CHIP.flash).to_vec();
+    let fresh = || {
+        let mut flash = ModelFlash::new(&CHIP);
+        flash.poke(CHIP.flash.base, &cells);
+        flash
+    };
+    assert_eq!(autostart(&fresh()), Ok(old));
+    let mut flash = fresh();
+    update(&mut flash);
+    let operations = flash.operations;
+    assert!(operations > 80, "{operations}");
+    let mut seen = [0; 3];
+    for operation in 1..=operations {
+        for cut in [Cut::Before, Cut::After, Cut::Torn(7), Cut::Torn(8)] {
+            let mut flash = fresh();
+            flash.cut = Some((operation, cut));
+            assert!(until_power_cut(|| update(&mut flash)));
+            flash.power_on();
+            match autostart(&flash) {
+                Ok(seed) if seed == old => seen[0] += 1,
+                Ok(seed) if seed == new => seen[1] += 1,
+                Err(_) => seen[2] += 1,
+                other => panic!("cut {cut:?} at operation {operation}: {other:?} would start"),
+            }
+            update(&mut flash);
+            assert_eq!(autostart(&flash), Ok(new), "cut {cut:?} at operation {operation}");
+        }
+    }
+    assert!(seen.iter().all(|count| *count > 0), "old, new, none: {seen:?}");
 }
