@@ -314,46 +314,52 @@ fn procedure(
     }
     let original = session.node();
     let dialect = enter(session, running, options, state, tell)?;
-    let content = dialect.content(file);
-    if let Some(content) = content {
-        if options.trial_run {
-            return Err(Error::NotInDialect { dialect, what: "there are no signatures, so no trial either" });
+    let (repeats, transfer) = match dialect.content(file) {
+        Some(content) if !options.trial_run => {
+            let transfer_began = session.now();
+            let repeats = dialect::send(session, dialect, &content, options, state, tell)?;
+            let transfer = session.now().saturating_sub(transfer_began);
+            *state = DeviceState::Written;
+            // What 1F56h reads is a CRC in this bootloader and its like; elsewhere it is whatever its maker took.
+            if dialect::knows_crc(session)? {
+                verify(session, number, file.program_crc(), tell)?;
+            }
+            (repeats, transfer)
         }
-        let transfer_began = session.now();
-        let repeats = dialect::send(session, dialect, &content, options, state, tell)?;
-        let transfer = session.now().saturating_sub(transfer_began);
-        *state = DeviceState::Written;
-        // What 1F56h reads is a CRC in this bootloader and its like; elsewhere it is whatever its maker took.
-        if dialect::knows_crc(session)? {
-            verify(session, number, file.program_crc(), tell)?;
+        Some(_) => {
+            return Err(Error::NotInDialect { dialect, what: "there are no signatures, so no trial either" })
         }
-        let running = if options.start {
-            tell(Event::Starting);
-            let running = dialect::start(session, dialect, original, number)?;
-            tell(Event::Started(running));
-            Some(running)
-        } else {
-            None
-        };
-        if options.verify {
-            let crc = file.program_crc();
-            compare_crc(session, number, crc)?;
-            tell(Event::VerifiedAgain { crc });
-        }
-        let took = session.now().saturating_sub(began);
-        let (program_size, program_crc) = (file.program_size(), file.program_crc());
-        let transfers = session.transfers();
-        return Ok(Report {
-            program_size,
-            program_crc,
-            repeats,
-            took,
-            transfer,
-            transfers,
-            running,
-            dialect,
-        });
+        None => by_blocks(session, file, options, state, tell)?,
+    };
+    let running = if options.start {
+        tell(Event::Starting);
+        let running = dialect::start(session, dialect, original, number)?;
+        tell(Event::Started(running));
+        Some(running)
+    } else {
+        None
+    };
+    if options.verify {
+        let crc = file.program_crc();
+        compare_crc(session, number, crc)?;
+        tell(Event::VerifiedAgain { crc });
     }
+    let took = session.now().saturating_sub(began);
+    let (program_size, program_crc) = (file.program_size(), file.program_crc());
+    let transfers = session.transfers();
+    Ok(Report { program_size, program_crc, repeats, took, transfer, transfers, running, dialect })
+}
+
+/// The way of the dialect `block`: erases, sends the blocks, compares, tries if it is asked to, and signs. Gives how often a block was
+/// repeated, and how long the blocks took.
+fn by_blocks(
+    session: &mut Session<'_>,
+    file: &BlockFile,
+    options: &FlashOptions,
+    state: &mut DeviceState,
+    tell: &mut dyn FnMut(Event),
+) -> Result<(u32, Duration), Error> {
+    let number = options.program;
     let before = std::mem::replace(state, DeviceState::Erased);
     erase(session, number, tell)?;
     let transfer_began = session.now();
@@ -379,23 +385,7 @@ fn procedure(
     }
     sign(session, number, tell)?;
     *state = DeviceState::Signed;
-    let running = if options.start {
-        tell(Event::Starting);
-        let running = start(session, number)?;
-        tell(Event::Started(running));
-        Some(running)
-    } else {
-        None
-    };
-    if options.verify {
-        let crc = file.program_crc();
-        compare_crc(session, number, crc)?;
-        tell(Event::VerifiedAgain { crc });
-    }
-    let took = session.now().saturating_sub(began);
-    let (program_size, program_crc) = (file.program_size(), file.program_crc());
-    let transfers = session.transfers();
-    Ok(Report { program_size, program_crc, repeats, took, transfer, transfers, running, dialect })
+    Ok((repeats, transfer))
 }
 
 /// Step 3 in whatever dialect: afterwards the bootloader is running, and what it speaks is known.

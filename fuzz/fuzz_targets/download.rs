@@ -7,25 +7,13 @@
 use boot_core::download::{Downloader, Policy, Step};
 use boot_core::parameters::Journal;
 use canopen::program::{FlashError, FlashStatus, ProgramControl};
-use coboot_fuzz::model::{ModelFlash, CHIP};
+use coboot_fuzz::model::{ModelFlash, CHIP, ONE_PROGRAM};
 use coboot_fuzz::Input;
 use coflash::block_file::{Block, CRC};
 use libfuzzer_sys::fuzz_target;
-use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
-static LAYOUT: Layout = Layout {
-    board: "model",
-    chip: &CHIP,
-    bootloader: Region::new(0x0800_0000, 0x400),
-    callgate_offset: 0x200,
-    parameters: [Region::new(0x0800_0400, 0x200), Region::new(0x0800_0600, 0x200)],
-    programs: &[Region::new(0x0800_0800, 0x3C00)],
-    ram: Region::new(0x2000_0000, 0x1_FFC0),
-    handoff: Region::new(0x2001_FFC0, 48),
-    warm_start: Region::new(0x2001_FFF0, 16),
-}
-.checked();
+static LAYOUT: Layout = ONE_PROGRAM;
 
 /// The largest block that the device takes.
 const BUFFER: usize = 256;

@@ -14,24 +14,12 @@ use canopen::device::Device;
 use canopen::od::{Entry, Objects};
 use canopen::program::{ENABLE_FLASH, PROGRAM_CONTROL, PROGRAM_DATA, UNLOCK, UNLOCK_FIRMWARE};
 use canopen::{AbortCode, Address, BitRate, Instant, NodeId};
-use coboot_fuzz::model::{ModelFlash, CHIP};
+use coboot_fuzz::model::{ModelFlash, CHIP, TWO_PROGRAMS};
 use coboot_fuzz::Input;
 use libfuzzer_sys::fuzz_target;
-use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
-static LAYOUT: Layout = Layout {
-    board: "model",
-    chip: &CHIP,
-    bootloader: Region::new(0x0800_0000, 0x400),
-    callgate_offset: 0x200,
-    parameters: [Region::new(0x0800_0400, 0x200), Region::new(0x0800_0600, 0x200)],
-    programs: &[Region::new(0x0800_0800, 0x1C00), Region::new(0x0800_2400, 0x2000)],
-    ram: Region::new(0x2000_0000, 0x1_FFC0),
-    handoff: Region::new(0x2001_FFC0, 48),
-    warm_start: Region::new(0x2001_FFF0, 16),
-}
-.checked();
+static LAYOUT: Layout = TWO_PROGRAMS;
 
 const PROGRAMS: usize = 2;
 const DATA: Address = Address::new(PROGRAM_DATA, 1);

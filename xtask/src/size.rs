@@ -23,9 +23,9 @@ it is over the budget.
   --yes           installs what is missing with sudo
 ";
 
-/// What the bootloader may take of its region, in bytes: all of it, which is the hard limit. The aim is 24 KiB
-/// (docs/adr/0007-resident-part.md).
-pub const BUDGET: u32 = 32 * 1024;
+/// What the bootloader may take of its region, in bytes: so much less than all of it that this is told before the linker fails. The
+/// aim is 24 KiB (docs/adr/0007-resident-part.md).
+pub const BUDGET: u32 = 31 * 1024 + 512;
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
@@ -129,7 +129,7 @@ fn by_feature(board: &Layout) -> Outcome<String> {
     let bare = used(&[])?;
     let mut text = String::from("feature                          bytes, on top of none\n");
     for feature in build::OPTIONAL {
-        let _ = writeln!(text, "{feature:<31} {:>6}", used(&[feature])?.saturating_sub(bare));
+        let _ = writeln!(text, "{feature:<31} {:>6}", i64::from(used(&[feature])?) - i64::from(bare));
     }
     let _ = writeln!(text, "\nbootloader                       bytes\n{:<31} {bare:>6}", "without features");
     for features in [build::STANDARD, build::COMPLETE, "profile-paulus", "profile-esacademy", "profile-lift"]

@@ -12,20 +12,9 @@ use canopen::{AbortCode, BitRate, NodeId};
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
-use crate::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP};
+use crate::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
 
-pub const LAYOUT: Layout = Layout {
-    board: "model",
-    chip: &CHIP,
-    bootloader: Region::new(0x0800_0000, 0x400),
-    callgate_offset: 0x200,
-    parameters: [Region::new(0x0800_0400, 0x200), Region::new(0x0800_0600, 0x200)],
-    programs: &[Region::new(0x0800_0800, 0x3C00)],
-    ram: Region::new(0x2000_0000, 0x1_FFC0),
-    handoff: Region::new(0x2001_FFC0, 48),
-    warm_start: Region::new(0x2001_FFF0, 16),
-}
-.checked();
+pub const LAYOUT: Layout = ONE_PROGRAM;
 pub static LAYOUT_REF: &Layout = &LAYOUT;
 pub const PROGRAM: Region = LAYOUT.programs[0];
 

@@ -8,6 +8,7 @@ use std::task::Poll;
 
 use boot_core::flash::{Flash, FlashFault};
 use shared_abi::geometry::{Geometry, Region, Sector, SectorRun, STM32F407VG};
+use shared_abi::layout::Layout;
 
 /// The F407 with sectors a 64th of their size: the same shape, and cheap to erase in a model.
 pub static CHIP: Geometry = Geometry {
@@ -22,6 +23,25 @@ pub static CHIP: Geometry = Geometry {
     ports: 1,
     ..STM32F407VG
 };
+
+/// The flash of [`CHIP`] with one program.
+pub const ONE_PROGRAM: Layout = Layout {
+    board: "model",
+    chip: &CHIP,
+    bootloader: Region::new(0x0800_0000, 0x400),
+    callgate_offset: 0x200,
+    parameters: [Region::new(0x0800_0400, 0x200), Region::new(0x0800_0600, 0x200)],
+    programs: &[Region::new(0x0800_0800, 0x3C00)],
+    ram: Region::new(0x2000_0000, 0x1_FFC0),
+    handoff: Region::new(0x2001_FFC0, 48),
+    warm_start: Region::new(0x2001_FFF0, 16),
+}
+.checked();
+
+/// With two programs.
+pub const TWO_PROGRAMS: Layout =
+    Layout { programs: &[Region::new(0x0800_0800, 0x1C00), Region::new(0x0800_2400, 0x2000)], ..ONE_PROGRAM }
+        .checked();
 
 /// Thrown by the flash when the power goes. Catch it, then [`ModelFlash::power_on`].
 pub struct PowerCut;

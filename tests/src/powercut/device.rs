@@ -17,21 +17,10 @@ use boot_core::program::{verify, ProgramRecord};
 use shared_abi::geometry::{Region, Sector};
 use shared_abi::layout::Layout;
 
-use super::model::{ModelFlash, CHIP};
+use super::model::{ModelFlash, CHIP, TWO_PROGRAMS};
 
 /// Two programs; what has one uses the first.
-pub static LAYOUT: Layout = Layout {
-    board: "model",
-    chip: &CHIP,
-    bootloader: Region::new(0x0800_0000, 0x400),
-    callgate_offset: 0x200,
-    parameters: [Region::new(0x0800_0400, 0x200), Region::new(0x0800_0600, 0x200)],
-    programs: &[Region::new(0x0800_0800, 0x1C00), Region::new(0x0800_2400, 0x2000)],
-    ram: Region::new(0x2000_0000, 0x1_FFC0),
-    handoff: Region::new(0x2001_FFC0, 48),
-    warm_start: Region::new(0x2001_FFF0, 16),
-}
-.checked();
+pub static LAYOUT: Layout = TWO_PROGRAMS;
 
 const PROGRAMS: usize = 2;
 static ENTRIES: [Entry; entry_count(PROGRAMS as u8)] = entries(PROGRAMS as u8);
