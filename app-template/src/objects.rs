@@ -30,7 +30,19 @@ const DEVICE_TYPE: u32 = 0;
 /// 1017h, in ms.
 pub const HEARTBEAT_MS: u16 = 500;
 /// 100Ah.
-const SOFTWARE_VERSION: &str = if cfg!(feature = "version-2") { "2.0.0" } else { "1.0.0" };
+#[cfg(not(feature = "version-2"))]
+macro_rules! version {
+    () => {
+        "1.0.0"
+    };
+}
+#[cfg(feature = "version-2")]
+macro_rules! version {
+    () => {
+        "2.0.0"
+    };
+}
+const SOFTWARE_VERSION: &str = version!();
 
 /// Whom this image is for, at the place where the bootloader looks before it takes a raw image or HEX file.
 #[used]
@@ -40,15 +52,7 @@ static LABEL: Label =
 
 /// 100Ah as update tools find it in the image (CiA 814-1 clause 6.5).
 #[used]
-static MARKED_VERSION: [u8; 30] = *if cfg!(feature = "version-2") {
-    b"$CANopenSoftwareVersion\x002.0.0\0"
-} else {
-    b"$CANopenSoftwareVersion\x001.0.0\0"
-};
-
-/// The password that arms the change into the bootloader in a lift, and opens 1F50h there: choose your own.
-#[cfg(feature = "lift")]
-const PASSWORD: &[u8] = b"coboot";
+static MARKED_VERSION: &str = concat!("$CANopenSoftwareVersion\0", version!(), "\0");
 
 /// The application's state, as far as the bus sees it.
 pub struct Application {
@@ -94,7 +98,7 @@ impl Application {
             way: Way::default(),
             leave_for: None,
             #[cfg(feature = "lift")]
-            lock: Lock::new(PASSWORD),
+            lock: Lock::new(shared_abi::LIFT_PASSWORD),
             #[cfg(feature = "lift")]
             now: Instant::from_millis(0),
             armed: false,

@@ -6,6 +6,7 @@ use canopen::program::{
     BOOTLOADER_DEVICE_TYPE, ESACADEMY_DEVICE_TYPE, ESACADEMY_NODE_ID, LIFT_DEVICE_TYPE, LIFT_NODE_ID,
 };
 use canopen::{AbortCode, BitRate, NodeId};
+use shared_abi::LIFT_PASSWORD;
 
 use crate::bootloader::{Extras, PasswordObject};
 use crate::download::Policy;
@@ -65,7 +66,7 @@ impl Profile {
         device_type: LIFT_DEVICE_TYPE,
         node_id: NodeId::new(LIFT_NODE_ID),
         extras: Extras { password: PasswordObject::Unlock, read_back: true },
-        password: b"coboot",
+        password: LIFT_PASSWORD,
         download: Policy {
             locked: true,
             reset_starts: true,

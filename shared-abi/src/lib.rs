@@ -32,6 +32,10 @@ pub mod reset;
 pub mod vectors;
 pub mod warm_start;
 
+/// The password of a lift device (6005h), which arms the way into the bootloader in the application and opens 1F50h in the
+/// bootloader: choose your own.
+pub const LIFT_PASSWORD: &[u8] = b"coboot";
+
 /// The check word that guards a record in RAM: a rotating fold over its other words.
 ///
 /// It tells a record from the noise of an unpowered RAM; it is no protection against an attacker who

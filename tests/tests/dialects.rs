@@ -49,14 +49,13 @@ fn lift() -> Option<Bench> {
 
 const LIFT: u8 = 126;
 const UNLOCK: Address = Address::new(0x6005, 1);
-const PASSWORD: &[u8] = b"coboot";
 
 fn app(version: usize) -> Vec<u8> {
     firmware::raw(&firmware::of_board(LAYOUT.board, firmware::APP_LIFT[version]))
 }
 
 fn unlock(bench: &mut Bench, node: u8) {
-    bench.session_with(node).write(UNLOCK, PASSWORD, Doing::Block(0), &mut |_| {}).unwrap();
+    bench.session_with(node).write(UNLOCK, shared_abi::LIFT_PASSWORD, Doing::Block(0), &mut |_| {}).unwrap();
 }
 
 fn write(bench: &mut Bench, node: u8, sub: u8, data: &[u8]) {
