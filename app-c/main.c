@@ -14,7 +14,7 @@
 /* How long the device stays after the answer to 80h is on the bus: at least 10 ms (SYS TEC manual L-1112d_10, 4.5), and one
  * that may be almost over.
  */
-#define FAREWELL_MS 11
+#define ANSWER_TO_RESET_MS 11
 
 /* Without a bootloader, or where it leaves the bit rate to be found out, which this program cannot do. */
 #define DEFAULT_NODE_ID 1
@@ -51,9 +51,9 @@ static uint8_t program_number = 1;
 static uint8_t nmt_state = PRE_OPERATIONAL;
 
 /* The way out: first the answer, then a while in which nothing is said any more, then the reset. */
-static enum { STAYING, ANSWERING, LEAVING } departure;
-static uint32_t departure_request, departure_argument;
-static uint32_t leave_at_ms;
+static enum { REENTRY_IDLE, ANSWER_PENDING, RESET_PENDING } reentry;
+static uint32_t reentry_request, reentry_argument;
+static uint32_t reset_at_ms;
 
 /* Values of the object dictionary. */
 static uint32_t device_type = 0; /* No profile; the bootloader's is another. */
@@ -135,9 +135,9 @@ static enum abort_code find(uint16_t index, uint8_t sub, const struct object **f
 /* The 1F51h callback. It runs before the answer is sent, so it only notes what is to be done. */
 static enum abort_code depart_with(uint32_t request, uint32_t argument)
 {
-    departure = ANSWERING;
-    departure_request = request;
-    departure_argument = argument;
+    reentry = ANSWER_PENDING;
+    reentry_request = request;
+    reentry_argument = argument;
     return GOOD;
 }
 
@@ -285,16 +285,16 @@ static void handle(const struct can_frame *frame)
 }
 
 /* Goes on with the departure. Whether the device is silent from now on. */
-static bool depart(void)
+static bool start_reentry(void)
 {
-    if (departure == ANSWERING && can_is_free(CAN_SDO) && can_is_free(CAN_HEARTBEAT)) {
-        departure = LEAVING;
-        leave_at_ms = now_ms + FAREWELL_MS;
+    if (reentry == ANSWER_PENDING && can_is_free(CAN_SDO) && can_is_free(CAN_HEARTBEAT)) {
+        reentry = RESET_PENDING;
+        reset_at_ms = now_ms + ANSWER_TO_RESET_MS;
     }
-    if (departure == LEAVING && (int32_t)(now_ms - leave_at_ms) >= 0) {
-        coboot_reset(departure_request, departure_argument);
+    if (reentry == RESET_PENDING && (int32_t)(now_ms - reset_at_ms) >= 0) {
+        coboot_reset(reentry_request, reentry_argument);
     }
-    return departure != STAYING;
+    return reentry != REENTRY_IDLE;
 }
 
 /* ---- The chip ---- */
@@ -372,10 +372,10 @@ void main(void)
     heartbeat_at_ms = now_ms + heartbeat_ms;
     uint32_t blink_at_ms = now_ms;
     for (;;) {
-        if (!depart()) {
+        if (!start_reentry()) {
             struct can_frame frame;
             /* A request stays in the FIFO until its answer has room. */
-            while (departure == STAYING && can_is_free(CAN_SDO) && can_receive(&frame)) {
+            while (reentry == REENTRY_IDLE && can_is_free(CAN_SDO) && can_receive(&frame)) {
                 handle(&frame);
             }
             if (heartbeat_ms != 0 && (int32_t)(now_ms - heartbeat_at_ms) >= 0 && can_is_free(CAN_HEARTBEAT)) {

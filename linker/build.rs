@@ -1,5 +1,6 @@
-//! The build script of every image: hands the linker the numbers of the chosen board and the image's template. For the
-//! bootloader it builds the resident part first, which is a program of its own.
+//! The build script of every image: hands the linker the numbers of the chosen board and the
+//! image's template. For the bootloader it builds the resident part first, which is a program of
+//! its own.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -45,7 +46,8 @@ fn main() {
     }
 }
 
-/// Builds the resident part with the features of the bootloader, and leaves its bytes as `OUT_DIR/resident.bin`.
+/// Builds the resident part with the features of the bootloader, and leaves its bytes as
+/// `OUT_DIR/resident.bin`.
 fn resident(package: &Path, out: &Path) {
     let workspace = package.join("..");
     for used in ["bootloader/src", "boot-core/src", "bsp/src", "canopen/src", "shared-abi/src", ".cargo"] {

@@ -1,5 +1,5 @@
-//! Everything between this application and the bootloader underneath: how it came up, what it may call, and the
-//! way back.
+//! Everything between this application and the bootloader underneath: how it came up, what it may
+//! call, and the way back.
 
 use core::sync::atomic::{AtomicU32, Ordering};
 
@@ -14,10 +14,9 @@ use shared_abi::warm_start::{BootRequest, WarmStart};
 
 use crate::debugger;
 
-/// How long the device stays after the answer to 80h is on the bus, in ms: at least 10 (SYS TEC manual L-1112d_10,
-/// 4.5), and one
-/// that may be almost over.
-const FAREWELL_MS: u32 = 11;
+/// How long the device stays after the answer to 80h is on the bus, in ms: at least 10 (SYS TEC
+/// manual L-1112d_10, 4.5), and one that may be almost over.
+const ANSWER_TO_RESET_MS: u32 = 11;
 
 /// The bit rate without a bootloader.
 const DEFAULT_BIT_RATE: BitRate = match BitRate::from_bits_per_second(BIT_RATE) {
@@ -46,8 +45,9 @@ pub struct Start {
     pub program: u8,
 }
 
-/// Reads the handoff; started by a debugger without a bootloader, the application has the board's own values.
-pub fn how_we_came_up(layout: &Layout) -> Start {
+/// Reads the handoff; started by a debugger without a bootloader, the application has the board's
+/// own values.
+pub fn read_handoff(layout: &Layout) -> Start {
     // SAFETY: the layout's handoff region, checked to be RAM of that size in no image.
     let handoff = unsafe { Handoff::read(layout.handoff.base as *const Handoff) };
     match handoff {
@@ -66,8 +66,9 @@ pub fn how_we_came_up(layout: &Layout) -> Start {
     }
 }
 
-/// What 1F56h reads in the bootloader as well: the CRC over what was downloaded as this program. Without that (a debugger has put the
-/// program there), over the program as it was linked, computed through the callgate; 0 without a bootloader.
+/// What 1F56h reads in the bootloader as well: the CRC over what was downloaded as this program.
+/// Without that (a debugger has put the program there), over the program as it was linked, computed
+/// through the callgate; 0 without a bootloader.
 pub fn program_crc(number: u8) -> u32 {
     extern "C" {
         static __vector_table: u8;
@@ -78,8 +79,8 @@ pub fn program_crc(number: u8) -> u32 {
     program_info(number).map(|info| info.crc).or_else(|_| computed()).unwrap_or(0)
 }
 
-/// Stores node-ID and bit rate for bootloader and application; `None` and [`BitRate::Auto`] as layer setting
-/// services mean them.
+/// Stores node-ID and bit rate for bootloader and application; `None` and [`BitRate::Auto`] as
+/// layer setting services mean them.
 ///
 /// # Errors
 /// What the bootloader says.
@@ -97,7 +98,8 @@ pub fn program_info(number: u8) -> Result<ProgramArgs, CallgateError> {
     Callgate::find(LAYOUT)?.program_info(number)
 }
 
-/// Confirms this program: a trial that is content with itself is one no more. Or takes its signature away.
+/// Confirms this program: a trial that is content with itself is one no more. Or takes its
+/// signature away.
 ///
 /// # Errors
 /// What the bootloader says.
@@ -112,7 +114,7 @@ pub fn confirm(number: u8, content: bool) -> Result<(), CallgateError> {
 
 /// How the device goes back into the bootloader (`shared_abi::reentry`).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Way {
+pub enum ReentryPath {
     /// Through a system reset.
     #[default]
     SystemReset = 0,
@@ -122,7 +124,7 @@ pub enum Way {
     Jump = 2,
 }
 
-impl Way {
+impl ReentryPath {
     /// The way of this number.
     pub const fn from_number(number: u8) -> Option<Self> {
         Some(match number {
@@ -136,45 +138,48 @@ impl Way {
 
 /// The way out: first the answer, then a while in which nothing is said any more, then the reset.
 #[derive(Clone, Copy, Debug)]
-pub enum Departure {
+pub enum ReentrySequence {
     /// The device stays.
-    Staying,
+    Idle,
     /// What is to be said first is not on the bus yet.
-    Answering(Way, BootRequest),
+    AnswerPending(ReentryPath, BootRequest),
     /// The device leaves at this time. A frame that began now would be cut off by the reset.
-    Leaving(Way, BootRequest, Instant),
+    ResetPending(ReentryPath, BootRequest, Instant),
 }
 
-impl Departure {
-    /// Goes on with it: `quiet` says that everything is on the bus. Whether the device is silent from now on.
+impl ReentrySequence {
+    /// Goes on with it: `quiet` says that everything is on the bus. Whether the device is silent
+    /// from now on.
     pub fn proceed(&mut self, quiet: bool, now: Instant) -> bool {
         match *self {
-            Self::Answering(way, request) if quiet => *self = Self::Leaving(way, request, now + FAREWELL_MS),
-            Self::Leaving(way, request, at) if now.has_reached(at) => leave_by_idle(way, request),
+            Self::AnswerPending(way, request) if quiet => {
+                *self = Self::ResetPending(way, request, now + ANSWER_TO_RESET_MS)
+            }
+            Self::ResetPending(way, request, at) if now.has_reached(at) => request_reentry(way, request),
             _ => {}
         }
-        matches!(self, Self::Leaving(..))
+        matches!(self, Self::ResetPending(..))
     }
 }
 
-/// Told to `idle`, where no exception is active: 0 to stay, else the way (1 to 3), and from bit 8 on the request as the
-/// warm-start cell has it, from bit 16 on its argument.
-static LEAVING: AtomicU32 = AtomicU32::new(0);
+/// Told to `idle`, where no exception is active: 0 to stay, else the way (1 to 3), and from bit 8
+/// on the request as the warm-start cell has it, from bit 16 on its argument.
+static REENTRY_REQUEST: AtomicU32 = AtomicU32::new(0);
 
-fn leave_by_idle(way: Way, request: BootRequest) {
+fn request_reentry(path: ReentryPath, request: BootRequest) {
     let WarmStart { request, argument, .. } = WarmStart::new(request);
-    LEAVING.store((way as u32 + 1) | request << 8 | argument << 16, Ordering::Relaxed);
-    debugger::let_go();
+    REENTRY_REQUEST.store((way as u32 + 1) | request << 8 | argument << 16, Ordering::Relaxed);
+    debugger::release_program();
 }
 
 /// To be called by `idle` whenever it wakes. Does not return if the device is to leave.
-pub fn leave_if_told() {
-    let told = LEAVING.load(Ordering::Relaxed);
-    let Some(way) = (told as u8).checked_sub(1).and_then(Way::from_number) else { return };
+pub fn reenter_if_requested() {
+    let told = REENTRY_REQUEST.load(Ordering::Relaxed);
+    let Some(way) = (told as u8).checked_sub(1).and_then(ReentryPath::from_number) else { return };
     let request = WarmStart::encode(told >> 8 & 0xFF, told >> 16).request().unwrap_or(BootRequest::Stay);
     match way {
-        Way::SystemReset => reentry::system_reset(LAYOUT, request),
-        Way::Watchdog => reentry::watchdog_reset(LAYOUT, request),
-        Way::Jump => reentry::jump(LAYOUT, request),
+        ReentryPath::SystemReset => reentry::system_reset(LAYOUT, request),
+        ReentryPath::Watchdog => reentry::watchdog_reset(LAYOUT, request),
+        ReentryPath::Jump => reentry::jump(LAYOUT, request),
     }
 }

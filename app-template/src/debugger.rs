@@ -1,5 +1,6 @@
-//! The debugger interface, 1025h, and breakpoints, with the feature `debugger` alone: **everybody on the bus reads and writes
-//! this device's memory, and stops its program**. Without the feature nothing of it is there.
+//! The debugger interface, 1025h, and breakpoints, with the feature `debugger` alone: **everybody
+//! on the bus reads and writes this device's memory, and stops its program**. Without the feature
+//! nothing of it is there.
 
 #[cfg(not(feature = "debugger"))]
 pub use off::*;
@@ -26,7 +27,7 @@ mod off {
     }
 
     /// Nothing.
-    pub fn let_go() {}
+    pub fn release_program() {}
 
     /// Nothing.
     pub fn example() {}
@@ -52,7 +53,8 @@ mod on {
     pub static LIFT_ENTRIES: [Entry; entries::LIFT_ENTRIES.len() + debugger::ENTRIES.len()] =
         concat(entries::LIFT_ENTRIES, debugger::ENTRIES);
 
-    /// Tasks of this priority can be stopped no more, those of 1 and `idle` can. The tasks that serve the bus have higher ones.
+    /// Tasks of this priority can be stopped no more, those of 1 and `idle` can. The tasks that
+    /// serve the bus have higher ones.
     const PRIORITY: u8 = 2;
 
     /// The interface.
@@ -77,9 +79,10 @@ mod on {
         }
     }
 
-    /// The device is about to leave, which `idle` does: a program that is stopped goes on, and is stopped no more.
-    pub fn let_go() {
-        monitor::let_go();
+    /// The device is about to leave, which `idle` does: a program that is stopped goes on, and is
+    /// stopped no more.
+    pub fn release_program() {
+        monitor::release_program();
     }
 
     /// Calls of [`example`].

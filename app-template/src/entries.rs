@@ -1,6 +1,5 @@
-//! The table of the application's object dictionary. It needs nothing of the chip, so that the EDS file can be
-//! made from it
-//! on the host.
+//! The table of the application's object dictionary. It needs nothing of the chip, so that the EDS
+//! file can be made from it on the host.
 
 use canopen::device;
 use canopen::emcy;
@@ -18,14 +17,14 @@ const PROGRAM_ENTRIES: [Entry; 6] = [
 ];
 
 /// How 1F51h = 80h leads back into the bootloader: 0 system reset, 1 watchdog reset, 2 jump.
-pub const WAY_BACK: u16 = 0x2000;
+pub const REENTRY_PATH: u16 = 0x2000;
 /// What the bootloader knows of this program: bit 0 installed, bit 1 signed. Writing with bit 1 set
 /// confirms it, without takes the signature away.
 pub const CONFIRMATION: u16 = 0x2001;
 
 /// What shows the rest of coboot's services. A product has its own use for them.
 const SHOW_ENTRIES: [Entry; 2] = [
-    Entry::var(WAY_BACK, "Way back into the bootloader", DataType::Unsigned8, Access::Rw).default(0),
+    Entry::var(REENTRY_PATH, "Re-entry path into the bootloader", DataType::Unsigned8, Access::Rw).default(0),
     Entry::var(CONFIRMATION, "Confirmation", DataType::Unsigned8, Access::Rw),
 ];
 

@@ -8,8 +8,8 @@
 //! | `coboot.rs` | everything between application and bootloader: keep it as it is |
 //! | `debugger.rs` | the debugger interface (feature `debugger`): never in a product |
 //!
-//! Priorities: 4 and 3 serve the bus, 1 and `idle` are the application's. 2 is left free for the debugger, which stops what is
-//! below it and nothing else.
+//! Priorities: 4 and 3 serve the bus, 1 and `idle` are the application's. 2 is left free for the
+//! debugger, which stops what is below it and nothing else.
 #![no_std]
 #![no_main]
 
@@ -23,7 +23,8 @@ use rtic_monotonics::systick::prelude::*;
 
 systick_monotonic!(Mono, 1_000);
 
-/// A fault or a panic (which ends in one) starts the device again; what runs then is the bootloader's decision.
+/// A fault or a panic (which ends in one) starts the device again; what runs then is the
+/// bootloader's decision.
 #[cfg(not(feature = "debugger"))]
 #[cortex_m_rt::exception]
 unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
@@ -45,7 +46,7 @@ mod app {
     use rtic_monotonics::Monotonic;
 
     use super::Mono;
-    use crate::coboot::{self, Departure, Way};
+    use crate::coboot::{self, ReentryPath, ReentrySequence};
     use crate::debugger::{self, Debugger};
     use crate::objects::{Application, HEARTBEAT_MS};
 
@@ -66,7 +67,7 @@ mod app {
         slave: Slave,
         application: Application,
         debugger: Debugger,
-        departure: Departure,
+        reentry: ReentrySequence,
         led: bsp::Led,
     }
 
@@ -80,8 +81,9 @@ mod app {
         let can = CanPort::new(board.uart);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
-        // Same node-ID and bit rate as the bootloader: whoever talked to it goes on talking to this.
-        let start = coboot::how_we_came_up(LAYOUT);
+        // Same node-ID and bit rate as the bootloader: whoever talked to it goes on talking to
+        // this.
+        let start = coboot::read_handoff(LAYOUT);
         let application = Application::new(&start);
         let config = slave::Config {
             node: node::Config {
@@ -101,7 +103,7 @@ mod app {
                 slave: Slave::new(application.lss_address(), start.node_id, start.bit_rate, config),
                 application,
                 debugger: Debugger::start(),
-                departure: Departure::Staying,
+                reentry: ReentrySequence::Idle,
                 led: board.led,
             },
         )
@@ -110,7 +112,7 @@ mod app {
     #[idle]
     fn idle(_: idle::Context) -> ! {
         loop {
-            coboot::leave_if_told();
+            coboot::reenter_if_requested();
             cortex_m::asm::wfi();
         }
     }
@@ -120,9 +122,10 @@ mod app {
     fn can_rx(mut cx: can_rx::Context) {
         cx.shared.can.lock(|can| {
             while let Some(frame) = can.receive() {
-                // A full queue drops the frame; the client's time-out repeats it, and an emergency tells.
+                // A full queue drops the frame; the client's time-out repeats it, and an emergency
+                // tells.
                 if cx.local.received.enqueue(frame).is_err() {
-                    can.note_loss();
+                    can.record_overrun();
                 }
             }
         });
@@ -133,14 +136,14 @@ mod app {
     #[task(
         binds = CAN1_TX,
         shared = [can],
-        local = [to_handle, slave, application, debugger, departure],
+        local = [to_handle, slave, application, debugger, reentry],
         priority = 3
     )]
     fn protocol(cx: protocol::Context) {
         let now = Instant::from_millis(Mono::now().ticks());
         let protocol::SharedResources { mut can, .. } = cx.shared;
-        let protocol::LocalResources { to_handle, slave, application, debugger, departure, .. } = cx.local;
-        if departure.proceed(slave.is_idle() && can.lock(|can| can.is_idle()), now) {
+        let protocol::LocalResources { to_handle, slave, application, debugger, reentry, .. } = cx.local;
+        if reentry.proceed(slave.is_idle() && can.lock(|can| can.is_idle()), now) {
             return;
         }
         #[cfg(feature = "lift")]
@@ -150,7 +153,8 @@ mod app {
         #[cfg(feature = "debugger")]
         let device = &mut { device };
         slave.observe(status, now, device);
-        // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
+        // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting
+        // behind it.
         carry_out(slave, &mut can, now, device);
         let mut reset = false;
         while let Some(frame) = to_handle.dequeue() {
@@ -158,10 +162,10 @@ mod app {
             carry_out(slave, &mut can, now, device);
         }
         if reset {
-            *departure = Departure::Answering(Way::SystemReset, application.reset_request());
+            *reentry = ReentrySequence::AnswerPending(ReentryPath::SystemReset, application.reset_request());
         }
-        if let Some((way, request)) = application.take_leave() {
-            *departure = Departure::Answering(way, request);
+        if let Some((way, request)) = application.take_reentry() {
+            *reentry = ReentrySequence::AnswerPending(way, request);
         }
     }
 
@@ -177,7 +181,7 @@ mod app {
                 Output::Send(frame) => can.lock(|can| can.send(&frame)),
                 Output::Join(rate) => configure(can, rate, Mode::Normal),
                 Output::Listen(rate) => configure(can, rate, Mode::Silent),
-                Output::ComeBack => can.lock(|can| can.come_back()),
+                Output::RecoverFromBusOff => can.lock(|can| can.recover_from_bus_off()),
                 Output::Accept(ids) => can.lock(|can| can.accept(ids.into_iter().map(CobId::get))),
             }
         }
@@ -193,7 +197,7 @@ mod app {
     /// What the slave wants to know of its line.
     fn status(can: &mut CanPort) -> Status {
         let errors = can.errors();
-        let lost = can.take_lost();
+        let lost = can.take_overruns();
         Status {
             confinement: match errors {
                 Errors { off: true, .. } => Confinement::BusOff,

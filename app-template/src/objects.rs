@@ -1,4 +1,5 @@
-//! The object dictionary of the application, with the 1F51h callback that calls the bootloader back.
+//! The object dictionary of the application, with the 1F51h callback that calls the bootloader
+//! back.
 
 use core::task::Poll;
 
@@ -21,11 +22,12 @@ use shared_abi::callgate::PROGRAM_SIGNED;
 use shared_abi::label::Label;
 use shared_abi::warm_start::BootRequest;
 
-use crate::coboot::{self, Start, Way};
+use crate::coboot::{self, ReentryPath, Start};
 use crate::debugger::{ENTRIES, LIFT_ENTRIES};
-use crate::entries::{CONFIRMATION, WAY_BACK};
+use crate::entries::{CONFIRMATION, REENTRY_PATH};
 
-/// 1000h: no standardised profile. Anything but the bootloader's 10000000h tells a host that the application runs.
+/// 1000h: no standardised profile. Anything but the bootloader's 10000000h tells a host that the
+/// application runs.
 const DEVICE_TYPE: u32 = 0;
 /// 1017h, in ms.
 pub const HEARTBEAT_MS: u16 = 500;
@@ -44,7 +46,8 @@ macro_rules! version {
 }
 const SOFTWARE_VERSION: &str = version!();
 
-/// Whom this image is for, at the place where the bootloader looks before it takes a raw image or HEX file.
+/// Whom this image is for, at the place where the bootloader looks before it takes a raw image or
+/// HEX file.
 #[used]
 #[link_section = ".label"]
 static LABEL: Label =
@@ -61,7 +64,7 @@ pub struct Application {
     /// Which program this is.
     program: u8,
     /// The way back into the bootloader (2000h).
-    way: Way,
+    path: ReentryPath,
     leave_for: Option<BootRequest>,
     #[cfg(feature = "lift")]
     lock: Lock,
@@ -95,7 +98,7 @@ impl Application {
             device,
             program_crc: coboot::program_crc(start.program),
             program: start.program,
-            way: Way::default(),
+            path: ReentryPath::default(),
             leave_for: None,
             #[cfg(feature = "lift")]
             lock: Lock::new(shared_abi::LIFT_PASSWORD),
@@ -114,8 +117,8 @@ impl Application {
     }
 
     /// Whether, how and with which request the device shall go back to the bootloader, once.
-    pub fn take_leave(&mut self) -> Option<(Way, BootRequest)> {
-        self.leave_for.take().map(|request| (self.way, request))
+    pub fn take_reentry(&mut self) -> Option<(ReentryPath, BootRequest)> {
+        self.leave_for.take().map(|request| (self.path, request))
     }
 
     /// With which request the device restarts when the NMT master says so.
@@ -135,9 +138,8 @@ impl Application {
         let _ = self.lock.is_waiting(now);
     }
 
-    /// The 1F51h callback. It runs before the SDO answer is sent, so it only notes what is to be done: `main`
-    /// waits until
-    /// the answer is on the bus, then leaves.
+    /// The 1F51h callback. It runs before the SDO answer is sent, so it only notes what is to be
+    /// done: `main` waits until the answer is on the bus, then leaves.
     fn program_control(&mut self, command: ProgramControl) -> Result<(), AbortCode> {
         self.leave_for = Some(match command {
             // While a program is stopped the bootloader runs.
@@ -179,7 +181,7 @@ impl Objects for Application {
             PROGRAM_CONTROL => put(buf, &[ProgramState::Running as u8]),
             PROGRAM_ID => put(buf, &self.program_crc.to_le_bytes()),
             FLASH_STATUS => put(buf, &FlashStatus::OK.to_word().to_le_bytes()),
-            WAY_BACK => put(buf, &[self.way as u8]),
+            REENTRY_PATH => put(buf, &[self.path as u8]),
             CONFIRMATION => {
                 let info = coboot::program_info(self.program).map_err(|_| AbortCode::DEVICE_STATE)?;
                 put(buf, &[info.flags as u8])
@@ -200,8 +202,8 @@ impl Objects for Application {
                 self.armed = true;
                 Ok(())
             }
-            (WAY_BACK, &[value]) => {
-                self.way = Way::from_number(value).ok_or(AbortCode::INVALID_VALUE)?;
+            (REENTRY_PATH, &[value]) => {
+                self.path = ReentryPath::from_number(value).ok_or(AbortCode::INVALID_VALUE)?;
                 Ok(())
             }
             (CONFIRMATION, &[value @ 0..=3]) => {

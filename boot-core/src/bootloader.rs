@@ -61,8 +61,8 @@ pub enum PasswordObject {
     Unlock,
 }
 
-/// The objects of a device with `programs` programs (1 to 254), of which there are [`entry_count`] (SYS TEC manual
-/// L-1112d_10, table 1).
+/// The objects of a device with `programs` programs (1 to 254), of which there are [`entry_count`]
+/// (SYS TEC manual L-1112d_10, table 1).
 #[must_use]
 pub const fn entries<const LEN: usize>(programs: u8) -> [Entry; LEN] {
     entries_with(programs, Extras::NONE)
@@ -145,7 +145,8 @@ const PROGRAM_OBJECTS: [(u16, &str, Entry); 4] = [
     (
         PROGRAM_CONTROL,
         "Program control",
-        // Without a default value, which a configuration tool might write: what is read is a state, what is written a command.
+        // Without a default value, which a configuration tool might write: what is read is a state,
+        // what is written a command.
         Entry::sub(PROGRAM_CONTROL, 1, "Program control of a program", DataType::Unsigned8, Access::Rw),
     ),
     (
@@ -182,14 +183,14 @@ pub struct Config {
     pub layout: &'static Layout,
     /// The bit rates that its controller can be set to.
     pub supports: fn(BitRate) -> bool,
-    /// An emergency behind each boot-up, which tells a master that this is the bootloader and not the application:
-    /// its
-    /// code FF00h (device specific, CiA 301 table 26), "BOOT", and why the device stayed
-    /// ([`StayReason::code`](crate::decision::StayReason::code)).
+    /// An emergency behind each boot-up, which tells a master that this is the bootloader and not
+    /// the application: its code FF00h (device specific, CiA 301 table 26), "BOOT", and why the
+    /// device stayed ([`StayReason::code`](crate::decision::StayReason::code)).
     pub boot_up_emergency: bool,
     /// How programs are downloaded.
     pub download: Policy,
-    /// What opens 1F50h where [`Policy::locked`] says that something has to; it is written where [`Extras::password`] says.
+    /// What opens 1F50h where [`Policy::locked`] says that something has to; it is written where
+    /// [`Extras::password`] says.
     pub password: &'static [u8],
 }
 
@@ -218,9 +219,8 @@ pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize> {
 }
 
 impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PROGRAMS> {
-    /// Starts from what the parameters tell, for a device that stayed in the bootloader for this reason. The
-    /// larger `buffer`,
-    /// the further the flash may lag behind the bus.
+    /// Starts from what the parameters tell, for a device that stayed in the bootloader for this
+    /// reason. The larger `buffer`, the further the flash may lag behind the bus.
     pub fn new(
         config: &'static Config,
         serial_number: u32,
@@ -274,7 +274,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
     /// Carries the work on the flash on: a bounded piece of it.
     pub fn step(&mut self) -> Step {
         let step = self.download.step(&mut self.flash);
-        self.tell_outcome();
+        self.report_outcome();
         #[cfg(feature = "read-back")]
         if step == Step::Idle && self.config.download.read_back {
             return self.stored_version.step(&self.flash, self.download.installed(1));
@@ -289,7 +289,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
     }
 
     /// Tells by an emergency what became of work on the flash.
-    fn tell_outcome(&mut self) {
+    fn report_outcome(&mut self) {
         #[cfg(feature = "emcy")]
         match self.download.take_outcome() {
             None => {}
@@ -329,14 +329,14 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         self.download.is_finishing()
     }
 
-    /// The request to leave the bootloader, once; the answer to the command may still be on its way.
-    pub fn take_leave(&mut self) -> Option<BootRequest> {
-        self.download.take_leave()
+    /// The request to leave the bootloader, once; the answer to the command may still be on its
+    /// way.
+    pub fn take_boot_request(&mut self) -> Option<BootRequest> {
+        self.download.take_boot_request()
     }
 
-    /// Ends here, whatever is being done, as a reset ends it: gives flash and buffer back, for whoever resets a
-    /// device without
-    /// resetting itself.
+    /// Ends here, whatever is being done, as a reset ends it: gives flash and buffer back, for
+    /// whoever resets a device without resetting itself.
     pub fn into_parts(self) -> (F, &'b mut [u8]) {
         (self.flash, self.download.into_buffer())
     }
@@ -413,7 +413,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
 
     fn download_end(&mut self, _at: Address) -> Result<(), AbortCode> {
         let ended = self.download.block_end();
-        self.tell_outcome();
+        self.report_outcome();
         ended
     }
 

@@ -1,8 +1,8 @@
 //! CRC-32/ISO-HDLC: the one function of block file, 1F56h and journal.
 //!
-//! Without the feature `crc-table` it goes bit by bit, some 40 cycles a byte; with it, it takes a table of 1 KiB
-//! and some 10
-//! cycles. A chip with a CRC unit does long ranges by that, see [`Flash::crc32`](crate::flash::Flash::crc32).
+//! Without the feature `crc-table` it goes bit by bit, some 40 cycles a byte; with it, it takes a
+//! table of 1 KiB and some 10 cycles. A chip with a CRC unit does long ranges by that, see
+//! [`Flash::crc32`](crate::flash::Flash::crc32).
 
 #[cfg(feature = "crc-16")]
 use crc::CRC_16_XMODEM;
@@ -30,18 +30,17 @@ pub fn resume(crc: u32, bytes: &[u8]) -> u32 {
     digest.finalize()
 }
 
-/// The CRC of blocks and programs, behind data whose CRC is `crc` (0 for none): CRC-32, or with the feature
-/// `crc-16` the one of
-/// SDO block transfer (polynomial 1021h, start 0), in the lower half of the word.
+/// The CRC of blocks and programs, behind data whose CRC is `crc` (0 for none): CRC-32, or with the
+/// feature `crc-16` the one of SDO block transfer (polynomial 1021h, start 0), in the lower half of
+/// the word.
 #[must_use]
 #[cfg(not(feature = "crc-16"))]
 pub fn block(crc: u32, bytes: &[u8]) -> u32 {
     resume(crc, bytes)
 }
 
-/// The CRC of blocks and programs, behind data whose CRC is `crc` (0 for none): the one of SDO block transfer
-/// (polynomial
-/// 1021h, start 0), in the lower half of the word.
+/// The CRC of blocks and programs, behind data whose CRC is `crc` (0 for none): the one of SDO
+/// block transfer (polynomial 1021h, start 0), in the lower half of the word.
 #[must_use]
 #[cfg(feature = "crc-16")]
 pub fn block(crc: u32, bytes: &[u8]) -> u32 {

@@ -1,7 +1,8 @@
-//! The boot decision: bootloader or program, made once after every reset before any peripheral is touched.
+//! The boot decision: bootloader or program, made once after every reset before any peripheral is
+//! touched.
 //!
-//! The order is the product's promise (docs/architecture.md): what asks for the bootloader comes first,
-//! so that no program, however broken, can keep a device from being reached.
+//! The order is the product's promise (docs/architecture.md): what asks for the bootloader comes
+//! first, so that no program, however broken, can keep a device from being reached.
 
 use core::ops::RangeInclusive;
 
@@ -35,10 +36,9 @@ pub struct Policy {
 }
 
 impl Policy {
-    /// Resets in a row by which the application ended without being asked to, this one among them if it is one;
-    /// `before` were counted. A
-    /// request is a new beginning, and so is a power-on or the reset pin, but not for an application that was
-    /// given up already.
+    /// Resets in a row by which the application ended without being asked to, this one among them
+    /// if it is one; `before` were counted. A request is a new beginning, and so is a power-on or
+    /// the reset pin, but not for an application that was given up already.
     #[must_use]
     pub fn crash_resets(&self, before: u32, cause: ResetCause, request: Option<BootRequest>) -> u32 {
         use ResetCause::{IndependentWatchdog, LowPower, Software, WindowWatchdog};

@@ -17,11 +17,11 @@ pub enum FlashFault {
     Verify,
 }
 
-/// A flash that erases by sectors and programs by words, one operation at a time and without waiting for it.
+/// A flash that erases by sectors and programs by words, one operation at a time and without
+/// waiting for it.
 ///
-/// `read` and the starts may only be called while no operation runs: the engine of this crate sees to it, because
-/// on the
-/// F4 a read from busy flash stalls the core.
+/// `read` and the starts may only be called while no operation runs: the engine of this crate sees
+/// to it, because on the F4 a read from busy flash stalls the core.
 pub trait Flash {
     /// Copies `buffer.len()` bytes from `address` on. Addresses outside the flash read FFh.
     fn read(&self, address: u32, buffer: &mut [u8]);
@@ -41,8 +41,8 @@ pub trait Flash {
     /// The outcome of the running operation, `Ready(Ok(()))` when none runs.
     fn poll(&mut self) -> Poll<Result<(), FlashFault>>;
 
-    /// The CRC-32 of a region behind data whose CRC is `crc` (0 for none). A chip that has a unit for it overrides
-    /// this.
+    /// The CRC-32 of a region behind data whose CRC is `crc` (0 for none). A chip that has a unit
+    /// for it overrides this.
     fn crc32(&self, crc: u32, region: Region) -> u32 {
         crc32_by_software(self, crc, region)
     }
@@ -178,7 +178,8 @@ impl SectorEraser {
             if self.next >= self.end {
                 return Poll::Ready(Ok(()));
             }
-            // A checked layout ends at sector borders; a region outside the flash is refused, not looped over.
+            // A checked layout ends at sector borders; a region outside the flash is refused, not
+            // looped over.
             let Some(sector) = chip.sector_at(self.next) else {
                 return Poll::Ready(Err(FlashFault::Failed));
             };

@@ -25,6 +25,7 @@ pub mod program;
 #[cfg(feature = "read-back")]
 mod stored_version;
 
-/// Frames, node and transfers, in which the core speaks: a firmware that uses this crate needs no other for them.
+/// Frames, node and transfers, in which the core speaks: a firmware that uses this crate needs no
+/// other for them.
 pub use canopen;
 pub use crc::crc32;

@@ -1,4 +1,5 @@
-//! Node-ID and bit rate as the layer setting services store them, for bootloader and application alike.
+//! Node-ID and bit rate as the layer setting services store them, for bootloader and application
+//! alike.
 
 use canopen::bit_rate::BitRate;
 use canopen::NodeId;
@@ -19,7 +20,8 @@ pub struct NodeParameters {
 const NO_NODE_ID: u32 = 0xFF;
 
 impl NodeParameters {
-    /// What was stored, or the board's own values where nothing was, or nothing that this firmware can run with.
+    /// What was stored, or the board's own values where nothing was, or nothing that this firmware
+    /// can run with.
     pub fn load<F: Flash>(
         parameters: &impl Parameters,
         flash: &F,

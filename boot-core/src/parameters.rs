@@ -1,13 +1,15 @@
-//! Non-volatile parameters: a journal over two flash regions that survives a power cut at every operation.
+//! Non-volatile parameters: a journal over two flash regions that survives a power cut at every
+//! operation.
 //!
-//! A region holds slots of six words. Slot 0 is the header; every other slot is one record, written once. The
-//! latest sound record of a key is its value. When the region is full, the living records are copied to the other
-//! region, whose header is written **last**: until then the old region is the valid one, afterwards the new one is,
-//! and a cut leaves one of the two whole. Each slot carries a CRC, so a torn one reads as absent.
+//! A region holds slots of six words. Slot 0 is the header; every other slot is one record, written
+//! once. The latest sound record of a key is its value. When the region is full, the living records
+//! are copied to the other region, whose header is written **last**: until then the old region is
+//! the valid one, afterwards the new one is, and a cut leaves one of the two whole. Each slot
+//! carries a CRC, so a torn one reads as absent.
 //!
-//! A cut can leave bits between 0 and 1, which read well now and badly later. A header that reads well is
-//! therefore written once
-//! more before anything is added behind it: what was stored must not vanish with its region.
+//! A cut can leave bits between 0 and 1, which read well now and badly later. A header that reads
+//! well is therefore written once more before anything is added behind it: what was stored must not
+//! vanish with its region.
 
 use core::task::Poll;
 
@@ -23,9 +25,9 @@ const BLANK: Slot = [ERASED; SLOT_WORDS];
 
 /// Tells a region's header ("CBNV" read as little-endian bytes).
 const HEADER_MAGIC: u32 = u32::from_le_bytes(*b"CBNV");
-/// Version of the journal's format: what the values of the keys mean. A journal of an older one is read, and moves
-/// to this one
-/// with the next value that is stored; one of a newer version belongs to a newer bootloader and is left alone.
+/// Version of the journal's format: what the values of the keys mean. A journal of an older one is
+/// read, and moves to this one with the next value that is stored; one of a newer version belongs
+/// to a newer bootloader and is left alone.
 const FORMAT: u32 = 1;
 /// How often a record that does not read back is tried in a further slot.
 const ATTEMPTS: u8 = 8;
@@ -66,13 +68,12 @@ pub enum StoreError {
     Device,
 }
 
-/// Where parameters are kept: the [`Journal`] in flash, or what a board has for them (an EEPROM), which may leave
-/// the flash
-/// that it is handed alone.
+/// Where parameters are kept: the [`Journal`] in flash, or what a board has for them (an EEPROM),
+/// which may leave the flash that it is handed alone.
 ///
-/// Whoever implements it owes this: after a power cut at any moment [`get`](Self::get) gives the value from before
-/// the store
-/// or the new one, of every key; and every store comes to an end, a store that is full or worn out with an error.
+/// Whoever implements it owes this: after a power cut at any moment [`get`](Self::get) gives the
+/// value from before the store or the new one, of every key; and every store comes to an end, a
+/// store that is full or worn out with an error.
 pub trait Parameters {
     /// The value of a key, `None` where it was never stored.
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value>;
@@ -122,8 +123,8 @@ impl Journal {
             (a, b) => a.or(b),
         };
         let active = newest.map(|(region, sequence, format)| {
-            // Behind the slot of the last word that is not blank; a word at a time, because this is on the way of
-            // every start.
+            // Behind the slot of the last word that is not blank; a word at a time, because this is
+            // on the way of every start.
             let Region { base, .. } = regions[region];
             let mut words = slots(&regions[region]) * SLOT_WORDS as u32;
             while words > SLOT_WORDS as u32 && flash.read_word(base + 4 * (words - 1)) == ERASED {
@@ -189,7 +190,8 @@ enum State {
     Begin,
     /// Make the other region blank.
     Erase { eraser: SectorEraser },
-    /// Look for the next living record of the old region, from slot `from` on; `to` is the next slot of the new one.
+    /// Look for the next living record of the old region, from slot `from` on; `to` is the next
+    /// slot of the new one.
     Collect { from: u32, to: u32 },
     /// Write a slot.
     Write { what: What, slot: Slot, writer: WordWriter },
@@ -292,7 +294,8 @@ impl Journal {
             Err(FlashFault::Verify) if storing.attempts == ATTEMPTS => {
                 return Poll::Ready(Err(StoreError::WornOut));
             }
-            // Left half-charged by a power cut, or worn: another slot, another region, or this one erased.
+            // Left half-charged by a power cut, or worn: another slot, another region, or this one
+            // erased.
             Err(FlashFault::Verify) => {
                 storing.attempts += 1;
                 match what {

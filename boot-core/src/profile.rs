@@ -1,6 +1,8 @@
-//! Dialects: what the tools of different worlds expect of a bootloader where they contradict each other (docs/dialects.md).
+//! Dialects: what the tools of different worlds expect of a bootloader where they contradict each
+//! other (docs/dialects.md).
 //!
-//! Where they agree, or where a bootloader can tell them apart, one binary serves all; that is in [`STANDARD`](Profile::STANDARD).
+//! Where they agree, or where a bootloader can tell them apart, one binary serves all; that is in
+//! [`STANDARD`](Profile::STANDARD).
 
 use canopen::program::{
     BOOTLOADER_DEVICE_TYPE, ESACADEMY_DEVICE_TYPE, ESACADEMY_NODE_ID, LIFT_DEVICE_TYPE, LIFT_NODE_ID,
@@ -45,8 +47,8 @@ impl Profile {
     /// port's Paulus: another abort for what it does not know (table 3).
     pub const PAULUS: Self = Self { unknown_request: AbortCode::GENERAL, ..Self::STANDARD };
 
-    /// The boot loader of ESAcademy: node-ID 64 at 125 kbit/s, a password that voids the program and opens 1F50h, and the program
-    /// starts by itself.
+    /// The boot loader of ESAcademy: node-ID 64 at 125 kbit/s, a password that voids the program
+    /// and opens 1F50h, and the program starts by itself.
     pub const ESACADEMY: Self = Self {
         device_type: ESACADEMY_DEVICE_TYPE,
         default_node: match NodeId::new(ESACADEMY_NODE_ID) {
@@ -61,7 +63,8 @@ impl Profile {
     /// The default password of ESAcademy's boot loader, "INIT".
     pub const INIT: u32 = 0x494E_4954;
 
-    /// The lift bootloader (CiA 417, CiA 814-1): node-ID 126, a password, reading back, and program 2 is a set of parameters.
+    /// The lift bootloader (CiA 417, CiA 814-1): node-ID 126, a password, reading back, and program
+    /// 2 is a set of parameters.
     pub const LIFT: Self = Self {
         device_type: LIFT_DEVICE_TYPE,
         node_id: NodeId::new(LIFT_NODE_ID),

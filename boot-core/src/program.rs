@@ -11,7 +11,8 @@ use crate::parameters::{Key, Parameters, Value};
 /// The word that stands for "signed" in a program's record.
 pub const SIGNATURE: u32 = u32::from_le_bytes(*b"APP1");
 
-/// What the parameters tell of a program that was downloaded completely and whose CRC was right then.
+/// What the parameters tell of a program that was downloaded completely and whose CRC was right
+/// then.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ProgramRecord {
     /// Bytes from the start of its region on.

@@ -1,6 +1,8 @@
-//! The version that a stored program tells of itself: the text behind `$CANopenSoftwareVersion` in its image (CiA 814-1 clause 6.5).
+//! The version that a stored program tells of itself: the text behind `$CANopenSoftwareVersion` in
+//! its image (CiA 814-1 clause 6.5).
 //!
-//! The image is searched in steps while the flash has nothing to do, so that 100Ah is answered at once and without the flash.
+//! The image is searched in steps while the flash has nothing to do, so that 100Ah is answered at
+//! once and without the flash.
 
 use shared_abi::geometry::Region;
 

@@ -48,7 +48,8 @@ fn a_signed_program_starts_by_itself() {
     assert_eq!(decision, BootDecision::Start { program: signed().unwrap(), trial: false });
 }
 
-/// Whatever asks for the bootloader comes before whatever asks for a program, and then no program is even looked at.
+/// Whatever asks for the bootloader comes before whatever asks for a program, and then no program
+/// is even looked at.
 #[test]
 fn what_asks_for_the_bootloader_wins() {
     let stay = |circumstances: Circumstances, policy: Policy| match decide(&circumstances, &policy, |_| {

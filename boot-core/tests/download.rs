@@ -79,7 +79,8 @@ fn status_is_busy_from_the_acknowledgement_to_the_end_of_the_work() {
     assert_eq!(bench.status(), 0);
 }
 
-/// Each wrong block: the abort, the status of table 3, an untouched flash, and the right block right behind it.
+/// Each wrong block: the abort, the status of table 3, an untouched flash, and the right block
+/// right behind it.
 #[test]
 fn every_wrong_block_is_refused_and_the_next_attempt_works() {
     let image = program(192, 0x33);
@@ -169,7 +170,7 @@ fn a_program_whose_crc_or_vectors_are_wrong_is_no_program() {
         assert_eq!(bench.word(IDENTIFICATION), block_crc(stored), "1F56h shows what is in flash");
         assert_eq!(bench.command(SET_SIGNATURE), 0x02);
         assert_eq!(bench.command(START), 0x02);
-        assert_eq!(bench.node.take_leave(), None);
+        assert_eq!(bench.node.take_boot_request(), None);
         bench.install(&image);
     }
 }
@@ -182,7 +183,8 @@ fn an_installed_program_must_be_cleared_first_and_what_is_not_blank_is_not_writt
     let mut bench = Bench::new(&mut flash);
     bench.install(&image);
     assert_eq!(bench.block(&good[0]), (Err(AbortCode(0x0800_0022)), 0x08));
-    // After a power cut in the middle of a download there is no program, but the flash is not blank.
+    // After a power cut in the middle of a download there is no program, but the flash is not
+    // blank.
     flash.poke(PROGRAM.base + 90, &[0]);
     flash.poke(LAYOUT.parameters[0].base, &[0; 0x200]);
     let mut bench = Bench::new(&mut flash);
@@ -201,15 +203,15 @@ fn signature_and_start() {
     assert_eq!(bench.command(START), 0x02, "NOVALPROG");
     assert_eq!(bench.command(SET_SIGNATURE), 0x02);
     assert_eq!(bench.command(CLR_SIGNATURE), 0, "nothing to take away");
-    assert_eq!(bench.node.take_leave(), None);
+    assert_eq!(bench.node.take_boot_request(), None);
     assert_eq!(bench.command(0x02), 0, "RESET_STAT");
 
     bench.install(&image);
     assert_eq!(bench.command(START), 0);
-    assert_eq!(bench.node.take_leave(), Some(BootRequest::Trial(1)));
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Trial(1)));
     assert_eq!(bench.command(SET_SIGNATURE), 0);
     assert_eq!(bench.command(START), 0);
-    assert_eq!(bench.node.take_leave(), Some(BootRequest::Start(1)));
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
     assert_eq!(bench.command(CLR_SIGNATURE), 0);
     assert_eq!(autostart(&flash), Err(Invalid::Absent));
 
@@ -280,8 +282,8 @@ fn faults_of_the_flash_are_told_and_clear_begins_anew() {
     }
 }
 
-/// An update, cut at every operation: what starts afterwards is the old program or the new one, whole, or nothing;
-/// and the update then completes.
+/// An update, cut at every operation: what starts afterwards is the old program or the new one,
+/// whole, or nothing; and the update then completes.
 #[test]
 fn an_update_cut_anywhere_leaves_the_old_the_new_or_no_program() {
     let (old, new) = (program(200, 0xA0), program(300, 0xB0));
@@ -296,7 +298,8 @@ fn an_update_cut_anywhere_leaves_the_old_the_new_or_no_program() {
     });
 }
 
-/// Control block with identity: application size, vendor-ID, product code (SYS TEC manual, table 6).
+/// Control block with identity: application size, vendor-ID, product code (SYS TEC manual, table
+/// 6).
 fn control(app_size: u32, vendor_id: u32, product_code: u32) -> Vec<u8> {
     let words = [app_size, vendor_id, product_code];
     block(0, 0, &words.iter().flat_map(|word| word.to_le_bytes()).collect::<Vec<_>>())
@@ -335,7 +338,7 @@ fn a_file_for_another_product_is_refused_before_anything_is_lost() {
         );
         assert_eq!(bench.node.flash().touched, [], "{what}");
         assert_eq!(bench.command(START), 0, "{what}");
-        assert_eq!(bench.node.take_leave(), Some(BootRequest::Start(1)), "{what}");
+        assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)), "{what}");
     }
     // 0 stands for any; and what the integrator accepts needs no identity.
     for file in [control(0, 0, 0), control(0, DEVICE.0, DEVICE.1), control(0x600D, 7, 7)] {
@@ -368,7 +371,7 @@ fn while_programming_is_not_allowed_nothing_is_changed() {
     // Reading, and starting what is there, is no programming.
     assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
     assert_eq!(bench.command(START), 0);
-    assert_eq!(bench.node.take_leave(), Some(BootRequest::Trial(1)));
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Trial(1)));
     ALLOWED.store(true, Ordering::Relaxed);
     bench.install(&image);
 }
@@ -398,7 +401,7 @@ fn a_start_or_a_block_during_an_erase_is_told_to_wait() {
         assert_eq!(bench.node.download_start(DATA, None), Err(AbortCode(0x0800_0022)));
     }
     assert!(erasing > 8, "one at least per sector: {erasing}");
-    assert_eq!(bench.node.take_leave(), None);
+    assert_eq!(bench.node.take_boot_request(), None);
     assert_eq!(bench.command(START), 0x02, "nothing is left to be started");
     bench.install(&image);
 }
@@ -442,9 +445,8 @@ fn programs_that_do_not_exist_have_no_objects() {
     assert_eq!(bench.node.flash().touched, []);
 }
 
-/// Every operation of an update fails once, in each way: the status says so or the engine got over it; what would
-/// start is whole; and the
-/// next attempt succeeds.
+/// Every operation of an update fails once, in each way: the status says so or the engine got over
+/// it; what would start is whole; and the next attempt succeeds.
 #[test]
 fn a_fault_at_any_operation_costs_no_more_than_another_attempt() {
     let (old, new) = (program(200, 0xA0), program(300, 0xB0));
@@ -509,7 +511,8 @@ fn a_fault_at_any_operation_costs_no_more_than_another_attempt() {
 /// A store outside the flash takes the journal's place.
 #[test]
 fn parameters_may_be_kept_in_an_eeprom() {
-    /// Holds what it is told after a while, as one that is written byte by byte; fails when told to.
+    /// Holds what it is told after a while, as one that is written byte by byte; fails when told
+    /// to.
     #[derive(Default)]
     struct Eeprom {
         values: Vec<(Key, Value)>,

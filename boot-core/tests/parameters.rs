@@ -50,7 +50,8 @@ fn values_survive_a_restart_and_any_number_of_compactions() {
     assert_eq!(outside, None, "the journal wrote outside its regions");
 }
 
-/// Cuts the power at every operation of a long history, in every way, and once more in the recovery.
+/// Cuts the power at every operation of a long history, in every way, and once more in the
+/// recovery.
 #[test]
 fn after_any_cut_the_old_or_the_new_value_is_read_and_the_neighbour_is_untouched() {
     quiet_power_cuts();

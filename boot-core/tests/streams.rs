@@ -51,7 +51,7 @@ fn a_raw_image_is_stored_is_valid_and_starts() {
         assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
         assert_eq!(bench.read_state(), 0, "stopped");
         assert_eq!(bench.command(START), 0);
-        assert_eq!(bench.node.take_leave(), Some(BootRequest::Start(1)));
+        assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
         assert_eq!(&flash.cells(PROGRAM)[..3001], image);
         assert!(flash.cells(PROGRAM)[3001..].iter().all(|byte| *byte == 0xFF));
         assert_eq!(autostart(&flash), Ok(0x11));
@@ -113,19 +113,19 @@ fn command_2_starts_behind_a_stream_alone() {
     let mut bench = cleared(&mut flash);
     assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
     assert_eq!(bench.command(RESET_STAT), 0);
-    assert_eq!(bench.node.take_leave(), Some(BootRequest::Start(1)));
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
 
     let mut bench = Bench::new(&mut flash);
     assert_eq!(bench.command(RESET_STAT), 0);
-    assert_eq!(bench.node.take_leave(), None, "after a restart nobody has just sent one");
+    assert_eq!(bench.node.take_boot_request(), None, "after a restart nobody has just sent one");
     bench.install(&image);
     assert_eq!(bench.command(RESET_STAT), 0);
-    assert_eq!(bench.node.take_leave(), None, "a block file");
+    assert_eq!(bench.node.take_boot_request(), None, "a block file");
     // A refused stream is none.
     assert_eq!(bench.command(CLEAR), 0);
     assert_eq!(bench.stream(b"nonsense that is long enough", None, 7), (Err(STORE), 4));
     assert_eq!(bench.command(RESET_STAT), 0);
-    assert_eq!(bench.node.take_leave(), None);
+    assert_eq!(bench.node.take_boot_request(), None);
 }
 
 #[test]
@@ -134,21 +134,21 @@ fn a_profile_may_start_always_or_by_itself_or_want_a_signature() {
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = Bench::with(&mut flash, Policy { reset_starts: true, ..Policy::DEFAULT });
     assert_eq!(bench.command(RESET_STAT), 2, "NOVALPROG");
-    assert_eq!(bench.node.take_leave(), None);
+    assert_eq!(bench.node.take_boot_request(), None);
     bench.install(&image);
     assert_eq!(bench.command(RESET_STAT), 0);
-    assert_eq!(bench.node.take_leave(), Some(BootRequest::Trial(1)));
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Trial(1)));
 
     let mut bench = Bench::with(&mut flash, Policy { starts_by_itself: true, ..Policy::DEFAULT });
     assert_eq!(bench.command(CLEAR), 0);
     assert_eq!(bench.stream(hex(&image, 16, "\n").as_bytes(), None, 7), (Ok(()), 0));
-    assert_eq!(bench.node.take_leave(), Some(BootRequest::Start(1)));
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
 
     let mut bench = Bench::with(&mut flash, Policy { valid_without_signature: false, ..Policy::DEFAULT });
     assert_eq!(bench.command(CLEAR), 0);
     assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
     assert_eq!(bench.command(START), 0);
-    assert_eq!(bench.node.take_leave(), Some(BootRequest::Trial(1)));
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Trial(1)));
 }
 
 /// Hosts that poll nothing: START right behind the last segment waits for the verification.
@@ -162,10 +162,10 @@ fn start_right_behind_the_last_segment_waits_for_the_verification() {
         assert_eq!(bench.status(), 1, "busy");
         assert!(bench.node.is_finishing(), "a reset now would lose the program");
         assert_eq!(bench.node.write(CONTROL, &[command]), Ok(()));
-        assert_eq!(bench.node.take_leave(), None);
+        assert_eq!(bench.node.take_boot_request(), None);
         bench.settle();
         assert!(!bench.node.is_finishing());
-        assert_eq!(bench.node.take_leave(), Some(BootRequest::Start(1)));
+        assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
     }
     // What cannot be verified does not start.
     let mut flash = ModelFlash::new(&CHIP);
@@ -175,11 +175,11 @@ fn start_right_behind_the_last_segment_waits_for_the_verification() {
     let operations = bench.node.flash().operations;
     bench.node.flash().fail = Some((operations + 1, FlashFault::Failed));
     bench.settle();
-    assert_eq!((bench.status(), bench.node.take_leave()), (0x0A, None));
+    assert_eq!((bench.status(), bench.node.take_boot_request()), (0x0A, None));
 }
 
-/// What can be known before the first piece is complete costs the old program nothing, and the next attempt works.
-/// What is sent, what is announced, and the abort and status that answer.
+/// What can be known before the first piece is complete costs the old program nothing, and the next
+/// attempt works. What is sent, what is announced, and the abort and status that answer.
 type Case<'a> = (&'a str, Vec<u8>, Option<u32>, AbortCode, u32);
 
 #[test]
@@ -320,8 +320,8 @@ fn two_formats_in_one_session_are_refused() {
     assert_eq!(bench.stream(&image, None, 7), (Err(STATE), 0x08), "there is a program");
 }
 
-/// An error of the flash ends the transfer with the abort that says so: 06060000h for programming, 08000000h for erasing
-/// (table 3 of Paulus).
+/// An error of the flash ends the transfer with the abort that says so: 06060000h for programming,
+/// 08000000h for erasing (table 3 of Paulus).
 #[test]
 fn the_flash_fails_under_a_stream() {
     let image = program(3000, 0xC3);
@@ -357,7 +357,8 @@ fn a_stream_cut_anywhere_leaves_the_old_the_new_or_no_program() {
     }
 }
 
-/// The ESAcademy profile: closed until the password came, and who is wrong waits, whatever he tries.
+/// The ESAcademy profile: closed until the password came, and who is wrong waits, whatever he
+/// tries.
 #[test]
 fn a_password_opens_1f50_and_a_wrong_one_is_slowed_down() {
     const ENABLE: Address = Address::new(0x7F50, 1);
@@ -388,7 +389,7 @@ fn a_password_opens_1f50_and_a_wrong_one_is_slowed_down() {
     assert_eq!(at(2499, b"TINI"), (Err(STATE), true));
     assert_eq!(at(2500, b"TINI"), (Ok(()), false));
     assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
-    assert_eq!(bench.node.take_leave(), Some(BootRequest::Start(1)), "by itself");
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)), "by itself");
     // The next password voids it at once.
     let mut bench = Bench::with_config(
         &mut flash,
@@ -402,8 +403,8 @@ fn a_password_opens_1f50_and_a_wrong_one_is_slowed_down() {
 }
 
 proptest! {
-    /// Any bytes behind a beginning that may be good: refused or not, nothing outside is written, nothing hangs, and the
-    /// next attempt works.
+    /// Any bytes behind a beginning that may be good: refused or not, nothing outside is written,
+    /// nothing hangs, and the next attempt works.
     #[test]
     fn any_stream_is_answered_and_the_next_attempt_works(
         start in prop_oneof![Just(Vec::new()), Just(b":".to_vec()), Just(program(8, 1)), Just(hex(&program(64, 1), 16, "\n").into_bytes())],

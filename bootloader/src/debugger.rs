@@ -1,5 +1,5 @@
-//! The debugger interface, 1025h, with the feature `debugger` alone: **everybody on the bus reads and writes this device's
-//! memory**. Without the feature nothing of it is there.
+//! The debugger interface, 1025h, with the feature `debugger` alone: **everybody on the bus reads
+//! and writes this device's memory**. Without the feature nothing of it is there.
 
 #[cfg(not(feature = "debugger"))]
 use boot_core::canopen::od::Entry;

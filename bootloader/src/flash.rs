@@ -1,6 +1,8 @@
-//! The flash controller (RM0090 section 3) and the CRC unit (section 4), at the level of their registers.
+//! The flash controller (RM0090 section 3) and the CRC unit (section 4), at the level of their
+//! registers.
 //!
-//! The HAL's driver does not fit: it erases in units of 128 KiB, programs by bytes and leaves error flags standing.
+//! The HAL's driver does not fit: it erases in units of 128 KiB, programs by bytes and leaves error
+//! flags standing.
 
 use core::task::Poll;
 
@@ -14,7 +16,8 @@ const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
 /// `PSIZE` for words: the supply is 2.7 V or more (table 10).
 const WORDS: u8 = 0b10;
 
-/// The controller and the flash that it guards. The control register is locked whenever no operation runs.
+/// The controller and the flash that it guards. The control register is locked whenever no
+/// operation runs.
 pub struct FlashController {
     registers: pac::FLASH,
     /// The CRC unit, where it is not somebody else's.
@@ -28,9 +31,9 @@ const FLASH: Region = LAYOUT.chip.flash;
 impl FlashController {
     /// Takes the controller, and the CRC unit if `rcc` is there to switch it on.
     ///
-    /// The caches of the flash have to be off: they would show words as they were before they were programmed
-    /// (section
-    /// 3.5.4). They are so after a reset, and a bootloader that runs from RAM gains nothing by them.
+    /// The caches of the flash have to be off: they would show words as they were before they were
+    /// programmed (section 3.5.4). They are so after a reset, and a bootloader that runs from RAM
+    /// gains nothing by them.
     ///
     /// # Safety
     /// Nobody else may use the two until this is dropped.
@@ -59,9 +62,8 @@ impl FlashController {
         self.registers.sr().read().bsy().bit_is_set() || self.registers.cr().read().lock().bit_is_clear()
     }
 
-    /// Opens the control register for one operation. (A `write` starts from the register's reset value, in which
-    /// LOCK is
-    /// set: whoever writes it has to clear that.)
+    /// Opens the control register for one operation. (A `write` starts from the register's reset
+    /// value, in which LOCK is set: whoever writes it has to clear that.)
     fn unlock(&mut self) {
         // What an earlier operation left behind would be taken for the outcome of this one.
         self.clear_flags();
@@ -88,8 +90,8 @@ impl Flash for FlashController {
     fn read(&self, address: u32, buffer: &mut [u8]) {
         for (byte, address) in buffer.iter_mut().zip(address..) {
             *byte = if FLASH.contains(address, 1) {
-                // SAFETY: the address is inside the memory-mapped flash, which is always readable; volatile, because
-                // the controller changes it behind the compiler's back.
+                // SAFETY: the address is inside the memory-mapped flash, which is always readable;
+                // volatile, because the controller changes it behind the compiler's back.
                 unsafe { (address as *const u8).read_volatile() }
             } else {
                 u8::MAX
@@ -106,9 +108,8 @@ impl Flash for FlashController {
         }
     }
 
-    /// By the unit. It has the polynomial, but takes words with the most significant bit first, and starts anew:
-    /// what went
-    /// before comes back as one word that leaves it in the same state.
+    /// By the unit. It has the polynomial, but takes words with the most significant bit first, and
+    /// starts anew: what went before comes back as one word that leaves it in the same state.
     fn crc32(&self, crc: u32, region: Region) -> u32 {
         let Some(unit) = &self.crc else { return crc32_by_software(self, crc, region) };
         if !region.base.is_multiple_of(4) || !FLASH.contains(region.base, region.size) {
@@ -122,7 +123,8 @@ impl Flash for FlashController {
         if crc != 0 {
             feed(u32::MAX ^ word_before((!crc).reverse_bits()));
         }
-        // SAFETY: the region was checked to be inside the memory-mapped flash, which is always readable.
+        // SAFETY: the region was checked to be inside the memory-mapped flash, which is always
+        // readable.
         let feed_from =
             |address: u32| feed(unsafe { (address as *const u32).read_volatile() }.reverse_bits());
         let (mut address, end) = (region.base, region.base + words * 4);
@@ -162,7 +164,8 @@ impl Flash for FlashController {
         }
         self.unlock();
         self.registers.cr().write(|w| w.lock().clear_bit().psize().set(WORDS).pg().set_bit());
-        // SAFETY: the address was checked to be a word of the flash; with PG set, the store starts the operation.
+        // SAFETY: the address was checked to be a word of the flash; with PG set, the store starts
+        // the operation.
         unsafe { (address as *mut u32).write_volatile(word) };
         self.running = true;
         Ok(())

@@ -1,4 +1,5 @@
-//! A few words for whoever ports the bootloader (SYS TEC manual L-1112d_10, 4.7). They are there with these features alone:
+//! A few words for whoever ports the bootloader (SYS TEC manual L-1112d_10, 4.7). They are there
+//! with these features alone:
 //!
 //! | feature | what a line is | where it goes |
 //! |---|---|---|
@@ -60,7 +61,8 @@ pub fn line(words: &'static str, number: u32) {
     let _ = line;
 }
 
-/// A frame came in: says which command it is, if it is one. (A segment of a block transfer may look like one.)
+/// A frame came in: says which command it is, if it is one. (A segment of a block transfer may look
+/// like one.)
 pub fn received(frame: &Frame) {
     if !ON {
         return;

@@ -33,7 +33,8 @@ use shared_abi::warm_start::BootRequest;
 
 systick_monotonic!(Mono, 1_000);
 
-/// A fault or a panic (which ends in one) must not silence the device: start again, and stay reachable.
+/// A fault or a panic (which ends in one) must not silence the device: start again, and stay
+/// reachable.
 #[cortex_m_rt::exception]
 unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
     product::warm_start_cell().put(BootRequest::Fault);
@@ -72,22 +73,22 @@ mod app {
     use rtic_monotonics::fugit::ExtU32;
     use rtic_monotonics::Monotonic;
 
-    /// Frames that may wait for the protocol task. It has a higher priority than all that takes long, so few do.
+    /// Frames that may wait for the protocol task. It has a higher priority than all that takes
+    /// long, so few do.
     const RX_QUEUE: usize = 32;
-    /// Bytes of blocks that may wait for the flash: what RAM is free. While a sector of 128 KiB is erased, a bus
-    /// at 1 Mbit/s
-    /// brings some 55 KiB.
+    /// Bytes of blocks that may wait for the flash: what RAM is free. While a sector of 128 KiB is
+    /// erased, a bus at 1 Mbit/s brings some 55 KiB.
     const BLOCK_QUEUE: usize = 80 * 1024;
     /// Period of the heartbeat in ms.
     const HEARTBEAT_MS: u16 = 1000;
     /// How often the protocol looks at its deadlines, in ms.
     const TICK_MS: u32 = 2;
-    /// How long the device stays after the answer to its leaving is on the bus, in ms: clients want to see the
-    /// answer before
-    /// anything else happens.
-    const FAREWELL_MS: u32 = 20;
+    /// How long the device stays after the answer to its leaving is on the bus, in ms: clients want
+    /// to see the answer before anything else happens.
+    const ANSWER_TO_RESET_MS: u32 = 20;
 
-    /// Whether an emergency follows each boot-up, so that a master knows the bootloader from the application.
+    /// Whether an emergency follows each boot-up, so that a master knows the bootloader from the
+    /// application.
     const BOOT_UP_EMERGENCY: bool = true;
 
     /// Programs of the layout, each a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
@@ -129,7 +130,7 @@ mod app {
         to_handle: Consumer<'static, Frame>,
         slave: Slave,
         debugger: Debugger,
-        leaving: Leaving,
+        leaving: PendingReset,
         /// The program that starts at the end of the rescue window.
         waiting: Option<u8>,
         watchdog: Watchdog,
@@ -137,7 +138,7 @@ mod app {
     }
 
     /// The device is about to reset.
-    pub struct Leaving {
+    pub struct PendingReset {
         wanted: bool,
         request: BootRequest,
         /// When; set once the answer is on the bus.
@@ -194,14 +195,15 @@ mod app {
                 slave,
                 debugger: Debugger::new(),
                 waiting: start::program_in_waiting(),
-                leaving: Leaving { wanted: false, request: BootRequest::PowerOn, at: None },
+                leaving: PendingReset { wanted: false, request: BootRequest::PowerOn, at: None },
                 watchdog: Watchdog::new(cx.device.IWDG),
                 led: board.led,
             },
         )
     }
 
-    /// Works on the flash for as long as there is work, and sleeps otherwise; every task comes first.
+    /// Works on the flash for as long as there is work, and sleeps otherwise; every task comes
+    /// first.
     #[idle(shared = [bootloader])]
     fn idle(mut cx: idle::Context) -> ! {
         loop {
@@ -224,9 +226,10 @@ mod app {
     fn can_rx(mut cx: can_rx::Context) {
         cx.shared.can.lock(|can| {
             while let Some(frame) = can.receive() {
-                // A full queue drops the frame; the client's time-out repeats it, and an emergency tells.
+                // A full queue drops the frame; the client's time-out repeats it, and an emergency
+                // tells.
                 if cx.local.received.enqueue(frame).is_err() {
-                    can.note_loss();
+                    can.record_overrun();
                 }
             }
         });
@@ -260,35 +263,37 @@ mod app {
             #[cfg(feature = "debugger")]
             let device = &mut { device };
             slave.observe(status, now, device);
-            // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting behind it.
+            // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests
+            // waiting behind it.
             carry_out(slave, &mut can, now, device);
             while let Some(frame) = to_handle.dequeue() {
                 log::received(&frame);
-                // The filters let nothing in but network management and what is for this device, or for layer
-                // setting services.
+                // The filters let nothing in but network management and what is for this device, or
+                // for layer setting services.
                 if RESCUE_WINDOW_MS.is_some() && frame.cob_id() != Some(CobId::NMT) {
                     *waiting = None;
                 }
                 if slave.handle(&frame, now, device) {
-                    *leaving = Leaving { wanted: true, request: BootRequest::PowerOn, at: None };
+                    *leaving = PendingReset { wanted: true, request: BootRequest::PowerOn, at: None };
                 }
                 carry_out(slave, &mut can, now, device);
             }
-            if let Some(request) = bootloader.take_leave() {
-                *leaving = Leaving { wanted: true, request, at: None };
+            if let Some(request) = bootloader.take_boot_request() {
+                *leaving = PendingReset { wanted: true, request, at: None };
             }
         });
         if let (Some(program), Some(ms)) = (*waiting, RESCUE_WINDOW_MS) {
             if now.has_reached(Instant::from_millis(ms.into())) {
                 // Whether or not anybody is there to hear the boot-up.
-                *leaving = Leaving { wanted: true, request: BootRequest::Resume(program), at: Some(now) };
+                *leaving =
+                    PendingReset { wanted: true, request: BootRequest::Resume(program), at: Some(now) };
                 return;
             }
         }
         // What a host was told is done is not lost by a reset that comes too early.
         let finishing = bootloader.lock(|bootloader| bootloader.is_finishing());
         if leaving.wanted && !finishing && slave.is_idle() && can.lock(|can| can.is_idle()) {
-            leaving.at = Some(now + FAREWELL_MS);
+            leaving.at = Some(now + ANSWER_TO_RESET_MS);
             log!("leaving; request", WarmStart::new(leaving.request).request);
         }
     }
@@ -308,7 +313,7 @@ mod app {
                 }
                 Output::Join(rate) => configure(can, rate, Mode::Normal),
                 Output::Listen(rate) => configure(can, rate, Mode::Silent),
-                Output::ComeBack => can.lock(|can| can.come_back()),
+                Output::RecoverFromBusOff => can.lock(|can| can.recover_from_bus_off()),
                 Output::Accept(ids) => can.lock(|can| can.accept(ids.into_iter().map(CobId::get))),
             }
         }
@@ -324,7 +329,7 @@ mod app {
     /// What the slave wants to know of its line.
     fn status(can: &mut CanPort) -> Status {
         let errors = can.errors();
-        let lost = can.take_lost();
+        let lost = can.take_overruns();
         Status {
             confinement: match errors {
                 Errors { off: true, .. } => Confinement::BusOff,

@@ -32,18 +32,16 @@ pub const VERSION: u32 = 0x0000_0001;
 pub const POLICY: Policy = Policy { autostart: Some(1), max_crash_resets: 3, node_ids: NODE_IDS };
 /// Node-IDs with which programs may be started.
 const NODE_IDS: RangeInclusive<u8> = 1..=127;
-/// How long a program that would start by itself is held back, in ms, so that a master can catch the device: an
-/// SDO request to it, or
-/// any layer setting service, keeps it in the bootloader. `None` for a program that starts at once. Shorter than
-/// the heartbeat.
+/// How long a program that would start by itself is held back, in ms, so that a master can catch
+/// the device: an SDO request to it, or any layer setting service, keeps it in the bootloader.
+/// `None` for a program that starts at once. Shorter than the heartbeat.
 pub const RESCUE_WINDOW_MS: Option<u16> = if cfg!(feature = "rescue-window") { Some(500) } else { None };
-/// A program that is started has to feed the independent watchdog within this time, in ms, from its first
-/// instruction on;
-/// `None` for a program that is started without one.
+/// A program that is started has to feed the independent watchdog within this time, in ms, from its
+/// first instruction on; `None` for a program that is started without one.
 pub const PROGRAM_WATCHDOG_MS: Option<u16> = None;
 
-/// Where this product keeps its parameters. One with an EEPROM puts its own [`boot_core::parameters::Parameters`]
-/// here.
+/// Where this product keeps its parameters. One with an EEPROM puts its own
+/// [`boot_core::parameters::Parameters`] here.
 pub type Parameters = Journal;
 
 /// The parameters of this device.
@@ -93,7 +91,7 @@ pub const TIMINGS: [Option<BitTiming>; 9] = BitTiming::table(CAN_CLOCK, BitRate:
 
 /// The warm-start cell of this board.
 pub fn warm_start_cell() -> Cell {
-    // SAFETY: the layout's warm-start region, checked to be RAM of that size that the linker keeps out of every
-    // image.
+    // SAFETY: the layout's warm-start region, checked to be RAM of that size that the linker keeps
+    // out of every image.
     unsafe { Cell::at(LAYOUT.warm_start.base as *mut _) }
 }

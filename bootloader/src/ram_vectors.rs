@@ -1,10 +1,12 @@
-//! The vector table in RAM: the core fetches vectors from flash otherwise, and stalls there while flash is busy.
+//! The vector table in RAM: the core fetches vectors from flash otherwise, and stalls there while
+//! flash is busy.
 
 use core::cell::UnsafeCell;
 
 use cortex_m::peripheral::SCB;
 
-/// Entries of the F4's largest table: 16 exceptions and up to 112 interrupts, rounded up to VTOR's alignment.
+/// Entries of the F4's largest table: 16 exceptions and up to 112 interrupts, rounded up to VTOR's
+/// alignment.
 const ENTRIES: usize = 128;
 
 #[repr(C, align(512))]
@@ -24,9 +26,9 @@ extern "C" {
 ///
 /// Call it once, with interrupts off.
 pub fn relocate(scb: &mut SCB) {
-    // SAFETY: the linker script lays the table down at the start of the flash, of which `ENTRIES` words can be read, and no chip's
-    // table is longer; what stands behind a shorter one is nobody's vector. Interrupts are off, so nothing reads the copy while it is
-    // made.
+    // SAFETY: the linker script lays the table down at the start of the flash, of which `ENTRIES`
+    // words can be read, and no chip's table is longer; what stands behind a shorter one is
+    // nobody's vector. Interrupts are off, so nothing reads the copy while it is made.
     unsafe {
         let copy = VECTORS.0.get();
         copy.copy_from_nonoverlapping(&raw const __vector_table, 1);

@@ -1,5 +1,5 @@
-//! The start-up in flash: the resident part decides; if it comes back, code and constants are copied to RAM and
-//! `init` follows.
+//! The start-up in flash: the resident part decides; if it comes back, code and constants are
+//! copied to RAM and `init` follows.
 
 use core::arch::global_asm;
 use core::sync::atomic::{AtomicU32, Ordering};
@@ -11,16 +11,16 @@ const BYTES: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/resident.bin"));
 #[repr(C, align(4))]
 struct Resident([u8; BYTES.len()]);
 
-/// The resident part (`resident/main.rs`) at its place in flash; the linker script holds it to the address that it
-/// was linked for.
+/// The resident part (`resident/main.rs`) at its place in flash; the linker script holds it to the
+/// address that it was linked for.
 #[used]
 #[no_mangle]
 #[link_section = ".callgate.resident"]
 static RESIDENT: Resident = Resident(*include_bytes!(concat!(env!("OUT_DIR"), "/resident.bin")));
 
-// Reset calls `__pre_init` first of all, from flash. It switches the FPU on (the compiler may use its registers to
-// move
-// data) and calls the boot stage, whose address is the word behind the callgate's table.
+// Reset calls `__pre_init` first of all, from flash. It switches the FPU on (the compiler may use
+// its registers to move data) and calls the boot stage, whose address is the word behind the
+// callgate's table.
 global_asm!(
     ".section .boot, \"ax\"",
     ".global __pre_init",

@@ -1,17 +1,15 @@
-//! The independent watchdog (RM0090 section 21), fed when every task has checked in (SYS TEC manual L-1112d_10,
-//! 3.4.8).
+//! The independent watchdog (RM0090 section 21), fed when every task has checked in (SYS TEC manual
+//! L-1112d_10, 3.4.8).
 //!
-//! A reset is what stops it: the bootloader leaves by one, so that a program starts without it unless `product.rs`
-//! says
-//! otherwise.
+//! A reset is what stops it: the bootloader leaves by one, so that a program starts without it
+//! unless `product.rs` says otherwise.
 
 use core::sync::atomic::{AtomicBool, Ordering};
 
 use bsp::{pac, watchdog};
 
-/// How long a task may be missing, in ms. The longest that any is kept from running is a few of them: a block of
-/// 16 KiB being
-/// judged.
+/// How long a task may be missing, in ms. The longest that any is kept from running is a few of
+/// them: a block of 16 KiB being judged.
 const TIMEOUT_MS: u16 = 1000;
 
 /// Who has to check in.
@@ -40,7 +38,8 @@ impl Watchdog {
         Self(registers)
     }
 
-    /// Feeds it if all tasks have checked in since they last did. To be called by the task that drives the others.
+    /// Feeds it if all tasks have checked in since they last did. To be called by the task that
+    /// drives the others.
     pub fn feed(&mut self) {
         if CHECKED_IN.iter().all(|task| task.load(Ordering::Relaxed)) {
             for task in &CHECKED_IN {

@@ -1,5 +1,5 @@
-//! What every board does with its bxCAN: bit timing, filters, frames, and the state of the controller (RM0090
-//! section 32).
+//! What every board does with its bxCAN: bit timing, filters, frames, and the state of the
+//! controller (RM0090 section 32).
 
 use bxcan::filter::ListEntry16;
 use bxcan::{Can, Fifo, Interrupts, Mailbox, MasterInstance, OverrunError, StandardId};
@@ -17,9 +17,9 @@ pub struct BitTiming {
 }
 
 impl BitTiming {
-    /// The timing that makes `bit_rate` (bit/s) out of `clock` (Hz) exactly, with the sample point as near to 87.5 %
-    /// as it gets (the point that CiA 301 recommends) and as many quanta as fit; `None` where the clock cannot
-    /// make it.
+    /// The timing that makes `bit_rate` (bit/s) out of `clock` (Hz) exactly, with the sample point
+    /// as near to 87.5 % as it gets (the point that CiA 301 recommends) and as many quanta as fit;
+    /// `None` where the clock cannot make it.
     #[must_use]
     pub const fn new(clock: u32, bit_rate: u32) -> Option<Self> {
         if bit_rate == 0 || !clock.is_multiple_of(bit_rate) {
@@ -29,7 +29,8 @@ impl BitTiming {
         let mut quanta = 25;
         while quanta >= 8 {
             if cycles.is_multiple_of(quanta) && cycles / quanta <= 1024 {
-                // 1 quantum of sync, then the segments; 1/8 of the bit, rounded, behind the sample point.
+                // 1 quantum of sync, then the segments; 1/8 of the bit, rounded, behind the sample
+                // point.
                 let segment_2 = (quanta + 4) / 8;
                 let segment_1 = quanta - 1 - segment_2;
                 if segment_1 <= 16 {
@@ -73,7 +74,8 @@ pub enum Mode {
     Silent,
 }
 
-/// What a controller that was asked for its errors tells (`CAN_ESR` and `CAN_MSR`, RM0090 section 32.9.2).
+/// What a controller that was asked for its errors tells (`CAN_ESR` and `CAN_MSR`, RM0090 section
+/// 32.9.2).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Errors {
     /// Bus-off.
@@ -82,7 +84,8 @@ pub struct Errors {
     pub passive: bool,
     /// It has seen the bus idle since it was configured, and takes part.
     pub joined: bool,
-    /// What became of the last frame since the question before: nothing came, a good one, a bad one.
+    /// What became of the last frame since the question before: nothing came, a good one, a bad
+    /// one.
     pub last: Option<Result<(), ()>>,
 }
 
@@ -111,7 +114,8 @@ pub struct Port<I: MasterInstance> {
     lost: Lost,
 }
 
-/// Whether this is what a node says first (CiA 301 section 7.2.8.3.3): a state of 0 on 700h + node-ID.
+/// Whether this is what a node says first (CiA 301 section 7.2.8.3.3): a state of 0 on 700h +
+/// node-ID.
 fn is_boot_up(frame: &bxcan::Frame) -> bool {
     let boot_up = |data: &bxcan::Data| data[..] == [0];
     matches!(frame.id(), bxcan::Id::Standard(id) if id.as_raw() & 0x780 == 0x700)
@@ -138,12 +142,13 @@ impl<I: MasterInstance> Port<I> {
 
     /// Sets bit timing and mode, and joins the bus with empty mailboxes.
     ///
-    /// Joining takes 11 recessive bits on the bus; the controller waits for them by itself and this function does
-    /// not.
+    /// Joining takes 11 recessive bits on the bus; the controller waits for them by itself and this
+    /// function does not.
     pub fn configure(&mut self, timing: BitTiming, mode: Mode) {
         let config = self.can.modify_config();
         config.set_bit_timing(timing.register()).set_silent(mode == Mode::Silent).leave_disabled();
-        // Only now: while a frame is under way that nobody acknowledges, an abort would wait for it.
+        // Only now: while a frame is under way that nobody acknowledges, an abort would wait for
+        // it.
         self.waiting = None;
         for mailbox in [Mailbox::Mailbox0, Mailbox::Mailbox1, Mailbox::Mailbox2] {
             self.can.abort(mailbox);
@@ -152,7 +157,7 @@ impl<I: MasterInstance> Port<I> {
     }
 
     /// Comes back from bus-off: by itself, once the bus was idle for 128 × 11 bits.
-    pub fn come_back(&mut self) {
+    pub fn recover_from_bus_off(&mut self) {
         self.can.modify_config().leave_disabled();
         self.join();
     }
@@ -164,7 +169,8 @@ impl<I: MasterInstance> Port<I> {
         self.write(MCR, self.read(MCR) & !ABOM);
     }
 
-    /// Sets the acceptance filters to exactly these identifiers (data frames, 11 bits), all into FIFO 0.
+    /// Sets the acceptance filters to exactly these identifiers (data frames, 11 bits), all into
+    /// FIFO 0.
     pub fn accept(&mut self, identifiers: impl Iterator<Item = u16>) {
         let mut identifiers = identifiers.map(standard_id).peekable();
         let mut filters = self.can.modify_filters();
@@ -191,12 +197,12 @@ impl<I: MasterInstance> Port<I> {
     }
 
     /// A frame that was taken from the FIFO found no room with its taker.
-    pub fn note_loss(&mut self) {
+    pub fn record_overrun(&mut self) {
         self.lost.in_queue = true;
     }
 
-    /// Acknowledges the mailbox interrupt and moves a frame that waits into a mailbox. Whether there is room for
-    /// one now.
+    /// Acknowledges the mailbox interrupt and moves a frame that waits into a mailbox. Whether
+    /// there is room for one now.
     pub fn has_room(&mut self) -> bool {
         self.can.clear_tx_interrupt();
         if let Some(frame) = self.waiting.take() {
@@ -208,7 +214,8 @@ impl<I: MasterInstance> Port<I> {
 
     /// Sends a frame. To be called only when there is room; a frame that still waits would be lost.
     ///
-    /// Frames of one identifier leave in order: the mailboxes take the second only when the first is on its way.
+    /// Frames of one identifier leave in order: the mailboxes take the second only when the first
+    /// is on its way.
     pub fn send<F: Frame>(&mut self, frame: &F) {
         if let Some(frame) = convert(frame) {
             self.boot_up = is_boot_up(&frame);
@@ -226,7 +233,8 @@ impl<I: MasterInstance> Port<I> {
 
     /// Whether everything given to it is on the bus and acknowledged.
     pub fn is_idle(&mut self) -> bool {
-        // Who waits for this may do nothing else with the controller: its interrupt would come again and again.
+        // Who waits for this may do nothing else with the controller: its interrupt would come
+        // again and again.
         self.can.clear_tx_interrupt();
         self.waiting.is_none() && self.can.is_transmitter_idle()
     }
@@ -245,7 +253,7 @@ impl<I: MasterInstance> Port<I> {
     }
 
     /// Where frames were lost since the question before.
-    pub fn take_lost(&mut self) -> Lost {
+    pub fn take_overruns(&mut self) -> Lost {
         if self.read(RF0R) & FOVR0 != 0 {
             self.write(RF0R, FOVR0);
             self.lost.in_controller = true;
@@ -254,9 +262,8 @@ impl<I: MasterInstance> Port<I> {
     }
 
     fn read(&self, offset: usize) -> u32 {
-        // SAFETY: `REGISTERS` is the base of the controller that this port owns, the offset one of the registers
-        // above;
-        // reading them has no effect.
+        // SAFETY: `REGISTERS` is the base of the controller that this port owns, the offset one of
+        // the registers above; reading them has no effect.
         unsafe { I::REGISTERS.cast::<u32>().byte_add(offset).read_volatile() }
     }
 
@@ -271,7 +278,8 @@ fn standard_id(raw: u16) -> StandardId {
     StandardId::new(raw & 0x7FF).unwrap_or(StandardId::MAX)
 }
 
-/// The same frame in another crate's type. Both ends are checked types, so the conversion cannot fail.
+/// The same frame in another crate's type. Both ends are checked types, so the conversion cannot
+/// fail.
 fn convert<F: Frame, G: Frame>(frame: &F) -> Option<G> {
     if frame.is_remote_frame() {
         G::new_remote(frame.id(), frame.dlc())

@@ -1,6 +1,6 @@
-//! The clock tree at the level of its registers (RM0090 sections 3.5 and 7; RM0390 sections 3.4 and 6 say the
-//! same), for code that has to be small, and to be able to
-//! leave it as a reset does. An application takes the HAL's way, [`crate::clocks`].
+//! The clock tree at the level of its registers (RM0090 sections 3.5 and 7; RM0390 sections 3.4 and
+//! 6 say the same), for code that has to be small, and to be able to leave it as a reset does. An
+//! application takes the HAL's way, [`crate::clocks`].
 
 /// How a board makes its clocks out of its crystal.
 #[derive(Clone, Copy, Debug)]
@@ -50,7 +50,8 @@ impl ClockTree {
     /// The tree, if the chip can run with it.
     ///
     /// # Panics
-    /// At compile time, with the rule that is broken (RM0090 sections 7.3.2 and 7.3.3, DS8626 table 14).
+    /// At compile time, with the rule that is broken (RM0090 sections 7.3.2 and 7.3.3, DS8626 table
+    /// 14).
     #[must_use]
     pub const fn checked(self) -> Self {
         let vco = self.pll_input * self.pll_n;
@@ -63,7 +64,8 @@ impl ClockTree {
             "board: the PLL's input must be 1 to 2 MHz"
         );
         assert!(vco >= 100_000_000 && vco <= 432_000_000, "board: the PLL must run at 100 to 432 MHz");
-        // Chips that can do 180 MHz need over-drive for more than this, which nothing here switches on.
+        // Chips that can do 180 MHz need over-drive for more than this, which nothing here switches
+        // on.
         assert!(
             self.sysclk() <= 168_000_000,
             "board: the core is too fast: 168 MHz at most, without over-drive"
@@ -113,14 +115,14 @@ mod registers {
     /// RCC_CFGR: what the system clock runs from, as told back.
     const SWS_PLL: u32 = 0b10 << 2;
     const SWS: u32 = 0b11 << 2;
-    /// How often a crystal is looked at before it is given up: at 16 MHz and 8 cycles a look 50 ms, ten times what
-    /// one takes.
+    /// How often a crystal is looked at before it is given up: at 16 MHz and 8 cycles a look 50 ms,
+    /// ten times what one takes.
     const PATIENCE: u32 = 100_000;
 
     impl ClockTree {
-        /// Runs the core from the PLL. A crystal that does not start is done without, as long as the board has
-        /// power: a device that can be
-        /// reached badly is better than none. From the state after a reset or after [`slow_down`](Self::slow_down).
+        /// Runs the core from the PLL. A crystal that does not start is done without, as long as
+        /// the board has power: a device that can be reached badly is better than none. From the
+        /// state after a reset or after [`slow_down`](Self::slow_down).
         pub fn speed_up(&self, rcc: &pac::RCC, wanted: Source) -> Source {
             let mut source = Source::Internal;
             if wanted == Source::Crystal {
@@ -138,8 +140,8 @@ mod registers {
                 Source::Crystal => (self.hse, 1 << 22),
             };
             let pll = (from / self.pll_input) | (self.pll_n << 6) | ((self.pll_p / 2 - 1) << 16) | bit;
-            // SAFETY: a valid word of PLLCFGR, as `checked` has seen to; the reserved bits and Q keep their reset
-            // values.
+            // SAFETY: a valid word of PLLCFGR, as `checked` has seen to; the reserved bits and Q
+            // keep their reset values.
             rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR & 0xFF00_0000 | pll) });
             set(rcc, PLLON);
             latency(self.wait_states);
@@ -171,12 +173,11 @@ mod registers {
         rcc.cr().modify(|r, w| unsafe { w.bits(r.bits() | bit) });
     }
 
-    /// Wait states of the flash; the rest of its access control stays. The new value holds once it reads back
-    /// (section 3.5.1).
+    /// Wait states of the flash; the rest of its access control stays. The new value holds once it
+    /// reads back (section 3.5.1).
     fn latency(wait_states: u32) {
-        // SAFETY: the access control register is this module's as far as the wait states go; the flash driver does
-        // not touch
-        // them, and no other priority runs while clocks change.
+        // SAFETY: the access control register is this module's as far as the wait states go; the
+        // flash driver does not touch them, and no other priority runs while clocks change.
         let acr = unsafe { &*pac::FLASH::ptr() }.acr();
         // SAFETY: 0 to 15.
         acr.modify(|r, w| unsafe { w.bits((r.bits() & !0xF) | wait_states) });

@@ -1,4 +1,5 @@
-//! The chip's memory for the debugger interface (feature `debugger`): any address may be asked for, none faults.
+//! The chip's memory for the debugger interface (feature `debugger`): any address may be asked for,
+//! none faults.
 
 use shared_abi::memory_map::{may_read, may_write};
 
@@ -9,12 +10,13 @@ use crate::{pac, LAYOUT};
 pub enum Refused {
     /// Something else lies there, or nothing (`shared_abi::memory_map`).
     Address,
-    /// The flash is busy: reading it now would stop the CPU until that is over. Or the CCM has no clock.
+    /// The flash is busy: reading it now would stop the CPU until that is over. Or the CCM has no
+    /// clock.
     Busy,
 }
 
-/// Whether the chip's read-out protection is on, at whatever level (RM0090, embedded flash: read protection): `RDP` in `FLASH_OPTCR` is AAh
-/// where it is not.
+/// Whether the chip's read-out protection is on, at whatever level (RM0090, embedded flash: read
+/// protection): `RDP` in `FLASH_OPTCR` is AAh where it is not.
 #[must_use]
 pub fn is_locked() -> bool {
     const OPEN: u8 = 0xAA;
@@ -38,8 +40,8 @@ pub fn read(address: u32, bytes: &mut [u8]) -> Result<(), Refused> {
     while !rest.is_empty() {
         let width = width(at, rest.len());
         let (piece, behind) = rest.split_at_mut(width);
-        // SAFETY: the whole range can be read (`may_read`), and the address is aligned to the width. What such a read does to a
-        // peripheral is what whoever asked for it wants.
+        // SAFETY: the whole range can be read (`may_read`), and the address is aligned to the
+        // width. What such a read does to a peripheral is what whoever asked for it wants.
         unsafe {
             match width {
                 4 => piece.copy_from_slice(&(at as *const u32).read_volatile().to_le_bytes()),
@@ -69,9 +71,9 @@ pub fn write(address: u32, bytes: &[u8]) -> Result<(), Refused> {
     while !rest.is_empty() {
         let width = width(at, rest.len());
         let (piece, behind) = rest.split_at(width);
-        // SAFETY: the whole range can be written (`may_write`), and the address is aligned to the width. **What that does to this
-        // program is beyond all promises**: a debugger may change any variable, stacks included. This is why the feature is
-        // never on in a product.
+        // SAFETY: the whole range can be written (`may_write`), and the address is aligned to the
+        // width. **What that does to this program is beyond all promises**: a debugger may change
+        // any variable, stacks included. This is why the feature is never on in a product.
         unsafe {
             match *piece {
                 [a, b, c, d] => (at as *mut u32).write_volatile(u32::from_le_bytes([a, b, c, d])),
@@ -88,7 +90,8 @@ pub fn write(address: u32, bytes: &[u8]) -> Result<(), Refused> {
 
 /// Whether the memory at this address does not answer at present.
 fn is_busy(address: u32) -> bool {
-    /// `RCC_AHB1ENR.CCMDATARAMEN`, on after a reset (RM0090, RCC); a chip without CCM does not have it.
+    /// `RCC_AHB1ENR.CCMDATARAMEN`, on after a reset (RM0090, RCC); a chip without CCM does not have
+    /// it.
     const CCM_CLOCK: u32 = 1 << 20;
     // SAFETY: reading these registers changes nothing.
     let (flash, rcc) = unsafe { (pac::FLASH::steal(), pac::RCC::steal()) };

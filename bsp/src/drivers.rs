@@ -29,12 +29,13 @@ pub fn clocks(rcc: pac::RCC) -> Rcc {
     rcc.freeze(hse.sysclk(SYSCLK.Hz()).pclk1(CAN_CLOCK.Hz()))
 }
 
-/// Whether the entry strap ([`ENTRY_STRAP`]) asks for the bootloader. Leaves its port as after a reset.
+/// Whether the entry strap ([`ENTRY_STRAP`]) asks for the bootloader. Leaves its port as after a
+/// reset.
 #[must_use]
 pub fn entry_strap(rcc: &pac::RCC) -> bool {
     const PORT: u32 = ENTRY_STRAP.0 as u32 - 'A' as u32;
-    /// The ports lie behind one another (RM0090 and RM0390, register boundary addresses), and the switches of their clocks in the
-    /// same order (RCC_AHB1ENR).
+    /// The ports lie behind one another (RM0090 and RM0390, register boundary addresses), and the
+    /// switches of their clocks in the same order (RCC_AHB1ENR).
     const IDR: *const u32 = (0x4002_0010 + 0x400 * PORT) as *const u32;
     let clocks = rcc.ahb1enr();
     let before = clocks.read().bits();
@@ -42,7 +43,8 @@ pub fn entry_strap(rcc: &pac::RCC) -> bool {
     clocks.write(|w| unsafe { w.bits(before | 1 << PORT) });
     // It needs two cycles before the first access: reading back waits that long.
     let _ = clocks.read();
-    // SAFETY: the inputs of a port that the chip has (`lib.rs` looks) are read, and nothing is changed.
+    // SAFETY: the inputs of a port that the chip has (`lib.rs` looks) are read, and nothing is
+    // changed.
     let inputs = unsafe { IDR.read_volatile() };
     // SAFETY: what it was.
     clocks.write(|w| unsafe { w.bits(before) });

@@ -1,8 +1,8 @@
 //! Board support: everything that differs between two boards of one firmware.
 //!
 //! One file per board, chosen by the cargo feature `board-…`, beside its memory map in
-//! `shared-abi/src/layout/`. To port coboot, copy a board file and go through it from top to bottom.
-//! The rest of the crate is what all boards share.
+//! `shared-abi/src/layout/`. To port coboot, copy a board file and go through it from top to
+//! bottom. The rest of the crate is what all boards share.
 //!
 //! On the host there are the values of a board, without the drivers.
 #![no_std]
@@ -25,13 +25,15 @@ pub mod virtual_can;
 #[cfg(target_arch = "arm")]
 pub mod watchdog;
 
-/// A GPIO port or a UART, for the `init` of a board. The board file alone knows which that is about, so no caller hands them over;
-/// that it is asked for once is shown by the CAN controller, which exists once.
+/// A GPIO port or a UART, for the `init` of a board. The board file alone knows which that is
+/// about, so no caller hands them over; that it is asked for once is shown by the CAN controller,
+/// which exists once.
 #[cfg(target_arch = "arm")]
 macro_rules! take_port {
     ($port:ident, $can:ident) => {{
         let _: &pac::CAN1 = &$can;
-        // SAFETY: the pins of a board and its UART are set up by its `init` alone, and that takes the only CAN controller.
+        // SAFETY: the pins of a board and its UART are set up by its `init` alone, and that takes
+        // the only CAN controller.
         unsafe { pac::$port::steal() }
     }};
 }
@@ -72,7 +74,8 @@ pub const SYSCLK: u32 = CLOCK_TREE.sysclk();
 /// Clock of the CAN controller, in Hz: that of APB1.
 pub const CAN_CLOCK: u32 = CLOCK_TREE.apb1_clock();
 
-/// Who owns which address on this board; on the chip without the names, which nothing there asks for.
+/// Who owns which address on this board; on the chip without the names, which nothing there asks
+/// for.
 #[cfg(target_arch = "arm")]
 pub const LAYOUT: &Layout = {
     const CHIP: Geometry = Geometry { chip: "", ..*board::LAYOUT.chip };
@@ -121,7 +124,8 @@ pub struct Identity {
     pub hardware_version: &'static str,
 }
 
-/// Serial number of the device (1018h/4): a fold of the chip's 96-bit unique identifier (RM0090 section 39.1).
+/// Serial number of the device (1018h/4): a fold of the chip's 96-bit unique identifier (RM0090
+/// section 39.1).
 #[must_use]
 pub fn serial_number() -> u32 {
     const UNIQUE_ID: *const [u32; 3] = 0x1FFF_7A10 as *const _;

@@ -1,10 +1,12 @@
-//! Stops the program at a breakpoint while the bus goes on (feature `monitor`): the DebugMonitor exception of the core
-//! (ARM DDI 0403E, section C1).
+//! Stops the program at a breakpoint while the bus goes on (feature `monitor`): the DebugMonitor
+//! exception of the core (ARM DDI 0403E, section C1).
 //!
-//! The exception has a priority between that of the code to be debugged and that of the tasks that serve the bus. While
-//! its handler waits, those tasks pre-empt it as ever: SDO, heartbeats and the debugger interface itself stay alive, and so does
-//! every task of the application above it. The other side of it: **code of such a priority, code within a critical section and code
-//! that holds a lock of such a task cannot be stopped**. A breakpoint hit there turns all of them off, tells so, and the code runs on.
+//! The exception has a priority between that of the code to be debugged and that of the tasks that
+//! serve the bus. While its handler waits, those tasks pre-empt it as ever: SDO, heartbeats and the
+//! debugger interface itself stay alive, and so does every task of the application above it. The
+//! other side of it: **code of such a priority, code within a critical section and code that holds
+//! a lock of such a task cannot be stopped**. A breakpoint hit there turns all of them off, tells
+//! so, and the code runs on.
 //!
 //! The host works it by the core's own registers, through 1025h:
 //!
@@ -90,7 +92,8 @@ fn load(register: u32) -> u32 {
 }
 
 fn store(register: u32, value: u32) {
-    // SAFETY: one of the registers above. What they do to the flow of the program is what this module is for.
+    // SAFETY: one of the registers above. What they do to the flow of the program is what this
+    // module is for.
     unsafe { (register as *mut u32).write_volatile(value) }
 }
 
@@ -105,8 +108,8 @@ fn change_demcr(clear: u32, set: u32) {
     }
 }
 
-/// Before anything else of the program, memory included: turns breakpoints off. They outlive a reset and the exception does not, so
-/// that one that is hit before [`arm`] would be a fault.
+/// Before anything else of the program, memory included: turns breakpoints off. They outlive a
+/// reset and the exception does not, so that one that is hit before [`arm`] would be a fault.
 ///
 /// # Safety
 /// It is for the start-up of `cortex-m-rt` to call.
@@ -117,8 +120,9 @@ pub unsafe extern "C" fn __pre_init() {
     naked_asm!("movw r0, #0x2000", "movt r0, #0xE000", "movs r1, #2", "str r1, [r0]", "dsb", "isb", "bx lr")
 }
 
-/// Makes breakpoints stop the program, of which there are none yet, unless the chip's read-out protection is on. `priority` is the exception's, as the core has it
-/// (the upper four bits): more urgent (less) than that of the code to be stopped, less urgent than that of the tasks that serve
+/// Makes breakpoints stop the program, of which there are none yet, unless the chip's read-out
+/// protection is on. `priority` is the exception's, as the core has it (the upper four bits): more
+/// urgent (less) than that of the code to be stopped, less urgent than that of the tasks that serve
 /// the bus. A stop pends the interrupt of this number, to be told by [`take_stop`].
 pub fn arm(priority: u8, interrupt: u16) {
     if debugger::is_locked() {
@@ -145,7 +149,7 @@ pub fn take_stop() -> Option<(u8, u32)> {
 }
 
 /// A program that is stopped goes on, and nothing stops it any more.
-pub fn let_go() {
+pub fn release_program() {
     store(FP_CTRL, KEY);
     change_demcr(MON_EN | MON_STEP | MON_REQ, 0);
 }
@@ -183,7 +187,8 @@ pub unsafe extern "C" fn DebugMonitor() {
     )
 }
 
-/// A fault's entry. One by a breakpoint in code that cannot be stopped is none; any other restarts the device.
+/// A fault's entry. One by a breakpoint in code that cannot be stopped is none; any other restarts
+/// the device.
 ///
 /// # Safety
 /// It is the core's to call.
@@ -216,14 +221,16 @@ unsafe extern "C" fn on_fault(frame: *const Frame) {
     store(FP_CTRL, KEY);
     store(HFSR, HFSR_DEBUGEVT | HFSR_FORCED);
     store(DFSR, DFSR_ALL);
-    // SAFETY: a debug event did not come from a broken stack; what the entry passes is the frame on it.
+    // SAFETY: a debug event did not come from a broken stack; what the entry passes is the frame on
+    // it.
     tell(OUT_OF_REACH, unsafe { (*frame).pc });
     synchronize();
 }
 
 unsafe extern "C" fn on_debug_event(saved: *mut Saved) {
-    // SAFETY: the entry has just built it on the stack, and the core the frame; both stay there until this returns. What the host
-    // changes in them through 1025h it changes while this waits: they are read and written by volatile accesses.
+    // SAFETY: the entry has just built it on the stack, and the core the frame; both stay there
+    // until this returns. What the host changes in them through 1025h it changes while this waits:
+    // they are read and written by volatile accesses.
     let pc = unsafe { &raw mut (*(&raw const (*saved).frame).read_volatile()).pc };
     let cause = load(DFSR);
     store(DFSR, DFSR_ALL);
@@ -240,7 +247,8 @@ unsafe extern "C" fn on_debug_event(saved: *mut Saved) {
     store(DCRDR, saved as u32);
     tell(if cause & BKPT != 0 { BREAKPOINT } else { STEP }, stopped_at);
     while load(DEMCR) & MON_REQ != 0 {
-        // The tasks that serve the bus want to look at their deadlines; who does that otherwise may be what is stopped.
+        // The tasks that serve the bus want to look at their deadlines; who does that otherwise may
+        // be what is stopped.
         pend_teller();
         // SAFETY: it waits for an interrupt; the one that was pended has come before.
         unsafe { asm!("dsb", "isb", "wfi") };
@@ -273,7 +281,8 @@ struct Step {
     mask: Option<u8>,
 }
 
-/// The step that is under way, bit by bit: [`STEPS`], asked, over, changed the mask; the mask from bit 8 on.
+/// The step that is under way, bit by bit: [`STEPS`], asked, over, changed the mask; the mask from
+/// bit 8 on.
 static STEP_STATE: AtomicU32 = AtomicU32::new(0);
 const STEPS: u32 = 1 << 0;
 const ASKED: u32 = 1 << 1;
@@ -289,8 +298,8 @@ impl Step {
     }
 
     fn begin(mut self, instruction: Instruction) {
-        // Nothing else that can be stopped may come between: that would be stopped in its place. What changes the mask itself goes
-        // without.
+        // Nothing else that can be stopped may come between: that would be stopped in its place.
+        // What changes the mask itself goes without.
         let in_force = basepri();
         let least = (load(SHPR3) as u8).saturating_add(PRIORITY_STEP);
         if instruction != Instruction::SetsMask && (in_force == 0 || in_force > least) {
@@ -362,7 +371,8 @@ fn basepri() -> u8 {
 }
 
 fn set_basepri(value: u8) {
-    // SAFETY: the handler's own priority is above every mask that is set here: what it masks waits anyway.
+    // SAFETY: the handler's own priority is above every mask that is set here: what it masks waits
+    // anyway.
     unsafe { asm!("msr BASEPRI, {}", in(reg) u32::from(value)) };
 }
 

@@ -17,17 +17,20 @@ pub const IDENTITY: Identity = Identity {
     hardware_version: "MB1136",
 };
 
-/// Node-ID of a device that was never told another one, 1 to 127; 255 for one that waits for layer setting services.
+/// Node-ID of a device that was never told another one, 1 to 127; 255 for one that waits for layer
+/// setting services.
 pub const NODE_ID: u8 = 1;
 
-/// Bit rate of a device that was never told another one, in bit/s; 0 for one that finds it out by listening.
+/// Bit rate of a device that was never told another one, in bit/s; 0 for one that finds it out by
+/// listening.
 pub const BIT_RATE: u32 = 125_000;
 
-/// 8 MHz from the ST-LINK on OSC_IN (MCO; UM1724: as delivered). HSI alone would do for the core, but 1 % is too much
-/// for CAN above 125 kbit/s. Where the ST-LINK has been broken off and no crystal X3 is fitted, the bootloader falls back to HSI.
+/// 8 MHz from the ST-LINK on OSC_IN (MCO; UM1724: as delivered). HSI alone would do for the core,
+/// but 1 % is too much for CAN above 125 kbit/s. Where the ST-LINK has been broken off and no
+/// crystal X3 is fitted, the bootloader falls back to HSI.
 ///
-/// 160 MHz and not the 180 MHz that the chip could do with over-drive: APB1 at 40 MHz makes each bit rate of CiA 301, 45 MHz and
-/// 42 MHz do not make 800 kbit/s.
+/// 160 MHz and not the 180 MHz that the chip could do with over-drive: APB1 at 40 MHz makes each
+/// bit rate of CiA 301, 45 MHz and 42 MHz do not make 800 kbit/s.
 pub const CLOCK_TREE: ClockTree = ClockTree {
     hse: 8_000_000,
     hse_bypass: true,
@@ -79,7 +82,8 @@ mod pins {
         let led = gpioa.pa5.into_push_pull_output();
         #[cfg(feature = "uart")]
         let uart = Port::new(take_port!(USART2, can1), (gpioa.pa2, gpioa.pa3), rcc);
-        // AF9: CAN1_RX is PB8, CAN1_TX is PB9 (DS10693, alternate functions; the HAL's table has the same).
+        // AF9: CAN1_RX is PB8, CAN1_TX is PB9 (DS10693, alternate functions; the HAL's table has
+        // the same).
         let can = can1.can((gpiob.pb9, gpiob.pb8), rcc);
         Board {
             can,

@@ -1,4 +1,5 @@
-//! A ring of bytes between an interrupt and the rest of the program: one side puts, the other takes, and neither waits.
+//! A ring of bytes between an interrupt and the rest of the program: one side puts, the other
+//! takes, and neither waits.
 
 use core::sync::atomic::{AtomicBool, AtomicU8, AtomicUsize, Ordering};
 
@@ -102,7 +103,7 @@ impl<const N: usize> Inbox<N> {
     }
 
     /// Whether something was lost since the question before.
-    pub fn take_lost(&self) -> bool {
+    pub fn take_overruns(&self) -> bool {
         self.lost.swap(false, Ordering::Relaxed)
     }
 }

@@ -1,14 +1,16 @@
-//! The adapter's end of a line that speaks SLCAN: CAN frames as text, after the manuals of Lawicel's CAN232 and CANUSB. Bytes go in;
-//! answers and frames come out.
+//! The adapter's end of a line that speaks SLCAN: CAN frames as text, after the manuals of
+//! Lawicel's CAN232 and CANUSB. Bytes go in; answers and frames come out.
 //!
-//! What it stands for is a bus of two, this device and the host, that has no bit rate: every one is accepted. There are no time
-//! stamps, no filters that the host could set and no polling: commands for these are refused.
+//! What it stands for is a bus of two, this device and the host, that has no bit rate: every one is
+//! accepted. There are no time stamps, no filters that the host could set and no polling: commands
+//! for these are refused.
 
 use embedded_can::{ExtendedId, Frame, Id, StandardId};
 
 use crate::ring::LOST;
 
-/// The longest line of the protocol without its end: a data frame of eight bytes with an identifier of 29 bits.
+/// The longest line of the protocol without its end: a data frame of eight bytes with an identifier
+/// of 29 bits.
 const LONGEST: usize = 1 + 8 + 1 + 16;
 /// The longest text of a frame, with its end.
 pub const FRAME_TEXT: usize = LONGEST + 1;
@@ -46,7 +48,8 @@ impl Answer {
 /// Whether frames pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Channel {
-    /// After a reset of this device, of which the host need not know: frames pass, and it may be opened as if they did not.
+    /// After a reset of this device, of which the host need not know: frames pass, and it may be
+    /// opened as if they did not.
     Fresh,
     /// Both ways.
     Open,
@@ -74,7 +77,8 @@ impl Slcan {
         Self { channel: Channel::Fresh, line: [0; LONGEST], len: 0, overrun: false, serial }
     }
 
-    /// Whether frames to the host pass; otherwise they are lost, as on a bus that nobody else is on.
+    /// Whether frames to the host pass; otherwise they are lost, as on a bus that nobody else is
+    /// on.
     #[must_use]
     pub fn is_heard(&self) -> bool {
         self.channel != Channel::Closed

@@ -21,13 +21,16 @@ pub const IDENTITY: Identity = Identity {
     hardware_version: "MB997",
 };
 
-/// Node-ID of a device that was never told another one, 1 to 127; 255 for one that waits for layer setting services.
+/// Node-ID of a device that was never told another one, 1 to 127; 255 for one that waits for layer
+/// setting services.
 pub const NODE_ID: u8 = 1;
 
-/// Bit rate of a device that was never told another one, in bit/s; 0 for one that finds it out by listening.
+/// Bit rate of a device that was never told another one, in bit/s; 0 for one that finds it out by
+/// listening.
 pub const BIT_RATE: u32 = 125_000;
 
-/// A crystal of 8 MHz on OSC_IN and OSC_OUT; the fastest clocks that the chip allows at 3.3 V (datasheet DS8626, table 14).
+/// A crystal of 8 MHz on OSC_IN and OSC_OUT; the fastest clocks that the chip allows at 3.3 V
+/// (datasheet DS8626, table 14).
 pub const CLOCK_TREE: ClockTree = ClockTree {
     hse: 8_000_000,
     hse_bypass: false,
@@ -66,8 +69,8 @@ mod pins {
     pub type Led = Pin<'D', 12, Output>;
 
     uart! {
-        /// The UART, on PA2 and PA3, which are free on this board (UM1472).
-        /// It is set up with the feature `uart` alone.
+        /// The UART, on PA2 and PA3, which are free on this board (UM1472). It is set up with the
+        /// feature `uart` alone.
         USART2
     }
 

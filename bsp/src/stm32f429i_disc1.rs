@@ -1,7 +1,8 @@
 //! STM32F429I-DISC1 with a CAN transceiver on PB8 and PB9.
 //!
-//! Every pin of CAN1 has another use on this board (UM1670): PD0 and PD1 are data lines of the SDRAM, PA11, PA12, PB8 and PB9 go
-//! to the display's parallel interface, where they end in inputs. So PB8 and PB9 are free as long as the display stays dark.
+//! Every pin of CAN1 has another use on this board (UM1670): PD0 and PD1 are data lines of the
+//! SDRAM, PA11, PA12, PB8 and PB9 go to the display's parallel interface, where they end in inputs.
+//! So PB8 and PB9 are free as long as the display stays dark.
 
 use shared_abi::layout::{self, Layout};
 
@@ -20,14 +21,16 @@ pub const IDENTITY: Identity = Identity {
     hardware_version: "MB1075",
 };
 
-/// Node-ID of a device that was never told another one, 1 to 127; 255 for one that waits for layer setting services.
+/// Node-ID of a device that was never told another one, 1 to 127; 255 for one that waits for layer
+/// setting services.
 pub const NODE_ID: u8 = 1;
 
-/// Bit rate of a device that was never told another one, in bit/s; 0 for one that finds it out by listening.
+/// Bit rate of a device that was never told another one, in bit/s; 0 for one that finds it out by
+/// listening.
 pub const BIT_RATE: u32 = 125_000;
 
-/// A crystal of 8 MHz on OSC_IN and OSC_OUT (X3). 160 MHz and not 168 (180 with over-drive): APB1 at 40 MHz makes each bit rate of
-/// CiA 301, 42 MHz and 45 MHz do not make 800 kbit/s.
+/// A crystal of 8 MHz on OSC_IN and OSC_OUT (X3). 160 MHz and not 168 (180 with over-drive): APB1
+/// at 40 MHz makes each bit rate of CiA 301, 42 MHz and 45 MHz do not make 800 kbit/s.
 pub const CLOCK_TREE: ClockTree = ClockTree {
     hse: 8_000_000,
     hse_bypass: false,
@@ -81,7 +84,8 @@ mod pins {
         let gpioa = take_port!(GPIOA, can1).split(rcc);
         #[cfg(feature = "uart")]
         let uart = Port::new(take_port!(USART1, can1), (gpioa.pa9, gpioa.pa10), rcc);
-        // AF9: CAN1_RX is PB8, CAN1_TX is PB9 (DS9405, alternate functions; the HAL's table has the same).
+        // AF9: CAN1_RX is PB8, CAN1_TX is PB9 (DS9405, alternate functions; the HAL's table has the
+        // same).
         let can = can1.can((gpiob.pb9, gpiob.pb8), rcc);
         Board {
             can,

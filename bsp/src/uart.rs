@@ -1,8 +1,9 @@
-//! What every board does with its UART, if its firmware uses it (feature `uart`): eight bits, no parity, one stop bit (RM0090
-//! section 30).
+//! What every board does with its UART, if its firmware uses it (feature `uart`): eight bits, no
+//! parity, one stop bit (RM0090 section 30).
 
-/// What goes into `USART_BRR` to make `bit_rate` (bit/s) out of `clock` (Hz), 16 samples a bit (section 30.3.4); `None` where that
-/// is more than 2 % off, half of what the two ends may differ by.
+/// What goes into `USART_BRR` to make `bit_rate` (bit/s) out of `clock` (Hz), 16 samples a bit
+/// (section 30.3.4); `None` where that is more than 2 % off, half of what the two ends may differ
+/// by.
 #[must_use]
 pub const fn divider(clock: u32, bit_rate: u32) -> Option<u16> {
     if bit_rate == 0 {
@@ -161,7 +162,8 @@ mod drivers {
     /// Who does what there is to do.
     static HANDLER: Mutex<Cell<Handler>> = Mutex::new(Cell::new(None));
 
-    /// Lets the interrupt of the board's UART come, before all others, and has a function do what there is to do.
+    /// Lets the interrupt of the board's UART come, before all others, and has a function do what
+    /// there is to do.
     pub fn on_interrupt(handler: fn()) {
         interrupt::free(|cs| HANDLER.borrow(cs).set(Some(handler)));
         // SAFETY: nothing is masked in order to be alone with what the handler works with.

@@ -1,5 +1,6 @@
-//! CAN over the board's UART, in the place of bxCAN (feature `virtual-can`): the device and, on the same two wires, an SLCAN adapter
-//! of its own. What a program does with it is what it does with [`can::Port`](crate::can::Port).
+//! CAN over the board's UART, in the place of bxCAN (feature `virtual-can`): the device and, on the
+//! same two wires, an SLCAN adapter of its own. What a program does with it is what it does with
+//! [`can::Port`](crate::can::Port).
 
 use cortex_m::peripheral::NVIC;
 use embedded_can::{Frame, Id};
@@ -49,7 +50,7 @@ impl Port {
     pub fn configure(&mut self, _timing: BitTiming, _mode: Mode) {}
 
     /// A serial line has no bus-off.
-    pub fn come_back(&mut self) {}
+    pub fn recover_from_bus_off(&mut self) {}
 
     /// Sets the identifiers (data frames, 11 bits) that are taken.
     pub fn accept(&mut self, identifiers: impl Iterator<Item = u16>) {
@@ -81,7 +82,7 @@ impl Port {
     }
 
     /// A frame that was taken found no room with its taker.
-    pub fn note_loss(&mut self) {
+    pub fn record_overrun(&mut self) {
         self.lost.in_queue = true;
     }
 
@@ -90,8 +91,8 @@ impl Port {
         TO_SEND.room() >= FRAME_TEXT
     }
 
-    /// Sends a frame. To be called only when there is room; parts of it would be lost. While the host has closed the channel there is
-    /// nobody to send it to.
+    /// Sends a frame. To be called only when there is room; parts of it would be lost. While the
+    /// host has closed the channel there is nobody to send it to.
     pub fn send<F: Frame>(&mut self, frame: &F) {
         if self.slcan.is_heard() {
             slcan::text_of(frame, |byte| {
@@ -120,15 +121,16 @@ impl Port {
     }
 
     /// Where something was lost since the question before.
-    pub fn take_lost(&mut self) -> Lost {
-        Lost { in_controller: RECEIVED.take_lost(), ..core::mem::take(&mut self.lost) }
+    pub fn take_overruns(&mut self) -> Lost {
+        Lost { in_controller: RECEIVED.take_overruns(), ..core::mem::take(&mut self.lost) }
     }
 }
 
-/// The UART's interrupt: takes the byte that has come, sends the next one. It comes before all tasks, and tells them by the interrupts
-/// of the controller in whose place it is.
+/// The UART's interrupt: takes the byte that has come, sends the next one. It comes before all
+/// tasks, and tells them by the interrupts of the controller in whose place it is.
 fn serve() {
-    // SAFETY: of the registers that it touches, the port changes the control register alone, and does so while this cannot come.
+    // SAFETY: of the registers that it touches, the port changes the control register alone, and
+    // does so while this cannot come.
     let mut uart = unsafe { uart::Port::<UartController>::steal() };
     if let Some(Received { byte, overrun }) = uart.receive() {
         RECEIVED.come(byte, overrun);

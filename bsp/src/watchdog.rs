@@ -2,7 +2,8 @@
 
 use stm32f4xx_hal::pac;
 
-/// Starts it: a reset follows unless it is [fed](feed) every `ms` milliseconds, 2 to 8000, as the LSI counts them (± 50 %).
+/// Starts it: a reset follows unless it is [fed](feed) every `ms` milliseconds, 2 to 8000, as the
+/// LSI counts them (± 50 %).
 pub fn start(registers: &pac::IWDG, ms: u16) {
     // SAFETY: the keys of section 21.4.1.
     let key = |key: u16| registers.kr().write(|w| unsafe { w.bits(key) });

@@ -128,26 +128,28 @@ pub enum Heard {
     Error,
 }
 
-/// Finds the bit rate of a bus by listening (in the manner of CiA 801): a good frame proves a rate, an error disproves it.
+/// Finds the bit rate of a bus by listening (in the manner of CiA 801): a good frame proves a rate,
+/// an error disproves it.
 ///
-/// On a bus where nobody else acknowledges, the lone sender's frames come out bad even at the right rate, until it is error
-/// passive and its error flags no longer show (ISO 11898-1): the search comes round to the right rate again and finds it
-/// then.
+/// On a bus where nobody else acknowledges, the lone sender's frames come out bad even at the right
+/// rate, until it is error passive and its error flags no longer show (ISO 11898-1): the search
+/// comes round to the right rate again and finds it then.
 #[derive(Clone, Copy, Debug)]
 pub struct Detector {
     at: usize,
     since: Instant,
 }
 
-/// How long the bus may not be idle before the next rate gets its turn, in milliseconds. At the right rate it is idle behind
-/// each frame, and no frame takes longer than 14 ms at 10 kbit/s.
+/// How long the bus may not be idle before the next rate gets its turn, in milliseconds. At the
+/// right rate it is idle behind each frame, and no frame takes longer than 14 ms at 10 kbit/s.
 const NEVER_IDLE_MS: u32 = 50;
-/// How long silence is listened to before the next rate gets its turn, in milliseconds: more than a usual heartbeat.
-/// Slow sampling of a fast bus may hear nothing at all.
+/// How long silence is listened to before the next rate gets its turn, in milliseconds: more than a
+/// usual heartbeat. Slow sampling of a fast bus may hear nothing at all.
 const DWELL_MS: u32 = 1500;
 
 impl Detector {
-    /// Starts with this rate, or with the first there is; `supports` tells which of them the device can run at.
+    /// Starts with this rate, or with the first there is; `supports` tells which of them the device
+    /// can run at.
     pub fn new(first: BitRate, now: Instant, supports: impl FnMut(BitRate) -> bool) -> Self {
         let at = BitRate::FIXED.iter().position(|rate| *rate == first).unwrap_or(0);
         let mut detector = Self { at, since: now };
@@ -161,7 +163,8 @@ impl Detector {
         BitRate::FIXED[self.at]
     }
 
-    /// Takes what was heard. `true` proves the rate; otherwise [`rate`](Self::rate) may have become another one.
+    /// Takes what was heard. `true` proves the rate; otherwise [`rate`](Self::rate) may have become
+    /// another one.
     pub fn heard(&mut self, heard: Heard, now: Instant, supports: impl FnMut(BitRate) -> bool) -> bool {
         let go_on = match heard {
             Heard::Frame => return true,
@@ -177,7 +180,8 @@ impl Detector {
         false
     }
 
-    /// Passes over the rates that the device cannot run at. If there is none at all, it stays where it is.
+    /// Passes over the rates that the device cannot run at. If there is none at all, it stays where
+    /// it is.
     fn settle(&mut self, mut supports: impl FnMut(BitRate) -> bool) {
         for _ in BitRate::FIXED {
             if supports(self.rate()) {

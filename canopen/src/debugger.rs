@@ -1,7 +1,8 @@
-//! The debugger interface, object 1025h (ESAcademy "CANopen compliant bootloader and debugger cores"; feature `debugger`).
+//! The debugger interface, object 1025h (ESAcademy "CANopen compliant bootloader and debugger
+//! cores"; feature `debugger`).
 //!
-//! **Whoever reaches the bus reads and writes the memory of a device that has this.** It is for the bench, never for a
-//! device that leaves it.
+//! **Whoever reaches the bus reads and writes the memory of a device that has this.** It is for the
+//! bench, never for a device that leaves it.
 //!
 //! | sub-index | |
 //! |---|---|
@@ -9,8 +10,8 @@
 //! | 2 | status: 0 done, 1 done and there are data, 2 refused or failed, FFh waits for data (CiA 301, 1025h) |
 //! | 4 | data: a domain of exactly that number of bytes |
 //!
-//! Sub-index 3, the reply of CiA 301, does not exist, as in that document. A command is good for any number of reads or
-//! writes of its data, until the next one.
+//! Sub-index 3, the reply of CiA 301, does not exist, as in that document. A command is good for
+//! any number of reads or writes of its data, until the next one.
 //!
 //! | the client | abort |
 //! |---|---|
@@ -21,8 +22,9 @@
 //! | sends data without a command to write | 08000022h |
 //! | does anything of it to a device whose memory is locked | 08000022h |
 //!
-//! A device composes [`ENTRIES`] into its table, keeps a [`Debugger`] beside its own state and hands
-//! [`Debugger::attach`] to its slave in place of itself. When the program stops, it says so by [`Debugger::stopped`].
+//! A device composes [`ENTRIES`] into its table, keeps a [`Debugger`] beside its own state and
+//! hands [`Debugger::attach`] to its slave in place of itself. When the program stops, it says so
+//! by [`Debugger::stopped`].
 
 use core::task::Poll;
 
@@ -73,9 +75,11 @@ pub const USER_SOFTWARE: u16 = 0x6200;
 pub enum Stop {
     /// A code breakpoint: the instruction at the address is the next one.
     Breakpoint = 1,
-    /// A single step is done; the instruction at the address is the next one. (From 80h on, the types are our own.)
+    /// A single step is done; the instruction at the address is the next one. (From 80h on, the
+    /// types are our own.)
     Step = 0x80,
-    /// The breakpoint at the address lies in code that cannot be stopped: breakpoints are off, and the program runs on.
+    /// The breakpoint at the address lies in code that cannot be stopped: breakpoints are off, and
+    /// the program runs on.
     OutOfReach = 0x81,
 }
 
@@ -144,8 +148,8 @@ impl Command {
 
 /// The memory behind the interface.
 ///
-/// It is asked for pieces of at most [`PIECE`] bytes of what it has allowed, each a multiple of `PIECE` behind the
-/// command's address.
+/// It is asked for pieces of at most [`PIECE`] bytes of what it has allowed, each a multiple of
+/// `PIECE` behind the command's address.
 pub trait Memory {
     /// Whether the device keeps its memory to itself.
     fn is_locked(&mut self) -> bool;
@@ -166,8 +170,8 @@ pub trait Memory {
     fn write(&mut self, address: u32, bytes: &[u8]) -> Result<(), AbortCode>;
 }
 
-/// Bytes that are read or written at once. A longer read or write is carried out piece by piece while it is
-/// transferred; of a shorter write nothing is done before all of it is there.
+/// Bytes that are read or written at once. A longer read or write is carried out piece by piece
+/// while it is transferred; of a shorter write nothing is done before all of it is there.
 pub const PIECE: usize = 128;
 
 /// The state of the interface.

@@ -1,6 +1,7 @@
 //! The objects that every device has: what it is and who made it.
 //!
-//! A device puts [`ENTRIES`] into its table with [`concat`](crate::od::concat) and asks [`Device::read`] first.
+//! A device puts [`ENTRIES`] into its table with [`concat`](crate::od::concat) and asks
+//! [`Device::read`] first.
 
 use crate::lss::LssAddress;
 use crate::od::{put, Access, Address, DataType, Entry};

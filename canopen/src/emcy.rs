@@ -1,7 +1,8 @@
 //! Emergency producer (CiA 301 section 7.2.7) and the objects that go with it.
 //!
-//! A device keeps an [`Emcy`] beside its other values: it asks [`Emcy::read`] and [`Emcy::write`] first, before what else has
-//! 1001h, and passes [`Emcy::next_message`] on as [`Objects::next_emergency`](crate::Objects::next_emergency).
+//! A device keeps an [`Emcy`] beside its other values: it asks [`Emcy::read`] and [`Emcy::write`]
+//! first, before what else has 1001h, and passes [`Emcy::next_message`] on as
+//! [`Objects::next_emergency`](crate::Objects::next_emergency).
 
 use crate::frame::{CobId, NodeId};
 use crate::line::LineEvent;
@@ -15,7 +16,8 @@ pub const HISTORY: usize = 4;
 /// Emergencies that may wait to be sent.
 const WAITING: usize = 4;
 
-/// 1003h and 1014h. (1001h, which every device has, is in [`device::ENTRIES`](crate::device::ENTRIES).)
+/// 1003h and 1014h. (1001h, which every device has, is in
+/// [`device::ENTRIES`](crate::device::ENTRIES).)
 pub const ENTRIES: [Entry; HISTORY + 2] = [
     Entry::array(ERROR_FIELD, "Pre-defined error field", HISTORY as u8).access(Access::Rw).default(0),
     Entry::sub(ERROR_FIELD, 1, "Standard error field 1", DataType::Unsigned32, Access::Ro),
@@ -85,8 +87,8 @@ impl Emergency {
     }
 }
 
-/// The driver's status as CAN overrun carries it: in bytes 5 and 6 of the frame, counted from 0 (SYS TEC manual
-/// L-1112d_10, section 3.4.9).
+/// The driver's status as CAN overrun carries it: in bytes 5 and 6 of the frame, counted from 0
+/// (SYS TEC manual L-1112d_10, section 3.4.9).
 #[must_use]
 pub const fn driver_status(status: u16) -> [u8; 5] {
     let [low, high] = status.to_le_bytes();
@@ -135,7 +137,8 @@ impl Emcy {
         self.send(Emergency { code, register: self.register, detail });
     }
 
-    /// The cause of these bits has gone. The others are told with what is left; nothing is sent if none was set.
+    /// The cause of these bits has gone. The others are told with what is left; nothing is sent if
+    /// none was set.
     pub fn clear(&mut self, bits: u8) {
         let bits = bits & self.register & !register::GENERIC;
         let only_generic = self.register == register::GENERIC;

@@ -1,4 +1,5 @@
-//! CAN frames, node-IDs and the identifiers of the predefined connection set (CiA 301 section 7.3.5).
+//! CAN frames, node-IDs and the identifiers of the predefined connection set (CiA 301 section
+//! 7.3.5).
 
 use core::fmt;
 
@@ -121,8 +122,8 @@ impl Frame {
         Self { id: id.into(), remote: false, dlc: len as u8, data: bytes }
     }
 
-    /// The COB-ID, if this is a data frame with an 11-bit identifier. CANopen of this crate uses no others, so that
-    /// whoever dispatches by it never sees an extended or a remote frame.
+    /// The COB-ID, if this is a data frame with an 11-bit identifier. CANopen of this crate uses no
+    /// others, so that whoever dispatches by it never sees an extended or a remote frame.
     #[must_use]
     pub fn cob_id(&self) -> Option<CobId> {
         match self.id {

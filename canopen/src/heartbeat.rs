@@ -10,8 +10,8 @@ pub struct Heartbeat {
 }
 
 impl Heartbeat {
-    /// A producer whose first heartbeat is due one period after `now`. The period is the value of 1017h:
-    /// milliseconds, 0 is off.
+    /// A producer whose first heartbeat is due one period after `now`. The period is the value of
+    /// 1017h: milliseconds, 0 is off.
     #[must_use]
     pub const fn new(period_ms: u16, now: Instant) -> Self {
         Self { period_ms, last: now }
@@ -23,7 +23,8 @@ impl Heartbeat {
         self.period_ms
     }
 
-    /// Takes a new period; the next heartbeat comes one new period after `now`. The old period again changes nothing.
+    /// Takes a new period; the next heartbeat comes one new period after `now`. The old period
+    /// again changes nothing.
     pub fn set_period(&mut self, period_ms: u16, now: Instant) {
         if self.period_ms != period_ms {
             *self = Self::new(period_ms, now);
@@ -38,8 +39,8 @@ impl Heartbeat {
 
     /// Whether one is due; it counts as sent.
     ///
-    /// The period runs from due time to due time, so that a late call does not shift those to come. Whoever comes a
-    /// whole period late has lost heartbeats; they are not made up for.
+    /// The period runs from due time to due time, so that a late call does not shift those to come.
+    /// Whoever comes a whole period late has lost heartbeats; they are not made up for.
     pub fn take_due(&mut self, now: Instant) -> bool {
         let Some(due) = self.deadline().filter(|due| now.has_reached(*due)) else { return false };
         let late = now.since(due) >= u32::from(self.period_ms);

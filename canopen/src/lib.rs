@@ -1,8 +1,8 @@
 //! A CANopen slave and an SDO client (CiA 301), sans-IO and without an allocator.
 //!
-//! Nothing in here waits, reads a clock or touches a controller. Frames and the time are passed in, frames to send are
-//! fetched: `handle(&frame, now)` for each frame received, then `poll(now)` until it has nothing more to send, and
-//! again whenever time has passed.
+//! Nothing in here waits, reads a clock or touches a controller. Frames and the time are passed in,
+//! frames to send are fetched: `handle(&frame, now)` for each frame received, then `poll(now)`
+//! until it has nothing more to send, and again whenever time has passed.
 //!
 //! | module | what it is |
 //! |---|---|

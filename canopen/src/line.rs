@@ -1,8 +1,10 @@
-//! The CAN controller as a slave sees it: error passive, bus-off, frames lost (CiA 301 section 7.2.7.1, ISO 11898-1).
+//! The CAN controller as a slave sees it: error passive, bus-off, frames lost (CiA 301 section
+//! 7.2.7.1, ISO 11898-1).
 //!
-//! A controller that went bus-off stays off until it is told to come back. It is told after a while, and after a longer one each
-//! time it fails again soon: a device that disturbs its bus shall not do so without end, and one that suffered from
-//! somebody else's disturbance shall be back by itself.
+//! A controller that went bus-off stays off until it is told to come back. It is told after a
+//! while, and after a longer one each time it fails again soon: a device that disturbs its bus
+//! shall not do so without end, and one that suffered from somebody else's disturbance shall be
+//! back by itself.
 
 use crate::bit_rate::Heard;
 use crate::time::Instant;
@@ -26,8 +28,8 @@ pub struct Status {
     pub confinement: Confinement,
     /// What it heard since it was last asked; matters only while it listens.
     pub heard: Heard,
-    /// Frames that were lost since it was last asked, as driver status bits ([`CONTROLLER_OVERRUN`],
-    /// [`QUEUE_OVERRUN`]); 0 for none.
+    /// Frames that were lost since it was last asked, as driver status bits
+    /// ([`CONTROLLER_OVERRUN`], [`QUEUE_OVERRUN`]); 0 for none.
     pub lost: u16,
 }
 
@@ -49,15 +51,16 @@ pub enum LineEvent {
     Recovered,
 }
 
-/// First wait before a controller comes back, in milliseconds. Longer than the 128 × 11 bits that coming back takes at
-/// 10 kbit/s.
+/// First wait before a controller comes back, in milliseconds. Longer than the 128 × 11 bits that
+/// coming back takes at 10 kbit/s.
 const FIRST_WAIT_MS: u32 = 200;
 /// The longest wait.
 const LONGEST_WAIT_MS: u32 = 5000;
 /// Who was on the bus for so long has recovered: the next wait is the first one again.
 const RECOVERED_MS: u32 = 10_000;
 
-/// Lost frames are told at most once in this time, in milliseconds: a flood shall not cause another one.
+/// Lost frames are told at most once in this time, in milliseconds: a flood shall not cause another
+/// one.
 const LOST_INHIBIT_MS: u32 = 1000;
 
 /// Frames that were lost and have yet to be told.
@@ -102,7 +105,7 @@ pub enum Consequence {
     /// To be told.
     Tell(LineEvent),
     /// The controller is to come back onto the bus.
-    ComeBack,
+    RecoverFromBusOff,
 }
 
 impl Monitor {
@@ -136,7 +139,7 @@ impl Monitor {
             State::Off { come_back_at, .. } if now.has_reached(come_back_at) => {
                 self.wait_ms = (self.wait_ms * 2).min(LONGEST_WAIT_MS);
                 self.state = State::Off { come_back_at: now + self.wait_ms, told: true };
-                Some(Consequence::ComeBack)
+                Some(Consequence::RecoverFromBusOff)
             }
             State::Off { .. } => None,
         }

@@ -1,10 +1,12 @@
-//! Layer setting services of a slave (CiA 305): node-ID and bit rate over the bus, for a device without switches.
+//! Layer setting services of a slave (CiA 305): node-ID and bit rate over the bus, for a device
+//! without switches.
 //!
-//! [`Lss`] decides, its owner acts: [`Lss::handle`] takes frames, [`Lss::poll`] gives answers to send and tells when a
-//! node-ID or a bit rate comes into force. What the device can do and where it stores is behind [`LssDevice`].
+//! [`Lss`] decides, its owner acts: [`Lss::handle`] takes frames, [`Lss::poll`] gives answers to
+//! send and tells when a node-ID or a bit rate comes into force. What the device can do and where
+//! it stores is behind [`LssDevice`].
 //!
-//! Frames that are no LSS request, requests in a state that does not serve them and requests for other slaves get
-//! silence, as the standard has it.
+//! Frames that are no LSS request, requests in a state that does not serve them and requests for
+//! other slaves get silence, as the standard has it.
 
 use core::task::Poll;
 
@@ -47,8 +49,9 @@ pub trait LssDevice {
     /// Whether the device can run at this bit rate.
     fn supports(&mut self, rate: BitRate) -> bool;
 
-    /// Stores what was configured, for the next start. No node-ID makes the device one without (FFh); no bit rate leaves
-    /// the stored one as it is. A device that needs time for it (`Pending`) is asked by [`stored`](Self::stored).
+    /// Stores what was configured, for the next start. No node-ID makes the device one without
+    /// (FFh); no bit rate leaves the stored one as it is. A device that needs time for it
+    /// (`Pending`) is asked by [`stored`](Self::stored).
     ///
     /// # Errors
     /// The error code that the master gets.
@@ -66,10 +69,11 @@ pub trait LssDevice {
 /// What can be chosen about an LSS slave.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Config {
-    /// Start in LSS configuration state. Not of the standard: for a bus with one device to be configured.
+    /// Start in LSS configuration state. Not of the standard: for a bus with one device to be
+    /// configured.
     pub start_in_configuration: bool,
-    /// Without a node-ID, say "non-configured slave" once after the start in place of the boot-up message. Not of the
-    /// standard either.
+    /// Without a node-ID, say "non-configured slave" once after the start in place of the boot-up
+    /// message. Not of the standard either.
     pub announce: bool,
 }
 
@@ -183,8 +187,8 @@ impl Lss {
         self.active
     }
 
-    /// NMT Reset communication: the node-ID that was configured comes into force. Without one the node is not started, and
-    /// waits for LSS again.
+    /// NMT Reset communication: the node-ID that was configured comes into force. Without one the
+    /// node is not started, and waits for LSS again.
     pub fn reset_communication(&mut self) -> Option<NodeId> {
         self.active = self.pending;
         self.active
@@ -221,8 +225,8 @@ impl Lss {
         }
     }
 
-    /// Asks a device that is storing whether it is done, so that the master gets its answer. To be called before
-    /// [`poll`](Self::poll) where the device needs time to store.
+    /// Asks a device that is storing whether it is done, so that the master gets its answer. To be
+    /// called before [`poll`](Self::poll) where the device needs time to store.
     pub fn follow_store(&mut self, device: &mut impl LssDevice) {
         if self.storing {
             if let Poll::Ready(outcome) = device.stored() {

@@ -49,7 +49,8 @@ pub enum NmtCommand {
 }
 
 impl NmtCommand {
-    /// The command in a frame that addresses `node` or all nodes. Every other frame, of whatever form, is none.
+    /// The command in a frame that addresses `node` or all nodes. Every other frame, of whatever
+    /// form, is none.
     #[must_use]
     pub fn parse(frame: &Frame, node: NodeId) -> Option<Self> {
         if frame.cob_id() != Some(CobId::NMT) {

@@ -1,7 +1,8 @@
 //! A slave: NMT, boot-up, heartbeat and SDO server of one node-ID.
 //!
-//! The owner passes every frame received to [`Node::handle`], then fetches frames with [`Node::poll`] until there are
-//! none, and does the latter again at least once every few milliseconds (or at [`Node::next_deadline`]).
+//! The owner passes every frame received to [`Node::handle`], then fetches frames with
+//! [`Node::poll`] until there are none, and does the latter again at least once every few
+//! milliseconds (or at [`Node::next_deadline`]).
 
 use crate::frame::{CobId, Frame, NodeId};
 use crate::heartbeat::Heartbeat;
@@ -13,7 +14,8 @@ use crate::time::Instant;
 /// What Start and Stop of the NMT master do to the node.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum NmtPolicy {
-    /// It stays PRE-OPERATIONAL, as a bootloader does: there is nothing to operate, and SDO must be served.
+    /// It stays PRE-OPERATIONAL, as a bootloader does: there is nothing to operate, and SDO must be
+    /// served.
     #[default]
     StayPreOperational,
     /// It follows the master.
@@ -33,8 +35,9 @@ pub struct Config {
 
 /// What the NMT master asked for.
 ///
-/// The node has already done its own part of Start, Stop and `EnterPreOperational`. The two resets are the owner's: it
-/// restarts the device, or calls [`Node::restart`] with the node-ID that is now in force.
+/// The node has already done its own part of Start, Stop and `EnterPreOperational`. The two resets
+/// are the owner's: it restarts the device, or calls [`Node::restart`] with the node-ID that is now
+/// in force.
 pub type NmtEvent = NmtCommand;
 
 /// A slave on the bus.
@@ -83,14 +86,15 @@ impl Node {
         self.sdo.reset(objects);
     }
 
-    /// Starts anew under this node-ID, as after Reset communication: a transfer ends, the boot-up is said again.
+    /// Starts anew under this node-ID, as after Reset communication: a transfer ends, the boot-up
+    /// is said again.
     pub fn restart(&mut self, id: NodeId, objects: &mut impl Objects) {
         self.sdo.reset(objects);
         *self = Self::new(id, Config { heartbeat_ms: self.heartbeat.period_ms(), ..self.config });
     }
 
-    /// Takes the value of 1017h: the heartbeat's period in milliseconds, 0 for none. The same value again changes
-    /// nothing, so that it may be called after every frame.
+    /// Takes the value of 1017h: the heartbeat's period in milliseconds, 0 for none. The same value
+    /// again changes nothing, so that it may be called after every frame.
     pub fn set_heartbeat_ms(&mut self, period_ms: u16, now: Instant) {
         self.heartbeat.set_period(period_ms, now);
     }
@@ -129,7 +133,8 @@ impl Node {
         self.heartbeat.take_due(now).then(|| nmt::state_message(self.id, self.state))
     }
 
-    /// When [`poll`](Self::poll) will have something to do although no frame came; `None` for never.
+    /// When [`poll`](Self::poll) will have something to do although no frame came; `None` for
+    /// never.
     #[must_use]
     pub fn next_deadline(&self) -> Option<Instant> {
         match (self.sdo.next_deadline(), self.heartbeat.deadline()) {

@@ -27,8 +27,8 @@
 //! }
 //! ```
 //!
-//! The SDO server checks every access against the table before it asks for a value, so that an implementation sees
-//! only accesses that the table allows:
+//! The SDO server checks every access against the table before it asks for a value, so that an
+//! implementation sees only accesses that the table allows:
 //!
 //! | the client | abort |
 //! |---|---|
@@ -141,7 +141,8 @@ impl Access {
 pub enum Kind {
     /// An object of one value (VAR, or DOMAIN by its type).
     Var,
-    /// Sub-index 0 of an object whose values are all of one type; its value is the highest sub-index.
+    /// Sub-index 0 of an object whose values are all of one type; its value is the highest
+    /// sub-index.
     Array(u8),
     /// Sub-index 0 of an object of values of any type; its value is the highest sub-index.
     Record(u8),
@@ -172,7 +173,8 @@ pub struct Entry {
     pub access: Access,
     /// What it is part of.
     pub kind: Kind,
-    /// What it is called. For [`Kind::Array`] and [`Kind::Record`] it is the name of the whole object.
+    /// What it is called. For [`Kind::Array`] and [`Kind::Record`] it is the name of the whole
+    /// object.
     #[cfg(feature = "names")]
     pub name: &'static str,
     /// The value before anyone writes it.
@@ -202,13 +204,15 @@ impl Entry {
         Self::new(Address::new(index, 0), name, data_type, access, Kind::Var)
     }
 
-    /// The head of an object with parts of one type: its sub-index 0. The server answers it from the table.
+    /// The head of an object with parts of one type: its sub-index 0. The server answers it from
+    /// the table.
     #[must_use]
     pub const fn array(index: u16, name: &'static str, highest: u8) -> Self {
         Self::new(Address::new(index, 0), name, DataType::Unsigned8, Access::Const, Kind::Array(highest))
     }
 
-    /// The head of an object with parts of different types: its sub-index 0. The server answers it from the table.
+    /// The head of an object with parts of different types: its sub-index 0. The server answers it
+    /// from the table.
     #[must_use]
     pub const fn record(index: u16, name: &'static str, highest: u8) -> Self {
         Self::new(Address::new(index, 0), name, DataType::Unsigned8, Access::Const, Kind::Record(highest))
@@ -220,7 +224,8 @@ impl Entry {
         Self::new(Address::new(index, sub), name, data_type, access, Kind::Sub)
     }
 
-    /// With another access. A head that is not `const` is read from and written to the implementation (1003h/0).
+    /// With another access. A head that is not `const` is read from and written to the
+    /// implementation (1003h/0).
     #[must_use]
     pub const fn access(mut self, access: Access) -> Self {
         self.access = access;
@@ -257,7 +262,8 @@ impl Entry {
 /// Looks an entry up.
 ///
 /// # Errors
-/// [`AbortCode::NO_OBJECT`] if no entry has the index, [`AbortCode::NO_SUB_INDEX`] if none of those has the sub-index.
+/// [`AbortCode::NO_OBJECT`] if no entry has the index, [`AbortCode::NO_SUB_INDEX`] if none of those
+/// has the sub-index.
 pub fn find(entries: &[Entry], at: Address) -> Result<&Entry, AbortCode> {
     let mut code = AbortCode::NO_OBJECT;
     for entry in entries {
@@ -298,12 +304,13 @@ pub fn put(buf: &mut [u8], value: &[u8]) -> Result<usize, AbortCode> {
 
 /// The values behind the table.
 ///
-/// Variables and strings are read and written as a whole; **domains** are streamed and never held as a whole by the
-/// server. An error becomes the SDO abort that the client gets.
+/// Variables and strings are read and written as a whole; **domains** are streamed and never held
+/// as a whole by the server. An error becomes the SDO abort that the client gets.
 ///
-/// A domain download is `download_start`, `download_data` any number of times, and then exactly one of `download_end`
-/// and `download_cancel`: the latter if the client aborts or begins something else, if the time is up, if an earlier call
-/// returned an error or the sizes do not match. After an error of `download_start` neither comes.
+/// A domain download is `download_start`, `download_data` any number of times, and then exactly one
+/// of `download_end` and `download_cancel`: the latter if the client aborts or begins something
+/// else, if the time is up, if an earlier call returned an error or the sizes do not match. After
+/// an error of `download_start` neither comes.
 pub trait Objects {
     /// The table.
     fn entries(&self) -> &'static [Entry];
@@ -332,10 +339,11 @@ pub trait Objects {
         Err(AbortCode::UNSUPPORTED_ACCESS)
     }
 
-    /// Bytes that [`download_data`](Self::download_data) could take at present. The server holds its answer back, and with it the
-    /// client, until there is room for a segment (7 bytes). It asks with `held` once it has done so for
-    /// [`HOLD_MS`](crate::sdo::server::HOLD_MS): what is told then should come out of a reserve, so that the client is slowed
-    /// down but never left without an answer.
+    /// Bytes that [`download_data`](Self::download_data) could take at present. The server holds
+    /// its answer back, and with it the client, until there is room for a segment (7 bytes). It
+    /// asks with `held` once it has done so for [`HOLD_MS`](crate::sdo::server::HOLD_MS): what is
+    /// told then should come out of a reserve, so that the client is slowed down but never left
+    /// without an answer.
     fn download_space(&mut self, at: Address, held: bool) -> usize {
         let _ = (at, held);
         usize::MAX
@@ -378,8 +386,8 @@ pub trait Objects {
         Err(AbortCode::UNSUPPORTED_ACCESS)
     }
 
-    /// Bytes of the domain from `offset` on. It fills `buf`, unless the domain ends before; 0 is the end.
-    /// The same offset can be asked for again, when a block transfer has to be repeated.
+    /// Bytes of the domain from `offset` on. It fills `buf`, unless the domain ends before; 0 is
+    /// the end. The same offset can be asked for again, when a block transfer has to be repeated.
     ///
     /// # Errors
     /// The abort that the client gets.

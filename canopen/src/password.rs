@@ -3,7 +3,8 @@
 use crate::sdo::AbortCode;
 use crate::time::Instant;
 
-/// How long nobody may try again behind the first wrong password, in milliseconds. It doubles with each further one.
+/// How long nobody may try again behind the first wrong password, in milliseconds. It doubles with
+/// each further one.
 pub const FIRST_DELAY_MS: u32 = 500;
 /// Wrong passwords behind which the delay grows no more: half a minute then.
 const MOST_FAILURES: u32 = 6;
@@ -31,7 +32,8 @@ impl Lock {
         self.failures
     }
 
-    /// Whether nobody may try at present; to be asked at least every few weeks. Who restarts the device to get rid of that waits until it is over.
+    /// Whether nobody may try at present; to be asked at least every few weeks. Who restarts the
+    /// device to get rid of that waits until it is over.
     #[must_use]
     pub fn is_waiting(&mut self, now: Instant) -> bool {
         // Forgotten when it is over: instants wrap.
@@ -42,7 +44,8 @@ impl Lock {
     /// Tries a password.
     ///
     /// # Errors
-    /// [`AbortCode::INVALID_VALUE`] for a wrong one; [`AbortCode::DEVICE_STATE`], whatever it is, for one that comes too early.
+    /// [`AbortCode::INVALID_VALUE`] for a wrong one; [`AbortCode::DEVICE_STATE`], whatever it is,
+    /// for one that comes too early.
     pub fn open(&mut self, given: &[u8], now: Instant) -> Result<(), AbortCode> {
         if self.is_waiting(now) {
             return Err(AbortCode::DEVICE_STATE);

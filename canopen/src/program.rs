@@ -1,5 +1,5 @@
-//! Program download: the words of CiA 302-3 that both sides share, with the additions of the SYS TEC bootloader
-//! (manual L-1112d_10, tables 1 to 3).
+//! Program download: the words of CiA 302-3 that both sides share, with the additions of the SYS
+//! TEC bootloader (manual L-1112d_10, tables 1 to 3).
 
 use core::fmt;
 
@@ -32,17 +32,22 @@ pub const PROGRAM_ID: u16 = 0x1F56;
 /// Flash status identification: gives a [`FlashStatus`].
 pub const FLASH_STATUS: u16 = 0x1F57;
 
-/// Password of a lift device (CiA 417; CiA 814-1 clause 6.3): sub-index [`UNLOCK_FIRMWARE`] of "Lock/unlock parameters".
+/// Password of a lift device (CiA 417; CiA 814-1 clause 6.3): sub-index [`UNLOCK_FIRMWARE`] of
+/// "Lock/unlock parameters".
 pub const UNLOCK: u16 = 0x6005;
-/// "Firmware update". CiA 814-1 names object and purpose, not the sub-index; this is where coboot has it.
+/// "Firmware update". CiA 814-1 names object and purpose, not the sub-index; this is where coboot
+/// has it.
 pub const UNLOCK_FIRMWARE: u8 = 1;
-/// Enable flash programming (ESAcademy): the password of a program; the sub-index is the program's number.
+/// Enable flash programming (ESAcademy): the password of a program; the sub-index is the program's
+/// number.
 pub const ENABLE_FLASH: u16 = 0x7F50;
 
-/// What 1000h of the bootloader reads. An application has another value: this is how a host tells them apart.
+/// What 1000h of the bootloader reads. An application has another value: this is how a host tells
+/// them apart.
 pub const BOOTLOADER_DEVICE_TYPE: u32 = 0x1000_0000;
 
-/// What 1000h reads of a boot loader as ESAcademy describes it ("BOOT"), and of older lift bootloaders.
+/// What 1000h reads of a boot loader as ESAcademy describes it ("BOOT"), and of older lift
+/// bootloaders.
 pub const ESACADEMY_DEVICE_TYPE: u32 = 0x424F_4F54;
 /// What 1000h reads of a lift bootloader (CiA 814-1 clause 6.3).
 pub const LIFT_DEVICE_TYPE: u32 = 0xFE00_01A1;

@@ -1,4 +1,5 @@
-//! A device on the bus: its [`Node`], layer setting services, bit rate detection and the state of its line tied together.
+//! A device on the bus: its [`Node`], layer setting services, bit rate detection and the state of
+//! its line tied together.
 //!
 //! The owner of the CAN controller
 //!
@@ -48,13 +49,13 @@ pub struct Config {
 pub enum Output {
     /// Send this frame.
     Send(Frame),
-    /// Set the controller to this bit rate, never [`BitRate::Auto`], and take part in the bus. What waits in the mailboxes is
-    /// not sent any more.
+    /// Set the controller to this bit rate, never [`BitRate::Auto`], and take part in the bus. What
+    /// waits in the mailboxes is not sent any more.
     Join(BitRate),
     /// Set the controller to this bit rate and listen only.
     Listen(BitRate),
     /// Bring the controller back from bus-off.
-    ComeBack,
+    RecoverFromBusOff,
     /// Let in the frames of exactly these identifiers; one may be named twice.
     Accept([CobId; 3]),
 }
@@ -83,13 +84,13 @@ enum Line {
     },
     Up {
         monitor: Monitor,
-        come_back: bool,
+        recover_from_bus_off: bool,
     },
 }
 
 impl Slave {
-    /// A device with this node-ID, or without one, on a bus of this bit rate. One without node-ID is silent, but for layer
-    /// setting services.
+    /// A device with this node-ID, or without one, on a bus of this bit rate. One without node-ID
+    /// is silent, but for layer setting services.
     #[must_use]
     pub fn new(address: LssAddress, id: Option<NodeId>, rate: BitRate, config: Config) -> Self {
         #[cfg(not(feature = "lss"))]
@@ -161,15 +162,16 @@ impl Slave {
                     self.line = Line::Down(detector.rate());
                 }
             }
-            Line::Up { monitor, come_back } => match monitor.observe(status.confinement, now) {
+            Line::Up { monitor, recover_from_bus_off } => match monitor.observe(status.confinement, now) {
                 Some(Consequence::Tell(event)) => device.line_event(event),
-                Some(Consequence::ComeBack) => *come_back = true,
+                Some(Consequence::RecoverFromBusOff) => *recover_from_bus_off = true,
                 None => {}
             },
         }
     }
 
-    /// What to do next, until there is nothing. Frames are given only while there is `room` for one in the mailboxes.
+    /// What to do next, until there is nothing. Frames are given only while there is `room` for one
+    /// in the mailboxes.
     pub fn poll(&mut self, now: Instant, room: bool, device: &mut impl SlaveDevice) -> Option<Output> {
         if core::mem::take(&mut self.accept) {
             return Some(Output::Accept(self.identifiers()));
@@ -187,9 +189,9 @@ impl Slave {
                 *set = detector.rate();
                 return Some(Output::Listen(*set));
             }
-            Line::Up { come_back, .. } => {
-                if core::mem::take(come_back) {
-                    return Some(Output::ComeBack);
+            Line::Up { recover_from_bus_off, .. } => {
+                if core::mem::take(recover_from_bus_off) {
+                    return Some(Output::RecoverFromBusOff);
                 }
             }
         }
@@ -232,7 +234,7 @@ impl Slave {
             return Output::Listen(set);
         }
         let _ = device;
-        self.line = Line::Up { monitor: Monitor::new(now), come_back: false };
+        self.line = Line::Up { monitor: Monitor::new(now), recover_from_bus_off: false };
         Output::Join(rate)
     }
 

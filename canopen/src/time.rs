@@ -4,8 +4,8 @@ use core::ops::Add;
 
 /// A point in time, in milliseconds from an origin that the caller chose.
 ///
-/// It wraps. Two instants are compared by their difference, which is right as long as they lie less than
-/// 2³¹ ms (24 days) apart; hence there is no `Ord`.
+/// It wraps. Two instants are compared by their difference, which is right as long as they lie less
+/// than 2³¹ ms (24 days) apart; hence there is no `Ord`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Instant(u32);
 

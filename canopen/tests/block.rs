@@ -241,7 +241,8 @@ fn server_aborts_a_block_download_that_is_wrong() {
     bench.still_serves();
 }
 
-/// CRC-16 by the book (CiA 301 section 7.2.4.3.16), written once more: x^16 + x^12 + x^5 + 1, start 0.
+/// CRC-16 by the book (CiA 301 section 7.2.4.3.16), written once more: x^16 + x^12 + x^5 + 1, start
+/// 0.
 fn crc_hqx(bytes: &[u8]) -> u16 {
     bytes.iter().fold(0_u16, |crc, byte| {
         (0..8).fold(
@@ -268,7 +269,8 @@ fn server_gives_a_block_upload() {
         (ENDED, &[]),
     ]);
     assert!(bench.server.is_idle());
-    // Size not told: the end shows only when nothing more comes. Sub-blocks of one segment, then of two.
+    // Size not told: the end shows only when nothing more comes. Sub-blocks of one segment, then of
+    // two.
     bench.device.tells_size = false;
     bench.expect(&[
         ([0xA4, 0x00, 0x20, 0, 1, 0, 0, 0], &[[0xC4, 0x00, 0x20, 0, 0, 0, 0, 0]]),
@@ -315,7 +317,8 @@ fn server_repeats_what_the_client_did_not_get() {
     bench.server.handle(&request(START), at(0), &mut bench.device);
     assert_eq!(bench.server.poll(at(0), &mut bench.device), Some(response(FIRST)));
     bench.expect(&[(acked(0, 127), &[FIRST, LAST_OF_14])]);
-    // The acknowledgement of the sub-block before, twice: while the next one has not begun, and when it has.
+    // The acknowledgement of the sub-block before, twice: while the next one has not begun, and
+    // when it has.
     bench.expect(&[(READ_14, &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]), (START, &[FIRST, LAST_OF_14])]);
     for _ in 0..2 {
         bench.server.handle(&request(acked(0, 127)), at(0), &mut bench.device);

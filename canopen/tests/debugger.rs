@@ -54,8 +54,8 @@ fn status(target: &mut Target) -> u8 {
     answer[4]
 }
 
-/// The bytes of a read command as the document lays them out, in the frames of a segmented download (CiA 301 section 7.2.4.3);
-/// then its data.
+/// The bytes of a read command as the document lays them out, in the frames of a segmented download
+/// (CiA 301 section 7.2.4.3); then its data.
 #[test]
 fn a_read_frame_by_frame() {
     let mut target = Target::new();
@@ -100,7 +100,8 @@ fn data_of_another_length_are_refused_and_nothing_is_written() {
     let mut target = Target::new();
     let before = target.model().ram.clone();
     command(&mut target, Kind::Write, RAM, 5).unwrap();
-    // 06070013h too low, 06070012h too high; announced by the client (1st, 2nd) or found at the end.
+    // 06070013h too low, 06070012h too high; announced by the client (1st, 2nd) or found at the
+    // end.
     assert_eq!(write(&mut target, DATA, &[1; 4]), Err(AbortCode(0x0607_0013)));
     assert_eq!(status(&mut target), 2);
     assert_eq!(write(&mut target, DATA, &[1; 6]), Err(AbortCode(0x0607_0012)));
@@ -188,7 +189,8 @@ fn a_command_is_good_for_many_reads() {
     assert_eq!(status(&mut target), 1);
 }
 
-/// Byte 3 is the emergency type, "1" for a code breakpoint; bytes 4 to 7 the address (the document's bytes 1 to 5).
+/// Byte 3 is the emergency type, "1" for a code breakpoint; bytes 4 to 7 the address (the
+/// document's bytes 1 to 5).
 #[test]
 fn a_stop_is_told_by_an_emergency() {
     let mut target = Target::new();
@@ -204,7 +206,8 @@ fn a_stop_is_told_by_an_emergency() {
 }
 
 proptest! {
-    /// Whatever is written is there, and nothing else; whatever is read is what was there. By segments and by blocks.
+    /// Whatever is written is there, and nothing else; whatever is read is what was there. By
+    /// segments and by blocks.
     #[test]
     fn what_is_written_is_read_and_the_rest_stays(
         data in vec(any::<u8>(), 1..4 * PIECE),
@@ -240,8 +243,8 @@ proptest! {
         }
     }
 
-    /// Any commands and any data in any order, whole or broken off: the memory is touched by leave alone (the model
-    /// asserts it), and the next one is served.
+    /// Any commands and any data in any order, whole or broken off: the memory is touched by leave
+    /// alone (the model asserts it), and the next one is served.
     #[test]
     fn anybody_may_send_anything(
         frames in vec(

@@ -1,4 +1,5 @@
-//! Emergencies as the bus sees them, and the objects 1001h, 1003h and 1014h (CiA 301 sections 7.2.7 and 7.5.2).
+//! Emergencies as the bus sees them, and the objects 1001h, 1003h and 1014h (CiA 301 sections 7.2.7
+//! and 7.5.2).
 
 mod common;
 

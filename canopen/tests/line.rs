@@ -12,7 +12,9 @@ use Confinement::{Active, BusOff, Passive};
 
 /// When a controller that never recovers is told to come back, within a time.
 fn told_to_come_back(monitor: &mut Monitor, from: u32, until: u32) -> Vec<u32> {
-    (from..until).filter(|now| monitor.observe(BusOff, at(*now)) == Some(Consequence::ComeBack)).collect()
+    (from..until)
+        .filter(|now| monitor.observe(BusOff, at(*now)) == Some(Consequence::RecoverFromBusOff))
+        .collect()
 }
 
 #[test]
@@ -51,7 +53,7 @@ fn a_controller_that_left_bus_off_untold_is_believed_only_once_told() {
     let mut monitor = Monitor::new(at(0));
     assert_eq!(monitor.observe(BusOff, at(0)), None);
     assert_eq!(monitor.observe(Passive, at(100)), None);
-    assert_eq!(monitor.observe(Passive, at(200)), Some(Consequence::ComeBack));
+    assert_eq!(monitor.observe(Passive, at(200)), Some(Consequence::RecoverFromBusOff));
     assert_eq!(monitor.observe(Passive, at(202)), Some(Consequence::Tell(LineEvent::Recovered)));
 }
 

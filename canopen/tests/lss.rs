@@ -403,7 +403,8 @@ fn what_is_not_asked_of_it_gets_silence() {
     assert!(bench.is_in_configuration());
 }
 
-/// A master's fastscan over a bus with several slaves, by CiA 305: an answer of any of them is a yes.
+/// A master's fastscan over a bus with several slaves, by CiA 305: an answer of any of them is a
+/// yes.
 fn scan(slaves: &mut [(Lss, Device)]) -> Option<[u32; 4]> {
     let mut ask = |bytes: [u8; 8]| {
         let mut yes = false;

@@ -14,8 +14,8 @@ use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 
-/// Frames as an unkind bus brings them: SDO requests of every command to objects that exist and that do not, noise,
-/// other lengths, and NMT.
+/// Frames as an unkind bus brings them: SDO requests of every command to objects that exist and
+/// that do not, noise, other lengths, and NMT.
 fn any_frame() -> impl Strategy<Value = Frame> {
     let index = prop_oneof![
         Just(0x1000_u16),
@@ -208,8 +208,8 @@ proptest! {
         prop_assert_eq!(&device.domain, &data);
     }
 
-    /// A transfer need not wait for the old one to time out, if the client says that it gave that one up. (Without a
-    /// word from it an initiate might be a segment of a block download.)
+    /// A transfer need not wait for the old one to time out, if the client says that it gave that
+    /// one up. (Without a word from it an initiate might be a segment of a block download.)
     #[test]
     fn any_frames_do_not_delay_the_next_transfer(frames in vec(any_frame(), 0..20)) {
         let (mut slave, mut device) = slave();
@@ -258,8 +258,8 @@ proptest! {
         prop_assert_eq!(upload.into_sink(), data);
     }
 
-    /// Whatever the wire loses, doubles or delays: a transfer that both sides call done is right. And what comes late
-    /// changes nothing any more.
+    /// Whatever the wire loses, doubles or delays: a transfer that both sides call done is right.
+    /// And what comes late changes nothing any more.
     #[test]
     fn no_block_transfer_is_acknowledged_and_wrong(
         data in vec(any::<u8>(), 0..800),
@@ -288,8 +288,8 @@ proptest! {
         prop_assert!(device.incoming.is_none(), "the server is stuck");
     }
 
-    /// The same without blocks. There the wire does not delay beyond an answer: CAN never does, and the toggle bit of
-    /// the segmented transfer could not tell.
+    /// The same without blocks. There the wire does not delay beyond an answer: CAN never does, and
+    /// the toggle bit of the segmented transfer could not tell.
     #[test]
     fn no_segmented_transfer_is_acknowledged_and_wrong(
         data in vec(any::<u8>(), 0..300),
@@ -315,7 +315,8 @@ proptest! {
         prop_assert!(device.incoming.is_none(), "the server is stuck");
     }
 
-    /// A segment of a block transfer may be lost anywhere, but for a sub-block of which all is lost: the transfer goes on.
+    /// A segment of a block transfer may be lost anywhere, but for a sub-block of which all is
+    /// lost: the transfer goes on.
     #[test]
     fn lost_segments_are_repeated(data in vec(any::<u8>(), 100..800), lost in vec(2_usize..100, 1..6), up: bool) {
         let (mut slave, mut device) = slave();
@@ -324,8 +325,8 @@ proptest! {
         let sdo = canopen::sdo::server::Config { blksize: 20, ..Default::default() };
         slave = Node::new(slave.id(), Config { sdo, ..Config::default() });
         let _ = slave.poll(at(0), &mut device);
-        // Segments have a number and come in a row; the rest of the protocol starts at 80h. The first of a sub-block
-        // always comes.
+        // Segments have a number and come in a row; the rest of the protocol starts at 80h. The
+        // first of a sub-block always comes.
         let mut fate = |frame: &Frame| {
             let number = frame.exactly::<8>().unwrap()[0] & 0x7F;
             segments += 1;

@@ -46,7 +46,8 @@ impl Bench {
     }
 }
 
-/// The two are the ends of a service that works, so that a test can show that the server is still well.
+/// The two are the ends of a service that works, so that a test can show that the server is still
+/// well.
 #[track_caller]
 fn still_serves(bench: &mut Bench) {
     bench.expect(&[([0x40, 0x00, 0x10, 0, 0, 0, 0, 0], [0x43, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x10])]);

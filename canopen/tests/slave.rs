@@ -124,7 +124,7 @@ fn without_room_for_frames_the_controller_is_still_looked_after() {
     let off = Status { confinement: Confinement::BusOff, ..Status::default() };
     bench.slave.observe(off, at(10), &mut bench.device);
     bench.slave.observe(off, at(210), &mut bench.device);
-    assert_eq!(bench.slave.poll(at(210), false, &mut bench.device), Some(Output::ComeBack));
+    assert_eq!(bench.slave.poll(at(210), false, &mut bench.device), Some(Output::RecoverFromBusOff));
     bench.slave.observe(Status::default(), at(220), &mut bench.device);
     assert_eq!(bench.device.events, [LineEvent::Recovered]);
 }

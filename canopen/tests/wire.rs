@@ -1,5 +1,5 @@
-//! Frames of every SDO service, written by hand from the figures of CiA 301 section 7.2.4.3: each is taken apart and
-//! put together.
+//! Frames of every SDO service, written by hand from the figures of CiA 301 section 7.2.4.3: each
+//! is taken apart and put together.
 
 use canopen::sdo::wire::{BlockAck, BlockEnd, BlockSegment, Chunk, Payload, Request, Response, Segment};
 use canopen::sdo::AbortCode;

@@ -12,11 +12,12 @@ use crate::read::{Cause, Place, ReadError};
 /// The CRC of blocks and programs: polynomial EDB88320h reflected (manual L-1112d_10, chapter 3.1).
 pub const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISO_HDLC);
 
-/// The CRC that a bootloader built for it takes instead: polynomial 1021h, start value 0, as SDO block transfer has it
-/// (manual L-1112d_10, table 8, `--crc16`).
+/// The CRC that a bootloader built for it takes instead: polynomial 1021h, start value 0, as SDO
+/// block transfer has it (manual L-1112d_10, table 8, `--crc16`).
 const CRC16: Crc<u16, Table<16>> = Crc::<u16, Table<16>>::new(&CRC_16_XMODEM);
 
-/// With what the blocks and the program are checked. The file does not say it: host and bootloader have to agree.
+/// With what the blocks and the program are checked. The file does not say it: host and bootloader
+/// have to agree.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Checksum {
     /// [`CRC`].
@@ -56,8 +57,8 @@ impl fmt::Display for Checksum {
 /// The most data bytes that a block can have.
 pub const MAX_DATA: usize = MAX_BLOCK_SIZE - FRAMING;
 
-/// The most bytes from a program's start to its last one. No microcontroller's flash comes near it; what exceeds it
-/// holds data for two memories.
+/// The most bytes from a program's start to its last one. No microcontroller's flash comes near it;
+/// what exceeds it holds data for two memories.
 pub const MAX_PROGRAM_SIZE: u32 = 64 * 1024 * 1024;
 
 /// One block, as one SDO download takes it.
@@ -108,8 +109,8 @@ pub struct BlockFile {
 impl BlockFile {
     /// Puts a file together from the blocks of the program, whose region starts at `start`.
     ///
-    /// `blocks` are (address, data) in address order and not before `start`; each has at most [`MAX_DATA`] bytes.
-    /// `control` makes block 0 when the program's size is known.
+    /// `blocks` are (address, data) in address order and not before `start`; each has at most
+    /// [`MAX_DATA`] bytes. `control` makes block 0 when the program's size is known.
     pub(crate) fn new(
         start: u32,
         blocks: Vec<(u32, Vec<u8>)>,
@@ -139,7 +140,8 @@ impl BlockFile {
         })
     }
 
-    /// Reads a file and checks every number, size and CRC in it. Which CRC it is, the first block tells.
+    /// Reads a file and checks every number, size and CRC in it. Which CRC it is, the first block
+    /// tells.
     ///
     /// # Errors
     /// The first fault, with its offset.
@@ -183,8 +185,8 @@ impl BlockFile {
         if file.program_blocks().is_empty() {
             return Err(Place::File.fault(Cause::NoData));
         }
-        // The file does not say where its program starts. It is the first byte, or whatever lies the program's size
-        // before the end of the last byte.
+        // The file does not say where its program starts. It is the first byte, or whatever lies
+        // the program's size before the end of the last byte.
         let span = file.span();
         let by_end = (u64::from(span.last) + 1).checked_sub(last.program_size.into());
         let fits = |start| file.starts_at(start);
@@ -194,8 +196,8 @@ impl BlockFile {
         Err(Place::Offset(offset - FRAMING - 8).fault(file.program_fault()))
     }
 
-    /// Checks a file that was read from elsewhere against the region that it is to go into: every block inside, and
-    /// size and CRC counted from the region's start, as the device counts them.
+    /// Checks a file that was read from elsewhere against the region that it is to go into: every
+    /// block inside, and size and CRC counted from the region's start, as the device counts them.
     ///
     /// # Errors
     /// [`Cause::Outside`] or [`Cause::ProgramCrc`].
@@ -347,7 +349,8 @@ fn parse_block(bytes: &[u8], checksum: Checksum, place: Place) -> Result<(Block,
     Ok((Block { number, flash_address, data }, crc_at + CRC_SIZE))
 }
 
-/// Checks that a program block has data, ends inside the address space and lies behind the one before it.
+/// Checks that a program block has data, ends inside the address space and lies behind the one
+/// before it.
 fn check_order(before: Option<&Block>, block: &Block, place: Place) -> Result<(), ReadError> {
     if matches!(block.number, NUMBER_CONTROL | NUMBER_LAST) {
         return Ok(());

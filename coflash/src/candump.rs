@@ -1,4 +1,5 @@
-//! Logs as `candump -L` of the Linux can-utils writes them: `(1436509052.249713) can0 044#2A366C2BBA`.
+//! Logs as `candump -L` of the Linux can-utils writes them: `(1436509052.249713) can0
+//! 044#2A366C2BBA`.
 
 use std::time::Duration;
 
@@ -26,8 +27,8 @@ impl std::fmt::Display for Line {
 }
 
 impl Line {
-    /// Takes a line apart. `Ok(None)` for one that holds no classic frame: an empty line, a comment, a frame of CAN FD or an
-    /// error frame.
+    /// Takes a line apart. `Ok(None)` for one that holds no classic frame: an empty line, a
+    /// comment, a frame of CAN FD or an error frame.
     ///
     /// # Errors
     /// What is wrong with it.

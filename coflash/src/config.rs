@@ -28,7 +28,8 @@ impl fmt::Display for Fault {
 
 impl std::error::Error for Fault {}
 
-/// Takes a configuration file apart: options, each one of [`KEYS`], with their values as the command line would have them.
+/// Takes a configuration file apart: options, each one of [`KEYS`], with their values as the
+/// command line would have them.
 ///
 /// # Errors
 /// The first thing that is wrong with it.

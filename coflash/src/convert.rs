@@ -22,7 +22,8 @@ pub enum Region {
     Unknown,
     /// The flash of a program on a known board: data outside is an error.
     Strict(AddressRange),
-    /// What `--start-address` and `--end-address` cut out (manual, table 8): data outside is left out.
+    /// What `--start-address` and `--end-address` cut out (manual, table 8): data outside is left
+    /// out.
     Cut(AddressRange),
     /// The same with `--end-address` alone: the program starts at the first byte.
     CutBehind(u32),
@@ -36,7 +37,8 @@ impl GapFill {
     /// The erased state of the flash.
     pub const ERASED: Self = Self([0xFF; 4]);
 
-    /// The manual's value: up to FFh it is a byte (as in the manual of 2008), above it 32 bits (as in that of 2015).
+    /// The manual's value: up to FFh it is a byte (as in the manual of 2008), above it 32 bits (as
+    /// in that of 2015).
     #[must_use]
     pub fn new(value: u32) -> Self {
         match u8::try_from(value) {
@@ -113,7 +115,8 @@ pub struct Options {
     pub gap_fill: GapFill,
     /// What goes into block 0.
     pub label: Label,
-    /// What is added to every address, after [`Region::Cut`] and before [`Region::Strict`]; 2³² − n takes n away.
+    /// What is added to every address, after [`Region::Cut`] and before [`Region::Strict`]; 2³² − n
+    /// takes n away.
     pub adjust_start: u32,
     /// With what the blocks and the program are checked: what the bootloader was built for.
     pub checksum: Checksum,
@@ -175,8 +178,9 @@ pub struct Converted {
 
 /// Makes blocks out of a program.
 ///
-/// Blocks start at the first byte that is not yet in a block, rounded down to a word; gaps inside a block are filled,
-/// gaps between blocks are left to the erased flash. The same input gives the same blocks.
+/// Blocks start at the first byte that is not yet in a block, rounded down to a word; gaps inside a
+/// block are filled, gaps between blocks are left to the erased flash. The same input gives the
+/// same blocks.
 ///
 /// # Errors
 /// See [`ConvertError`].
@@ -196,8 +200,8 @@ pub fn convert(image: &Image, options: &Options) -> Result<Converted, ConvertErr
     Ok(Converted { file, left_out })
 }
 
-/// Blocks of whatever a file holds: an image is [converted](convert), blocks are checked against a strict region and
-/// taken as they are.
+/// Blocks of whatever a file holds: an image is [converted](convert), blocks are checked against a
+/// strict region and taken as they are.
 ///
 /// # Errors
 /// See [`ConvertError`].
@@ -232,7 +236,8 @@ fn payload(options: &Options) -> Result<usize, ConvertError> {
     Ok(data - data % WORD as usize)
 }
 
-/// What of the image belongs to the program, where the program starts, and how many bytes do not belong to it.
+/// What of the image belongs to the program, where the program starts, and how many bytes do not
+/// belong to it.
 fn place<'i>(image: &'i Image, options: &Options) -> Result<(Cow<'i, Image>, u32, u64), ConvertError> {
     let offset = options.adjust_start;
     let adjusted = |image: Cow<'i, Image>| match offset {

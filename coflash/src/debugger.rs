@@ -1,6 +1,8 @@
-//! The debugger interface of a device on the bench: memory, breakpoints and steps through 1025h. A product has no such object.
+//! The debugger interface of a device on the bench: memory, breakpoints and steps through 1025h. A
+//! product has no such object.
 //!
-//! The device's part stands in `docs/debugger.md` of coboot; breakpoints are those of a Cortex-M4 (ARM DDI 0403E section C1).
+//! The device's part stands in `docs/debugger.md` of coboot; breakpoints are those of a Cortex-M4
+//! (ARM DDI 0403E section C1).
 
 use std::time::Duration;
 
@@ -50,12 +52,13 @@ impl Registers {
         self.0[15]
     }
 
-    /// From what the device has saved: the handler's ten words, and the core's eight, which begin at the address that the first word
-    /// says.
+    /// From what the device has saved: the handler's ten words, and the core's eight, which begin
+    /// at the address that the first word says.
     fn of(handler: &[u32; 10], core: &[u32; 8]) -> Self {
         let [frame, r4, r5, r6, r7, r8, r9, r10, r11, exc_return] = *handler;
         let [r0, r1, r2, r3, r12, lr, pc, xpsr] = *core;
-        // With those of the FPU the frame has 26 words; bit 9 of xPSR tells of one for alignment (DDI 0403E section B1.5).
+        // With those of the FPU the frame has 26 words; bit 9 of xPSR tells of one for alignment
+        // (DDI 0403E section B1.5).
         let words = if exc_return & 0x10 == 0 { 26 } else { 8 } + (xpsr >> 9 & 1);
         let sp = frame.wrapping_add(4 * words);
         Self([r0, r1, r2, r3, r4, r5, r6, r7, r8, r9, r10, r11, r12, sp, lr, pc, xpsr & !(1 << 9)])
@@ -96,7 +99,8 @@ impl<'s, 'a> Debugger<'s, 'a> {
     /// Reads memory. Addresses do not wrap.
     ///
     /// # Errors
-    /// What the device says: 06090030h for what may not be read, 08000022h for a device that is secured.
+    /// What the device says: 06090030h for what may not be read, 08000022h for a device that is
+    /// secured.
     pub fn read(&mut self, address: u32, len: u32, progress: &mut dyn FnMut(u32)) -> Result<Vec<u8>, Error> {
         let mut bytes = Vec::new();
         for (at, len) in chunks(address, len) {
@@ -223,7 +227,7 @@ impl<'s, 'a> Debugger<'s, 'a> {
     ///
     /// # Errors
     /// As [`read`](Self::read).
-    pub fn go_on(&mut self) -> Result<(), Error> {
+    pub fn resume(&mut self) -> Result<(), Error> {
         self.set_word(DEMCR, DEMCR_ON)
     }
 
@@ -257,10 +261,11 @@ impl<'s, 'a> Debugger<'s, 'a> {
         Ok(Some(Registers::of(&handler, &core)))
     }
 
-    /// Waits until the program stops, or has run over a breakpoint that cannot stop it; `None` when it has not within this time.
+    /// Waits until the program stops, or has run over a breakpoint that cannot stop it; `None` when
+    /// it has not within this time.
     ///
-    /// An emergency may come before the answer to the command that brought the stop about, and be gone: so the program is asked as
-    /// well.
+    /// An emergency may come before the answer to the command that brought the stop about, and be
+    /// gone: so the program is asked as well.
     ///
     /// # Errors
     /// As [`read`](Self::read), and those of the adapter.
@@ -277,7 +282,8 @@ impl<'s, 'a> Debugger<'s, 'a> {
             if left.is_zero() {
                 return Ok(None);
             }
-            // Out of reach: the device has turned the unit off and left the comparators as they were.
+            // Out of reach: the device has turned the unit off and left the comparators as they
+            // were.
             if self.word(FP_CTRL)? & ENABLE == 0 {
                 let comparators: [u32; BREAKPOINTS as usize] = self.words(FP_COMP)?;
                 if let Some(address) = comparators.into_iter().flat_map(addresses).next() {
@@ -285,7 +291,7 @@ impl<'s, 'a> Debugger<'s, 'a> {
                 }
             }
             let mut heard = None;
-            self.session.hear_until(left.min(LOOK), &mut |frame| {
+            self.session.observe_until(left.min(LOOK), &mut |frame| {
                 heard = stop_of(frame, CobId::emcy(node));
                 heard.is_some()
             })?;

@@ -11,8 +11,8 @@ use canopen::sdo::wire::{BlockSegment, Payload, Request, Response};
 use canopen::{Address, CobId, Frame, NodeId};
 use embedded_can::Frame as _;
 
-/// Puts frames into words. It remembers the transfers that it has seen begin: a segment of a block transfer does not tell
-/// what it is.
+/// Puts frames into words. It remembers the transfers that it has seen begin: a segment of a block
+/// transfer does not tell what it is.
 #[derive(Debug, Default)]
 pub struct Decoder {
     blocks: HashMap<NodeId, Block>,

@@ -31,7 +31,7 @@ pub struct Diagnosis {
 /// [`Error::Adapter`] or [`Error::Cancelled`].
 pub fn diagnose(session: &mut Session<'_>) -> Result<Diagnosis, Error> {
     let mut diagnosis = Diagnosis { node: session.node(), frames: 0, heard: BTreeMap::new() };
-    session.hear(LISTEN, &mut |frame| {
+    session.observe(LISTEN, &mut |frame| {
         diagnosis.frames += 1;
         if let Some((node, state)) = parse_state_message(frame) {
             diagnosis.heard.insert(node, Some(state));

@@ -21,7 +21,7 @@ use canopen::{AbortCode, Address, NodeId};
 use crate::block_file::BlockFile;
 use crate::error::Error;
 use crate::flash::{
-    await_application, call_back, erase_patiently, find, judge, DeviceState, Event, FlashOptions, Judgement,
+    await_application, call_back, clear_and_wait, find, judge, DeviceState, Event, FlashOptions, Judgement,
     RepeatReason,
 };
 use crate::info::{absent, optional};
@@ -30,21 +30,26 @@ use crate::session::{DeviceType, Doing, Session, Timing, Transfers};
 /// The password of 7F50h as ESAcademy gives it: "INIT".
 pub const ESACADEMY_PASSWORD: u32 = 0x494E_4954;
 
-/// "Lock/unlock parameters: Firmware update" (CiA 814-1 clause 6.3). Where it has no sub-index 1, it is a plain variable.
+/// "Lock/unlock parameters: Firmware update" (CiA 814-1 clause 6.3). Where it has no sub-index 1,
+/// it is a plain variable.
 const UNLOCK: [Address; 2] =
     [Address::new(program::UNLOCK, program::UNLOCK_FIRMWARE), Address::new(program::UNLOCK, 0)];
 
-/// The program of a lift; what else 1F50h holds are data, which are not started (CiA 814-1 clause 6.4).
+/// The program of a lift; what else 1F50h holds are data, which are not started (CiA 814-1 clause
+/// 6.4).
 const LIFT_PROGRAM: u8 = 1;
 /// How long a lift bootloader may take to come up (CiA 814-1 clause 6.3).
 const LIFT_WAIT: Duration = Duration::from_secs(10);
-/// How often it is asked for meanwhile: a device that listens for the bit rate needs somebody who talks.
+/// How often it is asked for meanwhile: a device that listens for the bit rate needs somebody who
+/// talks.
 const LIFT_PAUSE: Duration = Duration::from_millis(125);
-/// A device that takes the whole program at once may erase behind any of its segments: 2 s at worst, and some more.
+/// A device that takes the whole program at once may erase behind any of its segments: 2 s at
+/// worst, and some more.
 const SLOW_SEGMENT: Duration = Duration::from_secs(5);
 /// How long a program that starts by itself may take until its bootloader is told to.
 const BY_ITSELF: Duration = Duration::from_secs(1);
-/// Generic error and manufacturer-specific error of 1001h: a flash operation went wrong (ESAcademy).
+/// Generic error and manufacturer-specific error of 1001h: a flash operation went wrong
+/// (ESAcademy).
 const ERROR_BITS: u32 = 0x81;
 
 /// Which dialect a bootloader speaks.
@@ -75,7 +80,8 @@ impl Dialect {
         }
     }
 
-    /// What a bootloader with this device type speaks, at this node-ID; `None` for what is an application or unknown.
+    /// What a bootloader with this device type speaks, at this node-ID; `None` for what is an
+    /// application or unknown.
     #[must_use]
     pub fn of_bootloader(running: DeviceType, node: NodeId) -> Option<Self> {
         match running.0 {
@@ -154,8 +160,9 @@ impl fmt::Debug for Password {
     }
 }
 
-/// Finds out which dialect a device speaks of which this is running. A bootloader tells it by its device type. Of an application it
-/// is known for lifts; of the others, whether they belong to a bootloader with the status of 1F57h, which tells more when it runs.
+/// Finds out which dialect a device speaks of which this is running. A bootloader tells it by its
+/// device type. Of an application it is known for lifts; of the others, whether they belong to a
+/// bootloader with the status of 1F57h, which tells more when it runs.
 ///
 /// # Errors
 /// What a [read](Session::read) has.
@@ -182,7 +189,8 @@ fn has(session: &mut Session<'_>, at: Address) -> Result<bool, Error> {
     }
 }
 
-/// The file as Intel HEX text: 16 bytes in a record, extended linear addresses (Intel, revision A, 1988).
+/// The file as Intel HEX text: 16 bytes in a record, extended linear addresses (Intel, revision A,
+/// 1988).
 #[must_use]
 pub fn intel_hex(file: &BlockFile) -> String {
     const RECORD: usize = 16;
@@ -216,10 +224,11 @@ pub fn intel_hex(file: &BlockFile) -> String {
     text
 }
 
-// --- the way into the bootloader -------------------------------------------------------------------------------------
+// --- the way into the bootloader
+// -------------------------------------------------------------------------------------
 
-/// Asks an application of a device that knows CiA 302-3 alone for its bootloader: STOP; a bootloader is what answers then. One that
-/// refuses may know coboot's and SYS TEC's call.
+/// Asks an application of a device that knows CiA 302-3 alone for its bootloader: STOP; a
+/// bootloader is what answers then. One that refuses may know coboot's and SYS TEC's call.
 ///
 /// # Errors
 /// [`Error::NoBootloader`].
@@ -263,10 +272,12 @@ pub(crate) fn stop_program(
     Ok(())
 }
 
-/// Brings a lift device into its bootloader and unlocks it there (CiA 814-1 clause 6.3). From then on the session is with node 126.
+/// Brings a lift device into its bootloader and unlocks it there (CiA 814-1 clause 6.3). From then
+/// on the session is with node 126.
 ///
 /// # Errors
-/// [`Error::NoPassword`], [`Error::Occupied`], [`Error::NoBootloader`], and [`Error::Refused`] for a wrong password.
+/// [`Error::NoPassword`], [`Error::Occupied`], [`Error::NoBootloader`], and [`Error::Refused`] for
+/// a wrong password.
 pub fn enter_lift(
     session: &mut Session<'_>,
     running: DeviceType,
@@ -347,9 +358,11 @@ fn reset_program(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
     }
 }
 
-// --- the program -----------------------------------------------------------------------------------------------------
+// --- the program
+// -----------------------------------------------------------------------------------------------------
 
-/// Sends the program as one SDO download, with what each attempt begins with; gives how often it was repeated.
+/// Sends the program as one SDO download, with what each attempt begins with; gives how often it
+/// was repeated.
 ///
 /// # Errors
 /// As [`flash`](crate::flash::flash).
@@ -412,7 +425,7 @@ fn prepare(
     match dialect {
         // Unlocked already; what is there is overwritten.
         Dialect::Block | Dialect::Lift => Ok(()),
-        Dialect::Raw | Dialect::Hex => erase_patiently(session, options.program, tell),
+        Dialect::Raw | Dialect::Hex => clear_and_wait(session, options.program, tell),
         Dialect::EsAcademy => {
             let node = session.node();
             let password = match options.unlock {
@@ -438,7 +451,8 @@ fn prepare(
     }
 }
 
-/// What the device says of the download: by 1F57h if it has that, otherwise as far as the dialect tells.
+/// What the device says of the download: by 1F57h if it has that, otherwise as far as the dialect
+/// tells.
 fn status(
     session: &mut Session<'_>,
     dialect: Dialect,
@@ -467,7 +481,8 @@ fn status(
     Ok(failed.then_some((FlashError::Unspecified, 0)))
 }
 
-/// Whether 1F56h of this bootloader is the CRC of the program, as far as its device type tells: coboot's, and SYS TEC's.
+/// Whether 1F56h of this bootloader is the CRC of the program, as far as its device type tells:
+/// coboot's, and SYS TEC's.
 ///
 /// # Errors
 /// What a [read](Session::read) has.
@@ -476,7 +491,8 @@ pub(crate) fn knows_crc(session: &mut Session<'_>) -> Result<bool, Error> {
     Ok(running.is_some_and(|running| running.0 == program::BOOTLOADER_DEVICE_TYPE))
 }
 
-/// Starts the program as the dialect has it; afterwards the session is with the node that it runs as.
+/// Starts the program as the dialect has it; afterwards the session is with the node that it runs
+/// as.
 ///
 /// # Errors
 /// [`Error::StartFailed`].
@@ -521,11 +537,13 @@ fn arrived(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Error> {
     Err(Error::StartFailed { node, running, status: session.status(number).ok() })
 }
 
-/// Reads an object of a device that has to be unlocked for it: a lift's program or parameter set, from its bootloader. A device that
-/// was not there before is restarted afterwards, whatever came of it.
+/// Reads an object of a device that has to be unlocked for it: a lift's program or parameter set,
+/// from its bootloader. A device that was not there before is restarted afterwards, whatever came
+/// of it.
 ///
 /// # Errors
-/// [`Error::NotInDialect`] for a device that is no lift, and what [`enter_lift`] and an [upload](Session::upload) have.
+/// [`Error::NotInDialect`] for a device that is no lift, and what [`enter_lift`] and an
+/// [upload](Session::upload) have.
 pub fn read_locked(
     session: &mut Session<'_>,
     at: Address,

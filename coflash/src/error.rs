@@ -168,7 +168,8 @@ impl From<AdapterError> for Error {
 }
 
 impl Error {
-    /// Whether the device has refused the very first block: one that erases with the first good block has lost nothing then.
+    /// Whether the device has refused the very first block: one that erases with the first good
+    /// block has lost nothing then.
     #[must_use]
     pub fn refuses_control_block(&self) -> bool {
         matches!(
@@ -177,8 +178,9 @@ impl Error {
         )
     }
 
-    /// The stable number: the manual's (L-1112e_5, table 5, which holds all of the newer manual's) where it has one,
-    /// otherwise 60000100h plus the word of 1F57h, 60000200h plus the error code of LSS, and 6000030xh for adapters.
+    /// The stable number: the manual's (L-1112e_5, table 5, which holds all of the newer manual's)
+    /// where it has one, otherwise 60000100h plus the word of 1F57h, 60000200h plus the error code
+    /// of LSS, and 6000030xh for adapters.
     #[must_use]
     pub const fn number(&self) -> u32 {
         match self {

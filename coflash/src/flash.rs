@@ -1,7 +1,8 @@
-//! The update of a device: the procedure of the manual (L-1112d_10, "Prinzipieller Ablauf"), steps 2 to 15.
+//! The update of a device: the procedure of the manual (L-1112d_10, "Prinzipieller Ablauf"), steps
+//! 2 to 15.
 //!
-//! Step 1, making the blocks, is [`convert`](crate::convert). Everything that can be judged without the device was
-//! judged there.
+//! Step 1, making the blocks, is [`convert`](crate::convert). Everything that can be judged without
+//! the device was judged there.
 
 use std::fmt;
 use std::time::Duration;
@@ -23,19 +24,22 @@ pub struct FlashOptions {
     pub program: u8,
     /// How often one block is sent again after a CRC error or a broken transfer.
     pub repeats: u32,
-    /// Compare the device's identity with this before anything is erased, and once more with that of the program on trial.
+    /// Compare the device's identity with this before anything is erased, and once more with that
+    /// of the program on trial.
     pub check_target: Option<Target>,
     /// Start the program once and call it back before it is signed (steps 10 to 13).
     pub trial_run: bool,
     /// Start the program at the end (step 15).
     pub start: bool,
-    /// Compare the CRC once more at the very end: the one that the program itself tells when it runs.
+    /// Compare the CRC once more at the very end: the one that the program itself tells when it
+    /// runs.
     pub verify: bool,
     /// The dialect that the device speaks; `None` to find it out.
     pub dialect: Option<Dialect>,
     /// What opens the device, in dialects that ask for it.
     pub unlock: Option<Password>,
-    /// Whether the session can follow a device to another node-ID, which lifts need. One of several at once cannot.
+    /// Whether the session can follow a device to another node-ID, which lifts need. One of several
+    /// at once cannot.
     pub follow: bool,
 }
 
@@ -275,13 +279,14 @@ pub struct Report {
 /// How often an application is asked to go back to the bootloader.
 const CALLS: u32 = 2;
 
-/// Puts a program into a device: finds out what runs there, calls the bootloader, erases, sends the blocks, compares
-/// the CRC, and as the options say tries, signs and starts it.
+/// Puts a program into a device: finds out what runs there, calls the bootloader, erases, sends the
+/// blocks, compares the CRC, and as the options say tries, signs and starts it.
 ///
 /// A run that was interrupted at any point can be started again at once.
 ///
 /// # Errors
-/// The first step that fails ends the procedure. Until the program is signed, the device comes up in the bootloader.
+/// The first step that fails ends the procedure. Until the program is signed, the device comes up
+/// in the bootloader.
 pub fn flash(
     session: &mut Session<'_>,
     file: &BlockFile,
@@ -320,7 +325,8 @@ fn procedure(
             let repeats = dialect::send(session, dialect, &content, options, state, tell)?;
             let transfer = session.now().saturating_sub(transfer_began);
             *state = DeviceState::Written;
-            // What 1F56h reads is a CRC in this bootloader and its like; elsewhere it is whatever its maker took.
+            // What 1F56h reads is a CRC in this bootloader and its like; elsewhere it is whatever
+            // its maker took.
             if dialect::knows_crc(session)? {
                 verify(session, number, file.program_crc(), tell)?;
             }
@@ -350,8 +356,8 @@ fn procedure(
     Ok(Report { program_size, program_crc, repeats, took, transfer, transfers, running, dialect })
 }
 
-/// The way of the dialect `block`: erases, sends the blocks, compares, tries if it is asked to, and signs. Gives how often a block was
-/// repeated, and how long the blocks took.
+/// The way of the dialect `block`: erases, sends the blocks, compares, tries if it is asked to, and
+/// signs. Gives how often a block was repeated, and how long the blocks took.
 fn by_blocks(
     session: &mut Session<'_>,
     file: &BlockFile,
@@ -367,7 +373,8 @@ fn by_blocks(
     if sent.as_ref().is_err_and(Error::refuses_control_block)
         && identification(session, number).is_ok_and(|crc| crc != 0)
     {
-        // The device erases with the first good block, and there was none: it still has the CRC of its program.
+        // The device erases with the first good block, and there was none: it still has the CRC of
+        // its program.
         *state = before;
     }
     let repeats = sent?;
@@ -436,7 +443,8 @@ fn enter(
     Ok(dialect)
 }
 
-/// Compares the device's identity with that of the file's target. Bootloader and application have the same one.
+/// Compares the device's identity with that of the file's target. Bootloader and application have
+/// the same one.
 ///
 /// # Errors
 /// [`Error::WrongTarget`], and what a [read](Session::read) has.
@@ -455,7 +463,8 @@ pub fn check_target(session: &mut Session<'_>, target: Target) -> Result<(), Err
 /// Steps 2 and 3: afterwards the bootloader is running.
 ///
 /// # Errors
-/// [`Error::NoAnswer`] where nothing answers, [`Error::NoBootloader`] where the application does not go back.
+/// [`Error::NoAnswer`] where nothing answers, [`Error::NoBootloader`] where the application does
+/// not go back.
 pub fn enter_bootloader(
     session: &mut Session<'_>,
     number: u8,
@@ -472,8 +481,8 @@ pub fn enter_bootloader(
     Ok(())
 }
 
-/// Step 2: what is running, or [`Error::NoAnswer`]. A device that was just reset misses a few requests, so that the
-/// question is repeated for as long as a restart may take.
+/// Step 2: what is running, or [`Error::NoAnswer`]. A device that was just reset misses a few
+/// requests, so that the question is repeated for as long as a restart may take.
 ///
 /// # Errors
 /// [`Error::NoAnswer`], and what a [read](Session::read) has.
@@ -519,15 +528,16 @@ pub fn call_back(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Er
     Err(Error::NoBootloader { node, running: seen, code: None })
 }
 
-/// Waits for a restarting device, [`Timing::boot`](crate::session::Timing::boot) at most, until what it runs is what is
-/// `wanted`; gives what answered last.
+/// Waits for a restarting device, [`Timing::boot`](crate::session::Timing::boot) at most, until
+/// what it runs is what is `wanted`; gives what answered last.
 fn settle(
     session: &mut Session<'_>,
     wanted: impl Fn(DeviceType) -> bool,
 ) -> Result<Option<DeviceType>, Error> {
     let deadline = session.now() + session.timing().boot;
     loop {
-        // The boot-up message says when to look; without it (it may get lost) a look now and then does.
+        // The boot-up message says when to look; without it (it may get lost) a look now and then
+        // does.
         let pause = session.timing().sdo;
         session.await_boot_up(pause)?;
         let seen = session.device_type()?;
@@ -549,8 +559,9 @@ pub fn erase(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event))
     Ok(())
 }
 
-/// Steps 4 and 5 on a device that may have no 1F57h to tell how it goes, and may answer when it has erased.
-pub(crate) fn erase_patiently(
+/// Steps 4 and 5 on a device that may have no 1F57h to tell how it goes, and may answer when it has
+/// erased.
+pub(crate) fn clear_and_wait(
     session: &mut Session<'_>,
     number: u8,
     tell: &mut dyn FnMut(Event),
@@ -569,11 +580,13 @@ pub(crate) fn erase_patiently(
     Ok(())
 }
 
-/// An erasure that is over sooner than this was put off, or had little to do. Erasing a sector of flash takes longer.
+/// An erasure that is over sooner than this was put off, or had little to do. Erasing a sector of
+/// flash takes longer.
 const PUT_OFF: Duration = Duration::from_millis(100);
 
-/// Gets rid of the program, without another one in its place. A bootloader that puts the erasure off until the first block comes
-/// (figure 12 of the manual) is told a second time, which there means at once; elsewhere that erases what is erased already.
+/// Gets rid of the program, without another one in its place. A bootloader that puts the erasure
+/// off until the first block comes (figure 12 of the manual) is told a second time, which there
+/// means at once; elsewhere that erases what is erased already.
 ///
 /// # Errors
 /// As [`erase`].
@@ -621,7 +634,8 @@ fn execute(session: &mut Session<'_>, number: u8, command: ProgramControl) -> Re
             Ok(()) => break,
             Err(Error::NoAnswer { .. } | Error::Protocol { .. }) if attempt < session.timing().attempts => {
                 attempt += 1;
-                // The command may have arrived, and the device may be silent because it carries it out.
+                // The command may have arrived, and the device may be silent because it carries it
+                // out.
                 session.await_idle(number, doing)?;
             }
             Err(Error::Refused { code, .. }) => return Err(explain(session, number, doing, code)),
@@ -690,8 +704,8 @@ fn send_block(
             return Err(error);
         }
         let status = session.await_idle(options.program, doing)?;
-        // It had arrived, and the bootloader waits for the next one. Should that not be so, the next one and at the
-        // latest the program's CRC will tell.
+        // It had arrived, and the bootloader waits for the next one. Should that not be so, the
+        // next one and at the latest the program's CRC will tell.
         if in_doubt && status.error == Some(FlashError::Sequence) {
             return Ok(repeat);
         }
@@ -703,7 +717,8 @@ fn send_block(
         match why {
             Some(why) if repeat < options.repeats => {
                 repeat += 1;
-                // A device, or an adapter, that cannot cope with block transfers may cope with segments.
+                // A device, or an adapter, that cannot cope with block transfers may cope with
+                // segments.
                 if repeat > 1 && matches!(why, RepeatReason::Broken(_) | RepeatReason::NoAnswer) {
                     session.transfer_by(Transfers::Segments);
                 }

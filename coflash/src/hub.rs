@@ -1,8 +1,9 @@
 //! Several conversations over one adapter at once.
 //!
-//! Each conversation runs in a thread of its own with a [`Port`] as its adapter, and needs to know nothing of the others. The
-//! adapter stays where it is: while all conversations wait, the hub waits for them, and whoever got a frame, or whose time is
-//! over, goes on. Nothing runs beside the hub, so that the same answers give the same course of events.
+//! Each conversation runs in a thread of its own with a [`Port`] as its adapter, and needs to know
+//! nothing of the others. The adapter stays where it is: while all conversations wait, the hub
+//! waits for them, and whoever got a frame, or whose time is over, goes on. Nothing runs beside the
+//! hub, so that the same answers give the same course of events.
 
 use std::collections::VecDeque;
 use std::io;
@@ -17,8 +18,8 @@ use crate::adapter::{Adapter, AdapterError};
 /// What a conversation does with its port; what it gives is gathered by [`run`].
 pub type Conversation<'c, R> = Box<dyn FnOnce(&mut Port) -> R + Send + 'c>;
 
-/// Frames that wait in the adapter may be the ones that are waited for: a conversation's time is over when there are none, or
-/// so much later.
+/// Frames that wait in the adapter may be the ones that are waited for: a conversation's time is
+/// over when there are none, or so much later.
 const GRACE: Duration = Duration::from_secs(1);
 
 /// What ports tell the hub.
@@ -95,7 +96,8 @@ enum State {
     Gone,
 }
 
-/// Holds the conversations, each with one node and `at_once` of them at a time, and gives what they gave, in their order.
+/// Holds the conversations, each with one node and `at_once` of them at a time, and gives what they
+/// gave, in their order.
 ///
 /// # Panics
 /// If a conversation does.
@@ -137,8 +139,8 @@ pub fn run<'c, R: Send + 'c>(
     results.into_iter().map(|(_, result)| result).collect()
 }
 
-/// Takes what the ports ask until all of them wait, and sends what they want to send: in the order of the ports, whoever was
-/// faster.
+/// Takes what the ports ask until all of them wait, and sends what they want to send: in the order
+/// of the ports, whoever was faster.
 fn settle(
     adapter: &mut dyn Adapter,
     asked: &Receiver<Ask>,

@@ -61,7 +61,8 @@ pub(crate) struct Piece {
 
 impl Piece {
     pub(crate) fn range(&self) -> AddressRange {
-        // `Pieces::add` lets nothing empty in, and the readers nothing that leaves the address space.
+        // `Pieces::add` lets nothing empty in, and the readers nothing that leaves the address
+        // space.
         AddressRange { first: self.address, last: self.address + (self.data.len() - 1) as u32 }
     }
 }
@@ -71,7 +72,8 @@ impl Piece {
 pub(crate) struct Pieces(Vec<Piece>);
 
 impl Pieces {
-    /// Adds what the file has at `place`; the caller has checked that it ends inside the address space.
+    /// Adds what the file has at `place`; the caller has checked that it ends inside the address
+    /// space.
     pub(crate) fn add(&mut self, address: u32, data: Vec<u8>, place: Place) {
         if !data.is_empty() {
             self.0.push(Piece { address, data, place });
@@ -84,7 +86,8 @@ impl Pieces {
         if pieces.is_empty() {
             return Err(Place::File.fault(Cause::NoData));
         }
-        // The sort is stable: of two pieces at one address the earlier one in the file stays in front.
+        // The sort is stable: of two pieces at one address the earlier one in the file stays in
+        // front.
         pieces.sort_by_key(|piece| piece.address);
         for pair in pieces.windows(2) {
             let (low, high) = (&pair[0], &pair[1]);
@@ -102,7 +105,8 @@ impl Pieces {
     }
 }
 
-/// What stands in front of the software version in a program (CiA 814-1, section 6.5), its final zero included.
+/// What stands in front of the software version in a program (CiA 814-1, section 6.5), its final
+/// zero included.
 const VERSION_MARK: &[u8] = b"$CANopenSoftwareVersion\0";
 /// The longest software version that is looked at.
 const VERSION_MAX: usize = 255;
@@ -145,8 +149,8 @@ impl Image {
         })
     }
 
-    /// The same, so many bytes further up in memory, or `None` where the address space ends before it does. An offset of
-    /// 2³² − n is one of −n.
+    /// The same, so many bytes further up in memory, or `None` where the address space ends before
+    /// it does. An offset of 2³² − n is one of −n.
     #[must_use]
     pub fn moved(&self, offset: u32) -> Option<Self> {
         let mut pieces = self.pieces.clone();
@@ -159,8 +163,9 @@ impl Image {
         in_order.then_some(Self { pieces })
     }
 
-    /// The software version that the program has behind `$CANopenSoftwareVersion` (CiA 814-1, section 6.5): the text of
-    /// object 100Ah, encoded as ISO 8859-1. What would move a cursor is replaced.
+    /// The software version that the program has behind `$CANopenSoftwareVersion` (CiA 814-1,
+    /// section 6.5): the text of object 100Ah, encoded as ISO 8859-1. What would move a cursor is
+    /// replaced.
     #[must_use]
     pub fn software_version(&self) -> Option<String> {
         self.segments().find_map(|(_, data)| {

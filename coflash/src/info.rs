@@ -27,7 +27,8 @@ pub struct DeviceInfo {
     pub software_version: Option<String>,
     /// 1018h/1 to 4: vendor-ID, product code, revision, serial number.
     pub identity: [Option<u32>; 4],
-    /// What its bootloader speaks, as far as that can be seen; `None` for a device without programs.
+    /// What its bootloader speaks, as far as that can be seen; `None` for a device without
+    /// programs.
     pub dialect: Option<Dialect>,
     /// Its programs, from number 1 on.
     pub programs: Vec<ProgramInfo>,

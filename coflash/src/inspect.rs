@@ -127,8 +127,8 @@ impl Blocks {
     }
 }
 
-/// The version in block 0: major in bits 0–7, minor in bits 8–15, release in bits 16–31 (manual, figure 13). `Display`
-/// writes it as the manual does: `V1.10r100`.
+/// The version in block 0: major in bits 0–7, minor in bits 8–15, release in bits 16–31 (manual,
+/// figure 13). `Display` writes it as the manual does: `V1.10r100`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Version(pub u32);
 

@@ -89,8 +89,8 @@ impl fmt::Display for Fault {
 
 impl std::error::Error for Fault {}
 
-/// Takes a job file apart that lies in this folder. There is at least one device in it; each has an image, and a node-ID or an LSS
-/// address that no other one has.
+/// Takes a job file apart that lies in this folder. There is at least one device in it; each has an
+/// image, and a node-ID or an LSS address that no other one has.
 ///
 /// # Errors
 /// The first thing that is wrong with it.

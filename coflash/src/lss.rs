@@ -1,4 +1,5 @@
-//! Layer setting services, the master's side (CiA 305): node-ID and bit rate over the bus, for devices without switches.
+//! Layer setting services, the master's side (CiA 305): node-ID and bit rate over the bus, for
+//! devices without switches.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
@@ -11,7 +12,7 @@ use canopen::{Address, CobId, Frame, NodeId};
 
 use crate::adapter::Adapter;
 use crate::error::{Error, LssFailure};
-use crate::scan::hear;
+use crate::scan::listen;
 use crate::session::Doing;
 
 // Command specifiers (CiA 305).
@@ -32,10 +33,11 @@ const ANYBODY: u8 = 0x80;
 /// The node-ID of a device without one.
 const NO_NODE_ID: u8 = 0xFF;
 
-/// How long a slave may take for its answer, unless told otherwise. Fastscan waits so long for each bit that is set in an
-/// address, so that patience costs time there.
+/// How long a slave may take for its answer, unless told otherwise. Fastscan waits so long for each
+/// bit that is set in an address, so that patience costs time there.
 pub const ANSWER: Duration = Duration::from_millis(100);
-/// How long a device may take to store what it was given: it may have to erase a sector of its flash for that.
+/// How long a device may take to store what it was given: it may have to erase a sector of its
+/// flash for that.
 const STORE_ANSWER: Duration = Duration::from_secs(2);
 /// Error code of a store: the device has no place for it (CiA 305).
 const STORE_UNSUPPORTED: u8 = 1;
@@ -96,7 +98,8 @@ impl<'a> Master<'a> {
         self.cancelled = Some(flag);
     }
 
-    /// Switches every device that listens into configuration state, or back to waiting. Nobody answers.
+    /// Switches every device that listens into configuration state, or back to waiting. Nobody
+    /// answers.
     ///
     /// # Errors
     /// [`Error::Adapter`] or [`Error::Cancelled`].
@@ -133,7 +136,8 @@ impl<'a> Master<'a> {
         Ok(LssAddress { vendor_id, product_code, revision, serial_number })
     }
 
-    /// Asks the device in configuration state for the node-ID that it has in force; `None` where it has none.
+    /// Asks the device in configuration state for the node-ID that it has in force; `None` where it
+    /// has none.
     ///
     /// # Errors
     /// [`Error::Lss`].
@@ -142,8 +146,9 @@ impl<'a> Master<'a> {
         Ok(NodeId::new(answer[1]))
     }
 
-    /// Gives the device in configuration state a node-ID, or takes it away. A device without one takes it when it is
-    /// switched back to waiting; one that has another needs a reset of its communication.
+    /// Gives the device in configuration state a node-ID, or takes it away. A device without one
+    /// takes it when it is switched back to waiting; one that has another needs a reset of its
+    /// communication.
     ///
     /// # Errors
     /// [`Error::Lss`].
@@ -152,8 +157,8 @@ impl<'a> Master<'a> {
         self.order([CONFIGURE_NODE_ID, number, 0, 0, 0, 0, 0, 0], LssDoing::NodeId)
     }
 
-    /// Gives the device in configuration state a bit rate; it comes into force by [`activate`](Self::activate), or with the
-    /// next start when it was stored.
+    /// Gives the device in configuration state a bit rate; it comes into force by
+    /// [`activate`](Self::activate), or with the next start when it was stored.
     ///
     /// # Errors
     /// [`Error::Lss`].
@@ -161,8 +166,9 @@ impl<'a> Master<'a> {
         self.order([CONFIGURE_BIT_TIMING, 0, rate as u8, 0, 0, 0, 0, 0], LssDoing::BitRate)
     }
 
-    /// Has all devices in configuration state change over to the bit rate that they were given: they fall silent for
-    /// `delay`, change over, and stay silent for as long again. Nobody answers.
+    /// Has all devices in configuration state change over to the bit rate that they were given:
+    /// they fall silent for `delay`, change over, and stay silent for as long again. Nobody
+    /// answers.
     ///
     /// # Errors
     /// [`Error::Adapter`] or [`Error::Cancelled`].
@@ -183,8 +189,9 @@ impl<'a> Master<'a> {
         stored
     }
 
-    /// Finds one of the devices without a node-ID, bit by bit of its address, and switches it into configuration state;
-    /// `None` where there is no such device. `progress` is told how many of the 128 bits are known.
+    /// Finds one of the devices without a node-ID, bit by bit of its address, and switches it into
+    /// configuration state; `None` where there is no such device. `progress` is told how many of
+    /// the 128 bits are known.
     ///
     /// # Errors
     /// [`Error::Lss`] where the device has gone in the middle.
@@ -193,8 +200,9 @@ impl<'a> Master<'a> {
         if !self.is_there(0, ANYBODY, 0, 0, self.answer)? {
             return Ok(None);
         }
-        // Answers of several devices come close behind one another, as a rule. Where one was so late that it was taken for
-        // the answer to the next question, the whole time is left for it.
+        // Answers of several devices come close behind one another, as a rule. Where one was so
+        // late that it was taken for the answer to the next question, the whole time is left for
+        // it.
         let address = match self.identify(self.answer / 5, progress)? {
             None => self.identify(self.answer, progress)?,
             found => found,
@@ -202,8 +210,8 @@ impl<'a> Master<'a> {
         address.map(Some).ok_or(no_answer(LssDoing::Fastscan))
     }
 
-    /// The address of one device; `None` where it comes out as one that no device has. `late` is how long further answers may
-    /// lag behind the first.
+    /// The address of one device; `None` where it comes out as one that no device has. `late` is
+    /// how long further answers may lag behind the first.
     fn identify(
         &mut self,
         late: Duration,
@@ -216,7 +224,8 @@ impl<'a> Master<'a> {
         let mut numbers = [0; 4];
         for (part, number) in (0..).zip(&mut numbers) {
             for bit in (0..32).rev() {
-                // "Do your bits from 31 down to this one read as these?": silence means that this one is set.
+                // "Do your bits from 31 down to this one read as these?": silence means that this
+                // one is set.
                 if !self.is_there(*number, bit, part, part, late)? {
                     *number |= 1 << bit;
                 }
@@ -231,8 +240,8 @@ impl<'a> Master<'a> {
         Ok(Some(LssAddress { vendor_id, product_code, revision, serial_number }))
     }
 
-    /// One question of fastscan. Several devices may answer, all with the same frame; these are all heard before the next
-    /// question.
+    /// One question of fastscan. Several devices may answer, all with the same frame; these are all
+    /// heard before the next question.
     fn is_there(&mut self, number: u32, bit: u8, part: u8, next: u8, late: Duration) -> Result<bool, Error> {
         let [a, b, c, d] = number.to_le_bytes();
         self.send([FASTSCAN, a, b, c, d, bit, part, next])?;
@@ -305,12 +314,13 @@ impl<'a> Master<'a> {
     }
 }
 
-/// Sees to it that the device with this address has a node-ID: its own, or the one that is asked for, which it is given if
-/// need be, and stores if it can: it has to outlive the restart into the program. Afterwards it is on the bus with it.
+/// Sees to it that the device with this address has a node-ID: its own, or the one that is asked
+/// for, which it is given if need be, and stores if it can: it has to outlive the restart into the
+/// program. Afterwards it is on the bus with it.
 ///
 /// # Errors
-/// [`Error::Lss`] where the device does not answer, has no node-ID and none is asked for, or refuses; [`Error::NoAnswer`]
-/// where it does not come up with its new node-ID within `boot`.
+/// [`Error::Lss`] where the device does not answer, has no node-ID and none is asked for, or
+/// refuses; [`Error::NoAnswer`] where it does not come up with its new node-ID within `boot`.
 pub fn ensure_node_id(
     adapter: &mut dyn Adapter,
     address: &LssAddress,
@@ -352,7 +362,7 @@ pub fn ensure_node_id(
     }
     let mut up = false;
     let boot_up = nmt::boot_up(new);
-    hear(adapter, boot, cancelled, &mut |frame| {
+    listen(adapter, boot, cancelled, &mut |frame| {
         up = *frame == boot_up;
         up
     })?;

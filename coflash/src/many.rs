@@ -26,8 +26,8 @@ pub struct Job {
 /// How to treat all of them.
 #[derive(Clone, Debug)]
 pub struct ManyOptions {
-    /// How long to wait for what. Answers wait behind those of other devices: the SDO time-out is taken as many times as
-    /// there are devices at once.
+    /// How long to wait for what. Answers wait behind those of other devices: the SDO time-out is
+    /// taken as many times as there are devices at once.
     pub timing: Timing,
     /// How to write.
     pub transfers: Transfers,
@@ -46,8 +46,8 @@ pub struct Failed {
     pub left: DeviceState,
 }
 
-/// Updates all devices; a failure of one does not stop the others. `tell` hears what happens to which job, in threads of
-/// their own. The results are in the order of the jobs.
+/// Updates all devices; a failure of one does not stop the others. `tell` hears what happens to
+/// which job, in threads of their own. The results are in the order of the jobs.
 pub fn flash_many(
     adapter: &mut dyn Adapter,
     jobs: &[Job],

@@ -30,7 +30,8 @@ pub struct Found {
 pub struct ScanOptions {
     /// Whom to ask.
     pub nodes: Vec<NodeId>,
-    /// How long to listen to what the bus says by itself; heartbeats come once a second in most networks.
+    /// How long to listen to what the bus says by itself; heartbeats come once a second in most
+    /// networks.
     pub listen: Duration,
     /// How long to wait for what.
     pub timing: Timing,
@@ -49,7 +50,8 @@ impl Default for ScanOptions {
     }
 }
 
-/// How many nodes are asked at once: each that is there answers, and an adapter must not lose answers.
+/// How many nodes are asked at once: each that is there answers, and an adapter must not lose
+/// answers.
 const AT_ONCE: usize = 16;
 
 /// Asks all nodes what they are, and listens to what the bus says by itself.
@@ -70,7 +72,7 @@ pub fn scan(
                 adapter.send(&Frame::of(CobId::sdo_request(*node), &question))?;
             }
             let mut silent: Vec<NodeId> = nodes.to_vec();
-            hear(adapter, options.timing.sdo.min(AT_ONCE_LIMIT), cancelled, &mut |frame| {
+            listen(adapter, options.timing.sdo.min(AT_ONCE_LIMIT), cancelled, &mut |frame| {
                 note_state(&mut found, frame);
                 let answering = silent.iter().position(|node| is_answer(frame, *node));
                 answered.extend(answering.map(|at| silent.remove(at)));
@@ -78,7 +80,7 @@ pub fn scan(
             })?;
         }
     }
-    hear(adapter, options.listen, cancelled, &mut |frame| {
+    listen(adapter, options.listen, cancelled, &mut |frame| {
         note_state(&mut found, frame);
         false
     })?;
@@ -114,7 +116,7 @@ fn note_state(found: &mut BTreeMap<NodeId, Found>, frame: &Frame) {
 ///
 /// # Errors
 /// [`Error::Adapter`] or [`Error::Cancelled`].
-pub fn hear(
+pub fn listen(
     adapter: &mut dyn Adapter,
     time: Duration,
     cancelled: &Arc<AtomicBool>,

@@ -1,4 +1,5 @@
-//! A conversation with one node: SDO reads and writes, commands and their outcome, over any [`Adapter`].
+//! A conversation with one node: SDO reads and writes, commands and their outcome, over any
+//! [`Adapter`].
 
 use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -23,11 +24,13 @@ pub struct Timing {
     pub sdo: Duration,
     /// How often a read, or a write that may be repeated, is tried when no answer comes.
     pub attempts: u32,
-    /// A command's execution (erase, program, check): how long 1F57h may read busy, or the device be silent.
+    /// A command's execution (erase, program, check): how long 1F57h may read busy, or the device
+    /// be silent.
     pub command: Duration,
     /// A restart: how long a device may take until it answers again.
     pub boot: Duration,
-    /// The first pause between two looks at a device that is at work. It doubles from look to look …
+    /// The first pause between two looks at a device that is at work. It doubles from look to look
+    /// …
     pub poll_first: Duration,
     /// … up to this one, so that the bus is not flooded.
     pub poll_most: Duration,
@@ -106,8 +109,8 @@ impl Sink for Grown {
     }
 }
 
-/// After so long without an abort, no more come for the segments of a transfer that was refused. A frame on the slowest
-/// bus takes 13 ms.
+/// After so long without an abort, no more come for the segments of a transfer that was refused. A
+/// frame on the slowest bus takes 13 ms.
 const QUIET: Duration = Duration::from_millis(30);
 /// After so many frames in a row, a look whether the node has something against them.
 const BURST: u32 = 8;
@@ -117,7 +120,8 @@ const SLICE: Duration = Duration::from_millis(100);
 /// How values of more than four bytes are written.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Transfers {
-    /// As blocks, the fast way, until the device says that it does not know them; from then on in segments.
+    /// As blocks, the fast way, until the device says that it does not know them; from then on in
+    /// segments.
     #[default]
     Blocks,
     /// In segments, which every device knows: one answer for seven bytes.
@@ -127,8 +131,8 @@ pub enum Transfers {
 /// Less is not worth the frames around a block transfer.
 const WORTH_BLOCKS: usize = 4 * 7;
 
-/// What [`Timing::command`] limits in a transfer. The SDO time-out alone does not end one: it counts from answer to
-/// answer, and a device that babbles always has one.
+/// What [`Timing::command`] limits in a transfer. The SDO time-out alone does not end one: it
+/// counts from answer to answer, and a device that babbles always has one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Patience {
     /// The transfer.
@@ -216,7 +220,8 @@ impl<'a> Session<'a> {
         let mut attempt = 1;
         loop {
             match self.read_once(at) {
-                // An answer that came late, to a request given up, spoils the next one: then, too, ask again.
+                // An answer that came late, to a request given up, spoils the next one: then, too,
+                // ask again.
                 Err(Error::NoAnswer { .. } | Error::Protocol { .. }) if attempt < attempts => attempt += 1,
                 result => return result,
             }
@@ -235,7 +240,8 @@ impl<'a> Session<'a> {
         Ok(upload.sink().filled().to_vec())
     }
 
-    /// Reads a value of any length, as blocks where the device knows them. `progress` is told how many bytes are here.
+    /// Reads a value of any length, as blocks where the device knows them. `progress` is told how
+    /// many bytes are here.
     ///
     /// # Errors
     /// As [`read`](Self::read); [`Error::Protocol`] for more than [`UPLOAD_MAX`] bytes.
@@ -316,11 +322,12 @@ impl<'a> Session<'a> {
         self.read_number(Address::new(program::FLASH_STATUS, number)).map(FlashStatus::from_word)
     }
 
-    /// Waits until 1F57h of a program is no longer busy, and gives what it says then. Silence counts as busy: a device
-    /// may be unable to answer while it erases.
+    /// Waits until 1F57h of a program is no longer busy, and gives what it says then. Silence
+    /// counts as busy: a device may be unable to answer while it erases.
     ///
     /// # Errors
-    /// [`Error::Busy`] or [`Error::NoAnswer`] when [`Timing::command`] has passed, and what [`read`](Self::read) has.
+    /// [`Error::Busy`] or [`Error::NoAnswer`] when [`Timing::command`] has passed, and what
+    /// [`read`](Self::read) has.
     pub fn await_idle(&mut self, number: u8, doing: Doing) -> Result<FlashStatus, Error> {
         let began = self.now();
         let at = Address::new(program::FLASH_STATUS, number);
@@ -366,8 +373,9 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Waits until the node has said nothing for a while: segments that were on their way when it refused a block
-    /// transfer draw an abort each, and none of these is the answer to what is asked next.
+    /// Waits until the node has said nothing for a while: segments that were on their way when it
+    /// refused a block transfer draw an abort each, and none of these is the answer to what is
+    /// asked next.
     fn settle_after_burst(&mut self) -> Result<(), Error> {
         let deadline = self.now() + self.timing.sdo;
         let response = CobId::sdo_response(self.node);
@@ -387,7 +395,7 @@ impl<'a> Session<'a> {
     ///
     /// # Errors
     /// [`Error::Adapter`] or [`Error::Cancelled`].
-    pub fn hear(&mut self, time: Duration, heard: &mut dyn FnMut(&Frame)) -> Result<(), Error> {
+    pub fn observe(&mut self, time: Duration, heard: &mut dyn FnMut(&Frame)) -> Result<(), Error> {
         self.listen(time, |frame| {
             heard(frame);
             false
@@ -395,11 +403,12 @@ impl<'a> Session<'a> {
         .map(|_| ())
     }
 
-    /// Listens to everything on the bus until `enough` says so, `time` at most; tells whether it did.
+    /// Listens to everything on the bus until `enough` says so, `time` at most; tells whether it
+    /// did.
     ///
     /// # Errors
     /// [`Error::Adapter`] or [`Error::Cancelled`].
-    pub fn hear_until(
+    pub fn observe_until(
         &mut self,
         time: Duration,
         enough: &mut dyn FnMut(&Frame) -> bool,
@@ -534,7 +543,8 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// The bus time as the state machines count it: they compare by difference, so wrapping is right.
+    /// The bus time as the state machines count it: they compare by difference, so wrapping is
+    /// right.
     fn instant(&self) -> Instant {
         Instant::from_millis(self.now().as_millis() as u32)
     }
@@ -545,7 +555,8 @@ impl<'a> Session<'a> {
 pub struct DeviceType(pub u32);
 
 impl DeviceType {
-    /// Whether it is that of a bootloader, of one dialect or the other; everything else is an application's.
+    /// Whether it is that of a bootloader, of one dialect or the other; everything else is an
+    /// application's.
     #[must_use]
     pub const fn is_bootloader(self) -> bool {
         matches!(self.0, BOOTLOADER_DEVICE_TYPE | LIFT_DEVICE_TYPE | ESACADEMY_DEVICE_TYPE)
@@ -559,7 +570,8 @@ impl fmt::Display for DeviceType {
     }
 }
 
-/// Whether this is how a server says that it does not know block transfer. Some use the general error for it.
+/// Whether this is how a server says that it does not know block transfer. Some use the general
+/// error for it.
 fn means_no_blocks(code: AbortCode) -> bool {
     matches!(code, AbortCode::COMMAND | AbortCode::UNSUPPORTED_ACCESS | AbortCode::GENERAL)
 }

@@ -30,8 +30,8 @@ fn standard(frame: &Frame) -> u16 {
     }
 }
 
-/// Lets a device take part in a conversation until the other side goes. `words` cuts what was read into frames for the
-/// device; what it answers goes out as `emit` writes it.
+/// Lets a device take part in a conversation until the other side goes. `words` cuts what was read
+/// into frames for the device; what it answers goes out as `emit` writes it.
 fn converse<S: Read + Write>(
     mut stream: S,
     mut fake: Fake,
@@ -162,7 +162,8 @@ fn slcan_over_a_serial_port() {
     assert_eq!(said[2..5], ["C", "S4", "O"]);
 }
 
-/// A line that ends when it is told to: a pseudo-terminal does not notice that nobody has the other end any more.
+/// A line that ends when it is told to: a pseudo-terminal does not notice that nobody has the other
+/// end any more.
 #[cfg(unix)]
 struct Until<L>(L, std::sync::Arc<std::sync::atomic::AtomicBool>);
 

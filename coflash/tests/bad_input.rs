@@ -34,7 +34,8 @@ fn a_file_cut_off_anywhere_is_refused() {
     for (name, bytes) in FILES {
         let whole = meaning(bytes, None).unwrap();
         for len in 0..bytes.len() {
-            // What may be absent: the line end of the last line, and whatever of an ELF no segment refers to.
+            // What may be absent: the line end of the last line, and whatever of an ELF no segment
+            // refers to.
             if let Ok(read) = meaning(&bytes[..len], None) {
                 let harmless = bytes[len..].trim_ascii().is_empty() || name.ends_with(".elf") && len >= 0x373;
                 assert!(harmless && read == whole, "{name} cut to {len} bytes passed");
@@ -51,8 +52,9 @@ fn a_damaged_text_or_block_file_never_means_something_else() {
             for bit in 0..8 {
                 let mut damaged = bytes.to_vec();
                 damaged[at] ^= 1 << bit;
-                // A flipped bit may turn a digit's case or a line end, and nothing else. (No checksum of an S-record
-                // covers its type, which tells how long the address is: there the format itself is at an end.)
+                // A flipped bit may turn a digit's case or a line end, and nothing else. (No
+                // checksum of an S-record covers its type, which tells how long the address is:
+                // there the format itself is at an end.)
                 let srec_type = name.contains(".s") && at > 0 && bytes[at - 1] == b'S';
                 if let Ok(read) = meaning(&damaged, None) {
                     assert!(read == whole || srec_type, "{name}: bit {bit} of byte {at}");
@@ -139,13 +141,15 @@ proptest! {
         let _ = meaning(&bytes[..len], None);
     }
 
-    /// Random text made of the formats' own alphabet gets further into the readers than random bytes.
+    /// Random text made of the formats' own alphabet gets further into the readers than random
+    /// bytes.
     #[test]
     fn random_records_never_panic(lines in prop::collection::vec("[:S][0-9A-F]{2,24}", 1..20)) {
         let _ = meaning(lines.join("\n").as_bytes(), None);
     }
 
-    /// What conversion cuts into blocks is the memory that went in, whatever the pieces and the block size.
+    /// What conversion cuts into blocks is the memory that went in, whatever the pieces and the
+    /// block size.
     #[test]
     fn blocks_hold_exactly_the_image(
         pieces in prop::collection::btree_map(0u32..4000, any::<u8>(), 1..300),
@@ -178,7 +182,8 @@ proptest! {
             }
         }
         for (address, byte) in (0u32..).zip(memory) {
-            // A hole inside a block has the fill's byte, as the flash's words show it; one between blocks is erased.
+            // A hole inside a block has the fill's byte, as the flash's words show it; one between
+            // blocks is erased.
             let hole = match covered[address as usize] {
                 true if gap_fill == GapFill::new(0) => 0,
                 true if gap_fill == GapFill::new(0x4433_2211) => [0x11, 0x22, 0x33, 0x44][address as usize % 4],

@@ -55,7 +55,8 @@ fn convert_writes_the_block_file_of_the_manual() {
     assert_eq!(done.out, words);
 }
 
-/// The manual's calls word by word (chapter 5.1), apart from the addresses, which are those of another chip.
+/// The manual's calls word by word (chapter 5.1), apart from the addresses, which are those of
+/// another chip.
 #[test]
 fn a_build_script_for_the_manuals_converter_works() {
     let folder = Folder::new("legacy");
@@ -73,7 +74,8 @@ fn a_build_script_for_the_manuals_converter_works() {
     assert_eq!(done.exit, 0, "{}", done.err);
     assert!(fs::read(folder.path("blcop_app.bin")).unwrap() == fs::read(data("release-110.blk")).unwrap());
     assert!(fs::read(folder.path("blcop_app.tmp")).unwrap() == fs::read(data("program.bin")).unwrap());
-    // Octal and suffixed numbers, the byte-wide fill of 2008, the CRC-16, and no name for the output.
+    // Octal and suffixed numbers, the byte-wide fill of 2008, the CRC-16, and no name for the
+    // output.
     let done =
         call(&["--block_size", "02000", "--gap_fill", "0xFFul", "--crc16", "--adjust_start", "0", &input]);
     assert_eq!(done.exit, 0, "{}", done.err);

@@ -518,7 +518,8 @@ fn the_configuration_gives_defaults_and_the_command_line_wins() {
         .env_remove("COFLASH_CONFIG"));
     assert!(done.exit == 0 && done.out.starts_with("node 5: "), "{}{}", done.out, done.err);
     server.join().unwrap();
-    // In the shell, too; but not for those who are meant by --all, and nobody is given it as a node-ID.
+    // In the shell, too; but not for those who are meant by --all, and nobody is given it as a
+    // node-ID.
     let (bus, server) = serve(quick(BOOTLOADER));
     let config = folder.file("node.toml", b"node = 5\n");
     let done = shell(&["--bus", &bus, "--config", &config], "read 1018/2\n");

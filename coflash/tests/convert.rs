@@ -1,4 +1,5 @@
-//! Conversion against block files made by other tools (`data/make.sh`) and against literals from the manual's tables.
+//! Conversion against block files made by other tools (`data/make.sh`) and against literals from
+//! the manual's tables.
 
 use coflash::block_file::{BlockFile, Checksum};
 use coflash::convert::{blocks_of, convert, ConvertError, Converted, GapFill, Label, Options, Region};
@@ -50,7 +51,8 @@ fn every_format_of_one_program_gives_the_same_block_file() {
     }
 }
 
-/// Polynomial 1021h in blocks and program, stored in 32 bits (manual, table 8); made with Python's `binascii.crc_hqx`.
+/// Polynomial 1021h in blocks and program, stored in 32 bits (manual, table 8); made with Python's
+/// `binascii.crc_hqx`.
 #[test]
 fn the_16_bit_crc_is_that_of_the_manual() {
     let elf = image(data!("program.elf"));
@@ -79,7 +81,8 @@ fn addresses_are_adjusted_behind_the_cut_and_before_the_board() {
     let back = Options { region: board(), adjust_start: 0xF000_0000, ..Options::default() };
     assert!(blocks_of(moved.clone(), &back).unwrap().file.emit() == data!("plain-400.blk"));
     assert!(blocks_of(moved, &Options { region: board(), ..Options::default() }).is_err());
-    // Over the end of the address space: the border within a piece, between two, and before the first.
+    // Over the end of the address space: the border within a piece, between two, and before the
+    // first.
     for (region, offset) in [
         (Region::Unknown, 0xF7FE_FFF0),
         (Region::Unknown, 0xF7FE_F200),
@@ -141,7 +144,8 @@ fn a_block_file_is_read_back_and_taken_as_it_is() {
     }
 }
 
-/// A program of five bytes, block by block as the tables of chapter 5.1 draw it; CRCs from Python's `zlib.crc32`.
+/// A program of five bytes, block by block as the tables of chapter 5.1 draw it; CRCs from Python's
+/// `zlib.crc32`.
 #[test]
 fn a_small_program_byte_by_byte() {
     let image = image(b":020000040801F1\n:050000000102030405EC\n:00000001FF\n");

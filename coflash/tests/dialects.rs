@@ -1,4 +1,5 @@
-//! Devices of other makers, each played from its document: what they are sent, byte for byte, and what becomes of it.
+//! Devices of other makers, each played from its document: what they are sent, byte for byte, and
+//! what becomes of it.
 
 mod fake;
 
@@ -60,9 +61,11 @@ fn locked(phrase: &str) -> FlashOptions {
     FlashOptions { unlock: Password::new(phrase), ..FlashOptions::default() }
 }
 
-// --- CiA 417 ---------------------------------------------------------------------------------------------------------
+// --- CiA 417
+// ---------------------------------------------------------------------------------------------------------
 
-/// A lift device (CiA 814-1 clause 6.3). The document leaves the abort codes open but for that of a wrong file.
+/// A lift device (CiA 814-1 clause 6.3). The document leaves the abort codes open but for that of a
+/// wrong file.
 struct Lift {
     kept: Kept,
     armed: bool,
@@ -272,7 +275,8 @@ fn a_lift_is_read_from_its_bootloader_and_restarted() {
     assert!(fake.writes().is_empty());
 }
 
-// --- ESAcademy -------------------------------------------------------------------------------------------------------
+// --- ESAcademy
+// -------------------------------------------------------------------------------------------------------
 
 /// The minimal boot loader that ESAcademy describes: no status, no CRC.
 struct EsAcademy {
@@ -381,9 +385,11 @@ fn esacademy_says_what_went_wrong_by_the_error_register_alone() {
     assert!(fake.writes().is_empty());
 }
 
-// --- CiA 302-3 -------------------------------------------------------------------------------------------------------
+// --- CiA 302-3
+// -------------------------------------------------------------------------------------------------------
 
-/// A device that knows CiA 302-3 and nothing else. Its device type is that of its profile, whatever runs; 1F51h tells.
+/// A device that knows CiA 302-3 and nothing else. Its device type is that of its profile, whatever
+/// runs; 1F51h tells.
 struct Standard {
     kept: Kept,
     /// 0 stopped, 1 started.
@@ -471,7 +477,8 @@ fn a_standard_device_is_stopped_cleared_written_and_started() {
     assert!(fake.writes().is_empty());
 }
 
-// --- telling them apart ----------------------------------------------------------------------------------------------
+// --- telling them apart
+// ----------------------------------------------------------------------------------------------
 
 #[test]
 fn each_is_recognised_by_what_its_document_says() {

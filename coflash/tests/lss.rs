@@ -1,4 +1,5 @@
-//! The LSS master against dialogues written by hand from CiA 305, and against devices that play the standard's slave.
+//! The LSS master against dialogues written by hand from CiA 305, and against devices that play the
+//! standard's slave.
 
 use std::collections::VecDeque;
 use std::sync::atomic::AtomicBool;
@@ -54,7 +55,7 @@ impl Slave {
         }
     }
 
-    fn hear(&mut self, bytes: [u8; 8]) -> Option<[u8; 8]> {
+    fn listen(&mut self, bytes: [u8; 8]) -> Option<[u8; 8]> {
         let number = u32::from_le_bytes(bytes[1..5].try_into().unwrap());
         let plain = |command| Some([command, 0, 0, 0, 0, 0, 0, 0]);
         let outcome = |command, (code, detail): (u8, u8)| Some([command, code, detail, 0, 0, 0, 0, 0]);
@@ -141,7 +142,7 @@ impl Adapter for Bus {
             return Ok(());
         }
         let mut answers: Vec<[u8; 8]> =
-            self.slaves.iter_mut().filter_map(|slave| slave.hear(bytes)).collect();
+            self.slaves.iter_mut().filter_map(|slave| slave.listen(bytes)).collect();
         answers.dedup();
         self.outbox.extend(answers.into_iter().map(answer));
         Ok(())
@@ -216,7 +217,8 @@ fn fastscan_finds_one_device_after_the_other() {
         master.switch_all(false).unwrap();
         found.push(address);
     }
-    // A device that has the bit 0 where others have 1 answers first: the lowest address is found first.
+    // A device that has the bit 0 where others have 1 answers first: the lowest address is found
+    // first.
     let lowest = [addresses[3], addresses[0], addresses[2], addresses[1]];
     assert_eq!(found, lowest);
     let nodes: Vec<u8> = bus.slaves.iter().map(|slave| slave.node).collect();

@@ -90,7 +90,8 @@ fn the_same_devices_give_the_same_course_of_events() {
     }
 }
 
-/// What an adapter promises: nothing means that the time has passed. And each port hears its own node alone.
+/// What an adapter promises: nothing means that the time has passed. And each port hears its own
+/// node alone.
 #[test]
 fn a_port_waits_as_long_as_it_says_and_hears_its_own_node() {
     let mut bus = Bus(vec![Fake::new(BOOTLOADER)]);

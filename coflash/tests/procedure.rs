@@ -132,7 +132,8 @@ fn blocks_are_used_where_the_device_knows_them() {
         let report = run(&mut fake, FlashOptions::default()).0.unwrap();
         assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"));
         assert_eq!((report.transfers, report.repeats), (Transfers::Blocks, 0));
-        // Block 0 and the last one have 28 and 24 bytes: four segments cost no more than the frames around a block.
+        // Block 0 and the last one have 28 and 24 bytes: four segments cost no more than the frames
+        // around a block.
         assert_eq!(fake.block_downloads, BLOCKS - 2);
     }
 }
@@ -185,7 +186,8 @@ fn lost_segments_of_a_block_are_sent_again_within_the_transfer() {
     }
 }
 
-/// What was on its way then draws an abort for each segment: none of them is taken for an answer to the next request.
+/// What was on its way then draws an abort for each segment: none of them is taken for an answer to
+/// the next request.
 #[test]
 fn a_block_transfer_that_is_refused_in_the_middle_is_told_by_its_status() {
     for segment in [1, 2, 9, 30] {
@@ -445,7 +447,8 @@ fn a_lost_answer_or_request_costs_a_repeat_and_nothing_else() {
             let mut fake = Fake::new(APPLICATION);
             fake.on_command = script(command, 1, outcome);
             let result = run(&mut fake, FlashOptions::default()).0;
-            // START is given once: a program that is already running would not know what to do with it.
+            // START is given once: a program that is already running would not know what to do with
+            // it.
             let fatal = command == 0x01 && outcome == Outcome::LoseRequest;
             assert_eq!(result.is_err(), fatal, "{command:02X} {outcome:?} {result:?}");
         }
@@ -677,7 +680,8 @@ fn answers_that_never_fit_are_given_up() {
 }
 
 proptest! {
-    /// No answer of a device makes the host panic or hang, and none makes it believe that a program is in.
+    /// No answer of a device makes the host panic or hang, and none makes it believe that a program
+    /// is in.
     #[test]
     fn no_device_can_break_the_host(
         frames in prop::collection::vec(

@@ -1,22 +1,24 @@
-//! The CAN bus in virtual time: who sends, for how long, and what everybody makes of it (ISO 11898-1:2015).
+//! The CAN bus in virtual time: who sends, for how long, and what everybody makes of it (ISO
+//! 11898-1:2015).
 //!
-//! The model works in whole frames, not in bits: at the start of a frame it knows who takes part, and works out from
-//! the frame's own bits when it ends and how. What follows from that:
+//! The model works in whole frames, not in bits: at the start of a frame it knows who takes part,
+//! and works out from the frame's own bits when it ends and how. What follows from that:
 //!
-//! - Start and end of frames are exact to the bit: stuff bits, error flags, intermission, and the eight bits that an
-//!   error passive transmitter leaves free. Received frames are valid one bit before the end of frame is over
-//!   (10.9), transmitted ones at its end.
-//! - Arbitration is among the requests pending at the start of frame. Two nodes that send the very same bits both
-//!   succeed; the same identifier with other bits behind is a bit error.
-//! - A node whose bit rate differs by more than 1 % from the transmitter's reads the frame at its own sample
-//!   points, without resynchronisation. It sees a stuff error, and unless it is error passive or silent it destroys
-//!   the frame for everybody.
-//! - All consequences of a bad frame reach the nodes when its error delimiter is over. An error flag is superposed
-//!   to 12 bits where the nodes see the error at different bits, and has 6 or 7 where they see it together.
-//! - A node that leaves without warning (reset, power) in the middle of its frame makes a bad frame of the same
-//!   length.
-//! - A controller in loop-back mode without silent mode arbitrates like any other, while the silicon would not
-//!   listen. With both modes it plays with itself.
+//! - Start and end of frames are exact to the bit: stuff bits, error flags, intermission, and the
+//!   eight bits that an error passive transmitter leaves free. Received frames are valid one bit
+//!   before the end of frame is over (10.9), transmitted ones at its end.
+//! - Arbitration is among the requests pending at the start of frame. Two nodes that send the very
+//!   same bits both succeed; the same identifier with other bits behind is a bit error.
+//! - A node whose bit rate differs by more than 1 % from the transmitter's reads the frame at its
+//!   own sample points, without resynchronisation. It sees a stuff error, and unless it is error
+//!   passive or silent it destroys the frame for everybody.
+//! - All consequences of a bad frame reach the nodes when its error delimiter is over. An error
+//!   flag is superposed to 12 bits where the nodes see the error at different bits, and has 6 or 7
+//!   where they see it together.
+//! - A node that leaves without warning (reset, power) in the middle of its frame makes a bad frame
+//!   of the same length.
+//! - A controller in loop-back mode without silent mode arbitrates like any other, while the
+//!   silicon would not listen. With both modes it plays with itself.
 //! - There are no overload frames.
 
 pub mod confinement;
@@ -52,8 +54,8 @@ const CLASH_BITS: u32 = 12;
 /// Bit rates that differ by more than this part are different.
 const TOLERANCE_PARTS: u64 = 100;
 
-/// No node notices earlier than so many bits behind the start of a frame what has become of it: six of an error flag
-/// and eight of its delimiter. Nodes may run ahead of each other by this much.
+/// No node notices earlier than so many bits behind the start of a frame what has become of it: six
+/// of an error flag and eight of its delimiter. Nodes may run ahead of each other by this much.
 pub const SHORTEST_CONSEQUENCE_BITS: u64 = 14;
 
 /// How a frame came out.
@@ -76,7 +78,8 @@ pub struct Record {
     pub end: Time,
     /// What the receivers see.
     pub frame: Frame,
-    /// Its transmitter's place among the nodes; `None` for a frame that an injected fault repeats or delays.
+    /// Its transmitter's place among the nodes; `None` for a frame that an injected fault repeats
+    /// or delays.
     pub from: Option<usize>,
     /// How it came out.
     pub outcome: Outcome,
@@ -177,7 +180,8 @@ struct Contender {
 
 type Sink = Box<dyn FnMut(&Record)>;
 
-/// The wire, and everything that runs on it. The nodes are lent to it for each call, always in the same order.
+/// The wire, and everything that runs on it. The nodes are lent to it for each call, always in the
+/// same order.
 #[derive(Default)]
 pub struct Bus {
     now: Time,
@@ -210,8 +214,8 @@ fn in_tune(a: Span, b: Span) -> bool {
     a.0.abs_diff(b.0) <= a.0.min(b.0) / TOLERANCE_PARTS
 }
 
-/// When a node with another bit rate notices that it does not understand the frame: at its sixth equal sample in a
-/// row, or at the frame's end.
+/// When a node with another bit rate notices that it does not understand the frame: at its sixth
+/// equal sample in a row, or at the frame's end.
 fn misread(wire: &[bool], bit: Span, line: &Line) -> Span {
     let (mut last, mut run) = (None, 0);
     let mut at = line.sample;
@@ -364,7 +368,8 @@ impl Bus {
         }
     }
 
-    // --- silent loop-back ------------------------------------------------------------------------------------------
+    // --- silent loop-back
+    // ------------------------------------------------------------------------------------------
 
     fn start_inner(&mut self, nodes: &mut [&mut dyn BusNode]) {
         let now = self.now;
@@ -396,7 +401,8 @@ impl Bus {
         });
     }
 
-    // --- start of a frame ------------------------------------------------------------------------------------------
+    // --- start of a frame
+    // ------------------------------------------------------------------------------------------
 
     fn contenders(&self, nodes: &[&mut dyn BusNode]) -> Vec<Contender> {
         let now = self.now;
@@ -542,7 +548,8 @@ impl Bus {
         Error { at, flag_bits: FLAG_BITS, transmit: ErrorKind::Acknowledge, receive: ErrorKind::Form }
     }
 
-    // --- end of a frame --------------------------------------------------------------------------------------------
+    // --- end of a frame
+    // --------------------------------------------------------------------------------------------
 
     fn progress(&mut self, flight: Flight, nodes: &mut [&mut dyn BusNode]) {
         match flight.plan {
@@ -627,7 +634,8 @@ impl Bus {
         let passive = |party: &Party| {
             nodes.get(party.node).is_some_and(|node| node.confinement().state() == ErrorState::Passive)
         };
-        // An error passive transmitter's flag is recessive: who only listens takes the frame for a good one.
+        // An error passive transmitter's flag is recessive: who only listens takes the frame for a
+        // good one.
         let unheard = error.transmit == ErrorKind::Acknowledge
             && error.receive == ErrorKind::Form
             && flight.transmitters.iter().all(passive);

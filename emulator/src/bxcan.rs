@@ -1,12 +1,13 @@
-//! The bxCAN controller CAN1 (RM0090 rev 19, section 32 "Controller area network (bxCAN)"), registers and behaviour
-//! taken from the manual.
+//! The bxCAN controller CAN1 (RM0090 rev 19, section 32 "Controller area network (bxCAN)"),
+//! registers and behaviour taken from the manual.
 //!
 //! The controller itself never decides what is on the wire. It offers frames and counters to the
-//! [`Bus`](crate::bus::Bus) through [`BusNode`], and the bus tells it what happened and when. As long as no bus has
-//! looked at it, it behaves like a controller whose transceiver hears a recessive line: it can be set up and comes
-//! out of initialisation, and its frames wait.
+//! [`Bus`](crate::bus::Bus) through [`BusNode`], and the bus tells it what happened and when. As
+//! long as no bus has looked at it, it behaves like a controller whose transceiver hears a
+//! recessive line: it can be set up and comes out of initialisation, and its frames wait.
 //!
-//! Not modelled, and reported when asked for: time-triggered mode, CAN2. MSR.SAMP and MSR.RX always read recessive.
+//! Not modelled, and reported when asked for: time-triggered mode, CAN2. MSR.SAMP and MSR.RX always
+//! read recessive.
 
 pub mod filters;
 #[cfg(test)]
@@ -304,7 +305,8 @@ impl Fifo {
         }
     }
 
-    /// Whether an interrupt is active; `enabled`: FMPIE, FFIE and FOVIE of this FIFO at their FIFO 0 places.
+    /// Whether an interrupt is active; `enabled`: FMPIE, FFIE and FOVIE of this FIFO at their FIFO
+    /// 0 places.
     fn interrupt(&self, enabled: u32) -> bool {
         enabled & ier::FMPIE != 0 && !self.frames.is_empty()
             || enabled & ier::FFIE != 0 && self.full
@@ -374,14 +376,15 @@ impl BxCan {
         self.clock_hz = hz;
     }
 
-    /// Whether the bus has to look before the CPU may go on: a transmission is requested, or the mode changes.
+    /// Whether the bus has to look before the CPU may go on: a transmission is requested, or the
+    /// mode changes.
     #[must_use]
     pub fn wants_attention(&self) -> bool {
         self.on_bus && self.attention.is_some()
     }
 
-    /// The nominal bit time that BTR and the clock make (RM0090, 32.7.7): (1 + TS1 + 1 + TS2 + 1) time quanta of
-    /// BRP + 1 clock cycles. `None` without a clock.
+    /// The nominal bit time that BTR and the clock make (RM0090, 32.7.7): (1 + TS1 + 1 + TS2 + 1)
+    /// time quanta of BRP + 1 clock cycles. `None` without a clock.
     #[must_use]
     pub fn bit_time(&self) -> Option<Span> {
         self.quanta(1 + self.segment_1() + self.segment_2())
@@ -430,7 +433,8 @@ impl BxCan {
         self.recovery != Recovery::None
     }
 
-    // --- modes -----------------------------------------------------------------------------------------------------
+    // --- modes
+    // -----------------------------------------------------------------------------------------------------
 
     /// Goes where INRQ and SLEEP say, at once where the bus has no part in it.
     fn follow_mode_bits(&mut self, now: Time) {
@@ -473,12 +477,12 @@ impl BxCan {
 
     /// MCR.RESET: back to sleep, FIFOs and requests gone, the configuration stays.
     fn master_reset(&mut self, now: Time) {
-        self.forget();
+        self.reset_state();
         self.mcr = mcr::AFTER_RESET;
         self.attend(now);
     }
 
-    fn forget(&mut self) {
+    fn reset_state(&mut self) {
         self.epoch = self.epoch.wrapping_add(1);
         self.mode = Mode::Resting(Rest::Sleep);
         self.leaving = None;
@@ -508,10 +512,11 @@ impl BxCan {
         }
     }
 
-    // --- transmission ----------------------------------------------------------------------------------------------
+    // --- transmission
+    // ----------------------------------------------------------------------------------------------
 
-    /// The pending mailbox that goes first (RM0090, 32.7.1): in the order of the requests with TXFP, else by
-    /// identifier, then by mailbox number.
+    /// The pending mailbox that goes first (RM0090, 32.7.1): in the order of the requests with
+    /// TXFP, else by identifier, then by mailbox number.
     fn next_mailbox(&self, now: Time) -> Option<usize> {
         let pending = self.mailboxes.iter().enumerate().filter_map(|(n, mailbox)| match mailbox.state {
             MailboxState::Pending { since, order } if since <= now => Some((n, mailbox, order)),
@@ -619,7 +624,8 @@ impl BxCan {
         }
     }
 
-    // --- reception and errors --------------------------------------------------------------------------------------
+    // --- reception and errors
+    // --------------------------------------------------------------------------------------
 
     fn store(&mut self, frame: &Frame) {
         if let Some(found) = self.filters.accept(frame) {
@@ -635,7 +641,8 @@ impl BxCan {
         flags.into_iter().filter(|(set, _)| *set).map(|(_, flag)| flag).sum()
     }
 
-    /// Counts an error (or a success, `kind` = `None`), and raises ERRI for what is new and enabled.
+    /// Counts an error (or a success, `kind` = `None`), and raises ERRI for what is new and
+    /// enabled.
     fn count(&mut self, kind: Option<ErrorKind>, now: Time, count: impl FnOnce(&mut Confinement)) {
         let before = self.esr_flags();
         count(&mut self.confinement);
@@ -840,7 +847,7 @@ impl Peripheral for BxCan {
     }
 
     fn reset(&mut self) {
-        self.forget();
+        self.reset_state();
         let fresh = Self::new();
         *self = Self { clock_hz: self.clock_hz, on_bus: self.on_bus, epoch: self.epoch, ..fresh };
     }

@@ -39,8 +39,8 @@ impl fmt::Display for Stamp {
     }
 }
 
-/// The error as Linux reports it (linux/can/error.h): class in the identifier with CAN_ERR_FLAG, kind of the
-/// violation in byte 2.
+/// The error as Linux reports it (linux/can/error.h): class in the identifier with CAN_ERR_FLAG,
+/// kind of the violation in byte 2.
 fn error_frame(kind: ErrorKind) -> &'static str {
     match kind {
         ErrorKind::Acknowledge => "20000020#0000000000000000",
@@ -55,7 +55,8 @@ fn error_frame(kind: ErrorKind) -> &'static str {
 /// Which lines go into the log.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Lines {
-    /// Good frames. A frame that an injected fault kept from its receivers is not in it, as candump would not see it.
+    /// Good frames. A frame that an injected fault kept from its receivers is not in it, as candump
+    /// would not see it.
     Frames,
     /// Error frames too.
     FramesAndErrors,
@@ -102,7 +103,8 @@ impl<W: Write + 'static> Handle<W> {
         }
     }
 
-    /// Brings everything to where it belongs. Gives the first failure since the last call; writing goes on behind it.
+    /// Brings everything to where it belongs. Gives the first failure since the last call; writing
+    /// goes on behind it.
     ///
     /// # Errors
     /// What the writer said.

@@ -1,15 +1,17 @@
 //! The Cortex-M4: instructions by Unicorn, exceptions by us.
 //!
-//! Unicorn runs instructions and nothing else: it stacks nothing, knows no priorities and no NVIC. This module enters
-//! and leaves exceptions (DDI 0403E section B1.5) and turns what stops Unicorn into an [`Exit`].
+//! Unicorn runs instructions and nothing else: it stacks nothing, knows no priorities and no NVIC.
+//! This module enters and leaves exceptions (DDI 0403E section B1.5) and turns what stops Unicorn
+//! into an [`Exit`].
 //!
-//! **Time.** One instruction takes one cycle, charged when its block (a straight run of code up to a branch) starts;
-//! entering an exception takes 12 cycles, leaving one 10. Code stops at block borders only, so an interrupt comes at
-//! most one block late. A CPU with wait states takes some 1.3 cycles an instruction; budgets measured here want that
-//! much reserve.
+//! **Time.** One instruction takes one cycle, charged when its block (a straight run of code up to
+//! a branch) starts; entering an exception takes 12 cycles, leaving one 10. Code stops at block
+//! borders only, so an interrupt comes at most one block late. A CPU with wait states takes some
+//! 1.3 cycles an instruction; budgets measured here want that much reserve.
 //!
-//! **What is missing.** Unaligned LDM, STM, LDRD and STRD work instead of faulting; the MPU is off; SEV is not seen (WFE
-//! ends by itself); an FPU instruction that a false IT condition skips faults all the same while the FPU is off.
+//! **What is missing.** Unaligned LDM, STM, LDRD and STRD work instead of faulting; the MPU is off;
+//! SEV is not seen (WFE ends by itself); an FPU instruction that a false IT condition skips faults
+//! all the same while the FPU is off.
 
 mod accesses;
 
@@ -122,7 +124,8 @@ struct Notes {
     fault: Option<Fault>,
     flash_busy: bool,
     invalid_instruction: bool,
-    /// The masks when the CPU was started, if it was without privilege: they cannot be read then, nor changed.
+    /// The masks when the CPU was started, if it was without privilege: they cannot be read then,
+    /// nor changed.
     masks: Option<Masks>,
     /// An instruction of the FPU that is switched off lies in the block, at this address.
     fpu_instruction: Option<u32>,
@@ -197,8 +200,9 @@ impl Cpu {
             if base == ccm_base && !with_ccm {
                 continue;
             }
-            // SAFETY: the memory belongs to the chip, which the engine's data owns: the engine is closed before its
-            // data is dropped. Its length is a multiple of the page size (`HostMemory::new`).
+            // SAFETY: the memory belongs to the chip, which the engine's data owns: the engine is
+            // closed before its data is dropped. Its length is a multiple of the page size
+            // (`HostMemory::new`).
             unsafe { self.uc.mem_map_ptr(base.into(), len, perms, memory.cast()) }
                 .map_err(failed("mapping memory"))?;
             // Mapping alone would let stores through to read-only memory behind the hook's back.
@@ -261,7 +265,8 @@ impl Cpu {
             uc.get_data_mut().notes.invalid_instruction = true;
             false
         })?;
-        // A hook over an address keeps the translator from storing straight into its page, so RAM is left out.
+        // A hook over an address keeps the translator from storing straight into its page, so RAM
+        // is left out.
         let ram = geometry.sram;
         for (begin, end) in [(0, ram.base - 1), (ram.end(), u32::MAX)] {
             self.uc.add_mem_hook(
@@ -293,7 +298,8 @@ impl Cpu {
         &mut self.uc.get_data_mut().chip
     }
 
-    // --- registers ---------------------------------------------------------------------------------------------------
+    // --- registers
+    // ---------------------------------------------------------------------------------------------------
 
     /// A register of the CPU. The names are Unicorn's own constants, so they are always there.
     #[must_use]
@@ -323,8 +329,8 @@ impl Cpu {
         self.register(RegisterARM::IPSR) & 0x1FF
     }
 
-    /// Thread mode without privilege hides the stack pointers and masks from Unicorn's accessors. This runs `act` with
-    /// privilege.
+    /// Thread mode without privilege hides the stack pointers and masks from Unicorn's accessors.
+    /// This runs `act` with privilege.
     fn privileged<R>(&mut self, act: impl FnOnce(&mut Self) -> R) -> R {
         if !self.is_unprivileged() {
             return act(self);
@@ -344,8 +350,8 @@ impl Cpu {
         self.set(RegisterARM::XPSR_NZCVQG, xpsr & !0x1FF | number);
     }
 
-    /// Unicorn keeps a digest of the CPU's mode, which writing IPSR or CONTROL leaves stale; writing the flags renews
-    /// it.
+    /// Unicorn keeps a digest of the CPU's mode, which writing IPSR or CONTROL leaves stale;
+    /// writing the flags renews it.
     fn renew_mode(&mut self) {
         let flags = self.register(RegisterARM::XPSR) & 0xF000_0000;
         self.set(RegisterARM::APSR_NZCV, flags);
@@ -353,10 +359,11 @@ impl Cpu {
         self.chip_mut().scs.ipsr = u16::try_from(ipsr).unwrap_or(0);
     }
 
-    /// Thread mode, privileged: sets CONTROL whatever it was. In handler mode afterwards if `handler` is not 0.
+    /// Thread mode, privileged: sets CONTROL whatever it was. In handler mode afterwards if
+    /// `handler` is not 0.
     fn set_mode(&mut self, control: u32, handler: u32) {
-        // Only privileged code may write CONTROL, and only thread mode SPSEL: go to a handler, drop nPRIV, go to thread
-        // mode, write the lot.
+        // Only privileged code may write CONTROL, and only thread mode SPSEL: go to a handler, drop
+        // nPRIV, go to thread mode, write the lot.
         self.set_ipsr(u32::from(HARD_FAULT));
         self.set(RegisterARM::CONTROL, 0);
         self.set_ipsr(0);
@@ -367,8 +374,9 @@ impl Cpu {
         self.renew_mode();
     }
 
-    /// Reset: SP and PC from the vector table at address 0, everything else as the architecture says; what it leaves
-    /// open is 0. A vector that cannot be fetched or run faults as on the chip.
+    /// Reset: SP and PC from the vector table at address 0, everything else as the architecture
+    /// says; what it leaves open is 0. A vector that cannot be fetched or run faults as on the
+    /// chip.
     pub fn reset(&mut self) {
         use RegisterARM as R;
         self.set_mode(0, 0);
@@ -394,7 +402,7 @@ impl Cpu {
             blocks: std::mem::take(&mut notes.blocks),
             ..Notes::default()
         };
-        notes.blocks.forget();
+        notes.blocks.clear();
         let chip = self.chip_mut();
         chip.block = (0, 0);
         chip.flush_tlb = true;
@@ -405,14 +413,15 @@ impl Cpu {
         let notes = &mut self.uc.get_data_mut().notes;
         notes.executed.fill(false);
         notes.flash_executed.fill(false);
-        notes.blocks.forget();
+        notes.blocks.clear();
         let _ = self.uc.ctl_flush_tb();
         let _ = self.uc.ctl_flush_tlb();
         self.chip_mut().stale.clear();
         self.chip_mut().flush_tlb = false;
     }
 
-    // --- memory ------------------------------------------------------------------------------------------------------
+    // --- memory
+    // ------------------------------------------------------------------------------------------------------
 
     /// The memory block behind `address` with the offset in it. Only plain memory, no peripherals.
     fn memory(chip: &Chip, address: u32) -> Option<(&HostMemory, usize)> {
@@ -486,7 +495,8 @@ impl Cpu {
         false
     }
 
-    // --- running -----------------------------------------------------------------------------------------------------
+    // --- running
+    // -----------------------------------------------------------------------------------------------------
 
     /// Runs translated code until the chip's slice ends or something else happens.
     pub fn run(&mut self) -> Exit {
@@ -586,7 +596,8 @@ impl Cpu {
         }
     }
 
-    /// A breakpoint: the DebugMonitor exception if it can be taken, and a HardFault otherwise (DDI 0403E section C1).
+    /// A breakpoint: the DebugMonitor exception if it can be taken, and a HardFault otherwise (DDI
+    /// 0403E section C1).
     pub fn breakpoint(&mut self) -> Entry {
         let monitors = self.can_monitor();
         self.chip_mut().scs.debug.note(DFSR_BKPT);
@@ -605,7 +616,7 @@ impl Cpu {
                 continue;
             }
             let _ = self.uc.ctl_remove_cache(u64::from(address), u64::from(address) + u64::from(len));
-            self.uc.get_data_mut().notes.blocks.forget();
+            self.uc.get_data_mut().notes.blocks.clear();
         }
         if std::mem::take(&mut self.chip_mut().flush_tlb) {
             let _ = self.uc.ctl_flush_tlb();
@@ -615,7 +626,8 @@ impl Cpu {
         }
     }
 
-    /// Whether code was fetched from a page of this range; only then can there be translations of it.
+    /// Whether code was fetched from a page of this range; only then can there be translations of
+    /// it.
     fn was_executed(&self, address: u32, len: u32) -> bool {
         let State { chip, notes } = self.uc.get_data();
         let geometry = chip.geometry;
@@ -663,8 +675,8 @@ impl Cpu {
                 // A write may have asked to leave in the very block that ends in WFI.
                 Ok(()) if self.chip().leave && !matches!(self.last_hint(pc), Some(Hint::Wfi)) => Exit::Slice,
                 Ok(()) => Exit::WaitForInterrupt,
-                // Every error of memory goes through a hook that notes a fault; what is left is an access that the
-                // model denies without one.
+                // Every error of memory goes through a hook that notes a fault; what is left is an
+                // access that the model denies without one.
                 Err(_) => Exit::Fault(Fault::bus(cfsr::PRECISERR, None)),
             },
         }
@@ -711,7 +723,8 @@ impl Cpu {
         chip.counters.instructions = chip.counters.instructions.saturating_sub(rest);
     }
 
-    // --- exceptions --------------------------------------------------------------------------------------------------
+    // --- exceptions
+    // --------------------------------------------------------------------------------------------------
 
     /// The exception that is to be taken now.
     #[must_use]
@@ -801,7 +814,8 @@ impl Cpu {
         Entry::Taken
     }
 
-    /// Leaves the present exception by `value` (DDI 0403E B1.5.8); the fault that a bad value or stack leads to.
+    /// Leaves the present exception by `value` (DDI 0403E B1.5.8); the fault that a bad value or
+    /// stack leads to.
     pub fn return_from_exception(&mut self, value: u32) -> Result<(), Fault> {
         use RegisterARM as R;
         let leaving = u16::try_from(self.ipsr()).unwrap_or(0);
@@ -879,10 +893,12 @@ impl Cpu {
         let _ = self.uc.reg_write(Self::single_register(n), u64::from(value));
     }
 
-    /// Takes a fault: at its own priority if it is enabled and high enough, as HardFault otherwise (DDI 0403E B1.5.10).
+    /// Takes a fault: at its own priority if it is enabled and high enough, as HardFault otherwise
+    /// (DDI 0403E B1.5.10).
     pub fn take_fault(&mut self, fault: Fault) -> Entry {
         let mut fault = fault;
-        // A fault while entering a fault's handler escalates once, to HardFault; then there is nothing higher.
+        // A fault while entering a fault's handler escalates once, to HardFault; then there is
+        // nothing higher.
         for _ in 0..3 {
             let masks = self.privileged(|cpu| cpu.masks());
             let scs = &mut self.chip_mut().scs;
@@ -952,8 +968,8 @@ fn masks(uc: &Unicorn<'_, State>) -> Masks {
     }
 }
 
-// The hooks of loads and stores never stop the engine themselves: it would put the PC back to the instruction, which then
-// runs twice. They set `Chip::leave`, and the next block does not start.
+// The hooks of loads and stores never stop the engine themselves: it would put the PC back to the
+// instruction, which then runs twice. They set `Chip::leave`, and the next block does not start.
 //
 /// Finds the instructions of accesses to peripherals that are to be reported.
 fn locate_reports(uc: &mut Unicorn<'_, State>) {
@@ -974,7 +990,8 @@ fn locate_reports(uc: &mut Unicorn<'_, State>) {
     }
 }
 
-// --- hooks -----------------------------------------------------------------------------------------------------------
+// --- hooks
+// -----------------------------------------------------------------------------------------------------------
 
 fn stop(uc: &mut Unicorn<'_, State>) {
     uc.get_data_mut().chip.leave = true;
@@ -1036,8 +1053,8 @@ struct Block {
     last: u32,
 }
 
-/// Remembers the blocks looked at last. Whoever changes code forgets them; a program that changes its own in RAM is
-/// charged for the block as it was.
+/// Remembers the blocks looked at last. Whoever changes code forgets them; a program that changes
+/// its own in RAM is charged for the block as it was.
 struct Blocks(Vec<(u32, u32, Block)>);
 
 impl Default for Blocks {
@@ -1057,7 +1074,7 @@ impl Blocks {
         slot.2
     }
 
-    fn forget(&mut self) {
+    fn clear(&mut self) {
         self.0.fill((0, 0, Block::default()));
     }
 }
@@ -1100,8 +1117,8 @@ fn is_flash_busy(chip: &mut Chip) -> bool {
     until > now
 }
 
-/// The translator asks what lies in a page. Memory is where it is, flash also at 0; RAM pages are executable only once
-/// something was executed there, because stores to executable pages are slow.
+/// The translator asks what lies in a page. Memory is where it is, flash also at 0; RAM pages are
+/// executable only once something was executed there, because stores to executable pages are slow.
 fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Option<TlbEntry> {
     let state = uc.get_data_mut();
     let chip = &mut state.chip;
@@ -1110,14 +1127,16 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
     if is_flash(chip, address) {
         let paddr = if address < geometry.flash.size { geometry.flash.base + address } else { address };
         return match kind {
-            // Its own entry, which allows nothing else: the store itself is carried out by its hook.
+            // Its own entry, which allows nothing else: the store itself is carried out by its
+            // hook.
             MemType::WRITE => entry(paddr, Prot::WRITE),
             MemType::READ if is_flash_busy(chip) => {
                 state.notes.flash_busy = true;
                 None
             }
             _ => {
-                // As for RAM: a page that was only read so far must come by here when it is fetched from, to be noted.
+                // As for RAM: a page that was only read so far must come by here when it is fetched
+                // from, to be noted.
                 let executed =
                     &mut state.notes.flash_executed[((paddr - geometry.flash.base) / PAGE) as usize];
                 *executed |= kind == MemType::FETCH;
@@ -1140,7 +1159,8 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
     if kind == MemType::FETCH {
         let pc = address;
         chip.report(Access::Fetch, pc, 2, 0, pc, "no code can be executed here".into());
-        // Peripheral and system space are never executable by the default memory map (PM0214 section 2.2.2).
+        // Peripheral and system space are never executable by the default memory map (PM0214
+        // section 2.2.2).
         let never = matches!(address, 0x4000_0000..=0x5FFF_FFFF | 0xA000_0000..);
         state.notes.fault = Some(if never {
             Fault::Configurable { exception: MEM_MANAGE, status: cfsr::IACCVIOL, address: None }
@@ -1183,8 +1203,9 @@ fn on_protected_write(uc: &mut Unicorn<'_, State>, address: u32, size: usize, va
     true
 }
 
-/// For a hook in the middle of a block, Unicorn writes down where in an IT block the CPU is, and leaves it at that. The rest of the
-/// block does without; but the next one would begin as if it lay in that IT block.
+/// For a hook in the middle of a block, Unicorn writes down where in an IT block the CPU is, and
+/// leaves it at that. The rest of the block does without; but the next one would begin as if it lay
+/// in that IT block.
 fn forget_it_state(uc: &mut Unicorn<'_, State>) {
     let xpsr = read(uc, RegisterARM::XPSR);
     if xpsr & XPSR_IT != 0 {

@@ -1,4 +1,5 @@
-//! What a program tells by `defmt`: frames whose words stand in its ELF file, as a debug probe's viewer decodes them.
+//! What a program tells by `defmt`: frames whose words stand in its ELF file, as a debug probe's
+//! viewer decodes them.
 
 use defmt_decoder::{DecodeError, StreamDecoder, Table};
 

@@ -1,10 +1,12 @@
-//! Classical CAN frames and the bits they become on the wire (ISO 11898-1:2015, clauses 10.4 and 10.5).
+//! Classical CAN frames and the bits they become on the wire (ISO 11898-1:2015, clauses 10.4 and
+//! 10.5).
 
 use std::fmt;
 
 pub use embedded_can::{ExtendedId, Id, StandardId};
 
-/// Bits behind the CRC sequence that carry no stuff bits: CRC delimiter, ACK slot, ACK delimiter, end of frame.
+/// Bits behind the CRC sequence that carry no stuff bits: CRC delimiter, ACK slot, ACK delimiter,
+/// end of frame.
 const TAIL_BITS: u32 = 1 + 1 + 1 + END_OF_FRAME_BITS;
 /// End of frame: seven recessive bits.
 pub const END_OF_FRAME_BITS: u32 = 7;
@@ -37,13 +39,15 @@ impl Frame {
         (dlc <= 8).then_some(Self { id, remote: true, dlc, data: [0; 8] })
     }
 
-    /// A data frame with an 11-bit identifier; `None` if the identifier needs more bits, or for more than eight bytes.
+    /// A data frame with an 11-bit identifier; `None` if the identifier needs more bits, or for
+    /// more than eight bytes.
     #[must_use]
     pub fn standard(id: u16, data: &[u8]) -> Option<Self> {
         Self::data_frame(Id::Standard(StandardId::new(id)?), data)
     }
 
-    /// A data frame with a 29-bit identifier; `None` if the identifier needs more bits, or for more than eight bytes.
+    /// A data frame with a 29-bit identifier; `None` if the identifier needs more bits, or for more
+    /// than eight bytes.
     #[must_use]
     pub fn extended(id: u32, data: &[u8]) -> Option<Self> {
         Self::data_frame(Id::Extended(ExtendedId::new(id)?), data)
@@ -98,11 +102,13 @@ impl Frame {
         self
     }
 
-    /// The arbitration field as a number that compares like the field on the wire: the smaller one wins the bus.
+    /// The arbitration field as a number that compares like the field on the wire: the smaller one
+    /// wins the bus.
     ///
-    /// Bits from the first sent on: 11 identifier bits; RTR and IDE of a standard frame, or SRR and IDE (both
-    /// recessive), 18 identifier bits and RTR of an extended one. A standard frame wins over an extended frame that
-    /// begins with the same 11 bits, a data frame over the remote frame of the same identifier.
+    /// Bits from the first sent on: 11 identifier bits; RTR and IDE of a standard frame, or SRR and
+    /// IDE (both recessive), 18 identifier bits and RTR of an extended one. A standard frame wins
+    /// over an extended frame that begins with the same 11 bits, a data frame over the remote frame
+    /// of the same identifier.
     #[must_use]
     pub fn arbitration_key(&self) -> u32 {
         let remote = u32::from(self.remote);
@@ -115,7 +121,8 @@ impl Frame {
         }
     }
 
-    /// The bits from the start of frame to the end of the data field, without stuff bits (`true` is recessive).
+    /// The bits from the start of frame to the end of the data field, without stuff bits (`true` is
+    /// recessive).
     fn head(&self) -> Vec<bool> {
         let mut bits = Vec::with_capacity(128);
         let mut put = |value: u32, count: u32| {
@@ -150,8 +157,8 @@ impl Frame {
         crc15(&self.head())
     }
 
-    /// Every bit of the frame as it is sent, from the start of frame to the last bit of the end of frame
-    /// (`true` is recessive). The ACK slot holds what the transmitter sends there: recessive.
+    /// Every bit of the frame as it is sent, from the start of frame to the last bit of the end of
+    /// frame (`true` is recessive). The ACK slot holds what the transmitter sends there: recessive.
     #[must_use]
     pub fn wire_bits(&self) -> Vec<bool> {
         let mut bits = self.head();
@@ -172,22 +179,23 @@ impl Frame {
         wire
     }
 
-    /// Length on the wire in bits, from the start of frame to the last bit of the end of frame, stuff bits
-    /// included, intermission not.
+    /// Length on the wire in bits, from the start of frame to the last bit of the end of frame,
+    /// stuff bits included, intermission not.
     #[must_use]
     pub fn wire_len(&self) -> u32 {
         u32::try_from(self.wire_bits().len()).unwrap_or(u32::MAX)
     }
 
-    /// What the frame takes of the bus, in bits: [`wire_len`](Self::wire_len) and the intermission behind it.
+    /// What the frame takes of the bus, in bits: [`wire_len`](Self::wire_len) and the intermission
+    /// behind it.
     #[must_use]
     pub fn bus_bits(&self) -> u32 {
         self.wire_len() + INTERMISSION_BITS
     }
 }
 
-/// CRC sequence over unstuffed bits: polynomial x^15+x^14+x^10+x^8+x^7+x^4+x^3+1, start value 0 (ISO 11898-1:2015,
-/// 10.4.2.6).
+/// CRC sequence over unstuffed bits: polynomial x^15+x^14+x^10+x^8+x^7+x^4+x^3+1, start value 0
+/// (ISO 11898-1:2015, 10.4.2.6).
 fn crc15(bits: &[bool]) -> u16 {
     bits.iter().fold(0, |crc: u16, &bit| {
         let next = bit != (crc >> 14 & 1 == 1);
@@ -200,14 +208,16 @@ fn crc15(bits: &[bool]) -> u16 {
     })
 }
 
-/// Where the tail of a frame of `wire_len` bits begins to matter: the first bit behind the ACK slot.
+/// Where the tail of a frame of `wire_len` bits begins to matter: the first bit behind the ACK
+/// slot.
 #[must_use]
 pub fn ack_delimiter(wire_len: u32) -> u32 {
     wire_len - END_OF_FRAME_BITS - 1
 }
 
 impl fmt::Display for Frame {
-    /// As candump's log writes it: `601#4000100000000000`, `00000123#` with 29 bits, `601#R8` for a remote frame.
+    /// As candump's log writes it: `601#4000100000000000`, `00000123#` with 29 bits, `601#R8` for a
+    /// remote frame.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.id {
             Id::Standard(id) => write!(f, "{:03X}#", id.as_raw())?,
@@ -263,8 +273,8 @@ mod tests {
 
     #[test]
     fn all_dominant_frame_without_data() {
-        // 1 + 11 + 1 + 1 + 1 + 4 dominant bits, CRC 0 (15 dominant bits): 34 in a row, a recessive stuff bit after
-        // every five of them; then the ten unstuffed recessive bits.
+        // 1 + 11 + 1 + 1 + 1 + 4 dominant bits, CRC 0 (15 dominant bits): 34 in a row, a recessive
+        // stuff bit after every five of them; then the ten unstuffed recessive bits.
         let frame = Frame::standard(0, &[]).unwrap();
         assert_eq!(frame.crc15(), 0);
         assert_eq!(wire(&frame), format!("{}0000{}", "000001".repeat(6), "1".repeat(10)));
@@ -274,10 +284,12 @@ mod tests {
 
     #[test]
     fn frames_worked_out_apart() {
-        // CRC by polynomial long division and stuffing by a few lines of Python that share nothing with this code.
+        // CRC by polynomial long division and stuffing by a few lines of Python that share nothing
+        // with this code.
         let zeros = Frame::standard(0, &[0; 8]).unwrap();
         assert_eq!((zeros.crc15(), zeros.wire_len()), (0x145B, 124));
-        // SOF to r0 and the DLC's first bits: 15 dominant, three stuff bits; the DLC's 1 follows the third.
+        // SOF to r0 and the DLC's first bits: 15 dominant, three stuff bits; the DLC's 1 follows
+        // the third.
         assert!(wire(&zeros).starts_with("0000010000010000011000001"));
         let read_1000 = Frame::standard(0x601, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]).unwrap();
         assert_eq!((read_1000.crc15(), read_1000.wire_len()), (0x191A, 121));
@@ -292,8 +304,9 @@ mod tests {
 
     #[test]
     fn crc_by_long_division() {
-        // A lone 1 as the last bit is the generator without its x^15; eight bits before the end it is
-        // x^23 mod g = 0x4599 shifted eight times: 4599 -> 4EAB -> 58CF -> 7407 -> 2D97 -> 5B2E -> 73C5 -> 2213 -> 4426.
+        // A lone 1 as the last bit is the generator without its x^15; eight bits before the end it
+        // is x^23 mod g = 0x4599 shifted eight times: 4599 -> 4EAB -> 58CF -> 7407 -> 2D97 -> 5B2E
+        // -> 73C5 -> 2213 -> 4426.
         let mut bits = vec![false; 40];
         bits[39] = true;
         assert_eq!(crc15(&bits), 0x4599);
@@ -306,17 +319,17 @@ mod tests {
 
     #[test]
     fn no_stuff_bits_in_an_alternating_head() {
-        // 555h: SOF 0, 101 0101 0101, RTR 0, IDE 0, r0 0, DLC 0000. The run 0000000 behind the last identifier bit
-        // takes one stuff bit after five.
+        // 555h: SOF 0, 101 0101 0101, RTR 0, IDE 0, r0 0, DLC 0000. The run 0000000 behind the last
+        // identifier bit takes one stuff bit after five.
         let frame = Frame::standard(0x555, &[]).unwrap();
         assert!(wire(&frame).starts_with("0101010101010000010"), "{}", wire(&frame));
     }
 
     #[test]
     fn lengths_stay_in_the_standards_bounds() {
-        // n data bytes: 44 + 8n bits without the intermission and without stuff bits (64 + 8n with 29 bits); of
-        // those 34 + 8n (54 + 8n) can be stuffed, at worst one stuff bit for the first five and one for every four
-        // behind them.
+        // n data bytes: 44 + 8n bits without the intermission and without stuff bits (64 + 8n with
+        // 29 bits); of those 34 + 8n (54 + 8n) can be stuffed, at worst one stuff bit for the first
+        // five and one for every four behind them.
         let mut seed = 0x1234_5678_u32;
         let mut next = || {
             seed ^= seed << 13;

@@ -71,8 +71,8 @@ pub enum Stop {
     Reset(ResetCause),
     /// The power cut that was armed struck; the machine is off.
     PowerCut,
-    /// The CPU has locked up: a fault within the HardFault handler. Only a reset (the watchdog's, perhaps) helps. Told
-    /// once; the machine can be run on.
+    /// The CPU has locked up: a fault within the HardFault handler. Only a reset (the watchdog's,
+    /// perhaps) helps. Told once; the machine can be run on.
     Lockup,
 }
 
@@ -116,8 +116,8 @@ enum Activity {
     LockedUp,
 }
 
-/// A WFE ends after this time even without an event: SEV is invisible to the model, and the architecture allows WFE to
-/// end for no reason (DDI 0403E B1.5.18).
+/// A WFE ends after this time even without an event: SEV is invisible to the model, and the
+/// architecture allows WFE to end for no reason (DDI 0403E B1.5.18).
 const DOZE: Span = Span::from_micros(10);
 
 /// One board.
@@ -191,7 +191,8 @@ impl Machine {
         }
     }
 
-    // --- power and reset ---------------------------------------------------------------------------------------------
+    // --- power and reset
+    // ---------------------------------------------------------------------------------------------
 
     /// Power comes up at `now`: RAM holds noise, the chip starts at its reset vector.
     pub fn power_on(&mut self, now: Time) {
@@ -250,13 +251,14 @@ impl Machine {
         self.activity = Activity::Runs;
     }
 
-    /// Cuts the power at a flash operation, counted from this call on; `None` takes the order back. A cut ends
-    /// [`Self::run_until`] with [`Stop::PowerCut`].
+    /// Cuts the power at a flash operation, counted from this call on; `None` takes the order back.
+    /// A cut ends [`Self::run_until`] with [`Stop::PowerCut`].
     pub fn cut_power_at(&mut self, cut: Option<FlashCut>) {
         self.cpu.chip_mut().flash.cut_power_at(cut);
     }
 
-    // --- time --------------------------------------------------------------------------------------------------------
+    // --- time
+    // --------------------------------------------------------------------------------------------------------
 
     /// The machine's virtual time.
     #[must_use]
@@ -268,8 +270,9 @@ impl Machine {
         }
     }
 
-    /// Runs until `deadline`, or until something the outside must see, and says which. Where it says
-    /// [`Stop::Deadline`], [`Self::now`] is at `deadline` or less than a block of code past it.
+    /// Runs until `deadline`, or until something the outside must see, and says which. Where it
+    /// says [`Stop::Deadline`], [`Self::now`] is at `deadline` or less than a block of code past
+    /// it.
     pub fn run_until(&mut self, deadline: Time) -> Stop {
         self.cpu.chip_mut().deadline = deadline;
         loop {
@@ -413,9 +416,11 @@ impl Machine {
         busy.is_some()
     }
 
-    // --- looking and touching ----------------------------------------------------------------------------------------
+    // --- looking and touching
+    // ----------------------------------------------------------------------------------------
 
-    /// Starts the independent watchdog with this reload value, as code would that then never feeds it; the prescaler stays.
+    /// Starts the independent watchdog with this reload value, as code would that then never feeds
+    /// it; the prescaler stays.
     pub fn start_watchdog(&mut self, reload: u32) {
         let chip = self.cpu.chip_mut();
         let now = chip.now();
@@ -433,8 +438,8 @@ impl Machine {
         self.cpu.chip_mut().flash.protect_sector(number, protected);
     }
 
-    /// Sets the option byte RDP as a debug probe does: AAh no read-out protection, CCh level 2, anything else level 1. The model
-    /// tells it in its registers and does nothing about it.
+    /// Sets the option byte RDP as a debug probe does: AAh no read-out protection, CCh level 2,
+    /// anything else level 1. The model tells it in its registers and does nothing about it.
     pub fn set_read_protection(&mut self, rdp: u8) {
         self.cpu.chip_mut().flash.preset_read_protection(rdp);
     }
@@ -476,8 +481,9 @@ impl Machine {
         }
     }
 
-    /// The word of a peripheral's or the core's register as a load would give it, whether the peripheral has a clock or not; `None`
-    /// where nothing is modelled. What a load does to a register is done, so this is for machines that are looked at and left.
+    /// The word of a peripheral's or the core's register as a load would give it, whether the
+    /// peripheral has a clock or not; `None` where nothing is modelled. What a load does to a
+    /// register is done, so this is for machines that are looked at and left.
     pub fn register(&mut self, address: u32) -> Option<u32> {
         self.cpu.chip_mut().register(address)
     }
@@ -500,7 +506,8 @@ impl Machine {
         self.cpu.pc()
     }
 
-    /// Drives a pin from outside (`Some`), or lets it go (`None`). Ports that the chip does not have are ignored.
+    /// Drives a pin from outside (`Some`), or lets it go (`None`). Ports that the chip does not
+    /// have are ignored.
     pub fn set_pin(&mut self, port: char, pin: u8, level: Option<bool>) {
         if let Some(index) = port_index(port) {
             if let Some(port) = self.cpu.chip_mut().gpio.get_mut(index) {
@@ -531,7 +538,8 @@ impl Machine {
         self.cpu.chip_mut().watch = Some(Watch { code, inside: false, touched: BTreeSet::new() });
     }
 
-    /// Hands out which pages of RAM (4 KiB, by their first addresses) the code that is watched has accessed since the last time.
+    /// Hands out which pages of RAM (4 KiB, by their first addresses) the code that is watched has
+    /// accessed since the last time.
     pub fn take_touched(&mut self) -> Vec<u32> {
         let watch = self.cpu.chip_mut().watch.as_mut();
         watch.map(|watch| std::mem::take(&mut watch.touched).into_iter().collect()).unwrap_or_default()

@@ -7,13 +7,14 @@ use crate::time::{Span, Time};
 /// How fast virtual time goes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Speed {
-    /// So many virtual seconds in a second of the wall clock. Idle or not, the clock goes on, so the time-outs of both
-    /// sides come when they should.
+    /// So many virtual seconds in a second of the wall clock. Idle or not, the clock goes on, so
+    /// the time-outs of both sides come when they should.
     Times(f64),
-    /// As fast as the host can, but for a moment behind every frame that a client got: then it goes 1:1, so that the
-    /// client's answer does not come late in the device's eyes. Waits in which nobody has to answer (an erase, a
-    /// heartbeat's period) are skipped through. Time never stands still. Beware: a client that waits for wall-clock
-    /// time between two requests lets much virtual time pass, and time-outs of the device may strike.
+    /// As fast as the host can, but for a moment behind every frame that a client got: then it goes
+    /// 1:1, so that the client's answer does not come late in the device's eyes. Waits in which
+    /// nobody has to answer (an erase, a heartbeat's period) are skipped through. Time never stands
+    /// still. Beware: a client that waits for wall-clock time between two requests lets much
+    /// virtual time pass, and time-outs of the device may strike.
     Max,
 }
 
@@ -38,7 +39,8 @@ const MOST: Span = Span::from_millis(2);
 const MOST_AT_MAX: Span = Span::from_millis(10);
 /// What a client gets of wall-clock time to react to a frame at [`Speed::Max`].
 const GRACE: Duration = Duration::from_millis(5);
-/// A world that is further behind than this (of wall-clock time) does not catch up: the host is too slow, or slept.
+/// A world that is further behind than this (of wall-clock time) does not catch up: the host is too
+/// slow, or slept.
 const PATIENCE: Duration = Duration::from_millis(100);
 
 /// Says how far the world may go. The wall clock is passed in.
@@ -97,7 +99,8 @@ fn scaled(duration: Duration, times: f64) -> Span {
 mod tests {
     use super::*;
 
-    /// Milliseconds of virtual time gone after so many milliseconds of wall clock, looked at every `tick`.
+    /// Milliseconds of virtual time gone after so many milliseconds of wall clock, looked at every
+    /// `tick`.
     fn run(speed: Speed, wall_ms: u64, tick: u64) -> u64 {
         let start = Instant::now();
         let mut pacer = Pacer::new(speed, start, Time(0));

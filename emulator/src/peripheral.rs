@@ -8,8 +8,8 @@ pub struct Unmodelled(pub String);
 
 /// A memory-mapped block of registers.
 ///
-/// The machine hands in word-aligned accesses; it takes care of bytes, half-words and bit-band aliases.
-/// A model never reads a clock: `now` is the virtual time of the access.
+/// The machine hands in word-aligned accesses; it takes care of bytes, half-words and bit-band
+/// aliases. A model never reads a clock: `now` is the virtual time of the access.
 pub trait Peripheral {
     /// Name as in the reference manual, for reports.
     fn name(&self) -> &'static str;
@@ -23,12 +23,14 @@ pub trait Peripheral {
     /// Lets everything happen that is due up to and including `now`.
     fn advance(&mut self, now: Time);
 
-    /// When something will happen next without anybody's doing, if it will: a timer runs out, an operation ends.
+    /// When something will happen next without anybody's doing, if it will: a timer runs out, an
+    /// operation ends.
     fn next_event(&self) -> Option<Time>;
 
     /// The NVIC lines that this block holds active (level), as interrupt numbers.
     fn interrupts(&self, active: &mut Vec<u16>);
 
-    /// System reset. What survives it (RAM, the reset flags, the watchdog's start) is the model's to know.
+    /// System reset. What survives it (RAM, the reset flags, the watchdog's start) is the model's
+    /// to know.
     fn reset(&mut self);
 }

@@ -1,4 +1,5 @@
-//! What a program writes for a debug probe: SEGGER's RTT (J-Link manual UM08001, chapter 16), read from RAM as a probe does it.
+//! What a program writes for a debug probe: SEGGER's RTT (J-Link manual UM08001, chapter 16), read
+//! from RAM as a probe does it.
 
 use shared_abi::geometry::Region;
 
@@ -41,8 +42,8 @@ impl Reader {
         Self { decoder, ..Self::default() }
     }
 
-    /// The lines that the program has written since the last time. `sram` is where the block is looked for. A block of noise gives
-    /// nothing.
+    /// The lines that the program has written since the last time. `sram` is where the block is
+    /// looked for. A block of noise gives nothing.
     pub fn lines(&mut self, machine: &mut Machine, sram: Region) -> Vec<String> {
         let is_there = |block: &u32| read::<16>(machine, *block).as_ref() == Some(ID);
         // A reset may have brought another program.

@@ -1,4 +1,5 @@
-//! A board's USART for other programs: as a pseudo-terminal, which they open like a serial port, or over TCP.
+//! A board's USART for other programs: as a pseudo-terminal, which they open like a serial port, or
+//! over TCP.
 
 use std::collections::VecDeque;
 use std::io::{self, ErrorKind, Read, Write};
@@ -85,8 +86,8 @@ impl Serial {
         }
     }
 
-    /// Carries over what the board and the client have to say to each other; waits for nothing. Gives the number of bytes that the
-    /// client got.
+    /// Carries over what the board and the client have to say to each other; waits for nothing.
+    /// Gives the number of bytes that the client got.
     pub fn exchange(&mut self, machine: &mut Machine) -> usize {
         let now = machine.now();
         let powered = machine.is_powered();
@@ -143,7 +144,8 @@ impl Line {
         }
         match self {
             #[cfg(unix)]
-            // Writing waits for as long as not all of it finds room, and only that there is some is asked before: a byte at a time.
+            // Writing waits for as long as not all of it finds room, and only that there is some is
+            // asked before: a byte at a time.
             Self::Terminal(terminal) => {
                 bytes.iter().take_while(|byte| matches!(terminal.ours.write(&[**byte]), Ok(1))).count()
             }

@@ -1,14 +1,17 @@
-//! The bus for other programs: the socketcand protocol over TCP, as python-can and can-utils' friends speak it.
+//! The bus for other programs: the socketcand protocol over TCP, as python-can and can-utils'
+//! friends speak it.
 //!
-//! All clients share one host port, the "adapter" of the bench: it is on the bus whether clients are connected or not,
-//! so a device always gets its acknowledge. A client sees the frames of the other clients too, but not its own.
-//! Time stamps are virtual time. Remote frames reach clients as `< rtr … >`.
+//! All clients share one host port, the "adapter" of the bench: it is on the bus whether clients
+//! are connected or not, so a device always gets its acknowledge. A client sees the frames of the
+//! other clients too, but not its own. Time stamps are virtual time. Remote frames reach clients as
+//! `< rtr … >`.
 //!
-//! What clients taught us: python-can expects each answer of the opening alone in one read, so no frame goes out for
-//! [`HOLD`] behind the answer to `rawmode`; and without TCP_NODELAY every exchange waits for delayed acknowledges.
+//! What clients taught us: python-can expects each answer of the opening alone in one read, so no
+//! frame goes out for [`HOLD`] behind the answer to `rawmode`; and without TCP_NODELAY every
+//! exchange waits for delayed acknowledges.
 //!
-//! No client can hold up the world: who does not read is disconnected, and who sends more than the bus takes is read
-//! more slowly.
+//! No client can hold up the world: who does not read is disconnected, and who sends more than the
+//! bus takes is read more slowly.
 
 pub mod protocol;
 #[cfg(test)]
@@ -106,7 +109,8 @@ impl Client {
     }
 }
 
-/// The server. Its threads only carry texts; whoever owns the world calls [`exchange`](Self::exchange).
+/// The server. Its threads only carry texts; whoever owns the world calls
+/// [`exchange`](Self::exchange).
 pub struct Server {
     address: SocketAddr,
     events: Receiver<Event>,
@@ -160,8 +164,8 @@ impl Server {
         std::mem::take(&mut self.notices)
     }
 
-    /// Hands the clients' frames to the port, and the port's frames to the clients. Gives the number of frames that
-    /// clients got.
+    /// Hands the clients' frames to the port, and the port's frames to the clients. Gives the
+    /// number of frames that clients got.
     pub fn exchange<M: Computer>(&mut self, world: &mut World<M>, port: PortId) -> usize {
         while let Some(event) = self.early.pop_front().or_else(|| self.events.try_recv().ok()) {
             self.take_in(event, world, port);
@@ -306,7 +310,8 @@ fn serve(
     Ok(())
 }
 
-/// Takes a client's elements until the connection or the server ends, or the client asks for what ends it.
+/// Takes a client's elements until the connection or the server ends, or the client asks for what
+/// ends it.
 fn read(
     mut stream: &TcpStream,
     id: ClientId,

@@ -2,8 +2,8 @@
 
 use std::ops::{Add, Sub};
 
-/// A point of virtual time, in picoseconds since the bench was set up. One cycle at 168 MHz is 5952 ps; 2^64 ps are
-/// 213 days.
+/// A point of virtual time, in picoseconds since the bench was set up. One cycle at 168 MHz is 5952
+/// ps; 2^64 ps are 213 days.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Time(pub u64);
 

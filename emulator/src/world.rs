@@ -1,8 +1,9 @@
 //! Machines and host ports on one bus, in one virtual time.
 //!
-//! The rule that makes it deterministic: the bus decides about a point of time when every machine has come to it. A
-//! machine stops where it asks the bus for something, and waits there until the bus has answered. Until then the
-//! others may be ahead of it by less than the shortest time in which the bus can let them feel anything of it.
+//! The rule that makes it deterministic: the bus decides about a point of time when every machine
+//! has come to it. A machine stops where it asks the bus for something, and waits there until the
+//! bus has answered. Until then the others may be ahead of it by less than the shortest time in
+//! which the bus can let them feel anything of it.
 
 use std::collections::VecDeque;
 
@@ -27,14 +28,15 @@ pub trait Computer {
     /// How far it has come.
     fn now(&self) -> Time;
 
-    /// Runs until `deadline` or a little further; less far only if its CAN controller wants attention, or to say that
-    /// something happened.
+    /// Runs until `deadline` or a little further; less far only if its CAN controller wants
+    /// attention, or to say that something happened.
     fn run_until(&mut self, deadline: Time) -> Self::Stop;
 
     /// Its CAN controller.
     fn can(&mut self) -> &mut BxCan;
 
-    /// Whether the world's user should hear of the stop (a reset, a lock-up) or it is part of running.
+    /// Whether the world's user should hear of the stop (a reset, a lock-up) or it is part of
+    /// running.
     fn is_news(stop: &Self::Stop) -> bool;
 }
 
@@ -90,7 +92,8 @@ struct Slot<M> {
 const STUCK: u32 = 10_000;
 /// News that nobody fetched.
 const MAX_NEWS: usize = 4096;
-/// The bit time that bounds how far machines may be apart while nobody is on the bus: 1 Mbit/s, the fastest there is.
+/// The bit time that bounds how far machines may be apart while nobody is on the bus: 1 Mbit/s, the
+/// fastest there is.
 const FASTEST_BIT: Span = Span::from_micros(1);
 
 /// The bench: a bus and all that is plugged into it.
@@ -256,13 +259,15 @@ impl<M: Computer> World<M> {
         }
     }
 
-    /// Sends a frame from the port as soon as the bus lets it. Gives a ticket, see [`HostPort::sent`].
+    /// Sends a frame from the port as soon as the bus lets it. Gives a ticket, see
+    /// [`HostPort::sent`].
     pub fn send(&mut self, port: PortId, frame: Frame) -> u64 {
         let now = self.now;
         self.port_mut(port).send(frame, now)
     }
 
-    /// The oldest frame that the port has received and nobody has fetched, and when it was complete.
+    /// The oldest frame that the port has received and nobody has fetched, and when it was
+    /// complete.
     pub fn receive(&mut self, port: PortId) -> Option<(Time, Frame)> {
         self.port_mut(port).receive()
     }
@@ -284,8 +289,8 @@ impl<M: Computer> World<M> {
         self.run_until(self.now + span);
     }
 
-    /// Runs until the port has a frame, at most until `deadline`; fetches the frame. A frame that is waiting already
-    /// comes at once.
+    /// Runs until the port has a frame, at most until `deadline`; fetches the frame. A frame that
+    /// is waiting already comes at once.
     pub fn run_until_frame_or(&mut self, port: PortId, deadline: Time) -> Option<(Time, Frame)> {
         loop {
             if let Some(received) = self.receive(port) {
@@ -298,10 +303,11 @@ impl<M: Computer> World<M> {
         }
     }
 
-    /// Runs the machines to the next point at which the bus has something to decide, `limit` at the latest, and lets
-    /// it decide.
+    /// Runs the machines to the next point at which the bus has something to decide, `limit` at the
+    /// latest, and lets it decide.
     fn step(&mut self, limit: Time) {
-        // A machine that has just got power is not known to the bus yet; without the bus it would not stop for it.
+        // A machine that has just got power is not known to the bus yet; without the bus it would
+        // not stop for it.
         self.bus.advance(self.now, &mut nodes(&mut self.slots));
         let horizon = {
             let nodes = nodes(&mut self.slots);
@@ -366,9 +372,9 @@ mod tests {
     use std::cell::RefCell;
     use std::rc::Rc;
 
-    /// A machine with a program of a few lines: it joins the bus at 1 Mbit/s, sends a frame every `period`, answers
-    /// every frame that it gets with one of its own, and takes a while for each step. It remembers what its registers
-    /// said and when.
+    /// A machine with a program of a few lines: it joins the bus at 1 Mbit/s, sends a frame every
+    /// `period`, answers every frame that it gets with one of its own, and takes a while for each
+    /// step. It remembers what its registers said and when.
     struct Scripted {
         can: BxCan,
         now: Time,
@@ -473,8 +479,9 @@ mod tests {
         world.send(port, Frame::standard(0x080, &[]).unwrap());
         let (at, answer) = world.run_until_frame_or(port, Time(2_000_000_000)).unwrap();
         assert_eq!(answer.raw_id(), 0x410);
-        // Sent at 1000 us, 48 bits, received at 1047 us and answered within a step; the bus is free at 1051 us, and
-        // 410# (47 bits: 0 10000 (1) 010000 ... see the frame's own length) is valid one bit before its end.
+        // Sent at 1000 us, 48 bits, received at 1047 us and answered within a step; the bus is free
+        // at 1051 us, and 410# (47 bits: 0 10000 (1) 010000 ... see the frame's own length) is
+        // valid one bit before its end.
         let len = u64::from(answer.wire_len());
         assert_eq!(at, Time((1051 + len - 1) * 1_000_000));
         assert_eq!(world.now(), at);

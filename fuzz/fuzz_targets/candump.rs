@@ -1,7 +1,8 @@
 //! Lines of a candump log.
 //!
-//! Must hold: any text gives a frame, nothing, or an error that can be shown; a frame that was understood is written so that it is
-//! understood as the same again, with the same decoding into words.
+//! Must hold: any text gives a frame, nothing, or an error that can be shown; a frame that was
+//! understood is written so that it is understood as the same again, with the same decoding into
+//! words.
 #![no_main]
 
 use coflash::candump::Line;

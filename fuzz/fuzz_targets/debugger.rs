@@ -1,8 +1,8 @@
-//! The debugger interface, 1025h, against any frames: commands, data of any length by segments and blocks, broken off at any place, on a
-//! device that is secured now and then.
+//! The debugger interface, 1025h, against any frames: commands, data of any length by segments and
+//! blocks, broken off at any place, on a device that is secured now and then.
 //!
-//! Must hold: memory is touched within what was allowed and never while the device is secured (the memory of the tests asserts it); and
-//! afterwards a correct write and read are served.
+//! Must hold: memory is touched within what was allowed and never while the device is secured (the
+//! memory of the tests asserts it); and afterwards a correct write and read are served.
 #![no_main]
 
 use canopen::debugger::{Command, Kind, COMMAND, DATA};

@@ -1,7 +1,9 @@
-//! The program download against any blocks and commands in any order, with the flash's work done or not in between.
+//! The program download against any blocks and commands in any order, with the flash's work done or
+//! not in between.
 //!
-//! Must hold: nothing outside the program's region and the parameters is ever written (the flash refuses more than the chip
-//! would); and afterwards CLEAR and a correct sequence of blocks install a program.
+//! Must hold: nothing outside the program's region and the parameters is ever written (the flash
+//! refuses more than the chip would); and afterwards CLEAR and a correct sequence of blocks install
+//! a program.
 #![no_main]
 
 use boot_core::download::{Downloader, Policy, Step};
@@ -92,7 +94,7 @@ fuzz_target!(|bytes: &[u8]| {
             180..=219 => drop(device.step(&mut flash)),
             _ => settle(&mut device, &mut flash),
         }
-        if device.take_leave().is_some() {
+        if device.take_boot_request().is_some() {
             // The device resets.
             break;
         }
@@ -128,7 +130,7 @@ fuzz_target!(|bytes: &[u8]| {
     assert_eq!(device.identification(1), crc);
     device.command(1, ProgramControl::Start).expect("START");
     assert_ne!(device.status(1).error, Some(FlashError::NoValidProgram));
-    assert!(device.take_leave().is_some(), "the program does not start");
+    assert!(device.take_boot_request().is_some(), "the program does not start");
 });
 
 /// What the SDO server does with a block.

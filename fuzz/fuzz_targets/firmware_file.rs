@@ -1,7 +1,9 @@
-//! The readers of firmware files (Intel HEX, S-record, ELF, block file, raw) and the conversion behind them.
+//! The readers of firmware files (Intel HEX, S-record, ELF, block file, raw) and the conversion
+//! behind them.
 //!
-//! Must hold: any bytes give an image or an error that can be shown; an image that can be converted gives a block file that reads
-//! back as the same, with every byte of the image in it; a block file is written as it was read.
+//! Must hold: any bytes give an image or an error that can be shown; an image that can be converted
+//! gives a block file that reads back as the same, with every byte of the image in it; a block file
+//! is written as it was read.
 #![no_main]
 
 use coflash::block_file::BlockFile;

@@ -1,7 +1,8 @@
 //! An LSS slave against any frames at any time.
 //!
-//! Must hold: it answers with 8 bytes under the slave's identifier; it is silent while a bit rate is being activated; what it
-//! stores is what was configured; and afterwards a correct master finds, configures and stores it.
+//! Must hold: it answers with 8 bytes under the slave's identifier; it is silent while a bit rate
+//! is being activated; what it stores is what was configured; and afterwards a correct master
+//! finds, configures and stores it.
 #![no_main]
 
 use core::task::Poll;

@@ -1,7 +1,7 @@
 //! A transfer of the SDO client against any answers at any time.
 //!
-//! Must hold: it sends requests of 8 bytes and nothing else; an upload that ends well has delivered what the server announced;
-//! left alone it ends; and the end stays the end.
+//! Must hold: it sends requests of 8 bytes and nothing else; an upload that ends well has delivered
+//! what the server announced; left alone it ends; and the end stays the end.
 #![no_main]
 
 use canopen::sdo::client::{Block, Config, Download, Sink, Step, Transfer, Upload};

@@ -1,8 +1,10 @@
-//! A node with its SDO server against any frames at any time, answers fetched or not, from a consumer of any speed.
+//! A node with its SDO server against any frames at any time, answers fetched or not, from a
+//! consumer of any speed.
 //!
-//! Must hold: a domain hears start, data, and exactly one of end and cancel (the device of the tests asserts it); an
-//! answer comes with the server's identifier and 8 bytes; and afterwards the next correct transfers are served, without
-//! and with blocks, at once after an abort by the client or after the time-out.
+//! Must hold: a domain hears start, data, and exactly one of end and cancel (the device of the
+//! tests asserts it); an answer comes with the server's identifier and 8 bytes; and afterwards the
+//! next correct transfers are served, without and with blocks, at once after an abort by the client
+//! or after the time-out.
 #![no_main]
 
 use canopen::node::{Config, NmtPolicy, Node};

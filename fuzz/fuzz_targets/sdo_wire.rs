@@ -1,6 +1,7 @@
 //! Client and server over a wire that loses and doubles frames as the input says, and later none.
 //!
-//! Must hold: a transfer that ends well has moved the data unchanged; it ends; and the server comes to rest.
+//! Must hold: a transfer that ends well has moved the data unchanged; it ends; and the server comes
+//! to rest.
 #![no_main]
 
 use std::collections::VecDeque;

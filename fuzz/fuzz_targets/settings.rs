@@ -1,7 +1,7 @@
 //! Job file and configuration file.
 //!
-//! Must hold: any text gives a job, settings, or a fault whose place is in the text; each device of a job has an image and is named,
-//! and no two are the same one; each setting is one that there is.
+//! Must hold: any text gives a job, settings, or a fault whose place is in the text; each device of
+//! a job has an image and is named, and no two are the same one; each setting is one that there is.
 #![no_main]
 
 use std::path::Path;

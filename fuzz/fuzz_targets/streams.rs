@@ -1,8 +1,10 @@
-//! Whole programs in one download: the detection of the format, raw images and Intel HEX, in pieces of any length, cut off anywhere, with
-//! the flash's work done or not in between; and the passwords in front of them.
+//! Whole programs in one download: the detection of the format, raw images and Intel HEX, in pieces
+//! of any length, cut off anywhere, with the flash's work done or not in between; and the passwords
+//! in front of them.
 //!
-//! Must hold: nothing outside the programs and the parameters is ever written; the device never takes more than it said there was
-//! room for; and afterwards CLEAR and a good image install a program. A wrong password never opens anything.
+//! Must hold: nothing outside the programs and the parameters is ever written; the device never
+//! takes more than it said there was room for; and afterwards CLEAR and a good image install a
+//! program. A wrong password never opens anything.
 #![no_main]
 
 use boot_core::bootloader::{entries_with, entry_count_with, Bootloader, Config};
@@ -87,7 +89,7 @@ fuzz_target!(|bytes: &[u8]| {
     device.download_end(DATA).expect("a good image");
     settle(&mut device);
     device.write(Address::new(PROGRAM_CONTROL, 1), &[1]).expect("START");
-    assert!(device.take_leave().is_some(), "the program does not start");
+    assert!(device.take_boot_request().is_some(), "the program does not start");
 });
 
 type Model<'b, 'f> = Bootloader<'b, &'f mut ModelFlash, Journal, PROGRAMS>;
@@ -158,7 +160,7 @@ fn session(config: &'static Config, flash: &mut ModelFlash, input: &mut Input<'_
             210..=239 => drop(device.step()),
             _ => settle(&mut device),
         }
-        if device.take_leave().is_some() {
+        if device.take_boot_request().is_some() {
             return;
         }
     }

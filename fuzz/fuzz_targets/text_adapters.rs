@@ -1,7 +1,7 @@
 //! What CAN adapters say as text: SLCAN over a line, socketcand over TCP in both directions.
 //!
-//! Must hold: any bytes, in any pieces, give frames, nothing, or an error, and never an endless wait; a frame comes out of what says
-//! it as it went in.
+//! Must hold: any bytes, in any pieces, give frames, nothing, or an error, and never an endless
+//! wait; a frame comes out of what says it as it went in.
 #![no_main]
 
 use std::collections::VecDeque;

@@ -1,4 +1,5 @@
-//! What the fuzz targets share. `cargo xtask fuzz` runs them; each says in its first lines what must hold.
+//! What the fuzz targets share. `cargo xtask fuzz` runs them; each says in its first lines what
+//! must hold.
 
 /// The devices and the wire of `canopen`'s own tests.
 #[path = "../../canopen/tests/common/mod.rs"]

@@ -1,7 +1,8 @@
-//! What a frame costs the host: an update through a socketcand bus on this machine, into a node whose flash takes no time.
+//! What a frame costs the host: an update through a socketcand bus on this machine, into a node
+//! whose flash takes no time.
 //!
-//! `cargo xtask bench` runs it. Nothing waits for a wire here, so the rate says how fast tool, system and node are together; the time
-//! on the processor is the tool's own.
+//! `cargo xtask bench` runs it. Nothing waits for a wire here, so the rate says how fast tool,
+//! system and node are together; the time on the processor is the tool's own.
 
 use std::error::Error;
 use std::io::{BufRead, BufReader};
@@ -134,7 +135,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// What this thread, the only one at work, has had of the processor; `None` where the system does not tell.
+/// What this thread, the only one at work, has had of the processor; `None` where the system does
+/// not tell.
 fn processor_time() -> Option<Duration> {
     let text = fs::read_to_string("/proc/thread-self/schedstat").ok()?;
     text.split_ascii_whitespace().next()?.parse().ok().map(Duration::from_nanos)

@@ -1,8 +1,8 @@
 //! A device: what the firmware's boot stage and tasks do around `boot-core`, without a chip.
 //!
-//! A START leaves a request and resets, as on the chip, and so does whatever else ends the bootloader; the boot decision is made
-//! anew. Where it falls on a program there is no CPU to run it: the device is silent from then on, or a
-//! [stand-in](crate::stand_in) answers.
+//! A START leaves a request and resets, as on the chip, and so does whatever else ends the
+//! bootloader; the boot decision is made anew. Where it falls on a program there is no CPU to run
+//! it: the device is silent from then on, or a [stand-in](crate::stand_in) answers.
 
 use std::io;
 use std::time::Duration;
@@ -25,8 +25,9 @@ use crate::stand_in::StandIn;
 
 /// Bytes of blocks that may wait for the flash, as in the firmware for the STM32F407.
 pub const BUFFER: usize = 80 * 1024;
-/// How long a device stays after the answer to its leaving, in ms: clients want to see the answer before anything else happens.
-const FAREWELL_MS: u32 = 20;
+/// How long a device stays after the answer to its leaving, in ms: clients want to see the answer
+/// before anything else happens.
+const ANSWER_TO_RESET_MS: u32 = 20;
 /// The file is never older than this while the flash changes.
 const SAVE_AFTER: Duration = Duration::from_millis(250);
 /// What the device does after a reset: the firmware's policy. Nothing here can crash.
@@ -34,7 +35,8 @@ const POLICY: Policy = Policy { autostart: Some(1), max_crash_resets: 3, node_id
 /// Stands for no node-ID (CiA 305).
 const NO_NODE_ID: u8 = 255;
 
-/// Whether a device can be set to this bit rate. The bus has none of its own, so any can be; there is nothing to find out.
+/// Whether a device can be set to this bit rate. The bus has none of its own, so any can be; there
+/// is nothing to find out.
 #[must_use]
 pub fn supports(rate: BitRate) -> bool {
     rate != BitRate::Auto
@@ -130,7 +132,8 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         }
     }
 
-    /// Carries everything on: a bounded piece of work on the flash, frames to send, a reset. Whether there is more to do at once.
+    /// Carries everything on: a bounded piece of work on the flash, frames to send, a reset.
+    /// Whether there is more to do at once.
     ///
     /// # Errors
     /// The file cannot be written.
@@ -152,7 +155,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                 if finished && flash.is_urgent() || flash.unsaved().is_some_and(|since| since >= SAVE_AFTER) {
                     flash.save()?;
                 }
-                if let Some(request) = running.device.take_leave() {
+                if let Some(request) = running.device.take_boot_request() {
                     running.leaving = Some(Leaving { request: Some(request), at: None });
                 }
                 let finishing = running.device.is_finishing();
@@ -268,11 +271,11 @@ impl<D: SlaveDevice> Running<D> {
             match output {
                 Output::Send(frame) => send(frame),
                 // The bus has no bit rate, no filters and no bus-off.
-                Output::Join(_) | Output::Listen(_) | Output::ComeBack | Output::Accept(_) => {}
+                Output::Join(_) | Output::Listen(_) | Output::RecoverFromBusOff | Output::Accept(_) => {}
             }
         }
         if let Some(leaving) = self.leaving.as_mut().filter(|_| may_leave && self.slave.is_idle()) {
-            leaving.at = Some(now + FAREWELL_MS);
+            leaving.at = Some(now + ANSWER_TO_RESET_MS);
         }
         None
     }

@@ -1,8 +1,8 @@
 //! The flash of a chip in a file: its raw contents, byte by byte, from the first address on.
 //!
-//! The file is replaced as a whole, by renaming, so that whoever reads it finds a state that the flash has had; ending the program
-//! is cutting the power. What the bus is told to be stored is in the file before ([`FileFlash::is_urgent`]). A crash of the computer
-//! itself may cost more.
+//! The file is replaced as a whole, by renaming, so that whoever reads it finds a state that the
+//! flash has had; ending the program is cutting the power. What the bus is told to be stored is in
+//! the file before ([`FileFlash::is_urgent`]). A crash of the computer itself may cost more.
 
 use std::fs;
 use std::io;
@@ -23,7 +23,8 @@ pub enum Speed {
     Typical,
 }
 
-/// Typical erase times by the size of the sector (datasheet DocID022152, flash memory programming, 32 bits at a time).
+/// Typical erase times by the size of the sector (datasheet DocID022152, flash memory programming,
+/// 32 bits at a time).
 const ERASE: [(u32, Duration); 3] = [
     (16 * 1024, Duration::from_millis(250)),
     (64 * 1024, Duration::from_millis(550)),
@@ -31,7 +32,8 @@ const ERASE: [(u32, Duration); 3] = [
 ];
 /// Typical time to program a word (the same table).
 const PROGRAM: Duration = Duration::from_micros(16);
-/// A host cannot wait for microseconds: words are programmed ahead of time after a wait, by no more than this.
+/// A host cannot wait for microseconds: words are programmed ahead of time after a wait, by no more
+/// than this.
 const CATCH_UP: Duration = Duration::from_millis(5);
 
 /// A flash in a file.
@@ -49,7 +51,8 @@ pub struct FileFlash {
 }
 
 impl FileFlash {
-    /// Takes the contents from the file. Where there is none, the flash is erased, and the file is made.
+    /// Takes the contents from the file. Where there is none, the flash is erased, and the file is
+    /// made.
     ///
     /// # Errors
     /// It cannot be read or made, or is no image of this chip's flash.
@@ -90,7 +93,8 @@ impl FileFlash {
         self.unsaved.map(|since| since.elapsed())
     }
 
-    /// Whether parameters changed that are not in the file: node-ID and bit rate, or that there is a program, or none.
+    /// Whether parameters changed that are not in the file: node-ID and bit rate, or that there is
+    /// a program, or none.
     #[must_use]
     pub fn is_urgent(&self) -> bool {
         self.urgent
@@ -170,7 +174,8 @@ impl Flash for FileFlash {
             return Err(FlashFault::Failed);
         }
         let cells = self.begin(Region::new(address, 4), PROGRAM, CATCH_UP)?;
-        // Programming makes zeros of ones and nothing else; what cannot be is found when it is read back.
+        // Programming makes zeros of ones and nothing else; what cannot be is found when it is read
+        // back.
         for (cell, byte) in cells.iter_mut().zip(word.to_le_bytes()) {
             *cell &= byte;
         }

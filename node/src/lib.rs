@@ -1,6 +1,8 @@
-//! Bootloader nodes without a chip: the `boot-core` of the firmware on a bus of the host, with a file in place of flash.
+//! Bootloader nodes without a chip: the `boot-core` of the firmware on a bus of the host, with a
+//! file in place of flash.
 //!
-//! For whoever writes a tool or a CANopen master and wants a device to try it on, or many; and for tests.
+//! For whoever writes a tool or a CANopen master and wants a device to try it on, or many; and for
+//! tests.
 //!
 //! | module | what it does |
 //! |---|---|

@@ -27,9 +27,9 @@ const TICK: Duration = Duration::from_millis(2);
 
 /// Bootloader nodes on a CAN bus of the host, each with a file in place of its flash.
 ///
-/// They run the bootloader of the firmware and take programs as it does. There is no CPU behind them: a program that is started
-/// is silent from then on, or a stand-in answers for it. Ctrl-C is cutting the power: all that a node said to be stored is in its
-/// file.
+/// They run the bootloader of the firmware and take programs as it does. There is no CPU behind
+/// them: a program that is started is silent from then on, or a stand-in answers for it. Ctrl-C is
+/// cutting the power: all that a node said to be stored is in its file.
 #[derive(Debug, Parser)]
 #[command(name = "coboot-node", version)]
 struct Args {
@@ -57,7 +57,8 @@ struct Args {
     #[arg(long, default_value = "1", value_parser = number)]
     serial: u32,
 
-    /// Folder of the files, SERIAL.flash for each node: raw contents of the flash. What is not there is made, erased
+    /// Folder of the files, SERIAL.flash for each node: raw contents of the flash. What is not
+    /// there is made, erased
     #[arg(long, default_value = ".", value_name = "DIR")]
     folder: PathBuf,
 
@@ -205,7 +206,7 @@ fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, B
         (None, Some(address)) => {
             let server =
                 Server::bind(address, "can0").map_err(|error| format!("listening at {address}: {error}"))?;
-            say(&format!("bus: socketcand://{}/can0", server.address()));
+            print_line(&format!("bus: socketcand://{}/can0", server.address()));
             Box::new(server)
         }
         (None, None) => return Err("name a bus: --bus URL or --listen HOST:PORT".into()),
@@ -298,10 +299,10 @@ fn tell(serial: u32, event: Event) {
         }
     };
     let node = node.map_or("no node-ID".to_owned(), |node| format!("node {}", node.get()));
-    say(&format!("serial {serial}, {node}: {what}"));
+    print_line(&format!("serial {serial}, {node}: {what}"));
 }
 
-fn say(line: &str) {
+fn print_line(line: &str) {
     // Nobody has to read it.
     let _ = writeln!(io::stdout(), "{line}");
 }

@@ -1,7 +1,8 @@
-//! A bus of its own, for socketcand clients: coflash, python-can and their friends. Every client hears the devices and the
-//! other clients.
+//! A bus of its own, for socketcand clients: coflash, python-can and their friends. Every client
+//! hears the devices and the other clients.
 //!
-//! Time on this bus is the host's, and a frame takes none: there is no bit rate, no arbitration and no error.
+//! Time on this bus is the host's, and a frame takes none: there is no bit rate, no arbitration and
+//! no error.
 
 use std::collections::BTreeMap;
 use std::io::{self, ErrorKind, Read, Write};
@@ -20,7 +21,8 @@ const MAX_CLIENTS: usize = 64;
 const EVENTS: usize = 1024;
 /// A client that takes nothing for so long is disconnected.
 const PATIENCE: Duration = Duration::from_millis(500);
-/// How long frames are held back behind the answer to `rawmode`: python-can wants that answer alone in one read.
+/// How long frames are held back behind the answer to `rawmode`: python-can wants that answer alone
+/// in one read.
 const HOLD: Duration = Duration::from_millis(10);
 
 /// What the threads of the connections tell, of the client of this number.

@@ -1,6 +1,6 @@
-//! A program that is none: there is no CPU here that could run the one in the file. It answers what a host asks a running
-//! application for, as CiA 302-3 has it: which program runs (1F51h) and which one it is (1F56h); and it lets itself be called back
-//! to the bootloader (1F51h = 80h).
+//! A program that is none: there is no CPU here that could run the one in the file. It answers what
+//! a host asks a running application for, as CiA 302-3 has it: which program runs (1F51h) and which
+//! one it is (1F56h); and it lets itself be called back to the bootloader (1F51h = 80h).
 
 use std::task::Poll;
 
@@ -29,8 +29,8 @@ pub struct StandIn {
 }
 
 impl StandIn {
-    /// Of this program, of those with these CRCs (0 for one that is not there), on a device that says this of itself as a
-    /// bootloader.
+    /// Of this program, of those with these CRCs (0 for one that is not there), on a device that
+    /// says this of itself as a bootloader.
     #[must_use]
     pub fn new(entries: &'static [Entry], bootloader: Device, program: u8, crcs: Vec<u32>) -> Self {
         let device = Device { device_type: DEVICE_TYPE, software_version: SOFTWARE_VERSION, ..bootloader };

@@ -1,5 +1,5 @@
-//! Every command of `coflash` that talks to a device, against nodes over a real socket. (`nodes.rs` has those that it needs itself;
-//! `convert`, `inspect`, `completions` and `man` talk to nobody.)
+//! Every command of `coflash` that talks to a device, against nodes over a real socket. (`nodes.rs`
+//! has those that it needs itself; `convert`, `inspect`, `completions` and `man` talk to nobody.)
 
 mod bus;
 
@@ -12,7 +12,8 @@ use std::time::Duration;
 use bus::{Coflash, Folder, Nodes};
 use serde_json::{json, Value};
 
-/// A program as far as a bootloader looks at one: initial stack pointer in RAM, reset vector inside, Thumb bit set.
+/// A program as far as a bootloader looks at one: initial stack pointer in RAM, reset vector
+/// inside, Thumb bit set.
 fn program(first: u8) -> Vec<u8> {
     let mut bytes = vec![first; 200 * 1024];
     bytes[..8].copy_from_slice(&[0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x01, 0x08]);
@@ -81,7 +82,8 @@ fn erasing_waits_for_the_flash() {
     assert!(erased["seconds"].as_f64().unwrap() >= 3.55, "{erased}");
 }
 
-/// What a device refuses to read is told with its abort code (06010001h: it is write-only), in words.
+/// What a device refuses to read is told with its abort code (06010001h: it is write-only), in
+/// words.
 #[test]
 fn the_program_cannot_be_read_back() {
     let folder = folder("read");
@@ -226,7 +228,8 @@ fn no_bus_no_node_no_sense() {
     assert_eq!(done.exit, 7, "{}{}", done.out, done.err);
 }
 
-/// Two hosts at work on one node: each comes to an end and says what happened, and the node takes the next update.
+/// Two hosts at work on one node: each comes to an end and says what happened, and the node takes
+/// the next update.
 #[test]
 fn a_second_host_on_the_same_node_ends_in_words() {
     let folder = folder("two-hosts");
@@ -249,7 +252,8 @@ fn a_second_host_on_the_same_node_ends_in_words() {
     }
 }
 
-/// Somebody else fills the bus, also with frames that look like answers of other nodes and like nothing at all.
+/// Somebody else fills the bus, also with frames that look like answers of other nodes and like
+/// nothing at all.
 #[test]
 fn frames_of_others_are_passed_over() {
     let folder = folder("noise");
@@ -262,7 +266,8 @@ fn frames_of_others_are_passed_over() {
         assert_eq!(bus::message(&mut stream), "< hi >");
         stream.write_all(b"< open can0 >").unwrap();
         assert_eq!(bus::message(&mut stream), "< ok >");
-        // Answers of node 6; an SDO that is too short; a heartbeat of five bytes; a 29-bit frame with an answer's number; PDOs.
+        // Answers of node 6; an SDO that is too short; a heartbeat of five bytes; a 29-bit frame
+        // with an answer's number; PDOs.
         let frames = b"< send 586 8 60 50 1F 1 0 0 0 0 >< send 586 8 80 50 1F 1 0 0 0 8 >< send 585 3 60 50 1F >\
                        < send 705 5 0 0 0 0 0 >< send 00000585 8 80 50 1F 1 0 0 0 8 >< send 185 8 1 2 3 4 5 6 7 8 >";
         let mut rounds = 0;
@@ -278,7 +283,8 @@ fn frames_of_others_are_passed_over() {
     assert_eq!(folder.read("1.flash")[0x1_0000..0x4_2000], program(0xA5));
 }
 
-/// Images and Intel HEX, and the dialects in which nodes contradict the standard one; coflash says which one it is.
+/// Images and Intel HEX, and the dialects in which nodes contradict the standard one; coflash says
+/// which one it is.
 #[test]
 fn dialects_are_found_out_or_named() {
     let folder = folder("dialects");
@@ -318,8 +324,8 @@ fn dialects_are_found_out_or_named() {
     assert_eq!(refused.exit, 2, "{}", refused.err);
 }
 
-/// The program with the label that a lift wants, for vendor-ID and product code 0: its check word is the ABI's fold over the seven words
-/// before, written again.
+/// The program with the label that a lift wants, for vendor-ID and product code 0: its check word
+/// is the ABI's fold over the seven words before, written again.
 fn labelled() -> Vec<u8> {
     let mut words = [0_u32; 7];
     words[0] = u32::from_le_bytes(*b"CBL1");

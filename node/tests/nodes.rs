@@ -1,4 +1,5 @@
-//! `coboot-node` as its users run it: over real sockets, with `coflash` as the host, and the file read from outside.
+//! `coboot-node` as its users run it: over real sockets, with `coflash` as the host, and the file
+//! read from outside.
 
 mod bus;
 
@@ -9,7 +10,8 @@ use std::time::Duration;
 
 use bus::{node, Coflash, Folder, Nodes};
 
-/// A program as far as a bootloader looks at one: initial stack pointer in RAM, reset vector inside, Thumb bit set.
+/// A program as far as a bootloader looks at one: initial stack pointer in RAM, reset vector
+/// inside, Thumb bit set.
 fn program() -> Vec<u8> {
     let mut bytes: Vec<u8> = (0..300 * 1024_u32).map(|i| (i * 7 + (i >> 8) * 13) as u8).collect();
     bytes[..8].copy_from_slice(&[0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x01, 0x08]);
@@ -157,7 +159,8 @@ fn nodes_are_commissioned_by_layer_setting_services() {
     coflash.done(&[&["lss", "store"][..], &device].concat());
 }
 
-/// From the factory to a running program in one job: the node-ID that a device is given by its LSS address outlives the restart.
+/// From the factory to a running program in one job: the node-ID that a device is given by its LSS
+/// address outlives the restart.
 #[test]
 fn a_device_without_node_id_is_given_one_and_flashed_in_one_job() {
     let folder = folder("lss-job");

@@ -1,16 +1,16 @@
-//! The block file: the container that object 1F50h takes (SYS TEC manual L-1112d_10, chapter 3 figure 2
-//! and chapter 5.1).
+//! The block file: the container that object 1F50h takes (SYS TEC manual L-1112d_10, chapter 3
+//! figure 2 and chapter 5.1).
 //!
-//! A file is a row of blocks: number 0 (control), 1…N (program data, ascending), FFFFFFFFh (size and CRC
-//! of the program). Each block is one SDO download:
+//! A file is a row of blocks: number 0 (control), 1…N (program data, ascending), FFFFFFFFh (size
+//! and CRC of the program). Each block is one SDO download:
 //!
 //! ```text
 //! u32 number | u32 flash address | u32 size | size bytes | u32 CRC over all of the block before it
 //! ```
 //!
-//! All words are little-endian. The CRC is CRC-32/ISO-HDLC (polynomial EDB88320h reflected); the manual gives its
-//! start value once as 0 and once as FFFFFFFFh, which is one function called in two ways. It is
-//! computed by whoever uses this module, so that this crate needs none of its own.
+//! All words are little-endian. The CRC is CRC-32/ISO-HDLC (polynomial EDB88320h reflected); the
+//! manual gives its start value once as 0 and once as FFFFFFFFh, which is one function called in
+//! two ways. It is computed by whoever uses this module, so that this crate needs none of its own.
 
 /// Bytes in front of a block's data.
 pub const HEADER_SIZE: usize = 12;
@@ -18,7 +18,8 @@ pub const HEADER_SIZE: usize = 12;
 pub const CRC_SIZE: usize = 4;
 /// Bytes of a block that are not data; `--block-size` counts them.
 pub const FRAMING: usize = HEADER_SIZE + CRC_SIZE;
-/// The largest block the manual allows, framing included (table 1: "container of up to 16384 bytes").
+/// The largest block the manual allows, framing included (table 1: "container of up to 16384
+/// bytes").
 pub const MAX_BLOCK_SIZE: usize = 16384;
 
 /// The number of the control block.

@@ -1,7 +1,8 @@
 //! The callgate: services of the bootloader that an application calls like a function.
 //!
-//! At a fixed address ([`Layout::callgate`]) lies a table with magic, ABI version, length and one entry
-//! point. The code behind it runs from flash and uses the caller's stack alone: the application owns all RAM.
+//! At a fixed address ([`Layout::callgate`]) lies a table with magic, ABI version, length and one
+//! entry point. The code behind it runs from flash and uses the caller's stack alone: the
+//! application owns all RAM.
 //!
 //! What it costs the caller: at most [`STACK`] bytes of stack.
 
@@ -22,8 +23,8 @@ pub const STACK: u32 = 1024;
 /// The entry point: a [selector](Selector), its argument structure, and a [result code](Status).
 pub type Entry = unsafe extern "C" fn(selector: u32, args: *mut core::ffi::c_void) -> i32;
 
-/// The table in flash. `E` is the [`Entry`] in the bootloader that defines it and its 32-bit address for everyone
-/// else.
+/// The table in flash. `E` is the [`Entry`] in the bootloader that defines it and its 32-bit
+/// address for everyone else.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Table<E = u32> {
@@ -39,11 +40,9 @@ pub struct Table<E = u32> {
     pub entry: E,
 }
 
-/// What can be called: one service at a time, from one priority, with the flash controller left alone meanwhile.
-/// Every
-/// service that stores keeps the core from its flash for as long as that takes: some 100 us, and once in several
-/// hundred times a
-/// second, when a sector is erased.
+/// What can be called: one service at a time, from one priority, with the flash controller left
+/// alone meanwhile. Every service that stores keeps the core from its flash for as long as that
+/// takes: some 100 us, and once in several hundred times a second, when a sector is erased.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Selector {
@@ -55,11 +54,11 @@ pub enum Selector {
     StoreNode = 3,
     /// What is known of a program; takes [`ProgramArgs`].
     ProgramInfo = 4,
-    /// Gives a program its signature, as 1F51h = 83h does, and forgets its crashes: how a trial confirms itself.
-    /// Takes
-    /// [`ProgramArgs`], of which only the number counts.
+    /// Gives a program its signature, as 1F51h = 83h does, and forgets its crashes: how a trial
+    /// confirms itself. Takes [`ProgramArgs`], of which only the number counts.
     Confirm = 5,
-    /// Takes a program's signature away, as 1F51h = 84h does. Takes [`ProgramArgs`], of which only the number counts.
+    /// Takes a program's signature away, as 1F51h = 84h does. Takes [`ProgramArgs`], of which only
+    /// the number counts.
     Invalidate = 6,
 }
 
@@ -133,7 +132,8 @@ pub struct ProgramArgs {
     pub size: u32,
     /// Result: CRC over them.
     pub crc: u32,
-    /// Result: the version that its control block told, 0 for none (SYS TEC manual L-1112d_10, figure 13).
+    /// Result: the version that its control block told, 0 for none (SYS TEC manual L-1112d_10,
+    /// figure 13).
     pub version: u32,
     /// Result: [`PROGRAM_INSTALLED`], [`PROGRAM_SIGNED`].
     pub flags: u32,
@@ -190,8 +190,8 @@ impl Callgate {
     /// # Errors
     /// [`CallgateError::Absent`] or [`CallgateError::Version`].
     pub fn find(layout: &Layout) -> Result<Self, CallgateError> {
-        // SAFETY: a checked layout puts the table inside the flash, which is always readable; any bits make a
-        // `Table`.
+        // SAFETY: a checked layout puts the table inside the flash, which is always readable; any
+        // bits make a `Table`.
         Self::check(unsafe { (layout.callgate() as *const Table).read_volatile() })
     }
 
@@ -218,7 +218,8 @@ impl Callgate {
     /// Stores node-ID and bit rate; they are in force from the next reset on.
     ///
     /// # Errors
-    /// [`CallgateError::Refused`] with [`Status::BadArgument`], [`Status::Busy`] or [`Status::Failed`].
+    /// [`CallgateError::Refused`] with [`Status::BadArgument`], [`Status::Busy`] or
+    /// [`Status::Failed`].
     pub fn store_node(&self, mut node: NodeArgs) -> Result<(), CallgateError> {
         self.call(Selector::StoreNode, (&raw mut node).cast())
     }
@@ -236,8 +237,8 @@ impl Callgate {
     /// Gives a program its signature and forgets its crashes: how a trial confirms itself.
     ///
     /// # Errors
-    /// [`CallgateError::Refused`] with [`Status::BadArgument`], [`Status::NoProgram`], [`Status::Busy`] or
-    /// [`Status::Failed`].
+    /// [`CallgateError::Refused`] with [`Status::BadArgument`], [`Status::NoProgram`],
+    /// [`Status::Busy`] or [`Status::Failed`].
     pub fn confirm(&self, number: u8) -> Result<(), CallgateError> {
         let mut args = ProgramArgs { number: number.into(), ..ProgramArgs::default() };
         self.call(Selector::Confirm, (&raw mut args).cast())
@@ -253,8 +254,9 @@ impl Callgate {
     }
 
     fn call(&self, selector: Selector, args: *mut core::ffi::c_void) -> Result<(), CallgateError> {
-        // SAFETY: `check` found the magic and the version of a table that a bootloader of ours put there, so the
-        // word is the address of an `Entry`; every caller passes the argument structure of its selector.
+        // SAFETY: `check` found the magic and the version of a table that a bootloader of ours put
+        // there, so the word is the address of an `Entry`; every caller passes the argument
+        // structure of its selector.
         let status = unsafe {
             let entry: Entry = core::mem::transmute::<usize, Entry>(self.table.entry as usize);
             entry(selector as u32, args)

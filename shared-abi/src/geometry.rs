@@ -1,6 +1,6 @@
-//! The silicon: what a chip has, as its reference manual states it (RM0090 rev 19 for STM32F405–F439, RM0390 for
-//! STM32F446: section 3 "Embedded flash memory" and section 2 "Memory map"). Nothing here is a choice of ours; the
-//! choices are in [`crate::layout`].
+//! The silicon: what a chip has, as its reference manual states it (RM0090 rev 19 for
+//! STM32F405–F439, RM0390 for STM32F446: section 3 "Embedded flash memory" and section 2 "Memory
+//! map"). Nothing here is a choice of ours; the choices are in [`crate::layout`].
 
 /// A half-open range of addresses: `base..base + size`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -24,7 +24,8 @@ impl Region {
         self.base + self.size
     }
 
-    /// Whether the `len` bytes from `address` all lie inside; no address and no length overflows it.
+    /// Whether the `len` bytes from `address` all lie inside; no address and no length overflows
+    /// it.
     #[must_use]
     pub const fn contains(&self, address: u32, len: u32) -> bool {
         address >= self.base
@@ -43,7 +44,8 @@ impl Region {
 /// One erasable unit of the flash.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Sector {
-    /// Its number in the manual's table; [`Geometry::sector_code`] makes of it what goes into `FLASH_CR.SNB`.
+    /// Its number in the manual's table; [`Geometry::sector_code`] makes of it what goes into
+    /// `FLASH_CR.SNB`.
     pub number: u8,
     /// The bytes it covers.
     pub region: Region,
@@ -75,7 +77,8 @@ pub struct Geometry {
     pub ccm: Region,
     /// Number of interrupt lines behind the 16 exceptions of the core.
     pub interrupts: u16,
-    /// Number of GPIO ports, from A on (the memory map's table of register boundaries). Packages have fewer.
+    /// Number of GPIO ports, from A on (the memory map's table of register boundaries). Packages
+    /// have fewer.
     pub ports: u8,
 }
 
@@ -102,7 +105,8 @@ pub const STM32F407VG: Geometry = Geometry {
 
 /// STM32F429ZI and its packages: 2 MiB flash in two banks, 112 + 16 + 64 KiB SRAM, 64 KiB CCM.
 ///
-/// RM0090 (sectors; SRAM1, SRAM2 and SRAM3 follow one another); 91 interrupt lines as the PAC has them.
+/// RM0090 (sectors; SRAM1, SRAM2 and SRAM3 follow one another); 91 interrupt lines as the PAC has
+/// them.
 pub const STM32F429ZI: Geometry = Geometry {
     chip: "stm32f429zi",
     flash: Region::new(0x0800_0000, 2048 * KIB),
@@ -145,7 +149,8 @@ pub const STM32F446RE: Geometry = Geometry {
 pub const CHIPS: &[&Geometry] = &[&STM32F407VG, &STM32F429ZI, &STM32F446RE];
 
 impl Geometry {
-    /// Gives the geometry back if it can be that of a chip; fails the build with the broken rule's name if not.
+    /// Gives the geometry back if it can be that of a chip; fails the build with the broken rule's
+    /// name if not.
     #[must_use]
     pub const fn checked(self) -> Self {
         let (mut total, mut count, mut run) = (0, 0, 0);
@@ -178,9 +183,8 @@ impl Geometry {
         self
     }
 
-    /// What `FLASH_CR.SNB` takes for a sector: its number, but bit 4 chooses the second bank, whose sectors count
-    /// from 0 again
-    /// (RM0090 section 3.9.8: sector 12 is 10000b).
+    /// What `FLASH_CR.SNB` takes for a sector: its number, but bit 4 chooses the second bank, whose
+    /// sectors count from 0 again (RM0090 section 3.9.8: sector 12 is 10000b).
     #[must_use]
     pub const fn sector_code(&self, number: u8) -> u8 {
         match self.second_bank {
@@ -231,7 +235,8 @@ impl Geometry {
         None
     }
 
-    /// Whether a region starts and ends where sectors do, so that it can be erased without touching a neighbour.
+    /// Whether a region starts and ends where sectors do, so that it can be erased without touching
+    /// a neighbour.
     #[must_use]
     pub const fn is_whole_sectors(&self, region: &Region) -> bool {
         let starts = match self.sector_at(region.base) {
@@ -251,8 +256,8 @@ impl Geometry {
         (16 + self.interrupts as u32) * 4
     }
 
-    /// What `VTOR` demands of a vector table's address: the table's size rounded up to a power of two
-    /// (PM0214 section 4.4.4).
+    /// What `VTOR` demands of a vector table's address: the table's size rounded up to a power of
+    /// two (PM0214 section 4.4.4).
     #[must_use]
     pub const fn vector_table_alignment(&self) -> u32 {
         self.vector_table_size().next_power_of_two()

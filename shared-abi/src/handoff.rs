@@ -1,15 +1,16 @@
 //! The handoff: what the bootloader tells the application about how the device came up.
 //!
-//! Written by the bootloader right before the jump, at [`Layout::handoff`](crate::layout::Layout::handoff),
-//! in no image's RAM. An application reads it early and may read it again later.
+//! Written by the bootloader right before the jump, at
+//! [`Layout::handoff`](crate::layout::Layout::handoff), in no image's RAM. An application reads it
+//! early and may read it again later.
 
 use crate::check_word;
 
 /// Tells a handoff ("CBHO" read as little-endian bytes).
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBHO");
 
-/// The layout version of this page. A reader accepts every version that is not older than the one it knows:
-/// later versions only give names to reserved words.
+/// The layout version of this page. A reader accepts every version that is not older than the one
+/// it knows: later versions only give names to reserved words.
 pub const VERSION: u16 = 1;
 
 /// Why the chip left reset, from `RCC_CSR` (RM0090 section 7.3.21).
@@ -53,7 +54,8 @@ impl ResetCause {
 
     /// From the reset flags of `RCC_CSR` (RM0090 section 7.3.21).
     ///
-    /// Every reset also pulls NRST low, and a power-on sets the brown-out flag as well; the most telling flag wins.
+    /// Every reset also pulls NRST low, and a power-on sets the brown-out flag as well; the most
+    /// telling flag wins.
     #[must_use]
     pub const fn from_rcc_csr(csr: u32) -> Self {
         const LPWRRSTF: u32 = 1 << 31;
@@ -154,7 +156,8 @@ impl Handoff {
         handoff
     }
 
-    /// What it tells, or `None` where no bootloader left a sound one (a debugger started the application, say).
+    /// What it tells, or `None` where no bootloader left a sound one (a debugger started the
+    /// application, say).
     #[must_use]
     pub fn info(&self) -> Option<BootInfo> {
         let sound = self.magic == MAGIC
@@ -196,14 +199,16 @@ impl Handoff {
     /// `address` must be the layout's handoff region (word-aligned RAM of 48 bytes).
     #[must_use]
     pub unsafe fn read(address: *const Self) -> Option<BootInfo> {
-        // SAFETY: the caller vouches for the address; any bits make a valid `Handoff`, `info` judges them.
+        // SAFETY: the caller vouches for the address; any bits make a valid `Handoff`, `info`
+        // judges them.
         unsafe { address.read_volatile() }.info()
     }
 
     /// Leaves the handoff for the application.
     ///
     /// # Safety
-    /// `address` must be the layout's handoff region (word-aligned RAM of 48 bytes that nothing else uses).
+    /// `address` must be the layout's handoff region (word-aligned RAM of 48 bytes that nothing
+    /// else uses).
     pub unsafe fn write(self, address: *mut Self) {
         // SAFETY: the caller vouches for the address.
         unsafe { address.write_volatile(self) };

@@ -1,13 +1,16 @@
-//! What a program image says of itself, so that the bootloader can refuse one that is for another device before it touches the one
-//! that is there: vendor-ID, product code and version at a fixed place behind the vector table.
+//! What a program image says of itself, so that the bootloader can refuse one that is for another
+//! device before it touches the one that is there: vendor-ID, product code and version at a fixed
+//! place behind the vector table.
 //!
-//! A block file tells the same in its control block; this is for a raw image and Intel HEX, which have none.
+//! A block file tells the same in its control block; this is for a raw image and Intel HEX, which
+//! have none.
 
 use crate::check_word;
 
 /// Tells a label, layout version 1 ("CBL1" read as little-endian bytes).
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBL1");
-/// Where it lies, from the start of the program: the last 32 bytes of the first 512, behind the vectors of every STM32F4.
+/// Where it lies, from the start of the program: the last 32 bytes of the first 512, behind the
+/// vectors of every STM32F4.
 pub const OFFSET: u32 = 0x1E0;
 /// Bytes of a label.
 pub const SIZE: usize = 32;

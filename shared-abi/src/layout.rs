@@ -1,8 +1,9 @@
 //! Who owns which address: the one source of truth.
 //!
-//! One file per board in `layout/` holds **the numbers**; linker scripts, firmware, host tool, tests
-//! and documentation derive theirs from it. [`Layout::checked`] runs when the crate is compiled, so a
-//! layout that breaks a rule does not build, and the compiler's message names the rule.
+//! One file per board in `layout/` holds **the numbers**; linker scripts, firmware, host tool,
+//! tests and documentation derive theirs from it. [`Layout::checked`] runs when the crate is
+//! compiled, so a layout that breaks a rule does not build, and the compiler's message names the
+//! rule.
 
 use core::fmt;
 
@@ -52,7 +53,8 @@ pub struct Layout {
 }
 
 impl Layout {
-    /// Gives the layout back if every rule holds; fails the build with the broken rule's name if not.
+    /// Gives the layout back if every rule holds; fails the build with the broken rule's name if
+    /// not.
     #[must_use]
     pub const fn checked(self) -> Self {
         let chip = self.chip;

@@ -15,7 +15,8 @@
 //! | [`block_file`] | the container that object 1F50h takes |
 //!
 //! Everything that crosses a border between two images is `repr(C)`, little-endian and versioned.
-//! This crate has no dependencies, so that a C or foreign application can be held against it easily.
+//! This crate has no dependencies, so that a C or foreign application can be held against it
+//! easily.
 #![no_std]
 
 pub mod block_file;
@@ -32,15 +33,15 @@ pub mod reset;
 pub mod vectors;
 pub mod warm_start;
 
-/// The password of a lift device (6005h), which arms the way into the bootloader in the application and opens 1F50h in the
-/// bootloader: choose your own.
+/// The password of a lift device (6005h), which arms the way into the bootloader in the application
+/// and opens 1F50h in the bootloader: choose your own.
 pub const LIFT_PASSWORD: &[u8] = b"coboot";
 
 /// The check word that guards a record in RAM: a rotating fold over its other words.
 ///
-/// It tells a record from the noise of an unpowered RAM; it is no protection against an attacker who
-/// can write RAM. All-zero and all-one records never check (the seed sees to that), and the fold is
-/// simple enough to be written again in C in three lines.
+/// It tells a record from the noise of an unpowered RAM; it is no protection against an attacker
+/// who can write RAM. All-zero and all-one records never check (the seed sees to that), and the
+/// fold is simple enough to be written again in C in three lines.
 #[must_use]
 pub const fn check_word(words: &[u32]) -> u32 {
     let mut fold = CHECK_SEED;

@@ -1,5 +1,5 @@
-//! Which addresses of a chip may be touched blindly, as a debugger does: those behind which something answers. An access to
-//! any other is a bus fault.
+//! Which addresses of a chip may be touched blindly, as a debugger does: those behind which
+//! something answers. An access to any other is a bus fault.
 //!
 //! | what | read | written |
 //! |---|---|---|
@@ -8,13 +8,15 @@
 //! | registers of the peripherals, by words | yes | yes, but for those of the flash |
 //! | registers of the core, by words: DWT, FPB, system control space, DBGMCU | yes | yes |
 //!
-//! The registers of the flash are left out because a write to them could erase the bootloader. Left out altogether are
-//! USB, Ethernet, the camera, cryptography, random numbers, DMA2D and external memory: some of them stall the bus while they have no
-//! clock. The bit-band aliases and the alias of the flash at 0 are left out because they lead around this table.
+//! The registers of the flash are left out because a write to them could erase the bootloader. Left
+//! out altogether are USB, Ethernet, the camera, cryptography, random numbers, DMA2D and external
+//! memory: some of them stall the bus while they have no clock. The bit-band aliases and the alias
+//! of the flash at 0 are left out because they lead around this table.
 
 use crate::geometry::{Geometry, Region, STM32F407VG, STM32F429ZI, STM32F446RE};
 
-/// One-time programmable bytes, unique ID and flash size (RM0090, embedded flash and device electronic signature).
+/// One-time programmable bytes, unique ID and flash size (RM0090, embedded flash and device
+/// electronic signature).
 const SYSTEM: Region = Region::new(0x1FFF_7800, 0x224);
 /// The option bytes (RM0090, embedded flash).
 const OPTION_BYTES: Region = Region::new(0x1FFF_C000, 0x10);
@@ -82,8 +84,8 @@ const F446: &[Region] = &[
     Region::new(0x4002_6000, 0x0800), // DMA1, DMA2
 ];
 
-/// The peripherals of a chip, which its number of interrupt lines tells: firmware does without the names. A chip that is not listed
-/// has none: its memory can be looked at all the same.
+/// The peripherals of a chip, which its number of interrupt lines tells: firmware does without the
+/// names. A chip that is not listed has none: its memory can be looked at all the same.
 const fn peripherals(chip: &Geometry) -> &'static [Region] {
     const LINES_F407: u16 = STM32F407VG.interrupts;
     const LINES_F429: u16 = STM32F429ZI.interrupts;
@@ -106,14 +108,16 @@ fn within<'a>(regions: impl IntoIterator<Item = &'a Region>, address: u32, len: 
     len > 0 && regions.into_iter().any(|region| region.contains(address, len))
 }
 
-/// Whether these bytes may be read. Any address and any length may be asked for; no bytes may not be.
+/// Whether these bytes may be read. Any address and any length may be asked for; no bytes may not
+/// be.
 #[must_use]
 pub fn may_read(chip: &Geometry, address: u32, len: u32) -> bool {
     within([&chip.flash, &chip.sram, &chip.ccm, &SYSTEM, &OPTION_BYTES], address, len)
         || are_registers(chip, address, len)
 }
 
-/// Whether these bytes may be written. Any address and any length may be asked for; no bytes may not be.
+/// Whether these bytes may be written. Any address and any length may be asked for; no bytes may
+/// not be.
 #[must_use]
 pub fn may_write(chip: &Geometry, address: u32, len: u32) -> bool {
     let is_flash = || FLASH_REGISTERS.overlaps(&Region::new(address, len));

@@ -6,31 +6,30 @@
 //! | [`watchdog_reset`] | a millisecond | code that may not write the system control block |
 //! | [`jump`] | the list below | a chip whose reset would switch something off that must stay on |
 //!
-//! Each leaves a request in the warm-start cell. The answer to the command that asked for it has to be on the bus
-//! before: wait for the
-//! transmit mailboxes to be empty, then 10 ms (SYS TEC manual L-1112d_10, 4.5), and let nothing else be sent.
+//! Each leaves a request in the warm-start cell. The answer to the command that asked for it has to
+//! be on the bus before: wait for the transmit mailboxes to be empty, then 10 ms (SYS TEC manual
+//! L-1112d_10, 4.5), and let nothing else be sent.
 
 use crate::layout::Layout;
 use crate::reset;
 use crate::warm_start::{BootRequest, Cell};
 
 /// Leaves the request where the bootloader looks for it.
-fn leave_request(layout: &Layout, request: BootRequest) {
-    // SAFETY: the layout's warm-start region, checked to be RAM of that size that the linker scripts keep out of
-    // every image.
+fn put_request(layout: &Layout, request: BootRequest) {
+    // SAFETY: the layout's warm-start region, checked to be RAM of that size that the linker
+    // scripts keep out of every image.
     unsafe { Cell::at(layout.warm_start.base as *mut _) }.put(request);
 }
 
 fn read(register: u32) -> u32 {
-    // SAFETY: every caller in this file names a register of the core or of an STM32F4 that can be read without
-    // side effects.
+    // SAFETY: every caller in this file names a register of the core or of an STM32F4 that can be
+    // read without side effects.
     unsafe { (register as *const u32).read_volatile() }
 }
 
 fn write(register: u32, value: u32) {
-    // SAFETY: every caller in this file names a register of the core or of an STM32F4. Interrupts are off, and
-    // nobody comes
-    // back to what was set up before.
+    // SAFETY: every caller in this file names a register of the core or of an STM32F4. Interrupts
+    // are off, and nobody comes back to what was set up before.
     unsafe { (register as *mut u32).write_volatile(value) }
 }
 
@@ -39,7 +38,8 @@ fn interrupts_off() {
     unsafe { core::arch::asm!("cpsid i", options(nostack)) };
 }
 
-/// Application interrupt and reset control register (ARMv7-M B3.2.6), and the key that its writes need.
+/// Application interrupt and reset control register (ARMv7-M B3.2.6), and the key that its writes
+/// need.
 const AIRCR: u32 = 0xE000_ED0C;
 const VECTKEY: u32 = 0x05FA_0000;
 
@@ -47,22 +47,22 @@ const VECTKEY: u32 = 0x05FA_0000;
 pub fn system_reset(layout: &Layout, request: BootRequest) -> ! {
     const SYSRESETREQ: u32 = 1 << 2;
     interrupts_off();
-    leave_request(layout, request);
+    put_request(layout, request);
     write(AIRCR, read(AIRCR) & 0x700 | VECTKEY | SYSRESETREQ);
     loop {
         core::hint::spin_loop();
     }
 }
 
-/// Lets the independent watchdog reset the chip: within a millisecond if it is not running yet, else when it runs
-/// out.
+/// Lets the independent watchdog reset the chip: within a millisecond if it is not running yet,
+/// else when it runs out.
 pub fn watchdog_reset(layout: &Layout, request: BootRequest) -> ! {
     // RM0090 section 21.4.
     const KR: u32 = 0x4000_3000;
     const PR: u32 = 0x4000_3004;
     const RLR: u32 = 0x4000_3008;
     interrupts_off();
-    leave_request(layout, request);
+    put_request(layout, request);
     for (register, value) in [(KR, 0xCCCC), (KR, 0x5555), (PR, 0), (RLR, 1)] {
         write(register, value);
     }
@@ -73,14 +73,17 @@ pub fn watchdog_reset(layout: &Layout, request: BootRequest) -> ! {
 
 /// Jumps into the bootloader, which finds the chip as after a reset:
 ///
-/// - interrupts are off, and none is pending; priorities, fault handlers and vector table are those of a reset;
+/// - interrupts are off, and none is pending; priorities, fault handlers and vector table are those
+///   of a reset;
 /// - every peripheral of the buses, DMA among them, has been reset and is without clock;
 /// - the core runs from HSI, without wait states, caches or prefetch;
 /// - FPU and MPU are off; the stack is the bootloader's.
 ///
-/// What only a real reset can do: a running independent watchdog goes on, and the backup domain stays what it is.
+/// What only a real reset can do: a running independent watchdog goes on, and the backup domain
+/// stays what it is.
 ///
-/// Call it in thread mode. In a handler, whose exception would stay active, it is a [`system_reset`].
+/// Call it in thread mode. In a handler, whose exception would stay active, it is a
+/// [`system_reset`].
 pub fn jump(layout: &Layout, request: BootRequest) -> ! {
     let ipsr: u32;
     // SAFETY: reads a register.
@@ -91,11 +94,11 @@ pub fn jump(layout: &Layout, request: BootRequest) -> ! {
     interrupts_off();
     release_peripherals();
     release_core();
-    leave_request(layout, request);
+    put_request(layout, request);
     let table = layout.bootloader.base;
-    // SAFETY: the layout's bootloader begins with its vector table: first stack pointer and Reset. Nothing can
-    // interrupt any more,
-    // and nobody comes back. All operands are in registers when the stack changes.
+    // SAFETY: the layout's bootloader begins with its vector table: first stack pointer and Reset.
+    // Nothing can interrupt any more, and nobody comes back. All operands are in registers when the
+    // stack changes.
     unsafe {
         core::arch::asm!(
             "msr BASEPRI, {zero}",
@@ -122,9 +125,8 @@ fn release_peripherals() {
     const PLLCFGR: u32 = RCC + 0x04;
     const CFGR: u32 = RCC + 0x08;
     const CIR: u32 = RCC + 0x0C;
-    /// AHB1, AHB2, AHB3, APB1, APB2: offset of the reset register, that of the clock register behind it, and what
-    /// that is after a
-    /// reset.
+    /// AHB1, AHB2, AHB3, APB1, APB2: offset of the reset register, that of the clock register
+    /// behind it, and what that is after a reset.
     const BUSES: [(u32, u32, u32); 5] = [
         (0x10, 0x30, reset::RCC_AHB1ENR),
         (0x14, 0x34, 0),

@@ -16,8 +16,8 @@ pub enum VectorFault {
     NotThumb,
 }
 
-/// A vector table that has passed its checks. Only [`VectorTable::check`] makes one, and only one of these can be
-/// jumped to (`VectorTable::jump`).
+/// A vector table that has passed its checks. Only [`VectorTable::check`] makes one, and only one
+/// of these can be jumped to (`VectorTable::jump`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct VectorTable {
     address: u32,
@@ -53,7 +53,8 @@ impl VectorTable {
     /// Whether a word may be the first one of a table: a pointer to the end of a stack in RAM.
     #[must_use]
     pub fn is_stack_pointer(word: u32, layout: &Layout) -> bool {
-        // A full descending stack: the pointer may stand right behind the last byte, and needs room below.
+        // A full descending stack: the pointer may stand right behind the last byte, and needs room
+        // below.
         let on_stack = |ram: &Region| ram.size > 0 && word > ram.base && word <= ram.end();
         word.is_multiple_of(8) && (on_stack(&layout.ram) || on_stack(&layout.chip.ccm))
     }
@@ -76,17 +77,19 @@ impl VectorTable {
         self.reset
     }
 
-    /// Starts the image: FPU off and privileged thread mode on the main stack as after a reset, `VTOR`, `MSP`, branch.
+    /// Starts the image: FPU off and privileged thread mode on the main stack as after a reset,
+    /// `VTOR`, `MSP`, branch.
     ///
     /// # Safety
-    /// No interrupt may be enabled or pending and no bus master active: what they would do next belongs to an image
-    /// that is no more.
+    /// No interrupt may be enabled or pending and no bus master active: what they would do next
+    /// belongs to an image that is no more.
     #[cfg(target_arch = "arm")]
     pub unsafe fn jump(self) -> ! {
         const VTOR: u32 = 0xE000_ED08;
         const CPACR: u32 = 0xE000_ED88;
-        // SAFETY: the addresses are those of ARMv7-M (B3.2.2); the table was checked; the caller vouches for the rest.
-        // Nothing after the write to MSP touches the stack: all operands are in registers.
+        // SAFETY: the addresses are those of ARMv7-M (B3.2.2); the table was checked; the caller
+        // vouches for the rest. Nothing after the write to MSP touches the stack: all operands are
+        // in registers.
         unsafe {
             core::arch::asm!(
                 "str {table}, [{vtor}]",

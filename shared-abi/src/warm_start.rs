@@ -1,9 +1,9 @@
 //! The warm-start cell: what the application asks of the bootloader across a reset.
 //!
-//! The cell is the last RAM cell of the chip ([`Layout::warm_start`](crate::layout::Layout::warm_start)), in no
-//! image's RAM. It survives a
-//! warm reset and holds noise after a power-on; whatever it holds is treated as hostile input, and it
-//! is read once: [`Cell::take`] consumes it.
+//! The cell is the last RAM cell of the chip
+//! ([`Layout::warm_start`](crate::layout::Layout::warm_start)), in no image's RAM. It survives a
+//! warm reset and holds noise after a power-on; whatever it holds is treated as hostile input, and
+//! it is read once: [`Cell::take`] consumes it.
 
 use crate::check_word;
 
@@ -15,7 +15,8 @@ pub const MAGIC: u32 = u32::from_le_bytes(*b"CBW1");
 pub enum BootRequest {
     /// Stay in the bootloader, whatever program is valid (1F51h = 80h, START_BOOTLOADER).
     Stay,
-    /// Start program `n` once although it may carry no signature; the next reset ends in the bootloader.
+    /// Start program `n` once although it may carry no signature; the next reset ends in the
+    /// bootloader.
     Trial(u8),
     /// Start program `n` as the autostart would.
     Start(u8),
@@ -23,8 +24,8 @@ pub enum BootRequest {
     Fault,
     /// Start as after a power-on: what an NMT reset asks for. Whoever asks has not crashed.
     PowerOn,
-    /// Go on with the start of program `n`, which was held back for a rescue window; the bootloader asks this of
-    /// itself.
+    /// Go on with the start of program `n`, which was held back for a rescue window; the bootloader
+    /// asks this of itself.
     Resume(u8),
     /// Stay, and carry out CLEAR of program `n`, which was asked of the application (1F51h = 3).
     Clear(u8),
@@ -70,8 +71,8 @@ impl WarmStart {
         Self { magic: MAGIC, request, argument, check }
     }
 
-    /// The request in it, or `None` for noise, another version, a wrong check word, an unknown request or
-    /// an argument out of its range.
+    /// The request in it, or `None` for noise, another version, a wrong check word, an unknown
+    /// request or an argument out of its range.
     #[must_use]
     pub fn request(&self) -> Option<BootRequest> {
         let program = u8::try_from(self.argument).ok();
@@ -98,8 +99,8 @@ impl Cell {
     /// The cell at `address`.
     ///
     /// # Safety
-    /// `address` must be word-aligned RAM of 16 bytes that nothing else in the program uses: the layout's
-    /// warm-start region, which the linker scripts keep out of every image.
+    /// `address` must be word-aligned RAM of 16 bytes that nothing else in the program uses: the
+    /// layout's warm-start region, which the linker scripts keep out of every image.
     #[must_use]
     pub const unsafe fn at(address: *mut WarmStart) -> Self {
         Self(address)
@@ -113,13 +114,15 @@ impl Cell {
         found.request()
     }
 
-    /// Leaves a request for the bootloader. The write is complete when this returns; reset may follow at once.
+    /// Leaves a request for the bootloader. The write is complete when this returns; reset may
+    /// follow at once.
     pub fn put(&mut self, request: BootRequest) {
         self.write(WarmStart::new(request));
     }
 
     fn write(&mut self, value: WarmStart) {
-        // SAFETY: `at` vouches for the address; volatile, because only another image reads the cell.
+        // SAFETY: `at` vouches for the address; volatile, because only another image reads the
+        // cell.
         unsafe { self.0.write_volatile(value) };
         #[cfg(target_arch = "arm")]
         // SAFETY: `dsb` has no operands; it waits until the store above has reached the RAM.

@@ -1,6 +1,7 @@
 //! Every rule of the layout: a layout that breaks it is refused, with a message that names it.
 //!
-//! `checked` is a `const fn` that the board files call in a constant, so what panics here does not compile there.
+//! `checked` is a `const fn` that the board files call in a constant, so what panics here does not
+//! compile there.
 
 use std::panic::catch_unwind;
 

@@ -221,7 +221,8 @@ def main():
     options = parser.parse_args()
     host, colon, port = options.endpoint.rpartition(":")
     if host == "slcan":
-        # Whatever the bit rate of the bus behind it; the default pause behind the opening is for boards that it resets.
+        # Whatever the bit rate of the bus behind it; the default pause behind the opening is for
+        # boards that it resets.
         bus = {"interface": "slcan", "channel": port, "bitrate": 125_000, "sleep_after_open": 0.1}
     elif colon and port.isdecimal():
         # tcp_tune sets TCP_NODELAY; without it every answer waits for the kernel's delayed ACK.

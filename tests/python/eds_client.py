@@ -81,7 +81,8 @@ def check(sdo, value):
     """Compares one value, and tells in a few words how it is."""
     if value.access_type == "wo":
         expect_abort(lambda: read(sdo, value), READ_OF_WRITE_ONLY, "reading")
-        # A domain takes data of its own form alone; what matters here is that writing as such is allowed.
+        # A domain takes data of its own form alone; what matters here is that writing as such is
+        # allowed.
         code = abort_of(lambda: sdo.download(value.index, value.subindex, b"\0"))
         if code in (WRITE_OF_READ_ONLY, NO_OBJECT, NO_SUB_INDEX):
             raise Differs(f"writing gives {shown(code)}")

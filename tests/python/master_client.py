@@ -42,10 +42,12 @@ UNCONFIGURED = 255
 BOOT_UP, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x05, 0x7F
 # Abort codes (CiA 301, table 22).
 WRITE_ONLY, READ_ONLY, NO_OBJECT, NOT_STORED = 0x0601_0001, 0x0601_0002, 0x0602_0000, 0x0800_0020
-# Emergencies (CiA 301, table 26): wrong data set, device specific; and bit 0 and 7 of the error register.
+# Emergencies (CiA 301, table 26): wrong data set, device specific; and bit 0 and 7 of the error
+# register.
 DATA_SET, DEVICE_SPECIFIC, ERROR_RESET = 0x6300, 0xFF00, 0x0000
 GENERIC, MANUFACTURER = 0x01, 0x80
-# The emergency after boot-up: a bootloader, and why it stayed one (docs/protocol.md: 6 is "no program").
+# The emergency after boot-up: a bootloader, and why it stayed one (docs/protocol.md: 6 is "no
+# program").
 NO_PROGRAM_TO_START = b"BOOT\x06"
 CRC_STATUS = 0x06
 
@@ -119,7 +121,8 @@ def commission(network, node_ids, refused_bit_rate):
     for node_id in node_ids:
         network.subscribe(0x700 + node_id, on_heartbeat)
 
-    # Is anybody there? Three answer the same at once. (python-canopen leaves the answer in its queue.)
+    # Is anybody there? Three answer the same at once. (python-canopen leaves the answer in its
+    # queue.)
     master.send_identify_non_configured_remote_slave()
     expect("identify non-configured", master.responses.get(timeout=2)[0], lss.CS_IDENTIFY_NON_CONFIGURED_SLAVE)
 
@@ -265,7 +268,8 @@ def use(network, path, node_ids, device_name, timeout):
     for number, *_, block in blocks[1:]:
         download_by_blocks(sdo, 0x1F50, 1, block)
         if number == 1:
-            # The device erases behind the first good block: neither it nor anybody else is silent meanwhile.
+            # The device erases behind the first good block: neither it nor anybody else is silent
+            # meanwhile.
             talk(nodes[first], device_name)
             for node_id, node in nodes.items():
                 expect(f"{node_id}: heartbeat", node.nmt.wait_for_heartbeat(timeout=5), "PRE-OPERATIONAL")

@@ -1,5 +1,5 @@
-//! The bench: emulated boards with the built firmware on a bus, one as a rule, and a port for the host, all in virtual
-//! time.
+//! The bench: emulated boards with the built firmware on a bus, one as a rule, and a port for the
+//! host, all in virtual time.
 
 use std::cell::{Cell, RefCell};
 use std::rc::Rc;
@@ -62,8 +62,8 @@ impl Bench {
         Self::of(bootloader, vec![Options::default()])
     }
 
-    /// So many boards whose bootloaders have every option, each with a unique ID and noise of its own. They share bus and
-    /// node-ID until they are told others.
+    /// So many boards whose bootloaders have every option, each with a unique ID and noise of its
+    /// own. They share bus and node-ID until they are told others.
     ///
     /// # Panics
     /// As [`with`](Self::with), and for no board at all.
@@ -213,7 +213,8 @@ impl Bench {
         self.world.send(self.port, Frame::standard(id, data).expect("11 bits, 8 bytes"));
     }
 
-    /// Sends a raw frame from the host and gives the next frame with identifier `answer`, within 100 ms.
+    /// Sends a raw frame from the host and gives the next frame with identifier `answer`, within
+    /// 100 ms.
     ///
     /// # Panics
     /// If the frame is no frame.
@@ -228,8 +229,9 @@ impl Bench {
         }
     }
 
-    /// As in the factory: gives a board alone on the bus (the others have no power) node-ID, 255 for none, and bit rate by
-    /// layer setting services, and stores them. Gives the board's serial number, and leaves it without power.
+    /// As in the factory: gives a board alone on the bus (the others have no power) node-ID, 255
+    /// for none, and bit rate by layer setting services, and stores them. Gives the board's serial
+    /// number, and leaves it without power.
     ///
     /// # Panics
     /// If the board refuses, or does not answer as [`NODE`] at [`BIT_RATE`] as a new one does.
@@ -237,7 +239,8 @@ impl Bench {
         self.world.power_on(board);
         self.await_boot_up(100);
         let serial = self.session().read_number(Address::new(0x1018, 4)).expect("a serial number");
-        // Switch state global: configuration. Configure node-ID, bit timing (of table 0). Store (CiA 305).
+        // Switch state global: configuration. Configure node-ID, bit timing (of table 0). Store
+        // (CiA 305).
         self.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
         for [command, a, b] in [[0x11, node, 0], [0x13, 0, rate as u8], [0x17, 0, 0]] {
             let answer = self.ask(0x7E5, &[command, a, b, 0, 0, 0, 0, 0], 0x7E4);
@@ -247,7 +250,8 @@ impl Bench {
         serial
     }
 
-    /// Lets the endpoint's clients take part, and time go on to `until`; gives the number of frames that they got.
+    /// Lets the endpoint's clients take part, and time go on to `until`; gives the number of frames
+    /// that they got.
     pub fn serve(&mut self, server: &mut Server, until: Time) -> usize {
         let before = server.exchange(&mut self.world, self.port);
         self.world.run_until(until);

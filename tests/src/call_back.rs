@@ -1,4 +1,5 @@
-//! The way back into the bootloader, asked for over the bus, at each bit rate that the board can make.
+//! The way back into the bootloader, asked for over the bus, at each bit rate that the board can
+//! make.
 
 use bsp::can::BitTiming;
 use canopen::program::ProgramControl;
@@ -25,9 +26,9 @@ const RATES: [(BitRate, u32); 8] = [
 /// What has to be between the answer and the departure (SYS TEC manual L-1112d_10, 4.5).
 const PAUSE: Span = Span::from_millis(10);
 
-/// At each bit rate of the board: installs the program, asks it by 1F51h for the bootloader, and looks that the answer is whole
-/// on the bus, and 10 ms more have passed, when the chip is reset. `then` goes on with the board, whose bootloader has
-/// answered.
+/// At each bit rate of the board: installs the program, asks it by 1F51h for the bootloader, and
+/// looks that the answer is whole on the bus, and 10 ms more have passed, when the chip is reset.
+/// `then` goes on with the board, whose bootloader has answered.
 ///
 /// # Panics
 /// When the board does not do that.

@@ -1,7 +1,8 @@
 //! The EDS files (CiA 306-1): what a configuration tool knows of a device before it has met one.
 //!
-//! They are made from the tables that the firmware itself serves, so that they cannot say anything else. Values that every
-//! image of a board shares come from its board file. `cargo xtask eds` writes them to `docs/eds/`.
+//! They are made from the tables that the firmware itself serves, so that they cannot say anything
+//! else. Values that every image of a board shares come from its board file. `cargo xtask eds`
+//! writes them to `docs/eds/`.
 
 use std::fmt::Write;
 
@@ -58,7 +59,8 @@ pub fn bootloader() -> Image {
     }
 }
 
-/// The application template, version 1. What stands here and in its `objects.rs` is compared over the bus by the tests.
+/// The application template, version 1. What stands here and in its `objects.rs` is compared over
+/// the bus by the tests.
 #[must_use]
 pub fn application() -> Image {
     Image {
@@ -220,8 +222,8 @@ impl Image {
         eds.line("PDOMapping", 0);
     }
 
-    /// What a device reads there as long as nobody wrote it: from the table, from the head itself, or from what the device
-    /// says of itself.
+    /// What a device reads there as long as nobody wrote it: from the table, from the head itself,
+    /// or from what the device says of itself.
     fn default(&self, entry: &Entry) -> Option<String> {
         match (entry.default, entry.kind) {
             (DefaultValue::Number(value), _) => return Some(number(entry.data_type, value)),

@@ -1,5 +1,5 @@
-//! The bench for other programs: they reach its bus through the socketcand endpoint, or the board's UART through a terminal, in real
-//! time.
+//! The bench for other programs: they reach its bus through the socketcand endpoint, or the board's
+//! UART through a terminal, in real time.
 
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};

@@ -16,7 +16,8 @@ pub const BOOTLOADER_COMPLETE: &str = "bootloader-complete.elf";
 pub const BOOTLOADER_MINIMAL: &str = "bootloader-minimal.elf";
 /// The standard one with a rescue window of half a second.
 pub const BOOTLOADER_RESCUE: &str = "bootloader-rescue.elf";
-/// The one for masters that know Paulus, and the one for those that know the boot loader of ESAcademy.
+/// The one for masters that know Paulus, and the one for those that know the boot loader of
+/// ESAcademy.
 pub const BOOTLOADER_PAULUS: &str = "bootloader-paulus.elf";
 /// See [`BOOTLOADER_PAULUS`].
 pub const BOOTLOADER_ESACADEMY: &str = "bootloader-esacademy.elf";

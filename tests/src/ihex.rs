@@ -1,4 +1,5 @@
-//! Intel HEX as tools write it, for devices that take it (Intel, "Hexadecimal Object File Format Specification", 1988).
+//! Intel HEX as tools write it, for devices that take it (Intel, "Hexadecimal Object File Format
+//! Specification", 1988).
 
 use std::fmt::Write;
 
@@ -20,7 +21,8 @@ pub fn record(offset: u16, kind: u8, data: &[u8]) -> String {
 /// The last record.
 pub const END_OF_FILE: &str = ":00000001FF";
 
-/// Bytes from this address on, in records of 16, with a linear base record where the upper half of the address changes.
+/// Bytes from this address on, in records of 16, with a linear base record where the upper half of
+/// the address changes.
 #[must_use]
 pub fn intel_hex(base: u32, bytes: &[u8]) -> String {
     let mut text = String::new();
@@ -39,7 +41,8 @@ pub fn intel_hex(base: u32, bytes: &[u8]) -> String {
 mod tests {
     use super::*;
 
-    /// The best-known example (Wikipedia "Intel HEX", after the specification), and a base record summed by hand.
+    /// The best-known example (Wikipedia "Intel HEX", after the specification), and a base record
+    /// summed by hand.
     #[test]
     fn records_are_those_of_the_specification() {
         let data = [0x21, 0x46, 0x01, 0x36, 1, 0x21, 0x47, 1, 0x36, 0, 0x7E, 0xFE, 9, 0xD2, 0x19, 1];

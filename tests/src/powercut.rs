@@ -1,4 +1,5 @@
-//! Proof by power cut: the same update, the power cut at every flash operation, and once more in the recovery.
+//! Proof by power cut: the same update, the power cut at every flash operation, and once more in
+//! the recovery.
 //!
 //! | module | what it does |
 //! |---|---|

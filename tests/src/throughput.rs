@@ -17,10 +17,11 @@ use crate::firmware;
 
 const DATA: Address = Address::new(0x1F50, 1);
 const STATUS: Address = Address::new(0x1F57, 1);
-/// Bytes of a block, framing included: large enough that the wire hardly notices the framing, small enough that the last one is
-/// programmed in no time.
+/// Bytes of a block, framing included: large enough that the wire hardly notices the framing, small
+/// enough that the last one is programmed in no time.
 const BLOCK_SIZE: usize = 4096;
-/// Typical erase times of the STM32F405/407 by words, in ms (datasheet DocID022152, flash memory programming).
+/// Typical erase times of the STM32F405/407 by words, in ms (datasheet DocID022152, flash memory
+/// programming).
 const ERASE_MS: [(u32, u64); 3] = [(16 * 1024, 250), (64 * 1024, 550), (128 * 1024, 1000)];
 /// Typical time to program a word, in us (the same table).
 const PROGRAM_US: u64 = 16;
@@ -34,8 +35,8 @@ pub struct Measurement {
     pub kib: u32,
     /// From the CLEAR command to the status that says "verified".
     pub took: u64,
-    /// What one SDO block transfer of these bytes takes on the wire, without a pause: stuff bits, acknowledgements and
-    /// intermissions included.
+    /// What one SDO block transfer of these bytes takes on the wire, without a pause: stuff bits,
+    /// acknowledgements and intermissions included.
     pub wire: u64,
     /// What erasing the sectors and programming the words take.
     pub flash: u64,
@@ -118,8 +119,9 @@ impl Load {
     }
 }
 
-/// Has the procedure of `coflash flash`, as it is without any option but `--no-start`, bring a program of this size into a board in
-/// virtual time. So what the bus is idle is the procedure's and the device's doing, not the computer's.
+/// Has the procedure of `coflash flash`, as it is without any option but `--no-start`, bring a
+/// program of this size into a board in virtual time. So what the bus is idle is the procedure's
+/// and the device's doing, not the computer's.
 ///
 /// # Panics
 /// If the device refuses it, or the firmware was not built.

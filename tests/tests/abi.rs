@@ -16,7 +16,8 @@ use shared_abi::warm_start::{BootRequest, WarmStart};
 /// The bytes that a structure has in RAM. (The host is little-endian, as the chip is.)
 fn bytes<T: Copy>(value: &T) -> Vec<u8> {
     const { assert!(cfg!(target_endian = "little")) };
-    // SAFETY: `T` is one of the ABI's `repr(C)` structures without padding (the sizes are checked in these tests).
+    // SAFETY: `T` is one of the ABI's `repr(C)` structures without padding (the sizes are checked
+    // in these tests).
     unsafe { std::slice::from_raw_parts(std::ptr::from_ref(value).cast(), size_of::<T>()) }.to_vec()
 }
 
@@ -186,7 +187,8 @@ fn every_symbol_lies_in_its_own_flash_or_in_the_images_ram() {
         let file = ElfFile32::<Endianness>::parse(&*elf).unwrap();
         let mut count = 0;
         for symbol in file.symbols() {
-            // Numbers (absolute symbols) and names of sections that are not loaded have no place in memory.
+            // Numbers (absolute symbols) and names of sections that are not loaded have no place in
+            // memory.
             let SymbolSection::Section(section) = symbol.section() else { continue };
             let SectionFlags::Elf { sh_flags } = file.section_by_index(section).unwrap().flags() else {
                 continue;
@@ -230,7 +232,8 @@ fn the_callgate_is_where_the_layout_says() {
     assert!(entry & 1 == 1 && callgate.contains(entry & !1, 2), "{entry:#x} leaves the callgate");
 }
 
-/// The F4 stalls the core on every access to busy flash: what runs in bootloader mode must not be there.
+/// The F4 stalls the core on every access to busy flash: what runs in bootloader mode must not be
+/// there.
 #[test]
 fn the_bootloader_runs_from_ram() {
     let layout: &Layout = firmware::board();

@@ -1,5 +1,5 @@
-//! More than one device on the bus, and more on the bus than the device's own frames. All in virtual time; frames are
-//! written by hand from CiA 301 and CiA 305.
+//! More than one device on the bus, and more on the bus than the device's own frames. All in
+//! virtual time; frames are written by hand from CiA 301 and CiA 305.
 
 use std::collections::BTreeSet;
 
@@ -49,7 +49,8 @@ fn install(session: &mut Session<'_>, image: &str) {
     report.unwrap();
 }
 
-/// Three boards; two have node-IDs, the third has none until the master gives it one, picked by its identity.
+/// Three boards; two have node-IDs, the third has none until the master gives it one, picked by its
+/// identity.
 #[test]
 fn three_devices_are_updated_one_after_the_other_and_one_of_them_had_no_node_id() {
     let mut bench = Bench::of_boards(3);
@@ -147,7 +148,8 @@ fn foreign(n: usize) -> Frame {
     frame.expect("an identifier and its data")
 }
 
-/// What went over the device's SDO channel, apart from the looks at 1F57h, of which there are as many as there is time.
+/// What went over the device's SDO channel, apart from the looks at 1F57h, of which there are as
+/// many as there is time.
 fn sdo_trace(records: &[Record], from: Time) -> Vec<(u32, Vec<u8>)> {
     let of_channel = |record: &&Record| {
         let id = record.frame.raw_id();
@@ -161,8 +163,8 @@ fn sdo_trace(records: &[Record], from: Time) -> Vec<(u32, Vec<u8>)> {
         .collect()
 }
 
-/// A whole update at 1 Mbit/s, while others leave no gap between two frames: exactly the same frames go over the SDO
-/// channel as on a quiet bus.
+/// A whole update at 1 Mbit/s, while others leave no gap between two frames: exactly the same
+/// frames go over the SDO channel as on a quiet bus.
 #[test]
 fn a_bus_full_of_foreign_frames_costs_no_sdo_frame() {
     let mut quiet = fast_board();
@@ -202,8 +204,8 @@ fn a_bus_full_of_foreign_frames_costs_no_sdo_frame() {
     bench.assert_nothing_unmodelled();
 }
 
-/// How often the device was interrupted for a frame received: CAN1_RX0 is interrupt 20 (RM0090 table 62), and thus
-/// exception 36.
+/// How often the device was interrupted for a frame received: CAN1_RX0 is interrupt 20 (RM0090
+/// table 62), and thus exception 36.
 fn receive_interrupts(bench: &mut Bench) -> u64 {
     bench.machine().counters().exceptions[16 + 20]
 }
@@ -223,12 +225,14 @@ fn a_burst_of_127_segments_back_to_back_at_1_mbit_is_taken_without_loss() {
     bench.session().write(DATA, &block(0, 0, &[0; 8]), Doing::Block(0), &mut |_| {}).unwrap();
     bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
 
-    // Two sub-blocks of 127 segments; the bits of the data change so often that no stuff bit makes the frames longer.
+    // Two sub-blocks of 127 segments; the bits of the data change so often that no stuff bit makes
+    // the frames longer.
     let data: Vec<u8> =
         (0..2 * 127 * 7 - 16).map(|n| if n % 64 == 0 { (n / 64) as u8 } else { 0x55 }).collect();
     let block = block(1, firmware::board().programs[0].base, &data);
     assert_eq!(block.len(), 1778);
-    // The first burst meets the device's own heartbeat, which finds no room on the bus: that keeps nobody waiting.
+    // The first burst meets the device's own heartbeat, which finds no room on the bus: that keeps
+    // nobody waiting.
     let from = bench.time();
     while heartbeats(&bench, from).is_empty() {
         bench.run_ms(1);
@@ -272,7 +276,8 @@ fn a_burst_of_127_segments_back_to_back_at_1_mbit_is_taken_without_loss() {
     let ended = bench.ask(REQUEST, &[0xC1, low, high, 0, 0, 0, 0, 0], RESPONSE);
     assert_eq!(ended.as_deref(), Some(&[0xA1, 0, 0, 0, 0, 0, 0, 0][..]));
     assert_eq!(bench.session().await_idle(1, Doing::Read(STATUS)).unwrap().to_word(), 0);
-    // The status is free as soon as there is room for the next block; the flash has yet to erase and to program.
+    // The status is free as soon as there is room for the next block; the flash has yet to erase
+    // and to program.
     bench.run_ms(2000);
     assert!(bench.machine().flash()[0x1_0000..].starts_with(&data));
     assert_eq!(lost_frames(&bench, from), 0);
@@ -284,7 +289,8 @@ fn heartbeats(bench: &Bench, from: Time) -> Vec<Time> {
     beats.map(|(at, ..)| at).collect()
 }
 
-/// CRC of a block transfer: polynomial 1021h, start 0 (CiA 301 section 7.2.4.3.16). "123456789" gives 31C3h there.
+/// CRC of a block transfer: polynomial 1021h, start 0 (CiA 301 section 7.2.4.3.16). "123456789"
+/// gives 31C3h there.
 fn crc16(bytes: &[u8]) -> u16 {
     bytes.iter().fold(0, |crc, byte| {
         (0..8).fold(

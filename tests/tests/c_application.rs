@@ -1,4 +1,5 @@
-//! An application in C: what a program that knows coboot by its generated header alone gets from it, and what it cannot break.
+//! An application in C: what a program that knows coboot by its generated header alone gets from
+//! it, and what it cannot break.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -77,7 +78,8 @@ fn number(bench: &mut Bench, at: Address) -> u32 {
     bench.session().read_number(at).unwrap()
 }
 
-/// Writes a word. A call that erases a sector of the journal may take longer than a host usually waits.
+/// Writes a word. A call that erases a sector of the journal may take longer than a host usually
+/// waits.
 fn put(bench: &mut Bench, at: Address, value: u32) {
     let timing = Timing { sdo: Duration::from_secs(3), ..Timing::default() };
     let mut session = Session::new(bench, NodeId::new(NODE).unwrap(), timing);
@@ -114,7 +116,8 @@ fn call_with(bench: &mut Bench, selector: u32, pointer: u32, words: [u32; 5]) ->
     }
     put(bench, probe::CALL, 0);
     let stack = number(bench, probe::STACK);
-    // The way in alone puts something on it; more than it may would be RAM that is not the callgate's.
+    // The way in alone puts something on it; more than it may would be RAM that is not the
+    // callgate's.
     assert!((8..=callgate::STACK).contains(&stack), "selector {selector} took {stack} bytes of stack");
     Called {
         status: number(bench, probe::CALL) as i32,
@@ -222,8 +225,8 @@ fn it_can_be_called_back_at_every_bit_rate() {
     });
 }
 
-/// The pages of RAM that the callgate has accessed since the last time: those of its part of the stack, and of the structure that was
-/// handed over.
+/// The pages of RAM that the callgate has accessed since the last time: those of its part of the
+/// stack, and of the structure that was handed over.
 fn assert_stack_alone(bench: &mut Bench, good: u32, selector: u32) {
     let sp = number(bench, probe::SP);
     let pages = |region: Region| region.base / PAGE..=(region.end() - 1) / PAGE;
@@ -238,8 +241,8 @@ fn assert_stack_alone(bench: &mut Bench, good: u32, selector: u32) {
     }
 }
 
-/// Each service does what it says, with two kinds of garbage in all RAM that the application does not use, and with an eye on
-/// each page of RAM.
+/// Each service does what it says, with two kinds of garbage in all RAM that the application does
+/// not use, and with an eye on each page of RAM.
 #[test]
 fn every_service_works_on_the_stack_alone() {
     let (mut bench, report) = running_board();
@@ -457,8 +460,9 @@ fn a_node_id_that_it_stores_is_in_force_from_the_next_reset_on() {
     assert!(bench.is_bootloader(42));
 }
 
-/// The flash takes nothing any more, as when somebody has protected the parameters' sectors by the option bytes: whoever stores is
-/// told so, everything else goes on, and so does storing once they can be written again.
+/// The flash takes nothing any more, as when somebody has protected the parameters' sectors by the
+/// option bytes: whoever stores is told so, everything else goes on, and so does storing once they
+/// can be written again.
 #[test]
 fn a_flash_that_refuses_is_told_and_harms_nothing() {
     let (mut bench, report) = running_board();
@@ -470,7 +474,8 @@ fn a_flash_that_refuses_is_told_and_harms_nothing() {
     for sector in &sectors {
         bench.machine().protect_sector(*sector, true);
     }
-    // Twice: a refusal leaves the flash controller as it was, or the next call would be told that it is busy.
+    // Twice: a refusal leaves the flash controller as it was, or the next call would be told that
+    // it is busy.
     for _ in 0..2 {
         for (selector, words) in [(STORE_NODE, [9, 250_000, 3, 4, 5]), (INVALIDATE, [1, 2, 3, 4, 5])] {
             let called = call(&mut bench, selector, words);
@@ -520,8 +525,8 @@ fn a_trial_confirms_itself_and_takes_it_back() {
     assert!(bench.is_bootloader(NODE), "it has taken that back");
 }
 
-/// Two programs: each knows of the other; one that is not there is told as such; one that was linked for the place of the other is
-/// refused in words.
+/// Two programs: each knows of the other; one that is not there is told as such; one that was
+/// linked for the place of the other is refused in words.
 #[test]
 fn the_other_program_and_a_program_for_the_other_place() {
     let layout = &stm32f407g_disc1_two::LAYOUT;
@@ -548,7 +553,8 @@ fn the_other_program_and_a_program_for_the_other_place() {
     assert_eq!(number(&mut bench, Address::new(0x1F57, 1)), 0x0C, "ADDRESS: {refused}");
     println!("{refused}");
 
-    // A host that moves it to the first place makes blocks that fit, of a program that does not: its vectors point to the second.
+    // A host that moves it to the first place makes blocks that fit, of a program that does not:
+    // its vectors point to the second.
     let moved = layout.programs[0].base.wrapping_sub(layout.programs[1].base);
     let options = Options { region: strict(1), adjust_start: moved, ..Options::default() };
     let blocks = blocks_of(elf(firmware::APP_C_PROGRAM_2), &options).unwrap().file;

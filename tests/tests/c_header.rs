@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, fs};
 
-/// A program that prints what the header's functions make, as bytes, and a verdict on records that come in as bytes.
+/// A program that prints what the header's functions make, as bytes, and a verdict on records that
+/// come in as bytes.
 const PROGRAM: &str = r#"
 #include <stdio.h>
 #include <string.h>
@@ -84,7 +85,8 @@ fn scratch(name: &str) -> PathBuf {
     Path::new(env!("CARGO_TARGET_TMPDIR")).join(name)
 }
 
-/// The bytes are those of tests/abi.rs, whose check words come from an implementation in a third language.
+/// The bytes are those of tests/abi.rs, whose check words come from an implementation in a third
+/// language.
 #[test]
 fn c_makes_the_same_bytes_and_comes_to_the_same_verdicts() {
     let (source, program) = (scratch("header.c"), scratch("header"));
@@ -108,7 +110,8 @@ fn c_makes_the_same_bytes_and_comes_to_the_same_verdicts() {
     assert_eq!(printed, expected);
 }
 
-/// Both float ABIs of the chip, as C and as freestanding as it gets: the assertions on sizes and offsets hold there, too.
+/// Both float ABIs of the chip, as C and as freestanding as it gets: the assertions on sizes and
+/// offsets hold there, too.
 #[test]
 fn it_compiles_for_the_chip() {
     let source = scratch("chip.c");

@@ -1,5 +1,5 @@
-//! Programs that we did not write, unmodified, and our own command line as a person runs it: against the emulated device
-//! through the socketcand endpoint.
+//! Programs that we did not write, unmodified, and our own command line as a person runs it:
+//! against the emulated device through the socketcand endpoint.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -64,7 +64,8 @@ fn python_canopen_identifies_flashes_and_starts_the_device() {
     endpoint.bench.assert_nothing_unmodelled();
 }
 
-/// A master with nothing of ours: a raw image in segments into an empty device, and in blocks into one that runs.
+/// A master with nothing of ours: a raw image in segments into an empty device, and in blocks into
+/// one that runs.
 #[test]
 fn python_canopen_updates_the_device_by_raw_images() {
     let mut endpoint = endpoint();

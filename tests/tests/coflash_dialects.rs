@@ -1,5 +1,5 @@
-//! `coflash` finds out what the firmware speaks, and updates it so: images and Intel HEX into the standard bootloader, the profiles of
-//! ESAcademy and lifts.
+//! `coflash` finds out what the firmware speaks, and updates it so: images and Intel HEX into the
+//! standard bootloader, the profiles of ESAcademy and lifts.
 
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};

@@ -1,5 +1,5 @@
-//! The debugger interface, 1025h, of the real images: memory through the bus in bootloader and application, and breakpoints while the
-//! bus goes on.
+//! The debugger interface, 1025h, of the real images: memory through the bus in bootloader and
+//! application, and breakpoints while the bus goes on.
 
 use std::process::Command;
 use std::time::Duration;
@@ -116,7 +116,8 @@ fn emergencies(bench: &Bench, from: Time) -> Vec<Vec<u8>> {
         .collect()
 }
 
-/// 6200h, no error in the error register, the type, the address (the document's table of the five bytes).
+/// 6200h, no error in the error register, the type, the address (the document's table of the five
+/// bytes).
 fn stop_of_type(kind: u8, address: u32) -> Vec<u8> {
     [&[0x00, 0x62, 0x00, kind], &address.to_le_bytes()[..]].concat()
 }
@@ -145,7 +146,8 @@ fn await_stop(bench: &mut Bench, from: Time) -> Vec<u8> {
 fn the_bootloader_reads_and_writes_what_there_is() {
     let mut bench = bootloader();
     let board = firmware::board();
-    // Flash, over several pieces, and from an odd address; the unique identifier; RAM at the end of the images' part.
+    // Flash, over several pieces, and from an odd address; the unique identifier; RAM at the end of
+    // the images' part.
     for (address, len) in [
         (board.bootloader.base, 700),
         (board.bootloader.base + 0x201, 5),
@@ -155,7 +157,8 @@ fn the_bootloader_reads_and_writes_what_there_is() {
         let expected = seen(&mut bench, address, len);
         assert_eq!(read(&mut bench, address, len as u16), expected, "{address:08X}");
     }
-    // The handoff is nobody's while the bootloader runs. An odd address, an odd length, both its neighbours left alone.
+    // The handoff is nobody's while the bootloader runs. An odd address, an odd length, both its
+    // neighbours left alone.
     let at = board.handoff.base + 1;
     let mut expected = seen(&mut bench, at - 1, 16);
     expected[1..14].copy_from_slice(b"thirteen long");
@@ -169,7 +172,8 @@ fn the_bootloader_reads_and_writes_what_there_is() {
     assert_eq!(bench.events(), [], "no reset");
 }
 
-/// Nothing there, or not to be written: the bootloader, the parameters, a program, and the registers by which they could be erased.
+/// Nothing there, or not to be written: the bootloader, the parameters, a program, and the
+/// registers by which they could be erased.
 #[test]
 fn what_must_not_be_touched_is_refused_and_faults_nothing() {
     let board = firmware::board();
@@ -213,7 +217,8 @@ fn what_must_not_be_touched_is_refused_and_faults_nothing() {
     }
 }
 
-/// 08000021h, local control: the CPU would stand still until the sector is erased, or the memory has no clock.
+/// 08000021h, local control: the CPU would stand still until the sector is erased, or the memory
+/// has no clock.
 #[test]
 fn memory_that_does_not_answer_now_is_refused_now() {
     let mut bench = bootloader();
@@ -409,7 +414,8 @@ fn registers_are_read_and_changed_and_steps_are_steps() {
         }
     }
     assert!(steps >= 4, "{steps}");
-    // Now back to the beginning of the function: the program goes on from there, and counts once more.
+    // Now back to the beginning of the function: the program goes on from there, and counts once
+    // more.
     let before = read_word(&mut bench, calls);
     let frame = {
         let saved = read_word(&mut bench, DCRDR);
@@ -446,8 +452,8 @@ fn a_program_is_stopped_on_request_and_goes_on() {
     assert_eq!(bench.events(), [], "no reset");
 }
 
-/// `idle` sleeps, and what interrupts it has long been due when it goes on: the instruction with the breakpoint is carried out first
-/// nevertheless, and the next one comes next.
+/// `idle` sleeps, and what interrupts it has long been due when it goes on: the instruction with
+/// the breakpoint is carried out first nevertheless, and the next one comes next.
 #[test]
 fn a_step_over_a_breakpoint_is_not_lost_to_an_interrupt() {
     let mut bench = application();
@@ -479,7 +485,8 @@ fn a_step_over_a_breakpoint_is_not_lost_to_an_interrupt() {
     bench.assert_nothing_unmodelled();
 }
 
-/// The interrupt that serves the bus cannot be stopped: breakpoints are off then, it is told, and everything goes on.
+/// The interrupt that serves the bus cannot be stopped: breakpoints are off then, it is told, and
+/// everything goes on.
 #[test]
 fn a_breakpoint_out_of_reach_harms_nothing() {
     let mut bench = application();
@@ -501,7 +508,8 @@ fn a_breakpoint_out_of_reach_harms_nothing() {
     assert_eq!(bench.events(), [], "no reset");
 }
 
-/// A fault that is none of the debugger's restarts the device, as it does without it: here the program is sent where no code is.
+/// A fault that is none of the debugger's restarts the device, as it does without it: here the
+/// program is sent where no code is.
 #[test]
 fn a_fault_restarts_the_device_as_ever() {
     let mut bench = application();
@@ -524,8 +532,8 @@ fn a_fault_restarts_the_device_as_ever() {
     assert!(read_word(&mut bench, calls) >= 2);
 }
 
-/// A stopped program is reset, goes back to the bootloader, and neither start stumbles over the breakpoint, which the core keeps over
-/// a reset.
+/// A stopped program is reset, goes back to the bootloader, and neither start stumbles over the
+/// breakpoint, which the core keeps over a reset.
 #[test]
 fn a_stopped_program_can_be_reset_and_called_back() {
     let mut bench = application();
@@ -550,7 +558,8 @@ fn a_stopped_program_can_be_reset_and_called_back() {
     assert_eq!(bench.events().len(), 2, "to the bootloader, and back");
 }
 
-// --- coflash ---------------------------------------------------------------------------------------------------------
+// --- coflash
+// ---------------------------------------------------------------------------------------------------------
 
 /// The library: what `coflash debug` does, in virtual time.
 #[test]

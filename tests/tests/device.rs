@@ -145,14 +145,16 @@ fn a_transfer_that_breaks_off_does_not_block_the_next_one() {
     let mut bench = empty_board();
     bench.session().command(1, ProgramControl::Clear).unwrap();
     bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
-    // Initiate a segmented download of 24 bytes (21h, size indicated), send one segment, fall silent.
+    // Initiate a segmented download of 24 bytes (21h, size indicated), send one segment, fall
+    // silent.
     let initiated = bench.ask(REQUEST, &[0x21, 0x50, 0x1F, 0x01, 24, 0, 0, 0], RESPONSE);
     assert_eq!(initiated.as_deref(), Some(&[0x60, 0x50, 0x1F, 0x01, 0, 0, 0, 0][..]));
     let segment = bench.ask(REQUEST, &[0x00, 0, 0, 0, 0, 0, 0, 0], RESPONSE);
     assert_eq!(segment.as_deref(), Some(&[0x20, 0, 0, 0, 0, 0, 0, 0][..]));
     // Somebody else begins at once, and is served.
     assert_eq!(send(&mut bench, &block(0, 0, &[0; 8])), (None, 0));
-    // Once more, and this time the server's time-out frees the transfer: abort 05040000h for 1F50h/1.
+    // Once more, and this time the server's time-out frees the transfer: abort 05040000h for
+    // 1F50h/1.
     bench.ask(REQUEST, &[0x21, 0x50, 0x1F, 0x01, 24, 0, 0, 0], RESPONSE);
     let from = bench.time();
     bench.run_ms(5000);
@@ -162,8 +164,8 @@ fn a_transfer_that_breaks_off_does_not_block_the_next_one() {
     assert_eq!(send(&mut bench, &block(1, program_start(), &[7; 64])), (None, 0));
 }
 
-/// The power goes at eleven points of an update: before anything is lost, during the erase, between blocks, in the
-/// middle of one.
+/// The power goes at eleven points of an update: before anything is lost, during the erase, between
+/// blocks, in the middle of one.
 #[test]
 fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
     let mut untouched = 0;
@@ -171,7 +173,8 @@ fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
         let mut bench = running_board();
         call_back(&mut bench);
         let file = firmware::blocks(firmware::APP_V2);
-        // The host pulls the plug by its own clock: the update is given up at that time, then the power goes.
+        // The host pulls the plug by its own clock: the update is given up at that time, then the
+        // power goes.
         let deadline = bench.time() + Span::from_millis(after_ms);
         let clock = bench.clock();
         let flag = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
@@ -228,7 +231,8 @@ fn a_trial_run_comes_back_to_the_bootloader_and_an_unsigned_program_does_not_sta
     assert!(running(&mut bench).is_bootloader(), "and not again");
 }
 
-/// The promise of 1F51h = 80h: the answer is on the bus, then at least 10 ms pass, then the device resets.
+/// The promise of 1F51h = 80h: the answer is on the bus, then at least 10 ms pass, then the device
+/// resets.
 #[test]
 fn the_answer_to_the_call_back_is_on_the_bus_well_before_the_reset() {
     let mut bench = running_board();
@@ -247,7 +251,8 @@ fn the_answer_to_the_call_back_is_on_the_bus_well_before_the_reset() {
     assert!(boot_up.0 > reset);
 }
 
-/// Asks for 1F57h every 7 ms until it is not busy any more; gives the longest that an answer took, and how many said busy.
+/// Asks for 1F57h every 7 ms until it is not busy any more; gives the longest that an answer took,
+/// and how many said busy.
 fn slowest_answer(bench: &mut Bench) -> (Span, u32) {
     let mut slowest = Span(0);
     let mut busy = 0;
@@ -264,7 +269,8 @@ fn slowest_answer(bench: &mut Bench) -> (Span, u32) {
     (slowest, busy)
 }
 
-/// While all of the program's flash is being erased: each SDO is answered within 5 ms, and the heartbeat keeps its period within 10 %.
+/// While all of the program's flash is being erased: each SDO is answered within 5 ms, and the
+/// heartbeat keeps its period within 10 %.
 #[test]
 fn never_silent_during_an_erase() {
     let mut bench = running_board();
@@ -332,7 +338,8 @@ fn nmt_resets_restart_the_device_or_the_communication() {
     assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0");
 }
 
-/// Whatever the RAM holds at power-on (the warm-start cell and the handoff among it), it asks for nothing.
+/// Whatever the RAM holds at power-on (the warm-start cell and the handoff among it), it asks for
+/// nothing.
 #[test]
 fn noise_in_the_ram_is_no_request() {
     let mut installed = running_board();
@@ -347,7 +354,8 @@ fn noise_in_the_ram_is_no_request() {
     }
 }
 
-/// The callgate runs without the bootloader's RAM: all that the application does not use is garbage when it calls.
+/// The callgate runs without the bootloader's RAM: all that the application does not use is garbage
+/// when it calls.
 #[test]
 fn the_callgate_needs_nothing_of_the_bootloaders_ram() {
     let mut bench = running_board();
@@ -371,15 +379,17 @@ fn the_callgate_needs_nothing_of_the_bootloaders_ram() {
     assert_eq!(crc, firmware::blocks(firmware::APP_V1).program_crc());
 }
 
-/// The proof of the test above: with eight bytes of code left in flash it fails. The CAN interrupt goes by way of a jump
-/// there, as it would if its handler had not been copied to RAM.
+/// The proof of the test above: with eight bytes of code left in flash it fails. The CAN interrupt
+/// goes by way of a jump there, as it would if its handler had not been copied to RAM.
 #[test]
 fn code_left_in_flash_would_not_answer_in_time() {
     let mut bench = running_board();
     call_back(&mut bench);
-    // Behind the bootloader's image, in its own flash. ARMv7-M A7.7.44: ldr.w pc, [pc, #0], and the address behind it.
+    // Behind the bootloader's image, in its own flash. ARMv7-M A7.7.44: ldr.w pc, [pc, #0], and the
+    // address behind it.
     let stub_address = firmware::board().bootloader.end() - 0x100;
-    // CAN1_TX is interrupt 19 (RM0090 table 61); the table of vectors lies at the beginning of the RAM.
+    // CAN1_TX is interrupt 19 (RM0090 table 61); the table of vectors lies at the beginning of the
+    // RAM.
     let vector = firmware::board().ram.base + (16 + 19) * 4;
     let mut handler = [0; 4];
     bench.machine().read_memory(vector, &mut handler).unwrap();

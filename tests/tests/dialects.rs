@@ -1,4 +1,5 @@
-//! The dialects of 1F50h and 1F51h (docs/dialects.md): scripted sessions with the frames of their documents.
+//! The dialects of 1F50h and 1F51h (docs/dialects.md): scripted sessions with the frames of their
+//! documents.
 
 use canopen::program::ProgramControl;
 use canopen::{AbortCode, Address};
@@ -17,6 +18,13 @@ fn bench(bootloader: &str) -> Bench {
     bench.power_on();
     bench.run_ms(50);
     bench
+}
+
+#[test]
+fn a_master_that_knows_cia_302_alone() {
+    let mut bench = bench(firmware::BOOTLOADER);
+    script::play(&mut bench, "cia302.candump");
+    bench.assert_nothing_unmodelled();
 }
 
 #[test]
@@ -65,7 +73,8 @@ fn write(bench: &mut Bench, node: u8, sub: u8, data: &[u8]) {
     assert_eq!(status.to_word(), 0);
 }
 
-/// CiA 814-1 clause 6.3, and what comes after: the update, the backup of what was stored, and the way back to the own node-ID.
+/// CiA 814-1 clause 6.3, and what comes after: the update, the backup of what was stored, and the
+/// way back to the own node-ID.
 #[test]
 fn a_lift_tool() {
     let Some(mut bench) = lift() else { return };
@@ -94,7 +103,8 @@ fn a_lift_tool() {
     bench.assert_nothing_unmodelled();
 }
 
-/// A program of another vendor, for another product, or without a label: 08000020h, and the old one stays.
+/// A program of another vendor, for another product, or without a label: 08000020h, and the old one
+/// stays.
 #[test]
 fn a_lift_takes_what_is_for_it_alone() {
     let Some(mut bench) = lift() else { return };
@@ -133,12 +143,13 @@ fn a_lift_takes_what_is_for_it_alone() {
     }
 }
 
-/// The tool asks node 126 for 1000h every 125 ms, on a bus where nobody else is: the device finds the bit rate by that and answers
-/// within 10 s.
+/// The tool asks node 126 for 1000h every 125 ms, on a bus where nobody else is: the device finds
+/// the bit rate by that and answers within 10 s.
 #[test]
 fn a_lift_device_alone_with_the_tool_finds_the_bit_rate() {
     let Some(mut bench) = lift() else { return };
-    // By layer setting services of the application (CiA 305): configuration state, bit timing 9 of table 0 (found out), store.
+    // By layer setting services of the application (CiA 305): configuration state, bit timing 9 of
+    // table 0 (found out), store.
     for (request, answer) in [
         (&[0x04, 0x01, 0, 0, 0, 0, 0, 0], None),
         (&[0x13, 0x00, 0x09, 0, 0, 0, 0, 0], Some(&[0x13, 0, 0, 0, 0, 0, 0, 0][..])),

@@ -1,4 +1,5 @@
-//! The EDS files against a checker, an importer and a client that we did not write, and against the device.
+//! The EDS files against a checker, an importer and a client that we did not write, and against the
+//! device.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

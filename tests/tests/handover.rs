@@ -13,7 +13,7 @@ use coflash::read::{read, Format};
 use coflash::session::Doing;
 
 /// The application template's way back (object 2000h), and that of the three which is a jump.
-const WAY_BACK: Address = Address::new(0x2000, 0);
+const REENTRY_PATH: Address = Address::new(0x2000, 0);
 const JUMP: u8 = 2;
 
 /// A jump to itself, in Thumb.
@@ -30,12 +30,12 @@ const SYST_CSR: u32 = 0xE000_E010;
 const NVIC_ISER: u32 = 0xE000_E100;
 const VTOR: u32 = 0xE000_ED08;
 
-/// What a reset does not set, or sets to what the way to it was: the flags of the reset's cause (RCC_CSR), and reload and current
-/// value of SysTick (ARMv7-M B3.3: unknown).
+/// What a reset does not set, or sets to what the way to it was: the flags of the reset's cause
+/// (RCC_CSR), and reload and current value of SysTick (ARMv7-M B3.3: unknown).
 const LEFT_OUT: [u32; 3] = [RCC + 0x74, 0xE000_E014, 0xE000_E018];
 
-/// All registers that the emulator models, of peripherals and core, with or without clock. Not what tells time: the cycle counter
-/// lies outside.
+/// All registers that the emulator models, of peripherals and core, with or without clock. Not what
+/// tells time: the cycle counter lies outside.
 fn registers(bench: &mut Bench) -> BTreeMap<u32, u32> {
     let addresses = (0x4000_0000..0x4008_0000).chain(0xE000_E000..0xE000_F000).step_by(4);
     addresses
@@ -80,11 +80,12 @@ fn after_a_reset(bench: &mut Bench) -> BTreeMap<u32, u32> {
     registers(bench)
 }
 
-/// An application that jumps leaves everything as a reset does: clocks, pins, peripherals, interrupts.
+/// An application that jumps leaves everything as a reset does: clocks, pins, peripherals,
+/// interrupts.
 #[test]
 fn the_bootloader_finds_the_chip_as_after_a_reset() {
     let mut bench = running_board();
-    bench.session().write(WAY_BACK, &[JUMP], Doing::Write(WAY_BACK), &mut |_| {}).unwrap();
+    bench.session().write(REENTRY_PATH, &[JUMP], Doing::Write(REENTRY_PATH), &mut |_| {}).unwrap();
     let running = registers(&mut bench);
     let first = stop_at_reset_of(&mut bench, firmware::board().bootloader.base);
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
@@ -93,7 +94,8 @@ fn the_bootloader_finds_the_chip_as_after_a_reset() {
     assert_eq!(bench.machine().pc(), first);
     let found = registers(&mut bench);
     let reset = after_a_reset(&mut bench);
-    // There was something to put back: the clocks, the controller, a pin, the interrupts, the timer, the caches.
+    // There was something to put back: the clocks, the controller, a pin, the interrupts, the
+    // timer, the caches.
     for register in [RCC, AHB1ENR, APB1ENR, FLASH_ACR, CAN_MCR, SYST_CSR, NVIC_ISER, VTOR] {
         assert_ne!(running[&register], reset[&register], "{register:08X}");
     }
@@ -102,13 +104,14 @@ fn the_bootloader_finds_the_chip_as_after_a_reset() {
     assert!(differences.is_empty(), "{differences:#?}");
 }
 
-/// And the boot stage, which has looked at the strap and checked the program at full speed, leaves the same to the application, but
-/// for the place of the vector table.
+/// And the boot stage, which has looked at the strap and checked the program at full speed, leaves
+/// the same to the application, but for the place of the vector table.
 #[test]
 fn the_application_finds_the_chip_as_after_a_reset() {
     let program = firmware::board().programs[0].base;
     let first = program + 0x200;
-    // A program that does nothing: a vector table and a loop. It does nothing to the registers either.
+    // A program that does nothing: a vector table and a loop. It does nothing to the registers
+    // either.
     let mut image = vec![0; 0x400];
     image[..4].copy_from_slice(&firmware::board().ram.end().to_le_bytes());
     image[4..8].copy_from_slice(&(first | 1).to_le_bytes());

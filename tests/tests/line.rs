@@ -1,5 +1,6 @@
-//! The device on its line: node-ID and bit rate by layer setting services, bit rates found by listening, errors of the bus
-//! and how the device comes back from them. Frames are written by hand from CiA 301 and CiA 305.
+//! The device on its line: node-ID and bit rate by layer setting services, bit rates found by
+//! listening, errors of the bus and how the device comes back from them. Frames are written by hand
+//! from CiA 301 and CiA 305.
 
 use std::time::Duration;
 
@@ -347,7 +348,8 @@ fn frames_lost_in_a_flood_are_told_once() {
     restart(&mut bench);
     bench.set_host_bit_rate(1_000_000);
     bench.run_ms(50);
-    // The largest block there is, in one block transfer without CRC: a control block as its header says, of zeros.
+    // The largest block there is, in one block transfer without CRC: a control block as its header
+    // says, of zeros.
     let mut block = vec![0; 16_384];
     block[8..12].copy_from_slice(&(16_384_u32 - 16).to_le_bytes());
     bench.ask(0x601, &[0xC2, 0x50, 0x1F, 1, 0, 0x40, 0, 0], 0x581).unwrap();
@@ -363,8 +365,8 @@ fn frames_lost_in_a_flood_are_told_once() {
         bench.run_ms(20);
     }
     let from = bench.time();
-    // The end makes the device check 16 KiB, and right behind it comes a flood of the shortest frames that it lets in: NMT
-    // commands without data, which are nobody's.
+    // The end makes the device check 16 KiB, and right behind it comes a flood of the shortest
+    // frames that it lets in: NMT commands without data, which are nobody's.
     let flood = bench.world.add_host_port(1_000_000);
     bench.post(0x601, &[0xC1 | 3 << 2, 0, 0, 0, 0, 0, 0, 0]);
     bench.world.run_for(Span::from_micros(150));

@@ -1,4 +1,5 @@
-//! What the bootloader tells whoever ports it, by each of its ways, and that a release tells nothing.
+//! What the bootloader tells whoever ports it, by each of its ways, and that a release tells
+//! nothing.
 
 use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE};
@@ -37,7 +38,8 @@ impl Listener {
     }
 }
 
-/// What has come out of the board's UARTs; a terminal at 115 200 bit/s reads what is 2 % off at most.
+/// What has come out of the board's UARTs; a terminal at 115 200 bit/s reads what is 2 % off at
+/// most.
 fn heard(machine: &mut Machine) -> Vec<Character> {
     let usarts = machine.usarts_mut().iter_mut();
     let heard: Vec<_> = usarts.flat_map(|usart| usart.take_heard()).collect();
@@ -61,7 +63,8 @@ fn ways() -> [(&'static str, Listener); 3] {
     ]
 }
 
-/// Codes from docs/protocol.md: 6 no valid program; 02 NOVALPROG; 06090030h an unknown command, and request 5 as after a power-on.
+/// Codes from docs/protocol.md: 6 no valid program; 02 NOVALPROG; 06090030h an unknown command, and
+/// request 5 as after a power-on.
 #[test]
 fn it_tells_why_it_stayed_what_it_refuses_and_that_it_leaves() {
     for (image, mut listener) in ways() {
@@ -98,7 +101,8 @@ fn it_tells_why_it_stayed_what_it_refuses_and_that_it_leaves() {
     }
 }
 
-/// Without a probe nobody takes the lines away, and a UART is slower than the bus: what finds no room is left out, and the device goes on.
+/// Without a probe nobody takes the lines away, and a UART is slower than the bus: what finds no
+/// room is left out, and the device goes on.
 #[test]
 fn nobody_waits_for_who_reads_it() {
     for (image, mut listener) in ways() {
@@ -126,7 +130,8 @@ fn nobody_waits_for_who_reads_it() {
     }
 }
 
-/// The UART is served from RAM: what is said while a sector is erased is on the line at once, and the erase holds nothing up.
+/// The UART is served from RAM: what is said while a sector is erased is on the line at once, and
+/// the erase holds nothing up.
 #[test]
 fn the_uart_speaks_while_the_flash_erases() {
     let mut bench = Bench::of_image(firmware::BOOTLOADER_LOG_UART);

@@ -1,4 +1,5 @@
-//! The main job, with the real images on the emulated chip: flash, start, call back, flash again, survive a power cut.
+//! The main job, with the real images on the emulated chip: flash, start, call back, flash again,
+//! survive a power cut.
 
 use canopen::Address;
 use coboot_tests::bench::Bench;

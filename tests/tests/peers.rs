@@ -1,4 +1,5 @@
-//! python-canopen, unmodified, as the master of a bus with three emulated devices, through the socketcand endpoint.
+//! python-canopen, unmodified, as the master of a bus with three emulated devices, through the
+//! socketcand endpoint.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -26,8 +27,8 @@ fn master(endpoint: &mut Endpoint, arguments: &[&str]) -> String {
     said
 }
 
-/// Three devices come without node-ID, are found by fastscan and get node-ID and bit rate; after the power was off they are
-/// a bus at that bit rate, on which one is updated.
+/// Three devices come without node-ID, are found by fastscan and get node-ID and bit rate; after
+/// the power was off they are a bus at that bit rate, on which one is updated.
 #[test]
 fn python_canopen_commissions_three_devices_and_works_with_them() {
     let mut bench = Bench::of_boards(3);

@@ -1,4 +1,5 @@
-//! The way to a new board (docs/porting.md): followed to the letter, and left in every way that the build has to notice.
+//! The way to a new board (docs/porting.md): followed to the letter, and left in every way that the
+//! build has to notice.
 //!
 //! Both tests work on a copy of the repository, one after the other.
 
@@ -12,16 +13,16 @@ const TARGET: &str = "thumbv7em-none-eabihf";
 /// A copy of the repository.
 struct Copy {
     root: PathBuf,
-    /// Cargo's folder for it: cargo tells packages apart by where they are in their workspace, so a folder shared with another
-    /// copy would be built anew each time.
+    /// Cargo's folder for it: cargo tells packages apart by where they are in their workspace, so a
+    /// folder shared with another copy would be built anew each time.
     target: PathBuf,
     /// One test at a time.
     _alone: MutexGuard<'static, ()>,
 }
 
 impl Copy {
-    /// What is there from an earlier run is brought up to date: files that did not change keep their time, so that cargo
-    /// builds anew only what it has to.
+    /// What is there from an earlier run is brought up to date: files that did not change keep
+    /// their time, so that cargo builds anew only what it has to.
     fn new() -> Self {
         static ALONE: Mutex<()> = Mutex::new(());
         let alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
@@ -87,8 +88,9 @@ fn synchronise(from: &Path, to: &Path) {
     }
 }
 
-/// From `new-board` to an update on the emulated board. The steps are filled in with the numbers of a NUCLEO-F446RE
-/// (but for the strap: this board has a button as it stands there at first); those laid down are of a board with another chip.
+/// From `new-board` to an update on the emulated board. The steps are filled in with the numbers of
+/// a NUCLEO-F446RE (but for the strap: this board has a button as it stands there at first); those
+/// laid down are of a board with another chip.
 #[test]
 fn a_board_is_made_as_the_guide_says() {
     let copy = Copy::new();

@@ -6,7 +6,8 @@ fn scenario(name: &str) -> &'static Scenario {
     SCENARIOS.iter().find(|scenario| scenario.name == name).expect("a scenario of this name")
 }
 
-/// Level 1: `boot-core` on the flash model; every operation, every way, and every operation of the recovery.
+/// Level 1: `boot-core` on the flash model; every operation, every way, and every operation of the
+/// recovery.
 #[test]
 fn no_cut_bricks_the_device_or_starts_half_a_program() {
     let mut points = 0;
@@ -23,7 +24,8 @@ fn no_cut_bricks_the_device_or_starts_half_a_program() {
     assert!(points > 20_000, "{points}");
 }
 
-/// By a power cut, and in the scenario that is there for it: a scenario that fails anyhow would prove nothing about cuts.
+/// By a power cut, and in the scenario that is there for it: a scenario that fails anyhow would
+/// prove nothing about cuts.
 #[test]
 fn a_cut_shows_every_seeded_bug_where_it_should() {
     for bug in Bug::ALL {
@@ -41,7 +43,8 @@ fn a_cut_shows_every_seeded_bug_where_it_should() {
     }
 }
 
-/// What is refused in time costs no flash operation, so there is nothing to cut; an erase ahead of the check is seen at once.
+/// What is refused in time costs no flash operation, so there is nothing to cut; an erase ahead of
+/// the check is seen at once.
 #[test]
 fn a_program_for_another_product_costs_nothing() {
     let scenario = scenario("wrong-product");

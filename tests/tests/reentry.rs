@@ -12,7 +12,7 @@ use emulator::time::Span;
 
 const VERSION: Address = Address::new(0x100A, 0);
 /// The application template's own: the way back, and its confirmation.
-const WAY_BACK: Address = Address::new(0x2000, 0);
+const REENTRY_PATH: Address = Address::new(0x2000, 0);
 const CONFIRMATION: Address = Address::new(0x2001, 0);
 const INSTALLED: u32 = 1;
 const SIGNED: u32 = 2;
@@ -54,7 +54,7 @@ fn three_ways_lead_back_and_the_bootloader_is_whole_behind_each() {
         (2, vec![]),
     ] {
         let mut bench = running_board();
-        write(&mut bench, WAY_BACK, way).unwrap();
+        write(&mut bench, REENTRY_PATH, way).unwrap();
         let from = bench.time();
         bench.session().command(1, ProgramControl::StartBootloader).unwrap();
         let boot_up = bench.await_boot_up(1000);
@@ -73,7 +73,7 @@ fn three_ways_lead_back_and_the_bootloader_is_whole_behind_each() {
         bench.assert_nothing_unmodelled();
     }
     let mut bench = running_board();
-    assert!(write(&mut bench, WAY_BACK, 3).is_err(), "there is no fourth way");
+    assert!(write(&mut bench, REENTRY_PATH, 3).is_err(), "there is no fourth way");
 }
 
 /// A jump out of thousands of interrupts, and again: no stray one reaches the other program.
@@ -81,8 +81,9 @@ fn three_ways_lead_back_and_the_bootloader_is_whole_behind_each() {
 fn both_programs_take_interrupts_in_turn_and_none_goes_astray() {
     let mut bench = running_board();
     for round in 0..10 {
-        write(&mut bench, WAY_BACK, 2).unwrap();
-        // SDO requests back to back keep both CAN vectors busy until the last moment; SysTick never rests.
+        write(&mut bench, REENTRY_PATH, 2).unwrap();
+        // SDO requests back to back keep both CAN vectors busy until the last moment; SysTick never
+        // rests.
         for _ in 0..100 {
             bench.session().read_text(VERSION).unwrap();
         }
@@ -119,7 +120,8 @@ fn the_answer_comes_before_the_departure_at_every_bit_rate() {
     call_back::at_every_bit_rate(firmware::APP_V1, |_, _| {});
 }
 
-/// A program without signature is on trial: it confirms itself, or the next reset ends in the bootloader.
+/// A program without signature is on trial: it confirms itself, or the next reset ends in the
+/// bootloader.
 #[test]
 fn a_trial_confirms_itself_through_the_callgate() {
     let mut bench = Bench::new();
@@ -150,7 +152,8 @@ fn a_trial_confirms_itself_through_the_callgate() {
     assert!(bench.is_bootloader(NODE), "it has taken that back");
 }
 
-/// Gives a node another node-ID and, if told, bit rate by layer setting services (CiA 305), and stores them.
+/// Gives a node another node-ID and, if told, bit rate by layer setting services (CiA 305), and
+/// stores them.
 fn store_by_lss(bench: &mut Bench, node: u8, rate: Option<BitRate>) {
     bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
     let rate = rate.map(|rate| [0x13, 0, rate as u8]);
@@ -163,8 +166,9 @@ fn store_by_lss(bench: &mut Bench, node: u8, rate: Option<BitRate>) {
     bench.power_on();
 }
 
-/// Node-ID and bit rate set in the application are the bootloader's as well, and the other way round (SYS TEC manual L-1112d_10,
-/// 3.4.4): where both serve LSS, and where the application alone does.
+/// Node-ID and bit rate set in the application are the bootloader's as well, and the other way
+/// round (SYS TEC manual L-1112d_10, 3.4.4): where both serve LSS, and where the application alone
+/// does.
 #[test]
 fn node_id_and_bit_rate_are_shared() {
     for bootloader in [firmware::BOOTLOADER, firmware::BOOTLOADER_MINIMAL] {
@@ -193,7 +197,8 @@ fn node_id_and_bit_rate_are_shared() {
     }
 }
 
-/// On a bootloader with another version of the ABI, or with none, the application does without, and can be called back.
+/// On a bootloader with another version of the ABI, or with none, the application does without, and
+/// can be called back.
 #[test]
 fn an_application_on_a_bootloader_with_another_abi_does_without_it() {
     let table = firmware::board().callgate();
@@ -220,7 +225,8 @@ fn an_application_on_a_bootloader_with_another_abi_does_without_it() {
     }
 }
 
-/// An application that ends again and again without being asked to is given up, and stays so; a request is a new beginning.
+/// An application that ends again and again without being asked to is given up, and stays so; a
+/// request is a new beginning.
 #[test]
 fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
     let mut bench = running_board();
@@ -254,7 +260,8 @@ fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
     }
 }
 
-/// With a rescue window a program that never answers is no dead end: whoever speaks to the device in time has it.
+/// With a rescue window a program that never answers is no dead end: whoever speaks to the device
+/// in time has it.
 #[test]
 fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     let mut bench = Bench::of_image(firmware::BOOTLOADER_RESCUE);
@@ -317,12 +324,14 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     bench.assert_nothing_unmodelled();
 }
 
-/// What a broken application, or noise, may leave in the warm-start cell: it asks for nothing, or for what cannot be had.
+/// What a broken application, or noise, may leave in the warm-start cell: it asks for nothing, or
+/// for what cannot be had.
 #[test]
 fn a_cell_that_asks_for_what_is_not_there_does_no_harm() {
     let magic = u32::from_le_bytes(*b"CBW1");
     let check = |words: [u32; 3]| {
-        // The fold of the ABI, written again: rotate by 5, exclusive or, multiply; inverted in the end.
+        // The fold of the ABI, written again: rotate by 5, exclusive or, multiply; inverted in the
+        // end.
         !words
             .iter()
             .fold(0xC0B0_07A5_u32, |fold, word| (fold.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B1))

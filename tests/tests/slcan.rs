@@ -1,4 +1,5 @@
-//! CAN over UART, the adapter's end (`bsp::slcan`): what the manuals of Lawicel's CAN232 and CANUSB say, and what nobody should send.
+//! CAN over UART, the adapter's end (`bsp::slcan`): what the manuals of Lawicel's CAN232 and CANUSB
+//! say, and what nobody should send.
 
 use bsp::slcan::{text_of, Slcan, FRAME_TEXT};
 use canopen::Frame;
@@ -118,7 +119,8 @@ fn a_channel_that_only_listens_sends_nothing() {
     assert!(slcan.is_heard());
 }
 
-/// The device was reset, and the host does not know: frames pass. Or it does, and opens the channel.
+/// The device was reset, and the host does not know: frames pass. Or it does, and opens the
+/// channel.
 #[test]
 fn after_a_reset_the_channel_is_whatever_the_host_thinks() {
     let mut slcan = Slcan::new(1);
@@ -174,7 +176,8 @@ fn what_is_no_frame_is_refused_and_the_next_line_is_taken() {
     assert_eq!(say(&mut open(), b"\nt1000\r\nt1000\r\n").0, "z\rz\r");
 }
 
-/// A mark stands where bytes were lost: two halves of two lines must not make one, and the host is told when it asks.
+/// A mark stands where bytes were lost: two halves of two lines must not make one, and the host is
+/// told when it asks.
 #[test]
 fn a_line_with_a_gap_is_refused() {
     let mut slcan = open();
@@ -184,7 +187,8 @@ fn a_line_with_a_gap_is_refused() {
     assert_eq!(say(&mut slcan, b"F\rF\r").0, "F08\rF00\r");
 }
 
-/// Noise, with many line ends and many good lines in it: each end of a line gets one answer, and a good line behind it is understood.
+/// Noise, with many line ends and many good lines in it: each end of a line gets one answer, and a
+/// good line behind it is understood.
 #[test]
 fn noise_is_answered_line_by_line() {
     let mut state = 0x9E37_79B9_7F4A_7C15_u64;

@@ -1,4 +1,5 @@
-//! A whole program in one SDO download, with the real images: raw and Intel HEX, segmented and in blocks.
+//! A whole program in one SDO download, with the real images: raw and Intel HEX, segmented and in
+//! blocks.
 
 use canopen::{Address, BitRate};
 use coboot_tests::bench::{Bench, NODE};
@@ -40,7 +41,8 @@ fn crc32(bytes: &[u8]) -> u32 {
     crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(bytes)
 }
 
-/// A master that knows CiA 302-3 alone: clear, one download, and 1F51h = 2 right behind it, without asking for 1F57h.
+/// A master that knows CiA 302-3 alone: clear, one download, and 1F51h = 2 right behind it, without
+/// asking for 1F57h.
 #[test]
 fn a_program_in_one_download_starts_by_reset_program() {
     let raw = throughput::program(20);
@@ -82,8 +84,8 @@ fn a_reset_right_behind_the_download_does_not_lose_it() {
     assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0");
 }
 
-/// At 1 Mbit/s with a flash as slow as the data sheet allows, which the bus is twice as fast as: each answer comes within 5 ms
-/// nevertheless, and the heartbeat keeps its period within 10 %.
+/// At 1 Mbit/s with a flash as slow as the data sheet allows, which the bus is twice as fast as:
+/// each answer comes within 5 ms nevertheless, and the heartbeat keeps its period within 10 %.
 #[test]
 fn never_silent_while_the_flash_is_slower_than_the_bus() {
     let raw = throughput::program(300);
@@ -120,8 +122,9 @@ fn never_silent_while_the_flash_is_slower_than_the_bus() {
     }
 }
 
-/// A master as CiA 302-2 and 302-3 describe it, which knows nothing of coboot, updates a running device: it compares 1F56h, stops the
-/// program, clears it, sends the new one, waits for 1F57h, compares, starts, and finds 1F51h and 1F56h of the application.
+/// A master as CiA 302-2 and 302-3 describe it, which knows nothing of coboot, updates a running
+/// device: it compares 1F56h, stops the program, clears it, sends the new one, waits for 1F57h,
+/// compares, starts, and finds 1F51h and 1F56h of the application.
 #[test]
 fn a_cia_302_master_updates_a_running_device() {
     let old = throughput::program(20);
@@ -158,7 +161,8 @@ fn a_cia_302_master_updates_a_running_device() {
     }
 }
 
-/// Reset program, written to the application, starts it anew; what was cleared by the application's own hand needs no second CLEAR.
+/// Reset program, written to the application, starts it anew; what was cleared by the application's
+/// own hand needs no second CLEAR.
 #[test]
 fn reset_program_starts_the_application_anew() {
     let mut bench = board_at_1_mbit(Options::default());

@@ -1,5 +1,5 @@
-//! The budget of the design: at 1 Mbit/s a download comes to 90 % of what the wire allows, erasing, programming and
-//! verifying included.
+//! The budget of the design: at 1 Mbit/s a download comes to 90 % of what the wire allows, erasing,
+//! programming and verifying included.
 
 use canopen::BitRate;
 use coboot_tests::throughput::{load, measure};
@@ -14,8 +14,8 @@ fn a_download_at_1_mbit_uses_nine_tenths_of_the_wire() {
     }
 }
 
-/// The host tool as it is, with its default block size, keeps a fast bus busy: sectors are erased ahead of the data, and
-/// a look at the status takes little of its time.
+/// The host tool as it is, with its default block size, keeps a fast bus busy: sectors are erased
+/// ahead of the data, and a look at the status takes little of its time.
 #[test]
 fn the_host_tool_saturates_the_bus_at_1_mbit() {
     let load = load(BitRate::K1000, 256, 1024);

@@ -1,4 +1,5 @@
-//! A device with two programs: each has its own place, record and signature, and one is never at the mercy of the other.
+//! A device with two programs: each has its own place, record and signature, and one is never at
+//! the mercy of the other.
 
 use canopen::program::ProgramControl;
 use canopen::{Address, NodeId};
@@ -11,7 +12,8 @@ use coflash::read::read;
 use coflash::session::Doing;
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
 
-/// Whether the bench has the chip of the board with two programs: it is that of the board the tests are run for.
+/// Whether the bench has the chip of the board with two programs: it is that of the board the tests
+/// are run for.
 fn is_its_chip() -> bool {
     let same = firmware::board().chip == LAYOUT.chip;
     if !same {
@@ -104,7 +106,8 @@ fn two_programs_are_installed_started_and_erased_each_by_itself() {
     assert!(NodeId::new(NODE).is_some());
 }
 
-/// A program that was linked for another place has no business here: its vectors would point into the other one.
+/// A program that was linked for another place has no business here: its vectors would point into
+/// the other one.
 #[test]
 fn a_block_for_the_other_program_is_refused() {
     if !is_its_chip() {

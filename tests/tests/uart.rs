@@ -3,7 +3,8 @@
 use bsp::ring::{Inbox, Ring, LOST};
 use bsp::uart::divider;
 
-/// RM0090 section 30.3.4 (42 MHz, 16 samples a bit): USARTDIV 22.8125 for 115.2 kbit/s, 273.4375 for 9.6, 2.875 for 921.6 (0.93 % off).
+/// RM0090 section 30.3.4 (42 MHz, 16 samples a bit): USARTDIV 22.8125 for 115.2 kbit/s, 273.4375
+/// for 9.6, 2.875 for 921.6 (0.93 % off).
 #[test]
 fn dividers_of_the_manual() {
     assert_eq!(divider(42_000_000, 115_200), Some(365));
@@ -33,16 +34,17 @@ fn all<const N: usize>(inbox: &Inbox<N>) -> Vec<u8> {
     std::iter::from_fn(|| inbox.take()).collect()
 }
 
-/// Wherever bytes are missing there is one mark, once there is room for it: what came before and what comes after never touch.
+/// Wherever bytes are missing there is one mark, once there is room for it: what came before and
+/// what comes after never touch.
 #[test]
 fn a_mark_stands_wherever_bytes_are_missing() {
     let inbox: Inbox<6> = Inbox::new();
     inbox.come(Some(b'a'), false);
-    assert!(!inbox.take_lost() && !inbox.is_pressing());
+    assert!(!inbox.take_overruns() && !inbox.is_pressing());
     // Nobody could read the next one; and behind the one after it the controller lost some.
     inbox.come(None, false);
     inbox.come(Some(b'b'), true);
-    assert!(inbox.take_lost() && !inbox.take_lost());
+    assert!(inbox.take_overruns() && !inbox.take_overruns());
     inbox.come(Some(b'c'), false);
     assert!(inbox.is_pressing());
     assert_eq!(all(&inbox), [b'a', LOST, b'b', LOST, b'c']);
@@ -51,7 +53,7 @@ fn a_mark_stands_wherever_bytes_are_missing() {
     for byte in b"1234567" {
         inbox.come(Some(*byte), false);
     }
-    assert!(inbox.take_lost());
+    assert!(inbox.take_overruns());
     assert_eq!(inbox.take(), Some(b'1'));
     inbox.come(Some(b'8'), false);
     assert_eq!(inbox.take(), Some(b'2'));

@@ -1,4 +1,5 @@
-//! CAN over UART: the bootloader and the application that talk through the board's serial port, to `coflash` and its adapter.
+//! CAN over UART: the bootloader and the application that talk through the board's serial port, to
+//! `coflash` and its adapter.
 
 use std::path::PathBuf;
 use std::process::Command;
@@ -46,8 +47,8 @@ fn session(adapter: &mut dyn Adapter) -> Session<'_> {
     Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default())
 }
 
-/// Boot-up and emergency (docs/protocol.md) in the text of the CAN232's manual, and an SDO upload of 1000h (CiA 301 section
-/// 7.2.4.3.5), all by hand: 10000000h is the bootloader's device type.
+/// Boot-up and emergency (docs/protocol.md) in the text of the CAN232's manual, and an SDO upload
+/// of 1000h (CiA 301 section 7.2.4.3.5), all by hand: 10000000h is the bootloader's device type.
 #[test]
 fn the_text_on_the_line() {
     let mut bench = empty_board();
@@ -55,7 +56,8 @@ fn the_text_on_the_line() {
     assert_eq!(told, "t701100\rt081800FF00424F4F5406\r");
     assert_eq!(ask(&mut bench, b"C\rS4\rO\r", 20), "\r\r\r");
     assert_eq!(ask(&mut bench, b"t60184000100000000000\r", 20), "z\rt58184300100000000010\r");
-    // Somebody else's, network management for nobody here, a remote frame and 29 bits: acknowledged, as by any node of a bus.
+    // Somebody else's, network management for nobody here, a remote frame and 29 bits:
+    // acknowledged, as by any node of a bus.
     assert_eq!(
         ask(&mut bench, b"t60284000100000000000\rt00028105\rr6010\rT0000060184000100000000000\r", 30),
         "z\rz\rz\rZ\r"
@@ -66,7 +68,8 @@ fn the_text_on_the_line() {
     bench.assert_nothing_unmodelled();
 }
 
-/// The main job over the line: install, verify, start, call back, update; and nothing on the CAN bus meanwhile.
+/// The main job over the line: install, verify, start, call back, update; and nothing on the CAN
+/// bus meanwhile.
 #[test]
 fn coflash_updates_the_device_through_its_serial_port() {
     let mut bench = empty_board();
@@ -94,12 +97,14 @@ fn coflash_updates_the_device_through_its_serial_port() {
     bench.assert_nothing_unmodelled();
 }
 
-/// Asks for 1F57h/1 by hand; whether it is answered within 10 ms: 2.3 ms for the question on the line, 2 for the answer.
+/// Asks for 1F57h/1 by hand; whether it is answered within 10 ms: 2.3 ms for the question on the
+/// line, 2 for the answer.
 fn is_answered(bench: &mut Bench) -> bool {
     ask(bench, b"t601840571F0100000000\r", 10).contains("t581843571F01")
 }
 
-/// What nobody should send: it is refused line by line, the device stays reachable, and its heartbeats come.
+/// What nobody should send: it is refused line by line, the device stays reachable, and its
+/// heartbeats come.
 #[test]
 fn noise_on_the_line_costs_nothing_but_itself() {
     let mut bench = empty_board();
@@ -119,7 +124,8 @@ fn noise_on_the_line_costs_nothing_but_itself() {
     assert!((3..=4).contains(&told.matches("t70117F\r").count()), "{told:?}");
     ask(&mut bench, b"\r", 10);
     assert!(is_answered(&mut bench));
-    // A host that wants answers to more than the line can carry: twice as many as it says. The device's own are among them.
+    // A host that wants answers to more than the line can carry: twice as many as it says. The
+    // device's own are among them.
     let flood = b"V\r".repeat(15_000);
     let told = ask(&mut bench, &flood, 2700);
     assert!((2..=3).contains(&told.matches("t70117F\r").count()), "heartbeats in a flood");
@@ -134,8 +140,9 @@ fn noise_on_the_line_costs_nothing_but_itself() {
     bench.assert_nothing_unmodelled();
 }
 
-/// The host's terminal runs at another bit rate: nothing of it is taken for a frame, an emergency tells that something was lost
-/// (8110h, controller overrun), and the right one is understood at once.
+/// The host's terminal runs at another bit rate: nothing of it is taken for a frame, an emergency
+/// tells that something was lost (8110h, controller overrun), and the right one is understood at
+/// once.
 #[test]
 fn another_bit_rate_is_noticed() {
     let mut bench = empty_board();
@@ -188,7 +195,8 @@ fn the_coflash_command_finds_the_device_at_its_serial_port() {
     assert!(told.contains("the bootloader") && told.contains(bsp::IDENTITY.device_name), "{told}");
 }
 
-/// python-can's adapter and python-canopen, neither of which knows that there is no box between: they install and start the application.
+/// python-can's adapter and python-canopen, neither of which knows that there is no box between:
+/// they install and start the application.
 #[cfg(unix)]
 #[test]
 fn python_canopen_flashes_the_device_through_its_serial_port() {

@@ -1,8 +1,8 @@
-//! zencan-client, a CANopen master that we did not write, unmodified, against emulated devices: as SDO client, LSS master
-//! and NMT master.
+//! zencan-client, a CANopen master that we did not write, unmodified, against emulated devices: as
+//! SDO client, LSS master and NMT master.
 //!
-//! Its transport is a pair of traits. Here they are two queues to the bench, and its time-outs run on virtual time, so the
-//! tests are as deterministic as the bench.
+//! Its transport is a pair of traits. Here they are two queues to the bench, and its time-outs run
+//! on virtual time, so the tests are as deterministic as the bench.
 
 use std::time::Duration;
 
@@ -21,7 +21,8 @@ use zencan_client::common::traits::{AsyncCanReceiver, AsyncCanSender, CanSendErr
 use zencan_client::common::NodeId;
 use zencan_client::{BusManager, RawAbortCode, SdoClient, SdoClientError};
 
-/// How long zencan may take in all, in virtual time: it would scan for ever for a device that does not mind being found.
+/// How long zencan may take in all, in virtual time: it would scan for ever for a device that does
+/// not mind being found.
 const PATIENCE: Duration = Duration::from_secs(120);
 
 /// zencan's way to the bus.
@@ -79,8 +80,8 @@ fn on<T>(bench: &mut Bench, peer: impl AsyncFnOnce(Sender, Receiver) -> T) -> T 
     })
 }
 
-/// Lets the bus live: in turn, zencan does all it can, and the bench runs until zencan has something to hear, or for a
-/// millisecond, which then passes for zencan as well.
+/// Lets the bus live: in turn, zencan does all it can, and the bench runs until zencan has
+/// something to hear, or for a millisecond, which then passes for zencan as well.
 async fn drive(
     bench: &mut Bench,
     mut sent: UnboundedReceiver<CanMessage>,
@@ -146,9 +147,10 @@ fn as_sdo_client_it_reads_downloads_by_blocks_and_by_segments_and_starts_the_pro
         );
         // Segments.
         assert_eq!(client.read_device_name().await.as_deref(), Ok(bsp::IDENTITY.device_name));
-        // Blocks: of the server's answer C6h (CRC, size announced) zencan 0.0.5 takes two bits for the subcommand, where CiA
-        // 301 has one and the other says that the size follows. So it gives up, without a word; the server serves the
-        // next request all the same. (Block upload to a client is shown with python-canopen.)
+        // Blocks: of the server's answer C6h (CRC, size announced) zencan 0.0.5 takes two bits for
+        // the subcommand, where CiA 301 has one and the other says that the size follows. So it
+        // gives up, without a word; the server serves the next request all the same. (Block upload
+        // to a client is shown with python-canopen.)
         assert_eq!(client.block_upload(0x1008, 0).await, Err(SdoClientError::MalformedResponse));
         // What is not there, cannot be read, cannot be written, or makes no sense.
         assert_eq!(client.upload(0x2000, 0).await, refused(0x2000, 0, AbortCode::NoSuchObject));

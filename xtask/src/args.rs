@@ -1,4 +1,5 @@
-//! The words of a command line. A job takes the options it knows; [`Args::none_left`] refuses the rest.
+//! The words of a command line. A job takes the options it knows; [`Args::none_left`] refuses the
+//! rest.
 
 use crate::Outcome;
 

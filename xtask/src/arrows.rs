@@ -1,10 +1,11 @@
 //! `cargo xtask arrows`: who may depend on whom.
 //!
-//! The house stands on a few independent walls. The emulator knows nothing of our drivers, so that a
-//! mistake in one does not cancel out in the other; the application knows nothing of `boot-core`, so
-//! that it can be replaced; the wire code knows nothing of us at all; and nothing that leaves the desk
-//! links the GPL-2.0 library under the emulator. This check reads the manifests as cargo does, and the
-//! sources where a manifest does not tell: the emulator's, and the roots of the crates without `unsafe`.
+//! The house stands on a few independent walls. The emulator knows nothing of our drivers, so that
+//! a mistake in one does not cancel out in the other; the application knows nothing of `boot-core`,
+//! so that it can be replaced; the wire code knows nothing of us at all; and nothing that leaves
+//! the desk links the GPL-2.0 library under the emulator. This check reads the manifests as cargo
+//! does, and the sources where a manifest does not tell: the emulator's, and the roots of the
+//! crates without `unsafe`.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -22,7 +23,8 @@ emulator takes nothing but the geometry of the silicon from shared-abi; and that
 forbid unsafe code.
 ";
 
-/// What one of our crates may depend on, of ours. Dev- and build-dependencies are held to the same row.
+/// What one of our crates may depend on, of ours. Dev- and build-dependencies are held to the same
+/// row.
 struct Rule {
     name: &'static str,
     may_use: &'static [&'static str],
@@ -322,7 +324,8 @@ mod tests {
         assert_eq!(broken_arrows(&house).len(), 2);
     }
 
-    /// The form is that of `cargo metadata --format-version 1 --no-deps`; renamed and of every kind.
+    /// The form is that of `cargo metadata --format-version 1 --no-deps`; renamed and of every
+    /// kind.
     #[test]
     fn metadata_is_read_by_the_real_names() {
         let text = r#"{"packages":[{"name":"canopen","manifest_path":"/x/canopen/Cargo.toml","dependencies":[

@@ -99,7 +99,8 @@ pub fn images(board: &Layout) -> Outcome<Images> {
     Ok(Images { dir: workspace::firmware_dir(board), bootloader, logs, virtual_can })
 }
 
-/// Builds the application in C for each program of a board. A board that app-c/boards does not know has none.
+/// Builds the application in C for each program of a board. A board that app-c/boards does not know
+/// has none.
 ///
 /// # Errors
 /// When it does not build, or is no image of this board.
@@ -142,8 +143,8 @@ pub fn c_applications(board: &Layout) -> Outcome {
 
 /// What the application in C is made of.
 const C_SOURCES: [&str; 4] = ["startup.c", "can.c", "probe.c", "main.c"];
-/// How it is compiled. It keeps the FPU off, so it is compiled for a chip without one; what it calls in the bootloader takes and
-/// gives no floating-point numbers.
+/// How it is compiled. It keeps the FPU off, so it is compiled for a chip without one; what it
+/// calls in the bootloader takes and gives no floating-point numbers.
 const C_FLAGS: &[&str] = &[
     "--target=thumbv7em-none-eabi",
     "-mcpu=cortex-m4",
@@ -190,16 +191,17 @@ pub const OPTIONAL: [&str; 9] = [
     "password",
     "read-back",
 ];
-/// Those of them that a product usually has: this bootloader is the one that is measured against the budget.
+/// Those of them that a product usually has: this bootloader is the one that is measured against
+/// the budget.
 pub const STANDARD: &str = "standard";
 /// With a rescue window. Beside everything that is standard there is no room for it.
 const RESCUE: &str = "emcy,lss,raw-image,rescue-window";
-/// Bootloaders with words for whoever ports them, by the way that they take. The standard one and its words would not fit: these do
-/// without the dialects.
+/// Bootloaders with words for whoever ports them, by the way that they take. The standard one and
+/// its words would not fit: these do without the dialects.
 pub const LOGS: [(&str, &str); 3] =
     [("rtt", "emcy,lss,log-rtt"), ("defmt", "emcy,lss,log-defmt"), ("uart", "emcy,lss,log-uart")];
-/// The one with the debugger interface, for the tests: without programs that come in one piece and layer setting services, or it would
-/// not fit.
+/// The one with the debugger interface, for the tests: without programs that come in one piece and
+/// layer setting services, or it would not fit.
 pub const DEBUGGER: &str = "emcy,debugger";
 /// A bootloader that speaks CAN over the UART, without the dialects as there is no room for them.
 pub const VIRTUAL_CAN: &str = "emcy,lss,virtual-can";

@@ -45,14 +45,15 @@ fn write(file: &PathBuf, text: &str) -> Outcome {
     fs::write(file, text).map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(file)))
 }
 
-/// The picture with the mark of what it was drawn from, and without what another version of Graphviz would change for nothing.
+/// The picture with the mark of what it was drawn from, and without what another version of
+/// Graphviz would change for nothing.
 fn marked(drawn: &str, source: &str) -> Outcome<String> {
     let from = drawn.find("<svg").ok_or("Graphviz drew no SVG.")?;
     Ok(format!("{}\n{}", mark(source), &drawn[from..]))
 }
 
-/// Tells a text from every other version of it (64-bit FNV-1a): pictures of another Graphviz differ in every line, so the
-/// sources are what is compared.
+/// Tells a text from every other version of it (64-bit FNV-1a): pictures of another Graphviz differ
+/// in every line, so the sources are what is compared.
 fn mark(source: &str) -> String {
     let hash = source.bytes().fold(0xCBF2_9CE4_8422_2325_u64, |hash, byte| {
         (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3)
@@ -65,8 +66,8 @@ const BAR: u32 = 150;
 const COLUMN: u32 = 440;
 const TOP: u32 = 56;
 
-/// Flash and RAM of a board as an SVG, each in the order of its addresses from bottom to top, as manuals have it. The heights
-/// are not to scale: 16 bytes beside 960 KiB could not be seen.
+/// Flash and RAM of a board as an SVG, each in the order of its addresses from bottom to top, as
+/// manuals have it. The heights are not to scale: 16 bytes beside 960 KiB could not be seen.
 fn memory_map(layout: &Layout) -> String {
     let programs = (1..).zip(layout.programs).map(|(number, region)| (format!("program {number}"), *region));
     let mut flash = vec![

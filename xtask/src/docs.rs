@@ -31,7 +31,8 @@ fn quotes(document: &str) -> Vec<Quote> {
     document.split(MARKER).skip(1).map(quote).collect()
 }
 
-/// The first part of the quote that does not stand in the source, in one piece and behind the part before.
+/// The first part of the quote that does not stand in the source, in one piece and behind the part
+/// before.
 fn missing(quote: &[String], source: &str) -> Option<String> {
     let source = bare(source);
     let mut rest = source.as_slice();

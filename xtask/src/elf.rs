@@ -1,4 +1,5 @@
-//! As much of an ELF file as the size gate needs: 32 bit, little-endian (System V ABI, chapter 4 and 5).
+//! As much of an ELF file as the size gate needs: 32 bit, little-endian (System V ABI, chapter 4
+//! and 5).
 //!
 //! Every offset in the file is taken as hostile: what points outside is an error that says so.
 
@@ -26,7 +27,8 @@ pub struct Section {
     pub offset: u32,
     /// Its length in bytes.
     pub size: u32,
-    /// Whether the image holds its bytes: it is allocated, and neither zeroed nor left alone at start-up.
+    /// Whether the image holds its bytes: it is allocated, and neither zeroed nor left alone at
+    /// start-up.
     pub loaded: bool,
 }
 
@@ -187,8 +189,8 @@ impl<'a> File<'a> {
 pub mod tests {
     use super::*;
 
-    /// A file by hand, as the System V ABI lays it out: a vector table at 0800_0000, and `.data` that
-    /// runs at 2000_0000 and is loaded behind the vectors; one function in `.vectors`.
+    /// A file by hand, as the System V ABI lays it out: a vector table at 0800_0000, and `.data`
+    /// that runs at 2000_0000 and is loaded behind the vectors; one function in `.vectors`.
     pub fn by_hand() -> Vec<u8> {
         let mut file = vec![
             0x7F, b'E', b'L', b'F', 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, // e_ident

@@ -1,7 +1,7 @@
 //! `cargo xtask header`: the ABI for applications in C.
 //!
-//! Every number in it comes from shared-abi: sizes, offsets and values are asked for, not typed. The text around them is
-//! `header.h`, in which `@NAME@` stands for what [`parts`] makes.
+//! Every number in it comes from shared-abi: sizes, offsets and values are asked for, not typed.
+//! The text around them is `header.h`, in which `@NAME@` stands for what [`parts`] makes.
 
 use std::fmt::Write as _;
 use std::mem::{offset_of, size_of};

@@ -23,7 +23,8 @@ pub enum Value {
     Object(BTreeMap<String, Value>),
 }
 
-/// Deeper nesting than any file of cargo's is refused, so that hostile text does not exhaust the stack.
+/// Deeper nesting than any file of cargo's is refused, so that hostile text does not exhaust the
+/// stack.
 const MAX_DEPTH: usize = 64;
 
 impl Value {

@@ -1,4 +1,5 @@
-//! `cargo xtask new-board`: lays down the files of a port, two and a header for programs in C, and registers them.
+//! `cargo xtask new-board`: lays down the files of a port, two and a header for programs in C, and
+//! registers them.
 
 use std::fs;
 use std::path::Path;
@@ -165,7 +166,8 @@ fn constant(chip: &Geometry) -> String {
     chip.chip.to_uppercase()
 }
 
-/// A map that fits the chip: the smallest sectors for bootloader and parameters, all the rest for one program.
+/// A map that fits the chip: the smallest sectors for bootloader and parameters, all the rest for
+/// one program.
 fn layout_file(name: &str, chip: &Geometry) -> String {
     let address = |value: u32| format!("0x{:04X}_{:04X}", value >> 16, value & 0xFFFF);
     let flash = chip.flash.base;
@@ -250,7 +252,8 @@ fn c_with_steps(source: &str, name: &str, from: &str) -> Outcome<String> {
     }
 }
 
-/// A board file copied from another board's, with the steps as comments in front of what they are about.
+/// A board file copied from another board's, with the steps as comments in front of what they are
+/// about.
 fn with_steps(source: &str, name: &str, from: &str, module: &str) -> Outcome<String> {
     let mut text = String::new();
     let mut steps = 0;

@@ -1,7 +1,7 @@
 //! What the jobs need on a machine, installed where it is missing and where that is allowed.
 //!
-//! A fresh Debian 12 or Ubuntu 24.04 with rustup, git and a C compiler is enough to start from. When
-//! nothing is missing this takes a fraction of a second.
+//! A fresh Debian 12 or Ubuntu 24.04 with rustup, git and a C compiler is enough to start from.
+//! When nothing is missing this takes a fraction of a second.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -63,7 +63,8 @@ impl Setup {
     /// Sees to it that what these parts need is there.
     ///
     /// # Errors
-    /// When something is missing and may not or cannot be installed; the message has the line to run.
+    /// When something is missing and may not or cannot be installed; the message has the line to
+    /// run.
     pub fn prepare(&self, parts: &[Part]) -> Outcome {
         self.packages(parts)?;
         if parts.contains(&Part::Firmware) {
@@ -175,7 +176,8 @@ impl Tool {
                 process::succeeds("make", &["--version"]) || process::succeeds("ninja", &["--version"])
             }
             Self::Cmake => process::succeeds("cmake", &["--version"]),
-            // The configure script inside Unicorn stops without it, and the build then misses a header.
+            // The configure script inside Unicorn stops without it, and the build then misses a
+            // header.
             Self::PkgConfig => process::succeeds("pkg-config", &["--version"]),
             Self::Libclang => libclang_is_there(),
             // One without the target for Arm is of no use here.
@@ -205,7 +207,8 @@ fn missing_packages(parts: &[Part], is_there: impl Fn(Tool) -> bool) -> Vec<&'st
     missing.into_iter().collect()
 }
 
-/// libclang with the compiler's own headers, where the bindings' generator (clang-sys) looks for it.
+/// libclang with the compiler's own headers, where the bindings' generator (clang-sys) looks for
+/// it.
 fn libclang_is_there() -> bool {
     if env::var_os("LIBCLANG_PATH").is_some() {
         // Whoever sets it knows better; the build tells if not.

@@ -23,8 +23,8 @@ it is over the budget.
   --yes           installs what is missing with sudo
 ";
 
-/// What the bootloader may take of its region, in bytes: so much less than all of it that this is told before the linker fails. The
-/// aim is 24 KiB (docs/adr/0007-resident-part.md).
+/// What the bootloader may take of its region, in bytes: so much less than all of it that this is
+/// told before the linker fails. The aim is 24 KiB (docs/adr/0007-resident-part.md).
 pub const BUDGET: u32 = 31 * 1024 + 512;
 
 pub fn run(mut args: Args) -> Outcome {
@@ -121,7 +121,8 @@ impl Flash {
     }
 }
 
-/// What each optional feature costs on top of a bootloader without any, and what whole dialects take.
+/// What each optional feature costs on top of a bootloader without any, and what whole dialects
+/// take.
 fn by_feature(board: &Layout) -> Outcome<String> {
     let used = |features: &[&str]| -> Outcome<u32> {
         Ok(Flash::of(&read(&build::bootloader_with(board, features)?)?, board.bootloader)?.used)

@@ -1,6 +1,7 @@
 //! Which crate a symbol comes from, as far as its mangled name tells.
 
-/// The crate that a symbol was made from; `None` for a name that is not Rust's (`memcpy`, `Reset`, …).
+/// The crate that a symbol was made from; `None` for a name that is not Rust's (`memcpy`, `Reset`,
+/// …).
 ///
 /// Of `<Type as Trait>::method` it is the crate of `Type`, where that is a path. The legacy scheme
 /// (`_ZN4core3fmt…17h…E`) and v0 (`_RNv…C…_4core…`, RFC 2603) are both read, since which one is

@@ -81,7 +81,8 @@ pub fn run(mut args: Args) -> Outcome {
     }
 }
 
-/// The test programs that every board goes through each time: what a port can get wrong shows in them.
+/// The test programs that every board goes through each time: what a port can get wrong shows in
+/// them.
 const MAIN_TESTS: [&str; 9] =
     ["main_job", "device", "watchdog", "boot_time", "abi", "c_application", "handover", "log", "virtual_can"];
 

@@ -1,8 +1,9 @@
-//! Intel HEX as it comes over the bus: a byte at a time, whatever the transfer's segments are (Intel, "Hexadecimal Object
-//! File Format Specification", revision A, 1988).
+//! Intel HEX as it comes over the bus: a byte at a time, whatever the transfer's segments are
+//! (Intel, "Hexadecimal Object File Format Specification", revision A, 1988).
 //!
-//! Between records stand line ends of any kind and blanks. Nothing is held of a record but its header: the owner takes
-//! the data as they come, and must not use them before the record was [`Event::Good`].
+//! Between records stand line ends of any kind and blanks. Nothing is held of a record but its
+//! header: the owner takes the data as they come, and must not use them before the record was
+//! [`Event::Good`].
 
 use super::{unfit, Refusal};
 use canopen::program::FlashError;

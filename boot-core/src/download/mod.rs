@@ -1,18 +1,17 @@
-//! Program download by block file: 1F50h takes the blocks, 1F51h the commands, 1F57h tells what became of them.
+//! Program download by block file: 1F50h takes the blocks, 1F51h the commands, 1F57h tells what
+//! became of them.
 //!
-//! Two halves that never wait for each other. The **SDO half** (`block_…`, [`Downloader::command`]) judges what
-//! comes in: it
-//! refuses at once, with an abort and a status, or accepts and leaves work behind. The **flash half**
-//! ([`Downloader::step`]) carries the work through, an operation or a bounded computation at a time.
+//! Two halves that never wait for each other. The **SDO half** (`block_…`, [`Downloader::command`])
+//! judges what comes in: it refuses at once, with an abort and a status, or accepts and leaves work
+//! behind. The **flash half** ([`Downloader::step`]) carries the work through, an operation or a
+//! bounded computation at a time.
 //!
-//! Between them lies a queue of blocks. While it has room for another block the status is not busy, although the
-//! flash
-//! works: a host that looks at the status between blocks sends the next one while those before are being programmed,
-//! and sectors are erased ahead of the data.
+//! Between them lies a queue of blocks. While it has room for another block the status is not busy,
+//! although the flash works: a host that looks at the status between blocks sends the next one
+//! while those before are being programmed, and sectors are erased ahead of the data.
 //!
-//! Nothing of an installed program is lost before the first block of another one was judged good: CLEAR is carried
-//! out
-//! with it (SYS TEC manual L-1112d_10, figure 12), see [`Erase`].
+//! Nothing of an installed program is lost before the first block of another one was judged good:
+//! CLEAR is carried out with it (SYS TEC manual L-1112d_10, figure 12), see [`Erase`].
 
 #[cfg(feature = "intel-hex")]
 mod ihex;
@@ -61,9 +60,9 @@ pub enum Step {
 /// When CLEAR erases.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Erase {
-    /// With the first block that is for this device: until then the old program stays, and can be started. Sectors
-    /// are erased as the
-    /// data need them. A second CLEAR, with no block in between, erases all at once.
+    /// With the first block that is for this device: until then the old program stays, and can be
+    /// started. Sectors are erased as the data need them. A second CLEAR, with no block in between,
+    /// erases all at once.
     #[default]
     WithFirstBlock,
     /// All sectors of the program, before anything else.
@@ -84,25 +83,26 @@ pub enum Verdict {
 /// What can be chosen about the download.
 #[derive(Clone, Copy, Debug)]
 pub struct Policy {
-    /// Vendor-ID and product code of the device. A control block that tells others is refused; 0 in it stands for
-    /// any.
+    /// Vendor-ID and product code of the device. A control block that tells others is refused; 0 in
+    /// it stands for any.
     pub identity: Option<(u32, u32)>,
-    /// The integrator's own check, with all that the control block tells (`TgtProcessAppInfoData` of the manual).
+    /// The integrator's own check, with all that the control block tells (`TgtProcessAppInfoData`
+    /// of the manual).
     pub check: fn(program: u8, control: &Control) -> Verdict,
     /// Whether programs may be changed now; where not, the status is `NO_ACCESS`.
     pub allowed: fn() -> bool,
     /// When CLEAR erases.
     pub erase: Erase,
-    /// Whether a complete raw image or Intel HEX download is valid without the signature (83h) that those who send it know
-    /// nothing of.
+    /// Whether a complete raw image or Intel HEX download is valid without the signature (83h) that
+    /// those who send it know nothing of.
     pub valid_without_signature: bool,
-    /// Whether 1F51h = 2 always starts the program, as CiA 302-3 has it; otherwise it does so right behind a raw image or
-    /// Intel HEX, and resets the status in all other cases.
+    /// Whether 1F51h = 2 always starts the program, as CiA 302-3 has it; otherwise it does so right
+    /// behind a raw image or Intel HEX, and resets the status in all other cases.
     pub reset_starts: bool,
     /// Whether a valid raw image or Intel HEX starts by itself when it is complete.
     pub starts_by_itself: bool,
-    /// Whether a raw image or Intel HEX has to carry a label (`shared_abi::label`). A label that it carries has to fit in any
-    /// case.
+    /// Whether a raw image or Intel HEX has to carry a label (`shared_abi::label`). A label that it
+    /// carries has to fit in any case.
     pub wants_label: bool,
     /// The number of a program that is none, but data of the application: any bytes, never started.
     pub data: Option<u8>,
@@ -112,8 +112,8 @@ pub struct Policy {
     pub read_back: bool,
     /// Whether a download takes the place of what is there, without CLEAR.
     pub replaces: bool,
-    /// Bytes of flash that one step of a CRC covers: the longest that other work of the same priority is kept
-    /// waiting.
+    /// Bytes of flash that one step of a CRC covers: the longest that other work of the same
+    /// priority is kept waiting.
     pub crc_step: u32,
 }
 
@@ -136,7 +136,8 @@ impl Policy {
     };
 }
 
-/// Why a block or a command is refused: the status that 1F57h shows, and the abort that the client gets.
+/// Why a block or a command is refused: the status that 1F57h shows, and the abort that the client
+/// gets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Refusal(FlashError, AbortCode);
 
@@ -169,7 +170,8 @@ struct Program {
 }
 
 /// How far the download of a program is.
-// Not to be compared as a whole, which costs 140 bytes of flash: `matches!` looks at what is asked for.
+// Not to be compared as a whole, which costs 140 bytes of flash: `matches!` looks at what is asked
+// for.
 #[derive(Clone, Copy, Debug)]
 enum Session {
     /// No block was taken yet.
@@ -230,13 +232,15 @@ impl Reception {
 
 /// What is being done to the flash.
 enum Work {
-    /// The record goes first, so that a program that is partly erased is no program. `all`: then every sector.
+    /// The record goes first, so that a program that is partly erased is no program. `all`: then
+    /// every sector.
     Invalidate { program: u8, all: bool },
     /// All sectors.
     Erase { program: u8, eraser: SectorEraser },
     /// One sector ahead of the data.
     EraseNext { program: u8, until: u32, eraser: SectorEraser },
-    /// The block at the front of the queue. `edges` are its first and last word, filled up with what is there.
+    /// The block at the front of the queue. `edges` are its first and last word, filled up with
+    /// what is there.
     Write { program: u8, header: Header, edges: [u32; 2], writer: WordWriter },
     /// What was being done does not matter any more, but the flash has yet to finish it.
     Settle,
@@ -285,9 +289,8 @@ pub struct Downloader<'b, P, const PROGRAMS: usize> {
 }
 
 impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
-    /// Starts from what the parameters tell. The larger `buffer`, the further the flash may lag behind the bus;
-    /// blocks larger
-    /// than it, or than [`MAX_BLOCK_SIZE`], are refused.
+    /// Starts from what the parameters tell. The larger `buffer`, the further the flash may lag
+    /// behind the bus; blocks larger than it, or than [`MAX_BLOCK_SIZE`], are refused.
     pub fn new<F: Flash>(
         layout: &'static Layout,
         policy: &'static Policy,
@@ -338,7 +341,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         self.state_of(program).is_some()
     }
 
-    /// 1F57h. Busy while a command of this program is carried out, or while no further block can be taken.
+    /// 1F57h. Busy while a command of this program is carried out, or while no further block can be
+    /// taken.
     #[must_use]
     pub fn status(&self, program: u8) -> FlashStatus {
         let error = self.state_of(program).and_then(|state| state.error);
@@ -355,7 +359,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         FlashStatus { busy: busy || full, error, detail: 0 }
     }
 
-    /// Whether the queue takes a block of the largest size. (One that is not even as large takes one at a time.)
+    /// Whether the queue takes a block of the largest size. (One that is not even as large takes
+    /// one at a time.)
     fn has_room(&self) -> bool {
         self.queue.is_empty() || self.queue.free() >= MAX_BLOCK_SIZE
     }
@@ -384,8 +389,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             || self.sector_ahead().is_some()
     }
 
-    /// The request to leave the bootloader, once: the answer to the command may still be on its way.
-    pub fn take_leave(&mut self) -> Option<BootRequest> {
+    /// The request to leave the bootloader, once: the answer to the command may still be on its
+    /// way.
+    pub fn take_boot_request(&mut self) -> Option<BootRequest> {
         self.leave.take()
     }
 
@@ -416,8 +422,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         }
     }
 
-    /// A password came: 1F50h takes data from now on, and CLEAR is as good as given. `at_once`: the old program is void now, and not
-    /// only when there is another one.
+    /// A password came: 1F50h takes data from now on, and CLEAR is as good as given. `at_once`: the
+    /// old program is void now, and not only when there is another one.
     ///
     /// # Errors
     /// If other work goes on.
@@ -433,7 +439,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         state.session = Session::Cleared { just: false };
         self.reception = Reception::Idle;
         self.owner = program;
-        self.break_off();
+        self.abort_work();
         if at_once && self.work.is_none() {
             self.work = Some(self.invalidate(program, false));
         }
@@ -479,7 +485,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         // A new beginning does not wait for the end of the old one.
         let broken_off =
             command == Clear && self.owner == program && self.expected.is_none() && self.is_downloading();
-        // Who sends a program in one go means by 2 what CiA 302-3 says: reset the program, which starts it.
+        // Who sends a program in one go means by 2 what CiA 302-3 says: reset the program, which
+        // starts it.
         let command = match command {
             ResetStat if streamed || self.policy.reset_starts => Start,
             command => command,
@@ -506,14 +513,15 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 let again = matches!(state.session, Session::Cleared { just: true });
                 state.session = Session::Cleared { just: true };
                 self.reception = Reception::Idle;
-                self.break_off();
+                self.abort_work();
                 if self.work.is_none() && (again || self.policy.erase == Erase::AtOnce) {
                     self.work = Some(self.invalidate(program, true));
                 }
             }
             (Start, Some(record)) => self.start(program, record),
             (SetSignature | ClrSignature, Some(record)) => {
-                // Also where it is so already: after a power cut it may read so now and otherwise later.
+                // Also where it is so already: after a power cut it may read so now and otherwise
+                // later.
                 let signed = command == SetSignature;
                 self.work = Some(self.store_record(program, ProgramRecord { signed, ..record }));
             }
@@ -529,7 +537,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     }
 
     /// What was received is not wanted any more.
-    fn break_off(&mut self) {
+    fn abort_work(&mut self) {
         self.queue.clear();
         self.work = match self.work.take() {
             Some(Work::EraseNext { .. } | Work::Write { .. }) => Some(Work::Settle),
@@ -538,8 +546,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         };
     }
 
-    /// Whether a program was sent completely, or a command acknowledged, and it is not carried through yet: whoever resets
-    /// the device now takes that back.
+    /// Whether a program was sent completely, or a command acknowledged, and it is not carried
+    /// through yet: whoever resets the device now takes that back.
     #[must_use]
     pub fn is_finishing(&self) -> bool {
         self.expected.is_some() || matches!(self.work, Some(Work::Verify { .. } | Work::Record { .. }))
@@ -586,8 +594,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 return Err(self.refuse(program, Refusal(FlashError::Format, AbortCode::LENGTH_TOO_LOW)));
             }
         }
-        // A second CLEAR erases all, but not behind a block: it may come from a host that tries the same wrong
-        // file again.
+        // A second CLEAR erases all, but not behind a block: it may come from a host that tries the
+        // same wrong file again.
         if let Some(Session::Cleared { just }) = self.session(program) {
             *just = false;
         }
@@ -595,7 +603,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             state.streamed = false;
         }
         self.owner = program;
-        self.queue.forget();
+        self.queue.discard_open();
         #[cfg(feature = "streams")]
         let reception = Reception::Unknown { program, size };
         #[cfg(not(feature = "streams"))]
@@ -623,7 +631,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         }
         #[cfg(feature = "streams")]
         if let Reception::Unknown { size, .. } = self.reception {
-            self.tell_format(program, size)?;
+            self.detect_format(program, size)?;
         }
         if matches!(self.reception, Reception::Header { .. }) && self.queue.open() >= HEADER_SIZE {
             let header = Header::parse(&self.queue.of_open(0));
@@ -656,9 +664,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// 1F50h: the transfer ended before the block did. The block may be sent again.
     pub fn block_cancel(&mut self) {
         #[cfg(feature = "streams")]
-        self.break_stream();
+        self.abort_stream();
         self.reception = Reception::Idle;
-        self.queue.forget();
+        self.queue.discard_open();
     }
 
     /// Carries the work on.
@@ -970,7 +978,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         };
         let cleared = matches!(session, Session::Cleared { .. });
         *session = Session::Open { next: 1, erased, ahead };
-        // Also where there is no record: one that a power cut left between 0 and 1 may be there the next time.
+        // Also where there is no record: one that a power cut left between 0 and 1 may be there the
+        // next time.
         if cleared && self.work.is_none() {
             self.work = Some(self.invalidate(program, false));
         }
@@ -1022,7 +1031,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 if let Some(state) = self.state(program) {
                     state.version = told;
                 }
-                self.queue.forget();
+                self.queue.discard_open();
                 self.open_session(program, app_size);
             }
             NUMBER_LAST => {
@@ -1035,7 +1044,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 if last.program_size > region.size {
                     return Err(unfit(FlashError::Address));
                 }
-                self.queue.forget();
+                self.queue.discard_open();
                 self.expect(program, Expected { size: last.program_size, crc: Some(last.program_crc) });
             }
             number => {
@@ -1048,7 +1057,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         Ok(())
     }
 
-    /// Whether a program is for this device; gives the size that it is said to have, 0 where it is not said.
+    /// Whether a program is for this device; gives the size that it is said to have, 0 where it is
+    /// not said.
     fn check_identity(&self, program: u8, control: &Control) -> Result<u32, Refusal> {
         let identity = match control {
             Control::Plain => None,
@@ -1083,7 +1093,8 @@ fn words_of(header: &Header) -> usize {
     (before + header.size).div_ceil(4) as usize
 }
 
-/// The `i`-th of them. Flash is programmed by words: the edges are filled up with what is there already.
+/// The `i`-th of them. Flash is programmed by words: the edges are filled up with what is there
+/// already.
 fn word(queue: &Queue<'_>, header: &Header, edges: &[u32; 2], i: usize, words: usize) -> u32 {
     let there = edges[usize::from(i + 1 == words)].to_le_bytes();
     let before = (header.flash_address % 4) as usize;

@@ -1,8 +1,8 @@
-//! The blocks that were received and are not in flash yet: a ring of bytes, so that the flash may lag behind the bus.
+//! The blocks that were received and are not in flash yet: a ring of bytes, so that the flash may
+//! lag behind the bus.
 //!
-//! A block is *open* while it arrives. It is judged as a whole, and then either joins the queue or is forgotten.
-//! Offsets
-//! count from the front of the queue or of the open block.
+//! A block is *open* while it arrives. It is judged as a whole, and then either joins the queue or
+//! is forgotten. Offsets count from the front of the queue or of the open block.
 
 /// A ring of bytes; its front is the oldest block.
 pub(super) struct Queue<'b> {
@@ -68,7 +68,7 @@ impl<'b> Queue<'b> {
     }
 
     /// The open block is not.
-    pub(super) fn forget(&mut self) {
+    pub(super) fn discard_open(&mut self) {
         self.open = 0;
     }
 
@@ -152,7 +152,7 @@ mod tests {
             assert_eq!(queue.open(), 0, "all or nothing");
             assert!(queue.push(&[7; 4]));
             assert_eq!(queue.free(), 0);
-            queue.forget();
+            queue.discard_open();
             assert_eq!(queue.free(), 4);
             let read: Vec<u8> = (0..6).map(|i| queue.byte(i)).collect();
             assert_eq!(read, [round, round, round, round, 99, round]);

@@ -1,8 +1,8 @@
 //! A whole program in one SDO download: a raw image, or Intel HEX.
 //!
-//! The bytes are cut into pieces which join the queue as blocks of the block file do, so that the flash half knows one
-//! thing only. A piece joins when all that it holds was judged: the first one opens the session, and until then nothing is
-//! lost.
+//! The bytes are cut into pieces which join the queue as blocks of the block file do, so that the
+//! flash half knows one thing only. A piece joins when all that it holds was judged: the first one
+//! opens the session, and until then nothing is lost.
 
 #[cfg(feature = "intel-hex")]
 use super::ihex::{Event, Hex};
@@ -12,8 +12,9 @@ use shared_abi::label::Label;
 
 /// Data of a piece: so long that the flash is kept busy, so short that a small queue holds some.
 const PIECE: usize = 1024;
-/// Part of the queue that is filled slowly, so that a client whose data find the flash erasing still gets its answers
-/// in time. An erasure of 2 s at 7 bytes every [`HOLD_MS`](canopen::sdo::server::HOLD_MS) needs 7 KiB.
+/// Part of the queue that is filled slowly, so that a client whose data find the flash erasing
+/// still gets its answers in time. An erasure of 2 s at 7 bytes every
+/// [`HOLD_MS`](canopen::sdo::server::HOLD_MS) needs 7 KiB.
 const RESERVE: usize = 8 * 1024;
 
 /// A program on its way in.
@@ -37,8 +38,9 @@ enum Format {
 }
 
 impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
-    /// Bytes that [`block_data`](Self::block_data) takes at present. Blocks have their room before they begin, so this is
-    /// about streams: `held` for a client whose answer is already being held back, which may use the reserve.
+    /// Bytes that [`block_data`](Self::block_data) takes at present. Blocks have their room before
+    /// they begin, so this is about streams: `held` for a client whose answer is already being held
+    /// back, which may use the reserve.
     #[must_use]
     pub fn space(&self, held: bool) -> usize {
         let stream = match &self.reception {
@@ -54,14 +56,15 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         match stream.format {
             #[cfg(feature = "raw-image")]
             Format::Raw => free,
-            // Records of a byte each, all over the flash, are a piece each: 20 bytes of the queue for 13 characters.
+            // Records of a byte each, all over the flash, are a piece each: 20 bytes of the queue
+            // for 13 characters.
             #[cfg(feature = "intel-hex")]
             Format::Hex(_) => free / 2,
         }
     }
 
     /// Tells the format by the first bytes, as soon as they suffice, and takes them.
-    pub(super) fn tell_format(&mut self, program: u8, size: Option<u32>) -> Result<(), Refusal> {
+    pub(super) fn detect_format(&mut self, program: u8, size: Option<u32>) -> Result<(), Refusal> {
         let (len, first) = (self.queue.open(), self.queue.of_open::<4>(0));
         let region = self.region(program);
         let stream = |format, size| Stream { format, next: region.base, end: region.base, size };
@@ -99,7 +102,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let mut came = [0; 8];
         let len = len.min(came.len());
         came.copy_from_slice(&self.queue.of_open::<8>(0));
-        self.queue.forget();
+        self.queue.discard_open();
         self.reception = Reception::Stream { program, stream };
         self.stream_data(program, stream, &came[..len])
     }
@@ -223,7 +226,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         Ok(())
     }
 
-    /// Whether a program is for this device, by its label; gives its version, 0 where there is no label.
+    /// Whether a program is for this device, by its label; gives its version, 0 where there is no
+    /// label.
     pub(super) fn check_label(&self, program: u8, bytes: &[u8; label::SIZE]) -> Result<u32, Refusal> {
         let Some(label) = Label::parse(bytes) else {
             return if self.policy.wants_label { Err(unfit(FlashError::Format)) } else { Ok(0) };
@@ -240,7 +244,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     }
 
     /// What is left of a stream that ends before its end: half a program, if any.
-    pub(super) fn break_stream(&mut self) {
+    pub(super) fn abort_stream(&mut self) {
         let Reception::Stream { program, .. } = self.reception else { return };
         if !self.has_begun(program) {
             return;
@@ -249,6 +253,6 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             state.session = Session::Failed;
             state.error.get_or_insert(FlashError::Format);
         }
-        self.break_off();
+        self.abort_work();
     }
 }

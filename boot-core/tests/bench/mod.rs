@@ -145,8 +145,8 @@ impl<'f> Bench<'f> {
         self.node.download_end(DATA)
     }
 
-    /// A whole program in one download, `pieces` of it at a time, with the flash working in between when there is no room;
-    /// the abort, if any, and then the status when all work is done.
+    /// A whole program in one download, `pieces` of it at a time, with the flash working in between
+    /// when there is no room; the abort, if any, and then the status when all work is done.
     pub fn stream(&mut self, data: &[u8], size: Option<u32>, pieces: usize) -> (Result<(), AbortCode>, u32) {
         let outcome = self.pour(data, size, pieces);
         self.settle();
@@ -252,8 +252,8 @@ pub fn autostart(flash: &ModelFlash) -> Result<u8, Invalid> {
     }
 }
 
-/// An update of an installed program, cut at every operation: what starts afterwards is the old program or the new one (told by
-/// their seeds), whole, or nothing; and the update then completes.
+/// An update of an installed program, cut at every operation: what starts afterwards is the old
+/// program or the new one (told by their seeds), whole, or nothing; and the update then completes.
 pub fn cut_at_every_operation(installed: &ModelFlash, old: u8, new: u8, update: impl Fn(&mut ModelFlash)) {
     quiet_power_cuts();
     let cells = installed.cells(CHIP.flash).to_vec();

@@ -1,4 +1,5 @@
-//! A strict flash: it does what the F4's does, refuses what the F4 would silently spoil, and loses power on demand.
+//! A strict flash: it does what the F4's does, refuses what the F4 would silently spoil, and loses
+//! power on demand.
 #![allow(dead_code)]
 
 use std::cell::Cell;
@@ -53,9 +54,8 @@ pub enum Cut {
     Before,
     /// A part: some bits of the word, a part of the sector.
     Torn(u64),
-    /// A part, and some bits are left between 0 and 1: they read differently each time, until they are programmed
-    /// to 0 or erased
-    /// once more.
+    /// A part, and some bits are left between 0 and 1: they read differently each time, until they
+    /// are programmed to 0 or erased once more.
     Unstable(u64),
     /// All, but nobody has seen it.
     After,
@@ -189,9 +189,9 @@ impl ModelFlash {
         }
     }
 
-    /// Does a part of the operation, which `seed` selects. An odd seed of a torn erase ends it in the middle of
-    /// the sector; an odd
-    /// seed of an unstable operation does all of it but for one bit.
+    /// Does a part of the operation, which `seed` selects. An odd seed of a torn erase ends it in
+    /// the middle of the sector; an odd seed of an unstable operation does all of it but for one
+    /// bit.
     fn tear(&mut self, operation: Operation, seed: u64, unstable: bool) {
         let mut state = seed.wrapping_add(u64::from(self.operations) << 8);
         let odd = seed & 1 == 1;

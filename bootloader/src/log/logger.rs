@@ -34,8 +34,8 @@ unsafe fn with<T>(act: impl FnOnce(&mut State) -> T) -> T {
     act(unsafe { &mut *STATE.0.get() })
 }
 
-// SAFETY: between `acquire` and `release` interrupts are off, so there is one frame at a time; what `defmt` formats has no
-// formatters of ours that would log themselves.
+// SAFETY: between `acquire` and `release` interrupts are off, so there is one frame at a time; what
+// `defmt` formats has no formatters of ours that would log themselves.
 unsafe impl defmt::Logger for Logger {
     fn acquire() {
         let interrupts = primask::read().is_active();

@@ -1,5 +1,6 @@
-//! RTT (SEGGER UM08001 section 16.4): a ring buffer in RAM that a debug probe finds by its first bytes and reads while the program
-//! runs. A message that finds no room is left out: nobody waits for a probe.
+//! RTT (SEGGER UM08001 section 16.4): a ring buffer in RAM that a debug probe finds by its first
+//! bytes and reads while the program runs. A message that finds no room is left out: nobody waits
+//! for a probe.
 
 use core::sync::atomic::{AtomicPtr, AtomicU32, AtomicU8, Ordering};
 
@@ -40,7 +41,8 @@ static CONTROL: ControlBlock = ControlBlock {
     flags: AtomicU32::new(0),
 };
 
-/// Makes the block known. The first bytes come last: a probe may look at any time, and must not find them anywhere else.
+/// Makes the block known. The first bytes come last: a probe may look at any time, and must not
+/// find them anywhere else.
 fn open() {
     CONTROL.up_buffers.store(1, Ordering::Relaxed);
     CONTROL.name.store(NAME.as_ptr().cast_mut().cast(), Ordering::Relaxed);
@@ -51,7 +53,8 @@ fn open() {
     }
 }
 
-/// A message that is being written, one at a time and with interrupts off. The probe sees it when it has ended.
+/// A message that is being written, one at a time and with interrupts off. The probe sees it when
+/// it has ended.
 pub struct Message {
     at: u32,
     fits: bool,

@@ -1,5 +1,5 @@
-//! Text over the board's UART, 8N1. A ring in RAM holds what waits to be sent, byte by byte from the UART's interrupt; a line that
-//! finds no room in it is left out: nobody waits for a UART.
+//! Text over the board's UART, 8N1. A ring in RAM holds what waits to be sent, byte by byte from
+//! the UART's interrupt; a line that finds no room in it is left out: nobody waits for a UART.
 
 use bsp::ring::Ring;
 use bsp::uart::{on_interrupt, Port};
@@ -15,7 +15,8 @@ pub fn open(port: Port<UartController>) {
     on_interrupt(send);
 }
 
-/// The port that `open` took. It is used with interrupts off, or from its own interrupt, which no other one disturbs.
+/// The port that `open` took. It is used with interrupts off, or from its own interrupt, which no
+/// other one disturbs.
 fn port() -> Port<UartController> {
     // SAFETY: as above, one user at a time.
     unsafe { Port::steal() }

@@ -1,9 +1,10 @@
-//! The caches of the flash interface (RM0090 section 3.5), which an application may have switched on.
+//! The caches of the flash interface (RM0090 section 3.5), which an application may have switched
+//! on.
 
 use bsp::pac;
 
-/// Keeps them off, and the prefetch with them; when dropped, makes them forget what they hold and leaves them as
-/// they were.
+/// Keeps them off, and the prefetch with them; when dropped, makes them forget what they hold and
+/// leaves them as they were.
 pub struct CachesOff {
     registers: pac::FLASH,
     before: u32,
@@ -27,8 +28,8 @@ impl CachesOff {
     }
 
     fn write(&self, bits: u32) {
-        // SAFETY: the wait states stay, and the rest may be switched at any time, the resets while the caches are
-        // off.
+        // SAFETY: the wait states stay, and the rest may be switched at any time, the resets while
+        // the caches are off.
         self.registers.acr().write(|w| unsafe { w.bits(bits) });
     }
 }

@@ -1,8 +1,7 @@
 //! The callgate: what an application may call (`shared_abi::callgate`).
 //!
-//! The flash controller may be the application's otherwise, and so may the CRC unit and the caches of the flash:
-//! they are taken when they are free,
-//! and left as they were found.
+//! The flash controller may be the application's otherwise, and so may the CRC unit and the caches
+//! of the flash: they are taken when they are free, and left as they were found.
 
 use core::ffi::c_void;
 
@@ -22,7 +21,8 @@ use crate::flash::FlashController;
 use crate::product::{self, NO_NODE_ID};
 
 /// # Safety
-/// `args` must point to the argument structure of `selector`; what can be told of a wrong pointer is refused.
+/// `args` must point to the argument structure of `selector`; what can be told of a wrong pointer
+/// is refused.
 pub unsafe extern "C" fn entry(selector: u32, args: *mut c_void) -> i32 {
     let Some(selector) = Selector::from_number(selector) else { return Status::UnknownSelector as i32 };
     // SAFETY: the caller vouches for the structure; `argument` has looked where it lies.
@@ -56,7 +56,8 @@ fn is_in_ram(address: u32, size: u32) -> bool {
 
 /// Runs `act` with the flash, if nobody works on it.
 fn with_flash<T>(act: impl FnOnce(&mut FlashController) -> Result<T, Status>) -> Result<T, Status> {
-    // SAFETY: the application calls one service at a time and does not use the flash controller meanwhile.
+    // SAFETY: the application calls one service at a time and does not use the flash controller
+    // meanwhile.
     let rcc = unsafe { pac::RCC::steal() };
     let crc_is_free = rcc.ahb1enr().read().crcen().is_disabled();
     // SAFETY: as above; the CRC unit only where its clock is off.
@@ -143,7 +144,8 @@ fn program(args: &ProgramArgs) -> Result<u8, Status> {
 /// Stores a value and waits for it.
 fn store(flash: &mut FlashController, key: Key, value: Value) -> Result<(), Status> {
     // They would show words as they were before they were programmed.
-    // SAFETY: the application calls one service at a time and does not use the flash controller meanwhile.
+    // SAFETY: the application calls one service at a time and does not use the flash controller
+    // meanwhile.
     let _caches = unsafe { CachesOff::new() };
     let mut parameters = product::parameters(flash);
     parameters.store(key, value);

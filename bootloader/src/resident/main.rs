@@ -1,4 +1,5 @@
-//! The resident part of the bootloader: what runs from flash, beside an application that owns all RAM.
+//! The resident part of the bootloader: what runs from flash, beside an application that owns all
+//! RAM.
 //!
 //! | file | what it does | unsafe |
 //! |---|---|---|
@@ -7,9 +8,9 @@
 //! | `callgate.rs` | services for the application | its ABI |
 //! | `caches.rs` | the caches of the flash, off for a while | registers |
 //!
-//! It is a program of its own, so that the linker can see that it has no variables: nothing but the stack and its
-//! own code is
-//! there when it runs. `linker/build.rs` builds it, and the bootloader carries it as bytes.
+//! It is a program of its own, so that the linker can see that it has no variables: nothing but the
+//! stack and its own code is there when it runs. `linker/build.rs` builds it, and the bootloader
+//! carries it as bytes.
 #![no_std]
 #![no_main]
 
@@ -26,7 +27,8 @@ mod stage;
 use shared_abi::callgate::{Entry, Table, ABI_VERSION, MAGIC, TABLE_SIZE};
 use shared_abi::warm_start::BootRequest;
 
-/// What lies at the callgate's address: its table, and behind it the way in for the bootloader's own start-up.
+/// What lies at the callgate's address: its table, and behind it the way in for the bootloader's
+/// own start-up.
 #[repr(C)]
 struct Header {
     callgate: Table<Entry>,

@@ -1,8 +1,7 @@
 //! The boot stage: from the reset to the jump into a program, or to the rest of the bootloader.
 //!
-//! It runs before any peripheral but the reset flags, the warm-start cell, the flash controller, the CRC unit and
-//! the entry strap was
-//! touched, and leaves those as after a reset.
+//! It runs before any peripheral but the reset flags, the warm-start cell, the flash controller,
+//! the CRC unit and the entry strap was touched, and leaves those as after a reset.
 
 use boot_core::canopen::NodeId;
 use boot_core::decision::{decide, BootDecision, Circumstances, StayReason};
@@ -16,8 +15,9 @@ use shared_abi::warm_start::BootRequest;
 use crate::flash::FlashController;
 use crate::product::{self, NO_NODE_ID, POLICY, PROGRAM_WATCHDOG_MS, RESCUE_WINDOW_MS};
 
-/// Decides. Does not come back if a program is to run; else tells why the bootloader stays ([`StayReason::code`]),
-/// in the next byte which program waits for the end of the rescue window, and in the one behind that which is to be cleared.
+/// Decides. Does not come back if a program is to run; else tells why the bootloader stays
+/// ([`StayReason::code`]), in the next byte which program waits for the end of the rescue window,
+/// and in the one behind that which is to be cleared.
 pub extern "C" fn stage() -> u32 {
     // SAFETY: nothing else runs yet; the rest of the bootloader takes them after this has returned.
     let (rcc, iwdg) = unsafe { (pac::RCC::steal(), pac::IWDG::steal()) };
@@ -28,7 +28,8 @@ pub extern "C" fn stage() -> u32 {
     let request = product::warm_start_cell().take();
     let strap = bsp::entry_strap(&rcc);
 
-    // A CRC over a whole program wants speed. Exact it need not be, and the crystal would take its time.
+    // A CRC over a whole program wants speed. Exact it need not be, and the crystal would take its
+    // time.
     CLOCK_TREE.speed_up(&rcc, Source::Internal);
     // SAFETY: as above.
     let mut flash = unsafe { FlashController::steal(Some(&rcc)) };
@@ -63,9 +64,8 @@ pub extern "C" fn stage() -> u32 {
             if let Some(ms) = PROGRAM_WATCHDOG_MS {
                 bsp::watchdog::start(&iwdg, ms);
             }
-            // SAFETY: the layout's handoff region, checked to be RAM of that size in no image. No interrupt was
-            // enabled
-            // and no bus master started since the reset.
+            // SAFETY: the layout's handoff region, checked to be RAM of that size in no image. No
+            // interrupt was enabled and no bus master started since the reset.
             unsafe {
                 handoff.write(LAYOUT.handoff.base as *mut Handoff);
                 program.vectors().jump()
@@ -85,7 +85,8 @@ fn count_crash_resets(
     let now = POLICY.crash_resets(before, reset_cause, request);
     if now != before {
         parameters.store(Key::CrashCount, [now, 0, 0, 0]);
-        // Nothing else runs that could be kept waiting. A store that fails costs the count, not the start.
+        // Nothing else runs that could be kept waiting. A store that fails costs the count, not the
+        // start.
         while parameters.poll(flash).is_pending() {}
     }
     now

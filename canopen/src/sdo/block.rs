@@ -1,4 +1,5 @@
-//! What both ends of a block transfer share: the CRC, and the order of the segments (CiA 301 section 7.2.4.3.9 ff.).
+//! What both ends of a block transfer share: the CRC, and the order of the segments (CiA 301
+//! section 7.2.4.3.9 ff.).
 
 use crate::sdo::wire::{BlockEnd, BlockSegment, Chunk};
 use crate::sdo::AbortCode;
@@ -9,7 +10,8 @@ pub const BLKSIZE_MAX: u8 = 127;
 /// Bytes of a segment.
 pub(super) const SEGMENT: usize = 7;
 
-/// CRC-16 of the block transfer (CiA 301 section 7.2.4.3.16): polynomial 1021h, start value 0, not reflected.
+/// CRC-16 of the block transfer (CiA 301 section 7.2.4.3.16): polynomial 1021h, start value 0, not
+/// reflected.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Crc16(u16);
 
@@ -20,7 +22,8 @@ impl Crc16 {
         Self(0)
     }
 
-    /// Takes more data in. Bit by bit: 88 bytes of code where a table takes 512, and 60 kB/s of CAN at most.
+    /// Takes more data in. Bit by bit: 88 bytes of code where a table takes 512, and 60 kB/s of CAN
+    /// at most.
     pub fn update(&mut self, data: &[u8]) {
         for byte in data {
             self.0 ^= u16::from(*byte) << 8;
@@ -51,10 +54,12 @@ pub(super) fn check_blksize(blksize: u8) -> Result<u8, AbortCode> {
 
 /// The receiving end: takes segments that come in order and tells when to acknowledge.
 ///
-/// A segment out of order is left for the repetition that the acknowledgement of the sub-block asks for.
+/// A segment out of order is left for the repetition that the acknowledgement of the sub-block asks
+/// for.
 #[derive(Debug)]
 pub(super) struct Receiver {
-    /// Segments of the sub-block that is open; 0 while none is, because an acknowledgement is still to be sent.
+    /// Segments of the sub-block that is open; 0 while none is, because an acknowledgement is still
+    /// to be sent.
     blksize: u8,
     /// The last segment that came in order.
     ackseq: u8,
@@ -136,7 +141,8 @@ impl Receiver {
         Ok(received)
     }
 
-    /// Whether a frame is the last segment of all once more, in the place where the end is expected.
+    /// Whether a frame is the last segment of all once more, in the place where the end is
+    /// expected.
     pub fn is_duplicate_of_tail(&self, bytes: &[u8; 8]) -> bool {
         match (BlockSegment::parse(bytes), self.tail) {
             (Some(segment), Some(tail)) => {

@@ -1,12 +1,13 @@
 //! The SDO server: one transfer at a time, for one client.
 //!
-//! - A frame that is not the request identifier's, is remote or extended, or does not have 8 bytes is no SDO (CiA 301
-//!   section 7.2.4.3: all are 8 bytes long) and gets silence.
+//! - A frame that is not the request identifier's, is remote or extended, or does not have 8 bytes
+//!   is no SDO (CiA 301 section 7.2.4.3: all are 8 bytes long) and gets silence.
 //! - Every other request gets an answer or an abort; only an abort gets silence.
-//! - An initiate ends the transfer that was going on. Within a sub-block of a block download an initiate cannot be told from
-//!   a segment: there an abort ends the transfer, or the time-out.
+//! - An initiate ends the transfer that was going on. Within a sub-block of a block download an
+//!   initiate cannot be told from a segment: there an abort ends the transfer, or the time-out.
 //! - A transfer in which the client stays silent for the time-out is aborted with 05040000h.
-//! - A block download whose sub-block stops short is acknowledged as far as it came, so that the client repeats the rest.
+//! - A block download whose sub-block stops short is acknowledged as far as it came, so that the
+//!   client repeats the rest.
 
 use crate::frame::{CobId, Frame, NodeId};
 use crate::od::{self, Address, DataType, Entry, Kind, Objects};
@@ -22,7 +23,8 @@ use crate::time::Instant;
 /// The longest variable or string, in bytes. Longer things are domains.
 pub const VALUE_MAX: usize = 64;
 
-/// How long an answer is held back for want of room before the device is asked for room in its reserve, in milliseconds.
+/// How long an answer is held back for want of room before the device is asked for room in its
+/// reserve, in milliseconds.
 pub const HOLD_MS: u32 = 2;
 
 /// What can be chosen about a server.
@@ -30,10 +32,12 @@ pub const HOLD_MS: u32 = 2;
 pub struct Config {
     /// How long the client may stay silent within a transfer, in milliseconds.
     pub timeout_ms: u32,
-    /// How long a sub-block of a block download may pause before what came is acknowledged and the rest asked for again,
-    /// in milliseconds. Longer than a client ever pauses between two segments, shorter than it waits for an answer.
+    /// How long a sub-block of a block download may pause before what came is acknowledged and the
+    /// rest asked for again, in milliseconds. Longer than a client ever pauses between two
+    /// segments, shorter than it waits for an answer.
     pub repeat_ms: u32,
-    /// Segments of a sub-block of a block download: at most 127, and no more than the receive path can queue.
+    /// Segments of a sub-block of a block download: at most 127, and no more than the receive path
+    /// can queue.
     pub blksize: u8,
     /// The abort for a request that is none of CiA 301's, or not of this moment.
     pub unknown_request: AbortCode,
@@ -202,7 +206,8 @@ impl SdoServer {
         }
     }
 
-    /// The next frame to send, until there is none. A caller whose transmit queue is full asks again when it is not.
+    /// The next frame to send, until there is none. A caller whose transmit queue is full asks
+    /// again when it is not.
     pub fn poll(&mut self, now: Instant, objects: &mut impl Objects) -> Option<Frame> {
         self.watch(now, objects);
         #[cfg(feature = "block-upload")]
@@ -241,8 +246,8 @@ impl SdoServer {
         }
     }
 
-    /// Whether the answer that waits may go: one that makes the client send data waits until there is room for them. An
-    /// answer that opens a sub-block is told here how large it may be.
+    /// Whether the answer that waits may go: one that makes the client send data waits until there
+    /// is room for them. An answer that opens a sub-block is told here how large it may be.
     fn grant(&mut self, now: Instant, objects: &mut impl Objects) -> bool {
         let Some(answer) = &mut self.answer else { return false };
         let Some(incoming) = self.state.incoming() else { return true };
@@ -254,7 +259,8 @@ impl SdoServer {
         let most = self.config.blksize.clamp(1, BLKSIZE_MAX);
         let granted = (space / SEGMENT).min(usize::from(most)) as u8;
         let State::BlockDownload { receiver, .. } = &mut self.state else { return granted != 0 };
-        // Behind the last segment there is nothing to make room for; the field wants a number all the same.
+        // Behind the last segment there is nothing to make room for; the field wants a number all
+        // the same.
         let granted = if receiver.is_complete() { most } else { granted };
         if let Response::InitiateBlockDownload { blksize, .. }
         | Response::AckBlockDownload(BlockAck { blksize, .. }) = answer
@@ -412,7 +418,8 @@ impl SdoServer {
     ) -> Result<Option<Response>, AbortCode> {
         let State::BlockDownload { receiver, .. } = &mut self.state else { return Err(AbortCode::COMMAND) };
         let Some(segment) = BlockSegment::parse(bytes) else {
-            // No segment has sequence number 0, and an abort is the one request that looks like this.
+            // No segment has sequence number 0, and an abort is the one request that looks like
+            // this.
             return match Request::parse(bytes) {
                 Some(Request::Abort(..)) => {
                     self.reset(objects);
@@ -600,7 +607,8 @@ impl Incoming {
         }
         if self.is_domain() {
             if !data.is_empty() {
-                // Held back are the answers; a client that sends without having got one, or expedited, is refused.
+                // Held back are the answers; a client that sends without having got one, or
+                // expedited, is refused.
                 if objects.download_space(at, true) < data.len() {
                     return Err(AbortCode::OUT_OF_MEMORY);
                 }

@@ -1,9 +1,11 @@
 //! The eight bytes of an SDO frame as named fields (CiA 301 section 7.2.4.3).
 //!
-//! [`Request`] is what a client sends, [`Response`] what a server sends. The top three bits of byte 0 are the command
-//! specifier; reserved bits are sent as 0 and not looked at when received. Multi-byte fields are little-endian.
+//! [`Request`] is what a client sends, [`Response`] what a server sends. The top three bits of byte
+//! 0 are the command specifier; reserved bits are sent as 0 and not looked at when received.
+//! Multi-byte fields are little-endian.
 //!
-//! Segments of a block transfer have no command specifier and are a type of their own: [`BlockSegment`].
+//! Segments of a block transfer have no command specifier and are a type of their own:
+//! [`BlockSegment`].
 
 use core::ops::Deref;
 
@@ -108,8 +110,8 @@ impl Segment {
     }
 }
 
-/// One segment of a block transfer, in either direction. Whether all seven bytes of the last one count is told by the
-/// end of the transfer.
+/// One segment of a block transfer, in either direction. Whether all seven bytes of the last one
+/// count is told by the end of the transfer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BlockSegment {
     /// No more segments follow ("c").
@@ -121,7 +123,8 @@ pub struct BlockSegment {
 }
 
 impl BlockSegment {
-    /// `None` for sequence number 0, which no segment has: this is how an abort (80h) stays recognisable between them.
+    /// `None` for sequence number 0, which no segment has: this is how an abort (80h) stays
+    /// recognisable between them.
     #[must_use]
     pub fn parse(bytes: &[u8; 8]) -> Option<Self> {
         let [head, data @ ..] = *bytes;
@@ -200,7 +203,8 @@ pub enum Request {
         crc: bool,
         /// Segments per sub-block, 1 to 127.
         blksize: u8,
-        /// Protocol switch threshold: up to this many bytes the server may answer with another protocol; 0 for never.
+        /// Protocol switch threshold: up to this many bytes the server may answer with another
+        /// protocol; 0 for never.
         pst: u8,
     },
     /// End block upload (ccs 5, cs 1): the client has checked everything.

@@ -1,4 +1,5 @@
-//! A device with the debugger interface, and a memory that fails the test when it is touched without leave.
+//! A device with the debugger interface, and a memory that fails the test when it is touched
+//! without leave.
 #![allow(dead_code, missing_docs)]
 
 use core::task::Poll;

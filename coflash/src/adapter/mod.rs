@@ -19,8 +19,8 @@ pub use self::trace::{OnFailure, Trace};
 
 /// A CAN bus, and the time on it.
 ///
-/// The time belongs to the adapter, so that an emulated bus can serve its own. The rest of this library knows no other
-/// clock and never sleeps: it waits by receiving.
+/// The time belongs to the adapter, so that an emulated bus can serve its own. The rest of this
+/// library knows no other clock and never sleeps: it waits by receiving.
 pub trait Adapter {
     /// Hands a frame to the bus.
     ///
@@ -28,8 +28,8 @@ pub trait Adapter {
     /// The adapter is gone, or takes no frames.
     fn send(&mut self, frame: &Frame) -> Result<(), AdapterError>;
 
-    /// The next frame from the bus. Waits for it, `timeout` at most; `None` means that this time has passed on
-    /// [`now`](Self::now)'s clock. A `timeout` of zero takes what is there already.
+    /// The next frame from the bus. Waits for it, `timeout` at most; `None` means that this time
+    /// has passed on [`now`](Self::now)'s clock. A `timeout` of zero takes what is there already.
     ///
     /// Frames which this adapter sent need not and should not come back.
     ///
@@ -84,8 +84,8 @@ pub fn open(url: &str) -> Result<Box<dyn Adapter>, AdapterError> {
     open_at(url, None)
 }
 
-/// Opens the adapter that a URL names, at this bit rate (in bit/s) if the URL names none and the adapter sets it. This is
-/// the place to add other adapters.
+/// Opens the adapter that a URL names, at this bit rate (in bit/s) if the URL names none and the
+/// adapter sets it. This is the place to add other adapters.
 ///
 /// # Errors
 /// The URL is no good, or the adapter does not open.

@@ -98,13 +98,15 @@ impl Slcan<Box<dyn serialport::SerialPort>> {
 }
 
 impl<L: Line> Slcan<L> {
-    /// Opens the bus of the adapter at the other end of `line`, at `bit_rate` (bit/s) or at the one that it has.
+    /// Opens the bus of the adapter at the other end of `line`, at `bit_rate` (bit/s) or at the one
+    /// that it has.
     ///
     /// # Errors
     /// [`AdapterError::Protocol`] where the adapter refuses, [`AdapterError::Lost`] where it goes.
     pub fn open(line: L, name: String, bit_rate: Option<u32>) -> Result<Self, AdapterError> {
         let mut adapter = Self::opened(line, name);
-        // Whatever was under way before: end it, and close the bus. A bus that is closed already is refused, which is well.
+        // Whatever was under way before: end it, and close the bus. A bus that is closed already is
+        // refused, which is well.
         adapter.say("\r\rC\r")?;
         adapter.settle()?;
         if let Some(rate) = bit_rate {
@@ -218,7 +220,8 @@ impl<L: Line> Slcan<L> {
 }
 
 impl<L: Line> Drop for Slcan<L> {
-    /// Closes the bus, so that the adapter does not fill up while nobody listens. If it is gone, so be it.
+    /// Closes the bus, so that the adapter does not fill up while nobody listens. If it is gone, so
+    /// be it.
     fn drop(&mut self) {
         let _ = self.say("C\r");
     }
@@ -232,8 +235,9 @@ impl<L: Line> Adapter for Slcan<L> {
     fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
         let deadline = self.line.now() + timeout;
         while let Some(message) = self.message(deadline)? {
-            // Acknowledgements of what was sent (z, Z, empty) are not for us. A frame that the adapter refused is lost as
-            // one may be lost on the bus: it will be missed and repeated.
+            // Acknowledgements of what was sent (z, Z, empty) are not for us. A frame that the
+            // adapter refused is lost as one may be lost on the bus: it will be missed and
+            // repeated.
             if let Message::Text(text) = message {
                 if let Some(frame) = parse_frame(&text) {
                     return Ok(Some(frame));

@@ -10,7 +10,8 @@ use socketcan::{CanFrame, CanSocket, Socket};
 
 use super::{Adapter, AdapterError};
 
-/// How long the interface may take to accept a frame. Its queue is full while nobody acknowledges on the bus.
+/// How long the interface may take to accept a frame. Its queue is full while nobody acknowledges
+/// on the bus.
 const PATIENCE: Duration = Duration::from_secs(1);
 /// `ENOBUFS`: the interface's queue is full. The kernel does not block for it.
 const QUEUE_FULL: i32 = 105;
@@ -24,7 +25,8 @@ pub struct SocketCan {
 }
 
 impl SocketCan {
-    /// Opens an interface, `can0` for example. Its bit rate is set and it is switched on by `ip link`.
+    /// Opens an interface, `can0` for example. Its bit rate is set and it is switched on by `ip
+    /// link`.
     ///
     /// # Errors
     /// [`AdapterError::Open`].

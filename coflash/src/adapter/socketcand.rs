@@ -1,5 +1,5 @@
-//! The socketcand protocol: CAN frames as text over TCP (socketcand, `doc/protocol.md`, raw mode). The client, and what a
-//! server needs of its texts.
+//! The socketcand protocol: CAN frames as text over TCP (socketcand, `doc/protocol.md`, raw mode).
+//! The client, and what a server needs of its texts.
 
 use std::collections::VecDeque;
 use std::io::{self, ErrorKind, Read, Write};
@@ -130,8 +130,8 @@ impl Adapter for Socketcand {
             if let Some(error) = message.strip_prefix("error") {
                 return Err(self.unexpected(format!("error{error}")));
             }
-            // Anything else (echo, statistics, frames of CAN FD) is not for us; a server that sends nothing else
-            // does not keep us here for ever.
+            // Anything else (echo, statistics, frames of CAN FD) is not for us; a server that sends
+            // nothing else does not keep us here for ever.
             if Instant::now() >= deadline {
                 break;
             }
@@ -144,15 +144,16 @@ impl Adapter for Socketcand {
     }
 }
 
-/// What a client says to send a frame: `< send 605 8 40 0 10 0 0 0 0 0 >`; a 29-bit identifier has eight digits.
+/// What a client says to send a frame: `< send 605 8 40 0 10 0 0 0 0 0 >`; a 29-bit identifier has
+/// eight digits.
 #[must_use]
 pub fn send_message(frame: &Frame) -> String {
     let data: String = frame.data().iter().map(|byte| format!("{byte:02X} ")).collect();
     format!("< send {} {} {data}>", identifier(frame), frame.dlc())
 }
 
-/// The frame that a server tells of: `frame 585 12.345678 4000100000000000`, without the brackets; servers write the data with or
-/// without blanks between the bytes. `None` for anything else.
+/// The frame that a server tells of: `frame 585 12.345678 4000100000000000`, without the brackets;
+/// servers write the data with or without blanks between the bytes. `None` for anything else.
 #[must_use]
 pub fn parse_frame(message: &str) -> Option<Frame> {
     let mut words = message.split_ascii_whitespace();
@@ -162,15 +163,17 @@ pub fn parse_frame(message: &str) -> Option<Frame> {
     Frame::new(id, &hex_bytes(&digits)?)
 }
 
-/// What a server says of a frame on the bus, so long after its start: `< frame 585 12.345678 4000100000000000 >`. Without data
-/// there are two blanks before the bracket; python-can wants them.
+/// What a server says of a frame on the bus, so long after its start: `< frame 585 12.345678
+/// 4000100000000000 >`. Without data there are two blanks before the bracket; python-can wants
+/// them.
 #[must_use]
 pub fn frame_message(frame: &Frame, time: Duration) -> String {
     let data: String = frame.data().iter().map(|byte| format!("{byte:02X}")).collect();
     format!("< frame {} {}.{:06} {data} >", identifier(frame), time.as_secs(), time.subsec_micros())
 }
 
-/// The frame that a client sends: `send 605 8 40 0 10 0 0 0 0 0`, without the brackets. `None` for anything else.
+/// The frame that a client sends: `send 605 8 40 0 10 0 0 0 0 0`, without the brackets. `None` for
+/// anything else.
 #[must_use]
 pub fn parse_send(message: &str) -> Option<Frame> {
     let mut words = message.split_ascii_whitespace();

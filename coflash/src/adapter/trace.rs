@@ -30,7 +30,8 @@ impl<A> std::fmt::Debug for Trace<A> {
 }
 
 impl<A: Adapter> Trace<A> {
-    /// Writes what goes over `adapter` to `path`, which is overwritten. `failed` is told when that does not go on.
+    /// Writes what goes over `adapter` to `path`, which is overwritten. `failed` is told when that
+    /// does not go on.
     ///
     /// # Errors
     /// [`AdapterError::Open`] where the file cannot be made.

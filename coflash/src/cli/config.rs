@@ -9,8 +9,8 @@ use coflash::config::{parse, Fault, KEYS};
 
 use super::output::Failure;
 
-/// The file: what `--config` or `COFLASH_CONFIG` says, otherwise `coflash.toml` in the current folder, otherwise the user's
-/// own; `None` where there is none.
+/// The file: what `--config` or `COFLASH_CONFIG` says, otherwise `coflash.toml` in the current
+/// folder, otherwise the user's own; `None` where there is none.
 pub(super) fn find(named: Option<PathBuf>) -> Option<PathBuf> {
     named.or_else(|| {
         let here = PathBuf::from("coflash.toml");

@@ -15,10 +15,11 @@ use super::Context;
 
 /// Converts a firmware file into a block file, ready for 1F50h.
 ///
-/// The same input gives the same output, byte for byte; with --ver, if --date or SOURCE_DATE_EPOCH is given.
+/// The same input gives the same output, byte for byte; with --ver, if --date or SOURCE_DATE_EPOCH
+/// is given.
 ///
-/// Numbers are in C notation: 4096, 0x1000 or octal 010000. The options of BinaryBlockConv are accepted in its own
-/// spelling, too (--start_address and so on).
+/// Numbers are in C notation: 4096, 0x1000 or octal 010000. The options of BinaryBlockConv are
+/// accepted in its own spelling, too (--start_address and so on).
 #[derive(Debug, Args)]
 pub(super) struct Convert {
     #[command(flatten)]
@@ -38,7 +39,8 @@ pub(super) struct Convert {
     #[command(flatten)]
     labels: Labels,
 
-    /// Also write the program as it will lie in flash, gaps filled, to OUT's name with .tmp in the current folder.
+    /// Also write the program as it will lie in flash, gaps filled, to OUT's name with .tmp in the
+    /// current folder.
     #[arg(long)]
     temp: bool,
 
@@ -61,16 +63,19 @@ pub(super) struct Labels {
     #[arg(long, value_name = "NUMBER", value_parser = number, requires = "vid")]
     pid: Option<u32>,
 
-    /// The program's version: major in bits 0-7, minor in bits 8-15, release in bits 16-31 (0x00640A01 is V1.10r100).
+    /// The program's version: major in bits 0-7, minor in bits 8-15, release in bits 16-31
+    /// (0x00640A01 is V1.10r100).
     #[arg(long, value_name = "NUMBER", value_parser = number, requires = "vid")]
     ver: Option<u32>,
 
-    /// The date that goes with --ver, in seconds since 1970; otherwise SOURCE_DATE_EPOCH, otherwise now.
+    /// The date that goes with --ver, in seconds since 1970; otherwise SOURCE_DATE_EPOCH, otherwise
+    /// now.
     #[arg(long, value_name = "SECONDS", env = "SOURCE_DATE_EPOCH")]
     date: Option<u64>,
 }
 
-/// What the manual's converter could do and no bootloader of this house undoes: better no file than a wrong one.
+/// What the manual's converter could do and no bootloader of this house undoes: better no file than
+/// a wrong one.
 #[derive(Debug, Args)]
 struct Encryption {
     #[arg(long, value_name = "KEY", hide = true)]

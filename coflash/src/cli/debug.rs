@@ -16,8 +16,8 @@ use super::Context;
 
 /// Looks into the memory of a device on the bench, and stops its program.
 ///
-/// For firmware that was built with the feature `debugger` (docs/debugger.md); no product has it. Addresses are in C notation, like
-/// 0x20000000.
+/// For firmware that was built with the feature `debugger` (docs/debugger.md); no product has it.
+/// Addresses are in C notation, like 0x20000000.
 #[derive(Debug, Args)]
 pub(super) struct Debug {
     #[command(subcommand)]
@@ -166,7 +166,7 @@ impl What {
             Self::Break(at) => at.run(debugger),
             Self::Continue(Continue { wait }) => {
                 stopped_program(debugger)?;
-                debugger.go_on()?;
+                debugger.resume()?;
                 match wait.wait {
                     Some(time) => stop(debugger, time),
                     None => Ok(Done { words: "the program goes on".to_string(), value: json!({}) }),

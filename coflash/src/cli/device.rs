@@ -56,12 +56,13 @@ pub(super) struct Patience {
     #[arg(long, default_value = "5000", value_parser = milliseconds, value_name = "MS")]
     boot_timeout: Duration,
 
-    /// The pause between two looks at a device that is at work, in milliseconds; otherwise 10 at first and 250 at most.
+    /// The pause between two looks at a device that is at work, in milliseconds; otherwise 10 at
+    /// first and 250 at most.
     #[arg(long, value_parser = milliseconds, value_name = "MS", conflicts_with = "command_timeout")]
     delay: Option<Duration>,
 
-    /// How often a device that is at work is looked at before it is given up, --delay (or a second) apart; in place of
-    /// --command-timeout.
+    /// How often a device that is at work is looked at before it is given up, --delay (or a second)
+    /// apart; in place of --command-timeout.
     #[arg(long, value_parser = number, value_name = "TIMES", conflicts_with = "command_timeout")]
     repeats: Option<u32>,
 
@@ -111,7 +112,8 @@ impl Patience {
     }
 }
 
-/// The flag that Ctrl-C sets. The first time ends a transfer in order, the second time the program at once.
+/// The flag that Ctrl-C sets. The first time ends a transfer in order, the second time the program
+/// at once.
 pub(super) fn cancelled() -> Result<Arc<AtomicBool>, Failure> {
     static FLAG: OnceLock<Arc<AtomicBool>> = OnceLock::new();
     if let Some(flag) = FLAG.get() {

@@ -10,8 +10,8 @@ pub(super) struct Access {
     #[arg(long, value_name = "DIALECT", value_enum, default_value = "auto")]
     dialect: Name,
 
-    /// The password of a device that is locked: a text for lifts; for esacademy a number like 0x494E4954 or its four
-    /// characters, in place of its default.
+    /// The password of a device that is locked: a text for lifts; for esacademy a number like
+    /// 0x494E4954 or its four characters, in place of its default.
     #[arg(long, value_name = "PASSWORD", env = "COFLASH_UNLOCK", hide_env_values = true, value_parser = password)]
     unlock: Option<Password>,
 }

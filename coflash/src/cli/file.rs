@@ -40,7 +40,8 @@ pub(super) struct Source {
     #[arg(long, alias = "adjust_start", value_name = "OFFSET", value_parser = number, default_value = "0")]
     adjust_start: u32,
 
-    /// Check blocks and program with the 16-bit CRC (polynomial 1021h): for a bootloader that was built for it.
+    /// Check blocks and program with the 16-bit CRC (polynomial 1021h): for a bootloader that was
+    /// built for it.
     #[arg(long)]
     crc16: bool,
 
@@ -88,7 +89,8 @@ fn board(name: &str) -> Result<&'static layout::Layout, String> {
 }
 
 impl Source {
-    /// Reads `file` for program `number` and makes its blocks. No device is needed, and none is touched.
+    /// Reads `file` for program `number` and makes its blocks. No device is needed, and none is
+    /// touched.
     pub(super) fn blocks(&self, file: &Path, program: u8, label: Label) -> Result<Converted, Failure> {
         let (firmware, _) = self.load(file, program)?;
         self.convert(firmware, file, program, label)
@@ -96,7 +98,8 @@ impl Source {
 
     /// Reads `file`; tells its format, too.
     pub(super) fn load(&self, file: &Path, program: u8) -> Result<(Firmware, Format), Failure> {
-        // A raw file starts where the region does; conversion will adjust that like any other address.
+        // A raw file starts where the region does; conversion will adjust that like any other
+        // address.
         let raw_address = match self.region(program)? {
             Region::Unknown | Region::CutBehind(_) => None,
             Region::Strict(range) => Some(range.first.wrapping_sub(self.adjust_start)),

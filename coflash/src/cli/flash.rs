@@ -29,15 +29,17 @@ use super::Context;
 
 /// Puts a program into a device, or into many, and starts it.
 ///
-/// Takes a block file, or any other firmware file and converts it on the fly. The file is read and checked completely
-/// before a device is touched. An update that was interrupted can be started again at once.
+/// Takes a block file, or any other firmware file and converts it on the fly. The file is read and
+/// checked completely before a device is touched. An update that was interrupted can be started
+/// again at once.
 ///
 /// Devices with bootloaders of other makers are told apart by themselves, or by --dialect.
 ///
-/// With several nodes, or a job file, the devices are updated at the same time; a failure of one does not stop the others.
+/// With several nodes, or a job file, the devices are updated at the same time; a failure of one
+/// does not stop the others.
 ///
-/// The options of BinaryBlockDownload and DotNetFlashtool are accepted in their own spelling, too (-F, --node_id,
-/// --prog_no, --chk_tgt, --chk_run, --sdo_timeout, --timeout and so on).
+/// The options of BinaryBlockDownload and DotNetFlashtool are accepted in their own spelling, too
+/// (-F, --node_id, --prog_no, --chk_tgt, --chk_run, --sdo_timeout, --timeout and so on).
 #[derive(Debug, Args)]
 pub(super) struct Flash {
     /// The firmware: Intel HEX, Motorola S-record, ELF, raw binary or block file.

@@ -12,7 +12,8 @@ use super::Context;
 
 /// Shows what a firmware file or block file holds, and checks every record, size and CRC in it.
 ///
-/// With --board it also checks that the program lies where the board has room for it. No device is needed.
+/// With --board it also checks that the program lies where the board has room for it. No device is
+/// needed.
 #[derive(Debug, Args)]
 pub(super) struct Inspect {
     #[command(flatten)]
@@ -30,7 +31,8 @@ impl Inspect {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = self.input.path();
         let (firmware, format) = self.source.load(path, self.program)?;
-        // What conversion would refuse is worth knowing now; an image without a board has no region to leave.
+        // What conversion would refuse is worth knowing now; an image without a board has no region
+        // to leave.
         if self.source.has_region() || matches!(firmware, Firmware::Blocks(_)) {
             self.source.convert(firmware.clone(), path, self.program, Default::default())?;
         }

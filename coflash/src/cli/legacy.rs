@@ -1,5 +1,5 @@
-//! What the manual's download tools have and this one does otherwise (tables 9 and 11): accepted, so that a script works
-//! by changing the program's name.
+//! What the manual's download tools have and this one does otherwise (tables 9 and 11): accepted,
+//! so that a script works by changing the program's name.
 
 use clap::Args;
 use coflash::lss::LssAddress;
@@ -12,7 +12,8 @@ use super::Context;
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Options of the manual's tools")]
 pub(super) struct Legacy {
-    /// The bit rate as an index (0 is 1 Mbit/s, 2 is 500, 3 is 250, 4 is 125 kbit/s), for adapters that set it.
+    /// The bit rate as an index (0 is 1 Mbit/s, 2 is 500, 3 is 250, 4 is 125 kbit/s), for adapters
+    /// that set it.
     #[arg(short = 'B', alias = "br_idx", long = "bit-rate-index", value_name = "0..8", value_parser = bit_rate_of_index)]
     index: Option<u32>,
 
@@ -79,7 +80,8 @@ impl Legacy {
         Ok(())
     }
 
-    /// The LSS address, if any part of it was given; the other parts have the manual's defaults (table 9).
+    /// The LSS address, if any part of it was given; the other parts have the manual's defaults
+    /// (table 9).
     pub(super) fn address(&self) -> Option<LssAddress> {
         let parts = [self.vendor, self.product, self.revision, self.serial];
         parts.iter().any(Option::is_some).then(|| LssAddress {

@@ -23,7 +23,8 @@ pub(super) struct Lss {
     #[command(subcommand)]
     service: Service,
 
-    /// How long a device may take for its answer, in milliseconds. Fastscan takes up to 128 times as long.
+    /// How long a device may take for its answer, in milliseconds. Fastscan takes up to 128 times
+    /// as long.
     #[arg(long, global = true, default_value = "100", value_parser = milliseconds, value_name = "MS")]
     lss_timeout: Duration,
 }
@@ -84,7 +85,8 @@ struct Assign {
     #[arg(long)]
     store: bool,
 
-    /// Reset the communication of a device that had another node-ID, so that the new one comes into force at once.
+    /// Reset the communication of a device that had another node-ID, so that the new one comes into
+    /// force at once.
     #[arg(long)]
     reset: bool,
 
@@ -98,7 +100,8 @@ struct SetBitRate {
     #[arg(value_name = "KBITS", value_parser = bit_rate)]
     rate: BitRate,
 
-    /// Change over now, after so many milliseconds of silence; the adapter's own bit rate has to follow.
+    /// Change over now, after so many milliseconds of silence; the adapter's own bit rate has to
+    /// follow.
     #[arg(long, value_name = "MS", value_parser = milliseconds, num_args = 0..=1, default_missing_value = "500")]
     activate: Option<Duration>,
 

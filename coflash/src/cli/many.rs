@@ -14,7 +14,8 @@ use super::output::{Exit, Failure, Output};
 
 const STYLE: &str = "{prefix:<9} {bar:30} {percent:>3} %  {bytes_per_sec:>12}  {msg}";
 
-/// A line of progress for each device: a bar on a terminal, and elsewhere lines with the node in front.
+/// A line of progress for each device: a bar on a terminal, and elsewhere lines with the node in
+/// front.
 pub(super) struct Board {
     out: Output,
     names: Vec<String>,

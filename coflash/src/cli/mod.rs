@@ -38,12 +38,13 @@ const GLOBAL: &str = "For all commands";
 #[derive(Debug, Parser)]
 #[command(name = "coflash", version, max_term_width = 100, after_help = EXIT_CODES)]
 struct Cli {
-    /// The CAN bus: socketcand://HOST:PORT/BUS, slcan:PORT@BITRATE, slcan:tcp://HOST:PORT@BITRATE or (on Linux)
-    /// socketcan:INTERFACE.
+    /// The CAN bus: socketcand://HOST:PORT/BUS, slcan:PORT@BITRATE, slcan:tcp://HOST:PORT@BITRATE
+    /// or (on Linux) socketcan:INTERFACE.
     #[arg(long, global = true, help_heading = GLOBAL, env = "COFLASH_BUS", value_name = "URL")]
     bus: Option<String>,
 
-    /// A file with defaults for options; otherwise coflash.toml in the current folder, or the user's own.
+    /// A file with defaults for options; otherwise coflash.toml in the current folder, or the
+    /// user's own.
     #[arg(long, global = true, help_heading = GLOBAL, env = "COFLASH_CONFIG", value_name = "FILE")]
     config: Option<PathBuf>,
 
@@ -136,7 +137,8 @@ pub fn main() -> ExitCode {
     }
 }
 
-/// Reads the command line, with defaults from the configuration file. Help and wrong usage end the program here.
+/// Reads the command line, with defaults from the configuration file. Help and wrong usage end the
+/// program here.
 fn command_line() -> Result<Cli, Failure> {
     // The file has to be known before the command line can be read in earnest.
     let first = Cli::command().ignore_errors(true).get_matches();

@@ -54,7 +54,8 @@ impl Output {
         self.for_people() && io::stdout().is_terminal()
     }
 
-    /// Says something to people. A reader that has gone away (`| head`) is no reason to stop an update.
+    /// Says something to people. A reader that has gone away (`| head`) is no reason to stop an
+    /// update.
     pub(super) fn say(self, words: impl fmt::Display) {
         if self.for_people() {
             let _ = writeln!(io::stdout(), "{words}");
@@ -85,7 +86,8 @@ impl Output {
         }
     }
 
-    /// A line of an endless list: words for people, a value for programs. Tells whether anybody still reads.
+    /// A line of an endless list: words for people, a value for programs. Tells whether anybody
+    /// still reads.
     pub(super) fn listed(self, words: impl fmt::Display, value: impl FnOnce() -> Value) -> bool {
         if self.json {
             writeln!(io::stdout(), "{}", value()).is_ok()
@@ -111,7 +113,8 @@ impl Output {
     }
 }
 
-/// Colours a word on standard error, if that is a terminal and nobody objects (<https://no-color.org>).
+/// Colours a word on standard error, if that is a terminal and nobody objects
+/// (<https://no-color.org>).
 fn paint(word: &str, colour: &str) -> String {
     let objected = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
     if io::stderr().is_terminal() && !objected {
@@ -171,7 +174,8 @@ pub(super) struct Failure {
 }
 
 impl Failure {
-    /// A conversation that failed. Where the device is silent, the bus is listened to for the reason.
+    /// A conversation that failed. Where the device is silent, the bus is listened to for the
+    /// reason.
     pub(super) fn diagnosed(error: Error, session: &mut Session<'_>) -> Self {
         let silent = matches!(error, Error::NoAnswer { .. });
         let failure = Self::from(error);

@@ -14,11 +14,12 @@ use super::Context;
 
 /// Reads an object, or a program where the device allows it (1F50/1).
 ///
-/// With --unlock a lift device is brought into its bootloader, unlocked there and restarted afterwards, so that its program
-/// (1F50/1) and its parameter set (1F50/2) can be saved.
+/// With --unlock a lift device is brought into its bootloader, unlocked there and restarted
+/// afterwards, so that its program (1F50/1) and its parameter set (1F50/2) can be saved.
 #[derive(Debug, Args)]
 pub(super) struct Read {
-    /// The object: hexadecimal index and, behind a slash, decimal sub-index: 1018/4, or 100A for sub-index 0.
+    /// The object: hexadecimal index and, behind a slash, decimal sub-index: 1018/4, or 100A for
+    /// sub-index 0.
     #[arg(value_name = "INDEX[/SUB]", value_parser = address)]
     object: Address,
 

@@ -5,7 +5,7 @@ use std::time::Duration;
 use canopen::nmt::{parse_state_message, NmtCommand, NmtState};
 use canopen::NodeId;
 use clap::Args;
-use coflash::scan::hear;
+use coflash::scan::listen;
 use serde_json::json;
 
 use super::device::cancelled;
@@ -43,13 +43,14 @@ impl Reset {
         let mut adapter = context.open()?;
         adapter.send(&command.emit(node))?;
         let mut back: Vec<NodeId> = Vec::new();
-        hear(&mut *adapter, self.boot_timeout, &cancelled()?, &mut |frame| {
+        listen(&mut *adapter, self.boot_timeout, &cancelled()?, &mut |frame| {
             if let Some((node, NmtState::Initialisation)) = parse_state_message(frame) {
                 if !back.contains(&node) {
                     back.push(node);
                 }
             }
-            // With a new node-ID it comes back as another one: only the one that was reset ends the waiting.
+            // With a new node-ID it comes back as another one: only the one that was reset ends the
+            // waiting.
             node.is_some_and(|node| back.contains(&node))
         })?;
         let words = match back.as_slice() {

@@ -17,7 +17,8 @@ use super::{info, Context};
 
 /// Shows who is on the bus: asks all node-IDs by SDO, and listens for heartbeats.
 ///
-/// A question disturbs an SDO transfer that another tool has under way with the same node; --listen-only asks nothing.
+/// A question disturbs an SDO transfer that another tool has under way with the same node;
+/// --listen-only asks nothing.
 #[derive(Debug, Args)]
 pub(super) struct Scan {
     /// Whom to ask: node-IDs and ranges, like 1,5,9-12.

@@ -14,8 +14,8 @@ use super::{Cli, Command, Context};
 
 /// Reads commands from the keyboard, with history; or from standard input, one a line.
 ///
-/// What was said on the command line (--bus, --json and so on) holds for all of them. `exit` or Ctrl-D ends it. From
-/// standard input the first command that fails ends it.
+/// What was said on the command line (--bus, --json and so on) holds for all of them. `exit` or
+/// Ctrl-D ends it. From standard input the first command that fails ends it.
 #[derive(Debug, Args)]
 pub(super) struct Shell {}
 

@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use canopen::NodeId;
 
-/// A number of up to 32 bits in C notation: `4096`, `0x1000`, `010000` (octal), with an `u` or `l` behind it if need be.
+/// A number of up to 32 bits in C notation: `4096`, `0x1000`, `010000` (octal), with an `u` or `l`
+/// behind it if need be.
 pub(super) fn number(text: &str) -> Result<u32, String> {
     let bare = text.trim_end_matches(['u', 'U', 'l', 'L']);
     let (digits, radix) = match bare.strip_prefix("0x").or_else(|| bare.strip_prefix("0X")) {

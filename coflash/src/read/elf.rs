@@ -9,8 +9,8 @@ use crate::image::{Image, Pieces};
 
 /// Reads a whole file.
 ///
-/// What counts are the `PT_LOAD` program headers: `p_filesz` bytes at `p_paddr`, where they lie in flash. (Sections
-/// and `p_vaddr` tell where they are used, which is RAM for initialised data.)
+/// What counts are the `PT_LOAD` program headers: `p_filesz` bytes at `p_paddr`, where they lie in
+/// flash. (Sections and `p_vaddr` tell where they are used, which is RAM for initialised data.)
 ///
 /// # Errors
 /// The first fault, with its offset.
@@ -62,7 +62,8 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
         }
         pieces.add(address, data.to_vec(), place);
     }
-    // Linkers write the section headers last: a file that lacks them was cut off, even if all segments are there.
+    // Linkers write the section headers last: a file that lacks them was cut off, even if all
+    // segments are there.
     let sections = u64::from(header.e_shoff(endian));
     let sections_end = sections + u64::from(header.e_shentsize(endian)) * u64::from(header.e_shnum(endian));
     if sections != 0 && sections_end > bytes.len() as u64 {
@@ -75,8 +76,9 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
 mod tests {
     use super::*;
 
-    /// An ELF file written by hand from the System V ABI (gABI chapters 4 and 5): header, two program headers of
-    /// 32 bytes, and the data of two segments. The second runs in RAM (p_vaddr) and lies in flash (p_paddr).
+    /// An ELF file written by hand from the System V ABI (gABI chapters 4 and 5): header, two
+    /// program headers of 32 bytes, and the data of two segments. The second runs in RAM (p_vaddr)
+    /// and lies in flash (p_paddr).
     #[rustfmt::skip]
     const EXAMPLE: [u8; 124] = [
         // e_ident: magic, 32 bit, little-endian, version 1, padding
@@ -91,7 +93,8 @@ mod tests {
         40, 0, 0, 0, 0, 0,          // shentsize, shnum, shstrndx
         // PT_LOAD: offset 116, vaddr = paddr = 08010000h, filesz = memsz = 4, flags r-x, align 1
         1, 0, 0, 0, 116, 0, 0, 0, 0, 0, 1, 8, 0, 0, 1, 8, 4, 0, 0, 0, 4, 0, 0, 0, 5, 0, 0, 0, 1, 0, 0, 0,
-        // PT_LOAD: offset 120, vaddr 20000000h, paddr 08010100h, filesz 4, memsz 16, flags rw-, align 1
+        // PT_LOAD: offset 120, vaddr 20000000h, paddr 08010100h, filesz 4, memsz 16, flags rw-,
+        // align 1
         1, 0, 0, 0, 120, 0, 0, 0, 0, 0, 0, 0x20, 0, 1, 1, 8, 4, 0, 0, 0, 16, 0, 0, 0, 6, 0, 0, 0, 1, 0, 0, 0,
         1, 2, 3, 4,
         5, 6, 7, 8,

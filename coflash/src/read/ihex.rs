@@ -7,7 +7,8 @@ use crate::image::{Image, Pieces};
 /// What the 16-bit offsets of data records count from.
 #[derive(Clone, Copy)]
 enum Base {
-    /// Segment base address (record 02, and 0 before any base record): an offset may not leave its 64 KiB.
+    /// Segment base address (record 02, and 0 before any base record): an offset may not leave its
+    /// 64 KiB.
     Segment(u32),
     /// Upper half of a linear address (record 04).
     Linear(u32),
@@ -34,7 +35,8 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
             }
             0x02 => base = Base::Segment(number(&data, 2, place)? << 4),
             0x04 => base = Base::Linear(number(&data, 2, place)? << 16),
-            // Start addresses: a device starts through its vector table, so they are checked and passed over.
+            // Start addresses: a device starts through its vector table, so they are checked and
+            // passed over.
             0x03 | 0x05 => expect_length(&data, 4, place)?,
             _ => return Err(place.fault(Cause::UnknownRecord(format!("{kind:02X}")))),
         }
@@ -111,8 +113,8 @@ mod tests {
         assert!(image.segments().eq([(0x100, data.to_vec())]));
     }
 
-    /// Segment base 1234h (12340h) and linear base 0801h; the base records' checksums by hand: two's complement of
-    /// 02+02+12+34 = 4A and of 02+04+08+01 = 0F.
+    /// Segment base 1234h (12340h) and linear base 0801h; the base records' checksums by hand:
+    /// two's complement of 02+02+12+34 = 4A and of 02+04+08+01 = 0F.
     #[test]
     fn base_records_move_what_follows() {
         let text = "\

@@ -1,5 +1,5 @@
-//! Readers of firmware files: bytes in, [`Image`] or [`BlockFile`] out. No reader touches a device or the file system
-//! except [`load`].
+//! Readers of firmware files: bytes in, [`Image`] or [`BlockFile`] out. No reader touches a device
+//! or the file system except [`load`].
 
 use std::fmt;
 use std::path::Path;
@@ -29,7 +29,8 @@ pub enum Format {
 }
 
 impl Format {
-    /// Finds out by the first bytes. A raw file looks like nothing in particular and is never found.
+    /// Finds out by the first bytes. A raw file looks like nothing in particular and is never
+    /// found.
     #[must_use]
     pub fn detect(bytes: &[u8]) -> Option<Self> {
         let text = bytes.trim_ascii_start();
@@ -352,8 +353,8 @@ pub enum Cause {
 }
 
 impl Cause {
-    /// The stable number: that of the manual's error table (L-1112e_5, table 5) where it has one, otherwise the
-    /// operating system's.
+    /// The stable number: that of the manual's error table (L-1112e_5, table 5) where it has one,
+    /// otherwise the operating system's.
     #[must_use]
     pub fn number(&self) -> u32 {
         match self {

@@ -6,7 +6,8 @@ use crate::image::{Image, Pieces};
 /// Takes the bytes as they are.
 ///
 /// # Errors
-/// [`Cause::NoAddress`] without an address, [`Cause::AddressOverflow`] where the bytes do not fit behind it.
+/// [`Cause::NoAddress`] without an address, [`Cause::AddressOverflow`] where the bytes do not fit
+/// behind it.
 pub fn read(bytes: &[u8], address: Option<u32>) -> Result<Image, ReadError> {
     let address = address.ok_or(Place::File.fault(Cause::NoAddress))?;
     if u64::from(address) + bytes.len() as u64 > 1 << 32 {

@@ -18,7 +18,8 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
         }
         let Record { kind, address, data } = record(place, line)?;
         match kind {
-            // The header is a text for people. No checksum covers the type: a damaged one would drop a record.
+            // The header is a text for people. No checksum covers the type: a damaged one would
+            // drop a record.
             b'0' if counted > 0 => {
                 return Err(
                     place.fault(Cause::Malformed("a header (S0) behind data records; the line is damaged"))
@@ -120,8 +121,8 @@ mod tests {
         assert_eq!((data[0], data[0x10], data[0x33]), (0x28, 0x00, 0xD4));
     }
 
-    /// Checksums by hand: S2 FF-(05+01+00+00+AA)=4F, S3 FF-(06+08+01+00+00+BB)=35, S5 FF-(03+00+02)=FA,
-    /// S6 FF-(04+00+00+02)=F9, S7 FF-(05+08+01+01+89)=67.
+    /// Checksums by hand: S2 FF-(05+01+00+00+AA)=4F, S3 FF-(06+08+01+00+00+BB)=35, S5
+    /// FF-(03+00+02)=FA, S6 FF-(04+00+00+02)=F9, S7 FF-(05+08+01+01+89)=67.
     #[test]
     fn addresses_have_two_three_or_four_bytes() {
         let text = "S205010000AA4F\r\nS30608010000BB35\r\nS5030002FA\r\nS604000002F9\r\nS7050801018967\r\n";

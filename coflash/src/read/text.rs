@@ -2,7 +2,8 @@
 
 use super::{Cause, Place, ReadError};
 
-/// The lines with their numbers, without line end (LF, CR LF or CR) and trailing blanks. Empty lines are left out.
+/// The lines with their numbers, without line end (LF, CR LF or CR) and trailing blanks. Empty
+/// lines are left out.
 pub(super) fn lines(bytes: &[u8]) -> impl Iterator<Item = (Place, &[u8])> {
     let mut rest = Some(bytes);
     let mut number = 0;

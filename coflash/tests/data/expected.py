@@ -38,7 +38,8 @@ def block_file(control, block_size, crc=zlib.crc32, offset=0):
     assert flash == open("program.bin", "rb").read()
     out, number, address = block(0, 0, control(len(flash)), crc), 1, START
     while any(a >= address for a in found):
-        # A block starts at the word of the first byte that is not in a block yet, and ends with its last byte.
+        # A block starts at the word of the first byte that is not in a block yet, and ends with its
+        # last byte.
         address = min(a for a in found if a >= address) & ~3
         last = max(a for a in found if a < address + block_size - 16)
         out += block(number, address + offset, flash[address - START:last + 1 - START], crc)

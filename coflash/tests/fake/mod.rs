@@ -1,5 +1,6 @@
-//! A device that is none: an adapter with virtual time whose other end plays a bootloader and an application, written
-//! from the manual and from CiA 301 byte by byte, without the product's own server.
+//! A device that is none: an adapter with virtual time whose other end plays a bootloader and an
+//! application, written from the manual and from CiA 301 byte by byte, without the product's own
+//! server.
 
 // Each test uses its part of it.
 #![allow(dead_code)]
@@ -94,7 +95,8 @@ pub struct Fake {
     pub knows_blocks: Blocks,
     /// Segments of block downloads that are lost, as they are counted from the start.
     pub lost_segments: Vec<usize>,
-    /// The segment of a block download at which the device has seen enough: it aborts, and from then on 1F57h reads this.
+    /// The segment of a block download at which the device has seen enough: it aborts, and from
+    /// then on 1F57h reads this.
     pub refuses_segment: Option<(usize, u32)>,
     segments: usize,
     /// Block downloads that were begun.
@@ -122,7 +124,8 @@ struct Download {
     size: usize,
     data: Vec<u8>,
     toggle: u8,
-    /// Of a block download: the last segment in order of this sub-block, and whether it was the last of all.
+    /// Of a block download: the last segment in order of this sub-block, and whether it was the
+    /// last of all.
     sub_block: Option<(u8, bool)>,
 }
 
@@ -230,7 +233,8 @@ impl Fake {
         self.restart = Some((self.now + self.leave_time + self.restart_time, next));
     }
 
-    /// A frame of a block download (CiA 301, 7.2.4.3.9 to 11), if one is under way; tells whether it was one.
+    /// A frame of a block download (CiA 301, 7.2.4.3.9 to 11), if one is under way; tells whether
+    /// it was one.
     fn block_frame(&mut self, bytes: [u8; 8]) -> bool {
         let Blocks::Known(blksize) = self.knows_blocks else { return false };
         let Some(Download { data, size, sub_block: Some((seqno, ended)), .. }) = &mut self.download else {

@@ -41,8 +41,8 @@ pub fn data(name: &str) -> String {
     format!("{}/tests/data/{name}", env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Compares with `tests/snapshots/NAME.txt`, where a person has read and approved what another person will read. With
-/// `COFLASH_BLESS` in the environment the file is written instead.
+/// Compares with `tests/snapshots/NAME.txt`, where a person has read and approved what another
+/// person will read. With `COFLASH_BLESS` in the environment the file is written instead.
 #[track_caller]
 pub fn snapshot(name: &str, found: &str) {
     let path = format!("{}/tests/snapshots/{name}.txt", env!("CARGO_MANIFEST_DIR"));
@@ -81,7 +81,8 @@ impl Drop for Folder {
     }
 }
 
-/// Puts a fake device behind a socketcand server; gives the bus URL. The device is handed back when the client goes.
+/// Puts a fake device behind a socketcand server; gives the bus URL. The device is handed back when
+/// the client goes.
 pub fn serve<A: Adapter + Send + 'static>(mut fake: A) -> (String, thread::JoinHandle<A>) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let bus = format!("socketcand://{}/can0", listener.local_addr().unwrap());

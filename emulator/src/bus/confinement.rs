@@ -1,11 +1,13 @@
-//! Fault confinement: the error counters of a node and what follows from them (ISO 11898-1:2015, 12.1.4).
+//! Fault confinement: the error counters of a node and what follows from them (ISO 11898-1:2015,
+//! 12.1.4).
 
 /// What a node's counters allow it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ErrorState {
     /// Takes part, and answers errors with six dominant bits that destroy the frame for everyone.
     Active,
-    /// Takes part, but its error flags are recessive and it leaves eight more bits free behind its own frames.
+    /// Takes part, but its error flags are recessive and it leaves eight more bits free behind its
+    /// own frames.
     Passive,
     /// Takes no part until 128 × 11 recessive bits have gone by.
     BusOff,
@@ -13,8 +15,9 @@ pub enum ErrorState {
 
 /// The transmit and receive error counters of one node.
 ///
-/// Simplified in two points: an error costs a receiver 1, or 9 where the standard's rules (a) and (b) apply together
-/// (it saw the error first, and the others' flags follow its own); and no node counts more than once per error frame.
+/// Simplified in two points: an error costs a receiver 1, or 9 where the standard's rules (a) and
+/// (b) apply together (it saw the error first, and the others' flags follow its own); and no node
+/// counts more than once per error frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Confinement {
     tec: u16,
@@ -27,8 +30,8 @@ const WARNING: u16 = 96;
 const ACTIVE_LIMIT: u16 = 127;
 /// A transmit error counter above this puts the node bus-off.
 const BUS_OFF_LIMIT: u16 = 255;
-/// The receive error counter after a good frame in error passive state; the standard allows 119 to 127, the bxCAN
-/// takes 120 (RM0090, CAN_ESR).
+/// The receive error counter after a good frame in error passive state; the standard allows 119 to
+/// 127, the bxCAN takes 120 (RM0090, CAN_ESR).
 const AFTER_PASSIVE: u8 = 120;
 
 impl Confinement {
@@ -62,8 +65,8 @@ impl Confinement {
         self.tec >= WARNING || u16::from(self.rec) >= WARNING
     }
 
-    /// A frame of its own failed. `exempt`: rule (c) exception 1, an error passive transmitter without an acknowledge
-    /// that sees no dominant bit during its passive flag.
+    /// A frame of its own failed. `exempt`: rule (c) exception 1, an error passive transmitter
+    /// without an acknowledge that sees no dominant bit during its passive flag.
     pub fn transmit_failed(&mut self, exempt: bool) {
         if !exempt {
             self.tec = (self.tec + 8).min(BUS_OFF_LIMIT + 8);

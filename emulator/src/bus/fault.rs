@@ -10,14 +10,16 @@ pub enum FaultAction {
     Drop,
     /// The receivers see a CRC error: error frame, counters, and the controller repeats the frame.
     Disturb,
-    /// The receivers get other bits in one data byte, with a CRC that matches: what only an end-to-end check finds.
+    /// The receivers get other bits in one data byte, with a CRC that matches: what only an
+    /// end-to-end check finds.
     Alter {
         /// Which data byte, from 0. A frame without it passes unchanged.
         byte: usize,
         /// The bits to flip.
         mask: u8,
     },
-    /// As by a store-and-forward gateway: acknowledged, kept back, and sent again so much later as a frame of its own.
+    /// As by a store-and-forward gateway: acknowledged, kept back, and sent again so much later as
+    /// a frame of its own.
     Delay(Span),
     /// The frame gets through, and once more right behind.
     Duplicate,
@@ -48,7 +50,8 @@ impl FrameMatch {
     }
 }
 
-/// Which of the matching frames are hit. Every attempt counts, so a frame that the controller repeats counts again.
+/// Which of the matching frames are hit. Every attempt counts, so a frame that the controller
+/// repeats counts again.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum When {
     /// All.

@@ -32,7 +32,8 @@ pub fn bit_rate(bit: Span) -> u32 {
     (PICOS + bit.0 / 2).checked_div(bit.0).and_then(|rate| u32::try_from(rate).ok()).unwrap_or(0)
 }
 
-/// The node waits for the bus to be recessive: to synchronise with it, or to come back from bus-off.
+/// The node waits for the bus to be recessive: to synchronise with it, or to come back from
+/// bus-off.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Wait {
     /// Bits before this time do not count.
@@ -77,8 +78,8 @@ impl ErrorKind {
 /// What the bus tells a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BusEvent {
-    /// A frame begins. `own`: it is the one that the node's [`BusNode::request`] named (the node may still lose the
-    /// arbitration).
+    /// A frame begins. `own`: it is the one that the node's [`BusNode::request`] named (the node
+    /// may still lose the arbitration).
     Started {
         /// Whether the node is among its transmitters.
         own: bool,
@@ -96,8 +97,8 @@ pub enum BusEvent {
     },
     /// A good frame (in loop-back mode its own).
     Received(Frame),
-    /// A frame that others see on the wire was kept from this node by an injected fault: it counts as good but
-    /// carries nothing.
+    /// A frame that others see on the wire was kept from this node by an injected fault: it counts
+    /// as good but carries nothing.
     Missed,
     /// A bad frame. `first`: this node saw the error before the others.
     ReceiveFailed {
@@ -117,12 +118,15 @@ pub enum BusEvent {
     Ended,
 }
 
-/// A controller on the bus. Its answers are about one point of virtual time; the bus asks in the order of time.
+/// A controller on the bus. Its answers are about one point of virtual time; the bus asks in the
+/// order of time.
 pub trait BusNode {
-    /// How it takes part; `None` while it does not (off, initialising, asleep, not synchronised, bus-off).
+    /// How it takes part; `None` while it does not (off, initialising, asleep, not synchronised,
+    /// bus-off).
     fn line(&self) -> Option<Line>;
 
-    /// Changes whenever the node forgets what it was doing (reset, power): a frame begun before is lost.
+    /// Changes whenever the node forgets what it was doing (reset, power): a frame begun before is
+    /// lost.
     fn epoch(&self) -> u32;
 
     /// Its error counters.

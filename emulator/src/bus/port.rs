@@ -1,4 +1,5 @@
-//! A port for the host: a controller with queues instead of mailboxes, for tests, clients and traces.
+//! A port for the host: a controller with queues instead of mailboxes, for tests, clients and
+//! traces.
 
 use std::collections::VecDeque;
 
@@ -20,8 +21,8 @@ struct Outgoing {
     ticket: u64,
 }
 
-/// A controller that takes every frame, sends its own in the order in which it got them, and comes back from bus-off
-/// by itself.
+/// A controller that takes every frame, sends its own in the order in which it got them, and comes
+/// back from bus-off by itself.
 #[derive(Clone, Debug)]
 pub struct HostPort {
     bit: Span,
@@ -65,8 +66,8 @@ impl HostPort {
         self.bit = Span(PICOS / u64::from(bit_rate.max(1)));
     }
 
-    /// Puts a frame into the queue; it may go out from `at` on. Gives the ticket under which [`sent`](Self::sent)
-    /// reports it.
+    /// Puts a frame into the queue; it may go out from `at` on. Gives the ticket under which
+    /// [`sent`](Self::sent) reports it.
     pub fn send(&mut self, frame: Frame, at: Time) -> u64 {
         self.tickets += 1;
         self.outgoing.push_back(Outgoing { at, frame, ticket: self.tickets });
@@ -95,7 +96,8 @@ impl HostPort {
         self.received.front().map(|(at, _)| *at)
     }
 
-    /// The oldest frame sent that has not been asked for: when it had gone out, its ticket, and itself.
+    /// The oldest frame sent that has not been asked for: when it had gone out, its ticket, and
+    /// itself.
     pub fn sent(&mut self) -> Option<(Time, u64, Frame)> {
         self.sent.pop_front()
     }

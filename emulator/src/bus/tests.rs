@@ -1,5 +1,6 @@
-//! The bus with host ports and bxCAN controllers on it. Times are worked out by hand from the frame lengths that the
-//! tests of [`crate::frame`] fix: 080# has 48 bits without intermission, 701#00 has 56.
+//! The bus with host ports and bxCAN controllers on it. Times are worked out by hand from the frame
+//! lengths that the tests of [`crate::frame`] fix: 080# has 48 bits without intermission, 701#00
+//! has 56.
 
 use std::cell::RefCell;
 use std::rc::Rc;
@@ -100,7 +101,8 @@ fn boot_up() -> Frame {
     Frame::standard(0x701, &[0]).unwrap()
 }
 
-/// A controller at 1 Mbit/s that is on the bus at `BASE` µs, all frames into FIFO 0. `btr`: SILM and LBKM.
+/// A controller at 1 Mbit/s that is on the bus at `BASE` µs, all frames into FIFO 0. `btr`: SILM
+/// and LBKM.
 fn controller(btr: u32, mcr: u32) -> Node {
     let mut can = BxCan::new();
     can.set_clock(42_000_000);
@@ -145,7 +147,8 @@ fn three_nodes_arbitrate() {
     bench.send(0, 10, Frame::standard(0x701, &[0]).unwrap());
     bench.send(1, 10, Frame::extended(0x080 << 18, &[]).unwrap());
     bench.send(2, 10, Frame::standard(0x080, &[]).unwrap());
-    // Comes while the first frame is on the wire, and is the strongest of those that wait at its end.
+    // Comes while the first frame is on the wire, and is the strongest of those that wait at its
+    // end.
     bench.send(3, 40, Frame::standard(0x000, &[]).unwrap());
     bench.run(1000);
     let order: Vec<_> = bench.log.borrow().iter().map(|record| record.frame.to_string()).collect();
@@ -175,8 +178,8 @@ fn same_identifier_with_other_data_is_a_bit_error() {
     bench.send(0, 0, Frame::standard(0x701, &[0x00]).unwrap());
     bench.send(1, 0, Frame::standard(0x701, &[0x7F]).unwrap());
     bench.run(45);
-    // SOF 0, identifier 111 00000 (1) 001, RTR, IDE, r0 000, DLC 00 (1) 01, where (1) are stuff bits: 21 bits. The
-    // first data bit is 0 in both, the second one differs: the 23rd.
+    // SOF 0, identifier 111 00000 (1) 001, RTR, IDE, r0 000, DLC 00 (1) 01, where (1) are stuff
+    // bits: 21 bits. The first data bit is 0 in both, the second one differs: the 23rd.
     let (start, end, _, outcome) = bench.log()[0];
     assert_eq!((start, outcome), (0, Outcome::Bad(ErrorKind::BitRecessive)));
     assert_eq!(end, 23 + 12 + 8, "flag and echo, delimiter");
@@ -199,7 +202,8 @@ fn a_lone_node_ends_error_passive_and_goes_on() {
     bench.run(10_000);
     let log = bench.log();
     assert!(log.iter().all(|(.., outcome)| *outcome == Outcome::Bad(ErrorKind::Acknowledge)));
-    // 48 bits less ACK delimiter and end of frame (8), 6 of error flag, 8 of delimiter: 54; next one after 3 more.
+    // 48 bits less ACK delimiter and end of frame (8), 6 of error flag, 8 of delimiter: 54; next
+    // one after 3 more.
     assert_eq!(log[0], (0, 54, 0x080, Outcome::Bad(ErrorKind::Acknowledge)));
     assert_eq!(log[1].0, 57);
     // Error passive after the 16th: 8 bits more between the frames.
@@ -230,8 +234,8 @@ fn a_controller_joins_after_eleven_recessive_bits() {
     assert_eq!(bench.read(0, 0x04) & 1, 1, "INAK");
     bench.run(11);
     assert_eq!(bench.read(0, 0x04) & 1, 0);
-    // Out, and back in the middle of a frame: it waits for the end of it, and 11 recessive bits are what lies
-    // between the ACK slot and the end of the intermission.
+    // Out, and back in the middle of a frame: it waits for the end of it, and 11 recessive bits are
+    // what lies between the ACK slot and the end of the intermission.
     bench.write(0, 0x00, 0x1_0001);
     bench.run(20);
     assert_eq!(bench.read(0, 0x04) & 1, 1);
@@ -285,9 +289,9 @@ fn wrong_bit_rate_disturbs_until_it_is_error_passive() {
     let mut bench = Bench::ports(&[500_000, 500_000, 1_000_000]);
     bench.send(0, 0, sync());
     bench.run(50);
-    // 080h begins 0 000 1 0000 0 1 ...: the fast node samples each bit twice, in the middle of its own. The sixth
-    // equal sample in a row is in the third bit: bit 2 of the slow ones, at (5 + 7/8) us. Flag and echo 12 x 2 us,
-    // delimiter 8 x 2 us.
+    // 080h begins 0 000 1 0000 0 1 ...: the fast node samples each bit twice, in the middle of its
+    // own. The sixth equal sample in a row is in the third bit: bit 2 of the slow ones, at (5 +
+    // 7/8) us. Flag and echo 12 x 2 us, delimiter 8 x 2 us.
     let first = bench.log.borrow()[0];
     assert_eq!(first.outcome, Outcome::Bad(ErrorKind::BitRecessive));
     assert_eq!(first.end, Time(5_875_000 + 40 * US));
@@ -295,7 +299,8 @@ fn wrong_bit_rate_disturbs_until_it_is_error_passive() {
     assert_eq!(bench.port(1).error_counters().rec(), 1);
     assert_eq!(bench.port(2).error_counters().rec(), 9, "it saw it first");
     bench.run(5_000);
-    // 15 errors of 9 make it error passive (135); the transmitter is at 120 then, and its next attempt gets through.
+    // 15 errors of 9 make it error passive (135); the transmitter is at 120 then, and its next
+    // attempt gets through.
     let log = bench.log();
     assert_eq!(log.len(), 16);
     assert_eq!(log[15].3, Outcome::Good);
@@ -447,12 +452,14 @@ fn injected_faults() {
 
     let mut bench = faulty(FaultAction::Duplicate);
     let times = bench.received(2).iter().map(|(at, _)| *at).collect::<Vec<_>>();
-    // Repeated after the intermission: 159 to 215; the third one, requested at 200, waits until 218.
+    // Repeated after the intermission: 159 to 215; the third one, requested at 200, waits until
+    // 218.
     assert_eq!(times, [55, 155, 159 + 55, 218 + 55]);
     assert_eq!(bench.log.borrow()[2].from, None);
 
     let mut bench = faulty(FaultAction::Disturb);
-    // 56 bits: the ACK delimiter is bit 48, the flag begins behind it; 7 + 8 + 3 bits later it is repeated.
+    // 56 bits: the ACK delimiter is bit 48, the flag begins behind it; 7 + 8 + 3 bits later it is
+    // repeated.
     assert_eq!(bench.log()[1], (100, 100 + 49 + 15, 0x701, Outcome::Bad(ErrorKind::BitRecessive)));
     assert_eq!(bench.log()[2].0, 100 + 49 + 18);
     assert_eq!(bench.received(2).len(), 3);

@@ -1,4 +1,5 @@
-//! The acceptance filters: 28 banks shared by CAN1 and CAN2 (RM0090, 32.7.4 "Identifier filtering").
+//! The acceptance filters: 28 banks shared by CAN1 and CAN2 (RM0090, 32.7.4 "Identifier
+//! filtering").
 
 use crate::frame::{Frame, Id};
 use crate::peripheral::Unmodelled;
@@ -6,7 +7,8 @@ use crate::peripheral::Unmodelled;
 /// Banks of the dual bxCAN.
 pub const BANKS: usize = 28;
 const ALL_BANKS: u32 = (1 << BANKS) - 1;
-/// FMR behind a reset: 14 banks for CAN1, initialisation mode, and reserved bits that read as they are.
+/// FMR behind a reset: 14 banks for CAN1, initialisation mode, and reserved bits that read as they
+/// are.
 const FMR_RESET: u32 = 0x2A1C_0E01;
 const FINIT: u32 = 1;
 const CAN2SB: u32 = 0x3F << 8;
@@ -109,7 +111,8 @@ impl Filters {
         })
     }
 
-    /// Writes the register at `offset` of the CAN block. What the hardware ignores comes back as an error.
+    /// Writes the register at `offset` of the CAN block. What the hardware ignores comes back as an
+    /// error.
     pub fn write(&mut self, offset: u32, value: u32) -> Result<(), Unmodelled> {
         let configuration = |name: &str| {
             if self.fmr & FINIT != 0 {
@@ -169,7 +172,8 @@ impl Filters {
         }
     }
 
-    /// Where CAN1 puts the frame; `None` if no filter lets it through or the filters are being set up.
+    /// Where CAN1 puts the frame; `None` if no filter lets it through or the filters are being set
+    /// up.
     #[must_use]
     pub fn accept(&self, frame: &Frame) -> Option<Match> {
         if self.fmr & FINIT != 0 {
@@ -356,7 +360,8 @@ mod tests {
     #[test]
     fn wider_then_list_then_lower_number_wins() {
         let mut filters = Filters::default();
-        // Banks 0 and 1: 16-bit mask, let everything through, bank 1 to FIFO 1. Bank 2: 16-bit list. Bank 3: 32-bit mask.
+        // Banks 0 and 1: 16-bit mask, let everything through, bank 1 to FIFO 1. Bank 2: 16-bit
+        // list. Bank 3: 32-bit mask.
         filters.write(FFA1R, 0b0010).unwrap();
         filters.write(FM1R, 0b0100).unwrap();
         filters.write(FS1R, 0b1000).unwrap();

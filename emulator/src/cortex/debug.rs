@@ -1,7 +1,8 @@
-//! The parts of the debug architecture that a program reaches without a debugger (DDI 0403E section C1): the breakpoint
-//! comparators of the FPB, and what the DebugMonitor exception needs.
+//! The parts of the debug architecture that a program reaches without a debugger (DDI 0403E section
+//! C1): the breakpoint comparators of the FPB, and what the DebugMonitor exception needs.
 //!
-//! **What is missing.** Flash patches (remapping), literal comparators, watchpoints, vector catches.
+//! **What is missing.** Flash patches (remapping), literal comparators, watchpoints, vector
+//! catches.
 
 use crate::peripheral::Unmodelled;
 
@@ -16,7 +17,8 @@ const DEMCR_MON_PEND: u32 = 1 << 17;
 const DEMCR_MON_STEP: u32 = 1 << 18;
 const DEMCR_MON_REQ: u32 = 1 << 19;
 const DEMCR_TRCENA: u32 = 1 << 24;
-/// What a system reset clears (C1.6): everything of the monitor. The rest goes with the power alone.
+/// What a system reset clears (C1.6): everything of the monitor. The rest goes with the power
+/// alone.
 const DEMCR_MON: u32 = DEMCR_MON_EN | DEMCR_MON_STEP | DEMCR_MON_REQ;
 
 const ENABLE: u32 = 1 << 0;

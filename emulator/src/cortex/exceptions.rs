@@ -46,7 +46,8 @@ pub struct Masks {
 pub struct Exceptions {
     pending: u128,
     active: u128,
-    /// Interrupt lines only; the enables of the faults are in [`Self::set_enabled`] too, under their numbers.
+    /// Interrupt lines only; the enables of the faults are in [`Self::set_enabled`] too, under
+    /// their numbers.
     enabled: u128,
     /// Lines that the peripherals hold high at the moment.
     level: u128,
@@ -82,7 +83,8 @@ impl Exceptions {
         }
     }
 
-    /// Takes the pending state away; a line that is still high comes back at the next [`Self::set_levels`].
+    /// Takes the pending state away; a line that is still high comes back at the next
+    /// [`Self::set_levels`].
     pub fn unpend(&mut self, number: u16) {
         if number < self.count {
             self.pending &= !bit(number);
@@ -131,8 +133,8 @@ impl Exceptions {
         }
     }
 
-    /// Takes over which lines (interrupt numbers) are high. A high line becomes pending unless its handler is active
-    /// (PM0214 section 4.3.9).
+    /// Takes over which lines (interrupt numbers) are high. A high line becomes pending unless its
+    /// handler is active (PM0214 section 4.3.9).
     pub fn set_levels(&mut self, lines: &[u16]) {
         self.level = 0;
         for &line in lines {
@@ -216,7 +218,8 @@ impl Exceptions {
         (group < self.execution_priority(masks)).then_some(number)
     }
 
-    /// Whether WFI ends: an exception is pending that would be taken if PRIMASK were clear (PM0214 section 2.5.3).
+    /// Whether WFI ends: an exception is pending that would be taken if PRIMASK were clear (PM0214
+    /// section 2.5.3).
     #[must_use]
     pub fn wakes(&self, masks: Masks) -> bool {
         self.deliverable(Masks { primask: false, ..masks }).is_some()
@@ -304,7 +307,8 @@ mod tests {
         assert_eq!(exceptions.deliverable(Masks::default()), Some(FIRST_LINE + 7));
     }
 
-    /// PM0214 table 44: PRIGROUP 5 leaves bits 7 and 6 for the group, bits 5 and 4 for the subpriority.
+    /// PM0214 table 44: PRIGROUP 5 leaves bits 7 and 6 for the group, bits 5 and 4 for the
+    /// subpriority.
     #[test]
     fn a_subpriority_orders_but_does_not_pre_empt() {
         let mut exceptions = two_lines();

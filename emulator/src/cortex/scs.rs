@@ -1,5 +1,5 @@
-//! The system control space: NVIC and SCB registers (PM0214 sections 4.3 and 4.4), SysTick's registers, the FPU's
-//! access control (section 4.6), and the cycle counter of the DWT.
+//! The system control space: NVIC and SCB registers (PM0214 sections 4.3 and 4.4), SysTick's
+//! registers, the FPU's access control (section 4.6), and the cycle counter of the DWT.
 
 use super::debug::Debug;
 use super::exceptions::{
@@ -131,7 +131,8 @@ impl Scs {
         }
     }
 
-    /// Whether the FPU may be used (CPACR, CP10 and CP11; privileged access suffices, our code is privileged).
+    /// Whether the FPU may be used (CPACR, CP10 and CP11; privileged access suffices, our code is
+    /// privileged).
     #[must_use]
     pub fn fpu_enabled(&self) -> bool {
         self.cpacr >> 20 & 0b101 == 0b101
@@ -149,7 +150,8 @@ impl Scs {
         self.ccr & CCR_RESET != 0
     }
 
-    /// CCR.BFHFNMIGN and the like are kept, not acted upon; SLEEPDEEP is for the caller to see at WFI.
+    /// CCR.BFHFNMIGN and the like are kept, not acted upon; SLEEPDEEP is for the caller to see at
+    /// WFI.
     #[must_use]
     pub fn sleeps_deeply(&self) -> bool {
         self.scr & SCR_SLEEPDEEP != 0

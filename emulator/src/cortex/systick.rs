@@ -9,7 +9,8 @@ const CSR_CLKSOURCE: u32 = 1 << 2;
 const CSR_COUNTFLAG: u32 = 1 << 16;
 const COUNTER: u32 = 0x00FF_FFFF;
 
-/// The 24-bit down-counter. It is computed from the time since it was last touched, so it costs nothing while it runs.
+/// The 24-bit down-counter. It is computed from the time since it was last touched, so it costs
+/// nothing while it runs.
 #[derive(Clone, Debug)]
 pub struct SysTick {
     csr: u32,
@@ -24,7 +25,8 @@ pub struct SysTick {
 }
 
 impl SysTick {
-    /// As after reset, with a core clock of `hclk` Hz. The counter's value is unknown on the chip, zero here.
+    /// As after reset, with a core clock of `hclk` Hz. The counter's value is unknown on the chip,
+    /// zero here.
     #[must_use]
     pub fn new(hclk: u64) -> Self {
         Self { csr: 0, reload: 0, value: 0, anchor: Time(0), zeros_seen: 0, hclk }
@@ -161,8 +163,8 @@ impl SysTick {
         self.csr &= !CSR_COUNTFLAG;
     }
 
-    /// SYST_CALIB: on the STM32F4 TENMS is 18750 (1 ms at 150 MHz / 8), NOREF 0, SKEW 1 (PM0214 section 4.5.4; the
-    /// reset value 4000493Eh).
+    /// SYST_CALIB: on the STM32F4 TENMS is 18750 (1 ms at 150 MHz / 8), NOREF 0, SKEW 1 (PM0214
+    /// section 4.5.4; the reset value 4000493Eh).
     #[must_use]
     pub fn read_calib(&self) -> u32 {
         0x4000_493E

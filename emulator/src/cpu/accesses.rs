@@ -1,7 +1,8 @@
 //! Which instruction of a block makes a given access.
 //!
-//! Unicorn tells a peripheral's callback the address, but not the instruction. The registers are up to date then, so the
-//! instruction is the one whose base and offset give that address (encodings: DDI 0403E A5.2.4 and A5.3.5 to A5.3.10).
+//! Unicorn tells a peripheral's callback the address, but not the instruction. The registers are up
+//! to date then, so the instruction is the one whose base and offset give that address (encodings:
+//! DDI 0403E A5.2.4 and A5.3.5 to A5.3.10).
 
 use crate::machine::report::Access;
 
@@ -14,8 +15,8 @@ struct Form {
     len: u32,
 }
 
-/// The address, relative to the block, of the first instruction in `code` that makes this access, the registers being
-/// `registers` (r0 to r14).
+/// The address, relative to the block, of the first instruction in `code` that makes this access,
+/// the registers being `registers` (r0 to r14).
 pub fn find(code: &[u8], registers: &[u32; 15], access: Access, address: u32) -> Option<u32> {
     let halves: Vec<u16> = code.chunks_exact(2).map(|half| u16::from_le_bytes([half[0], half[1]])).collect();
     let mut at = 0;

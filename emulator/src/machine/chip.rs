@@ -1,4 +1,5 @@
-//! Everything of the chip that is not the instruction set: memories, peripherals, clocks, and who answers where.
+//! Everything of the chip that is not the instruction set: memories, peripherals, clocks, and who
+//! answers where.
 
 use std::collections::BTreeSet;
 
@@ -44,7 +45,8 @@ const FPB: u32 = 0xE000_2000;
 const SCS: u32 = 0xE000_E000;
 const DBGMCU: u32 = 0xE004_2000;
 
-/// Bit-band alias of the first MiB of SRAM space (PM0214 section 2.2.5); as much as there is SRAM is mapped.
+/// Bit-band alias of the first MiB of SRAM space (PM0214 section 2.2.5); as much as there is SRAM
+/// is mapped.
 pub const SRAM_ALIAS: u32 = 0x2200_0000;
 /// Bit-band alias of the first MiB of peripheral space.
 pub const PERIPHERAL_ALIAS: Region = Region::new(0x4200_0000, 0x0200_0000);
@@ -84,7 +86,8 @@ enum Place {
     Nobody,
 }
 
-/// Where RCC enables the clock of a block: register offset and bit; `None` for a block that is always clocked.
+/// Where RCC enables the clock of a block: register offset and bit; `None` for a block that is
+/// always clocked.
 type ClockEnable = Option<(u32, u32)>;
 
 /// Start, block, and its clock.
@@ -218,8 +221,8 @@ pub struct Chip {
     pub options: HostMemory,
     /// What went wrong.
     pub reports: Reports,
-    /// Reports of accesses to peripherals whose instruction is still to be found; their address is the one that the
-    /// program used.
+    /// Reports of accesses to peripherals whose instruction is still to be found; their address is
+    /// the one that the program used.
     pub unlocated: Vec<Report>,
     /// What was done.
     pub counters: Counters,
@@ -242,7 +245,8 @@ pub struct Chip {
     pub bus_error: bool,
     /// Translations hold code that has changed since: (address, length).
     pub stale: Vec<(u32, u32)>,
-    /// The translator's memory of what may be read must go: an operation started, and loads from flash must be noticed.
+    /// The translator's memory of what may be read must go: an operation started, and loads from
+    /// flash must be noticed.
     pub flush_tlb: bool,
     /// That was done for the operation that runs.
     guarded: bool,
@@ -408,7 +412,8 @@ impl Chip {
         }
     }
 
-    /// Reports a clock tree that the chip cannot follow. The model runs on; silicon would read rubbish or hang.
+    /// Reports a clock tree that the chip cannot follow. The model runs on; silicon would read
+    /// rubbish or hang.
     fn check_clocks(&mut self) {
         let Clocks { hclk, pclk1, pclk2 } = self.clocks;
         let latency = self.flash.latency();
@@ -420,7 +425,8 @@ impl Chip {
                 "HCLK is {hclk} Hz with {latency} flash wait states: it needs {needed}, to be set before (FLASH_ACR)"
             ));
         }
-        // Datasheet, general operating conditions; those of all chips, as over-drive is not modelled.
+        // Datasheet, general operating conditions; those of all chips, as over-drive is not
+        // modelled.
         for (name, hz, most) in
             [("HCLK", hclk, 168_000_000), ("PCLK1", pclk1, 42_000_000), ("PCLK2", pclk2, 84_000_000)]
         {
@@ -506,7 +512,8 @@ impl Chip {
         .min()
     }
 
-    /// The deadline or the next event, whichever comes first. An event that is due already has had its chance.
+    /// The deadline or the next event, whichever comes first. An event that is due already has had
+    /// its chance.
     #[must_use]
     pub fn next_stop(&self) -> Time {
         let now = self.now();
@@ -525,7 +532,8 @@ impl Chip {
         self.reports.add(Report { time, address, pc, size, access, value, what, count: 1 });
     }
 
-    // --- accesses by the CPU -----------------------------------------------------------------------------------------
+    // --- accesses by the CPU
+    // -----------------------------------------------------------------------------------------
 
     /// The CPU loads `size` bytes (1, 2 or 4) from a peripheral address.
     pub fn load(&mut self, address: u32, size: u8) -> u32 {
@@ -544,7 +552,8 @@ impl Chip {
     /// The CPU stores `size` bytes to a peripheral address.
     pub fn store(&mut self, address: u32, size: u8, value: u32) {
         let result = if PERIPHERAL_ALIAS.contains(address, 1) {
-            // The bus matrix reads the word, changes the bit, writes the word (PM0214 section 2.2.5).
+            // The bus matrix reads the word, changes the bit, writes the word (PM0214 section
+            // 2.2.5).
             let (word, bit) = bit_band(PERIPHERALS.base, address - PERIPHERAL_ALIAS.base);
             self.change_word(word, 1 << bit, (value & 1) << bit)
         } else if size == 4 || address & 3 == 0 && self.takes_halves(address) {
@@ -559,7 +568,8 @@ impl Chip {
         self.after_write();
     }
 
-    /// Whether a register is one of those that a half-word is all of, so that writing it reads nothing.
+    /// Whether a register is one of those that a half-word is all of, so that writing it reads
+    /// nothing.
     fn takes_halves(&self, address: u32) -> bool {
         matches!(self.place(address), Place::Block { block: Block::Usart(_), .. })
     }
@@ -660,8 +670,8 @@ impl Chip {
         result
     }
 
-    /// The word of a register as a load would give it, whether its block has a clock or not; `None` where nothing is modelled.
-    /// What a load does to the register is done.
+    /// The word of a register as a load would give it, whether its block has a clock or not; `None`
+    /// where nothing is modelled. What a load does to the register is done.
     pub fn register(&mut self, address: u32) -> Option<u32> {
         let now = self.now();
         match self.place(address & !3) {

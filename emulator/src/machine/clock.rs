@@ -13,8 +13,8 @@ pub fn ticks_in(picos: u64, hz: u64) -> u64 {
     }
 }
 
-/// How long `ticks` of a clock of `hz` take in picoseconds, rounded up, so that at the end of the span the last tick
-/// is over.
+/// How long `ticks` of a clock of `hz` take in picoseconds, rounded up, so that at the end of the
+/// span the last tick is over.
 #[must_use]
 pub fn picos_of(ticks: u64, hz: u64) -> u64 {
     match ticks.checked_mul(PICOS_PER_SECOND) {
@@ -27,7 +27,8 @@ fn clamp(value: u128) -> u64 {
     u64::try_from(value).unwrap_or(u64::MAX)
 }
 
-/// Counts the CPU's cycles and knows the virtual time that they took, across changes of the clock, without drift.
+/// Counts the CPU's cycles and knows the virtual time that they took, across changes of the clock,
+/// without drift.
 #[derive(Clone, Debug)]
 pub struct CycleClock {
     hz: u64,

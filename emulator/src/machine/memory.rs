@@ -8,8 +8,9 @@ pub const PAGE: u32 = 4096;
 
 /// A block of host memory at a fixed address, page aligned.
 ///
-/// Translated code writes to it through a raw pointer, so no Rust reference to it may live while code runs:
-/// [`Self::bytes`] and [`Self::bytes_mut`] borrow the owner, and the owner is not reachable then.
+/// Translated code writes to it through a raw pointer, so no Rust reference to it may live while
+/// code runs: [`Self::bytes`] and [`Self::bytes_mut`] borrow the owner, and the owner is not
+/// reachable then.
 pub struct HostMemory {
     start: NonNull<u8>,
     layout: Layout,
@@ -43,7 +44,8 @@ impl HostMemory {
     /// What it holds.
     #[must_use]
     pub fn bytes(&self) -> &[u8] {
-        // SAFETY: the block is allocated and initialised as long as `self` lives; the type's rule keeps writers away.
+        // SAFETY: the block is allocated and initialised as long as `self` lives; the type's rule
+        // keeps writers away.
         unsafe { std::slice::from_raw_parts(self.start.as_ptr(), self.size()) }
     }
 

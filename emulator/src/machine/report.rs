@@ -23,16 +23,16 @@ impl std::fmt::Display for Access {
     }
 }
 
-/// An access that the model does not cover, or that the chip would punish or ignore. Each pair of address and program
-/// counter is reported once, with a count.
+/// An access that the model does not cover, or that the chip would punish or ignore. Each pair of
+/// address and program counter is reported once, with a count.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Report {
     /// When it happened first.
     pub time: Time,
     /// The address accessed.
     pub address: u32,
-    /// The instruction that did it, or the first one of its straight run of code where the instruction itself cannot
-    /// be told.
+    /// The instruction that did it, or the first one of its straight run of code where the
+    /// instruction itself cannot be told.
     pub pc: u32,
     /// Bytes accessed.
     pub size: u8,

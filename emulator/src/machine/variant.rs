@@ -1,5 +1,5 @@
-//! What differs between the chips beside memories and interrupt lines: which registers and bits exist, and what they say of
-//! themselves. Other chips of the family go by the STM32F407.
+//! What differs between the chips beside memories and interrupt lines: which registers and bits
+//! exist, and what they say of themselves. Other chips of the family go by the STM32F407.
 
 use shared_abi::geometry::Geometry;
 
@@ -79,8 +79,9 @@ static F429: Variant = Variant {
     ],
 };
 
-/// STM32F446, device 421h, revision A (RM0390, DBGMCU_IDCODE). Reset values and bits of the registers as the PAC has them.
-/// Bit 20 of AHB1ENR, on the others the clock of the CCM RAM, is set after a reset here too, as the PAC has it.
+/// STM32F446, device 421h, revision A (RM0390, DBGMCU_IDCODE). Reset values and bits of the
+/// registers as the PAC has them. Bit 20 of AHB1ENR, on the others the clock of the CCM RAM, is set
+/// after a reset here too, as the PAC has it.
 static F446: Variant = Variant {
     name: "STM32F446",
     idcode: 0x1000_6421,

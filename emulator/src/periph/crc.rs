@@ -5,7 +5,8 @@ use crate::time::Time;
 
 const POLYNOMIAL: u32 = 0x04C1_1DB7;
 
-/// CRC-32 over whole words, most significant bit first, start value FFFF_FFFFh, nothing reflected or inverted.
+/// CRC-32 over whole words, most significant bit first, start value FFFF_FFFFh, nothing reflected
+/// or inverted.
 #[derive(Clone, Debug)]
 pub struct Crc {
     data: u32,
@@ -66,8 +67,9 @@ impl Peripheral for Crc {
 mod tests {
     use super::*;
 
-    /// The CRC-32/MPEG-2 check value: 0376_E6E7h over the text "123456789", of which the unit takes the first eight
-    /// bytes as two big-endian words; one more byte by hand gives the published value.
+    /// The CRC-32/MPEG-2 check value: 0376_E6E7h over the text "123456789", of which the unit takes
+    /// the first eight bytes as two big-endian words; one more byte by hand gives the published
+    /// value.
     #[test]
     fn agrees_with_the_published_check_value() {
         let mut unit = Crc::default();

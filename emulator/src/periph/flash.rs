@@ -1,7 +1,8 @@
 //! Embedded flash interface (RM0090 section 3) and the flash array itself.
 //!
-//! Programming clears bits and never sets one, as on the chip: the F4 does not check that the target is erased. While
-//! an operation runs (BSY) the array answers neither fetches nor data reads; the machine stalls the CPU then.
+//! Programming clears bits and never sets one, as on the chip: the F4 does not check that the
+//! target is erased. While an operation runs (BSY) the array answers neither fetches nor data
+//! reads; the machine stalls the CPU then.
 
 use shared_abi::geometry::{Geometry, Sector};
 
@@ -59,13 +60,15 @@ pub enum FlashTimes {
     Worst,
 }
 
-/// Erase times in milliseconds by parallelism x8, x16, x32, x64: (typical, worst). STM32F405/407 datasheet
-/// (DocID022152 rev 8) tables 40 and 41; x64 needs the external voltage and has no maximum there: the x32 one is used.
+/// Erase times in milliseconds by parallelism x8, x16, x32, x64: (typical, worst). STM32F405/407
+/// datasheet (DocID022152 rev 8) tables 40 and 41; x64 needs the external voltage and has no
+/// maximum there: the x32 one is used.
 const ERASE_16_KIB: [(u64, u64); 4] = [(400, 800), (300, 600), (250, 500), (230, 500)];
 const ERASE_64_KIB: [(u64, u64); 4] = [(1_200, 2_400), (700, 1_400), (550, 1_100), (490, 1_100)];
 const ERASE_128_KIB: [(u64, u64); 4] = [(2_000, 4_000), (1_300, 2_600), (1_000, 2_000), (875, 2_000)];
 const ERASE_MASS: [(u64, u64); 4] = [(16_000, 32_000), (11_000, 22_000), (8_000, 16_000), (6_900, 16_000)];
-/// Programming one unit of any width takes this many microseconds (the same tables): (typical, worst).
+/// Programming one unit of any width takes this many microseconds (the same tables): (typical,
+/// worst).
 const PROGRAM: (u64, u64) = (16, 100);
 
 /// What an operation does to the array when it ends.
@@ -97,8 +100,8 @@ pub enum Cut {
     Before,
     /// When it was complete.
     After,
-    /// In the middle: some bits of a word are programmed, some bytes of a sector erased; which ones follows from the
-    /// seed.
+    /// In the middle: some bits of a word are programmed, some bytes of a sector erased; which ones
+    /// follows from the seed.
     Torn {
         /// Chooses the bits.
         seed: u64,
@@ -225,7 +228,8 @@ impl Flash {
         std::mem::take(&mut self.bus_error)
     }
 
-    /// Takes the time up to which the bus was held because a write had to wait for the running operation.
+    /// Takes the time up to which the bus was held because a write had to wait for the running
+    /// operation.
     pub fn take_wait(&mut self) -> Option<Time> {
         self.waited_until.take()
     }
@@ -248,7 +252,8 @@ impl Flash {
         self.changed.push((offset, u32::try_from(bytes.len()).unwrap_or(u32::MAX)));
     }
 
-    /// Sets the option byte RDP as a debug probe does: AAh no read-out protection, CCh level 2, anything else level 1.
+    /// Sets the option byte RDP as a debug probe does: AAh no read-out protection, CCh level 2,
+    /// anything else level 1.
     pub fn preset_read_protection(&mut self, rdp: u8) {
         for options in [&mut self.options, &mut self.options_written] {
             *options = *options & !0xFF00 | u32::from(rdp) << 8;
@@ -341,7 +346,8 @@ impl Flash {
         Store::Started
     }
 
-    /// Where a write must wait for the running operation, ends it; returns when the write takes effect.
+    /// Where a write must wait for the running operation, ends it; returns when the write takes
+    /// effect.
     fn wait_until_idle(&mut self, now: Time) -> Time {
         match self.busy_until() {
             Some(ends) if ends > now => {
@@ -414,8 +420,8 @@ impl Flash {
         Ok(())
     }
 
-    /// The sector that a value of SNB names. With two banks bit 4 is the bank and the others count its sectors from 0 (section
-    /// 3.9.8); values beyond are reserved.
+    /// The sector that a value of SNB names. With two banks bit 4 is the bank and the others count
+    /// its sectors from 0 (section 3.9.8); values beyond are reserved.
     fn sector_named(&self, code: u32) -> Option<Sector> {
         let code = u8::try_from(code).ok()?;
         let number = match self.geometry.second_bank {
@@ -478,7 +484,8 @@ impl Flash {
                     self.changed.push((sector.region.base - self.geometry.flash.base, sector.region.size));
                 }
             }
-            // The option bytes are double-checked by their complements; a torn set loads as the factory one.
+            // The option bytes are double-checked by their complements; a torn set loads as the
+            // factory one.
             Operation::Options { .. } => self.options = OPTCR_FACTORY & !(OPTCR_OPTLOCK | OPTCR_OPTSTRT),
         }
     }
@@ -530,14 +537,16 @@ impl Flash {
         if value & OPTCR_OPTLOCK != 0 {
             self.option_lock = Lock::Locked;
         } else if value & OPTCR_OPTSTRT != 0 {
-            // Option bytes lie in a sector of their own; the datasheet gives no time: that of a 16 KiB sector.
+            // Option bytes lie in a sector of their own; the datasheet gives no time: that of a 16
+            // KiB sector.
             let takes = Span::from_millis(self.pick(ERASE_16_KIB[2]));
             self.start(Operation::Options { optcr: self.options_written }, takes, start);
         }
         Ok(())
     }
 
-    /// The sixteen option bytes as they read at 1FFF_C000 (section 3.6.1): each value with its complement.
+    /// The sixteen option bytes as they read at 1FFF_C000 (section 3.6.1): each value with its
+    /// complement.
     #[must_use]
     pub fn option_bytes(&self) -> [u8; 16] {
         let mut bytes = [0xFF; 16];
@@ -637,10 +646,12 @@ impl Peripheral for Flash {
         }
     }
 
-    /// System reset: an operation that runs is broken off (section 3.4.1: its contents are not protected).
+    /// System reset: an operation that runs is broken off (section 3.4.1: its contents are not
+    /// protected).
     fn reset(&mut self) {
         if let Some(running) = self.running.take() {
-            // A fixed seed: a reset is no power failure, but leaves the same kind of half-done work.
+            // A fixed seed: a reset is no power failure, but leaves the same kind of half-done
+            // work.
             self.tear(&running.operation, 0x5EED);
         }
         self.acr = 0;
@@ -739,7 +750,8 @@ mod tests {
         assert_eq!(flash.counters.sectors_erased, 1);
     }
 
-    /// RM0090 section 3.9.8: SNB is 10000b for sector 12, the first of the second bank; 01100b to 01111b are not allowed.
+    /// RM0090 section 3.9.8: SNB is 10000b for sector 12, the first of the second bank; 01100b to
+    /// 01111b are not allowed.
     #[test]
     fn sectors_of_the_second_bank_have_codes_of_their_own() {
         for (code, erased) in [

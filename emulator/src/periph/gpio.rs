@@ -81,8 +81,8 @@ impl Gpio {
         }
     }
 
-    /// The level at `pin`. A push-pull output wins over the outside; an open-drain one pulls low only; a floating pin
-    /// reads low.
+    /// The level at `pin`. A push-pull output wins over the outside; an open-drain one pulls low
+    /// only; a floating pin reads low.
     #[must_use]
     pub fn level(&self, pin: u8) -> bool {
         let bit = 1u16 << (pin & 15);

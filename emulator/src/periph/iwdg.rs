@@ -4,7 +4,8 @@ use crate::machine::clock::{picos_of, ticks_in};
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::{Span, Time};
 
-/// Nominal frequency of the low-speed internal oscillator (datasheet DocID022152, LSI characteristics: 17 to 47 kHz).
+/// Nominal frequency of the low-speed internal oscillator (datasheet DocID022152, LSI
+/// characteristics: 17 to 47 kHz).
 pub const LSI_HZ: u64 = 32_000;
 
 const KEY_RELOAD: u32 = 0xAAAA;
@@ -13,7 +14,8 @@ const KEY_START: u32 = 0xCCCC;
 const SR_PVU: u32 = 1 << 0;
 const SR_RVU: u32 = 1 << 1;
 
-/// A value that was written takes up to five LSI cycles to get across the clock domains (section 21.4.4).
+/// A value that was written takes up to five LSI cycles to get across the clock domains (section
+/// 21.4.4).
 const UPDATE: Span = Span(5 * 1_000_000_000_000 / LSI_HZ);
 
 /// The watchdog. Once started only a reset stops it.
@@ -137,8 +139,8 @@ impl Peripheral for Iwdg {
 }
 
 impl Iwdg {
-    /// A new prescaler or reload value. The counter itself keeps its value until the next reload: its remaining ticks
-    /// are counted at the new rate.
+    /// A new prescaler or reload value. The counter itself keeps its value until the next reload:
+    /// its remaining ticks are counted at the new rate.
     fn rescale(&mut self, now: Time, prescaler: u32, reload: u32) {
         if let Some(loaded) = self.loaded {
             let old_divider = 4u64 << self.prescaler.min(6);

@@ -12,7 +12,8 @@ const CR_PVD: u32 = 0b1111 << 4;
 const CR_OVER_DRIVE: u32 = 0b11 << 16;
 const CSR_VOSRDY: u32 = 1 << 14;
 
-/// Regulator scale and backup-domain access; standby, stop and the voltage detector are not modelled.
+/// Regulator scale and backup-domain access; standby, stop and the voltage detector are not
+/// modelled.
 #[derive(Clone, Debug)]
 pub struct Pwr {
     variant: &'static Variant,

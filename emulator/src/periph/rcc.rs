@@ -144,8 +144,8 @@ impl Rcc {
         }
     }
 
-    /// Adds the flags of a reset. Every internal reset pulls NRST low too, so the pin's flag comes with it
-    /// (section 7.1.1).
+    /// Adds the flags of a reset. Every internal reset pulls NRST low too, so the pin's flag comes
+    /// with it (section 7.1.1).
     pub fn note_reset(&mut self, cause: ResetCause) {
         self.csr_flags |= CSR_PINRSTF
             | match cause {
@@ -335,7 +335,8 @@ impl Peripheral for Rcc {
     }
 
     fn next_event(&self) -> Option<Time> {
-        // Only a pending switch of the system clock acts by itself; the ready flags are computed when read.
+        // Only a pending switch of the system clock acts by itself; the ready flags are computed
+        // when read.
         if self.cfgr & 3 == self.sws {
             return None;
         }
@@ -349,7 +350,8 @@ impl Peripheral for Rcc {
 
     fn interrupts(&self, _active: &mut Vec<u16>) {}
 
-    /// System reset: everything but the reset flags, the LSI's request and the backup domain (section 7.1.1).
+    /// System reset: everything but the reset flags, the LSI's request and the backup domain
+    /// (section 7.1.1).
     fn reset(&mut self) {
         let fresh = Self::new(self.variant, self.hse_hz);
         *self = Self {
@@ -375,7 +377,8 @@ mod tests {
 
     const MS: u64 = 1_000_000_000;
 
-    /// The usual set-up of the F407: 8 MHz crystal, M 8, N 336, P 2 give 168 MHz, APB1 a quarter, APB2 a half.
+    /// The usual set-up of the F407: 8 MHz crystal, M 8, N 336, P 2 give 168 MHz, APB1 a quarter,
+    /// APB2 a half.
     #[test]
     fn the_pll_makes_168_mhz_from_an_8_mhz_crystal() {
         let mut rcc = f407(8_000_000);
@@ -436,7 +439,8 @@ mod tests {
         assert_eq!(rcc.read(0x00, Time(u64::MAX)).unwrap() & CR_HSERDY, 0);
     }
 
-    /// What one chip of the family has, another has not: port I of the F407, the clock gates of the F446.
+    /// What one chip of the family has, another has not: port I of the F407, the clock gates of the
+    /// F446.
     #[test]
     fn registers_and_bits_are_those_of_the_chip() {
         const CKGATENR: u32 = 0x90;

@@ -1,4 +1,5 @@
-//! System configuration controller and external interrupts, as plain registers (RM0090 sections 9 and 12).
+//! System configuration controller and external interrupts, as plain registers (RM0090 sections 9
+//! and 12).
 
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::Time;

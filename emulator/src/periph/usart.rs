@@ -1,8 +1,10 @@
-//! Universal (synchronous) asynchronous receiver transmitter (RM0090 section 30), and the line at its two pins.
+//! Universal (synchronous) asynchronous receiver transmitter (RM0090 section 30), and the line at
+//! its two pins.
 //!
-//! The outside speaks 8N1 at a bit rate of its own. Modelled is what makes a serial port of it: start bit, eight data bits, stop
-//! bits, one register and one shift register each way, their flags and interrupts. Parity, nine bits, idle and break detection,
-//! flow control, LIN, IrDA, smart cards, the synchronous mode and DMA are reported when asked for.
+//! The outside speaks 8N1 at a bit rate of its own. Modelled is what makes a serial port of it:
+//! start bit, eight data bits, stop bits, one register and one shift register each way, their flags
+//! and interrupts. Parity, nine bits, idle and break detection, flow control, LIN, IrDA, smart
+//! cards, the synchronous mode and DMA are reported when asked for.
 
 use std::collections::VecDeque;
 
@@ -19,7 +21,8 @@ pub struct Instance {
     pub line: u16,
     /// Whether it is clocked from APB2; from APB1 otherwise.
     pub apb2: bool,
-    /// Pins that can be its transmitter: port, number, alternate function (datasheets, alternate function mapping).
+    /// Pins that can be its transmitter: port, number, alternate function (datasheets, alternate
+    /// function mapping).
     pub tx: &'static [(char, u8, u8)],
     /// Pins that can be its receiver.
     pub rx: &'static [(char, u8, u8)],
@@ -97,15 +100,16 @@ mod cr1 {
 /// `USART_CR2`: what is modelled of it.
 const CR2_STOP: u32 = 3 << 12;
 const CR2_ALL: u32 = 0x7F6F;
-/// `USART_CR3`: what is modelled of it, which is what does nothing without DMA and changes nothing here.
+/// `USART_CR3`: what is modelled of it, which is what does nothing without DMA and changes nothing
+/// here.
 const CR3_EIE: u32 = 1 << 0;
 const CR3_ONEBIT: u32 = 1 << 11;
 const CR3_ALL: u32 = 0x0FFF;
 
 /// Start bit, data and one stop bit.
 const OUTSIDE_BITS: u64 = 10;
-/// A receiver whose bit rate is further off than this many parts in a thousand cannot read the character (section 30.3.5,
-/// tolerance with eight bits and the fraction in use, rounded).
+/// A receiver whose bit rate is further off than this many parts in a thousand cannot read the
+/// character (section 30.3.5, tolerance with eight bits and the fraction in use, rounded).
 const TOLERANCE: u64 = 38;
 /// Characters that nobody took from the line.
 const MOST_HEARD: usize = 64 * 1024;
@@ -229,7 +233,8 @@ impl Usart {
         self.outside.bit_rate = bit_rate;
     }
 
-    /// The outside sends bytes, one behind the other, from `now` on. Gives how many it takes; the rest has to come again.
+    /// The outside sends bytes, one behind the other, from `now` on. Gives how many it takes; the
+    /// rest has to come again.
     pub fn hear(&mut self, bytes: &[u8], now: Time) -> usize {
         let room = MOST_WAITING - self.outside.waiting.len();
         let taken = bytes.len().min(room);
@@ -506,7 +511,8 @@ mod tests {
     const CR1: u32 = 0x0C;
     const MICRO: u64 = 1_000_000;
 
-    /// On, both ways, at 42 MHz and 22.8125 × 16 cycles a bit: 115 068 bit/s, 0.11 % from 115 200 (section 30.3.4).
+    /// On, both ways, at 42 MHz and 22.8125 × 16 cycles a bit: 115 068 bit/s, 0.11 % from 115 200
+    /// (section 30.3.4).
     fn on(enable: u32) -> Usart {
         let mut usart = Usart::new(&INSTANCES[1]);
         usart.set_clock(42_000_000);
@@ -606,7 +612,8 @@ mod tests {
         assert!(line(&usart).is_empty());
     }
 
-    /// Section 30.3.3: the register keeps what is in it, what comes is lost, and a read of SR and one of DR clear ORE.
+    /// Section 30.3.3: the register keeps what is in it, what comes is lost, and a read of SR and
+    /// one of DR clear ORE.
     #[test]
     fn a_character_that_nobody_took_stays_and_the_next_is_lost() {
         let mut usart = on(1 << 5);
@@ -672,7 +679,8 @@ mod tests {
         }
     }
 
-    /// What the outside sends while the chip resets comes whether or not anybody hears it; without power the line is dead.
+    /// What the outside sends while the chip resets comes whether or not anybody hears it; without
+    /// power the line is dead.
     #[test]
     fn the_outside_knows_of_no_reset() {
         let mut usart = on(0);

@@ -1,5 +1,5 @@
-//! The texts of the protocol, without any socket: what linux-can/socketcand's `doc/protocol.md` describes, modes
-//! NO_BUS, BCM (sending only) and RAW.
+//! The texts of the protocol, without any socket: what linux-can/socketcand's `doc/protocol.md`
+//! describes, modes NO_BUS, BCM (sending only) and RAW.
 
 use crate::frame::{ExtendedId, Frame, Id, StandardId};
 use crate::time::Time;
@@ -236,8 +236,9 @@ fn parse_remote_frame(words: &[&str]) -> Result<Frame, String> {
     Frame::remote_frame(parse_id(id)?, parse_dlc(dlc)?).ok_or_else(|| "more than eight data bytes".into())
 }
 
-/// A frame as a client in raw mode gets it. Data bytes stand together, as the daemon writes them (its description
-/// puts blanks between them), and a frame without data has two blanks before its closing bracket: clients split there.
+/// A frame as a client in raw mode gets it. Data bytes stand together, as the daemon writes them
+/// (its description puts blanks between them), and a frame without data has two blanks before its
+/// closing bracket: clients split there.
 #[must_use]
 pub fn frame_element(at: Time, frame: &Frame) -> String {
     let id = match frame.id() {

@@ -1,5 +1,5 @@
-//! Real connections to a world with two ports: the server's and a "device" played by hand. Nothing here looks at a
-//! clock; loops give up after so many turns.
+//! Real connections to a world with two ports: the server's and a "device" played by hand. Nothing
+//! here looks at a clock; loops give up after so many turns.
 
 use super::*;
 use crate::bxcan::BxCan;

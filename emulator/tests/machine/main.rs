@@ -1,4 +1,5 @@
-//! The machine from outside: hand-assembled programs, and what the architecture and the reference manual say of them.
+//! The machine from outside: hand-assembled programs, and what the architecture and the reference
+//! manual say of them.
 
 #[rustfmt::skip]
 mod programs;
@@ -73,7 +74,8 @@ fn put(machine: &mut Machine, address: u32, value: u32) {
     machine.write_ram(address, &value.to_le_bytes()).unwrap();
 }
 
-// --- start and time --------------------------------------------------------------------------------------------------
+// --- start and time
+// --------------------------------------------------------------------------------------------------
 
 #[test]
 fn reset_fetches_stack_pointer_and_entry_and_wfi_costs_nothing() {
@@ -155,9 +157,11 @@ fn ram_is_noise_at_power_on_and_kept_over_a_reset() {
     assert!(snapshot(&other) != first);
 }
 
-// --- exceptions ------------------------------------------------------------------------------------------------------
+// --- exceptions
+// ------------------------------------------------------------------------------------------------------
 
-/// DDI 0403E table B1-8: EXC_RETURN FFFF_FFF1 to a handler, FFFF_FFF9 to the thread on the main stack.
+/// DDI 0403E table B1-8: EXC_RETURN FFFF_FFF1 to a handler, FFFF_FFF9 to the thread on the main
+/// stack.
 #[test]
 fn a_higher_priority_pre_empts() {
     let mut machine = machine(&programs::NESTING);
@@ -183,7 +187,8 @@ fn basepri_and_primask_hold_back_and_primask_lets_wfi_end() {
     assert_eq!(words(&machine, 6), [1, 9, 2, 3, 9, 4]);
 }
 
-/// DDI 0403E B1.5.6: the frame on the process stack, padded to eight bytes with bit 9 of the stacked xPSR.
+/// DDI 0403E B1.5.6: the frame on the process stack, padded to eight bytes with bit 9 of the
+/// stacked xPSR.
 #[test]
 fn svc_from_the_process_stack_and_back() {
     let mut machine = machine(&programs::PROCESS_STACK);
@@ -226,7 +231,8 @@ fn an_interrupt_within_a_conditional_block_leaves_it_whole() {
     assert!(word(&machine, OUT + 16) > 10_000, "ticks: {}", word(&machine, OUT + 16));
 }
 
-/// A load that has to look its page up tells the host where it is; the code behind its IT block is not conditional for that.
+/// A load that has to look its page up tells the host where it is; the code behind its IT block is
+/// not conditional for that.
 #[test]
 fn a_load_within_a_conditional_block_leaves_the_code_behind_it_alone() {
     let mut machine = machine(&programs::CONDITIONAL_LOADS);
@@ -261,7 +267,8 @@ fn faultmask_ends_with_its_handler() {
     assert_eq!(words(&machine, 2), [0, 1]);
 }
 
-// --- FPU -------------------------------------------------------------------------------------------------------------
+// --- FPU
+// -------------------------------------------------------------------------------------------------------------
 
 #[test]
 fn the_fpu_faults_until_it_is_enabled() {
@@ -285,7 +292,8 @@ fn fpu_registers_survive_an_interrupt() {
     assert_eq!(word(&machine, OUT + 8), STACK - 4 * 26);
 }
 
-// --- faults ----------------------------------------------------------------------------------------------------------
+// --- faults
+// ----------------------------------------------------------------------------------------------------------
 
 /// What each bad thing leads to: IPSR, CFSR, HFSR, stacked PC.
 fn fault(kind: u32, enabled: u32, again: u32) -> (Machine, Stop) {
@@ -353,7 +361,8 @@ fn code_runs_in_ram_but_not_in_core_coupled_memory() {
     assert_eq!(machine.reports()[0].access, Access::Fetch);
 }
 
-// --- reset causes ----------------------------------------------------------------------------------------------------
+// --- reset causes
+// ----------------------------------------------------------------------------------------------------
 
 /// RM0090 section 7.3.21: RCC_CSR reset flags.
 #[test]
@@ -385,11 +394,13 @@ fn the_watchdog_resets_unless_it_is_fed() {
     assert!((9 * MS..9 * MS + MS / 10).contains(&fed.now().0), "{}", fed.now());
 }
 
-// --- flash -----------------------------------------------------------------------------------------------------------
+// --- flash
+// -----------------------------------------------------------------------------------------------------------
 
 const SECTOR_1: usize = 0x4000;
 
-/// Datasheet: 250 ms for 16 KiB at x32. Polling from flash sees BSY set never more than once: the CPU stands still.
+/// Datasheet: 250 ms for 16 KiB at x32. Polling from flash sees BSY set never more than once: the
+/// CPU stands still.
 #[test]
 fn code_in_flash_stands_still_while_the_flash_is_busy() {
     let mut machine = with_options(&programs::FLASH_FROM_FLASH, Options::default());
@@ -476,8 +487,9 @@ fn losing_the_power_tears_the_operation_that_runs() {
     assert!(machine.flash()[..SECTOR_1] == before[..SECTOR_1], "its neighbour is whole");
 }
 
-/// With table and handlers in RAM the ticks go on during the erase; with the table in flash the first one waits for the
-/// vector. 250 ms hold 249 ticks and the end of the erase may come just before or after the next.
+/// With table and handlers in RAM the ticks go on during the erase; with the table in flash the
+/// first one waits for the vector. 250 ms hold 249 ticks and the end of the erase may come just
+/// before or after the next.
 #[test]
 fn interrupts_during_an_erase_need_their_vectors_in_ram() {
     let run = |table: u32| {
@@ -509,9 +521,11 @@ fn a_wrong_key_is_a_fault() {
     assert!(machine.reports()[0].what.contains("FLASH_KEYR"));
 }
 
-// --- clocks ----------------------------------------------------------------------------------------------------------
+// --- clocks
+// ----------------------------------------------------------------------------------------------------------
 
-/// 2 ms for the crystal and 0.2 ms for the PLL pass before; 168 MHz / 16 800 makes a tick each 100 µs.
+/// 2 ms for the crystal and 0.2 ms for the PLL pass before; 168 MHz / 16 800 makes a tick each 100
+/// µs.
 #[test]
 fn the_program_sets_the_clock_and_the_cycles_follow() {
     let mut machine = machine(&programs::SCALES_THE_CLOCK);
@@ -547,7 +561,8 @@ fn without_its_crystal_the_board_never_gets_there() {
     assert!(machine.reports()[0].what.contains("no crystal"));
 }
 
-// --- memory map ------------------------------------------------------------------------------------------------------
+// --- memory map
+// ------------------------------------------------------------------------------------------------------
 
 #[test]
 fn bit_band_aliases_reach_their_bits() {
@@ -619,7 +634,8 @@ fn the_host_may_write_into_the_ccm_while_a_program_runs() {
     assert_eq!(word(&machine, 0x1000_003C), 0xA5A5_A5A5);
 }
 
-// --- hostile input ---------------------------------------------------------------------------------------------------
+// --- hostile input
+// ---------------------------------------------------------------------------------------------------
 
 #[test]
 fn bad_images_are_refused_and_leave_the_flash_alone() {
@@ -641,7 +657,8 @@ fn bad_images_are_refused_and_leave_the_flash_alone() {
     assert!(!machine.pin('Z', 99));
 }
 
-/// A machine must take whatever a program does. The program is noise, its registers point at peripherals and memories.
+/// A machine must take whatever a program does. The program is noise, its registers point at
+/// peripherals and memories.
 #[test]
 fn noise_as_a_program_does_no_harm() {
     const PLACES: [u32; 16] = [
@@ -688,7 +705,8 @@ fn noise_as_a_program_does_no_harm() {
     }
 }
 
-// --- debugging -------------------------------------------------------------------------------------------------------
+// --- debugging
+// -------------------------------------------------------------------------------------------------------
 
 /// Runs [`programs::BREAKPOINTS`]; gives pairs of the log, and the three results.
 fn debugged(machine: &mut Machine, arguments: [u32; 4], events: u32) -> (Vec<[u32; 2]>, Vec<u32>) {
@@ -707,8 +725,9 @@ fn debugged(machine: &mut Machine, arguments: [u32; 4], events: u32) -> (Vec<[u3
     (log, words(machine, 3))
 }
 
-/// DDI 0403E section C1: the breakpoint comes before its instruction, which is carried out afterwards; each step is one
-/// instruction, a branch among them; DFSR says 2 for a breakpoint and 1 for a step.
+/// DDI 0403E section C1: the breakpoint comes before its instruction, which is carried out
+/// afterwards; each step is one instruction, a branch among them; DFSR says 2 for a breakpoint and
+/// 1 for a step.
 #[test]
 fn the_monitor_stops_at_breakpoints_and_steps() {
     for (comparator, first) in

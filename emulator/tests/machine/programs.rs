@@ -1,5 +1,5 @@
-//! Thumb programs as machine code, with the listing of GNU as beside it. None comes from a compiler of ours, and the
-//! tests need no assembler.
+//! Thumb programs as machine code, with the listing of GNU as beside it. None comes from a compiler
+//! of ours, and the tests need no assembler.
 
 /// A program: its code, where that lies, and the exception handlers by exception number.
 pub struct Program {
@@ -26,7 +26,8 @@ pub const STORES_AND_SLEEPS: Program = Program {
     ],
 };
 
-/// SysTick every 16 000 cycles; its handler counts at 2000_0000h. The loop counts its wake-ups at 2000_0004h.
+/// SysTick every 16 000 cycles; its handler counts at 2000_0000h. The loop counts its wake-ups at
+/// 2000_0004h.
 pub const SYSTICK: Program = Program {
     base: 0x0800_0200,
     vectors: &[(15, 0x0800_0223)],
@@ -56,9 +57,9 @@ pub const SYSTICK: Program = Program {
     ],
 };
 
-/// Line 0 pends line 1 from its handler. What happens is logged from 2000_0000h on: 1 line 0 starts, its LR;
-/// 2 line 1, its LR and its SP; 3 line 0 ends; 4 back in the thread. The priority of line 1 is taken from
-/// 2000_0100h.
+/// Line 0 pends line 1 from its handler. What happens is logged from 2000_0000h on: 1 line 0
+/// starts, its LR; 2 line 1, its LR and its SP; 3 line 0 ends; 4 back in the thread. The priority
+/// of line 1 is taken from 2000_0100h.
 pub const NESTING: Program = Program {
     base: 0x0800_0200,
     vectors: &[(16, 0x0800_022F), (17, 0x0800_024F)],
@@ -112,8 +113,8 @@ pub const NESTING: Program = Program {
     ],
 };
 
-/// Line 0 at priority 80h is pended under BASEPRI 80h and under PRIMASK; the log at 2000_0000h shows when
-/// its handler (9) comes.
+/// Line 0 at priority 80h is pended under BASEPRI 80h and under PRIMASK; the log at 2000_0000h
+/// shows when its handler (9) comes.
 pub const MASKS: Program = Program {
     base: 0x0800_0200,
     vectors: &[(16, 0x0800_025B)],
@@ -166,8 +167,8 @@ pub const MASKS: Program = Program {
     ],
 };
 
-/// The thread goes to the process stack and calls SVC; logged: LR and MSP in the handler, the stacked PC,
-/// CONTROL and SP back in the thread.
+/// The thread goes to the process stack and calls SVC; logged: LR and MSP in the handler, the
+/// stacked PC, CONTROL and SP back in the thread.
 pub const PROCESS_STACK: Program = Program {
     base: 0x0800_0200,
     vectors: &[(11, 0x0800_0225)],
@@ -205,8 +206,8 @@ pub const PROCESS_STACK: Program = Program {
     ],
 };
 
-/// Uses the FPU after enabling it if 2000_0100h is not 0; line 0's handler clobbers s0 and logs its LR at
-/// 2000_0000h; s0 comes to 2000_0004h afterwards.
+/// Uses the FPU after enabling it if 2000_0100h is not 0; line 0's handler clobbers s0 and logs its
+/// LR at 2000_0000h; s0 comes to 2000_0004h afterwards.
 pub const FPU: Program = Program {
     base: 0x0800_0200,
     vectors: &[(3, 0x0800_0253), (16, 0x0800_0245)],
@@ -254,8 +255,8 @@ pub const FPU: Program = Program {
     ],
 };
 
-/// Does the bad thing that 2000_0100h chooses, with the faults of 2000_0104h (SHCSR) enabled. The handler
-/// logs IPSR, CFSR, HFSR, BFAR, the stacked PC.
+/// Does the bad thing that 2000_0100h chooses, with the faults of 2000_0104h (SHCSR) enabled. The
+/// handler logs IPSR, CFSR, HFSR, BFAR, the stacked PC.
 pub const FAULTS: Program = Program {
     base: 0x0800_0200,
     vectors: &[(3, 0x0800_026D), (4, 0x0800_026D), (5, 0x0800_026D), (6, 0x0800_026D)],
@@ -327,7 +328,8 @@ pub const FAULTS: Program = Program {
     ],
 };
 
-/// Logs RCC_CSR at 2000_0010h, counts its starts at 2000_0000h, and asks for a system reset the first time.
+/// Logs RCC_CSR at 2000_0010h, counts its starts at 2000_0000h, and asks for a system reset the
+/// first time.
 pub const RESET: Program = Program {
     base: 0x0800_0200,
     vectors: &[],
@@ -357,8 +359,8 @@ pub const RESET: Program = Program {
     ],
 };
 
-/// Starts the IWDG with the reload value 0 at /32: 1 ms. Reloads it as often as 2000_0100h says, every 800
-/// µs or so.
+/// Starts the IWDG with the reload value 0 at /32: 1 ms. Reloads it as often as 2000_0100h says,
+/// every 800 µs or so.
 pub const WATCHDOG: Program = Program {
     base: 0x0800_0200,
     vectors: &[],
@@ -391,8 +393,9 @@ pub const WATCHDOG: Program = Program {
     ],
 };
 
-/// Unlocks the flash and erases sector 1 with x32, polling BSY from flash; then programs 1234_5678h at its
-/// start. 2000_0000h counts the polls, 2000_0004h SysTick's exceptions, 2000_0008h holds SR afterwards.
+/// Unlocks the flash and erases sector 1 with x32, polling BSY from flash; then programs 1234_5678h
+/// at its start. 2000_0000h counts the polls, 2000_0004h SysTick's exceptions, 2000_0008h holds SR
+/// afterwards.
 pub const FLASH_FROM_FLASH: Program = Program {
     base: 0x0800_0200,
     vectors: &[(15, 0x0800_0249)],
@@ -447,9 +450,9 @@ pub const FLASH_FROM_FLASH: Program = Program {
     ],
 };
 
-/// Runs at 2000_1000h: calls 0800_4001h, erases sector 1 from RAM, reads a word of flash once meanwhile if
-/// 2000_0100h says so, programs `movs r0, #2; bx lr` and calls again. 2000_0000h: polls; +4, +8: the two
-/// results.
+/// Runs at 2000_1000h: calls 0800_4001h, erases sector 1 from RAM, reads a word of flash once
+/// meanwhile if 2000_0100h says so, programs `movs r0, #2; bx lr` and calls again. 2000_0000h:
+/// polls; +4, +8: the two results.
 pub const FLASH_FROM_RAM: Program = Program {
     base: 0x2000_1000,
     vectors: &[],
@@ -516,8 +519,8 @@ pub const TO_RAM: Program = Program {
     ],
 };
 
-/// Bits through their aliases: RCC_AHB1ENR bit 3 (GPIOD), GPIOD_MODER, a bit of RAM; results from 2000_0000h
-/// on.
+/// Bits through their aliases: RCC_AHB1ENR bit 3 (GPIOD), GPIOD_MODER, a bit of RAM; results from
+/// 2000_0000h on.
 pub const BIT_BAND: Program = Program {
     base: 0x0800_0200,
     vectors: &[],
@@ -586,8 +589,8 @@ pub const PERIPHERALS: Program = Program {
     ],
 };
 
-/// Works and is interrupted by SysTick every 1 000 cycles, for the comparison of two runs; keeps a checksum
-/// of what it saw.
+/// Works and is interrupted by SysTick every 1 000 cycles, for the comparison of two runs; keeps a
+/// checksum of what it saw.
 pub const BUSY: Program = Program {
     base: 0x0800_0200,
     vectors: &[(15, 0x0800_0235)],
@@ -699,8 +702,8 @@ pub const SLEEPS_ON_EXIT: Program = Program {
     ],
 };
 
-/// Copies `movs r0, #1; bx lr` to 2000_1000h, calls it, overwrites it with `movs r0, #2; bx lr`, calls it
-/// again.
+/// Copies `movs r0, #1; bx lr` to 2000_1000h, calls it, overwrites it with `movs r0, #2; bx lr`,
+/// calls it again.
 pub const WRITES_ITS_OWN_CODE: Program = Program {
     base: 0x0800_0200,
     vectors: &[],
@@ -730,9 +733,9 @@ pub const WRITES_ITS_OWN_CODE: Program = Program {
     ],
 };
 
-/// Pends line 0 (priority 80h) under BASEPRI 80h and drops its privilege; counts at 2000_0000h, up to 1 000,
-/// then SVC clears BASEPRI. The handlers log at 2000_0004h (line 0: the count) and 2000_0008h (CONTROL as
-/// SVC sees it).
+/// Pends line 0 (priority 80h) under BASEPRI 80h and drops its privilege; counts at 2000_0000h, up
+/// to 1 000, then SVC clears BASEPRI. The handlers log at 2000_0004h (line 0: the count) and
+/// 2000_0008h (CONTROL as SVC sees it).
 pub const UNPRIVILEGED: Program = Program {
     base: 0x0800_0200,
     vectors: &[(11, 0x0800_0241), (16, 0x0800_023B)],
@@ -822,8 +825,9 @@ pub const WRONG_KEY: Program = Program {
 };
 
 /// Runs at 2000_1000h: SysTick every millisecond with its handler in RAM and the vector table where
-/// 2000_0100h says (its SysTick vector is written there if that is RAM); erases sector 1 with EOPIE; the
-/// flash's handler logs the number of ticks until then at 2000_0004h and SR at 2000_0008h.
+/// 2000_0100h says (its SysTick vector is written there if that is RAM); erases sector 1 with
+/// EOPIE; the flash's handler logs the number of ticks until then at 2000_0004h and SR at
+/// 2000_0008h.
 pub const ERASE_UNDER_INTERRUPTS: Program = Program {
     base: 0x2000_1000,
     vectors: &[],
@@ -886,9 +890,9 @@ pub const ERASE_UNDER_INTERRUPTS: Program = Program {
     ],
 };
 
-/// Switches to 168 MHz (8 MHz crystal, M 8, N 336, P 2, APB1 /4, APB2 /2, 5 wait states if 2000_0100h says
-/// so) by polling, then counts SysTick's 16 800 cycles at 2000_0000h and CYCCNT over 1 000 000 rounds of a
-/// two-cycle loop at 2000_0004h.
+/// Switches to 168 MHz (8 MHz crystal, M 8, N 336, P 2, APB1 /4, APB2 /2, 5 wait states if
+/// 2000_0100h says so) by polling, then counts SysTick's 16 800 cycles at 2000_0000h and CYCCNT
+/// over 1 000 000 rounds of a two-cycle loop at 2000_0004h.
 pub const SCALES_THE_CLOCK: Program = Program {
     base: 0x0800_0200,
     vectors: &[(15, 0x0800_0269)],
@@ -957,8 +961,9 @@ pub const SCALES_THE_CLOCK: Program = Program {
     ],
 };
 
-/// 100 000 rounds of an IT block that lies across a page border, interrupted every 67 cycles by a handler
-/// that changes the flags. Every second round adds 7, 1, 3 and 5 to the words at 2000_0000h.
+/// 100 000 rounds of an IT block that lies across a page border, interrupted every 67 cycles by a
+/// handler that changes the flags. Every second round adds 7, 1, 3 and 5 to the words at
+/// 2000_0000h.
 pub const CONDITIONS: Program = Program {
     base: 0x0800_0FDC,
     vectors: &[(15, 0x0800_1013)],
@@ -1002,8 +1007,8 @@ pub const CONDITIONS: Program = Program {
     ],
 };
 
-/// In 64 rounds the first load from a page of flash, within an IT block; behind the block four additions of 1. Their sum at
-/// 2000_0000h.
+/// In 64 rounds the first load from a page of flash, within an IT block; behind the block four
+/// additions of 1. Their sum at 2000_0000h.
 pub const CONDITIONAL_LOADS: Program = Program {
     base: 0x0800_0200,
     vectors: &[],
@@ -1034,7 +1039,8 @@ pub const CONDITIONAL_LOADS: Program = Program {
     ],
 };
 
-/// Reads the word at 0801_0000h, then calls what is there for ever, and keeps its result at 2000_0000h.
+/// Reads the word at 0801_0000h, then calls what is there for ever, and keeps its result at
+/// 2000_0000h.
 pub const CALLS_WHAT_IT_HAS_READ: Program = Program {
     base: 0x0800_0200,
     vectors: &[],
@@ -1050,10 +1056,11 @@ pub const CALLS_WHAT_IT_HAS_READ: Program = Program {
     ],
 };
 
-/// Sets a breakpoint, comes to it, and then to a BKPT. What DEMCR is given is taken from 2000_0100h, the comparator from 2000_0104h
-/// (0: neither it nor the unit is touched), whether PRIMASK is set from 2000_0108h. Each DebugMonitor logs the PC that was stacked
-/// and DFSR, from 2000_0200h on, turns the breakpoint off, skips a BKPT, and asks for as many steps as 2000_010Ch says. A HardFault
-/// logs the PC, HFSR and DFSR there, and stays.
+/// Sets a breakpoint, comes to it, and then to a BKPT. What DEMCR is given is taken from
+/// 2000_0100h, the comparator from 2000_0104h (0: neither it nor the unit is touched), whether
+/// PRIMASK is set from 2000_0108h. Each DebugMonitor logs the PC that was stacked and DFSR, from
+/// 2000_0200h on, turns the breakpoint off, skips a BKPT, and asks for as many steps as 2000_010Ch
+/// says. A HardFault logs the PC, HFSR and DFSR there, and stays.
 pub const BREAKPOINTS: Program = Program {
     base: 0x0800_0200,
     vectors: &[(3, 0x0800_0279), (12, 0x0800_0241)],

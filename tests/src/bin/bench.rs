@@ -1,4 +1,5 @@
-//! `cargo xtask bench`: how fast a program gets into the device, beside the limits of wire and flash.
+//! `cargo xtask bench`: how fast a program gets into the device, beside the limits of wire and
+//! flash.
 
 use std::process::ExitCode;
 

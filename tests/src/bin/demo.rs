@@ -1,6 +1,7 @@
 //! The main job for people to watch: `cargo xtask demo`.
 //!
-//! Host tool, bus and chip run in this process, in virtual time; the firmware is the one that goes onto the board.
+//! Host tool, bus and chip run in this process, in virtual time; the firmware is the one that goes
+//! onto the board.
 
 use std::fs::File;
 use std::io::BufWriter;
@@ -56,9 +57,9 @@ fn demo(trace: Option<&str>) -> Outcome<()> {
 
     chapter("Power on: an empty board comes up in its bootloader");
     bench.power_on();
-    say(bench.time(), "power on");
+    print_line(bench.time(), "power on");
     let up = bench.await_boot_up(1000);
-    say(up, &format!("boot-up of node {NODE}"));
+    print_line(up, &format!("boot-up of node {NODE}"));
     introduce(&mut bench)?;
 
     chapter("Version 1 goes into the board");
@@ -69,9 +70,9 @@ fn demo(trace: Option<&str>) -> Outcome<()> {
 
     chapter("The master calls the application back: 1F51h = 80h");
     bench.session().command(1, ProgramControl::StartBootloader)?;
-    say(bench.time(), "the application acknowledged, and leaves");
+    print_line(bench.time(), "the application acknowledged, and leaves");
     let up = bench.await_boot_up(1000);
-    say(up, "boot-up: the bootloader is back");
+    print_line(up, "boot-up: the bootloader is back");
     introduce(&mut bench)?;
 
     chapter("Version 2 goes into the board");
@@ -81,12 +82,12 @@ fn demo(trace: Option<&str>) -> Outcome<()> {
 
     chapter("The power fails, and comes back");
     bench.power_off();
-    say(bench.time(), "power off");
+    print_line(bench.time(), "power off");
     bench.run_ms(1000);
     bench.power_on();
-    say(bench.time(), "power on");
+    print_line(bench.time(), "power on");
     let up = bench.await_boot_up(1000);
-    say(up, "boot-up: the program started by itself");
+    print_line(up, "boot-up: the program started by itself");
     introduce(&mut bench)?;
     heartbeat(&mut bench)?;
     bench.assert_nothing_unmodelled();
@@ -104,7 +105,7 @@ fn chapter(title: &str) {
     println!("\n{title}");
 }
 
-fn say(at: Time, what: &str) {
+fn print_line(at: Time, what: &str) {
     println!("  {:>9.3} s  {what}", at.0 as f64 / 1e12);
 }
 
@@ -116,7 +117,7 @@ fn introduce(bench: &mut Bench) -> Outcome<()> {
     let version = session.read_text(Address::new(SOFTWARE_VERSION, 0))?;
     let crc = session.read_number(Address::new(PROGRAM_ID, 1))?;
     let what = if running.is_bootloader() { "the bootloader answers" } else { "the application answers" };
-    say(bench.time(), &format!("{what}: \"{name}\", version \"{version}\", program CRC {crc:08X}h"));
+    print_line(bench.time(), &format!("{what}: \"{name}\", version \"{version}\", program CRC {crc:08X}h"));
     Ok(())
 }
 
@@ -132,7 +133,7 @@ fn heartbeat(bench: &mut Bench) -> Outcome<()> {
         [0x7F] => "PRE-OPERATIONAL",
         _ => "in an unexpected state",
     };
-    say(beat.0, &format!("heartbeat: {state}"));
+    print_line(beat.0, &format!("heartbeat: {state}"));
     Ok(())
 }
 
@@ -164,14 +165,14 @@ fn install(bench: &mut Bench, file: &BlockFile) -> Outcome<()> {
             if done == total && !complete {
                 complete = true;
                 bar.finish();
-                say(clock.get(), &format!("all {total} bytes are in the device"));
+                print_line(clock.get(), &format!("all {total} bytes are in the device"));
             }
         }
-        event => say(clock.get(), &event.to_string()),
+        event => print_line(clock.get(), &event.to_string()),
     });
     let report = outcome?;
     let rate = f64::from(report.program_size) / report.took.as_secs_f64() / 1024.0;
-    say(
+    print_line(
         bench.time(),
         &format!("the update took {:.1} s on the bus ({rate:.1} KiB/s)", report.took.as_secs_f64()),
     );

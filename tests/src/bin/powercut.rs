@@ -1,4 +1,5 @@
-//! `cargo xtask powercut`: the power cut at every flash operation, and what is there when it comes back.
+//! `cargo xtask powercut`: the power cut at every flash operation, and what is there when it comes
+//! back.
 
 use std::fmt::Display;
 use std::process::ExitCode;

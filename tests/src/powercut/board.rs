@@ -1,8 +1,9 @@
-//! Level 2: the built firmware on the emulated chip, updated by `coflash`, its power cut at flash operations.
+//! Level 2: the built firmware on the emulated chip, updated by `coflash`, its power cut at flash
+//! operations.
 //!
-//! A point starts from a copy of the flash of a board that runs version 1, so that points depend on nothing before
-//! them and run
-//! beside each other. What must be in the flash in the end is taken from the ELF files by the emulator's own loader.
+//! A point starts from a copy of the flash of a board that runs version 1, so that points depend on
+//! nothing before them and run beside each other. What must be in the flash in the end is taken
+//! from the ELF files by the emulator's own loader.
 
 use std::fmt;
 use std::panic::{catch_unwind, AssertUnwindSafe};
@@ -20,16 +21,16 @@ use crate::bench::{Bench, NODE};
 use crate::firmware;
 
 const VERSION: Address = Address::new(0x100A, 0);
-/// As fast as the bus can be. It is stored in the device, and is not what a device without parameters uses: one
-/// that answers
-/// has kept them.
+/// As fast as the bus can be. It is stored in the device, and is not what a device without
+/// parameters uses: one that answers has kept them.
 const RATE: BitRate = BitRate::K1000;
 const BIT_RATE: u32 = 1_000_000;
 /// A board with a program says its boot-up within this time; in ms.
 const BOOT_MS: u64 = 200;
 /// The name before the numbers of a point.
 pub const NAME: &str = "board";
-/// The first and last operations of an update, which are those on the parameters: a sample has all of them.
+/// The first and last operations of an update, which are those on the parameters: a sample has all
+/// of them.
 const EDGE: u64 = 10;
 
 /// In which way an operation is cut.
@@ -98,7 +99,8 @@ impl FromStr for Point {
 /// Which points are run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Effort {
-    /// The first and last operations, and about so many in between, each in one way; some with a cut in the recovery.
+    /// The first and last operations, and about so many in between, each in one way; some with a
+    /// cut in the recovery.
     Sample(u64),
     /// Each operation in every way, and a cut in each recovery.
     Full,
@@ -221,7 +223,8 @@ impl Story {
         Ok(outcome)
     }
 
-    /// Runs a point, looks behind each cut and at the end, and gives what the device did behind each cut.
+    /// Runs a point, looks behind each cut and at the end, and gives what the device did behind
+    /// each cut.
     fn at(&self, point: Point) -> Result<Vec<Outcome>, String> {
         let mut bench = board_with(&self.start)?;
         let mut last = Outcome::Old;

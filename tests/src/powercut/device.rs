@@ -1,4 +1,5 @@
-//! A device of `boot-core` and the flash model: power on, boot stage, bootloader; and the same with a bug in it.
+//! A device of `boot-core` and the flash model: power on, boot stage, bootloader; and the same with
+//! a bug in it.
 
 use core::task::Poll;
 
@@ -149,7 +150,8 @@ impl Device {
         }
     }
 
-    /// Whether each program with a record is what the record says: nothing may vouch for a program that is not there.
+    /// Whether each program with a record is what the record says: nothing may vouch for a program
+    /// that is not there.
     ///
     /// # Errors
     /// The program that is not.
@@ -342,8 +344,8 @@ enum Store {
     Journal(Journal),
     /// Stores this record where it should take one away, or none at all.
     Instead(Journal, Option<Value>),
-    /// One region, record behind record; a word in front of each tells what it is about. `checked`: with a CRC
-    /// behind it.
+    /// One region, record behind record; a word in front of each tells what it is about. `checked`:
+    /// with a CRC behind it.
     Naive {
         checked: bool,
         work: Vec<(u32, u32)>,

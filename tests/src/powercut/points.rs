@@ -244,9 +244,8 @@ fn at_operation(scenario: &Scenario, device: &Device, operation: u32, every_kind
     report
 }
 
-/// Cuts the power at every operation of a scenario, in every way, and at every operation of the recovery; there in
-/// one way that
-/// changes from operation to operation, or in `every_kind`.
+/// Cuts the power at every operation of a scenario, in every way, and at every operation of the
+/// recovery; there in one way that changes from operation to operation, or in `every_kind`.
 ///
 /// # Errors
 /// If the scenario does not even work without a cut.
@@ -295,7 +294,8 @@ fn run_until(
 
     let next = AtomicU32::new(1);
     let total = Mutex::new(Report { operations: operations.into(), ..Report::default() });
-    // One that is to stop early goes through the operations in order: what it tells is the first, whoever asks.
+    // One that is to stop early goes through the operations in order: what it tells is the first,
+    // whoever asks.
     let threads =
         if violations == 1 { 1 } else { std::thread::available_parallelism().map_or(1, usize::from) };
     std::thread::scope(|scope| {

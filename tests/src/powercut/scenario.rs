@@ -36,7 +36,8 @@ pub struct Allowed {
 /// Told by a script as it goes on.
 pub type Tell<'a> = &'a mut dyn FnMut(Allowed);
 
-/// A story: how the device is before, what is done to it, and what brings it to the end after a cut.
+/// A story: how the device is before, what is done to it, and what brings it to the end after a
+/// cut.
 pub struct Scenario {
     /// Its name on the command line.
     pub name: &'static str,
@@ -97,7 +98,8 @@ fn with_second(outcomes: &[Outcome], second: &[Option<(u8, bool)>]) -> Allowed {
     Allowed { second: second.to_vec(), ..allowed(outcomes) }
 }
 
-// --- block files -----------------------------------------------------------------------------------------------------
+// --- block files
+// -----------------------------------------------------------------------------------------------------
 
 fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
     let mut bytes = Vec::new();
@@ -187,7 +189,8 @@ fn update_after_a_cut(device: &mut Device, _: &Allowed, tell: Tell<'_>) -> Resul
     device.host(|host| host.command(1, SET_SIGNATURE))
 }
 
-// --- the stories -----------------------------------------------------------------------------------------------------
+// --- the stories
+// -----------------------------------------------------------------------------------------------------
 
 /// All of them.
 pub const SCENARIOS: &[Scenario] = &[

@@ -11,7 +11,8 @@ use crate::time::Instant;
 /// Sub-blocks in a row of which nothing arrives, until the transfer is given up.
 const HOPELESS: u8 = 10;
 
-/// Writes a value: expedited up to four bytes; above that segmented, or as blocks where that is asked for.
+/// Writes a value: expedited up to four bytes; above that segmented, or as blocks where that is
+/// asked for.
 #[derive(Debug)]
 pub struct Download<D> {
     link: Link,
@@ -164,8 +165,8 @@ impl SubBlock {
         BlockSegment { last: self.sent(data) == data.len(), seqno: self.seqno, data: bytes }
     }
 
-    /// On with the next sub-block, from behind the last segment that arrived. If that was the last of all it gives
-    /// the CRC over all data, 0 where it is not wanted.
+    /// On with the next sub-block, from behind the last segment that arrived. If that was the last
+    /// of all it gives the CRC over all data, 0 where it is not wanted.
     fn acknowledged(&mut self, ack: BlockAck, data: &[u8]) -> Result<Option<u16>, AbortCode> {
         let blksize = check_blksize(ack.blksize)?;
         if ack.ackseq > self.seqno {

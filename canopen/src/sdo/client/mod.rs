@@ -1,8 +1,9 @@
 //! The SDO client: one value per transfer, [`Download`] or [`Upload`].
 //!
-//! A transfer is driven through [`Transfer`]: [`handle`](Transfer::handle) takes frames, whatever they are, and
-//! [`poll`](Transfer::poll) tells what to do next. A blocking caller loops over one transfer, a caller with many nodes
-//! keeps one transfer per node and passes every frame to all of them.
+//! A transfer is driven through [`Transfer`]: [`handle`](Transfer::handle) takes frames, whatever
+//! they are, and [`poll`](Transfer::poll) tells what to do next. A blocking caller loops over one
+//! transfer, a caller with many nodes keeps one transfer per node and passes every frame to all of
+//! them.
 //!
 //! ```
 //! use canopen::sdo::client::{Config, Step, Transfer, Upload};
@@ -29,8 +30,9 @@
 //! # assert_eq!(result, Err(canopen::sdo::SdoError::NoAnswer));
 //! ```
 //!
-//! A block transfer has many frames to send, or to receive, between two answers. A caller should take in what has arrived
-//! between two [`Step::Send`], so that a refusal in the middle is heard in the middle.
+//! A block transfer has many frames to send, or to receive, between two answers. A caller should
+//! take in what has arrived between two [`Step::Send`], so that a refusal in the middle is heard in
+//! the middle.
 
 use core::fmt;
 
@@ -70,8 +72,8 @@ pub struct Block {
     pub blksize: u8,
     /// Upload: up to this many bytes the server may answer without blocks; 0 for never.
     pub pst: u8,
-    /// Upload: how long a sub-block may pause before what came is acknowledged and the rest asked for again, in
-    /// milliseconds. Less than the server's time-out.
+    /// Upload: how long a sub-block may pause before what came is acknowledged and the rest asked
+    /// for again, in milliseconds. Less than the server's time-out.
     pub repeat_ms: u32,
 }
 
@@ -89,7 +91,8 @@ pub enum SdoError {
     NoAnswer,
     /// The server aborted.
     Server(AbortCode),
-    /// This side aborted: the server's answer broke the protocol, or the target of an upload refused.
+    /// This side aborted: the server's answer broke the protocol, or the target of an upload
+    /// refused.
     Client(AbortCode),
 }
 
@@ -149,7 +152,8 @@ struct Link {
 enum Next {
     Send(Request),
     Wait,
-    /// It was nothing: it does not count as life, or a stranger's answers would keep a transfer from its time-out.
+    /// It was nothing: it does not count as life, or a stranger's answers would keep a transfer
+    /// from its time-out.
     Ignore,
     /// Well done; with a last word to the server, where it wants one.
     Done(Option<Request>),
@@ -224,7 +228,8 @@ impl Link {
         }
     }
 
-    /// An answer that has no place here. The late answer to an earlier transfer's initiate says nothing about this one.
+    /// An answer that has no place here. The late answer to an earlier transfer's initiate says
+    /// nothing about this one.
     fn unexpected(&self, response: Option<Response>) -> Result<Next, SdoError> {
         match response {
             Some(Response::Abort(_, code)) => Err(SdoError::Server(code)),
@@ -239,7 +244,8 @@ impl Link {
     }
 }
 
-/// Whether this is how a server says that it does not know block transfer. Some use the general error for it.
+/// Whether this is how a server says that it does not know block transfer. Some use the general
+/// error for it.
 fn means_unknown(code: AbortCode) -> bool {
     matches!(code, AbortCode::COMMAND | AbortCode::UNSUPPORTED_ACCESS | AbortCode::GENERAL)
 }

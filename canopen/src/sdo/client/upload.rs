@@ -187,7 +187,8 @@ impl<S: Sink> Upload<S> {
     fn block_segment(&mut self, bytes: &[u8; 8]) -> Result<Next, SdoError> {
         let State::Blocks(receiver) = &mut self.state else { return Ok(Next::Ignore) };
         let Some(segment) = BlockSegment::parse(bytes) else {
-            // No segment has sequence number 0, and an abort is the one answer that looks like this.
+            // No segment has sequence number 0, and an abort is the one answer that looks like
+            // this.
             return match Response::parse(bytes) {
                 Some(Response::Abort(_, code)) => Err(SdoError::Server(code)),
                 _ => Err(SdoError::Client(AbortCode::SEQUENCE_NUMBER)),

@@ -30,8 +30,9 @@ use shared_abi::geometry::{Geometry, Region, STM32F407VG, STM32F429ZI, STM32F446
 
 /// Runs boards on a virtual CAN bus and shows in words what happens.
 ///
-/// The boards run the very images that go onto real ones. Other programs reach the bus through --socketcand; the
-/// adapter behind it is always on the bus and acknowledges. Times are virtual; see --speed. Ctrl-C ends.
+/// The boards run the very images that go onto real ones. Other programs reach the bus through
+/// --socketcand; the adapter behind it is always on the bus and acknowledges. Times are virtual;
+/// see --speed. Ctrl-C ends.
 #[derive(Debug, Parser)]
 #[command(name = "emulate", version)]
 struct Args {
@@ -43,7 +44,8 @@ struct Args {
     #[arg(long, value_name = "FILE")]
     bootloader: Option<PathBuf>,
 
-    /// An application's image. It is put into flash as a debug probe does it: without a signature of the bootloader's
+    /// An application's image. It is put into flash as a debug probe does it: without a signature
+    /// of the bootloader's
     #[arg(long, value_name = "FILE")]
     app: Option<PathBuf>,
 
@@ -55,8 +57,8 @@ struct Args {
     #[arg(long, value_name = "HOST:PORT")]
     socketcand: Option<String>,
 
-    /// Serve the board's UART to a client, as a pseudo-terminal (`pty`) or over TCP at this address. Without it, what comes out of
-    /// a UART is shown as text
+    /// Serve the board's UART to a client, as a pseudo-terminal (`pty`) or over TCP at this
+    /// address. Without it, what comes out of a UART is shown as text
     #[arg(long, value_name = "pty|HOST:PORT", conflicts_with = "node_count")]
     serial: Option<String>,
 
@@ -76,13 +78,14 @@ struct Args {
     #[arg(short, long)]
     verbose: bool,
 
-    /// How many boards with these images are on the bus. They differ in their unique IDs and in nothing else, so the
-    /// images must get different node-IDs out of them
+    /// How many boards with these images are on the bus. They differ in their unique IDs and in
+    /// nothing else, so the images must get different node-IDs out of them
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=32))]
     node_count: u8,
 
-    /// Virtual seconds per second of the wall clock, or `max`: as fast as the host can, but 1:1 for a moment behind every
-    /// frame that a client gets, so that its answer is not late in virtual time
+    /// Virtual seconds per second of the wall clock, or `max`: as fast as the host can, but 1:1 for
+    /// a moment behind every frame that a client gets, so that its answer is not late in virtual
+    /// time
     #[arg(long, default_value = "1")]
     speed: Speed,
 
@@ -99,7 +102,8 @@ struct Args {
     run_for: Option<Time>,
 }
 
-/// What is known of a board here: its chip, its crystal, pins that a resistor pulls up, its serial port.
+/// What is known of a board here: its chip, its crystal, pins that a resistor pulls up, its serial
+/// port.
 #[derive(Debug)]
 struct Board {
     name: &'static str,
@@ -187,7 +191,7 @@ fn is_broken_pipe(error: &anyhow::Error) -> bool {
 #[error("the standard output is closed")]
 struct Unheard;
 
-fn say(text: &str) -> Result<()> {
+fn print_line(text: &str) -> Result<()> {
     match writeln!(io::stdout(), "{text}") {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Err(Unheard.into()),
         other => other.context("writing to the standard output"),
@@ -389,7 +393,7 @@ impl Bench {
             let server = Server::bind(address.as_str(), "can0").with_context(|| {
                 format!("cannot listen at {address}; is another emulator running? choose another port")
             })?;
-            say(&format!("clients reach the bus at socketcand://{}/can0", server.address()))?;
+            print_line(&format!("clients reach the bus at socketcand://{}/can0", server.address()))?;
             self.server = Some(server);
         }
         if let Some(place) = &args.serial {
@@ -401,7 +405,7 @@ impl Bench {
                     Serial::listen(usart, address).with_context(|| format!("cannot listen at {address}"))?
                 }
             };
-            say(&format!("{usart} is at {}", serial.place()))?;
+            print_line(&format!("{usart} is at {}", serial.place()))?;
             self.serial = Some(serial);
         }
         Ok(())
@@ -411,7 +415,7 @@ impl Bench {
         for n in 0..self.boards.len() {
             self.world.power_on(self.boards[n].id);
             let name = self.name(n);
-            say(&format!("{} {name}: power on", self.world.now()))?;
+            print_line(&format!("{} {name}: power on", self.world.now()))?;
         }
         Ok(())
     }
@@ -496,7 +500,7 @@ impl Bench {
             }
         }
         lines.sort_by_key(|(at, _)| *at);
-        lines.iter().try_for_each(|(at, line)| say(&format!("{at} {line}")))
+        lines.iter().try_for_each(|(at, line)| print_line(&format!("{at} {line}")))
     }
 
     fn flush(&self) -> Result<()> {
@@ -508,13 +512,13 @@ impl Bench {
 
     fn sum_up(&self) -> Result<()> {
         let (frames, errors) = self.world.bus().totals();
-        say(&format!("{} end: {frames} frames, {errors} error frames", self.world.now()))?;
+        print_line(&format!("{} end: {frames} frames, {errors} error frames", self.world.now()))?;
         for n in 0..self.boards.len() {
             let reports = self.world.machine(self.boards[n].id).reports();
             let times: u64 = reports.iter().map(|report| report.count).sum();
             if times > 0 {
                 let places = reports.len();
-                say(&format!(
+                print_line(&format!(
                     "{}: {times} accesses, in {places} places, that the emulator does not model",
                     self.name(n)
                 ))?;

@@ -1,5 +1,6 @@
-//! What is on the bus, in a person's words. Only what a person wants to hear of: who starts, who changes state, who has
-//! an emergency, and when frames do not get through. Meanings are CiA 301's (7.2.5 and 7.3.5).
+//! What is on the bus, in a person's words. Only what a person wants to hear of: who starts, who
+//! changes state, who has an emergency, and when frames do not get through. Meanings are CiA 301's
+//! (7.2.5 and 7.3.5).
 
 use std::collections::BTreeMap;
 
