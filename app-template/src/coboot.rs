@@ -125,7 +125,7 @@ pub enum ReentryPath {
 }
 
 impl ReentryPath {
-    /// The way of this number.
+    /// The path of this number.
     pub const fn from_number(number: u8) -> Option<Self> {
         Some(match number {
             0 => Self::SystemReset,
@@ -136,7 +136,7 @@ impl ReentryPath {
     }
 }
 
-/// The way out: first the answer, then a while in which nothing is said any more, then the reset.
+/// The re-entry in order: the answer, then a time without any transmission, then the reset.
 #[derive(Clone, Copy, Debug)]
 pub enum ReentrySequence {
     /// The device stays.
@@ -152,32 +152,32 @@ impl ReentrySequence {
     /// from now on.
     pub fn proceed(&mut self, quiet: bool, now: Instant) -> bool {
         match *self {
-            Self::AnswerPending(way, request) if quiet => {
-                *self = Self::ResetPending(way, request, now + ANSWER_TO_RESET_MS)
+            Self::AnswerPending(path, request) if quiet => {
+                *self = Self::ResetPending(path, request, now + ANSWER_TO_RESET_MS)
             }
-            Self::ResetPending(way, request, at) if now.has_reached(at) => request_reentry(way, request),
+            Self::ResetPending(path, request, at) if now.has_reached(at) => request_reentry(path, request),
             _ => {}
         }
         matches!(self, Self::ResetPending(..))
     }
 }
 
-/// Told to `idle`, where no exception is active: 0 to stay, else the way (1 to 3), and from bit 8
+/// Told to `idle`, where no exception is active: 0 to stay, else the path (1 to 3), and from bit 8
 /// on the request as the warm-start cell has it, from bit 16 on its argument.
 static REENTRY_REQUEST: AtomicU32 = AtomicU32::new(0);
 
 fn request_reentry(path: ReentryPath, request: BootRequest) {
     let WarmStart { request, argument, .. } = WarmStart::new(request);
-    REENTRY_REQUEST.store((way as u32 + 1) | request << 8 | argument << 16, Ordering::Relaxed);
+    REENTRY_REQUEST.store((path as u32 + 1) | request << 8 | argument << 16, Ordering::Relaxed);
     debugger::release_program();
 }
 
 /// To be called by `idle` whenever it wakes. Does not return if the device is to leave.
 pub fn reenter_if_requested() {
     let told = REENTRY_REQUEST.load(Ordering::Relaxed);
-    let Some(way) = (told as u8).checked_sub(1).and_then(ReentryPath::from_number) else { return };
+    let Some(path) = (told as u8).checked_sub(1).and_then(ReentryPath::from_number) else { return };
     let request = WarmStart::encode(told >> 8 & 0xFF, told >> 16).request().unwrap_or(BootRequest::Stay);
-    match way {
+    match path {
         ReentryPath::SystemReset => reentry::system_reset(LAYOUT, request),
         ReentryPath::Watchdog => reentry::watchdog_reset(LAYOUT, request),
         ReentryPath::Jump => reentry::jump(LAYOUT, request),

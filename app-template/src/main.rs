@@ -164,8 +164,8 @@ mod app {
         if reset {
             *reentry = ReentrySequence::AnswerPending(ReentryPath::SystemReset, application.reset_request());
         }
-        if let Some((way, request)) = application.take_reentry() {
-            *reentry = ReentrySequence::AnswerPending(way, request);
+        if let Some((path, request)) = application.take_reentry() {
+            *reentry = ReentrySequence::AnswerPending(path, request);
         }
     }
 

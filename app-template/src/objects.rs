@@ -63,7 +63,7 @@ pub struct Application {
     program_crc: u32,
     /// Which program this is.
     program: u8,
-    /// The way back into the bootloader (2000h).
+    /// The re-entry path (2000h).
     path: ReentryPath,
     leave_for: Option<BootRequest>,
     #[cfg(feature = "lift")]
