@@ -601,7 +601,7 @@ fn the_host_library_sets_breakpoints_and_shows_registers() {
             panic!("no step");
         };
         assert!((at + 2..=at + 4).contains(&address), "{address:08X}");
-        debugger.go_on().unwrap();
+        debugger.resume().unwrap();
         assert_eq!(debugger.await_stop(Duration::from_millis(300)).unwrap(), None);
         assert_eq!(word(&mut debugger, calls), counted + 1);
     }
@@ -614,11 +614,11 @@ fn the_host_library_sets_breakpoints_and_shows_registers() {
     debugger.clear_all().unwrap();
     assert!(debugger.breakpoints().unwrap().is_empty());
     // It may have come there once more.
-    debugger.go_on().unwrap();
+    debugger.resume().unwrap();
     assert_eq!(debugger.await_stop(second).unwrap(), None);
     debugger.stop().unwrap();
     assert!(matches!(debugger.await_stop(second).unwrap(), Some(Stopped { stop: DebugStop::Step, .. })));
-    debugger.go_on().unwrap();
+    debugger.resume().unwrap();
     debugger.break_at(out_of_reach).unwrap().unwrap();
     let missed = Some(Stopped { stop: DebugStop::OutOfReach, address: out_of_reach });
     assert_eq!(debugger.await_stop(second).unwrap(), missed);
