@@ -4,36 +4,27 @@ use core::task::Poll;
 
 use canopen::bit_rate::BitRate;
 use canopen::device::{self, Device};
-#[cfg(feature = "emcy")]
 use canopen::emcy::{self, Emcy};
-#[cfg(feature = "emcy")]
 use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
-#[cfg(feature = "emcy")]
 use canopen::od::concat;
 use canopen::od::{put, Access, Address, DataType, Entry, Objects};
-#[cfg(feature = "emcy")]
 use canopen::program::FlashError;
-#[cfg(feature = "read-back")]
 use canopen::program::SOFTWARE_VERSION;
 use canopen::program::{
     ProgramControl, ENABLE_FLASH, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, UNLOCK,
     UNLOCK_FIRMWARE,
 };
 use canopen::slave::SlaveDevice;
-#[cfg(feature = "password")]
 use canopen::{password::Lock, Instant};
 use canopen::{AbortCode, NodeId};
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
-#[cfg(feature = "emcy")]
+use crate::control::{Downloader, Policy, Step};
 use crate::decision::StayReason;
-use crate::download::{Downloader, Policy, Step};
 use crate::flash::Flash;
-use crate::node::NodeParameters;
-use crate::parameters::Parameters;
-#[cfg(feature = "read-back")]
+use crate::store::{NodeParameters, Parameters};
 use crate::stored_version::StoredVersion;
 
 /// What dialects add to the object dictionary.
@@ -162,10 +153,7 @@ const PROGRAM_OBJECTS: [(u16, &str, Entry); 4] = [
 ];
 
 /// What does not depend on the programs.
-#[cfg(feature = "emcy")]
 const COMMON: [Entry; 17] = concat(device::ENTRIES, emcy::ENTRIES);
-#[cfg(not(feature = "emcy"))]
-const COMMON: [Entry; 11] = device::ENTRIES;
 
 /// 1018h/4.
 const SERIAL_NUMBER: Address = Address::new(IDENTITY, 4);
@@ -199,7 +187,6 @@ pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize> {
     config: &'static Config,
     serial_number: u32,
     /// Why the device stayed in the bootloader.
-    #[cfg(feature = "emcy")]
     reason: u8,
     /// Node-ID and bit rate as they are stored.
     node: NodeParameters,
@@ -207,14 +194,10 @@ pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize> {
     id: Option<NodeId>,
     flash: F,
     download: Downloader<'b, P, PROGRAMS>,
-    #[cfg(feature = "emcy")]
     emcy: Emcy,
-    #[cfg(feature = "password")]
     lock: Lock,
     /// The time that was told last.
-    #[cfg(feature = "password")]
     now: Instant,
-    #[cfg(feature = "read-back")]
     stored_version: StoredVersion,
 }
 
@@ -234,24 +217,16 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         let mut bootloader = Self {
             config,
             serial_number,
-            #[cfg(feature = "emcy")]
             reason,
             node,
             id: None,
             flash,
             download,
-            #[cfg(feature = "emcy")]
             emcy: Emcy::new(),
-            #[cfg(feature = "password")]
             lock: Lock::new(config.password),
-            #[cfg(feature = "password")]
             now: Instant::from_millis(0),
-            #[cfg(feature = "read-back")]
             stored_version: StoredVersion::new(),
         };
-        #[cfg(not(feature = "emcy"))]
-        let _ = reason;
-        #[cfg(feature = "emcy")]
         if StayReason::is_trouble(reason) {
             bootloader.emcy.raise(emcy::code::SOFTWARE, 0, [reason, 0, 0, 0, 0]);
         }
@@ -275,7 +250,6 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
     pub fn step(&mut self) -> Step {
         let step = self.download.step(&mut self.flash);
         self.report_outcome();
-        #[cfg(feature = "read-back")]
         if step == Step::Idle && self.config.download.read_back {
             return self.stored_version.step(&self.flash, self.download.installed(1));
         }
@@ -283,14 +257,12 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
     }
 
     /// Tells the time: at least every few milliseconds.
-    #[cfg(feature = "password")]
     pub fn set_time(&mut self, now: Instant) {
         self.now = now;
     }
 
     /// Tells by an emergency what became of work on the flash.
     fn report_outcome(&mut self) {
-        #[cfg(feature = "emcy")]
         match self.download.take_outcome() {
             None => {}
             Some((_, Ok(()))) => self.emcy.clear(emcy::register::MANUFACTURER),
@@ -322,7 +294,6 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
     #[must_use]
     pub fn is_finishing(&mut self) -> bool {
         // A reset would let somebody try passwords faster.
-        #[cfg(feature = "password")]
         if self.lock.is_waiting(self.now) {
             return true;
         }
@@ -353,14 +324,12 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
     }
 
     fn read(&mut self, at: Address, buf: &mut [u8]) -> Result<usize, AbortCode> {
-        #[cfg(feature = "emcy")]
         if let Some(read) = self.id.and_then(|id| self.emcy.read(id, at, buf)) {
             return read;
         }
         if at == SERIAL_NUMBER {
             return put(buf, &self.serial_number.to_le_bytes());
         }
-        #[cfg(feature = "read-back")]
         if at == Address::new(SOFTWARE_VERSION, 0) {
             if let Some(version) = self.stored_version.text() {
                 return put(buf, version);
@@ -378,18 +347,15 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
     }
 
     fn write(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
-        #[cfg(feature = "emcy")]
         if let Some(written) = self.emcy.write(at, data) {
             return written;
         }
         match (at.index, data) {
             (PROGRAM_CONTROL, &[value]) => self.command(at.sub, ProgramControl::try_from(value)?),
-            #[cfg(feature = "password")]
             (ENABLE_FLASH, password) => {
                 self.lock.open(password, self.now)?;
                 self.download.unlock(at.sub, true)
             }
-            #[cfg(feature = "password")]
             (UNLOCK, password) => {
                 self.lock.open(password, self.now)?;
                 (1..=PROGRAMS as u8).try_for_each(|program| self.download.unlock(program, false))
@@ -399,34 +365,31 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
     }
 
     fn download_start(&mut self, at: Address, size: Option<u32>) -> Result<(), AbortCode> {
-        self.download.block_start(at.sub, size)
+        self.download.download_start(at.sub, size)
     }
 
-    #[cfg(feature = "streams")]
     fn download_space(&mut self, _at: Address, held: bool) -> usize {
         self.download.space(held)
     }
 
     fn download_data(&mut self, _at: Address, data: &[u8]) -> Result<(), AbortCode> {
-        self.download.block_data(data)
+        self.download.download_data(data)
     }
 
     fn download_end(&mut self, _at: Address) -> Result<(), AbortCode> {
-        let ended = self.download.block_end();
+        let ended = self.download.download_end();
         self.report_outcome();
         ended
     }
 
     fn download_cancel(&mut self, _at: Address) {
-        self.download.block_cancel();
+        self.download.download_cancel();
     }
 
-    #[cfg(feature = "read-back")]
     fn upload_start(&mut self, at: Address) -> Result<Option<u32>, AbortCode> {
         self.download.stored(at.sub).map(|stored| Some(stored.size))
     }
 
-    #[cfg(feature = "read-back")]
     fn upload_data(&mut self, at: Address, offset: u32, buf: &mut [u8]) -> Result<usize, AbortCode> {
         let stored = self.download.stored(at.sub)?;
         let rest = stored.size.saturating_sub(offset) as usize;
@@ -435,7 +398,6 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
         Ok(len)
     }
 
-    #[cfg(feature = "emcy")]
     fn next_emergency(&mut self) -> Option<[u8; 8]> {
         self.emcy.next_message()
     }
@@ -463,14 +425,12 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> LssDevice for Bootloader<'_
 }
 
 impl<F: Flash, P: Parameters, const PROGRAMS: usize> SlaveDevice for Bootloader<'_, F, P, PROGRAMS> {
-    #[cfg(feature = "emcy")]
     fn line_event(&mut self, event: LineEvent) {
         self.emcy.line_event(event);
     }
 
     fn node_id_changed(&mut self, id: Option<NodeId>) {
         self.id = id;
-        #[cfg(feature = "emcy")]
         if id.is_some() && self.config.boot_up_emergency {
             self.emcy.announce(emcy::code::DEVICE_SPECIFIC, [b'B', b'O', b'O', b'T', self.reason]);
         }

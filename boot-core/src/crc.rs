@@ -1,51 +1,50 @@
-//! CRC-32/ISO-HDLC: the one function of block file, 1F56h and journal.
+//! The CRCs of block file, programs and journal.
 //!
-//! Without the feature `crc-table` it goes bit by bit, some 40 cycles a byte; with it, it takes a
-//! table of 1 KiB and some 10 cycles. A chip with a CRC unit does long ranges by that, see
-//! [`Flash::crc32`](crate::flash::Flash::crc32).
+//! They go bit by bit, without a table: some 40 cycles a byte and 100 bytes of flash. A chip with a
+//! CRC unit does long ranges by that, see [`Flash::crc32`](crate::flash::Flash::crc32).
 
-#[cfg(feature = "crc-16")]
-use crc::CRC_16_XMODEM;
-use crc::{Crc, CRC_32_ISO_HDLC};
+use crc::{Crc, NoTable, CRC_16_XMODEM, CRC_32_ISO_HDLC};
 
-#[cfg(not(feature = "crc-table"))]
-type Means = crc::NoTable;
-#[cfg(feature = "crc-table")]
-type Means = crc::Table<1>;
+static CRC32: Crc<u32, NoTable> = Crc::<u32, NoTable>::new(&CRC_32_ISO_HDLC);
+static CRC16: Crc<u16, NoTable> = Crc::<u16, NoTable>::new(&CRC_16_XMODEM);
 
-static CRC32: Crc<u32, Means> = Crc::<u32, Means>::new(&CRC_32_ISO_HDLC);
+/// Which CRC the blocks and programs of a product carry (SYS TEC manual L-1112d_10, `BL_CRC`).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum CrcKind {
+    /// CRC-32/ISO-HDLC.
+    #[default]
+    Crc32,
+    /// The CRC of SDO block transfer (polynomial 1021h, start value 0), in the lower half of a
+    /// word.
+    Crc16,
+}
 
-/// The CRC of these bytes.
+impl CrcKind {
+    /// The CRC of these bytes behind others whose CRC is `crc`; 0 for none.
+    #[must_use]
+    pub fn resume(self, crc: u32, bytes: &[u8]) -> u32 {
+        match self {
+            Self::Crc32 => resume(crc, bytes),
+            Self::Crc16 => {
+                let mut digest = CRC16.digest_with_initial(crc as u16);
+                digest.update(bytes);
+                digest.finalize().into()
+            }
+        }
+    }
+}
+
+/// The CRC-32 of these bytes.
 #[must_use]
 pub fn crc32(bytes: &[u8]) -> u32 {
     resume(0, bytes)
 }
 
-/// The CRC of these bytes behind others whose CRC is `crc`; 0 for none.
+/// The CRC-32 of these bytes behind others whose CRC is `crc`; 0 for none.
 #[must_use]
 pub fn resume(crc: u32, bytes: &[u8]) -> u32 {
-    // The start value is told unreflected, and before the final inversion.
+    // The crate takes the start value unreflected, and before the final inversion.
     let mut digest = CRC32.digest_with_initial((!crc).reverse_bits());
     digest.update(bytes);
     digest.finalize()
-}
-
-/// The CRC of blocks and programs, behind data whose CRC is `crc` (0 for none): CRC-32, or with the
-/// feature `crc-16` the one of SDO block transfer (polynomial 1021h, start 0), in the lower half of
-/// the word.
-#[must_use]
-#[cfg(not(feature = "crc-16"))]
-pub fn block(crc: u32, bytes: &[u8]) -> u32 {
-    resume(crc, bytes)
-}
-
-/// The CRC of blocks and programs, behind data whose CRC is `crc` (0 for none): the one of SDO
-/// block transfer (polynomial 1021h, start 0), in the lower half of the word.
-#[must_use]
-#[cfg(feature = "crc-16")]
-pub fn block(crc: u32, bytes: &[u8]) -> u32 {
-    static CRC16: Crc<u16, crc::NoTable> = Crc::<u16, crc::NoTable>::new(&CRC_16_XMODEM);
-    let mut digest = CRC16.digest_with_initial(crc as u16);
-    digest.update(bytes);
-    digest.finalize().into()
 }

@@ -1,4 +1,4 @@
-//! The seam to the flash: what the engine asks of it, and nothing of how it is done.
+//! The seam to the flash: what the core asks of it, and nothing of how it is done.
 
 use core::task::Poll;
 
@@ -8,6 +8,7 @@ use crate::crc;
 
 /// Why a flash operation failed, as the controller tells it (RM0090 section 3.8.4, `FLASH_SR`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
 pub enum FlashFault {
     /// The range is write-protected by option bytes.
     Protected,
@@ -17,34 +18,62 @@ pub enum FlashFault {
     Verify,
 }
 
+/// One operation of the flash controller.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(C)]
+pub enum Operation {
+    /// Erase a sector: hundreds of milliseconds.
+    Erase(Sector),
+    /// Program a word: tens of microseconds.
+    Program {
+        /// Where; word-aligned.
+        address: u32,
+        /// What. Bits can only go from 1 to 0.
+        word: u32,
+    },
+}
+
+/// What a piece of work on the flash does next, told while no operation runs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Next<E> {
+    /// This operation; its outcome is to be told.
+    Start(Operation),
+    /// A further bounded computation.
+    Again,
+    /// Nothing: the work is over.
+    Done(Result<(), E>),
+}
+
 /// A flash that erases by sectors and programs by words, one operation at a time and without
 /// waiting for it.
 ///
-/// `read` and the starts may only be called while no operation runs: the engine of this crate sees
-/// to it, because on the F4 a read from busy flash stalls the core.
+/// Everything but [`poll`](Self::poll) may only be called while no operation runs, because on the
+/// F4 a read from busy flash stalls the core. The [programmer](crate::programmer) sees to it.
 pub trait Flash {
     /// Copies `buffer.len()` bytes from `address` on. Addresses outside the flash read FFh.
     fn read(&self, address: u32, buffer: &mut [u8]);
 
-    /// Starts to erase one sector.
+    /// Starts an operation.
     ///
     /// # Errors
     /// What the controller says at once; later faults come from [`Flash::poll`].
-    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashFault>;
-
-    /// Starts to program one word at a word-aligned address.
-    ///
-    /// # Errors
-    /// What the controller says at once; later faults come from [`Flash::poll`].
-    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashFault>;
+    fn start(&mut self, operation: Operation) -> Result<(), FlashFault>;
 
     /// The outcome of the running operation, `Ready(Ok(()))` when none runs.
     fn poll(&mut self) -> Poll<Result<(), FlashFault>>;
+
+    /// The sector that holds this address.
+    fn sector_at(&self, address: u32) -> Option<Sector>;
 
     /// The CRC-32 of a region behind data whose CRC is `crc` (0 for none). A chip that has a unit
     /// for it overrides this.
     fn crc32(&self, crc: u32, region: Region) -> u32 {
         crc32_by_software(self, crc, region)
+    }
+
+    /// Whether all bytes of a region read as erased.
+    fn is_blank(&self, region: Region) -> bool {
+        fold(self, true, region, |blank, bytes| blank && bytes.iter().all(|byte| *byte == u8::MAX))
     }
 
     /// The word at a word-aligned address.
@@ -77,25 +106,53 @@ pub(crate) fn fold<F: Flash + ?Sized, T>(
     result
 }
 
+/// Carries a piece of work through and waits for each operation, for those who have nothing else to
+/// do: `next` tells what follows on the outcome of the operation before.
+pub fn run<F: Flash, E>(
+    flash: &mut F,
+    mut next: impl FnMut(&F, Result<(), FlashFault>) -> Next<E>,
+) -> Result<(), E> {
+    let mut outcome = Ok(());
+    loop {
+        match next(flash, outcome) {
+            Next::Start(operation) => {
+                outcome = flash.start(operation);
+                while outcome.is_ok() {
+                    if let Poll::Ready(ended) = flash.poll() {
+                        outcome = ended;
+                        break;
+                    }
+                }
+            }
+            Next::Again => outcome = Ok(()),
+            Next::Done(result) => return result,
+        }
+    }
+}
+
 impl<F: Flash> Flash for &mut F {
     fn read(&self, address: u32, buffer: &mut [u8]) {
         (**self).read(address, buffer);
     }
 
-    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashFault> {
-        (**self).start_erase(sector)
-    }
-
-    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashFault> {
-        (**self).start_program(address, word)
+    fn start(&mut self, operation: Operation) -> Result<(), FlashFault> {
+        (**self).start(operation)
     }
 
     fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
         (**self).poll()
     }
 
+    fn sector_at(&self, address: u32) -> Option<Sector> {
+        (**self).sector_at(address)
+    }
+
     fn crc32(&self, crc: u32, region: Region) -> u32 {
         (**self).crc32(crc, region)
+    }
+
+    fn is_blank(&self, region: Region) -> bool {
+        (**self).is_blank(region)
     }
 
     fn read_word(&self, address: u32) -> u32 {
@@ -105,93 +162,3 @@ impl<F: Flash> Flash for &mut F {
 
 /// What an erased word reads as.
 pub const ERASED: u32 = u32::MAX;
-
-/// A row of words being programmed one after the other, each read back.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct WordWriter {
-    address: u32,
-    written: usize,
-    running: bool,
-}
-
-impl WordWriter {
-    pub(crate) const fn new(address: u32) -> Self {
-        Self { address, written: 0, running: false }
-    }
-
-    /// Carries on. `word(i)` gives the i-th of `count` words. `Pending` while the flash works.
-    pub(crate) fn poll<F: Flash>(
-        &mut self,
-        flash: &mut F,
-        count: usize,
-        word: impl Fn(usize) -> u32,
-    ) -> Poll<Result<(), FlashFault>> {
-        loop {
-            match flash.poll() {
-                Poll::Pending => return Poll::Pending,
-                Poll::Ready(Err(error)) => return Poll::Ready(Err(error)),
-                Poll::Ready(Ok(())) => {}
-            }
-            let address = self.address + 4 * self.written as u32;
-            if self.running {
-                self.running = false;
-                if flash.read_word(address) != word(self.written) {
-                    return Poll::Ready(Err(FlashFault::Verify));
-                }
-                self.written += 1;
-            } else if self.written == count {
-                return Poll::Ready(Ok(()));
-            } else {
-                if let Err(error) = flash.start_program(address, word(self.written)) {
-                    return Poll::Ready(Err(error));
-                }
-                self.running = true;
-            }
-        }
-    }
-}
-
-/// A row of whole sectors being erased one after the other.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct SectorEraser {
-    next: u32,
-    end: u32,
-}
-
-impl SectorEraser {
-    pub(crate) const fn new(region: shared_abi::geometry::Region) -> Self {
-        Self { next: region.base, end: region.end() }
-    }
-
-    /// Carries on. `Pending` while the flash works.
-    pub(crate) fn poll<F: Flash>(
-        &mut self,
-        flash: &mut F,
-        chip: &shared_abi::geometry::Geometry,
-    ) -> Poll<Result<(), FlashFault>> {
-        loop {
-            match flash.poll() {
-                Poll::Pending => return Poll::Pending,
-                Poll::Ready(Err(error)) => return Poll::Ready(Err(error)),
-                Poll::Ready(Ok(())) => {}
-            }
-            if self.next >= self.end {
-                return Poll::Ready(Ok(()));
-            }
-            // A checked layout ends at sector borders; a region outside the flash is refused, not
-            // looped over.
-            let Some(sector) = chip.sector_at(self.next) else {
-                return Poll::Ready(Err(FlashFault::Failed));
-            };
-            self.next = sector.region.end();
-            if let Err(error) = flash.start_erase(sector) {
-                return Poll::Ready(Err(error));
-            }
-        }
-    }
-}
-
-/// Whether all bytes read as erased.
-pub fn is_blank<F: Flash>(flash: &F, region: Region) -> bool {
-    fold(flash, true, region, |blank, bytes| blank && bytes.iter().all(|byte| *byte == u8::MAX))
-}

@@ -1,28 +1,35 @@
 //! The bootloader without its hardware: sans-IO, `no_std`, no unsafe.
 //!
-//! | module | what it does |
-//! |---|---|
-//! | [`bootloader`] | the object dictionary and everything behind it |
-//! | [`decision`] | bootloader or program, after every reset |
-//! | [`program`] | what is known of a program, and the proof that it may be started |
-//! | [`parameters`] | the power-fail-safe journal of the non-volatile parameters |
-//! | [`node`] | node-ID and bit rate of the device |
-//! | [`download`] | 1F50h, 1F51h, 1F56h, 1F57h: block files into flash |
-//! | [`crc`] | CRC-32 |
-//! | [`flash`] | the seam to the flash |
+//! | module | what it does | knows |
+//! |---|---|---|
+//! | [`decision`] | bootloader or program, after every reset | records, no flash |
+//! | [`intake`] | what arrives in 1F50h: bytes in, judged and placed pieces out | formats, no flash |
+//! | [`queue`] | the pieces between the two | |
+//! | [`programmer`] | erase, write, read back, verify | pieces and flash, no format, no object |
+//! | [`store`] | everything non-volatile | the journal |
+//! | [`control`] | 1F51h, 1F57h, sessions: the rules that tie the three together | all of them |
+//! | [`bootloader`] | the object dictionary over it | objects |
+//! | [`program`] | the proof that a program may be started | |
+//! | [`policy`], [`profile`] | what a product may choose | |
+//! | [`flash`] | the seam to the flash | |
 #![no_std]
 #![forbid(unsafe_code)]
 
 pub mod bootloader;
+pub mod control;
 pub mod crc;
 pub mod decision;
-pub mod download;
 pub mod flash;
-pub mod node;
-pub mod parameters;
+mod intake;
+pub mod policy;
 pub mod profile;
 pub mod program;
-#[cfg(feature = "read-back")]
+mod programmer;
+mod queue;
+mod refusal;
+mod sequence;
+mod session;
+pub mod store;
 mod stored_version;
 
 /// Frames, node and transfers, in which the core speaks: a firmware that uses this crate needs no

@@ -11,7 +11,7 @@ use canopen::{AbortCode, BitRate, NodeId};
 use shared_abi::LIFT_PASSWORD;
 
 use crate::bootloader::{Extras, PasswordObject};
-use crate::download::Policy;
+use crate::policy::Policy;
 
 /// A dialect.
 #[derive(Clone, Copy, Debug)]

@@ -4,43 +4,9 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 use shared_abi::vectors::{VectorFault, VectorTable};
 
-use crate::crc;
+use crate::crc::CrcKind;
 use crate::flash::{fold, Flash};
-use crate::parameters::{Key, Parameters, Value};
-
-/// The word that stands for "signed" in a program's record.
-pub const SIGNATURE: u32 = u32::from_le_bytes(*b"APP1");
-
-/// What the parameters tell of a program that was downloaded completely and whose CRC was right
-/// then.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct ProgramRecord {
-    /// Bytes from the start of its region on.
-    pub size: u32,
-    /// CRC-32 over them.
-    pub crc: u32,
-    /// Whether 1F51h = 83h has marked it valid for the autostart.
-    pub signed: bool,
-    /// The version that its control block told, 0 for none.
-    pub version: u32,
-}
-
-impl ProgramRecord {
-    /// The stored form of "no program".
-    pub const NONE: Value = [0; 4];
-
-    /// From the parameters; `None` where there is no program.
-    pub fn load<F: Flash>(parameters: &impl Parameters, flash: &F, number: u8) -> Option<Self> {
-        let [size, crc, signature, version] = parameters.get(flash, Key::Program(number))?;
-        (size > 0).then_some(Self { size, crc, signed: signature == SIGNATURE, version })
-    }
-
-    /// The stored form.
-    #[must_use]
-    pub const fn value(&self) -> Value {
-        [self.size, self.crc, if self.signed { SIGNATURE } else { 0 }, self.version]
-    }
-}
+use crate::store::{Parameters, ProgramRecord};
 
 /// A CRC over flash, computed in steps that the caller bounds.
 #[derive(Clone, Copy, Debug)]
@@ -56,18 +22,32 @@ impl FlashCrc {
         Self { crc: 0, rest: region }
     }
 
-    /// Goes on over at most `budget` bytes; the CRC once the end is reached.
-    pub fn step<F: Flash>(&mut self, flash: &F, budget: u32) -> Option<u32> {
+    /// Goes on over at most `budget` bytes; whether the end is reached.
+    pub fn step<F: Flash>(&mut self, flash: &F, kind: CrcKind, budget: u32) -> bool {
         let len = self.rest.size.min(budget);
         let next = Region::new(self.rest.base, len);
-        self.crc = if cfg!(feature = "crc-16") {
-            fold(flash, self.crc, next, crc::block)
-        } else {
-            flash.crc32(self.crc, next)
+        self.crc = match kind {
+            CrcKind::Crc32 => flash.crc32(self.crc, next),
+            CrcKind::Crc16 => fold(flash, self.crc, next, |crc, bytes| kind.resume(crc, bytes)),
         };
         self.rest = Region::new(self.rest.base + len, self.rest.size - len);
-        (self.rest.size == 0).then_some(self.crc)
+        self.rest.size == 0
     }
+
+    /// The CRC so far.
+    #[must_use]
+    pub const fn value(&self) -> u32 {
+        self.crc
+    }
+}
+
+/// What a program has to be that was sent completely.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Expected {
+    /// Bytes from the start of its region on.
+    pub size: u32,
+    /// `None`: what is in flash, word for word what was sent.
+    pub crc: Option<u32>,
 }
 
 /// Why a program may not be started.
@@ -89,7 +69,7 @@ pub enum Invalid {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct VerifiedProgram {
     number: u8,
-    signed: bool,
+    record: ProgramRecord,
     vectors: VectorTable,
 }
 
@@ -100,10 +80,17 @@ impl VerifiedProgram {
         self.number
     }
 
-    /// Whether it carries the signature.
+    /// Whether it is released for autostart.
     #[must_use]
     pub const fn signed(&self) -> bool {
-        self.signed
+        self.record.signed
+    }
+
+    /// Whether it has proved that the bootloader can be reached from it, so that it starts without
+    /// a rescue window.
+    #[must_use]
+    pub const fn confirmed(&self) -> bool {
+        self.record.confirmed
     }
 
     /// What to jump to.
@@ -134,6 +121,7 @@ pub fn verify<F: Flash>(
     flash: &F,
     parameters: &impl Parameters,
     layout: &Layout,
+    kind: CrcKind,
     number: u8,
 ) -> Result<VerifiedProgram, Invalid> {
     let region = layout.program(number).ok_or(Invalid::NoSuchProgram)?;
@@ -143,8 +131,8 @@ pub fn verify<F: Flash>(
     }
     let vectors = check_vectors(flash, region, layout).map_err(Invalid::Vectors)?;
     let mut crc = FlashCrc::new(Region::new(region.base, record.size));
-    if crc.step(flash, record.size) != Some(record.crc) {
+    if !crc.step(flash, kind, record.size) || crc.value() != record.crc {
         return Err(Invalid::Crc);
     }
-    Ok(VerifiedProgram { number, signed: record.signed, vectors })
+    Ok(VerifiedProgram { number, record, vectors })
 }

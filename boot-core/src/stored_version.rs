@@ -6,8 +6,8 @@
 
 use shared_abi::geometry::Region;
 
-use crate::download::Step;
 use crate::flash::Flash;
+use crate::programmer::Step;
 
 /// What stands in front of the version, its NUL included.
 const MARK: &[u8] = b"$CANopenSoftwareVersion\0";

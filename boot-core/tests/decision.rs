@@ -2,9 +2,11 @@
 
 mod model;
 
+use boot_core::crc::CrcKind;
 use boot_core::decision::{decide, BootDecision, Circumstances, Policy, StayReason};
-use boot_core::parameters::{Journal, Key, Parameters};
-use boot_core::program::{verify, Invalid, ProgramRecord, VerifiedProgram};
+use boot_core::flash::run;
+use boot_core::program::{verify, Invalid, VerifiedProgram};
+use boot_core::store::{Journal, Key, Parameters, ProgramRecord};
 use model::ModelFlash;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::vectors::VectorFault;
@@ -23,12 +25,13 @@ fn check(signed: bool, damage: impl FnOnce(&mut ModelFlash)) -> Result<VerifiedP
     bytes[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
     bytes[4..8].copy_from_slice(&0x0801_0189_u32.to_le_bytes());
     flash.poke(0x0801_0000, &bytes);
-    let mut journal = Journal::open(&flash, LAYOUT.chip, LAYOUT.parameters);
-    let record = ProgramRecord { size: 64, crc: boot_core::crc32(&bytes), signed, version: 0 };
+    let mut journal = Journal::open(&flash, LAYOUT.parameters);
+    let record =
+        ProgramRecord { size: 64, crc: boot_core::crc32(&bytes), signed, confirmed: false, version: 0 };
     journal.store(Key::Program(1), record.value());
-    while journal.poll(&mut flash).is_pending() {}
+    run(&mut flash, |flash, outcome| journal.next(flash, outcome)).unwrap();
     damage(&mut flash);
-    verify(&flash, &Journal::open(&flash, LAYOUT.chip, LAYOUT.parameters), &LAYOUT, 1)
+    verify(&flash, &Journal::open(&flash, LAYOUT.parameters), &LAYOUT, CrcKind::Crc32, 1)
 }
 
 fn signed() -> Result<VerifiedProgram, Invalid> {
@@ -90,10 +93,12 @@ fn without_signature_a_program_starts_as_a_trial_alone() {
 fn a_request_for_a_program_that_is_not_there_stays() {
     let start = Circumstances { request: Some(BootRequest::Start(7)), ..QUIET };
     let flash = ModelFlash::new(LAYOUT.chip);
-    let journal = Journal::open(&flash, LAYOUT.chip, LAYOUT.parameters);
-    let decision = decide(&start, &policy(), |number| verify(&flash, &journal, &LAYOUT, number));
+    let journal = Journal::open(&flash, LAYOUT.parameters);
+    let decision =
+        decide(&start, &policy(), |number| verify(&flash, &journal, &LAYOUT, CrcKind::Crc32, number));
     assert_eq!(decision, BootDecision::Stay(StayReason::Program(Invalid::NoSuchProgram)));
-    let decision = decide(&QUIET, &policy(), |number| verify(&flash, &journal, &LAYOUT, number));
+    let decision =
+        decide(&QUIET, &policy(), |number| verify(&flash, &journal, &LAYOUT, CrcKind::Crc32, number));
     assert_eq!(decision, BootDecision::Stay(StayReason::Program(Invalid::Absent)));
 }
 

@@ -3,13 +3,12 @@
 mod bench;
 mod model;
 
-use std::task::Poll;
-
 use bench::*;
-use boot_core::download::{Downloader, Policy, Step, Verdict};
-use boot_core::flash::{Flash, FlashFault};
-use boot_core::parameters::{Key, Parameters, StoreError, Value};
+use boot_core::control::{Downloader, Policy, Step, Verdict};
+use boot_core::crc::CrcKind;
+use boot_core::flash::{Flash, FlashFault, Next};
 use boot_core::program::{verify, Invalid};
+use boot_core::store::{Key, Parameters, StoreError, Value};
 use canopen::od::{Address, Objects};
 use canopen::program::{FlashError, ProgramControl};
 use canopen::AbortCode;
@@ -529,20 +528,20 @@ fn parameters_may_be_kept_in_an_eeprom() {
             self.storing = Some((key, value, 20));
         }
 
-        fn poll<F: Flash>(&mut self, _: &mut F) -> Poll<Result<(), StoreError>> {
+        fn next<F: Flash>(&mut self, _: &F, _: Result<(), FlashFault>) -> Next<StoreError> {
             match &mut self.storing {
-                Some((.., 0)) if self.fails => Poll::Ready(Err(StoreError::Device)),
+                Some((.., 0)) if self.fails => Next::Done(Err(StoreError::Device)),
                 Some((key, value, 0)) => {
                     let stored = (*key, *value);
                     self.values.push(stored);
                     self.storing = None;
-                    Poll::Ready(Ok(()))
+                    Next::Done(Ok(()))
                 }
                 Some((.., ticks)) => {
                     *ticks -= 1;
-                    Poll::Pending
+                    Next::Again
                 }
-                None => Poll::Ready(Ok(())),
+                None => Next::Done(Ok(())),
             }
         }
     }
@@ -563,9 +562,9 @@ fn parameters_may_be_kept_in_an_eeprom() {
     };
     device.command(1, ProgramControl::Clear).unwrap();
     for block in block_file(&image, 96) {
-        device.block_start(1, None).unwrap();
-        device.block_data(&block).unwrap();
-        device.block_end().unwrap();
+        device.download_start(1, None).unwrap();
+        device.download_data(&block).unwrap();
+        device.download_end().unwrap();
         assert_eq!(settle(&mut device, &mut flash), 0);
     }
     device.command(1, ProgramControl::SetSignature).unwrap();
@@ -575,12 +574,15 @@ fn parameters_may_be_kept_in_an_eeprom() {
         !flash.touched.iter().any(|at| nv.iter().any(|nv| nv.contains(at.base, 1))),
         "the journal's sectors"
     );
-    assert!(verify(&flash, &&mut eeprom, &LAYOUT, 1).unwrap().signed());
+    assert!(verify(&flash, &&mut eeprom, &LAYOUT, CrcKind::Crc32, 1).unwrap().signed());
 
     eeprom.fails = true;
     let mut device: Downloader<'_, _, 1> =
         Downloader::new(&LAYOUT, &Policy::DEFAULT, &mut eeprom, &flash, &mut buffer);
     device.command(1, ProgramControl::ClrSignature).unwrap();
     assert_eq!(settle(&mut device, &mut flash), 0x10, "NVDATA");
-    assert!(verify(&flash, &&mut eeprom, &LAYOUT, 1).unwrap().signed(), "the old value is still there");
+    assert!(
+        verify(&flash, &&mut eeprom, &LAYOUT, CrcKind::Crc32, 1).unwrap().signed(),
+        "the old value is still there"
+    );
 }

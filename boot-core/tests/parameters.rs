@@ -2,10 +2,8 @@
 
 mod model;
 
-use std::task::Poll;
-
-use boot_core::flash::FlashFault;
-use boot_core::parameters::{Journal, Key, Parameters, StoreError, Value};
+use boot_core::flash::{run, FlashFault};
+use boot_core::store::{Journal, Key, Parameters, StoreError, Value};
 use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash};
 use shared_abi::geometry::{Geometry, Region, SectorRun};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
@@ -21,22 +19,17 @@ const REGIONS: [Region; 2] = [Region::new(0x0800_0100, 256), Region::new(0x0800_
 
 fn store(flash: &mut ModelFlash, journal: &mut Journal, key: Key, value: Value) -> Result<(), StoreError> {
     journal.store(key, value);
-    for _ in 0..1_000_000 {
-        if let Poll::Ready(outcome) = journal.poll(flash) {
-            return outcome;
-        }
-    }
-    panic!("the store does not end");
+    run(flash, |flash, outcome| journal.next(flash, outcome))
 }
 
 #[test]
 fn values_survive_a_restart_and_any_number_of_compactions() {
     let mut flash = ModelFlash::new(&SMALL);
-    let mut journal = Journal::open(&flash, &SMALL, REGIONS);
+    let mut journal = Journal::open(&flash, REGIONS);
     assert_eq!(journal.get(&flash, Key::CrashCount), None);
     for i in 0..200 {
         store(&mut flash, &mut journal, Key::Program(1 + (i % 3) as u8), [i, !i, i * 7, 0]).unwrap();
-        let reopened = Journal::open(&flash, &SMALL, REGIONS);
+        let reopened = Journal::open(&flash, REGIONS);
         for age in 0..3.min(i + 1) {
             let j = i - age;
             for journal in [&journal, &reopened] {
@@ -57,7 +50,7 @@ fn after_any_cut_the_old_or_the_new_value_is_read_and_the_neighbour_is_untouched
     quiet_power_cuts();
     const STORES: u32 = 25;
     let history = |flash: &mut ModelFlash, done: &mut u32| {
-        let mut journal = Journal::open(flash, &SMALL, REGIONS);
+        let mut journal = Journal::open(flash, REGIONS);
         store(flash, &mut journal, Key::CrashCount, [0xC0FFEE, 0, 0, 0]).unwrap();
         for i in 1..=STORES {
             store(flash, &mut journal, Key::Program(1), [i, i, i, i]).unwrap();
@@ -81,7 +74,7 @@ fn after_any_cut_the_old_or_the_new_value_is_read_and_the_neighbour_is_untouched
             let at = format!("cut {cut:?} at operation {operation}, {done} stores done");
 
             let check = |flash: &ModelFlash, newest: u32| {
-                let journal = Journal::open(flash, &SMALL, REGIONS);
+                let journal = Journal::open(flash, REGIONS);
                 let value = journal.get(flash, Key::Program(1));
                 let expected = [done, newest].map(|i| (i > 0).then_some([i; 4]));
                 assert!(expected.contains(&value), "{at}: {value:?}");
@@ -95,7 +88,7 @@ fn after_any_cut_the_old_or_the_new_value_is_read_and_the_neighbour_is_untouched
             for second in 1..=8 {
                 flash.cut = Some((second, cut));
                 let recovered = until_power_cut(|| {
-                    let mut journal = Journal::open(&flash, &SMALL, REGIONS);
+                    let mut journal = Journal::open(&flash, REGIONS);
                     store(&mut flash, &mut journal, Key::Program(1), [done + 1; 4]).unwrap();
                 });
                 flash.power_on();
@@ -105,9 +98,9 @@ fn after_any_cut_the_old_or_the_new_value_is_read_and_the_neighbour_is_untouched
                     break;
                 }
             }
-            let mut journal = Journal::open(&flash, &SMALL, REGIONS);
+            let mut journal = Journal::open(&flash, REGIONS);
             store(&mut flash, &mut journal, Key::Program(1), [777; 4]).unwrap();
-            let journal = Journal::open(&flash, &SMALL, REGIONS);
+            let journal = Journal::open(&flash, REGIONS);
             assert_eq!(journal.get(&flash, Key::Program(1)), Some([777; 4]), "{at}");
         }
     }
@@ -120,22 +113,22 @@ fn noise_in_both_regions_is_an_empty_journal() {
     for (region, byte) in REGIONS.iter().zip([0x00, 0xA5]) {
         flash.poke(region.base, &[byte; 256]);
     }
-    let mut journal = Journal::open(&flash, &SMALL, REGIONS);
+    let mut journal = Journal::open(&flash, REGIONS);
     assert_eq!(journal.get(&flash, Key::Program(1)), None);
     store(&mut flash, &mut journal, Key::Program(1), [5; 4]).unwrap();
-    assert_eq!(Journal::open(&flash, &SMALL, REGIONS).get(&flash, Key::Program(1)), Some([5; 4]));
+    assert_eq!(Journal::open(&flash, REGIONS).get(&flash, Key::Program(1)), Some([5; 4]));
 }
 
 #[test]
 fn errors_of_the_flash_are_told_and_the_old_value_stays() {
     for operation in 1..=6 {
         let mut flash = ModelFlash::new(&SMALL);
-        let mut journal = Journal::open(&flash, &SMALL, REGIONS);
+        let mut journal = Journal::open(&flash, REGIONS);
         store(&mut flash, &mut journal, Key::Program(1), [1; 4]).unwrap();
         flash.fail = Some((flash.operations + operation, FlashFault::Protected));
         let outcome = store(&mut flash, &mut journal, Key::Program(1), [2; 4]);
         assert_eq!(outcome, Err(StoreError::Flash(FlashFault::Protected)));
-        assert_eq!(Journal::open(&flash, &SMALL, REGIONS).get(&flash, Key::Program(1)), Some([1; 4]));
+        assert_eq!(Journal::open(&flash, REGIONS).get(&flash, Key::Program(1)), Some([1; 4]));
     }
 }
 
@@ -159,11 +152,11 @@ fn a_journal_of_an_older_version_is_read_and_moves_to_this_one_and_a_newer_one_i
         let magic = u32::from_le_bytes(*b"CBNV");
         flash.poke(REGIONS[0].base, &slot([magic, 7, !7, version, u32::MAX]));
         flash.poke(REGIONS[0].base + 24, &slot([0x0001_0002, 1, 2, 3, 4]));
-        let mut journal = Journal::open(&flash, &SMALL, REGIONS);
+        let mut journal = Journal::open(&flash, REGIONS);
         assert_eq!(journal.get(&flash, Key::Program(2)), known.then_some([1, 2, 3, 4]), "version {version}");
         if version == 0 {
             store(&mut flash, &mut journal, Key::CrashCount, [9, 0, 0, 0]).unwrap();
-            let reopened = Journal::open(&flash, &SMALL, REGIONS);
+            let reopened = Journal::open(&flash, REGIONS);
             assert_eq!(reopened.get(&flash, Key::Program(2)), Some([1, 2, 3, 4]));
             assert_eq!(reopened.get(&flash, Key::CrashCount), Some([9, 0, 0, 0]));
             // The other region, the next sequence number, today's version.

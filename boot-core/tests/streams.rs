@@ -8,7 +8,7 @@ mod model;
 
 use bench::*;
 use boot_core::bootloader::{entries_with, entry_count_with, Config};
-use boot_core::download::Policy;
+use boot_core::control::Policy;
 use boot_core::flash::FlashFault;
 use boot_core::profile::Profile;
 use canopen::od::{Address, Entry, Objects};

@@ -2,10 +2,11 @@
 #![allow(dead_code, reason = "each test file uses some of it")]
 
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config};
-use boot_core::download::{Policy, Step};
-use boot_core::node::NodeParameters;
-use boot_core::parameters::Journal;
+use boot_core::control::{Policy, Step};
+use boot_core::crc::CrcKind;
 use boot_core::program::{verify, Invalid};
+use boot_core::store::Journal;
+use boot_core::store::NodeParameters;
 use canopen::device::Device;
 use canopen::od::{Address, Entry, Objects};
 use canopen::{AbortCode, BitRate, NodeId};
@@ -77,7 +78,7 @@ impl<'f> Bench<'f> {
     pub fn with_config(flash: &'f mut ModelFlash, config: Config, size: usize) -> Self {
         let buffer = Box::leak(vec![0; size].into_boxed_slice());
         let config = Box::leak(Box::new(config));
-        let parameters = Journal::open(flash, LAYOUT.chip, LAYOUT.parameters);
+        let parameters = Journal::open(flash, LAYOUT.parameters);
         Self { node: Bootloader::new(config, 0, node(), 0, parameters, flash, buffer) }
     }
 
@@ -190,13 +191,9 @@ pub fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// The CRC of blocks and programs, as the crate was built.
+/// The CRC-32 of blocks and programs.
 pub fn block_crc(bytes: &[u8]) -> u32 {
-    if cfg!(feature = "crc-16") {
-        crc16(bytes)
-    } else {
-        crc32(bytes)
-    }
+    crc32(bytes)
 }
 
 /// CRC-16/XMODEM from its definition (polynomial 1021h, start 0), bit by bit.
@@ -243,8 +240,8 @@ pub fn program(len: usize, seed: u8) -> Vec<u8> {
 
 /// Which program would start after a reset, told by its first data byte; `Err` for none.
 pub fn autostart(flash: &ModelFlash) -> Result<u8, Invalid> {
-    let journal = Journal::open(flash, LAYOUT.chip, LAYOUT.parameters);
-    let verified = verify(flash, &journal, &LAYOUT, 1)?;
+    let journal = Journal::open(flash, LAYOUT.parameters);
+    let verified = verify(flash, &journal, &LAYOUT, CrcKind::Crc32, 1)?;
     if verified.signed() {
         Ok(flash.cells(PROGRAM)[8] ^ 8_u8.wrapping_mul(31))
     } else {

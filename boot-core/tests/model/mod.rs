@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use std::panic::panic_any;
 use std::task::Poll;
 
-use boot_core::flash::{Flash, FlashFault};
+use boot_core::flash::{Flash, FlashFault, Operation as Started};
 use shared_abi::geometry::{Geometry, Region, Sector, SectorRun, STM32F407VG};
 use shared_abi::layout::Layout;
 
@@ -251,14 +251,22 @@ impl Flash for ModelFlash {
         }
     }
 
-    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashFault> {
-        assert_eq!(self.chip.sector(sector.number), Some(sector), "no such sector");
-        self.begin(Operation::Erase(sector.region))
+    fn start(&mut self, operation: Started) -> Result<(), FlashFault> {
+        match operation {
+            Started::Erase(sector) => {
+                assert_eq!(self.chip.sector(sector.number), Some(sector), "no such sector");
+                self.begin(Operation::Erase(sector.region))
+            }
+            Started::Program { address, word } => {
+                assert!(self.chip.flash.contains(address, 4) && address.is_multiple_of(4), "{address:#x}");
+                self.begin(Operation::Program { address, word })
+            }
+        }
     }
 
-    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashFault> {
-        assert!(self.chip.flash.contains(address, 4) && address.is_multiple_of(4), "{address:#x}");
-        self.begin(Operation::Program { address, word })
+    fn sector_at(&self, address: u32) -> Option<Sector> {
+        assert!(self.running.is_none(), "the store was asked while the flash is busy");
+        self.chip.sector_at(address)
     }
 
     fn poll(&mut self) -> Poll<Result<(), FlashFault>> {

@@ -4,8 +4,8 @@
 use canopen::bit_rate::BitRate;
 use canopen::NodeId;
 
+use super::{Key, Parameters, Value};
 use crate::flash::Flash;
-use crate::parameters::{Key, Parameters, Value};
 
 /// What a device is called on its bus, and how fast that is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -5,12 +5,65 @@
 //! header: the owner takes the data as they come, and must not use them before the record was
 //! [`Event::Good`].
 
-use super::{unfit, Refusal};
 use canopen::program::FlashError;
+use canopen::sdo::AbortCode;
+
+use super::stream::Stream;
+use super::{Destination, Format, Judge, Recognition};
+use crate::queue::{Queue, PIECE_HEADER};
+use crate::refusal::Refusal;
+
+/// A program in Intel HEX.
+pub(super) struct IntelHex {
+    reader: Hex,
+    stream: Stream,
+}
+
+impl Format for IntelHex {
+    const IS_STREAM: bool = true;
+
+    fn recognise(first: &[u8], judge: &Judge<'_>) -> Recognition<Self> {
+        if first.first() == Some(&b':') && !judge.is_data() {
+            Recognition::Yes(Self { reader: Hex::new(), stream: Stream::new(judge) })
+        } else {
+            Recognition::No
+        }
+    }
+
+    fn begin(&mut self, _size: Option<u32>, judge: &Judge<'_>, _queue: &Queue<'_>) -> Result<(), Refusal> {
+        judge.may_begin()
+    }
+
+    fn data(&mut self, bytes: &[u8], to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
+        for character in bytes {
+            match self.reader.push(*character)? {
+                Event::Nothing => {}
+                // A record has to be there as a whole, beside the piece that it belongs to.
+                Event::Data { size, .. } if size as usize + 4 * PIECE_HEADER > to.queue.capacity() / 2 => {
+                    return Err(Refusal(FlashError::Format, AbortCode::OUT_OF_MEMORY));
+                }
+                Event::Data { address, size } => {
+                    self.stream.seek(address, to)?;
+                    self.stream.check_place(size, &to.judge)?;
+                }
+                Event::Byte(byte) => self.stream.append(&[byte], to)?,
+                Event::Good => self.stream.close_if_full(to)?,
+            }
+        }
+        Ok(())
+    }
+
+    fn end(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
+        if !self.reader.has_ended() {
+            return Err(Refusal::unfit(FlashError::Format));
+        }
+        self.stream.end(to)
+    }
+}
 
 /// What a byte brought.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Event {
+enum Event {
     Nothing,
     /// A data record begins: where its data go, and how many there are.
     Data {
@@ -25,7 +78,7 @@ pub(super) enum Event {
 
 /// What has been read so far.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Hex {
+struct Hex {
     /// What the 16-bit offsets of data records count from.
     base: u32,
     /// A base of record type 02: an offset may not leave its 64 KiB.
@@ -67,18 +120,18 @@ const LINEAR_BASE: u8 = 4;
 const LINEAR_START: u8 = 5;
 
 impl Hex {
-    pub(super) const fn new() -> Self {
+    const fn new() -> Self {
         Self { base: 0, segment: true, place: Place::Between }
     }
 
     /// Whether the EOF record came.
-    pub(super) fn has_ended(&self) -> bool {
+    fn has_ended(&self) -> bool {
         self.place == Place::End
     }
 
     /// Takes the next character.
-    pub(super) fn push(&mut self, character: u8) -> Result<Event, Refusal> {
-        let malformed = unfit(FlashError::Format);
+    fn push(&mut self, character: u8) -> Result<Event, Refusal> {
+        let malformed = Refusal::unfit(FlashError::Format);
         let Place::Within(record) = &mut self.place else {
             match (character, self.place) {
                 (b'\r' | b'\n' | b' ' | b'\t' | 0 | 0x1A, _) => {}
@@ -128,7 +181,7 @@ impl Hex {
             return Ok(if kind == DATA { Event::Byte(byte) } else { Event::Nothing });
         }
         if record.sum != 0 {
-            return Err(unfit(FlashError::Crc));
+            return Err(Refusal::unfit(FlashError::Crc));
         }
         let value = record.value;
         self.place = if kind == END_OF_FILE { Place::End } else { Place::Between };

@@ -1,0 +1,133 @@
+//! 1F51h: what its commands do, and when they are refused. Passwords stand beside them: they give
+//! the right to a download, and one of them takes the place of CLEAR.
+
+use canopen::program::{FlashError, ProgramControl};
+use canopen::sdo::AbortCode;
+use shared_abi::warm_start::BootRequest;
+
+use super::{Downloader, Program};
+use crate::policy::Erase;
+use crate::refusal::Refusal;
+use crate::session::Session;
+use crate::store::{Parameters, ProgramRecord};
+
+impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
+    /// 1F51h: a command. It is judged and acknowledged now and carried out by
+    /// [`step`](Self::step).
+    ///
+    /// # Errors
+    /// The abort that answers it.
+    pub fn command(&mut self, program: u8, command: ProgramControl) -> Result<(), AbortCode> {
+        use ProgramControl::{Clear, ClrSignature, ResetStat, SetSignature, Start, StartBootloader, Stop};
+
+        let &Program { streamed, locked, .. } = self.program(program).ok_or(AbortCode::NO_SUB_INDEX)?;
+        if matches!(command, Stop | StartBootloader) {
+            // No program runs, and the bootloader does: both are so already.
+            return Ok(());
+        }
+        // Who sends a program in one go means by 2 what CiA 302-3 says: reset the program, which
+        // starts it.
+        let command = match command {
+            ResetStat if streamed || self.policy.reset_starts => Start,
+            command => command,
+        };
+        let finishing = self.programmer.finishing() == Some(program);
+        if let (Start, true, true, None, Some(state)) =
+            (command, streamed, finishing, self.boot_request, self.program_mut(program))
+        {
+            state.start_when_verified = true;
+            return Ok(());
+        }
+        // A new beginning does not wait for the end of the old one.
+        let own = self.programmer.program().is_none_or(|of| of == program);
+        let restarts = command == Clear && own && self.programmer.is_abortable();
+        if self.boot_request.is_some() || (self.busy() && !restarts) {
+            return Err(self.refuse(program, Refusal::untimely(FlashError::Busy)));
+        }
+        let changes = matches!(command, Clear | SetSignature | ClrSignature);
+        if changes && (locked || !(self.policy.allowed)()) {
+            return Err(self.refuse(program, Refusal::untimely(FlashError::NoAccess)));
+        }
+        let (erase, region, data) = (self.policy.erase, self.region(program), self.policy.data);
+        let Some(state) = self.program_mut(program) else { return Err(AbortCode::NO_SUB_INDEX) };
+        state.error = None;
+        state.streamed = false;
+        // Data are never started.
+        let record = state.record.filter(|_| data != Some(program));
+        match (command, record) {
+            (Clear, _) => {
+                let again = matches!(state.session, Session::Cleared { just: true });
+                state.session = Session::Cleared { just: true };
+                self.transfer = None;
+                // A sector that is still being erased for the old download is waited for.
+                let at_once = (again || erase == Erase::AtOnce) && !self.busy();
+                self.programmer.select(program);
+                self.programmer.abort();
+                if at_once {
+                    self.programmer.erase_all(program, region);
+                }
+            }
+            (Start, Some(record)) => self.start(program, record),
+            (SetSignature | ClrSignature, Some(record)) => {
+                // Also where it is so already: after a power cut it may read so now and otherwise
+                // later.
+                let signed = command == SetSignature;
+                let record = ProgramRecord { signed, ..record };
+                self.programmer.record(&mut self.parameters, program, record);
+            }
+            (Start | SetSignature, None) => state.error = Some(FlashError::NoValidProgram),
+            (Stop | StartBootloader | ResetStat | ClrSignature, _) => {}
+        }
+        Ok(())
+    }
+
+    /// The program has brought the device back to the bootloader, so it can do that: it needs no
+    /// rescue window any more.
+    pub fn confirm(&mut self, program: u8) {
+        let Some(record) = self.program(program).and_then(|state| state.record) else { return };
+        if !record.confirmed && !self.busy() {
+            let record = ProgramRecord { confirmed: true, ..record };
+            self.programmer.record(&mut self.parameters, program, record);
+        }
+    }
+
+    /// A password came: 1F50h takes data from now on, and CLEAR is as good as given. `at_once`: the
+    /// old program is void now, and not only when there is another one. What was being downloaded
+    /// before, of this program or another one, is broken off.
+    ///
+    /// # Errors
+    /// If other work goes on.
+    pub fn unlock(&mut self, program: u8, at_once: bool) -> Result<(), AbortCode> {
+        if !self.has(program) {
+            return Err(AbortCode::NO_SUB_INDEX);
+        }
+        if self.boot_request.is_some() || !self.programmer.is_abortable() {
+            return Err(self.refuse(program, Refusal::untimely(FlashError::Busy)));
+        }
+        self.download_cancel();
+        if let Some(other) = self.programmer.program().filter(|of| *of != program) {
+            if let Some(Session::Open { .. }) = self.session(other) {
+                self.set_session(other, Session::Failed);
+            }
+        }
+        self.programmer.abort();
+        self.programmer.select(program);
+        self.programmer.abort();
+        if let Some(state) = self.program_mut(program) {
+            state.locked = false;
+            state.error = None;
+            state.streamed = false;
+            state.session = Session::Cleared { just: false };
+        }
+        if at_once {
+            self.programmer.void(program);
+        }
+        Ok(())
+    }
+
+    /// Asks for the program to be started; unsigned, on trial.
+    pub(super) fn start(&mut self, program: u8, record: ProgramRecord) {
+        let request = if record.signed { BootRequest::Start } else { BootRequest::Trial };
+        self.boot_request = Some(request(program));
+    }
+}

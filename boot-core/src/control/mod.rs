@@ -1,0 +1,501 @@
+//! Program download: 1F50h takes the data, 1F51h the commands, 1F57h tells what became of them.
+//!
+//! Here stand the rules that tie the rooms together. The [intake](crate::intake) judges what comes
+//! in: it is refused at once, with an abort and a status, or accepted. The
+//! [programmer](crate::programmer) carries through what was accepted ([`Downloader::step`]). The two
+//! never wait for each other; between them lies a queue. While it has room for another block the
+//! status is not busy, although the flash works: a host that looks at the status between blocks
+//! sends the next one while those before are being programmed.
+//!
+//! Nothing of an installed program is lost before the first block of another one was judged good:
+//! CLEAR is carried out with it (SYS TEC manual L-1112d_10, figure 12), see
+//! [`Erase`](crate::policy::Erase).
+
+mod commands;
+
+use core::task::Poll;
+
+use canopen::program::{FlashError, FlashStatus, ProgramState};
+use canopen::sdo::AbortCode;
+use shared_abi::block_file::FRAMING;
+use shared_abi::geometry::Region;
+use shared_abi::label;
+use shared_abi::layout::Layout;
+use shared_abi::warm_start::BootRequest;
+
+use crate::flash::Flash;
+use crate::intake::{Destination, Intake, Judge, Progress};
+use crate::program::{check_vectors, Expected};
+use crate::programmer::{Event, Programmer};
+use crate::refusal::Refusal;
+use crate::session::Session;
+use crate::store::{NodeParameters, Parameters, ProgramRecord, StoreError};
+
+pub use crate::policy::{Erase, Policy, Verdict};
+pub use crate::programmer::Step;
+
+/// One program as the objects 1F50h–1F57h show it.
+#[derive(Clone, Copy, Debug)]
+struct Program {
+    /// What the store holds; kept here because the flash cannot be read while it is busy.
+    record: Option<ProgramRecord>,
+    /// 1F56h: the CRC that was computed last, or the stored one.
+    identification: u32,
+    /// How the last block or command ended.
+    error: Option<FlashError>,
+    session: Session,
+    /// The version that the last control block told.
+    version: u32,
+    /// A raw image or Intel HEX came last, completely, and no command since.
+    streamed: bool,
+    /// It is to start when it is verified: its host did not wait for that.
+    start_when_verified: bool,
+    /// A password is missing.
+    locked: bool,
+}
+
+/// The SDO transfer to 1F50h that is open.
+struct Transfer {
+    program: u8,
+    intake: Intake,
+}
+
+/// The download of programs into flash. `PROGRAMS` is the number of programs in the layout.
+pub struct Downloader<'b, P, const PROGRAMS: usize> {
+    layout: &'static Layout,
+    policy: &'static Policy,
+    parameters: P,
+    programs: [Program; PROGRAMS],
+    programmer: Programmer<'b, PROGRAMS>,
+    transfer: Option<Transfer>,
+    /// The abort for a client that goes on sending when the flash has failed.
+    fault: AbortCode,
+    /// A request that waits for the device to leave the bootloader.
+    boot_request: Option<BootRequest>,
+    /// How a piece of work on a program ended, or a block that was damaged; to be reported.
+    outcome: Option<(u8, Result<(), FlashError>)>,
+    /// How the last storing of node-ID and bit rate ended.
+    node_stored: Result<(), StoreError>,
+}
+
+impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
+    /// Starts from what the parameters tell. The larger `buffer`, the further the flash may lag
+    /// behind the bus; blocks larger than it, or than 16 KiB, are refused.
+    pub fn new<F: Flash>(
+        layout: &'static Layout,
+        policy: &'static Policy,
+        parameters: P,
+        flash: &F,
+        buffer: &'b mut [u8],
+    ) -> Self {
+        let mut number = 0;
+        let programs = [(); PROGRAMS].map(|()| {
+            number += 1;
+            let record = ProgramRecord::load(&parameters, flash, number);
+            Program {
+                record,
+                identification: record.map_or(0, |record| record.crc),
+                error: None,
+                session: Session::Idle,
+                version: 0,
+                streamed: false,
+                start_when_verified: false,
+                locked: policy.locked,
+            }
+        });
+        Self {
+            layout,
+            policy,
+            parameters,
+            programs,
+            programmer: Programmer::new(buffer, policy.crc, policy.crc_step),
+            transfer: None,
+            fault: AbortCode::DEVICE_STATE,
+            boot_request: None,
+            outcome: None,
+            node_stored: Ok(()),
+        }
+    }
+
+    /// Ends here, whatever is being done; gives the buffer back.
+    pub fn into_buffer(self) -> &'b mut [u8] {
+        self.programmer.into_buffer()
+    }
+
+    /// Whether sub-index `program` of 1F50h, 1F51h, 1F56h and 1F57h exists.
+    #[must_use]
+    pub fn has(&self, program: u8) -> bool {
+        self.program(program).is_some()
+    }
+
+    /// 1F57h. Busy while a command of this program is carried out, or while no further block can be
+    /// taken.
+    #[must_use]
+    pub fn status(&self, program: u8) -> FlashStatus {
+        let error = self.program(program).and_then(|state| state.error);
+        FlashStatus { busy: self.programmer.is_busy_with(program), error, detail: 0 }
+    }
+
+    /// 1F51h: no program runs, whether or not there is one.
+    #[must_use]
+    pub fn control(&self, program: u8) -> ProgramState {
+        match self.program(program).and_then(|state| state.record) {
+            Some(_) => ProgramState::Stopped,
+            None => ProgramState::Absent,
+        }
+    }
+
+    /// 1F56h: the CRC over the program, 0 where there is none.
+    #[must_use]
+    pub fn identification(&self, program: u8) -> u32 {
+        self.program(program).map_or(0, |state| state.identification)
+    }
+
+    /// Whether there is work for [`Downloader::step`].
+    #[must_use]
+    pub fn busy(&self) -> bool {
+        self.programmer.is_busy()
+    }
+
+    /// The request to leave the bootloader, once: the answer to the command may still be on its
+    /// way.
+    pub fn take_boot_request(&mut self) -> Option<BootRequest> {
+        self.boot_request.take()
+    }
+
+    /// How a piece of work on a program ended, or a block that was damaged, once.
+    pub fn take_outcome(&mut self) -> Option<(u8, Result<(), FlashError>)> {
+        self.outcome.take()
+    }
+
+    /// Whether a program was sent completely, or a command acknowledged, and it is not carried
+    /// through yet: a reset now would take that back.
+    #[must_use]
+    pub fn is_finishing(&self) -> bool {
+        self.programmer.finishing().is_some()
+    }
+
+    /// Stores node-ID and bit rate in the background.
+    ///
+    /// # Errors
+    /// If other work goes on.
+    pub fn store_node(&mut self, node: NodeParameters) -> Result<(), FlashError> {
+        if self.busy() || self.boot_request.is_some() {
+            return Err(FlashError::Busy);
+        }
+        self.programmer.store_node(&mut self.parameters, node);
+        Ok(())
+    }
+
+    /// How the last [`store_node`](Self::store_node) ended.
+    pub fn node_stored(&self) -> Poll<Result<(), StoreError>> {
+        if self.programmer.is_storing_node() {
+            Poll::Pending
+        } else {
+            Poll::Ready(self.node_stored)
+        }
+    }
+
+    /// 1F50h is about to be read back: gives the place of what is stored.
+    ///
+    /// # Errors
+    /// The abort that answers it.
+    pub fn stored(&self, program: u8) -> Result<Region, AbortCode> {
+        let state = self.program(program).ok_or(AbortCode::NO_SUB_INDEX)?;
+        if !self.policy.read_back {
+            return Err(AbortCode::WRITE_ONLY);
+        }
+        // While it works the flash cannot be read.
+        if state.locked || self.busy() {
+            return Err(AbortCode::DEVICE_STATE);
+        }
+        self.installed(program).map(|(place, _)| place).ok_or(AbortCode::NO_DATA)
+    }
+
+    /// Where a program is stored, and its CRC.
+    pub(crate) fn installed(&self, program: u8) -> Option<(Region, u32)> {
+        let record = self.program(program)?.record?;
+        Some((Region::new(self.region(program).base, record.size), record.crc))
+    }
+
+    /// 1F50h: the client announces a transfer, and its size if it knows it.
+    ///
+    /// # Errors
+    /// The abort that answers it.
+    pub fn download_start(&mut self, program: u8, size: Option<u32>) -> Result<(), AbortCode> {
+        self.download_cancel();
+        let Some(state) = self.program(program) else { return Err(AbortCode::NO_SUB_INDEX) };
+        let others = self.busy() && self.programmer.program().is_some_and(|of| of != program);
+        let refusal =
+            if self.boot_request.is_some() || others || !self.programmer.is_abortable() || !self.has_room() {
+                Some(Refusal::untimely(FlashError::Busy))
+            } else if state.locked {
+                Some(Refusal::untimely(FlashError::NoAccess))
+            } else if size.is_some_and(|size| size < FRAMING as u32) && self.policy.data != Some(program) {
+                Some(Refusal(FlashError::Format, AbortCode::LENGTH_TOO_LOW))
+            } else {
+                None
+            };
+        if let Some(refusal) = refusal {
+            return Err(self.refuse(program, refusal));
+        }
+        if let Some(state) = self.program_mut(program) {
+            // A second CLEAR erases all, but not behind a block: it may come from a host that tries
+            // the same wrong file again.
+            if let Session::Cleared { just } = &mut state.session {
+                *just = false;
+            }
+            state.streamed = false;
+        }
+        self.programmer.select(program);
+        self.transfer = Some(Transfer { program, intake: Intake::new(size) });
+        Ok(())
+    }
+
+    /// Bytes that [`download_data`](Self::download_data) takes at present. `held` for a client whose
+    /// answer is already being held back, which may use a reserve.
+    #[must_use]
+    pub fn space(&self, held: bool) -> usize {
+        let room = |transfer: &Transfer| transfer.intake.room(self.programmer.queue(), held);
+        self.transfer.as_ref().map_or(usize::MAX, room)
+    }
+
+    /// 1F50h: the next bytes of the transfer.
+    ///
+    /// # Errors
+    /// The abort that ends the transfer.
+    pub fn download_data(&mut self, data: &[u8]) -> Result<(), AbortCode> {
+        self.take(|intake, to| intake.data(data, to)).map(drop)
+    }
+
+    /// 1F50h: the transfer is complete. Judges it in full and leaves the work behind.
+    ///
+    /// # Errors
+    /// The abort that answers instead of the last acknowledgement.
+    pub fn download_end(&mut self) -> Result<(), AbortCode> {
+        let program = self.take(Intake::end)?;
+        self.transfer = None;
+        if let Some(state) = self.program_mut(program) {
+            state.error = None;
+        }
+        Ok(())
+    }
+
+    /// 1F50h: the transfer ended before its end. A block may be sent again; of a stream half a
+    /// program is left, if any.
+    pub fn download_cancel(&mut self) {
+        let Some(Transfer { program, intake }) = self.transfer.take() else { return };
+        self.programmer.queue_mut().discard();
+        let Some(state) = self.program_mut(program) else { return };
+        if intake.is_stream() && matches!(state.session, Session::Open { .. }) {
+            state.session = Session::Failed;
+            state.error.get_or_insert(FlashError::Format);
+            self.programmer.abort();
+        }
+    }
+
+    /// Hands something to the format of the open transfer and carries out what it leads to; gives
+    /// the program that it is about.
+    fn take(
+        &mut self,
+        hand: impl FnOnce(&mut Intake, &mut Destination<'_, 'b>) -> Result<(), Refusal>,
+    ) -> Result<u8, AbortCode> {
+        let Some(Transfer { program, mut intake }) = self.transfer.take() else { return Err(self.fault) };
+        let state = self.program(program).ok_or(self.fault)?;
+        let judge = Judge {
+            layout: self.layout,
+            policy: self.policy,
+            program,
+            session: state.session,
+            installed: state.record.is_some(),
+        };
+        let mut to = Destination { judge, queue: self.programmer.queue_mut(), progress: Progress::default() };
+        let outcome = hand(&mut intake, &mut to);
+        let progress = to.progress;
+        let streaming = intake.may_be_stream();
+        let is_stream = intake.is_stream();
+        self.transfer = Some(Transfer { program, intake });
+        match outcome {
+            Ok(()) => {
+                self.proceed(program, is_stream, progress);
+                Ok(program)
+            }
+            Err(refusal) => {
+                if progress.begins.is_some() && !matches!(judge.session, Session::Open { .. }) {
+                    // Its pieces are of a download that does not begin.
+                    self.programmer.queue_mut().clear();
+                }
+                if refusal.0 == FlashError::Crc || streaming {
+                    self.outcome = Some((program, Err(refusal.0)));
+                }
+                let abort = self.refuse(program, refusal);
+                self.download_cancel();
+                Err(abort)
+            }
+        }
+    }
+
+    /// What accepted bytes lead to.
+    fn proceed(&mut self, program: u8, is_stream: bool, progress: Progress) {
+        let (policy, region) = (self.policy, self.region(program));
+        let Some(state) = self.program_mut(program) else { return };
+        if let Some(begin) = progress.begins {
+            state.version = begin.version;
+            // A sequence of blocks that begins anew goes on over what is there.
+            if !matches!(state.session, Session::Open { .. }) {
+                let erase = state.session.erases(policy);
+                self.programmer.open(program, region, erase, begin.size);
+            }
+            self.set_session(program, Session::Open { next: 1 });
+        }
+        if progress.block {
+            if let Some(Session::Open { next }) = self.session(program) {
+                self.set_session(program, Session::Open { next: next.wrapping_add(1) });
+            }
+        }
+        if let Some(expected) = progress.complete {
+            self.programmer.complete(expected);
+            if let (Some(state), true) = (self.program_mut(program), is_stream) {
+                state.streamed = true;
+                state.start_when_verified = policy.starts_by_itself;
+            }
+        }
+    }
+
+    /// Carries the work on.
+    pub fn step<F: Flash>(&mut self, flash: &mut F) -> Step {
+        let (step, event) = self.programmer.step(&mut self.parameters, flash);
+        match event {
+            None => {}
+            Some(Event::NodeStored(outcome)) => self.node_stored = outcome,
+            Some(Event::Voided(program)) => {
+                if let Some(state) = self.program_mut(program) {
+                    state.record = None;
+                    state.identification = 0;
+                }
+            }
+            Some(Event::Erased(program)) => self.end(program, Ok(())),
+            Some(Event::Written { program, expected, crc }) => {
+                if let Some(state) = self.program_mut(program) {
+                    state.identification = crc;
+                    state.session = Session::Idle;
+                }
+                match self.check_stored(flash, program, &expected, crc) {
+                    Ok(version) => {
+                        let signed = expected.crc.is_none() && self.policy.valid_without_signature;
+                        let size = expected.size;
+                        let record = ProgramRecord { size, crc, signed, confirmed: false, version };
+                        self.programmer.record(&mut self.parameters, program, record);
+                    }
+                    Err(error) => self.end(program, Err(error)),
+                }
+            }
+            Some(Event::Recorded(program, record)) => {
+                if let Some(state) = self.program_mut(program) {
+                    state.record = Some(record);
+                }
+                self.end(program, Ok(()));
+            }
+            Some(Event::Failed { program, error, erasing }) => {
+                self.fault = if erasing { AbortCode::GENERAL } else { AbortCode::HARDWARE };
+                self.end(program, Err(error));
+            }
+        }
+        step
+    }
+
+    /// What is in flash, against what it should be; gives its version.
+    fn check_stored<F: Flash>(
+        &self,
+        flash: &F,
+        program: u8,
+        expected: &Expected,
+        crc: u32,
+    ) -> Result<u32, FlashError> {
+        let region = self.region(program);
+        let Some(state) = self.program(program) else { return Err(FlashError::Unspecified) };
+        if self.policy.data == Some(program) {
+            return Ok(state.version);
+        }
+        if expected.crc.is_some_and(|told| told != crc) || check_vectors(flash, region, self.layout).is_err()
+        {
+            return Err(FlashError::NoValidProgram);
+        }
+        if expected.crc.is_some() {
+            return Ok(state.version);
+        }
+        let mut label = [0; label::SIZE];
+        // Behind the program's end is nothing of it.
+        if expected.size >= label::OFFSET + label::SIZE as u32 {
+            flash.read(region.base + label::OFFSET, &mut label);
+        }
+        let judge = Judge {
+            layout: self.layout,
+            policy: self.policy,
+            program,
+            session: state.session,
+            installed: false,
+        };
+        judge.check_label(&label).map_err(|Refusal(error, _)| error)
+    }
+
+    /// A piece of work on a program is over.
+    fn end(&mut self, program: u8, outcome: Result<(), FlashError>) {
+        let current = self.transfer.as_ref().is_some_and(|transfer| transfer.program == program);
+        if outcome.is_err() && current {
+            self.transfer = None;
+            self.programmer.queue_mut().clear();
+        }
+        let Some(state) = self.program_mut(program) else { return };
+        let start = core::mem::take(&mut state.start_when_verified);
+        state.error = outcome.err();
+        if outcome.is_err() {
+            state.streamed = false;
+            if !matches!(state.session, Session::Idle) {
+                state.session = Session::Failed;
+            }
+        } else if let (true, Some(record)) = (start, state.record) {
+            self.start(program, record);
+        }
+        self.outcome = Some((program, outcome));
+    }
+
+    /// Shows why something was refused. The error that ended a session stays to be seen.
+    fn refuse(&mut self, program: u8, Refusal(error, abort): Refusal) -> AbortCode {
+        if let Some(state) = self.program_mut(program) {
+            if !matches!(state.session, Session::Failed) || state.error.is_none() {
+                state.error = Some(error);
+            }
+        }
+        abort
+    }
+
+    /// Whether the queue takes another transfer.
+    fn has_room(&self) -> bool {
+        self.programmer.has_room()
+    }
+
+    /// A program, if there is one of this number.
+    fn program(&self, program: u8) -> Option<&Program> {
+        self.programs.get(usize::from(program).checked_sub(1)?)
+    }
+
+    /// See [`program`](Self::program).
+    fn program_mut(&mut self, program: u8) -> Option<&mut Program> {
+        self.programs.get_mut(usize::from(program).checked_sub(1)?)
+    }
+
+    fn session(&self, program: u8) -> Option<Session> {
+        self.program(program).map(|state| state.session)
+    }
+
+    fn set_session(&mut self, program: u8, session: Session) {
+        if let Some(state) = self.program_mut(program) {
+            state.session = session;
+        }
+    }
+
+    fn region(&self, program: u8) -> Region {
+        self.layout.program(program).unwrap_or(Region::new(0, 0))
+    }
+}

@@ -1,0 +1,112 @@
+//! The rules that every format is judged by: where data may go, and whom a program is for.
+
+use canopen::program::FlashError;
+use shared_abi::block_file::{Control, Identity};
+use shared_abi::geometry::Region;
+use shared_abi::label::{self, Label};
+use shared_abi::layout::Layout;
+use shared_abi::vectors::VectorTable;
+
+use crate::policy::{Policy, Verdict};
+use crate::refusal::Refusal;
+use crate::session::Session;
+
+/// Judges what arrives for one program.
+#[derive(Clone, Copy)]
+pub(crate) struct Judge<'a> {
+    /// Who owns which address.
+    pub layout: &'a Layout,
+    /// What the product chose.
+    pub policy: &'a Policy,
+    /// The program, 1 to 254.
+    pub program: u8,
+    /// How far its download is.
+    pub session: Session,
+    /// Whether there is a program.
+    pub installed: bool,
+}
+
+impl Judge<'_> {
+    /// The program's flash.
+    pub(crate) fn region(&self) -> Region {
+        self.layout.program(self.program).unwrap_or(Region::new(0, 0))
+    }
+
+    /// Whether the program is none, but data of the application.
+    pub(crate) fn is_data(&self) -> bool {
+        self.policy.data == Some(self.program)
+    }
+
+    /// Whether the download has begun: the old program is given up then.
+    pub(crate) fn has_begun(&self) -> bool {
+        matches!(self.session, Session::Open { .. })
+    }
+
+    /// Whether a download may begin.
+    pub(crate) fn may_begin(&self) -> Result<(), Refusal> {
+        self.session.may_begin(self.policy, self.installed)
+    }
+
+    /// Why first bytes that no format knows are refused.
+    pub(crate) fn unknown_format(&self) -> Refusal {
+        if self.has_begun() {
+            Refusal::untimely(FlashError::Sequence)
+        } else {
+            Refusal::unfit(FlashError::Format)
+        }
+    }
+
+    /// Whether data of this program may go there.
+    pub(crate) fn check_place(&self, place: Region) -> Result<(), Refusal> {
+        if self.region().contains(place.base, place.size) {
+            return Ok(());
+        }
+        let secured = [self.layout.bootloader, self.layout.parameters[0], self.layout.parameters[1]];
+        let touches = |region: &Region| {
+            // No sum: an address near the end of the address space must not wrap.
+            place.base < region.end() && (place.base >= region.base || region.base - place.base < place.size)
+        };
+        let secured = secured.iter().any(touches);
+        Err(Refusal::unfit(if secured { FlashError::Secured } else { FlashError::Address }))
+    }
+
+    /// Whether the first two vectors are those of a program at this place.
+    pub(crate) fn check_vectors(&self, words: [u32; 2]) -> Result<(), Refusal> {
+        VectorTable::check(words, self.region(), self.layout)
+            .map(drop)
+            .map_err(|_| Refusal::unfit(FlashError::Format))
+    }
+
+    /// Whether a program is for this device, by its control block.
+    pub(crate) fn check_identity(&self, control: &Control) -> Result<(), Refusal> {
+        let identity = match control {
+            Control::Plain => None,
+            Control::Identity(identity) | Control::Dated { identity, .. } => Some(identity),
+        };
+        match ((self.policy.check)(self.program, control), identity, self.policy.identity) {
+            (Verdict::Refuse(error), ..) => return Err(Refusal::unfit(error)),
+            (Verdict::Standard, Some(told), Some((vendor_id, product_code))) => {
+                if told.vendor_id != 0 && told.vendor_id != vendor_id {
+                    return Err(Refusal::unfit(FlashError::WrongVendorId));
+                }
+                if told.product_code != 0 && told.product_code != product_code {
+                    return Err(Refusal::unfit(FlashError::WrongProductId));
+                }
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Whether a program is for this device, by its label; gives its version, 0 where there is no
+    /// label.
+    pub(crate) fn check_label(&self, bytes: &[u8; label::SIZE]) -> Result<u32, Refusal> {
+        let Some(label) = Label::parse(bytes) else {
+            return if self.policy.wants_label { Err(Refusal::unfit(FlashError::Format)) } else { Ok(0) };
+        };
+        let Label { vendor_id, product_code, version, .. } = label;
+        let identity = Identity { app_size: 0, vendor_id, product_code };
+        self.check_identity(&Control::Dated { identity, version, date: 0 })?;
+        Ok(version)
+    }
+}

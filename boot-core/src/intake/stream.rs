@@ -1,0 +1,125 @@
+//! What the formats share that bring a whole program in one transfer: the bytes are cut into pieces,
+//! and the first piece is judged before anything is lost.
+
+use canopen::program::FlashError;
+use canopen::sdo::AbortCode;
+use shared_abi::geometry::Region;
+use shared_abi::label;
+
+use super::{Begin, Destination, Judge, SMALLEST_PROGRAM};
+use crate::program::Expected;
+use crate::queue::{Queue, PIECE_HEADER};
+use crate::refusal::Refusal;
+
+/// Data of a piece: so long that the flash is kept busy, so short that a small queue holds some.
+const PIECE: usize = 1024;
+/// Part of the queue that is filled slowly, so that a client whose data find the flash erasing
+/// still gets its answers in time. An erasure of 2 s at 7 bytes every
+/// [`HOLD_MS`](canopen::sdo::server::HOLD_MS) needs 7 KiB.
+const RESERVE: usize = 8 * 1024;
+
+/// Bytes that a stream may send at present. `held`: for a client whose answer is already being held
+/// back, which may use the reserve. (Data that are scattered byte by byte take 9 bytes of the queue
+/// each, and at least 13 characters of Intel HEX.)
+pub(super) fn room(queue: &Queue<'_>, held: bool) -> usize {
+    let reserve = RESERVE.min(queue.capacity() / 4);
+    // The open piece has its header already; another one may begin.
+    let keep = 2 * PIECE_HEADER + if held { 0 } else { reserve };
+    queue.free().saturating_sub(keep)
+}
+
+/// A program on its way in.
+pub(super) struct Stream {
+    /// Where the next byte goes.
+    next: u32,
+    /// Behind the highest byte so far.
+    end: u32,
+    /// Bytes of the image, 0 where that is not known.
+    size: u32,
+}
+
+impl Stream {
+    pub(super) fn new(judge: &Judge<'_>) -> Self {
+        let base = judge.region().base;
+        Self { next: base, end: base, size: 0 }
+    }
+
+    /// The image has this many bytes.
+    pub(super) fn set_size(&mut self, size: u32) {
+        self.size = size;
+    }
+
+    /// The next bytes go there: what does not follow on the piece before begins another one.
+    pub(super) fn seek(&mut self, address: u32, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
+        if address != self.next {
+            self.close(to)?;
+            self.next = address;
+        }
+        Ok(())
+    }
+
+    /// Whether so many bytes may stand where the next one goes.
+    pub(super) fn check_place(&mut self, size: u32, judge: &Judge<'_>) -> Result<(), Refusal> {
+        judge.check_place(Region::new(self.next, size))?;
+        self.end = self.end.max(self.next + size);
+        Ok(())
+    }
+
+    /// Adds bytes to the open piece.
+    pub(super) fn append(&mut self, data: &[u8], to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
+        if !to.queue.push(self.next, data) {
+            // A client that waits for the answers does not get here.
+            return Err(Refusal(FlashError::Busy, AbortCode::OUT_OF_MEMORY));
+        }
+        self.next += data.len() as u32;
+        Ok(())
+    }
+
+    /// The open piece joins the queue if it is long enough. All that it holds must be judged.
+    pub(super) fn close_if_full(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
+        if to.queue.open_size() >= PIECE.min(to.queue.capacity() / 8) {
+            self.close(to)?;
+        }
+        Ok(())
+    }
+
+    /// All is sent.
+    pub(super) fn end(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
+        let size = self.end - to.judge.region().base;
+        if size < if to.judge.is_data() { 1 } else { SMALLEST_PROGRAM } {
+            return Err(Refusal::unfit(FlashError::Format));
+        }
+        self.close(to)?;
+        to.progress.complete = Some(Expected { size, crc: None });
+        Ok(())
+    }
+
+    fn close(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
+        if to.queue.open_size() > 0 && !to.judge.has_begun() && to.progress.begins.is_none() {
+            judge_start(to)?;
+            to.progress.begins = Some(Begin { size: self.size, version: 0 });
+        }
+        to.queue.commit();
+        Ok(())
+    }
+}
+
+/// Judges the first piece, where it is the start of the program. A HEX file may begin anywhere; its
+/// vectors and its label are then looked at when all is in flash.
+fn judge_start(to: &Destination<'_, '_>) -> Result<(), Refusal> {
+    if to.judge.is_data() {
+        return Ok(());
+    }
+    let base = to.judge.region().base;
+    if let Some((address, [a, b, c, d, e, f, g, h])) = to.queue.open_start(0) {
+        if address == base {
+            to.judge.check_vectors([[a, b, c, d], [e, f, g, h]].map(u32::from_le_bytes))?;
+        }
+    }
+    if let Some((address, label)) = to.queue.open_start(label::OFFSET as usize) {
+        if address == base {
+            to.judge.check_label(&label)?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,88 @@
+//! What a product may choose about downloads.
+
+use canopen::program::FlashError;
+use shared_abi::block_file::Control;
+
+use crate::crc::CrcKind;
+
+/// When CLEAR erases.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Erase {
+    /// With the first block that is for this device: until then the old program stays, and can be
+    /// started. Sectors are erased as the data need them. A second CLEAR, with no block in between,
+    /// erases all at once.
+    #[default]
+    WithFirstBlock,
+    /// All sectors of the program, before anything else.
+    AtOnce,
+}
+
+/// What the integrator's own check says of a program that is about to be downloaded.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    /// Nothing: vendor-ID and product code decide.
+    Standard,
+    /// It is for this device.
+    Accept,
+    /// It is not.
+    Refuse(FlashError),
+}
+
+/// What can be chosen about the download.
+#[derive(Clone, Copy, Debug)]
+pub struct Policy {
+    /// Vendor-ID and product code of the device. A control block that tells others is refused; 0 in
+    /// it stands for any.
+    pub identity: Option<(u32, u32)>,
+    /// The integrator's own check, with all that the control block tells (`TgtProcessAppInfoData`
+    /// of the manual).
+    pub check: fn(program: u8, control: &Control) -> Verdict,
+    /// Whether programs may be changed now; where not, the status is `NO_ACCESS`.
+    pub allowed: fn() -> bool,
+    /// When CLEAR erases.
+    pub erase: Erase,
+    /// Whether a complete raw image or Intel HEX download is valid without the signature (83h) that
+    /// those who send it know nothing of.
+    pub valid_without_signature: bool,
+    /// Whether 1F51h = 2 always starts the program, as CiA 302-3 has it; otherwise it does so right
+    /// behind a raw image or Intel HEX, and resets the status in all other cases.
+    pub reset_starts: bool,
+    /// Whether a valid raw image or Intel HEX starts by itself when it is complete.
+    pub starts_by_itself: bool,
+    /// Whether a raw image or Intel HEX has to carry a label (`shared_abi::label`). A label that it
+    /// carries has to fit in any case.
+    pub wants_label: bool,
+    /// The number of a program that is none, but data of the application: any bytes, never started.
+    pub data: Option<u8>,
+    /// Whether 1F50h takes nothing before a password has come.
+    pub locked: bool,
+    /// Whether 1F50h gives back what was stored.
+    pub read_back: bool,
+    /// Whether a download takes the place of what is there, without CLEAR.
+    pub replaces: bool,
+    /// Which CRC blocks and programs carry.
+    pub crc: CrcKind,
+    /// Bytes of flash that one step of a CRC covers: the longest that other work of the same
+    /// priority is kept waiting.
+    pub crc_step: u32,
+}
+
+impl Policy {
+    /// Anybody's programs at any time; steps of 1 KiB.
+    pub const DEFAULT: Self = Self {
+        identity: None,
+        check: |_, _| Verdict::Standard,
+        allowed: || true,
+        erase: Erase::WithFirstBlock,
+        valid_without_signature: true,
+        reset_starts: false,
+        starts_by_itself: false,
+        wants_label: false,
+        data: None,
+        locked: false,
+        read_back: false,
+        replaces: false,
+        crc: CrcKind::Crc32,
+        crc_step: 1024,
+    };
+}

@@ -1,0 +1,430 @@
+//! The flash half of a download: what was accepted is carried through, an operation or a bounded
+//! computation at a time.
+//!
+//! Pieces wait in a queue. Sectors are erased ahead of them, each piece is written and read back,
+//! and when all is there the CRC over the program is computed. Beside that it carries through what
+//! the store wants written. It knows pieces, addresses and program numbers; no format, no object
+//! and no command.
+//!
+//! **No data are touched while their record stands**: [`Programmer::open`] and
+//! [`Programmer::void`] only note that a record has to go, and as long as one has to, nothing is
+//! erased or written.
+
+mod write;
+
+use core::task::Poll;
+
+use canopen::program::FlashError;
+use shared_abi::block_file::MAX_BLOCK_SIZE;
+use shared_abi::geometry::Region;
+
+use crate::crc::CrcKind;
+use crate::flash::{Flash, FlashFault, Next, Operation};
+use crate::program::{Expected, FlashCrc};
+use crate::queue::Queue;
+use crate::sequence::EraseSectors;
+use crate::store::{Key, NodeParameters, Parameters, ProgramRecord, StoreError};
+use write::WritePiece;
+
+/// What came of a step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Step {
+    /// There is no work.
+    Idle,
+    /// The flash programs a word, which takes it tens of microseconds.
+    Programming,
+    /// The flash erases a sector, which takes it hundreds of milliseconds.
+    Erasing,
+    /// There is more to compute; step again soon.
+    Again,
+}
+
+/// A piece of work that is over.
+pub(crate) enum Event {
+    /// The record of a program is gone.
+    Voided(u8),
+    /// All of a program's flash is erased, as [`Programmer::erase_all`] was told to.
+    Erased(u8),
+    /// A program was written completely; its CRC over flash.
+    Written { program: u8, expected: Expected, crc: u32 },
+    /// The record of a program is stored.
+    Recorded(u8, ProgramRecord),
+    /// Node-ID and bit rate are stored, or not.
+    NodeStored(Result<(), StoreError>),
+    /// The work on a program failed. `erasing`: an erasure did.
+    Failed { program: u8, error: FlashError, erasing: bool },
+}
+
+/// How far the flash of a program is.
+#[derive(Clone, Copy, Debug)]
+struct Target {
+    region: Region,
+    /// Up to here the flash is erased.
+    erased: u32,
+    /// Up to here it may be erased before there are data.
+    ahead: u32,
+    /// All of it is being erased for a command.
+    clearing: bool,
+    /// To be verified when the queue is empty.
+    expected: Option<Expected>,
+}
+
+/// What is being done.
+enum Job {
+    /// A value is on its way into the store.
+    Store(Change),
+    /// Sectors up to `until`.
+    Erase { sectors: EraseSectors, until: u32 },
+    /// The piece at the front of the queue.
+    Write(WritePiece),
+    /// Is the flash what the host meant?
+    Verify { expected: Expected, crc: FlashCrc },
+}
+
+/// What changes in the store.
+enum Change {
+    Void(u8),
+    Record(u8, ProgramRecord),
+    Node,
+}
+
+/// The flash half. It starts operations and polls them, and never waits for one.
+pub(crate) struct Programmer<'b, const PROGRAMS: usize> {
+    queue: Queue<'b>,
+    crc_kind: CrcKind,
+    crc_step: u32,
+    targets: [Option<Target>; PROGRAMS],
+    /// Whose pieces are in the queue; 0 for nobody's.
+    current: u8,
+    /// Bit n: the record of program n + 1 has to go before anything is erased or written.
+    voids: u32,
+    job: Option<Job>,
+    /// What the flash is doing. Without a job nobody wants its outcome any more.
+    running: Option<Step>,
+}
+
+impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
+    /// The larger `buffer`, the further the flash may lag behind the bus. One step of a CRC covers
+    /// `crc_step` bytes.
+    pub(crate) fn new(buffer: &'b mut [u8], crc_kind: CrcKind, crc_step: u32) -> Self {
+        Self {
+            queue: Queue::new(buffer),
+            crc_kind,
+            crc_step,
+            targets: [None; PROGRAMS],
+            current: 0,
+            voids: 0,
+            job: None,
+            running: None,
+        }
+    }
+
+    pub(crate) fn into_buffer(self) -> &'b mut [u8] {
+        self.queue.into_buffer()
+    }
+
+    /// Where the pieces wait.
+    pub(crate) fn queue(&self) -> &Queue<'b> {
+        &self.queue
+    }
+
+    /// See [`queue`](Self::queue).
+    pub(crate) fn queue_mut(&mut self) -> &mut Queue<'b> {
+        &mut self.queue
+    }
+
+    /// Pieces of this program will come. `erase`: its record goes and its sectors are erased, those
+    /// of the first `size` bytes before there are data for them; otherwise each piece has to find
+    /// its place blank.
+    pub(crate) fn open(&mut self, program: u8, region: Region, erase: bool, size: u32) {
+        let (erased, ahead) = if erase {
+            self.void(program);
+            (region.base, region.base + size.min(region.size))
+        } else {
+            (region.end(), region.end())
+        };
+        self.select(program);
+        if let Some(target) = self.targets.get_mut(usize::from(program).wrapping_sub(1)) {
+            *target = Some(Target { region, erased, ahead, clearing: false, expected: None });
+        }
+    }
+
+    /// The next pieces are of this program. Nothing may be left to do for another one.
+    pub(crate) fn select(&mut self, program: u8) {
+        self.current = program;
+    }
+
+    /// The record of a program goes, then all its sectors are erased.
+    pub(crate) fn erase_all(&mut self, program: u8, region: Region) {
+        self.open(program, region, true, region.size);
+        if let Some(target) = self.target_mut() {
+            target.clearing = true;
+        }
+    }
+
+    /// The record of a program goes.
+    pub(crate) fn void(&mut self, program: u8) {
+        self.voids |= 1 << program.saturating_sub(1);
+    }
+
+    /// The program was sent completely.
+    pub(crate) fn complete(&mut self, expected: Expected) {
+        if let Some(target) = self.target_mut() {
+            target.expected = Some(expected);
+            // What no piece has written belongs to the program all the same, and reads FFh.
+            target.ahead = target.ahead.max(target.region.base + expected.size);
+        }
+    }
+
+    /// The record of a program becomes this.
+    pub(crate) fn record(&mut self, parameters: &mut impl Parameters, program: u8, record: ProgramRecord) {
+        parameters.store(Key::Program(program), record.value());
+        self.job = Some(Job::Store(Change::Record(program, record)));
+    }
+
+    /// Node-ID and bit rate become these.
+    pub(crate) fn store_node(&mut self, parameters: &mut impl Parameters, node: NodeParameters) {
+        parameters.store(Key::Node, node.value());
+        self.job = Some(Job::Store(Change::Node));
+    }
+
+    /// What was received is not wanted any more. What is on its way into the store goes on.
+    pub(crate) fn abort(&mut self) {
+        self.queue.clear();
+        if let Some(target) = self.targets.get_mut(usize::from(self.current).wrapping_sub(1)) {
+            *target = None;
+        }
+        self.current = 0;
+        if !matches!(self.job, Some(Job::Store(_))) {
+            self.job = None;
+        }
+    }
+
+    /// The program whose pieces are taken.
+    pub(crate) fn program(&self) -> Option<u8> {
+        (self.current > 0).then_some(self.current)
+    }
+
+    fn target(&self) -> Option<&Target> {
+        self.targets.get(usize::from(self.current).wrapping_sub(1))?.as_ref()
+    }
+
+    fn target_mut(&mut self) -> Option<&mut Target> {
+        self.targets.get_mut(usize::from(self.current).wrapping_sub(1))?.as_mut()
+    }
+
+    /// Whether there is work for [`step`](Self::step).
+    pub(crate) fn is_busy(&self) -> bool {
+        self.job.is_some()
+            || self.running.is_some()
+            || self.voids != 0
+            || !self.queue.is_empty()
+            || self.target().is_some_and(|target| target.expected.is_some() || target.erased < target.ahead)
+    }
+
+    /// Whether it works on a command or on the end of a program, so that no further block of that
+    /// program can be taken.
+    pub(crate) fn is_busy_with(&self, program: u8) -> bool {
+        let current = self.current == program;
+        let ending = match self.job {
+            Some(Job::Store(Change::Record(of, _))) => of == program,
+            Some(Job::Verify { .. }) => current,
+            _ => false,
+        };
+        let waiting = |target: &Target| target.clearing || target.expected.is_some() || !self.has_room();
+        ending || current && self.target().is_some_and(waiting)
+    }
+
+    /// The program that was sent completely, or whose record is being stored: what its host was
+    /// told is done, and a reset now would take back.
+    pub(crate) fn finishing(&self) -> Option<u8> {
+        match self.job {
+            Some(Job::Store(Change::Record(of, _))) => Some(of),
+            Some(Job::Verify { .. }) => self.program(),
+            _ => self.program().filter(|_| self.target().is_some_and(|target| target.expected.is_some())),
+        }
+    }
+
+    /// Whether [`abort`](Self::abort) takes nothing back that a host was told is done.
+    pub(crate) fn is_abortable(&self) -> bool {
+        let clearing = self.target().is_some_and(|target| target.clearing);
+        !clearing && self.finishing().is_none() && !self.is_storing_node()
+    }
+
+    /// Whether node-ID and bit rate are on their way.
+    pub(crate) fn is_storing_node(&self) -> bool {
+        matches!(self.job, Some(Job::Store(Change::Node)))
+    }
+
+    /// Whether the queue takes a block of the largest size. (One that is not even as large takes
+    /// one at a time.)
+    pub(crate) fn has_room(&self) -> bool {
+        self.queue.is_empty() || self.queue.free() >= MAX_BLOCK_SIZE
+    }
+
+    /// Carries the work on.
+    pub(crate) fn step<F: Flash>(
+        &mut self,
+        parameters: &mut impl Parameters,
+        flash: &mut F,
+    ) -> (Step, Option<Event>) {
+        let mut outcome = Ok(());
+        if let Some(running) = self.running {
+            let Poll::Ready(ended) = flash.poll() else { return (running, None) };
+            self.running = None;
+            outcome = ended;
+            if self.job.is_none() {
+                return (Step::Again, None);
+            }
+        }
+        if self.job.is_none() {
+            return match self.choose(parameters, flash) {
+                Ok(None) => (Step::Idle, None),
+                Ok(job) => {
+                    self.job = job;
+                    (Step::Again, None)
+                }
+                Err(error) => (Step::Again, self.fail(error, false)),
+            };
+        }
+        loop {
+            match self.next(parameters, flash, outcome) {
+                Next::Start(operation) => {
+                    outcome = flash.start(operation);
+                    if outcome.is_ok() {
+                        let step = match operation {
+                            Operation::Erase(_) => Step::Erasing,
+                            Operation::Program { .. } => Step::Programming,
+                        };
+                        self.running = Some(step);
+                        return (step, None);
+                    }
+                }
+                Next::Again => return (Step::Again, None),
+                Next::Done(result) => return (Step::Again, self.done(result)),
+            }
+        }
+    }
+
+    /// What the job does next.
+    fn next<F: Flash>(
+        &mut self,
+        parameters: &mut impl Parameters,
+        flash: &F,
+        outcome: Result<(), FlashFault>,
+    ) -> Next<Failure> {
+        let next = match (&mut self.job, outcome) {
+            (Some(Job::Store(_)), outcome) => return store_next(parameters.next(flash, outcome)),
+            (_, Err(fault)) => Err(fault),
+            (Some(Job::Erase { sectors, .. }), _) => sectors.next(flash),
+            (Some(Job::Write(write)), _) => write.next(flash, &self.queue),
+            (Some(Job::Verify { crc, .. }), _) => {
+                return match crc.step(flash, self.crc_kind, self.crc_step) {
+                    true => Next::Done(Ok(())),
+                    false => Next::Again,
+                };
+            }
+            (None, _) => Ok(None),
+        };
+        match next {
+            Ok(Some(operation)) => Next::Start(operation),
+            Ok(None) => Next::Done(Ok(())),
+            Err(fault) => Next::Done(Err(Failure::Flash(fault))),
+        }
+    }
+
+    /// The job is over.
+    fn done(&mut self, result: Result<(), Failure>) -> Option<Event> {
+        let job = self.job.take()?;
+        let erasing = matches!(job, Job::Erase { .. });
+        match (job, result) {
+            (Job::Store(Change::Node), result) => Some(Event::NodeStored(result.map_err(|failure| {
+                if let Failure::Store(error) = failure {
+                    error
+                } else {
+                    StoreError::Device
+                }
+            }))),
+            (Job::Store(Change::Void(program)), Ok(())) => {
+                self.voids &= !(1 << program.saturating_sub(1));
+                Some(Event::Voided(program))
+            }
+            (Job::Store(Change::Record(program, record)), Ok(())) => Some(Event::Recorded(program, record)),
+            (Job::Store(Change::Void(program) | Change::Record(program, _)), Err(_)) => {
+                // A record that does not go protects its data: nothing of them is touched.
+                self.voids &= !(1 << program.saturating_sub(1));
+                if self.current == program {
+                    self.abort();
+                }
+                Some(Event::Failed { program, error: FlashError::NvData, erasing })
+            }
+            (_, Err(Failure::Flash(FlashFault::Protected))) => self.fail(FlashError::Secured, erasing),
+            (_, Err(_)) => self.fail(FlashError::Write, erasing),
+            (Job::Erase { until, .. }, Ok(())) => {
+                let program = self.current;
+                let target = self.target_mut()?;
+                target.erased = until;
+                if !target.clearing || until < target.ahead {
+                    return None;
+                }
+                target.clearing = false;
+                Some(Event::Erased(program))
+            }
+            (Job::Write(_), Ok(())) => {
+                self.queue.pop();
+                None
+            }
+            (Job::Verify { expected, crc }, Ok(())) => {
+                Some(Event::Written { program: self.program()?, expected, crc: crc.value() })
+            }
+        }
+    }
+
+    fn fail(&mut self, error: FlashError, erasing: bool) -> Option<Event> {
+        let program = self.program()?;
+        self.abort();
+        Some(Event::Failed { program, error, erasing })
+    }
+
+    /// Chooses what to do to an idle flash.
+    fn choose<F: Flash>(
+        &mut self,
+        parameters: &mut impl Parameters,
+        flash: &F,
+    ) -> Result<Option<Job>, FlashError> {
+        if self.voids != 0 {
+            let program = self.voids.trailing_zeros() as u8 + 1;
+            parameters.store(Key::Program(program), ProgramRecord::NONE);
+            return Ok(Some(Job::Store(Change::Void(program))));
+        }
+        let piece = self.queue.first();
+        let Some(target) = self.target_mut() else { return Ok(None) };
+        let needed = piece.map_or(target.ahead, |piece| piece.address + piece.size);
+        if target.erased < needed {
+            let sector = flash.sector_at(target.erased).ok_or(FlashError::Address)?.region;
+            return Ok(Some(Job::Erase { sectors: EraseSectors::new(sector), until: sector.end() }));
+        }
+        if let Some(piece) = piece {
+            let write = WritePiece::new(flash, piece).ok_or(FlashError::NotCleared)?;
+            return Ok(Some(Job::Write(write)));
+        }
+        Ok(target.expected.take().map(|expected| {
+            let crc = FlashCrc::new(Region::new(target.region.base, expected.size));
+            Job::Verify { expected, crc }
+        }))
+    }
+}
+
+/// Why a job failed.
+enum Failure {
+    Flash(FlashFault),
+    Store(StoreError),
+}
+
+fn store_next(next: Next<StoreError>) -> Next<Failure> {
+    match next {
+        Next::Start(operation) => Next::Start(operation),
+        Next::Again => Next::Again,
+        Next::Done(result) => Next::Done(result.map_err(Failure::Store)),
+    }
+}

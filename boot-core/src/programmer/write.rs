@@ -1,0 +1,52 @@
+//! A piece on its way from the queue into flash.
+
+use shared_abi::geometry::Region;
+
+use crate::flash::{Flash, FlashFault, Operation};
+use crate::queue::{Piece, Queue};
+use crate::sequence::ProgramWords;
+
+/// The words of a piece being programmed. Flash is programmed by words: the first and the last one
+/// are filled up with what is there already.
+pub(super) struct WritePiece {
+    piece: Piece,
+    /// What was there in the first and in the last word.
+    edges: [u32; 2],
+    words: ProgramWords,
+}
+
+impl WritePiece {
+    /// `None` if its place is not blank.
+    pub(super) fn new<F: Flash>(flash: &F, piece: Piece) -> Option<Self> {
+        let place = Region::new(piece.address, piece.size);
+        if !flash.is_blank(place) {
+            return None;
+        }
+        let (first, last) = (place.base & !3, (place.end() - 1) & !3);
+        let edges = [flash.read_word(first), flash.read_word(last)];
+        Some(Self { piece, edges, words: ProgramWords::new(first) })
+    }
+
+    /// The next operation, `None` when all of the piece is in flash and was read back.
+    pub(super) fn next<F: Flash>(
+        &mut self,
+        flash: &F,
+        queue: &Queue<'_>,
+    ) -> Result<Option<Operation>, FlashFault> {
+        let (piece, edges) = (self.piece, self.edges);
+        let before = piece.address as usize % 4;
+        let size = piece.size as usize;
+        let count = (before + size).div_ceil(4);
+        self.words.next(flash, count, |word| {
+            let there = edges[usize::from(word + 1 == count)].to_le_bytes();
+            let mut bytes = if word == 0 || word + 1 == count { there } else { [0; 4] };
+            for (i, byte) in bytes.iter_mut().enumerate() {
+                let offset = (4 * word + i).wrapping_sub(before);
+                if offset < size {
+                    *byte = queue.data(offset);
+                }
+            }
+            u32::from_le_bytes(bytes)
+        })
+    }
+}

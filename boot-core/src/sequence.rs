@@ -1,0 +1,69 @@
+//! Rows of flash operations: sectors to erase, words to program. Each tells its next operation when
+//! the one before is over.
+
+use shared_abi::geometry::Region;
+
+use crate::flash::{Flash, FlashFault, Operation};
+
+/// Words being programmed one after the other, each read back.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct ProgramWords {
+    address: u32,
+    written: usize,
+    running: bool,
+}
+
+impl ProgramWords {
+    pub(crate) const fn new(address: u32) -> Self {
+        Self { address, written: 0, running: false }
+    }
+
+    /// The next operation, `None` when all words are there. `word(i)` gives the i-th of `count`.
+    pub(crate) fn next<F: Flash>(
+        &mut self,
+        flash: &F,
+        count: usize,
+        word: impl Fn(usize) -> u32,
+    ) -> Result<Option<Operation>, FlashFault> {
+        if self.running {
+            self.running = false;
+            if flash.read_word(self.at()) != word(self.written) {
+                return Err(FlashFault::Verify);
+            }
+            self.written += 1;
+        }
+        if self.written == count {
+            return Ok(None);
+        }
+        self.running = true;
+        Ok(Some(Operation::Program { address: self.at(), word: word(self.written) }))
+    }
+
+    const fn at(&self) -> u32 {
+        self.address + 4 * self.written as u32
+    }
+}
+
+/// Whole sectors being erased one after the other.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct EraseSectors {
+    next: u32,
+    end: u32,
+}
+
+impl EraseSectors {
+    pub(crate) const fn new(region: Region) -> Self {
+        Self { next: region.base, end: region.end() }
+    }
+
+    /// The next operation, `None` when all sectors are erased.
+    pub(crate) fn next<F: Flash>(&mut self, flash: &F) -> Result<Option<Operation>, FlashFault> {
+        if self.next >= self.end {
+            return Ok(None);
+        }
+        // A checked layout ends at sector borders; a region outside the flash is refused.
+        let sector = flash.sector_at(self.next).ok_or(FlashFault::Failed)?;
+        self.next = sector.region.end();
+        Ok(Some(Operation::Erase(sector)))
+    }
+}
