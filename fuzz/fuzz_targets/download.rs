@@ -6,8 +6,8 @@
 //! a program.
 #![no_main]
 
-use boot_core::download::{Downloader, Policy, Step};
-use boot_core::parameters::Journal;
+use boot_core::control::{Downloader, Policy, Step};
+use boot_core::store::Journal;
 use canopen::program::{FlashError, FlashStatus, ProgramControl};
 use coboot_fuzz::model::{ModelFlash, CHIP, ONE_PROGRAM};
 use coboot_fuzz::Input;

@@ -6,7 +6,7 @@
 
 use std::task::Poll;
 
-use boot_core::parameters::{Journal, Key, Parameters};
+use boot_core::store::{Journal, Key, Parameters};
 use coboot_fuzz::model::ModelFlash;
 use coboot_fuzz::Input;
 use libfuzzer_sys::fuzz_target;

@@ -8,9 +8,9 @@
 #![no_main]
 
 use boot_core::bootloader::{entries_with, entry_count_with, Bootloader, Config};
-use boot_core::download::{Policy, Step};
-use boot_core::node::NodeParameters;
-use boot_core::parameters::Journal;
+use boot_core::control::{Policy, Step};
+use boot_core::store::NodeParameters;
+use boot_core::store::Journal;
 use boot_core::profile::Profile;
 use canopen::device::Device;
 use canopen::od::{Entry, Objects};

@@ -13,11 +13,11 @@ use boot_core::canopen::od::Entry;
 use boot_core::canopen::program::ProgramControl;
 use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
 use boot_core::canopen::{BitRate, Frame, Instant, NodeId};
+use boot_core::control::Step;
 use boot_core::decision::{decide, BootDecision, Circumstances, Policy, StayReason};
-use boot_core::download::Step;
-use boot_core::node::NodeParameters;
-use boot_core::parameters::Journal;
-use boot_core::program::{verify, ProgramRecord};
+use boot_core::program::verify;
+use boot_core::store::NodeParameters;
+use boot_core::store::{Journal, ProgramRecord};
 use shared_abi::warm_start::BootRequest;
 
 use crate::file_flash::FileFlash;
@@ -188,7 +188,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
     fn reset(&mut self, idle: Idle<'b>, request: Option<BootRequest>) -> Event {
         let Setup { config, stand_in, serial_number, node, strap } = self.setup;
         let Idle { flash, buffer } = idle;
-        let journal = Journal::open(&flash, config.layout.chip, config.layout.parameters);
+        let journal = Journal::open(&flash, config.layout.parameters);
         let node = NodeParameters::load(&journal, &flash, node, supports);
         let circumstances = Circumstances {
             request,
@@ -196,7 +196,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
             crash_resets: 0,
             node_id: node.id.map_or(NO_NODE_ID, NodeId::get),
         };
-        let verified = |number| verify(&flash, &journal, config.layout, number);
+        let verified = |number| verify(&flash, &journal, config.layout, config.download.crc, number);
         match decide(&circumstances, &POLICY, verified) {
             BootDecision::Stay(reason) => {
                 let mut device =

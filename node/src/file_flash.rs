@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::task::Poll;
 use std::time::{Duration, Instant};
 
-use boot_core::flash::{Flash, FlashFault};
+use boot_core::flash::{Flash, FlashFault, Operation};
 use shared_abi::geometry::{Geometry, Region, Sector};
 use shared_abi::layout::Layout;
 
@@ -159,27 +159,33 @@ impl Flash for FileFlash {
         }
     }
 
-    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashFault> {
-        if self.layout.chip.sector(sector.number) != Some(sector) {
-            return Err(FlashFault::Failed);
+    fn start(&mut self, operation: Operation) -> Result<(), FlashFault> {
+        match operation {
+            Operation::Erase(sector) => {
+                if self.layout.chip.sector(sector.number) != Some(sector) {
+                    return Err(FlashFault::Failed);
+                }
+                let of_size = ERASE.iter().find(|(size, _)| *size == sector.region.size);
+                let takes = of_size.map_or(Duration::ZERO, |(_, takes)| *takes);
+                self.begin(sector.region, takes, Duration::ZERO)?.fill(u8::MAX);
+            }
+            Operation::Program { address, .. } if !address.is_multiple_of(4) => {
+                return Err(FlashFault::Failed);
+            }
+            Operation::Program { address, word } => {
+                let cells = self.begin(Region::new(address, 4), PROGRAM, CATCH_UP)?;
+                // Programming makes zeros of ones and nothing else; what cannot be is found when it
+                // is read back.
+                for (cell, byte) in cells.iter_mut().zip(word.to_le_bytes()) {
+                    *cell &= byte;
+                }
+            }
         }
-        let of_size = ERASE.iter().find(|(size, _)| *size == sector.region.size);
-        let takes = of_size.map_or(Duration::ZERO, |(_, takes)| *takes);
-        self.begin(sector.region, takes, Duration::ZERO)?.fill(u8::MAX);
         Ok(())
     }
 
-    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashFault> {
-        if !address.is_multiple_of(4) {
-            return Err(FlashFault::Failed);
-        }
-        let cells = self.begin(Region::new(address, 4), PROGRAM, CATCH_UP)?;
-        // Programming makes zeros of ones and nothing else; what cannot be is found when it is read
-        // back.
-        for (cell, byte) in cells.iter_mut().zip(word.to_le_bytes()) {
-            *cell &= byte;
-        }
-        Ok(())
+    fn sector_at(&self, address: u32) -> Option<Sector> {
+        self.layout.chip.sector_at(address)
     }
 
     fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
@@ -225,9 +231,9 @@ mod tests {
     fn words_go_to_their_place_and_can_only_lose_bits() {
         let path = file("words");
         let mut flash = open(&path);
-        flash.start_program(0x0801_0004, 0x4433_2211).unwrap();
+        flash.start(Operation::Program { address: 0x0801_0004, word: 0x4433_2211 }).unwrap();
         assert!(flash.poll().is_ready());
-        flash.start_program(0x0801_0004, 0xF0FF_FFFF).unwrap();
+        flash.start(Operation::Program { address: 0x0801_0004, word: 0xF0FF_FFFF }).unwrap();
         assert_eq!(fs::read(&path).unwrap()[0x1_0004], 0xFF, "not before it is saved");
         assert!(flash.unsaved().is_some());
         assert!(!flash.is_urgent());
@@ -237,12 +243,12 @@ mod tests {
         // As another run finds it; and a sector, here number 4, loses all.
         let mut flash = open(&path);
         assert_eq!(flash.read_word(0x0801_0004), 0x4033_2211);
-        flash.start_program(0x0802_0000, 0).unwrap();
-        flash.start_erase(STM32F407VG.sector(4).unwrap()).unwrap();
+        flash.start(Operation::Program { address: 0x0802_0000, word: 0 }).unwrap();
+        flash.start(Operation::Erase(STM32F407VG.sector(4).unwrap())).unwrap();
         assert_eq!(flash.read_word(0x0801_0004), u32::MAX);
         assert_eq!(flash.read_word(0x0802_0000), 0, "the next sector has not");
         // Parameters are in sectors 2 and 3.
-        flash.start_program(0x0800_8000, 0).unwrap();
+        flash.start(Operation::Program { address: 0x0800_8000, word: 0 }).unwrap();
         assert!(flash.is_urgent());
         fs::remove_dir_all(path.parent().unwrap()).unwrap();
     }
@@ -252,10 +258,14 @@ mod tests {
         let path = file("refused");
         let mut flash = open(&path);
         for address in [0x0801_0001, 0x07FF_FFFC, 0x0810_0000, u32::MAX - 3] {
-            assert_eq!(flash.start_program(address, 0), Err(FlashFault::Failed), "{address:08X}h");
+            assert_eq!(
+                flash.start(Operation::Program { address: address, word: 0 }),
+                Err(FlashFault::Failed),
+                "{address:08X}h"
+            );
         }
         let foreign = Sector { number: 4, region: Region::new(0x0801_0000, 4) };
-        assert_eq!(flash.start_erase(foreign), Err(FlashFault::Failed));
+        assert_eq!(flash.start(Operation::Erase(foreign)), Err(FlashFault::Failed));
         assert!(flash.unsaved().is_none());
         fs::remove_dir_all(path.parent().unwrap()).unwrap();
     }
@@ -265,9 +275,12 @@ mod tests {
         let path = file("typical");
         let mut flash = FileFlash::open(&path, &LAYOUT, Speed::Typical).unwrap();
         let began = Instant::now();
-        flash.start_erase(STM32F407VG.sector(0).unwrap()).unwrap();
+        flash.start(Operation::Erase(STM32F407VG.sector(0).unwrap())).unwrap();
         assert!(flash.poll().is_pending());
-        assert_eq!(flash.start_program(0x0801_0000, 0), Err(FlashFault::Failed));
+        assert_eq!(
+            flash.start(Operation::Program { address: 0x0801_0000, word: 0 }),
+            Err(FlashFault::Failed)
+        );
         while flash.poll().is_pending() {
             std::thread::sleep(Duration::from_millis(1));
         }

@@ -8,13 +8,13 @@ use boot_core::canopen::device::Device as Identity;
 use boot_core::canopen::lss::LssDevice;
 use boot_core::canopen::od::{Address, Entry, Objects};
 use boot_core::canopen::{AbortCode, BitRate, NodeId};
+use boot_core::control::{Erase, Policy, Step};
+use boot_core::crc::CrcKind;
 use boot_core::crc32;
 use boot_core::decision::{self, decide, BootDecision, Circumstances};
-use boot_core::download::{Erase, Policy, Step};
-use boot_core::flash::{Flash, FlashFault};
-use boot_core::node::NodeParameters;
-use boot_core::parameters::{Journal, Key, Parameters, StoreError, Value};
-use boot_core::program::{verify, ProgramRecord};
+use boot_core::flash::{run, Flash, FlashFault, Next, Operation};
+use boot_core::program::verify;
+use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord, StoreError, Value};
 use shared_abi::geometry::{Region, Sector};
 use shared_abi::layout::Layout;
 
@@ -134,7 +134,9 @@ impl Device {
             crash_resets: 0,
             node_id: node.id.map_or(255, NodeId::get),
         };
-        match decide(&circumstances, &DECISION, |n| verify(&self.flash, &parameters, &LAYOUT, n)) {
+        match decide(&circumstances, &DECISION, |n| {
+            verify(&self.flash, &parameters, &LAYOUT, CrcKind::Crc32, n)
+        }) {
             BootDecision::Stay(_) => Ok(Outcome::Bootloader),
             BootDecision::Start { program, .. } => {
                 let region = LAYOUT.programs[usize::from(program.number()) - 1];
@@ -189,7 +191,7 @@ impl Device {
         let mut parameters = self.parameters();
         if parameters.get(&self.flash, Key::CrashCount).is_some_and(|[count, ..]| count > 0) {
             parameters.store(Key::CrashCount, [0; 4]);
-            while parameters.poll(&mut self.flash).is_pending() {}
+            let _ = run(&mut self.flash, |flash, outcome| parameters.next(flash, outcome));
         }
     }
 
@@ -197,7 +199,7 @@ impl Device {
     pub fn store(&mut self, key: Key, value: Value) {
         let mut parameters = self.parameters();
         parameters.store(key, value);
-        while parameters.poll(&mut self.flash).is_pending() {}
+        let _ = run(&mut self.flash, |flash, outcome| parameters.next(flash, outcome));
     }
 
     /// Bootloader mode, with a host that talks to it.
@@ -321,17 +323,17 @@ impl Flash for Chip<'_> {
         self.flash.read(address, buffer);
     }
 
-    fn start_erase(&mut self, sector: Sector) -> Result<(), FlashFault> {
-        let mut first = [0; 4];
-        self.flash.read(sector.region.base, &mut first);
-        if self.bug == Some(Bug::BlankAtFirstSight) && first == [0xFF; 4] {
-            return Ok(());
+    fn start(&mut self, operation: Operation) -> Result<(), FlashFault> {
+        if let (Some(Bug::BlankAtFirstSight), Operation::Erase(sector)) = (self.bug, operation) {
+            if self.flash.read_word(sector.region.base) == u32::MAX {
+                return Ok(());
+            }
         }
-        self.flash.start_erase(sector)
+        self.flash.start(operation)
     }
 
-    fn start_program(&mut self, address: u32, word: u32) -> Result<(), FlashFault> {
-        self.flash.start_program(address, word)
+    fn sector_at(&self, address: u32) -> Option<Sector> {
+        self.flash.sector_at(address)
     }
 
     fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
@@ -354,15 +356,20 @@ enum Store {
 
 impl Store {
     fn open(flash: &ModelFlash, bug: Option<Bug>) -> Self {
-        let journal = Journal::open(flash, LAYOUT.chip, LAYOUT.parameters);
+        let journal = Journal::open(flash, LAYOUT.parameters);
         match bug {
             Some(Bug::JournalWithoutCrc) => Self::Naive { checked: false, work: Vec::new() },
             Some(Bug::CompactionInPlace) => Self::Naive { checked: true, work: Vec::new() },
             Some(Bug::EraseBeforeInvalidating) => Self::Instead(journal, None),
             Some(Bug::SignatureBeforeData) => {
                 let new = image(1, super::scenario::NEW);
-                let record =
-                    ProgramRecord { size: new.len() as u32, crc: crc32(&new), signed: true, version: 0 };
+                let record = ProgramRecord {
+                    size: new.len() as u32,
+                    crc: crc32(&new),
+                    signed: true,
+                    confirmed: false,
+                    version: 0,
+                };
                 Self::Instead(journal, Some(record.value()))
             }
             _ => Self::Journal(journal),
@@ -430,15 +437,13 @@ impl Parameters for Store {
         }
     }
 
-    fn poll<F: Flash>(&mut self, flash: &mut F) -> Poll<Result<(), StoreError>> {
+    fn next<F: Flash>(&mut self, flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
         let Self::Naive { checked, work } = self else {
             let (Self::Journal(journal) | Self::Instead(journal, _)) = self else { unreachable!() };
-            return journal.poll(flash);
+            return journal.next(flash, outcome);
         };
-        match flash.poll() {
-            Poll::Pending => return Poll::Pending,
-            Poll::Ready(Err(error)) => return Poll::Ready(Err(StoreError::Flash(error))),
-            Poll::Ready(Ok(())) => {}
+        if let Err(fault) = outcome {
+            return Next::Done(Err(StoreError::Flash(fault)));
         }
         let region = LAYOUT.parameters[0];
         if let Some(&(u32::MAX, key)) = work.first() {
@@ -455,10 +460,7 @@ impl Parameters for Store {
                 let words = latest.into_iter().flatten().chain(new);
                 *work = (region.base..).step_by(4).zip(words).collect();
                 let Some(sector) = LAYOUT.chip.sector_at(region.base) else { unreachable!() };
-                return match flash.start_erase(sector) {
-                    Ok(()) => Poll::Pending,
-                    Err(error) => Poll::Ready(Err(StoreError::Flash(error))),
-                };
+                return Next::Start(Operation::Erase(sector));
             }
             for (address, _) in work.iter_mut() {
                 *address = end;
@@ -466,12 +468,9 @@ impl Parameters for Store {
             }
         }
         if work.is_empty() {
-            return Poll::Ready(Ok(()));
+            return Next::Done(Ok(()));
         }
         let (address, word) = work.remove(0);
-        match flash.start_program(address, word) {
-            Ok(()) => Poll::Pending,
-            Err(error) => Poll::Ready(Err(StoreError::Flash(error))),
-        }
+        Next::Start(Operation::Program { address, word })
     }
 }

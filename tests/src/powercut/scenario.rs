@@ -2,8 +2,8 @@
 
 use boot_core::canopen::{BitRate, NodeId};
 use boot_core::crc32;
-use boot_core::node::NodeParameters;
-use boot_core::parameters::Key;
+use boot_core::store::Key;
+use boot_core::store::NodeParameters;
 
 use crate::ihex::intel_hex;
 
