@@ -269,35 +269,30 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
         flash: &mut F,
     ) -> (Step, Option<Event>) {
         let mut outcome = Ok(());
-        if let Some(running) = self.running {
-            let Poll::Ready(ended) = flash.poll() else { return (running, None) };
-            self.running = None;
-            outcome = ended;
-            if self.job.is_none() {
-                return (Step::Again, None);
-            }
-        }
-        if self.job.is_none() {
-            return match self.choose(parameters, flash) {
-                Ok(None) => (Step::Idle, None),
-                Ok(job) => {
-                    self.job = job;
-                    (Step::Again, None)
-                }
-                Err(error) => (Step::Again, self.fail(error, false)),
-            };
-        }
         loop {
+            if let Some(running) = self.running {
+                let Poll::Ready(ended) = flash.poll() else { return (running, None) };
+                self.running = None;
+                outcome = ended;
+            }
+            if self.job.is_none() {
+                return match self.choose(parameters, flash) {
+                    Ok(None) => (Step::Idle, None),
+                    Ok(job) => {
+                        self.job = job;
+                        (Step::Again, None)
+                    }
+                    Err(error) => (Step::Again, self.fail(error, false)),
+                };
+            }
             match self.next(parameters, flash, outcome) {
                 Next::Start(operation) => {
                     outcome = flash.start(operation);
                     if outcome.is_ok() {
-                        let step = match operation {
+                        self.running = Some(match operation {
                             Operation::Erase(_) => Step::Erasing,
                             Operation::Program { .. } => Step::Programming,
-                        };
-                        self.running = Some(step);
-                        return (step, None);
+                        });
                     }
                 }
                 Next::Again => return (Step::Again, None),
