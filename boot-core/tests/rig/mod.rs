@@ -434,8 +434,8 @@ pub fn words(words: &[u32]) -> Vec<u8> {
 /// A program as Intel HEX, 16 bytes a record.
 pub fn hex(base: u32, program: &[u8]) -> Vec<u8> {
     let mut text = record(0, 4, &((base >> 16) as u16).to_be_bytes()) + "\n";
-    for (address, data) in (base..).step_by(16).zip(program.chunks(16)) {
-        text += &record(address as u16, 0, data);
+    for (n, data) in (0..).zip(program.chunks(16)) {
+        text += &record(base.wrapping_add(16 * n) as u16, 0, data);
         text += "\n";
     }
     (text + END_OF_FILE + "\n").into_bytes()
