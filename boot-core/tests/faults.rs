@@ -7,10 +7,11 @@ mod ihex;
 mod model;
 mod rig;
 
+use canopen::od::Address;
 use canopen::{BitRate, NodeId};
 use model::{ModelFlash, CHIP};
 use rig::{
-    crc32, hex, program, words, Rig, Setup, AT_ONCE_2, ESACADEMY_2, LIFT_2, PRODUCT_CODE, STANDARD_1,
+    block, crc32, hex, program, words, Rig, Setup, AT_ONCE_2, ESACADEMY_2, LIFT_2, PRODUCT_CODE, STANDARD_1,
     STANDARD_2,
 };
 use shared_abi::warm_start::BootRequest;
@@ -152,6 +153,98 @@ fn start_behind_a_stream_starts_the_program_that_it_names() {
                     let expected = taken.then_some(BootRequest::Start(first));
                     if request != expected {
                         wrong.push((command, first, as_hex, moment, request));
+                    }
+                }
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "{} times; the first is {:?}", wrong.len(), wrong.first());
+}
+
+/// The same while a record of the other program is being stored, in place of a stream: whose work is
+/// being finished has to be asked there too.
+#[test]
+fn start_behind_a_signature_of_another_program_starts_the_program_that_it_names() {
+    let setup = &STANDARD_2;
+    let mut wrong = Vec::new();
+    for signature in [0x83, 0x84] {
+        for moment in 0..MOMENTS {
+            let mut device = Rig::new(setup, BUFFER);
+            device.install(2, &image(setup, 2, 700, 0x11));
+            device.install(1, &image(setup, 1, 700, 0x22));
+            device.command(2, signature).unwrap();
+            device.steps(moment);
+            let taken = device.command(1, START).is_ok();
+            device.settle();
+            let request = device.node.take_boot_request();
+            if request != taken.then_some(BootRequest::Start(1)) {
+                wrong.push((signature, moment, request));
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "{} times; the first is {:?}", wrong.len(), wrong.first());
+}
+
+/// A set of parameters is data: nothing that is said of it starts it, at any moment behind its
+/// download.
+#[test]
+fn data_are_never_started() {
+    let setup = &LIFT_2;
+    for command in [START, RESET_STAT] {
+        for moment in 0..MOMENTS {
+            let mut device = Rig::new(setup, BUFFER);
+            device.unlock(2).unwrap();
+            device.send(2, &image(setup, 2, 700, 0x66)).unwrap();
+            device.steps(moment);
+            let taken = device.command(2, command);
+            device.settle();
+            let request = device.node.take_boot_request();
+            assert_eq!(request, None, "1F51h/2 = {command} after {moment} steps was answered {taken:?}");
+        }
+    }
+}
+
+/// Layer setting services ask nobody whether a download is going on, and a second SDO server does
+/// not either: what they store must not take the place of the record that has to go first.
+#[test]
+fn a_record_never_outlives_its_program_whatever_is_stored_during_a_download() {
+    type Between = fn(&mut Rig) -> bool;
+    // Whether it is taken is the device's choice.
+    const BETWEEN: [(&str, Between); 3] = [
+        ("LSS", |device| device.node.store(NodeId::new(9), Some(BitRate::K250)).is_pending()),
+        ("SET_SIGNATURE", |device| device.command(1, 0x83).is_ok()),
+        ("CLR_SIGNATURE", |device| device.command(1, 0x84).is_ok()),
+    ];
+    let setup = &STANDARD_1;
+    let mut installed = Rig::new(setup, BUFFER);
+    installed.install(1, &image(setup, 1, 900, 0x11));
+    let installed = installed.chip.model().clone();
+    let new = image(setup, 1, 700, 0x77);
+    let control = block(0, 0, &words(&[700, 0, 0]));
+    let mut wrong = Vec::new();
+    for (what, between) in BETWEEN {
+        for data in [&control, &new, &hex(setup.region(1).base, &new)] {
+            for sent in (0..data.len().min(300)).step_by(7) {
+                let mut device = Rig::on(setup, BUFFER, installed.clone());
+                device.command(1, CLEAR).unwrap();
+                let at = Address::new(0x1F50, 1);
+                device.begin(1, None, &data[..sent]).unwrap();
+                between(&mut device);
+                let rest = data[sent..].chunks(7).try_for_each(|segment| {
+                    while device.node.download_space(at, false) < segment.len() {
+                        assert!(!device.node.is_idle_after_step(), "there is never room");
+                    }
+                    device.node.download_data(at, segment)
+                });
+                match rest {
+                    Ok(()) => drop(device.node.download_end(at)),
+                    Err(_) => device.node.download_cancel(at),
+                }
+                for _ in 0..2 * WORK {
+                    device.steps(1);
+                    if !device.is_true(1) {
+                        wrong.push((what, sent));
+                        break;
                     }
                 }
             }
