@@ -146,7 +146,7 @@ fn slot(words: [u32; 5]) -> Vec<u8> {
 }
 
 #[test]
-fn a_journal_of_an_older_version_is_read_and_moves_to_this_one_and_a_newer_one_is_left_alone() {
+fn a_journal_of_an_older_version_is_read_and_moves_to_this_one_and_a_newer_one_is_not_read() {
     for (version, known) in [(0, true), (1, true), (2, false)] {
         let mut flash = ModelFlash::new(&SMALL);
         let magic = u32::from_le_bytes(*b"CBNV");
@@ -161,6 +161,33 @@ fn a_journal_of_an_older_version_is_read_and_moves_to_this_one_and_a_newer_one_i
             assert_eq!(reopened.get(&flash, Key::CrashCount), Some([9, 0, 0, 0]));
             // The other region, the next sequence number, today's version.
             assert_eq!(flash.cells(REGIONS[1])[..24], slot([magic, 8, !8, 1, u32::MAX]));
+        }
+    }
+}
+
+/// Its owner is a newer bootloader, which may come back: what has to be stored is refused, and not a
+/// bit changes. Wherever the newer journal lies, and whatever it has left in the other region.
+#[test]
+fn a_journal_of_a_newer_version_refuses_every_store_and_stays_as_it_is() {
+    let header = |sequence: u32, version| {
+        let magic = u32::from_le_bytes(*b"CBNV");
+        slot([magic, sequence, !sequence, version, u32::MAX])
+    };
+    let others = [None, Some(header(6, 0)), Some(header(6, 1)), Some(vec![0xA5; 24])];
+    for (newer, other) in [0, 1].into_iter().flat_map(|newer| others.clone().map(|other| (newer, other))) {
+        let mut flash = ModelFlash::new(&SMALL);
+        flash.poke(REGIONS[newer].base, &header(7, 0xFF));
+        flash.poke(REGIONS[newer].base + 24, &slot([0x0001_0002, 1, 2, 3, 4]));
+        if let Some(other) = &other {
+            flash.poke(REGIONS[1 - newer].base, other);
+        }
+        let before = flash.cells(SMALL.flash).to_vec();
+        for key in [Key::CrashCount, Key::Node, Key::Program(1)] {
+            let mut journal = Journal::open(&flash, REGIONS);
+            let outcome = store(&mut flash, &mut journal, key, [9, 0, 0, 0]);
+            let what = format!("{key:?}, newer in region {newer}, {other:?} in the other one");
+            assert!(outcome.is_err(), "{what}");
+            assert!(flash.cells(SMALL.flash) == before, "{what}: the flash was changed");
         }
     }
 }

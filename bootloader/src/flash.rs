@@ -56,10 +56,13 @@ impl FlashController {
         self.clear_flags();
     }
 
-    /// Whether somebody is at work on the flash, or has opened the control register for it.
+    /// Whether somebody is at work on the flash, or has opened the control register for it. To be
+    /// asked before anything is taken: who is told to wait has to find all as it was.
     #[cfg(feature = "resident")]
-    pub fn is_in_use(&self) -> bool {
-        self.registers.sr().read().bsy().bit_is_set() || self.registers.cr().read().lock().bit_is_clear()
+    pub fn is_in_use() -> bool {
+        // SAFETY: reading these two registers has no effect, whoever owns them.
+        let registers = unsafe { pac::FLASH::steal() };
+        registers.sr().read().bsy().bit_is_set() || registers.cr().read().lock().bit_is_clear()
     }
 
     /// Opens the control register for one operation. (A `write` starts from the register's reset

@@ -444,6 +444,58 @@ fn every_hostile_call_has_its_status_and_does_nothing() {
     assert!(bench.is_bootloader(NODE));
 }
 
+/// RCC_AHB1ENR (RM0090 section 7.3.10), and the bit that gives the CRC unit its clock.
+const AHB1ENR: u32 = 0x4002_3830;
+const CRCEN: u32 = 1 << 12;
+
+/// A call that is refused as BUSY leaves the chip as it found it. A CRC unit whose clock is left on
+/// looks like the application's own to every later call, which then computes by software: five times
+/// as long.
+#[test]
+fn a_call_refused_as_busy_leaves_the_crc_unit_as_it_was() {
+    let (mut bench, _) = running_board();
+    let bootloader = firmware::board().bootloader;
+    let has_clock = |bench: &mut Bench| bench.machine().register(AHB1ENR).unwrap() & CRCEN != 0;
+    let arguments = [bootloader.base, bootloader.size, 0, 0, 0];
+    let crc_takes = |bench: &mut Bench| {
+        put(bench, probe::SELECTOR, CRC32);
+        for (at, word) in probe::WORDS.into_iter().zip(arguments) {
+            put(bench, at, word);
+        }
+        let before = bench.time();
+        put(bench, probe::CALL, 0);
+        let took = bench.time() - before;
+        assert_eq!(number(bench, probe::CALL) as i32, OK);
+        took
+    };
+    let good = number(&mut bench, probe::ADDRESS);
+    put(&mut bench, probe::POINTER, good);
+    assert!(!has_clock(&mut bench), "the application does not use it");
+    let before = crc_takes(&mut bench);
+    assert!(!has_clock(&mut bench), "a call that is served leaves it off");
+    for (selector, words) in [
+        (CRC32, arguments),
+        (READ_NODE, [0; 5]),
+        (STORE_NODE, [5, 125_000, 0, 0, 0]),
+        (PROGRAM_INFO, [1; 5]),
+        (CONFIRM, [1; 5]),
+        (INVALIDATE, [1; 5]),
+    ] {
+        put(&mut bench, probe::FLASH_OPEN, 1);
+        assert_eq!(call(&mut bench, selector, words).status, BUSY, "{selector}");
+        put(&mut bench, probe::FLASH_OPEN, 0);
+        let after = crc_takes(&mut bench);
+        assert!(
+            after.0 < before.0 * 11 / 10,
+            "behind a BUSY of {selector}: {} us in place of {}",
+            after.0 / 1_000_000,
+            before.0 / 1_000_000
+        );
+        assert!(!has_clock(&mut bench), "a BUSY of {selector} left the clock on");
+    }
+    bench.assert_nothing_unmodelled();
+}
+
 #[test]
 fn a_node_id_that_it_stores_is_in_force_from_the_next_reset_on() {
     let (mut bench, _) = running_board();

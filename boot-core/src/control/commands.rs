@@ -31,12 +31,14 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             ResetStat if streamed || self.policy.reset_starts => Start,
             command => command,
         };
-        let finishing = self.programmer.finishing() == Some(program);
-        if let (Start, true, true, None, Some(state)) =
-            (command, streamed, finishing, self.boot_request, self.program_mut(program))
-        {
-            state.start_when_verified = true;
-            return Ok(());
+        // Data are never started.
+        let data = self.policy.data == Some(program);
+        if command == Start && streamed && !data && self.boot_request.is_none() {
+            let finishing = self.programmer.finishing() == Some(program);
+            if let (true, Some(state)) = (finishing, self.program_mut(program)) {
+                state.start_when_verified = true;
+                return Ok(());
+            }
         }
         // A new beginning does not wait for the end of the old one.
         let own = self.programmer.program().is_none_or(|of| of == program);
@@ -48,12 +50,11 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         if changes && (locked || !(self.policy.allowed)()) {
             return Err(self.refuse(program, Refusal::untimely(FlashError::NoAccess)));
         }
-        let (erase, region, data) = (self.policy.erase, self.region(program), self.policy.data);
+        let (erase, region) = (self.policy.erase, self.region(program));
         let Some(state) = self.program_mut(program) else { return Err(AbortCode::NO_SUB_INDEX) };
         state.error = None;
         state.streamed = false;
-        // Data are never started.
-        let record = state.record.filter(|_| data != Some(program));
+        let record = state.record.filter(|_| !data);
         match (command, record) {
             (Clear, _) => {
                 let again = matches!(state.session, Session::Cleared { just: true });

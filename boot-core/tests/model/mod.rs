@@ -84,6 +84,8 @@ pub struct ModelFlash {
     pub cut: Option<(u32, Cut)>,
     /// Fail the operation of this number with this error.
     pub fail: Option<(u32, FlashFault)>,
+    /// Let the operation of this number do a part, which the seed selects, and say that all is well.
+    pub weak: Option<(u32, u64)>,
     /// Every region that was written to or erased.
     pub touched: Vec<Region>,
 }
@@ -100,6 +102,7 @@ impl ModelFlash {
             operations: 0,
             cut: None,
             fail: None,
+            weak: None,
             touched: Vec::new(),
         }
     }
@@ -281,7 +284,10 @@ impl Flash for ModelFlash {
                 return Poll::Ready(Err(error));
             }
         }
-        self.complete(operation);
+        match self.weak {
+            Some((number, seed)) if number == self.operations => self.tear(operation, seed, false),
+            _ => self.complete(operation),
+        }
         Poll::Ready(Ok(()))
     }
 }

@@ -4,6 +4,7 @@
 //! of the flash: they are taken when they are free, and left as they were found.
 
 use core::ffi::c_void;
+use core::task::Poll;
 
 use boot_core::canopen::{BitRate, NodeId};
 use boot_core::flash::Flash;
@@ -20,79 +21,73 @@ use crate::caches::CachesOff;
 use crate::flash::FlashController;
 use crate::product::{self, NO_NODE_ID};
 
+/// One way in for all services: the argument structure is looked at, the flash is taken once, the
+/// service does its work, and everything is given back as it was found.
+///
 /// # Safety
 /// `args` must point to the argument structure of `selector`; what can be told of a wrong pointer
 /// is refused.
 pub unsafe extern "C" fn entry(selector: u32, args: *mut c_void) -> i32 {
     let Some(selector) = Selector::from_number(selector) else { return Status::UnknownSelector as i32 };
-    // SAFETY: the caller vouches for the structure; `argument` has looked where it lies.
-    let outcome = unsafe {
-        match selector {
-            Selector::Crc32 => argument(args).and_then(|args| crc32(&mut *args)),
-            Selector::ReadNode => argument(args).and_then(|args| read_node(&mut *args)),
-            Selector::StoreNode => argument(args).and_then(|args| store_node(&*args)),
-            Selector::ProgramInfo => argument(args).and_then(|args| program_info(&mut *args)),
-            Selector::Confirm => argument(args).and_then(|args| sign(&*args, true)),
-            Selector::Invalidate => argument(args).and_then(|args| sign(&*args, false)),
-        }
+    let size = match selector {
+        Selector::Crc32 => size_of::<Crc32Args>(),
+        Selector::ReadNode | Selector::StoreNode => size_of::<NodeArgs>(),
+        Selector::ProgramInfo | Selector::Confirm | Selector::Invalidate => size_of::<ProgramArgs>(),
     };
-    outcome.err().unwrap_or(Status::Ok) as i32
-}
-
-/// The argument structure, if it lies in RAM, aligned.
-fn argument<T>(args: *mut c_void) -> Result<*mut T, Status> {
-    if is_in_ram(args as u32, size_of::<T>() as u32) {
-        Ok(args.cast())
-    } else {
-        Err(Status::BadPointer)
+    if !is_in_ram(args as u32, size as u32) {
+        return Status::BadPointer as i32;
     }
-}
-
-#[inline(never)]
-fn is_in_ram(address: u32, size: u32) -> bool {
-    let chip = LAYOUT.chip;
-    address.is_multiple_of(4) && (chip.sram.contains(address, size) || chip.ccm.contains(address, size))
-}
-
-/// Runs `act` with the flash, if nobody works on it.
-fn with_flash<T>(act: impl FnOnce(&mut FlashController) -> Result<T, Status>) -> Result<T, Status> {
+    // Before the CRC unit gets its clock.
+    if FlashController::is_in_use() {
+        return Status::Busy as i32;
+    }
     // SAFETY: the application calls one service at a time and does not use the flash controller
     // meanwhile.
     let rcc = unsafe { pac::RCC::steal() };
     let crc_is_free = rcc.ahb1enr().read().crcen().is_disabled();
     // SAFETY: as above; the CRC unit only where its clock is off.
     let mut flash = unsafe { FlashController::steal(crc_is_free.then_some(&rcc)) };
-    if flash.is_in_use() {
-        return Err(Status::Busy);
-    }
-    let outcome = act(&mut flash);
+    // SAFETY: the caller vouches for the structure, and it lies in RAM, aligned.
+    let outcome = unsafe {
+        match selector {
+            Selector::Crc32 => crc32(&flash, &mut *args.cast()),
+            Selector::ReadNode => read_node(&flash, &mut *args.cast()),
+            Selector::StoreNode => store_node(&mut flash, &*args.cast()),
+            Selector::ProgramInfo => program_info(&flash, &mut *args.cast()),
+            Selector::Confirm => sign(&mut flash, &*args.cast(), true),
+            Selector::Invalidate => sign(&mut flash, &*args.cast(), false),
+        }
+    };
     if crc_is_free {
         flash.release(&rcc);
     }
-    outcome
+    outcome.err().unwrap_or(Status::Ok) as i32
 }
 
-fn crc32(args: &mut Crc32Args) -> Result<(), Status> {
-    let region = Region::new(args.address, args.len);
+/// Whether a structure of this size lies there in RAM, aligned.
+fn is_in_ram(address: u32, size: u32) -> bool {
+    let chip = LAYOUT.chip;
+    address.is_multiple_of(4) && (chip.sram.contains(address, size) || chip.ccm.contains(address, size))
+}
+
+fn crc32(flash: &FlashController, args: &mut Crc32Args) -> Result<(), Status> {
     if args.len == 0 || !LAYOUT.chip.flash.contains(args.address, args.len) {
         return Err(Status::BadRange);
     }
-    args.crc = with_flash(|flash| Ok(flash.crc32(0, region)))?;
+    args.crc = flash.crc32(0, Region::new(args.address, args.len));
     Ok(())
 }
 
-fn read_node(args: &mut NodeArgs) -> Result<(), Status> {
-    with_flash(|flash| {
-        let node = product::node_parameters(&product::parameters(flash), flash);
-        *args = NodeArgs {
-            node_id: node.id.map_or(NO_NODE_ID, NodeId::get).into(),
-            bit_rate: node.bit_rate.or_zero(),
-        };
-        Ok(())
-    })
+fn read_node(flash: &FlashController, args: &mut NodeArgs) -> Result<(), Status> {
+    let node = product::node_parameters(&product::parameters(flash), flash);
+    *args = NodeArgs {
+        node_id: node.id.map_or(NO_NODE_ID, NodeId::get).into(),
+        bit_rate: node.bit_rate.or_zero(),
+    };
+    Ok(())
 }
 
-fn store_node(args: &NodeArgs) -> Result<(), Status> {
+fn store_node(flash: &mut FlashController, args: &NodeArgs) -> Result<(), Status> {
     let id = match u8::try_from(args.node_id) {
         Ok(NO_NODE_ID) => None,
         Ok(id) => Some(NodeId::new(id).ok_or(Status::BadArgument)?),
@@ -100,39 +95,34 @@ fn store_node(args: &NodeArgs) -> Result<(), Status> {
     };
     let bit_rate = BitRate::from_bits_per_second(args.bit_rate).filter(|rate| product::supports(*rate));
     let node = NodeParameters { id, bit_rate: bit_rate.ok_or(Status::BadArgument)? };
-    with_flash(|flash| store(flash, Key::Node, node.value()))
+    store(flash, Key::Node, node.value())
 }
 
-fn program_info(args: &mut ProgramArgs) -> Result<(), Status> {
-    let number = program(args)?;
-    with_flash(|flash| {
-        let record = ProgramRecord::load(&product::parameters(flash), flash, number);
-        *args = ProgramArgs { number: args.number, ..ProgramArgs::default() };
-        if let Some(record) = record {
-            args.size = record.size;
-            args.crc = record.crc;
-            args.version = record.version;
-            args.flags = PROGRAM_INSTALLED | if record.signed { PROGRAM_SIGNED } else { 0 };
-        }
-        Ok(())
-    })
+fn program_info(flash: &FlashController, args: &mut ProgramArgs) -> Result<(), Status> {
+    let record = ProgramRecord::load(&product::parameters(flash), flash, program(args)?);
+    *args = ProgramArgs { number: args.number, ..ProgramArgs::default() };
+    if let Some(record) = record {
+        args.size = record.size;
+        args.crc = record.crc;
+        args.version = record.version;
+        args.flags = PROGRAM_INSTALLED | if record.signed { PROGRAM_SIGNED } else { 0 };
+    }
+    Ok(())
 }
 
 /// Sets the signature of a program or takes it away. Whoever is signed has not crashed.
-fn sign(args: &ProgramArgs, signed: bool) -> Result<(), Status> {
+fn sign(flash: &mut FlashController, args: &ProgramArgs, signed: bool) -> Result<(), Status> {
     let number = program(args)?;
-    with_flash(|flash| {
-        let parameters = product::parameters(flash);
-        let record = ProgramRecord::load(&parameters, flash, number).ok_or(Status::NoProgram)?;
-        let crashes = parameters.get(flash, Key::CrashCount).is_some_and(|[count, ..]| count > 0);
-        if record.signed != signed {
-            store(flash, Key::Program(number), ProgramRecord { signed, ..record }.value())?;
-        }
-        if signed && crashes {
-            store(flash, Key::CrashCount, [0; 4])?;
-        }
-        Ok(())
-    })
+    let parameters = product::parameters(flash);
+    let record = ProgramRecord::load(&parameters, flash, number).ok_or(Status::NoProgram)?;
+    let crashes = parameters.get(flash, Key::CrashCount).is_some_and(|[count, ..]| count > 0);
+    if record.signed != signed {
+        store(flash, Key::Program(number), ProgramRecord { signed, ..record }.value())?;
+    }
+    if signed && crashes {
+        store(flash, Key::CrashCount, [0; 4])?;
+    }
+    Ok(())
 }
 
 /// The number of a program of the layout.
@@ -150,7 +140,7 @@ fn store(flash: &mut FlashController, key: Key, value: Value) -> Result<(), Stat
     let mut parameters = product::parameters(flash);
     parameters.store(key, value);
     loop {
-        if let core::task::Poll::Ready(outcome) = parameters.poll(flash) {
+        if let Poll::Ready(outcome) = parameters.poll(flash) {
             return outcome.map_err(|_| Status::Failed);
         }
     }

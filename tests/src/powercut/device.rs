@@ -3,7 +3,7 @@
 
 use core::task::Poll;
 
-use boot_core::bootloader::{entries, entry_count, Bootloader, Config};
+use boot_core::bootloader::{entries, entries_with, entry_count, entry_count_with, Bootloader, Config};
 use boot_core::canopen::device::Device as Identity;
 use boot_core::canopen::lss::LssDevice;
 use boot_core::canopen::od::{Address, Entry, Objects};
@@ -13,6 +13,7 @@ use boot_core::crc::CrcKind;
 use boot_core::crc32;
 use boot_core::decision::{self, decide, BootDecision, Circumstances};
 use boot_core::flash::{run, Flash, FlashFault, Next, Operation};
+use boot_core::profile::Profile;
 use boot_core::program::verify;
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord, StoreError, Value};
 use shared_abi::geometry::{Region, Sector};
@@ -25,6 +26,8 @@ pub static LAYOUT: Layout = TWO_PROGRAMS;
 
 const PROGRAMS: usize = 2;
 static ENTRIES: [Entry; entry_count(PROGRAMS as u8)] = entries(PROGRAMS as u8);
+/// 6005h/1.
+const LIFT_PASSWORD: Address = Address::new(0x6005, 1);
 
 /// Whom the programs are for.
 pub const VENDOR_ID: u32 = 0x0000_0319;
@@ -55,6 +58,28 @@ static SOUND: Config = CONFIG;
 /// A lift: program 2 is a set of parameters, and a download replaces what is there.
 static LIFT: Config = Config {
     download: Policy { data: Some(2), replaces: true, read_back: true, ..CONFIG.download },
+    ..CONFIG
+};
+/// A lift that wants its password.
+static LOCKED_LIFT: Config = Config {
+    entries: {
+        static ENTRIES: [Entry; entry_count_with(PROGRAMS as u8, Profile::LIFT.extras)] =
+            entries_with(PROGRAMS as u8, Profile::LIFT.extras);
+        &ENTRIES
+    },
+    download: Policy { locked: true, ..LIFT.download },
+    password: Profile::LIFT.password,
+    ..CONFIG
+};
+/// A password for each program, which voids it.
+static ESACADEMY: Config = Config {
+    entries: {
+        static ENTRIES: [Entry; entry_count_with(PROGRAMS as u8, Profile::ESACADEMY.extras)] =
+            entries_with(PROGRAMS as u8, Profile::ESACADEMY.extras);
+        &ENTRIES
+    },
+    download: Policy { identity: CONFIG.download.identity, ..Profile::ESACADEMY.download },
+    password: Profile::ESACADEMY.password,
     ..CONFIG
 };
 static HASTY: Config = Config { download: Policy { erase: Erase::AtOnce, ..CONFIG.download }, ..CONFIG };
@@ -212,6 +237,16 @@ impl Device {
         self.host_of(&LIFT, talk)
     }
 
+    /// The same for the bootloader of a lift that wants its password.
+    pub fn host_of_locked_lift<R>(&mut self, talk: impl FnOnce(&mut Host<'_, '_>) -> R) -> R {
+        self.host_of(&LOCKED_LIFT, talk)
+    }
+
+    /// The same for the bootloader of ESAcademy.
+    pub fn host_of_esacademy<R>(&mut self, talk: impl FnOnce(&mut Host<'_, '_>) -> R) -> R {
+        self.host_of(&ESACADEMY, talk)
+    }
+
     fn host_of<R>(&mut self, config: &'static Config, talk: impl FnOnce(&mut Host<'_, '_>) -> R) -> R {
         let (parameters, node) = (self.parameters(), self.node());
         let flash = Chip { flash: &mut self.flash, bug: self.bug };
@@ -226,7 +261,8 @@ pub struct Host<'b, 'f> {
 }
 
 impl Host<'_, '_> {
-    fn settle(&mut self) {
+    /// Until there is no work.
+    pub fn settle(&mut self) {
         for _ in 0..1_000_000 {
             if self.node.step() == Step::Idle {
                 return;
@@ -271,6 +307,44 @@ impl Host<'_, '_> {
         self.node.download_end(at).map_err(told)?;
         self.settle();
         self.ended(program)
+    }
+
+    /// The password that opens 1F50h of a program, as the profile has it. The work that is under way
+    /// is not waited for.
+    ///
+    /// # Errors
+    /// The abort.
+    pub fn password(&mut self, program: u8) -> Result<(), String> {
+        let lift = self.node.entries().iter().any(|entry| entry.at == LIFT_PASSWORD);
+        if lift {
+            self.node.write(LIFT_PASSWORD, Profile::LIFT.password).map_err(told)
+        } else {
+            self.node.write(Address::new(0x7F50, program), Profile::ESACADEMY.password).map_err(told)
+        }
+    }
+
+    /// A whole program of which only the first `sent` bytes come, and so many steps of work behind
+    /// them; then the client is gone.
+    ///
+    /// # Errors
+    /// The abort.
+    pub fn broken_off(&mut self, program: u8, data: &[u8], sent: usize, steps: u32) -> Result<(), String> {
+        let at = Address::new(0x1F50, program);
+        self.node.download_start(at, Some(data.len() as u32)).map_err(told)?;
+        for segment in data[..sent].chunks(7) {
+            while self.node.download_space(at, false) < segment.len() {
+                self.node.step();
+            }
+            if let Err(abort) = self.node.download_data(at, segment) {
+                self.node.download_cancel(at);
+                return Err(told(abort));
+            }
+        }
+        for _ in 0..steps {
+            self.node.step();
+        }
+        self.node.download_cancel(at);
+        Ok(())
     }
 
     fn ended(&mut self, program: u8) -> Result<(), String> {

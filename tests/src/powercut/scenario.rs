@@ -433,7 +433,101 @@ pub const SCENARIOS: &[Scenario] = &[
         },
         end: || with_second(&[START_NEW], &[Some((OLD, true))]),
     },
+    Scenario {
+        name: "lift-password-during",
+        about: "a lift's password in the middle of work, and then the set of parameters broken off",
+        prepare: install_in_lift,
+        act: |device, tell| {
+            const OLD_THERE: Option<(u8, bool)> = Some((OLD, true));
+            tell(with_second(&[START_OLD], &[OLD_THERE]));
+            device.host_of_locked_lift(|host| {
+                host.password(1)?;
+                tell(with_second(&[START_OLD, STAY], &[OLD_THERE]));
+                host.broken_off(1, &raw(), 140, WORK / 2)?;
+                // It may have to wait; then nothing is lost.
+                if host.password(2).is_ok() {
+                    tell(with_second(&[START_OLD, STAY], &[OLD_THERE, None]));
+                    let _ = host.broken_off(2, &parameter_set(NEW), 140, WORK);
+                }
+                host.settle();
+                Ok(())
+            })
+        },
+        recover: |device, _, tell| lift_from_anything(device, tell),
+        end: || with_second(&[START_NEW], &[Some((NEW, true))]),
+    },
+    Scenario {
+        name: "password-during",
+        about: "ESAcademy's passwords of two programs, one in the middle of work on the other one",
+        prepare: |device| {
+            for program in [1, 2] {
+                esacademy(device, program, OLD).expect("a sound device takes a good program");
+            }
+        },
+        act: |device, tell| {
+            const OLD_THERE: Option<(u8, bool)> = Some((OLD, true));
+            tell(with_second(&[START_OLD, STAY], &[OLD_THERE]));
+            device.host_of_esacademy(|host| {
+                host.password(1)?;
+                host.broken_off(1, &raw(), 140, WORK / 2)?;
+                if host.password(2).is_ok() {
+                    tell(with_second(&[START_OLD, STAY], &[OLD_THERE, None]));
+                    let _ = host.broken_off(2, &image(2, NEW), 140, WORK);
+                }
+                host.settle();
+                Ok(())
+            })
+        },
+        recover: |device, _, tell| esacademy_from_anything(device, tell),
+        end: || with_second(&[START_NEW], &[Some((NEW, true))]),
+    },
 ];
+
+/// Steps in which a sector is erased and some words are programmed.
+const WORK: u32 = 60;
+
+fn install_in_lift(device: &mut Device) {
+    let installed = device.host_of_locked_lift(|host| {
+        host.password(1)?;
+        host.block(1, &image(1, OLD))?;
+        host.block(2, &parameter_set(OLD))
+    });
+    installed.expect("a sound device takes a good program");
+}
+
+/// Password, program and set of parameters, whatever is there.
+fn lift_from_anything(device: &mut Device, tell: Tell<'_>) -> Result<(), String> {
+    const ANY: [Option<(u8, bool)>; 3] = [Some((OLD, true)), None, Some((NEW, true))];
+    tell(with_second(&[START_OLD, STAY, START_NEW], &ANY));
+    device.host_of_locked_lift(|host| {
+        host.password(1)?;
+        host.block(1, &raw())?;
+        tell(with_second(&[START_NEW], &ANY));
+        host.block(2, &parameter_set(NEW))
+    })?;
+    tell(with_second(&[START_NEW], &[Some((NEW, true))]));
+    Ok(())
+}
+
+/// Password and program, in one go.
+fn esacademy(device: &mut Device, program: u8, seed: u8) -> Result<(), String> {
+    device.host_of_esacademy(|host| {
+        host.password(program)?;
+        host.settle();
+        host.block(program, &image(program, seed))
+    })
+}
+
+/// Both programs, whatever is there.
+fn esacademy_from_anything(device: &mut Device, tell: Tell<'_>) -> Result<(), String> {
+    const ANY: [Option<(u8, bool)>; 3] = [Some((OLD, true)), None, Some((NEW, true))];
+    tell(with_second(&[START_OLD, STAY, START_NEW], &ANY));
+    esacademy(device, 1, NEW)?;
+    tell(with_second(&[START_NEW], &ANY));
+    esacademy(device, 2, NEW)?;
+    tell(with_second(&[START_NEW], &[Some((NEW, true))]));
+    Ok(())
+}
 
 /// The node-ID and bit rate of this number.
 fn node(id: u8) -> NodeParameters {

@@ -1,0 +1,440 @@
+//! A bootloader of any profile on one or two programs, driven through its object dictionary alone.
+//!
+//! Tests that use it say nothing of how the bootloader is made or of how it works inside. What is
+//! known of that stands in [`Rig::boot`] and [`Rig::stored`]: whoever changes the construction of
+//! the bootloader, or of what it keeps in flash, changes these two functions.
+#![allow(dead_code, reason = "each test file uses some of it")]
+
+use std::cell::{RefCell, RefMut};
+use std::rc::Rc;
+use std::task::Poll;
+
+use boot_core::bootloader::{entries_with, entry_count_with, Bootloader, Config, PasswordObject};
+use boot_core::control::{Erase, Policy, Step};
+use boot_core::flash::{Flash, FlashFault, Operation};
+use boot_core::profile::Profile;
+use boot_core::store::{Journal, NodeParameters, Parameters, ProgramRecord};
+use canopen::device::Device;
+use canopen::lss::LssDevice;
+use canopen::od::{Address, Entry, Objects};
+use canopen::{AbortCode, BitRate, Instant, NodeId};
+use shared_abi::geometry::{Region, Sector};
+use shared_abi::label::{self, Label};
+use shared_abi::layout::Layout;
+use shared_abi::warm_start::BootRequest;
+
+use crate::ihex::{record, END_OF_FILE};
+use crate::model::{ModelFlash, CHIP, ONE_PROGRAM, TWO_PROGRAMS};
+
+// --- setups
+
+/// What a bootloader is made for.
+pub struct Setup {
+    pub name: &'static str,
+    pub profile: Profile,
+    pub layout: &'static Layout,
+    config: Config,
+}
+
+pub const VENDOR_ID: u32 = 0x0000_0319;
+pub const PRODUCT_CODE: u32 = 0x0004_0001;
+
+static ONE: Layout = ONE_PROGRAM;
+static TWO: Layout = TWO_PROGRAMS;
+
+/// The setup of a profile, with an object dictionary of its own.
+macro_rules! setup {
+    ($name:literal, $programs:literal, $layout:ident, $profile:expr) => {{
+        const PROFILE: Profile = $profile;
+        static ENTRIES: [Entry; entry_count_with($programs, PROFILE.extras)] =
+            entries_with($programs, PROFILE.extras);
+        Setup {
+            name: $name,
+            profile: PROFILE,
+            layout: &$layout,
+            config: config(&PROFILE, &$layout, &ENTRIES),
+        }
+    }};
+}
+
+const fn config(profile: &Profile, layout: &'static Layout, entries: &'static [Entry]) -> Config {
+    Config {
+        entries,
+        device: Device {
+            device_type: profile.device_type,
+            name: "rig",
+            hardware_version: "0",
+            software_version: "0",
+            heartbeat_ms: 0,
+            vendor_id: VENDOR_ID,
+            product_code: PRODUCT_CODE,
+            revision: 0,
+            serial_number: 0,
+        },
+        node_id: profile.node_id,
+        layout,
+        supports: |_| true,
+        boot_up_emergency: false,
+        download: Policy { identity: Some((VENDOR_ID, PRODUCT_CODE)), ..profile.download },
+        password: profile.password,
+    }
+}
+
+/// The standard profile whose CLEAR erases at once.
+const AT_ONCE: Profile =
+    Profile { download: Policy { erase: Erase::AtOnce, ..Profile::STANDARD.download }, ..Profile::STANDARD };
+
+pub static STANDARD_1: Setup = setup!("STANDARD_1", 1, ONE, Profile::STANDARD);
+pub static STANDARD_2: Setup = setup!("STANDARD_2", 2, TWO, Profile::STANDARD);
+pub static AT_ONCE_2: Setup = setup!("AT_ONCE_2", 2, TWO, AT_ONCE);
+pub static PAULUS_1: Setup = setup!("PAULUS_1", 1, ONE, Profile::PAULUS);
+pub static PAULUS_2: Setup = setup!("PAULUS_2", 2, TWO, Profile::PAULUS);
+pub static ESACADEMY_1: Setup = setup!("ESACADEMY_1", 1, ONE, Profile::ESACADEMY);
+pub static ESACADEMY_2: Setup = setup!("ESACADEMY_2", 2, TWO, Profile::ESACADEMY);
+pub static LIFT_1: Setup = setup!("LIFT_1", 1, ONE, Profile::LIFT);
+pub static LIFT_2: Setup = setup!("LIFT_2", 2, TWO, Profile::LIFT);
+
+impl Setup {
+    pub fn programs(&self) -> u8 {
+        self.layout.programs.len() as u8
+    }
+
+    pub fn region(&self, program: u8) -> Region {
+        self.layout.programs[usize::from(program) - 1]
+    }
+
+    /// Whether a program is data of the application.
+    pub fn is_data(&self, program: u8) -> bool {
+        self.profile.download.data == Some(program)
+    }
+
+    /// Where the password of a program is written, and what it is.
+    pub fn password(&self, program: u8) -> Option<(Address, &'static [u8])> {
+        let at = match self.profile.extras.password {
+            PasswordObject::None => return None,
+            PasswordObject::EnableFlash => Address::new(0x7F50, program),
+            PasswordObject::Unlock => Address::new(0x6005, 1),
+        };
+        Some((at, self.profile.password))
+    }
+}
+
+// --- the device
+
+/// The flash, which outlives the bootloader that works on it.
+#[derive(Clone)]
+pub struct Chip(Rc<RefCell<ModelFlash>>);
+
+impl Chip {
+    pub fn model(&self) -> RefMut<'_, ModelFlash> {
+        self.0.borrow_mut()
+    }
+}
+
+impl Flash for Chip {
+    fn read(&self, address: u32, buffer: &mut [u8]) {
+        self.0.borrow().read(address, buffer);
+    }
+
+    fn start(&mut self, operation: Operation) -> Result<(), FlashFault> {
+        self.model().start(operation)
+    }
+
+    fn sector_at(&self, address: u32) -> Option<Sector> {
+        self.0.borrow().sector_at(address)
+    }
+
+    fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
+        self.model().poll()
+    }
+}
+
+/// What the rest of a device uses of its bootloader.
+pub trait Node: Objects + LssDevice {
+    /// A bounded piece of work; whether there was none.
+    fn is_idle_after_step(&mut self) -> bool;
+    fn is_finishing(&mut self) -> bool;
+    fn take_boot_request(&mut self) -> Option<BootRequest>;
+    fn set_time(&mut self, now: Instant);
+}
+
+impl<F: Flash, P: Parameters, const PROGRAMS: usize> Node for Bootloader<'_, F, P, PROGRAMS> {
+    fn is_idle_after_step(&mut self) -> bool {
+        self.step() == Step::Idle
+    }
+
+    fn is_finishing(&mut self) -> bool {
+        Bootloader::is_finishing(self)
+    }
+
+    fn take_boot_request(&mut self) -> Option<BootRequest> {
+        Bootloader::take_boot_request(self)
+    }
+
+    fn set_time(&mut self, now: Instant) {
+        Bootloader::set_time(self, now);
+    }
+}
+
+/// What the flash tells whoever looks after a reset.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stored {
+    /// By program, from 1 on: size, CRC, signed, version.
+    pub records: [Option<(u32, u32, bool, u32)>; 2],
+    pub node: NodeParameters,
+}
+
+/// A device: its flash, and the bootloader that runs on it.
+pub struct Rig {
+    pub setup: &'static Setup,
+    pub chip: Chip,
+    pub node: Box<dyn Node>,
+    buffer: usize,
+}
+
+pub const BOARD_NODE: NodeParameters = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
+
+impl Rig {
+    /// With an empty flash, and so many bytes of buffer for blocks.
+    pub fn new(setup: &'static Setup, buffer: usize) -> Self {
+        Self::on(setup, buffer, ModelFlash::new(&CHIP))
+    }
+
+    /// With this flash.
+    pub fn on(setup: &'static Setup, buffer: usize, flash: ModelFlash) -> Self {
+        let chip = Chip(Rc::new(RefCell::new(flash)));
+        let node = Self::boot(setup, &chip, buffer);
+        Self { setup, chip, node, buffer }
+    }
+
+    /// THE place where a bootloader is made.
+    fn boot(setup: &'static Setup, chip: &Chip, buffer: usize) -> Box<dyn Node> {
+        let flash = chip.clone();
+        let buffer = Box::leak(vec![0; buffer].into_boxed_slice());
+        let parameters = Journal::open(&flash, setup.layout.parameters);
+        let node = NodeParameters::load(&parameters, &flash, BOARD_NODE, |_| true);
+        match setup.programs() {
+            1 => Box::new(Bootloader::<_, _, 1>::new(&setup.config, 0, node, 0, parameters, flash, buffer)),
+            2 => Box::new(Bootloader::<_, _, 2>::new(&setup.config, 0, node, 0, parameters, flash, buffer)),
+            _ => unreachable!(),
+        }
+    }
+
+    /// What would be read after a reset now. The flash is looked at through a copy.
+    pub fn stored(&self) -> Stored {
+        let mut flash = self.chip.model().clone();
+        flash.power_on();
+        let layout = self.setup.layout;
+        let parameters = Journal::open(&flash, layout.parameters);
+        let record = |program| {
+            if program > self.setup.programs() {
+                return None;
+            }
+            let record = ProgramRecord::load(&parameters, &flash, program)?;
+            Some((record.size, record.crc, record.signed, record.version))
+        };
+        Stored {
+            records: [record(1), record(2)],
+            node: NodeParameters::load(&parameters, &flash, BOARD_NODE, |_| true),
+        }
+    }
+
+    /// A reset: whatever the flash is doing ends there.
+    pub fn reset(&mut self) {
+        self.chip.model().power_on();
+        self.node = Self::boot(self.setup, &self.chip, self.buffer);
+    }
+
+    /// Steps until there is no work.
+    pub fn settle(&mut self) {
+        assert!(self.settles(), "the work does not end");
+    }
+
+    /// The same; whether it came to an end.
+    pub fn settles(&mut self) -> bool {
+        (0..200_000).any(|_| self.node.is_idle_after_step())
+    }
+
+    pub fn steps(&mut self, steps: u32) {
+        for _ in 0..steps {
+            self.node.is_idle_after_step();
+        }
+    }
+
+    pub fn word(&mut self, index: u16, sub: u8) -> u32 {
+        let mut bytes = [0; 4];
+        self.node.read(Address::new(index, sub), &mut bytes).expect("the object can be read");
+        u32::from_le_bytes(bytes)
+    }
+
+    /// 1F51h: 0 stopped, 3 there is none.
+    pub fn state(&mut self, program: u8) -> u32 {
+        self.word(0x1F51, program)
+    }
+
+    /// 1F56h.
+    pub fn identification(&mut self, program: u8) -> u32 {
+        self.word(0x1F56, program)
+    }
+
+    /// 1F57h.
+    pub fn status(&mut self, program: u8) -> u32 {
+        self.word(0x1F57, program)
+    }
+
+    /// 1F51h.
+    pub fn command(&mut self, program: u8, command: u8) -> Result<(), AbortCode> {
+        self.node.write(Address::new(0x1F51, program), &[command])
+    }
+
+    /// The right password, where there is one.
+    pub fn unlock(&mut self, program: u8) -> Result<(), AbortCode> {
+        match self.setup.password(program) {
+            Some((at, password)) => self.node.write(at, password),
+            None => Ok(()),
+        }
+    }
+
+    /// Begins a download and sends these bytes of it.
+    pub fn begin(&mut self, program: u8, size: Option<u32>, data: &[u8]) -> Result<(), AbortCode> {
+        let at = Address::new(0x1F50, program);
+        self.node.download_start(at, size)?;
+        for segment in data.chunks(7) {
+            while self.node.download_space(at, false) < segment.len() {
+                assert!(!self.node.is_idle_after_step(), "there is never room");
+            }
+            if let Err(abort) = self.node.download_data(at, segment) {
+                self.node.download_cancel(at);
+                return Err(abort);
+            }
+        }
+        Ok(())
+    }
+
+    /// A whole download; what is left to do is not waited for.
+    pub fn send(&mut self, program: u8, data: &[u8]) -> Result<(), AbortCode> {
+        self.begin(program, Some(data.len() as u32), data)?;
+        self.node.download_end(Address::new(0x1F50, program))
+    }
+
+    pub fn cancel(&mut self, program: u8) {
+        self.node.download_cancel(Address::new(0x1F50, program));
+    }
+
+    /// Password or CLEAR, and a program in one download, carried out; the request to start it, if
+    /// it makes one, is taken.
+    pub fn install(&mut self, program: u8, data: &[u8]) {
+        self.unlock(program).expect("the password is right");
+        if self.setup.password(program).is_none() {
+            self.command(program, 3).expect("CLEAR is taken");
+            self.settle();
+        }
+        self.send(program, data).expect("a good program is taken");
+        self.settle();
+        assert_eq!((self.status(program), self.state(program)), (0, 0));
+        self.node.take_boot_request();
+    }
+
+    /// What the flash of a program holds, as a debug probe sees it.
+    pub fn cells(&self, program: u8) -> Vec<u8> {
+        self.chip.model().cells(self.setup.region(program)).to_vec()
+    }
+
+    /// The length of the part of a program's flash, from its start on, that has the CRC which 1F56h
+    /// tells; `None` where there is none: a record that stands is not true.
+    pub fn size_by_crc(&mut self, program: u8) -> Option<u32> {
+        let told = self.identification(program);
+        let cells = self.cells(program);
+        let mut crc = Crc::new();
+        (1..).zip(&cells).find_map(|(len, byte)| {
+            crc.push(*byte);
+            (crc.value() == told).then_some(len)
+        })
+    }
+
+    /// Whether a program is none, or is what its record says.
+    pub fn is_true(&mut self, program: u8) -> bool {
+        self.state(program) == 3 || self.size_by_crc(program).is_some()
+    }
+}
+
+// --- CRC-32
+
+/// CRC-32/ISO-HDLC from its definition (reflected polynomial EDB88320h), a byte at a time.
+pub struct Crc(u32);
+
+const TABLE: [u32; 256] = {
+    let mut table = [0; 256];
+    let mut byte = 0;
+    while byte < 256 {
+        let mut crc = byte as u32;
+        let mut bit = 0;
+        while bit < 8 {
+            crc = if crc & 1 == 1 { crc >> 1 ^ 0xEDB8_8320 } else { crc >> 1 };
+            bit += 1;
+        }
+        table[byte] = crc;
+        byte += 1;
+    }
+    table
+};
+
+impl Crc {
+    pub fn new() -> Self {
+        Self(u32::MAX)
+    }
+
+    pub fn push(&mut self, byte: u8) {
+        self.0 = TABLE[usize::from(self.0 as u8 ^ byte)] ^ self.0 >> 8;
+    }
+
+    pub fn value(&self) -> u32 {
+        !self.0
+    }
+}
+
+pub fn crc32(bytes: &[u8]) -> u32 {
+    let mut crc = Crc::new();
+    bytes.iter().for_each(|byte| crc.push(*byte));
+    crc.value()
+}
+
+// --- programs and how they are sent
+
+/// A program for this place and product: vectors, a label, and bytes that tell it from any other.
+pub fn program(region: Region, product_code: u32, len: usize, seed: u8) -> Vec<u8> {
+    let mut bytes: Vec<u8> = (0..len).map(|i| (i as u8).wrapping_mul(31) ^ (i >> 8) as u8 ^ seed).collect();
+    bytes[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
+    bytes[4..8].copy_from_slice(&(region.base + 0x101).to_le_bytes());
+    let at = label::OFFSET as usize;
+    if len >= at + label::SIZE {
+        let Label { magic, vendor_id, product_code, version, reserved: [a, b, c], check } =
+            Label::new(VENDOR_ID, product_code, seed.into());
+        let words = [magic, vendor_id, product_code, version, a, b, c, check];
+        for (place, word) in bytes[at..].chunks_mut(4).zip(words) {
+            place.copy_from_slice(&word.to_le_bytes());
+        }
+    }
+    bytes
+}
+
+pub fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
+    let mut bytes = words(&[number, address, data.len() as u32]);
+    bytes.extend(data);
+    bytes.extend(crc32(&bytes).to_le_bytes());
+    bytes
+}
+
+pub fn words(words: &[u32]) -> Vec<u8> {
+    words.iter().flat_map(|word| word.to_le_bytes()).collect()
+}
+
+/// A program as Intel HEX, 16 bytes a record.
+pub fn hex(base: u32, program: &[u8]) -> Vec<u8> {
+    let mut text = record(0, 4, &((base >> 16) as u16).to_be_bytes()) + "\n";
+    for (n, data) in (0..).zip(program.chunks(16)) {
+        text += &record(base.wrapping_add(16 * n) as u16, 0, data);
+        text += "\n";
+    }
+    (text + END_OF_FILE + "\n").into_bytes()
+}
