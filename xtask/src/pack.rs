@@ -7,11 +7,11 @@
 //! `.data` keeps its contents for the debugger, and belongs to no segment with contents any more:
 //! gdb's `load` writes it to the RAM, where the boot stage puts the same bytes later.
 
-use std::fs;
 use std::hash::{DefaultHasher, Hash, Hasher};
+use std::{fs, process};
 
 use crc::{Crc, CRC_32_ISO_HDLC};
-use shared_abi::ram_image::{unpack, Method, MAGIC, SERVICES_VERSION};
+use shared_abi::ram_image::{Method, MAGIC, SERVICES_VERSION};
 
 use crate::elf::{Elf, Section};
 use crate::{workspace, Outcome};
@@ -59,24 +59,20 @@ pub fn pack(file: &[u8]) -> Outcome<Vec<u8>> {
 }
 
 /// Compresses, the best that the format can do. That takes seconds, so what was compressed before
-/// is kept in the folder of what is built.
+/// is kept in the folder of what is built, under a hash of it.
 fn compressed(raw: &[u8]) -> Vec<u8> {
-    let is_good = |packed: &[u8]| {
-        let mut unpacked = vec![0; raw.len()];
-        unpack(packed, &mut unpacked).is_ok() && unpacked == raw
-    };
     let mut hasher = DefaultHasher::new();
     raw.hash(&mut hasher);
     let folder = workspace::target_dir().join("packed");
     let kept = folder.join(format!("{:016x}.zx0", hasher.finish()));
-    if let Some(packed) = fs::read(&kept).ok().filter(|packed| is_good(packed)) {
-        return packed;
-    }
-    let packed = zx0::compress(raw);
-    assert!(is_good(&packed), "the boot stage would not unpack what was packed");
-    // Where it cannot be kept, only time is lost.
-    let _ = fs::create_dir_all(&folder).and_then(|()| fs::write(&kept, &packed));
-    packed
+    fs::read(&kept).unwrap_or_else(|_| {
+        let packed = zx0::compress(raw);
+        // Under another name until it is whole. Where it cannot be kept, only time is lost.
+        let part = kept.with_extension(process::id().to_string());
+        let written = fs::create_dir_all(&folder).and_then(|()| fs::write(&part, &packed));
+        let _ = written.and_then(|()| fs::rename(&part, &kept));
+        packed
+    })
 }
 
 /// One of the two tables of an ELF file (System V ABI, chapter 4), by the places of its offset, its
@@ -208,9 +204,9 @@ mod tests {
         assert_eq!(segments, [(0x0800_0020, 24), (0x0800_0038, packed.size), (0x2000_0000, 0)]);
         // The image is where it was, for the debugger.
         assert_eq!(after[0x118..0x158], before[0x118..0x158]);
-        let mut unpacked = [0; 64];
-        unpack(&after[packed.offset as usize..][..packed.size as usize], &mut unpacked).unwrap();
-        assert_eq!(unpacked, before[0x118..0x158]);
+        let unpacked =
+            zx0decompress::decompress(&mut &after[packed.offset as usize..][..packed.size as usize]);
+        assert_eq!(unpacked.unwrap(), before[0x118..0x158]);
         let header: Vec<u32> = (0..6).map(|word| get(&after, 0x100 + word * 4)).collect();
         assert_eq!(header[2..], [SERVICES_VERSION, 1, packed.size, 64]);
         let crc = Crc::<u32>::new(&CRC_32_ISO_HDLC);

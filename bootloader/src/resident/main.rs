@@ -7,6 +7,7 @@
 //! | `stage.rs` | from the reset to the jump, or to the rest of the bootloader | jump, handoff |
 //! | `callgate.rs` | services for the application | its ABI |
 //! | `ram_image.rs` | the rest of the bootloader, checked and unpacked to RAM | memory |
+//! | `unpack.rs` | the unpacker of ZX0 | assembly |
 //! | `caches.rs` | the caches of the flash, off or on for a while | registers |
 //!
 //! It is a program of its own, so that the linker can see that it has no variables: nothing but the
@@ -25,6 +26,7 @@ mod memory;
 mod product;
 mod ram_image;
 mod stage;
+mod unpack;
 
 use shared_abi::callgate::{Entry, Table, ABI_VERSION, MAGIC, TABLE_SIZE};
 use shared_abi::warm_start::BootRequest;

@@ -5,9 +5,10 @@ use core::slice;
 use boot_core::flash::Flash;
 use bsp::LAYOUT;
 use shared_abi::geometry::Region;
-use shared_abi::ram_image::{unpack, Damage, Header, Method, LEAST_STACK};
+use shared_abi::ram_image::{Damage, Header, Method, LEAST_STACK};
 
 use crate::flash::FlashController;
+use crate::unpack::unpack;
 
 /// Checks the image and unpacks it to the start of the RAM.
 ///
@@ -40,8 +41,9 @@ pub unsafe fn load(header: *const Header, flash: &FlashController) -> Result<(),
             for (to, from) in ram.iter_mut().zip(stored) {
                 *to = *from;
             }
-            Ok(())
         }
-        Method::Zx0 => unpack(stored, ram).map_err(|_| Damage::Stream),
+        Method::Zx0 if !unpack(stored, ram) => return Err(Damage::Stream),
+        Method::Zx0 => {}
     }
+    Ok(())
 }

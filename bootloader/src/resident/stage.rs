@@ -7,7 +7,7 @@ use boot_core::canopen::NodeId;
 use boot_core::decision::{decide, BootDecision, Circumstances, StayReason};
 use boot_core::parameters::{Key, Parameters as _};
 use boot_core::program::verify;
-use bsp::clock::Source;
+use bsp::clock::{Source, HSI};
 use bsp::{pac, CLOCK_TREE, LAYOUT};
 use cortex_m::peripheral::SCB;
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
@@ -18,6 +18,9 @@ use crate::caches::Caches;
 use crate::flash::FlashController;
 use crate::product::{self, NO_NODE_ID, POLICY, PROGRAM_WATCHDOG_MS, RESCUE_WINDOW_MS};
 use crate::ram_image;
+
+/// About how long the warm-start cell can be read in peace between two resets where nothing can run.
+const RESET_PERIOD_MS: u32 = 100;
 
 /// Decides. Comes back if the bootloader stays, with the rest of it in RAM; tells why it stays
 /// ([`StayReason::code`]), in the next byte which program waits for the end of the rescue window,
@@ -72,14 +75,19 @@ pub unsafe extern "C" fn stage(image: *const Header) -> u32 {
             decision = choose(&Circumstances { request: None, strap: false, crash_resets: 0, node_id });
         }
     }
-    // Whoever runs next finds the chip as after a reset.
+    // Whoever runs next finds the chip as after a reset, but the bootloader finds it fast: it clears
+    // its memory first of all.
     drop(caches);
-    CLOCK_TREE.slow_down(&rcc);
     flash.release(&rcc);
     if let Some(reason) = stay {
         return reason;
     }
-    let BootDecision::Start { program, trial } = decision else { SCB::sys_reset() };
+    CLOCK_TREE.slow_down(&rcc);
+    let BootDecision::Start { program, trial } = decision else {
+        // A round of the loop takes three cycles.
+        cortex_m::asm::delay(HSI / 1000 * RESET_PERIOD_MS / 3);
+        SCB::sys_reset()
+    };
     let handoff = Handoff::new(&BootInfo {
         node_id,
         bit_rate: node.bit_rate.or_zero(),
