@@ -43,7 +43,7 @@ impl Policy {
     pub fn crash_resets(&self, before: u32, cause: ResetCause, request: Option<BootRequest>) -> u32 {
         use ResetCause::{IndependentWatchdog, LowPower, Software, WindowWatchdog};
         match request {
-            Some(BootRequest::Fault | BootRequest::Resume(_)) => before,
+            Some(BootRequest::Fault | BootRequest::Resume(_) | BootRequest::Damaged(_)) => before,
             Some(_) => 0,
             None if matches!(cause, IndependentWatchdog | WindowWatchdog | Software | LowPower) => {
                 before.saturating_add(1)

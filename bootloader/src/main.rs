@@ -7,7 +7,6 @@
 //! | `resident/` | what runs from flash: boot stage and callgate | jump, ABI |
 //! | `start.rs` | from the reset to the boot stage, and to `init` below | start-up |
 //! | `flash.rs` | the flash controller and the CRC unit | registers |
-//! | `ram_vectors.rs` | the vector table in RAM | one copy |
 //! | `watchdog.rs` | feeds the watchdog when all tasks are alive | no |
 //! | `log.rs`, `log/` | a few words for whoever ports it (features `log-…`) | interrupts |
 //! | `debugger.rs` | the debugger interface (feature `debugger`) | no |
@@ -22,7 +21,6 @@ mod flash;
 mod log;
 mod memory;
 mod product;
-mod ram_vectors;
 mod start;
 mod watchdog;
 
@@ -68,7 +66,6 @@ mod app {
     use crate::flash::FlashController;
     use crate::log::{self, log};
     use crate::product::{PROFILE, RESCUE_WINDOW_MS};
-    use crate::ram_vectors;
     use crate::watchdog::{self, Task, Watchdog};
     use rtic_monotonics::fugit::ExtU32;
     use rtic_monotonics::Monotonic;
@@ -146,8 +143,7 @@ mod app {
     }
 
     #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; BLOCK_QUEUE] = [0; BLOCK_QUEUE]])]
-    fn init(mut cx: init::Context) -> (Shared, Local) {
-        ram_vectors::relocate(&mut cx.core.SCB);
+    fn init(cx: init::Context) -> (Shared, Local) {
         CLOCK_TREE.speed_up(&cx.device.RCC, Source::Crystal);
         // SAFETY: the device's own are not used beside it.
         let flash = unsafe { FlashController::steal(Some(&cx.device.RCC)) };

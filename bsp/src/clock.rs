@@ -32,7 +32,8 @@ pub enum Source {
     Crystal,
 }
 
-const HSI: u32 = 16_000_000;
+/// What the core runs from after a reset, in Hz.
+pub const HSI: u32 = 16_000_000;
 
 impl ClockTree {
     /// The core's clock in Hz.
@@ -121,9 +122,12 @@ mod registers {
 
     impl ClockTree {
         /// Runs the core from the PLL. A crystal that does not start is done without, as long as
-        /// the board has power: a device that can be reached badly is better than none. From the
-        /// state after a reset or after [`slow_down`](Self::slow_down).
+        /// the board has power: a device that can be reached badly is better than none.
         pub fn speed_up(&self, rcc: &pac::RCC, wanted: Source) -> Source {
+            // The PLL cannot be changed over while it runs (section 7.3.2).
+            if rcc.cr().read().bits() & PLLON != 0 {
+                self.slow_down(rcc);
+            }
             let mut source = Source::Internal;
             if wanted == Source::Crystal {
                 // The bypass can be chosen only while the oscillator is off (section 7.3.1).

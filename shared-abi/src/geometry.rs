@@ -84,6 +84,12 @@ pub struct Geometry {
 
 const KIB: u32 = 1024;
 
+/// Vectors of the core, in front of those of the interrupts: the initial stack pointer, Reset and
+/// the other exceptions (ARMv7-M B1.5.3).
+pub const CORE_VECTORS: u32 = 16;
+/// Bytes of them.
+pub const CORE_VECTORS_SIZE: u32 = CORE_VECTORS * 4;
+
 /// STM32F407VG and STM32F407IG: 1 MiB flash, 112 + 16 KiB SRAM, 64 KiB CCM.
 ///
 /// RM0090 table 5 (sectors), table 61 (82 interrupt lines).
@@ -253,7 +259,7 @@ impl Geometry {
     /// Bytes that a vector table of this chip occupies.
     #[must_use]
     pub const fn vector_table_size(&self) -> u32 {
-        (16 + self.interrupts as u32) * 4
+        CORE_VECTORS_SIZE + self.interrupts as u32 * 4
     }
 
     /// What `VTOR` demands of a vector table's address: the table's size rounded up to a power of

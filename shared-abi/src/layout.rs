@@ -7,8 +7,8 @@
 
 use core::fmt;
 
-use crate::geometry::{Geometry, Region};
-use crate::{callgate, handoff, label, warm_start};
+use crate::geometry::{Geometry, Region, CORE_VECTORS_SIZE};
+use crate::{callgate, handoff, label, ram_image, warm_start};
 
 pub mod nucleo_f446re;
 pub mod stm32f407g_disc1;
@@ -38,7 +38,8 @@ pub struct Layout {
     pub chip: &'static Geometry,
     /// The bootloader's flash. Its vector table is at the base, where the core looks after a reset.
     pub bootloader: Region,
-    /// Where the bootloader's code leaves off and the [`callgate`] table begins, from the base on.
+    /// Where the [`callgate`] table begins, from the base on: behind the vectors of the core. (Those
+    /// of interrupts are in RAM alone.)
     pub callgate_offset: u32,
     /// The two homes of the non-volatile parameters, one sector or more each.
     pub parameters: [Region; 2],
@@ -67,7 +68,7 @@ impl Layout {
             "layout: the bootloader must end at a sector border"
         );
         assert!(
-            self.callgate_offset >= chip.vector_table_size(),
+            self.callgate_offset >= CORE_VECTORS_SIZE,
             "layout: the callgate overlaps the bootloader's vector table"
         );
         assert!(
@@ -202,6 +203,8 @@ impl fmt::Display for LinkerScript<'_> {
         for (symbol, value) in [
             ("__vector_table_alignment", layout.chip.vector_table_alignment()),
             ("__vector_table_size", layout.chip.vector_table_size()),
+            ("__core_vectors_size", CORE_VECTORS_SIZE),
+            ("__least_stack", ram_image::LEAST_STACK),
             ("__label", flash.base + label::OFFSET),
             ("__label_end", flash.base + label::OFFSET + label::SIZE as u32),
             ("__callgate_table", layout.callgate()),
@@ -232,7 +235,7 @@ impl fmt::Display for Layout {
         writeln!(f)?;
         writeln!(f, "  {:<14} {:<24} {:>12}   remarks", "region", "addresses", "size")?;
         let map = [
-            ("bootloader", self.bootloader, "vector table, then the callgate"),
+            ("bootloader", self.bootloader, "vectors of the core, then the callgate"),
             ("parameters A", self.parameters[0], ""),
             ("parameters B", self.parameters[1], ""),
         ];

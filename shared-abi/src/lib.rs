@@ -10,6 +10,7 @@
 //! | [`label`] | what a program image says of itself: whom it is for |
 //! | [`vectors`] | the proof that a vector table may be jumped to, and the jump |
 //! | [`callgate`] | the bootloader's services for the application, at a fixed address |
+//! | [`ram_image`] | the part of the bootloader that runs from RAM, as it lies in flash |
 //! | `reentry` | the way back from an application into its bootloader (on the target) |
 //! | `reset` | registers after a reset, for those who leave the chip so (on the target) |
 //! | [`block_file`] | the container that object 1F50h takes |
@@ -26,6 +27,7 @@ pub mod handoff;
 pub mod label;
 pub mod layout;
 pub mod memory_map;
+pub mod ram_image;
 #[cfg(target_arch = "arm")]
 pub mod reentry;
 #[cfg(target_arch = "arm")]

@@ -6,6 +6,7 @@
 //! it is read once: [`Cell::take`] consumes it.
 
 use crate::check_word;
+use crate::ram_image::Damage;
 
 /// Tells a warm-start cell, layout version 1 ("CBW1" read as little-endian bytes).
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBW1");
@@ -29,6 +30,9 @@ pub enum BootRequest {
     Resume(u8),
     /// Stay, and carry out CLEAR of program `n`, which was asked of the application (1F51h = 3).
     Clear(u8),
+    /// The bootloader mode cannot run, because its part of the flash is damaged. The boot stage
+    /// leaves this for a debugger to see, and starts as after a power-on.
+    Damaged(Damage),
 }
 
 /// The cell as it lies in RAM: 16 bytes, little-endian.
@@ -37,9 +41,10 @@ pub enum BootRequest {
 pub struct WarmStart {
     /// [`MAGIC`].
     pub magic: u32,
-    /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume, 7 clear.
+    /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume, 7 clear, 8 damaged.
     pub request: u32,
-    /// The program number of a trial, start, resume or clear (1 to 254), 0 otherwise.
+    /// The program number of a trial, start, resume or clear (1 to 254); the number of a
+    /// [`Damage`]; 0 otherwise.
     pub argument: u32,
     /// [`check_word`] over the three words before.
     pub check: u32,
@@ -60,6 +65,7 @@ impl WarmStart {
             BootRequest::PowerOn => (5, 0),
             BootRequest::Resume(program) => (6, program as u32),
             BootRequest::Clear(program) => (7, program as u32),
+            BootRequest::Damaged(damage) => (8, damage as u32),
         };
         Self::encode(request, argument)
     }
@@ -75,8 +81,8 @@ impl WarmStart {
     /// request or an argument out of its range.
     #[must_use]
     pub fn request(&self) -> Option<BootRequest> {
-        let program = u8::try_from(self.argument).ok();
-        let request = match (self.request, program) {
+        let argument = u8::try_from(self.argument).ok();
+        let request = match (self.request, argument) {
             (1, Some(0)) => BootRequest::Stay,
             (2, Some(program @ 1..=254)) => BootRequest::Trial(program),
             (3, Some(program @ 1..=254)) => BootRequest::Start(program),
@@ -84,6 +90,7 @@ impl WarmStart {
             (5, Some(0)) => BootRequest::PowerOn,
             (6, Some(program @ 1..=254)) => BootRequest::Resume(program),
             (7, Some(program @ 1..=254)) => BootRequest::Clear(program),
+            (8, Some(damage)) => BootRequest::Damaged(Damage::from_number(damage)?),
             _ => return None,
         };
         // One encoder decides what is well-formed: magic, words and check must be exactly its.
@@ -147,6 +154,8 @@ mod tests {
             BootRequest::PowerOn,
             BootRequest::Resume(2),
             BootRequest::Clear(3),
+            BootRequest::Damaged(Damage::Header),
+            BootRequest::Damaged(Damage::Stream),
         ];
         for request in requests {
             let mut ram = WarmStart::EMPTY;
@@ -182,9 +191,21 @@ mod tests {
 
     #[test]
     fn a_well_checked_request_for_an_impossible_program_is_refused() {
-        for (request, argument) in
-            [(1, 1), (2, 0), (2, 255), (3, 0), (3, 256), (0, 0), (4, 1), (5, 1), (6, 0), (7, 0), (8, 1)]
-        {
+        for (request, argument) in [
+            (1, 1),
+            (2, 0),
+            (2, 255),
+            (3, 0),
+            (3, 256),
+            (0, 0),
+            (4, 1),
+            (5, 1),
+            (6, 0),
+            (7, 0),
+            (8, 0),
+            (8, 5),
+            (9, 1),
+        ] {
             let check = check_word(&[MAGIC, request, argument]);
             let cell = WarmStart { magic: MAGIC, request, argument, check };
             assert_eq!(cell.request(), None, "{cell:?}");

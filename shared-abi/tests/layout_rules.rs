@@ -29,7 +29,7 @@ fn each_broken_rule_is_named() {
     let cases: Vec<(String, &str)> = vec![
         (broken(|l| l.bootloader.base = 0x0800_4000), "must start at the base of the flash"),
         (broken(|l| l.bootloader.size = 33 * KIB), "the bootloader must end at a sector border"),
-        (broken(|l| l.callgate_offset = 0x180), "the callgate overlaps the bootloader's vector table"),
+        (broken(|l| l.callgate_offset = 0x3C), "the callgate overlaps the bootloader's vector table"),
         (broken(|l| l.callgate_offset = 32 * KIB), "the callgate lies outside the bootloader"),
         (
             broken(|l| l.parameters[0].size = 8 * KIB),

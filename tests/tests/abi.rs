@@ -101,7 +101,7 @@ fn callgate_byte_for_byte() {
 fn the_layout_of_the_stm32f407_is_the_documented_one() {
     let layout = &shared_abi::layout::stm32f407g_disc1::LAYOUT;
     assert_eq!(layout.bootloader, Region::new(0x0800_0000, 0x8000));
-    assert_eq!(layout.callgate(), 0x0800_0200);
+    assert_eq!(layout.callgate(), 0x0800_0040);
     assert_eq!(layout.parameters, [Region::new(0x0800_8000, 0x4000), Region::new(0x0800_C000, 0x4000)]);
     assert_eq!(layout.programs, [Region::new(0x0801_0000, 960 * 1024)]);
     assert_eq!(layout.ram, Region::new(0x2000_0000, 128 * 1024 - 64));
@@ -247,13 +247,13 @@ fn the_bootloader_runs_from_ram() {
         }
         let name = symbol.name().unwrap();
         // The thunk is the linker's: Reset's way from flash to `main` in RAM.
-        let start_up = matches!(name, "Reset" | "__pre_init" | "__Thumbv7ABSLongThunk_main")
+        let start_up = matches!(name, "Reset" | "__pre_init" | "boot_fault" | "__Thumbv7ABSLongThunk_main")
             || name.contains("callgate");
         let address = symbol.address() as u32 & !1;
         if start_up {
             assert!(
                 layout.bootloader.contains(address, 2),
-                "{name} at {address:#x} runs before the copy to RAM"
+                "{name} at {address:#x} runs before the RAM image is there"
             );
         } else {
             assert!(

@@ -199,8 +199,8 @@ const MISTAKES: &[Mistake] = &[
     },
     Mistake {
         file: LAYOUT,
-        right: "callgate_offset: 0x200",
-        wrong: "callgate_offset: 0x180",
+        right: "callgate_offset: 0x40",
+        wrong: "callgate_offset: 0x3C",
         by: By::Layout,
         says: "layout: the callgate overlaps the bootloader's vector table",
     },

@@ -23,10 +23,10 @@ pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     args.none_left()?;
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
-    let images = build::images(board)?;
+    let images = build::images(board, &["bootloader", "bootloader-complete", "app-v1"])?;
     let mut bench = process::cargo("run");
     bench.args(build::tests_args(board)).args(["--bin", "bench"]);
-    bench.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", &images.dir);
+    bench.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", images);
     // Optimised, as users have it.
     let cost = || {
         process::run(process::cargo("build").args(["--release", "--package", "coboot-node"]))?;

@@ -11,92 +11,143 @@ use crate::args::Args;
 use crate::setup::{Part, Setup};
 use crate::size::{self, Flash};
 use crate::workspace::{PROFILE, TARGET};
-use crate::{process, workspace, Outcome};
+use crate::{pack, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask build [--board BOARD] [--yes]
+usage: cargo xtask build [NAME...] [--all] [--unpacked] [--board BOARD] [--yes]
 
-Builds the bootloader, standard, with every option, without any, with a rescue window, with words for
-whoever ports it and with CAN over UART, both versions of the application, the one for CAN over UART and
-the one in C, and puts them into target/firmware/BOARD/ as bootloader.elf, bootloader-complete.elf,
-bootloader-minimal.elf, bootloader-rescue.elf, bootloader-log-rtt.elf, -log-defmt.elf and -log-uart.elf,
-bootloader-virtual-can.elf, app-v1.elf, app-v2.elf, app-virtual-can.elf and app-c.elf; for a board with room for two programs also app-program-2.elf and app-c-program-2.elf.
-For the tests alone, bootloader-debugger.elf and app-debugger.elf have the debugger interface: never ship them.
+Builds images of a board and puts them into target/firmware/BOARD/NAME.elf. Without a NAME it builds
+bootloader, app-v1 and app-v2; the other names stand in xtask/src/build.rs, and a wrong one lists them.
 
+  --all           every image of the board and the applications in C: what the tests need
+  --unpacked      bootloaders as the linker makes them: the part that runs from RAM is not packed
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
 ";
 
-/// The built images of one board.
-pub struct Images {
-    /// The folder they are in.
-    pub dir: PathBuf,
-    /// The bootloader among them.
-    pub bootloader: PathBuf,
-    /// Those that tell what they do, by their places in [`LOGS`].
-    pub logs: Vec<PathBuf>,
-    /// The one that speaks CAN over the UART.
-    pub virtual_can: PathBuf,
+/// An image of a board.
+pub struct Variant {
+    /// Its file's name, without `.elf`.
+    pub name: &'static str,
+    /// The package, which is also the name of its program.
+    pub package: &'static str,
+    /// Features besides the one that chooses the board.
+    pub features: &'static str,
+    /// What the build finds in `COBOOT_PRODUCT`, where that matters.
+    pub product: Option<&'static str>,
+    /// The number of the program that it is; 0 for a bootloader.
+    pub program: u8,
+    /// Boards with fewer programs have no such image.
+    pub least_programs: usize,
+}
+
+/// All of them, in the order in which they are built.
+pub const VARIANTS: &[Variant] = &[
+    bootloader("bootloader", STANDARD),
+    bootloader("bootloader-complete", "complete"),
+    bootloader("bootloader-minimal", ""),
+    bootloader("bootloader-rescue", "emcy,lss,raw-image,rescue-window"),
+    bootloader("bootloader-paulus", "profile-paulus"),
+    bootloader("bootloader-esacademy", "profile-esacademy"),
+    // The second program's place takes the set of parameters.
+    Variant { least_programs: 2, ..bootloader("bootloader-lift", "profile-lift") },
+    // They tell what they do, each in a way of its own (`cargo xtask emulate --log=WAY`).
+    bootloader("bootloader-log-rtt", "emcy,lss,log-rtt"),
+    bootloader("bootloader-log-defmt", "emcy,lss,log-defmt"),
+    bootloader("bootloader-log-uart", "emcy,lss,log-uart"),
+    bootloader("bootloader-virtual-can", "emcy,lss,virtual-can"),
+    // With the debugger interface, for the tests alone: never ship it.
+    bootloader("bootloader-debugger", "emcy,debugger"),
+    application("app-debugger", "debugger"),
+    // Version 1 is the template as it stands.
+    application("app-v1", ""),
+    application("app-v2", "version-2"),
+    application("app-virtual-can", "virtual-can"),
+    Variant { program: 2, least_programs: 2, ..application("app-program-2", "version-2,program-2") },
+    Variant { least_programs: 2, ..application("app-lift", "lift") },
+    Variant { least_programs: 2, ..application("app-lift-v2", "lift,version-2") },
+];
+
+/// What the main job needs.
+pub const MAIN: [&str; 3] = ["bootloader", "app-v1", "app-v2"];
+
+const fn bootloader(name: &'static str, features: &'static str) -> Variant {
+    Variant { name, package: "bootloader", features, product: None, program: 0, least_programs: 1 }
+}
+
+const fn application(name: &'static str, features: &'static str) -> Variant {
+    Variant { name, package: "app-template", features, product: None, program: 1, least_programs: 1 }
+}
+
+impl Variant {
+    /// The one of this name, if a board has it.
+    ///
+    /// # Errors
+    /// When there is none; the message lists those that there are.
+    pub fn by_name(board: &Layout, name: &str) -> Outcome<&'static Self> {
+        Self::of(board).find(|variant| variant.name == name).ok_or_else(|| {
+            let known: Vec<_> = Self::of(board).map(|variant| variant.name).collect();
+            format!("{} has no image \"{name}\"; it has: {}.", board.board, known.join(", "))
+        })
+    }
+
+    /// Those that a board has.
+    pub fn of(board: &Layout) -> impl Iterator<Item = &'static Self> + '_ {
+        VARIANTS.iter().filter(|variant| variant.least_programs <= board.programs.len())
+    }
+
+    /// Whether it is a bootloader.
+    pub const fn is_bootloader(&self) -> bool {
+        self.program == 0
+    }
+
+    /// The flash that it is for.
+    fn region(&self, board: &Layout) -> Region {
+        board.program(self.program).unwrap_or(board.bootloader)
+    }
 }
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let setup = Setup::from(&mut args);
-    args.none_left()?;
-    setup.prepare(&[Part::Firmware, Part::C])?;
-    images(board)?;
-    c_applications(board)
+    let (every, unpacked) = (args.flag("--all"), args.flag("--unpacked"));
+    let names = args.rest();
+    let chosen: Vec<_> = match names.as_slice() {
+        [] if every => Variant::of(board).collect(),
+        [] => MAIN.map(|name| Variant::by_name(board, name)).into_iter().collect::<Outcome<_>>()?,
+        _ if every => return Err("--all and names do not go together.".into()),
+        names => names.iter().map(|name| Variant::by_name(board, name)).collect::<Outcome<_>>()?,
+    };
+    setup.prepare(if every { &[Part::Firmware, Part::C] } else { &[Part::Firmware] })?;
+    for variant in chosen {
+        let built = build(board, variant)?;
+        put(board, variant, if unpacked { built } else { finished(variant, built)? })?;
+    }
+    if every {
+        c_applications(board)?;
+    }
+    Ok(())
 }
 
-/// Builds all images of a board and prints their sizes.
+/// Builds images of a board by their names, and prints their sizes; gives the folder they are in.
 ///
 /// # Errors
 /// When one does not build, or is no image of this board.
-pub fn images(board: &Layout) -> Outcome<Images> {
-    let bootloader = bootloader(board)?;
-    let complete = Build { board, package: "bootloader", features: COMPLETE };
-    image(&complete, "bootloader-complete.elf", board.bootloader)?;
-    let minimal = Build { board, package: "bootloader", features: "" };
-    image(&minimal, "bootloader-minimal.elf", board.bootloader)?;
-    let rescue = Build { board, package: "bootloader", features: RESCUE };
-    image(&rescue, "bootloader-rescue.elf", board.bootloader)?;
-    // Beside a second program there is no room for ESAcademy's password.
-    let dialects: &[&str] = if board.programs.len() == 1 { &["paulus", "esacademy"] } else { &["paulus"] };
-    for dialect in dialects {
-        let features = format!("profile-{dialect}");
-        let dialect = format!("bootloader-{dialect}.elf");
-        image(&Build { board, package: "bootloader", features: &features }, &dialect, board.bootloader)?;
+pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
+    for name in names {
+        let variant = Variant::by_name(board, name)?;
+        put(board, variant, finished(variant, build(board, variant)?)?)?;
     }
-    let logs = LOGS.iter().map(|(way, features)| {
-        let log = Build { board, package: "bootloader", features };
-        image(&log, &format!("bootloader-log-{way}.elf"), board.bootloader)
-    });
-    let logs = logs.collect::<Outcome<_>>()?;
-    let debugger = Build { board, package: "bootloader", features: DEBUGGER };
-    image(&debugger, "bootloader-debugger.elf", board.bootloader)?;
-    let virtual_can = Build { board, package: "bootloader", features: VIRTUAL_CAN };
-    let virtual_can = image(&virtual_can, "bootloader-virtual-can.elf", board.bootloader)?;
-    let program = board.programs[0];
-    // Version 1 is the template as it stands.
-    image(&Build { board, package: "app-template", features: "" }, "app-v1.elf", program)?;
-    image(&Build { board, package: "app-template", features: "version-2" }, "app-v2.elf", program)?;
-    image(&Build { board, package: "app-template", features: "debugger" }, "app-debugger.elf", program)?;
-    let application = Build { board, package: "app-template", features: "virtual-can" };
-    image(&application, "app-virtual-can.elf", program)?;
-    if let Some(second) = board.programs.get(1) {
-        let features = "version-2,program-2";
-        image(&Build { board, package: "app-template", features }, "app-program-2.elf", *second)?;
-        // The second program's place takes the set of parameters.
-        let lift = Build { board, package: "bootloader", features: "profile-lift" };
-        image(&lift, "bootloader-lift.elf", board.bootloader)?;
-        image(&Build { board, package: "app-template", features: "lift" }, "app-lift.elf", program)?;
-        image(
-            &Build { board, package: "app-template", features: "lift,version-2" },
-            "app-lift-v2.elf",
-            program,
-        )?;
-    }
-    Ok(Images { dir: workspace::firmware_dir(board), bootloader, logs, virtual_can })
+    Ok(workspace::firmware_dir(board))
+}
+
+/// Builds all images of a board but those in C, and prints their sizes; gives the folder they are
+/// in.
+///
+/// # Errors
+/// As for [`images`].
+pub fn all(board: &Layout) -> Outcome<PathBuf> {
+    images(board, &Variant::of(board).map(|variant| variant.name).collect::<Vec<_>>())
 }
 
 /// Builds the application in C for each program of a board. A board that app-c/boards does not know
@@ -171,14 +222,6 @@ fn rust_lld() -> Outcome<PathBuf> {
     Ok(tools.join("rust-lld").with_extension(std::env::consts::EXE_EXTENSION))
 }
 
-/// Builds the bootloader of a board and prints its size.
-///
-/// # Errors
-/// When it does not build, or is no image of this board.
-pub fn bootloader(board: &Layout) -> Outcome<PathBuf> {
-    image(&Build { board, package: "bootloader", features: STANDARD }, "bootloader.elf", board.bootloader)
-}
-
 /// The bootloader's features that a product may go without.
 pub const OPTIONAL: [&str; 9] = [
     "emcy",
@@ -193,38 +236,17 @@ pub const OPTIONAL: [&str; 9] = [
 ];
 /// Those of them that a product usually has: this bootloader is the one that is measured against
 /// the budget.
-pub const STANDARD: &str = "standard";
-/// With a rescue window. Beside everything that is standard there is no room for it.
-const RESCUE: &str = "emcy,lss,raw-image,rescue-window";
-/// Bootloaders with words for whoever ports them, by the way that they take. The standard one and
-/// its words would not fit: these do without the dialects.
-pub const LOGS: [(&str, &str); 3] =
-    [("rtt", "emcy,lss,log-rtt"), ("defmt", "emcy,lss,log-defmt"), ("uart", "emcy,lss,log-uart")];
-/// The one with the debugger interface, for the tests: without programs that come in one piece and
-/// layer setting services, or it would not fit.
-pub const DEBUGGER: &str = "emcy,debugger";
-/// A bootloader that speaks CAN over the UART, without the dialects as there is no room for them.
-pub const VIRTUAL_CAN: &str = "emcy,lss,virtual-can";
-/// All of them.
-pub const COMPLETE: &str = "complete";
+const STANDARD: &str = "standard";
 
-/// Builds the bootloader of a board with some of [`OPTIONAL`], to look at.
+/// Builds a bootloader to look at; gives its ELF file.
 ///
 /// # Errors
 /// When it does not build.
-pub fn bootloader_with(board: &Layout, features: &[&str]) -> Outcome<PathBuf> {
-    let features = features.join(",");
+pub fn to_look_at(board: &Layout, features: &str, product: Option<&str>) -> Outcome<Vec<u8>> {
     let mut cargo = process::cargo("build");
-    process::run(cargo.arg("--quiet").args(firmware_args("bootloader", board, &features)))?;
-    Ok(workspace::target_dir().join("fw").join(TARGET).join(PROFILE).join("bootloader"))
-}
-
-/// One call of cargo: the package is also the name of its program.
-struct Build<'a> {
-    board: &'a Layout,
-    package: &'a str,
-    /// Besides the one that chooses the board.
-    features: &'a str,
+    cargo.arg("--quiet").args(firmware_args("bootloader", board, features));
+    process::run(with_product(&mut cargo, product))?;
+    pack::pack(&built("bootloader")?)
 }
 
 /// The arguments that make cargo work on a firmware package for a board; for `cargo clippy`, too.
@@ -252,25 +274,50 @@ pub fn tests_args(board: &Layout) -> Vec<String> {
     ["--package=coboot-tests", "--no-default-features", &features].map(str::to_owned).to_vec()
 }
 
-/// Builds an image and puts it, by its name there, into the board's folder.
-fn image(build: &Build<'_>, name: &str, region: Region) -> Outcome<PathBuf> {
-    let &Build { board, package, features } = build;
+/// Builds an image; gives its ELF file as the linker made it.
+fn build(board: &Layout, variant: &Variant) -> Outcome<Vec<u8>> {
+    let mut cargo = process::cargo("build");
+    cargo.args(firmware_args(variant.package, board, variant.features));
+    process::run(with_product(&mut cargo, variant.product))?;
+    built(variant.package)
+}
+
+/// Chooses a product for what cargo builds.
+fn with_product<'a>(cargo: &'a mut Command, product: Option<&str>) -> &'a mut Command {
+    if let Some(product) = product {
+        cargo.env("COBOOT_PRODUCT", product);
+    }
+    cargo
+}
+
+/// The ELF file that cargo built last of a package.
+fn built(package: &str) -> Outcome<Vec<u8>> {
+    let path = workspace::target_dir().join("fw").join(TARGET).join(PROFILE).join(package);
+    fs::read(&path)
+        .map_err(|error| format!("cargo built {package}, but {} cannot be read: {error}.", path.display()))
+}
+
+/// What is done after the link: a bootloader is packed.
+fn finished(variant: &Variant, built: Vec<u8>) -> Outcome<Vec<u8>> {
+    if variant.is_bootloader() {
+        pack::pack(&built).map_err(|problem| format!("{} cannot be packed: {problem}", variant.name))
+    } else {
+        Ok(built)
+    }
+}
+
+/// Puts an image, by its name there, into the board's folder, and prints its size.
+fn put(board: &Layout, variant: &Variant, file: Vec<u8>) -> Outcome {
     let dir = workspace::firmware_dir(board);
     fs::create_dir_all(&dir)
         .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&dir)))?;
-    let to = dir.join(name);
-    process::run(process::cargo("build").args(firmware_args(package, board, features)))?;
-    let built = workspace::target_dir().join("fw").join(TARGET).join(PROFILE).join(package);
-    let file = fs::read(&built).map_err(|error| {
-        format!("cargo built {package}, but {} cannot be read: {error}.", built.display())
-    })?;
+    let to = dir.join(format!("{}.elf", variant.name));
     // Left alone when nothing changed, so that whoever looks at the time sees no change.
     if fs::read(&to).ok().as_ref() != Some(&file) {
         fs::write(&to, &file)
             .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&to)))?;
     }
-    report(&to, region)?;
-    Ok(to)
+    report(&to, variant.region(board))
 }
 
 /// Prints the size of an image.
@@ -283,4 +330,31 @@ fn report(image: &Path, region: Region) -> Outcome {
     // Beside what cargo says: the standard output is the job's, which may be asked for JSON.
     eprintln!("  {:<52} {:>6} of {} bytes", workspace::shown(image), flash.used, region.size);
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use shared_abi::layout::{stm32f407g_disc1, stm32f407g_disc1_two};
+
+    use super::*;
+
+    #[test]
+    fn a_name_stands_for_one_image_and_an_unknown_one_lists_them() {
+        let (one, two) = (&stm32f407g_disc1::LAYOUT, &stm32f407g_disc1_two::LAYOUT);
+        for variant in VARIANTS {
+            let found = VARIANTS.iter().filter(|other| other.name == variant.name).count();
+            assert_eq!(found, 1, "{}", variant.name);
+        }
+        for name in MAIN {
+            assert!(Variant::by_name(one, name).is_ok(), "{name}");
+        }
+        let refused = Variant::by_name(one, "app-program-2").err().unwrap();
+        assert!(
+            refused.contains("has no image \"app-program-2\"") && refused.contains(", app-v1,"),
+            "{refused}"
+        );
+        let second = Variant::by_name(two, "app-program-2").ok().unwrap();
+        assert_eq!(second.region(two), two.programs[1]);
+        assert_eq!(Variant::by_name(two, "bootloader-lift").ok().unwrap().region(two), two.bootloader);
+    }
 }

@@ -1,13 +1,14 @@
 //! `cargo xtask emulate`: a board for other programs to talk to.
 
 use crate::args::Args;
+use crate::build::VARIANTS;
 use crate::setup::{Part, Setup};
 use crate::{build, process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask emulate [--board BOARD] [--log[=WAY] | --virtual-can] [--yes] [OPTIONS]
 
-Sets the machine up, builds the firmware and runs the emulated board with the bootloader in its flash.
+Sets the machine up, builds a bootloader and runs the emulated board with it in its flash.
 
   --board BOARD   the board (default: stm32f407g-disc1)
   --log[=WAY]     the bootloader that tells what it does, and what it tells. WAY: rtt (text for a debug
@@ -27,15 +28,18 @@ pub fn run(mut args: Args) -> Outcome {
     let log = log(&mut args)?;
     let virtual_can = args.flag("--virtual-can");
     let setup = Setup::from(&mut args);
-    setup.prepare(&[Part::Firmware, Part::Emulator])?;
-    let images = build::images(board)?;
-
     let options = args.rest();
+    let another = options.iter().any(|word| word == "--bootloader" || word.starts_with("--bootloader="));
+    let needed: &[Part] = if another { &[Part::Emulator] } else { &[Part::Firmware, Part::Emulator] };
+    setup.prepare(needed)?;
+
     let mut emulator = process::cargo("run");
     emulator.args(["--package", "emulator", "--bin", "emulate", "--", "--board", board.board]);
-    if !options.iter().any(|word| word == "--bootloader" || word.starts_with("--bootloader=")) {
-        let standard = if virtual_can { &images.virtual_can } else { &images.bootloader };
-        emulator.arg("--bootloader").arg(log.map_or(standard, |way| &images.logs[way]));
+    if !another {
+        let standard = if virtual_can { "bootloader-virtual-can" } else { "bootloader" };
+        let bootloader = log.unwrap_or(standard);
+        let dir = build::images(board, &[bootloader])?;
+        emulator.arg("--bootloader").arg(dir.join(format!("{bootloader}.elf")));
     }
     if virtual_can && !options.iter().any(|word| word == "--serial" || word.starts_with("--serial=")) {
         emulator.args(["--serial", "pty"]);
@@ -44,31 +48,35 @@ pub fn run(mut args: Args) -> Outcome {
     process::run(&mut emulator)
 }
 
-/// The bootloader that is asked for, as a place in [`build::LOGS`].
-fn log(args: &mut Args) -> Outcome<Option<usize>> {
-    if args.flag("--log") {
-        return Ok(Some(0));
-    }
-    let Some(wanted) = args.value("--log")? else { return Ok(None) };
-    let ways = build::LOGS.map(|(way, _)| way);
-    let found = ways.iter().position(|way| *way == wanted);
-    found.map(Some).ok_or_else(|| format!("--log={wanted} is no way; there are {}.", ways.join(", ")))
+/// What the names of the bootloaders begin with that tell what they do.
+const LOG: &str = "bootloader-log-";
+
+/// The name of the bootloader that is asked for by `--log`.
+fn log(args: &mut Args) -> Outcome<Option<&'static str>> {
+    let wanted = if args.flag("--log") { Some("rtt".to_owned()) } else { args.value("--log")? };
+    let Some(wanted) = wanted else { return Ok(None) };
+    let ways = || VARIANTS.iter().filter_map(|variant| Some((variant.name.strip_prefix(LOG)?, variant.name)));
+    let found = ways().find(|(way, _)| *way == wanted);
+    found.map(|(_, name)| Some(name)).ok_or_else(|| {
+        let ways: Vec<_> = ways().map(|(way, _)| way).collect();
+        format!("--log={wanted} is no way; there are {}.", ways.join(", "))
+    })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn asked(words: &str) -> Outcome<Option<usize>> {
+    fn asked(words: &str) -> Outcome<Option<&'static str>> {
         log(&mut Args::new(words.split_whitespace().map(str::to_owned)))
     }
 
     #[test]
     fn the_ways_of_the_log() {
         assert_eq!(asked(""), Ok(None));
-        assert_eq!(asked("--log --verbose"), Ok(Some(0)));
-        assert_eq!(asked("--log=uart").map(|way| build::LOGS[way.unwrap()].1), Ok("emcy,lss,log-uart"));
-        assert_eq!(asked("--log=defmt").map(|way| build::LOGS[way.unwrap()].1), Ok("emcy,lss,log-defmt"));
+        assert_eq!(asked("--log --verbose"), Ok(Some("bootloader-log-rtt")));
+        assert_eq!(asked("--log=uart"), Ok(Some("bootloader-log-uart")));
+        assert_eq!(asked("--log=defmt"), Ok(Some("bootloader-log-defmt")));
         assert!(asked("--log=smoke").unwrap_err().contains("rtt, defmt, uart"));
     }
 }

@@ -14,20 +14,6 @@ firmware of a board, and makes the documentation of the host crates, all with wa
   --yes           installs what is missing with sudo
 ";
 
-/// The firmware packages and the features that each is looked at with, besides the board's.
-const FIRMWARE: &[(&str, &str)] = &[
-    ("bsp", ""),
-    ("bootloader", ""),
-    ("bootloader", build::STANDARD),
-    ("bootloader", build::COMPLETE),
-    ("bootloader", build::DEBUGGER),
-    ("app-template", ""),
-    ("bootloader", build::VIRTUAL_CAN),
-    ("app-template", "version-2"),
-    ("app-template", "debugger"),
-    ("app-template", "virtual-can"),
-];
-
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let setup = Setup::from(&mut args);
@@ -45,9 +31,9 @@ pub fn run(mut args: Args) -> Outcome {
         problems.extend(process::run(&mut clippy).err());
     };
     clippy(&["--all-targets", "--keep-going"].map(str::to_owned));
-    let logs = build::LOGS.iter().map(|(_, features)| ("bootloader", *features));
-    for (package, features) in FIRMWARE.iter().copied().chain(logs) {
-        clippy(&build::firmware_args(package, board, features));
+    clippy(&build::firmware_args("bsp", board, ""));
+    for variant in build::Variant::of(board) {
+        clippy(&build::firmware_args(variant.package, board, variant.features));
     }
     let mut resident = build::firmware_args("bootloader", board, "standard,resident");
     resident.push("--bin=resident".to_owned());

@@ -1,8 +1,8 @@
 //! The jobs of the repository: `cargo xtask` lists them.
 //!
-//! One file per job. This crate depends on the standard library and on `shared-abi` alone, so that
-//! it compiles in seconds on a machine that has a Rust toolchain and nothing else; the jobs that
-//! need more call [`setup`] first.
+//! One file per job. This crate depends on the standard library, on `shared-abi` and on two small
+//! crates, so that it compiles in seconds on a machine that has a Rust toolchain and nothing else;
+//! the jobs that need more call [`setup`] first.
 #![forbid(unsafe_code)]
 
 use std::process::ExitCode;
@@ -24,6 +24,7 @@ mod json;
 mod layout;
 mod lint;
 mod new_board;
+mod pack;
 mod portable;
 mod powercut;
 mod process;

@@ -185,7 +185,7 @@ pub const LAYOUT: Layout = Layout {{
     chip: &{constant},
     // Step 1: the bootloader. 32 KiB are two sectors of 16 KiB on every chip of the family.
     bootloader: Region::new({}, 32 * 1024),
-    callgate_offset: 0x200,
+    callgate_offset: 0x40,
     // Step 2: the two homes of the parameters, a sector each.
     parameters: [Region::new({}, 16 * 1024), Region::new({}, 16 * 1024)],
     // Step 3: the programs, whole sectors each. One has all that is left.

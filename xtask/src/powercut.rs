@@ -25,13 +25,13 @@ pub fn run(mut args: Args) -> Outcome {
     let point = args.value("--reproduce")?;
     args.none_left()?;
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
-    let images = build::images(board)?;
+    let images = build::all(board)?;
     let mut powercut = process::cargo("run");
     powercut.args(build::tests_args(board)).args(["--bin", "powercut", "--"]);
     powercut.args(full.then_some("--full")).args(json.then_some("--json"));
     if let Some(point) = point {
         powercut.args(["--reproduce", &point]);
     }
-    powercut.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", &images.dir);
+    powercut.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", images);
     process::run(&mut powercut)
 }

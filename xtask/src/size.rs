@@ -9,15 +9,16 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
 use crate::args::Args;
-use crate::elf::Elf;
+use crate::elf::{Elf, Section};
 use crate::setup::{Part, Setup};
-use crate::{build, symbols, workspace, Outcome};
+use crate::{build, pack, symbols, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask size [--board BOARD] [--yes]
 
 Builds the bootloader, prints its flash by section, by crate and by optional feature, and fails when
-it is over the budget.
+it is over the budget. What runs from RAM lies in flash packed: sizes are told as they are unpacked (raw)
+and as the flash has them (packed). A share of what is packed is an estimate: as much of it as of the raw.
 
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -32,16 +33,18 @@ pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     args.none_left()?;
     setup.prepare(&[Part::Firmware])?;
-    let elf = read(&build::bootloader(board)?)?;
+    let dir = build::images(board, &["bootloader"])?;
+    let elf = read(&dir.join("bootloader.elf"))?;
     let flash = Flash::of(&elf, board.bootloader)?;
     print!("\n{}", flash.table());
     print!("\n{}", by_crate(&elf));
     print!("\n{}", by_feature(board)?);
     println!(
-        "\nbootloader: {} of {} bytes ({} of flash kept for it)",
+        "\nbootloader: {} of {} bytes ({} of flash kept for it); {} if nothing were packed",
         flash.used,
         BUDGET,
-        kib(board.bootloader.size)
+        kib(board.bootloader.size),
+        flash.raw()
     );
     flash.within(BUDGET)
 }
@@ -64,6 +67,30 @@ pub struct Flash {
     /// Bytes from the region's base to the last loaded one: what has to be written and what the CRC
     /// runs over, gaps included.
     pub used: u32,
+    /// What is packed, if anything is.
+    pub packed: Option<Packed>,
+}
+
+/// The part of an image that lies in flash packed (`pack.rs`).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Packed {
+    /// Bytes in flash.
+    pub stored: u32,
+    /// Bytes in RAM.
+    pub raw: u32,
+}
+
+impl Packed {
+    /// What is packed of an image.
+    fn of(elf: &Elf) -> Option<Self> {
+        let size_of = |name| Some(elf.sections.iter().find(|section| section.name == name)?.size);
+        Some(Self { stored: size_of(pack::PACKED)?, raw: size_of(pack::IMAGE)? })
+    }
+
+    /// The share of so many raw bytes.
+    fn share(self, raw: u32) -> u32 {
+        (u64::from(raw) * u64::from(self.stored)).div_ceil(u64::from(self.raw.max(1))) as u32
+    }
 }
 
 impl Flash {
@@ -74,6 +101,16 @@ impl Flash {
     pub fn of(elf: &Elf, region: Region) -> Outcome<Self> {
         let mut used = 0;
         for segment in elf.segments.iter().filter(|segment| segment.file_size > 0) {
+            let behind = segment.load_address.saturating_add(segment.file_size);
+            if region.contains(segment.load_address, 1) && behind > region.end() {
+                return Err(format!(
+                    "it needs {} bytes of flash{}, and has {}: {} too many.",
+                    behind - region.base,
+                    if Packed::of(elf).is_some() { ", packed" } else { "" },
+                    region.size,
+                    behind - region.end()
+                ));
+            }
             if !region.contains(segment.load_address, segment.file_size) {
                 return Err(format!(
                     "{} bytes are loaded at {:#010x}, outside the image's flash ({:#010x}, {}); \
@@ -95,7 +132,12 @@ impl Flash {
             .filter_map(|section| Some((section.name.clone(), elf.load_address(section)?, section.size)))
             .collect();
         sections.sort_by_key(|&(_, address, _)| address);
-        Ok(Self { sections, used })
+        Ok(Self { sections, used, packed: Packed::of(elf) })
+    }
+
+    /// Bytes as [`used`](Self::used), if nothing were packed.
+    pub fn raw(&self) -> u32 {
+        self.packed.map_or(self.used, |packed| self.used - packed.stored + packed.raw)
     }
 
     /// The gate.
@@ -113,59 +155,88 @@ impl Flash {
     }
 
     fn table(&self) -> String {
-        let mut text = String::from("section             flash at     bytes\n");
+        let mut text = String::from("section             flash at     bytes      raw\n");
         for (name, address, size) in &self.sections {
-            let _ = writeln!(text, "{name:<18}  {:04X}_{:04X}  {size:>7}", address >> 16, address & 0xFFFF);
+            let raw = self.packed.filter(|_| name == pack::PACKED).map_or(*size, |packed| packed.raw);
+            let (upper, lower) = (address >> 16, address & 0xFFFF);
+            let _ = writeln!(text, "{name:<18}  {upper:04X}_{lower:04X}  {size:>7}  {raw:>7}");
         }
         text
     }
 }
 
-/// What each optional feature costs on top of a bootloader without any, and what whole dialects
+/// What each optional feature costs on top of a bootloader without any, and what whole bootloaders
 /// take.
 fn by_feature(board: &Layout) -> Outcome<String> {
-    let used = |features: &[&str]| -> Outcome<u32> {
-        Ok(Flash::of(&read(&build::bootloader_with(board, features)?)?, board.bootloader)?.used)
+    let measure = |features: &str, product| -> Outcome<Flash> {
+        Flash::of(&Elf::parse(&build::to_look_at(board, features, product)?)?, board.bootloader)
     };
-    let bare = used(&[])?;
-    let mut text = String::from("feature                          bytes, on top of none\n");
+    let bare = measure("", None)?;
+    let mut text = String::from("feature                         packed     raw, on top of none\n");
+    let over = |with: u32, without: u32| i64::from(with) - i64::from(without);
     for feature in build::OPTIONAL {
-        let _ = writeln!(text, "{feature:<31} {:>6}", i64::from(used(&[feature])?) - i64::from(bare));
+        let with = measure(feature, None)?;
+        let (packed, raw) = (over(with.used, bare.used), over(with.raw(), bare.raw()));
+        let _ = writeln!(text, "{feature:<31} {packed:>6}  {raw:>6}");
     }
-    let _ = writeln!(text, "\nbootloader                       bytes\n{:<31} {bare:>6}", "without features");
-    for features in [build::STANDARD, build::COMPLETE, "profile-paulus", "profile-esacademy", "profile-lift"]
-    {
-        let _ = writeln!(text, "{features:<31} {:>6}", used(&[features])?);
+    let _ = writeln!(text, "\nbootloader                      packed     raw");
+    for variant in build::Variant::of(board).filter(|variant| variant.is_bootloader()) {
+        let flash = measure(variant.features, variant.product)?;
+        let _ = writeln!(text, "{:<31} {:>6}  {:>6}", variant.name, flash.used, flash.raw());
     }
     Ok(text)
 }
 
-/// Flash by crate, as the symbols tell. Code that was inlined counts for the crate it ended up in.
+/// Flash by crate, as the symbols tell: raw, and the share of what is packed. Code that was inlined
+/// counts for the crate it ended up in.
 fn by_crate(elf: &Elf) -> String {
+    /// Bytes that are in flash as they are, and bytes that are packed.
+    #[derive(Clone, Copy, Default)]
+    struct Bytes {
+        plain: u32,
+        packed: u32,
+    }
+    impl Bytes {
+        fn add(&mut self, size: u32, is_packed: bool) {
+            *(if is_packed { &mut self.packed } else { &mut self.plain }) += size;
+        }
+    }
+
+    let packed = Packed::of(elf);
+    let is_packed = |section: &Section| packed.is_some() && section.name == pack::IMAGE;
     let mut seen = HashSet::new();
-    let mut crates: BTreeMap<&str, u32> = BTreeMap::new();
-    let mut named = 0;
+    let mut crates: BTreeMap<&str, Bytes> = BTreeMap::new();
+    let mut named = Bytes::default();
     for symbol in &elf.symbols {
-        let loaded = elf.sections.get(symbol.section).is_some_and(|section| section.loaded);
+        let Some(section) = elf.sections.get(symbol.section).filter(|section| section.loaded) else {
+            continue;
+        };
         // Aliases (the default handlers are many names of one function) count once.
-        if loaded && symbol.size > 0 && seen.insert(symbol.address & !1) {
+        if symbol.size > 0 && seen.insert(symbol.address & !1) {
             let name = match symbols::crate_of(&symbol.name) {
                 Some(name) => name,
                 // Tasks, handlers and memcpy carry plain names; the large ones are worth a row.
                 None if symbol.size >= 64 => &symbol.name,
                 None => "(small symbols)",
             };
-            *crates.entry(name).or_default() += symbol.size;
-            named += symbol.size;
+            crates.entry(name).or_default().add(symbol.size, is_packed(section));
+            named.add(symbol.size, is_packed(section));
         }
     }
-    let all: u32 = elf.sections.iter().filter(|section| section.loaded).map(|section| section.size).sum();
-    let mut rows: Vec<_> = crates.into_iter().collect();
-    rows.push(("(no symbol)", all.saturating_sub(named)));
-    rows.sort_by_key(|&(_, size)| cmp::Reverse(size));
-    let mut text = String::from("crate, or plain symbol           bytes\n");
-    for (name, size) in rows {
-        let _ = writeln!(text, "{name:<31} {size:>6}");
+    let mut all = Bytes::default();
+    for section in elf.sections.iter().filter(|section| section.loaded && section.name != pack::PACKED) {
+        all.add(section.size, is_packed(section));
+    }
+    let unnamed = Bytes {
+        plain: all.plain.saturating_sub(named.plain),
+        packed: all.packed.saturating_sub(named.packed),
+    };
+    let mut rows: Vec<_> = crates.into_iter().chain([("(no symbol)", unnamed), ("(all)", all)]).collect();
+    rows.sort_by_key(|(_, Bytes { plain, packed })| cmp::Reverse(plain + packed));
+    let mut text = String::from("crate, or plain symbol             raw  packed (share)\n");
+    for (name, Bytes { plain, packed: raw }) in rows {
+        let share = plain + packed.map_or(0, |packed| packed.share(raw));
+        let _ = writeln!(text, "{name:<31} {:>6}  {share:>6}", plain + raw);
     }
     text
 }
@@ -205,7 +276,7 @@ mod tests {
 
     #[test]
     fn the_budget_itself_is_allowed_and_one_more_is_not() {
-        let flash = |used| Flash { sections: Vec::new(), used };
+        let flash = |used| Flash { sections: Vec::new(), used, packed: None };
         assert_eq!(flash(BUDGET).within(BUDGET), Ok(()));
         assert!(flash(BUDGET + 1).within(BUDGET).unwrap_err().contains("1 bytes over"));
     }
@@ -213,9 +284,11 @@ mod tests {
     #[test]
     fn an_image_outside_its_region_is_refused() {
         let elf = Elf::parse(&by_hand()).unwrap();
-        for region in [Region::new(0x0801_0000, 0x1000), Region::new(0x0800_0000, 0x27)] {
-            assert!(Flash::of(&elf, region).unwrap_err().contains("outside"));
-        }
+        let elsewhere = Region::new(0x0801_0000, 0x1000);
+        assert!(Flash::of(&elf, elsewhere).unwrap_err().contains("outside"));
+        let small = Region::new(0x0800_0000, 0x27);
+        let problem = Flash::of(&elf, small).unwrap_err();
+        assert_eq!(problem, "it needs 40 bytes of flash, and has 39: 1 too many.");
         let mut empty = elf;
         empty.segments.clear();
         assert!(Flash::of(&empty, REGION).unwrap_err().contains("nothing"));
@@ -229,9 +302,32 @@ mod tests {
         elf.symbols[1].name = "alias".into();
         let table = by_crate(&elf);
         // 0x20 + 8 bytes are loaded, 0x10 of them are `start`, counted once.
-        assert!(table.contains("(no symbol)                         24\n"), "{table}");
-        assert!(table.contains("(small symbols)                     16\n"), "{table}");
+        assert!(table.contains("(no symbol)                         24      24\n"), "{table}");
+        assert!(table.contains("(small symbols)                     16      16\n"), "{table}");
+        assert!(table.contains("(all)                               40      40\n"), "{table}");
         elf.symbols[0].size = 64;
-        assert!(by_crate(&elf).contains("start                               64\n"), "{table}");
+        assert!(by_crate(&elf).contains("start                               64      64\n"), "{table}");
+    }
+
+    /// Of 40 bytes in RAM 10 are in flash: a quarter of each part, rounded up.
+    #[test]
+    fn what_is_packed_counts_by_its_share() {
+        let packed = Packed { stored: 10, raw: 40 };
+        assert_eq!((packed.share(40), packed.share(8), packed.share(9), packed.share(0)), (10, 2, 3, 0));
+        let flash = Flash { sections: Vec::new(), used: 100, packed: Some(packed) };
+        assert_eq!(flash.raw(), 130);
+
+        let mut elf = Elf::parse(&by_hand()).unwrap();
+        // `.data` of 8 bytes, which the first symbol is moved into.
+        elf.symbols[0].section = 2;
+        elf.symbols[0].size = 6;
+        let mut stored = elf.sections[1].clone();
+        (stored.name, stored.size) = (pack::PACKED.into(), 4);
+        elf.sections.push(stored);
+        let table = by_crate(&elf);
+        assert!(table.contains("(small symbols)                      6       3\n"), "{table}");
+        // The other two of `.data`, and all of `.vectors`.
+        assert!(table.contains("(no symbol)                         34      33\n"), "{table}");
+        assert!(table.contains("(all)                               40      36\n"), "{table}");
     }
 }

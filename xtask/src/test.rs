@@ -32,11 +32,11 @@ pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let setup = Setup::from(&mut args);
     setup.prepare(&[Part::Firmware, Part::C, Part::Emulator, Part::Python])?;
-    build::images(board)?;
+    build::all(board)?;
     build::c_applications(board)?;
     // And one board with room for two programs, for the tests of that.
     for two in BOARDS.iter().filter(|other| other.programs.len() > 1 && other.board != board.board) {
-        build::images(two)?;
+        build::all(two)?;
         build::c_applications(two)?;
     }
     process::run(process::cargo("build").current_dir(workspace::root()).args(["--package", "coflash"]))?;
@@ -56,7 +56,7 @@ pub fn run(mut args: Args) -> Outcome {
             ["--package=boot-core", "--features=crc-16,crc-table", "--test=download", "--test=streams"];
         suite.run(board, &other_crc.map(String::from))?;
         for other in BOARDS.iter().filter(|other| other.chip.chip != board.chip.chip) {
-            build::images(other)?;
+            build::all(other)?;
             build::c_applications(other)?;
             println!("\n-- {} --", other.board);
             let tests = MAIN_TESTS.iter().map(|test| format!("--test={test}"));

@@ -30,7 +30,7 @@ pub const ONE_PROGRAM: Layout = Layout {
     board: "model",
     chip: &CHIP,
     bootloader: Region::new(0x0800_0000, 0x400),
-    callgate_offset: 0x200,
+    callgate_offset: 0x40,
     parameters: [Region::new(0x0800_0400, 0x200), Region::new(0x0800_0600, 0x200)],
     programs: &[Region::new(0x0800_0800, 0x3C00)],
     ram: Region::new(0x2000_0000, 0x1_FFC0),

@@ -17,7 +17,7 @@ use shared_abi::callgate::{
 };
 use shared_abi::geometry::Region;
 
-use crate::caches::CachesOff;
+use crate::caches::Caches;
 use crate::flash::FlashController;
 use crate::product::{self, NO_NODE_ID};
 
@@ -136,7 +136,7 @@ fn store(flash: &mut FlashController, key: Key, value: Value) -> Result<(), Stat
     // They would show words as they were before they were programmed.
     // SAFETY: the application calls one service at a time and does not use the flash controller
     // meanwhile.
-    let _caches = unsafe { CachesOff::new() };
+    let _caches = unsafe { Caches::off() };
     let mut parameters = product::parameters(flash);
     parameters.store(key, value);
     loop {

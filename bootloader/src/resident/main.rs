@@ -6,7 +6,9 @@
 //! | `main.rs` | the header at the layout's fixed address | no |
 //! | `stage.rs` | from the reset to the jump, or to the rest of the bootloader | jump, handoff |
 //! | `callgate.rs` | services for the application | its ABI |
-//! | `caches.rs` | the caches of the flash, off for a while | registers |
+//! | `ram_image.rs` | the rest of the bootloader, checked and unpacked to RAM | memory |
+//! | `unpack.rs` | the unpacker of ZX0 | assembly |
+//! | `caches.rs` | the caches of the flash, off or on for a while | registers |
 //!
 //! It is a program of its own, so that the linker can see that it has no variables: nothing but the
 //! stack and its own code is there when it runs. `linker/build.rs` builds it, and the bootloader
@@ -22,17 +24,20 @@ mod flash;
 mod memory;
 #[path = "../product.rs"]
 mod product;
+mod ram_image;
 mod stage;
+mod unpack;
 
 use shared_abi::callgate::{Entry, Table, ABI_VERSION, MAGIC, TABLE_SIZE};
 use shared_abi::warm_start::BootRequest;
 
-/// What lies at the callgate's address: its table, and behind it the way in for the bootloader's
-/// own start-up.
+/// What lies at the callgate's address: its table, and behind it the ways in for the bootloader's
+/// own start-up (`start.rs`).
 #[repr(C)]
 struct Header {
     callgate: Table<Entry>,
-    stage: extern "C" fn() -> u32,
+    stage: unsafe extern "C" fn(*const shared_abi::ram_image::Header) -> u32,
+    fault: extern "C" fn() -> !,
 }
 
 #[no_mangle]
@@ -46,12 +51,17 @@ static HEADER: Header = Header {
         entry: callgate::entry,
     },
     stage: stage::stage,
+    fault,
 };
 const _: () = assert!(size_of::<Table<Entry>>() == TABLE_SIZE as usize);
 
-/// There is nobody to tell but the bootloader after the reset.
-#[panic_handler]
-fn panic(_: &core::panic::PanicInfo<'_>) -> ! {
+/// A fault before the RAM image runs. There is nobody to tell but the bootloader after the reset.
+extern "C" fn fault() -> ! {
     product::warm_start_cell().put(BootRequest::Fault);
     cortex_m::peripheral::SCB::sys_reset()
+}
+
+#[panic_handler]
+fn panic(_: &core::panic::PanicInfo<'_>) -> ! {
+    fault()
 }

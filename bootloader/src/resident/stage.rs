@@ -7,70 +7,104 @@ use boot_core::canopen::NodeId;
 use boot_core::decision::{decide, BootDecision, Circumstances, StayReason};
 use boot_core::parameters::{Key, Parameters as _};
 use boot_core::program::verify;
-use bsp::clock::Source;
+use bsp::clock::{Source, HSI};
 use bsp::{pac, CLOCK_TREE, LAYOUT};
+use cortex_m::peripheral::SCB;
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
+use shared_abi::ram_image::Header;
 use shared_abi::warm_start::BootRequest;
 
+use crate::caches::Caches;
 use crate::flash::FlashController;
 use crate::product::{self, NO_NODE_ID, POLICY, PROGRAM_WATCHDOG_MS, RESCUE_WINDOW_MS};
+use crate::ram_image;
 
-/// Decides. Does not come back if a program is to run; else tells why the bootloader stays
+/// About how long the warm-start cell can be read in peace between two resets where nothing can run.
+const RESET_PERIOD_MS: u32 = 100;
+
+/// Decides. Comes back if the bootloader stays, with the rest of it in RAM; tells why it stays
 /// ([`StayReason::code`]), in the next byte which program waits for the end of the rescue window,
 /// and in the one behind that which is to be cleared.
-pub extern "C" fn stage() -> u32 {
+///
+/// A RAM image that is damaged does not run: it is told in the warm-start cell, and a program starts
+/// that would start by itself. Without one the chip is reset again and again.
+///
+/// # Safety
+/// `image` must be the address of the RAM image's header, and nothing else may run yet.
+pub unsafe extern "C" fn stage(image: *const Header) -> u32 {
     // SAFETY: nothing else runs yet; the rest of the bootloader takes them after this has returned.
     let (rcc, iwdg) = unsafe { (pac::RCC::steal(), pac::IWDG::steal()) };
 
     let reset_cause = ResetCause::from_rcc_csr(rcc.csr().read().bits());
     rcc.csr().modify(|_, w| w.rmvf().set_bit());
 
-    let request = product::warm_start_cell().take();
+    let mut cell = product::warm_start_cell();
+    let request = cell.take();
     let strap = bsp::entry_strap(&rcc);
 
-    // A CRC over a whole program wants speed. Exact it need not be, and the crystal would take its
-    // time.
+    // CRCs and unpacking want speed. Exact it need not be, and the crystal would take its time.
     CLOCK_TREE.speed_up(&rcc, Source::Internal);
     // SAFETY: as above.
     let mut flash = unsafe { FlashController::steal(Some(&rcc)) };
     let mut parameters = product::parameters(&flash);
     let crash_resets = count_crash_resets(&mut parameters, &mut flash, reset_cause, request);
+    // SAFETY: as above; nothing is programmed from here on.
+    let caches = unsafe { Caches::on() };
 
     let node = product::node_parameters(&parameters, &flash);
     let node_id = node.id.map_or(NO_NODE_ID, NodeId::get);
-    let circumstances = Circumstances { request, strap, crash_resets, node_id };
-    let decision = decide(&circumstances, &POLICY, |number| verify(&flash, &parameters, LAYOUT, number));
-    // Whoever runs next finds the chip as after a reset.
-    CLOCK_TREE.slow_down(&rcc);
-    flash.release(&rcc);
-    match decision {
+    let choose = |circumstances: &Circumstances| {
+        decide(circumstances, &POLICY, |number| verify(&flash, &parameters, LAYOUT, number))
+    };
+    let mut decision = choose(&Circumstances { request, strap, crash_resets, node_id });
+    let mut stay = match &decision {
         BootDecision::Stay(reason) => {
             let clear = if let Some(BootRequest::Clear(program)) = request { program } else { 0 };
-            u32::from(reason.code()) | u32::from(clear) << 16
+            Some(u32::from(reason.code()) | u32::from(clear) << 16)
         }
         BootDecision::Start { program, .. } if RESCUE_WINDOW_MS.is_some() && request.is_none() => {
-            u32::from(StayReason::Rescue.code()) | u32::from(program.number()) << 8
+            Some(u32::from(StayReason::Rescue.code()) | u32::from(program.number()) << 8)
         }
-        BootDecision::Start { program, trial } => {
-            let handoff = Handoff::new(&BootInfo {
-                node_id,
-                bit_rate: node.bit_rate.or_zero(),
-                program: program.number(),
-                reset_cause,
-                trial,
-                bootloader_version: product::VERSION,
-                serial_number: bsp::serial_number(),
-            });
-            if let Some(ms) = PROGRAM_WATCHDOG_MS {
-                bsp::watchdog::start(&iwdg, ms);
-            }
-            // SAFETY: the layout's handoff region, checked to be RAM of that size in no image. No
-            // interrupt was enabled and no bus master started since the reset.
-            unsafe {
-                handoff.write(LAYOUT.handoff.base as *mut Handoff);
-                program.vectors().jump()
-            }
+        BootDecision::Start { .. } => None,
+    };
+    if stay.is_some() {
+        // SAFETY: the caller vouches for the address; of the RAM nothing is in use but the stack.
+        if let Err(damage) = unsafe { ram_image::load(image, &flash) } {
+            cell.put(BootRequest::Damaged(damage));
+            stay = None;
+            decision = choose(&Circumstances { request: None, strap: false, crash_resets: 0, node_id });
         }
+    }
+    // Whoever runs next finds the chip as after a reset, but the bootloader finds it fast: it clears
+    // its memory first of all.
+    drop(caches);
+    flash.release(&rcc);
+    if let Some(reason) = stay {
+        return reason;
+    }
+    CLOCK_TREE.slow_down(&rcc);
+    let BootDecision::Start { program, trial } = decision else {
+        // A round of the loop takes three cycles.
+        cortex_m::asm::delay(HSI / 1000 * RESET_PERIOD_MS / 3);
+        SCB::sys_reset()
+    };
+    let handoff = Handoff::new(&BootInfo {
+        node_id,
+        bit_rate: node.bit_rate.or_zero(),
+        program: program.number(),
+        reset_cause,
+        trial,
+        bootloader_version: product::VERSION,
+        serial_number: bsp::serial_number(),
+    });
+    if let Some(ms) = PROGRAM_WATCHDOG_MS {
+        bsp::watchdog::start(&iwdg, ms);
+    }
+    // SAFETY: the layout's handoff region, checked to be RAM of that size in no image. No interrupt
+    // was enabled and no bus master started since the reset.
+    unsafe {
+        handoff.write(LAYOUT.handoff.base as *mut Handoff);
+        program.vectors().jump()
     }
 }
 

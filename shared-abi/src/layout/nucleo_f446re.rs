@@ -8,7 +8,7 @@ pub const LAYOUT: Layout = Layout {
     board: "nucleo-f446re",
     chip: &STM32F446RE,
     bootloader: Region::new(0x0800_0000, 32 * 1024),
-    callgate_offset: 0x200,
+    callgate_offset: 0x40,
     parameters: [Region::new(0x0800_8000, 16 * 1024), Region::new(0x0800_C000, 16 * 1024)],
     programs: &[Region::new(0x0801_0000, 448 * 1024)],
     ram: Region::new(0x2000_0000, 128 * 1024 - 64),

@@ -15,7 +15,7 @@ pub const LAYOUT: Layout = Layout {
     board: "stm32f429i-disc1",
     chip: &STM32F429ZI,
     bootloader: Region::new(0x0800_0000, 32 * 1024),
-    callgate_offset: 0x200,
+    callgate_offset: 0x40,
     parameters: [Region::new(0x0800_8000, 16 * 1024), Region::new(0x0800_C000, 16 * 1024)],
     programs: &[Region::new(0x0801_0000, (2048 - 64) * 1024)],
     ram: Region::new(0x2000_0000, 192 * 1024 - 64),

@@ -1,0 +1,49 @@
+//! The rest of the bootloader: from its place in flash to RAM, if it is whole.
+
+use core::slice;
+
+use boot_core::flash::Flash;
+use bsp::LAYOUT;
+use shared_abi::geometry::Region;
+use shared_abi::ram_image::{Damage, Header, Method, LEAST_STACK};
+
+use crate::flash::FlashController;
+use crate::unpack::unpack;
+
+/// Checks the image and unpacks it to the start of the RAM.
+///
+/// # Errors
+/// What is damaged; the RAM may hold a part of the image then.
+///
+/// # Safety
+/// `header` must be the address of the image's header in the bootloader's flash, aligned. Nobody
+/// may use the RAM but for the last [`LEAST_STACK`] bytes of it.
+pub unsafe fn load(header: *const Header, flash: &FlashController) -> Result<(), Damage> {
+    let at = header as u32;
+    // SAFETY: the caller vouches for it; any bits make a `Header`.
+    let header = unsafe { &*header };
+    let data = at + Header::SIZE;
+    let method = header.check(LAYOUT.bootloader.end() - data, LAYOUT.ram.size - LEAST_STACK)?;
+    if header.has_crc() {
+        let checked = Region::new(at + Header::CRC_FROM, Header::SIZE - Header::CRC_FROM + header.stored);
+        if flash.crc32(0, checked) != header.crc {
+            return Err(Damage::Crc);
+        }
+    }
+    // SAFETY: `check` has found the stored bytes to end with the bootloader's flash at the latest,
+    // and nothing writes to it meanwhile.
+    let stored = unsafe { slice::from_raw_parts(data as *const u8, header.stored as usize) };
+    // SAFETY: `check` has found this to be RAM, and the caller vouches that nobody else uses it.
+    let ram = unsafe { slice::from_raw_parts_mut(LAYOUT.ram.base as *mut u8, header.unpacked as usize) };
+    match method {
+        // `check` has found them to be of one length, which the compiler does not know.
+        Method::Raw => {
+            for (to, from) in ram.iter_mut().zip(stored) {
+                *to = *from;
+            }
+        }
+        Method::Zx0 if !unpack(stored, ram) => return Err(Damage::Stream),
+        Method::Zx0 => {}
+    }
+    Ok(())
+}

@@ -1,0 +1,495 @@
+//! The bootloader's image: what the linker made and what was packed are one, every loader puts it
+//! where it belongs, and one that is damaged in flash does not run.
+
+#[path = "image/gdb.rs"]
+mod gdb;
+
+use canopen::program::ProgramControl;
+use canopen::Address;
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::firmware;
+use coflash::flash::{flash, FlashOptions};
+use crc::{Crc, CRC_32_ISO_HDLC};
+use emulator::machine::{ResetCause, Stop};
+use emulator::time::Span;
+use object::elf::{FileHeader32, PT_LOAD};
+use object::read::elf::{ElfFile32, FileHeader, ProgramHeader};
+use object::{Endianness, Object, ObjectSection};
+use shared_abi::geometry::Region;
+
+/// Bytes of the header (shared_abi::ram_image, typed again).
+const HEADER: usize = 24;
+
+/// A section of an ELF file: its address, and what it holds.
+fn section(elf: &[u8], name: &str) -> (u32, Vec<u8>) {
+    let file = ElfFile32::<Endianness>::parse(elf).unwrap();
+    let section = file.section_by_name(name).unwrap_or_else(|| panic!("no section {name}"));
+    (section.address() as u32, section.data().unwrap().to_vec())
+}
+
+fn words(bytes: &[u8]) -> Vec<u32> {
+    bytes.chunks_exact(4).map(|word| u32::from_le_bytes(word.try_into().unwrap())).collect()
+}
+
+fn crc32(bytes: &[u8]) -> u32 {
+    Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(bytes)
+}
+
+/// A bootloader as it lies in flash, and where what is in it.
+struct Packed {
+    /// From the start of the flash on.
+    flash: Vec<u8>,
+    /// Offset of the header of the RAM image.
+    header: usize,
+    /// What it unpacks to.
+    ram: Vec<u8>,
+}
+
+impl Packed {
+    fn of(image: &str) -> Self {
+        let elf = firmware::elf(image);
+        let base = firmware::board().bootloader.base;
+        let mut flash = Vec::new();
+        for name in [".vector_table", ".callgate", ".boot", ".ram_image", ".ram_image.packed"] {
+            let (address, data) = section(&elf, name);
+            let at = (address - base) as usize;
+            assert!(at >= flash.len(), "{name} overlaps the section before");
+            flash.resize(at, 0xFF);
+            flash.extend(data);
+        }
+        let header = (section(&elf, ".ram_image").0 - base) as usize;
+        Self { flash, header, ram: section(&elf, ".data").1 }
+    }
+
+    /// The stored bytes.
+    fn stored(&mut self) -> &mut [u8] {
+        &mut self.flash[self.header + HEADER..]
+    }
+
+    /// A word of the header.
+    fn set(&mut self, word: usize, value: u32) {
+        let at = self.header + word * 4;
+        self.flash[at..at + 4].copy_from_slice(&value.to_le_bytes());
+    }
+
+    fn get(&self, word: usize) -> u32 {
+        words(&self.flash[self.header..self.header + HEADER])[word]
+    }
+
+    /// Makes the CRC right.
+    fn seal(&mut self) {
+        let crc = crc32(&self.flash[self.header + 8..]);
+        self.set(1, crc);
+    }
+}
+
+/// The words of the header by number.
+const MAGIC: usize = 0;
+const CRC: usize = 1;
+const SERVICES: usize = 2;
+const METHOD: usize = 3;
+const STORED: usize = 4;
+const UNPACKED: usize = 5;
+
+#[test]
+fn what_is_packed_is_what_was_linked() {
+    for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_MINIMAL] {
+        let mut packed = Packed::of(image);
+        let (stored, ram) = (packed.stored().to_vec(), packed.ram.len());
+        assert_eq!(packed.get(MAGIC), u32::from_le_bytes(*b"CBI1"));
+        assert_eq!([packed.get(SERVICES), packed.get(METHOD)], [1, 1]);
+        assert_eq!([packed.get(STORED), packed.get(UNPACKED)], [stored.len() as u32, ram as u32]);
+        assert_eq!(packed.get(CRC), crc32(&packed.flash[packed.header + 8..]));
+        // By somebody else's unpacker.
+        assert!(zx0decompress::decompress(&mut stored.as_slice()).unwrap() == packed.ram, "{image}");
+        assert!(stored.len() * 100 < ram * 85, "{image}: {} of {ram} bytes", stored.len());
+    }
+}
+
+/// In flash there are the 16 vectors of the core; the RAM image begins with all of them.
+#[test]
+fn vectors() {
+    let board = firmware::board();
+    let packed = Packed::of(firmware::BOOTLOADER);
+    let in_flash = words(&packed.flash[..64]);
+    assert_eq!(packed.flash[64..68], *b"CBCG", "the callgate is behind them");
+    assert_eq!(in_flash[0], board.ram.end());
+    for vector in &in_flash[1..] {
+        assert!(vector & 1 == 1 && board.bootloader.contains(vector & !1, 2), "{vector:#x}");
+    }
+    let in_ram = words(&packed.ram[..board.chip.vector_table_size() as usize]);
+    assert_eq!(in_ram[..2], in_flash[..2]);
+    // Of the handlers none is in flash, which may be busy. Some interrupts have none.
+    let handlers: Vec<_> = in_ram[2..].iter().filter(|vector| **vector != 0).collect();
+    assert!(handlers.iter().all(|vector| board.ram.contains(**vector & !1, 2)), "{in_ram:x?}");
+    assert!(handlers.len() > 80);
+    let (address, _) = section(&firmware::elf(firmware::BOOTLOADER), ".data");
+    assert_eq!(address, board.ram.base);
+}
+
+/// By the rule of probe-rs: segments with contents, at their physical address, where a section lies
+/// in them.
+#[test]
+fn probe_rs_loads_it() {
+    let elf = firmware::elf(firmware::BOOTLOADER);
+    let file = ElfFile32::<Endianness>::parse(&*elf).unwrap();
+    let header = FileHeader32::<Endianness>::parse(&*elf).unwrap();
+    let endian = Endianness::Little;
+    let base = firmware::board().bootloader.base;
+    let mut flash = vec![0xFF; firmware::board().bootloader.size as usize];
+    for segment in header.program_headers(endian, &*elf).unwrap() {
+        let range = u64::from(segment.p_offset(endian))..;
+        let end = range.start + u64::from(segment.p_filesz(endian));
+        let holds_a_section = file.sections().any(|section| {
+            section.file_range().is_some_and(|(at, size)| at >= range.start && at + size <= end && size > 0)
+        });
+        if segment.p_type(endian) == PT_LOAD && segment.p_filesz(endian) > 0 && holds_a_section {
+            let at = (segment.p_paddr(endian) - base) as usize;
+            let data = segment.data(endian, &*elf).unwrap();
+            flash[at..at + data.len()].copy_from_slice(data);
+        }
+    }
+    let packed = Packed::of(firmware::BOOTLOADER).flash;
+    assert!(flash[..packed.len()] == packed);
+    assert!(flash[packed.len()..].iter().all(|byte| *byte == 0xFF));
+}
+
+/// gdb itself, on a stub that has nothing but memory.
+#[test]
+fn gdb_loads_it_and_finds_symbols_in_ram() {
+    let board = firmware::board();
+    let commands = [
+        "load",
+        // Reads back what it wrote, section by section.
+        "compare-sections",
+        "info address main",
+        "info line bootloader::app::idle",
+    ];
+    let run = gdb::run(&firmware::dir().join(firmware::BOOTLOADER), &commands);
+    let said = &run.said;
+    let packed = Packed::of(firmware::BOOTLOADER).flash;
+    let flash = run.memory(board.bootloader.base, packed.len());
+    assert!(flash == packed, "gdb wrote something else:\n{said}");
+    let beyond = Region::new(board.bootloader.base, packed.len() as u32);
+    let flash = board.chip.flash;
+    assert!(run.written().all(|address| beyond.contains(address, 1) || !flash.contains(address, 1)));
+    assert!(said.contains(".ram_image.packed") && !said.contains("MIS-MATCHED"), "{said}");
+    let main = said.split_once("Symbol \"main\" is at 0x").unwrap_or_else(|| panic!("{said}")).1;
+    let main = u32::from_str_radix(&main[..8], 16).unwrap();
+    assert!(board.ram.contains(main, 2), "{main:#x}");
+    assert!(said.contains("of \"bootloader/src/main.rs\" starts at address 0x2"), "{said}");
+}
+
+// --- on the emulated board
+// -------------------------------------------------------------------------------------------------
+
+/// A board with version 1 of the application, switched off.
+fn board_with_a_program() -> Bench {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
+        .unwrap();
+    bench.power_off();
+    bench
+}
+
+fn load(bench: &mut Bench, image: &[u8]) {
+    bench.machine().load_bin(firmware::board().bootloader.base, image).unwrap();
+}
+
+/// The warm-start cell as a debugger reads it: request and argument, if it is one.
+fn cell(bench: &Bench) -> Option<(u32, u32)> {
+    let mut bytes = [0; 16];
+    bench.world.machine(bench.device).read_memory(firmware::board().warm_start.base, &mut bytes).unwrap();
+    let [magic, request, argument, check] = words(&bytes)[..] else { unreachable!("16 bytes") };
+    // The fold of the ABI, written again.
+    let fold = |fold: u32, word: &u32| (fold.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B1);
+    let sound = check == !words(&bytes)[..3].iter().fold(0xC0B0_07A5, fold);
+    (magic == u32::from_le_bytes(*b"CBW1") && sound).then_some((request, argument))
+}
+
+/// The request that tells of a damaged image, and its arguments.
+const DAMAGED: u32 = 8;
+const BY_HEADER: u32 = 1;
+const BY_SERVICES: u32 = 2;
+const BY_CRC: u32 = 3;
+const BY_STREAM: u32 = 4;
+
+/// Ways to damage an image, and what the boot stage says of it.
+fn damages() -> Vec<(&'static str, Packed, u32)> {
+    let damaged = |change: &dyn Fn(&mut Packed)| {
+        let mut image = Packed::of(firmware::BOOTLOADER);
+        change(&mut image);
+        image
+    };
+    let ram = firmware::board().ram.size;
+    vec![
+        ("a bit of the magic", damaged(&|image| image.flash[image.header] ^= 1), BY_HEADER),
+        ("an erased header", damaged(&|image| (0..6).for_each(|word| image.set(word, !0))), BY_HEADER),
+        ("an unknown method", damaged(&|image| image.set(METHOD, 3)), BY_HEADER),
+        ("more bytes than flash", damaged(&|image| image.set(STORED, 0x8000)), BY_HEADER),
+        ("as many as there can be", damaged(&|image| image.set(STORED, !0)), BY_HEADER),
+        ("more bytes than RAM", damaged(&|image| image.set(UNPACKED, ram - 4092)), BY_HEADER),
+        ("packed told as raw", damaged(&|image| image.set(METHOD, 0)), BY_HEADER),
+        ("other services", damaged(&|image| image.set(SERVICES, 2)), BY_SERVICES),
+        ("a bit of the CRC", damaged(&|image| image.flash[image.header + 5] ^= 0x10), BY_CRC),
+        ("no CRC", damaged(&|image| image.set(CRC, 0)), BY_CRC),
+        ("one byte less", damaged(&|image| image.set(STORED, image.get(STORED) - 1)), BY_CRC),
+        ("a word more in RAM", damaged(&|image| image.set(UNPACKED, image.get(UNPACKED) + 4)), BY_CRC),
+        ("the first bit", damaged(&|image| image.stored()[0] ^= 0x80), BY_CRC),
+        (
+            "the last bit",
+            damaged(&|image| {
+                let stored = image.stored();
+                stored[stored.len() - 1] ^= 1;
+            }),
+            BY_CRC,
+        ),
+        (
+            "a right CRC over another size",
+            damaged(&|image| {
+                image.set(UNPACKED, image.get(UNPACKED) - 4);
+                image.seal();
+            }),
+            BY_STREAM,
+        ),
+        (
+            "a right CRC over a stream without its end",
+            damaged(&|image| {
+                let len = image.flash.len();
+                image.flash.truncate(len - 8);
+                image.set(STORED, image.get(STORED) - 8);
+                image.seal();
+                image.flash.resize(len, 0xFF);
+            }),
+            BY_STREAM,
+        ),
+    ]
+}
+
+/// With a program the device goes on as an application: it runs, the callgate serves it, and who
+/// calls the bootloader gets the application back.
+#[test]
+fn a_damaged_image_does_not_run_and_the_program_does() {
+    let mut bench = board_with_a_program();
+    for (what, image, damage) in damages() {
+        load(&mut bench, &image.flash);
+        bench.power_on();
+        bench.await_boot_up(1000);
+        assert!(!bench.is_bootloader(NODE), "{what}: the start of a program needs nothing of the image");
+        assert_eq!(cell(&bench), None, "{what}");
+        bench.events();
+        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+        bench.await_boot_up(1000);
+        assert_eq!(bench.events().len(), 1, "{what}: one reset");
+        assert!(!bench.is_bootloader(NODE), "{what}");
+        assert_eq!(cell(&bench), Some((DAMAGED, damage)), "{what}");
+        // The application reads it through the callgate.
+        let crc = bench.session().read_number(Address::new(0x1F56, 1)).unwrap();
+        assert_eq!(crc, firmware::blocks(firmware::APP_V1).program_crc(), "{what}");
+        // And it starts as ever, with the cell used up.
+        bench.machine().reset_pin();
+        bench.await_boot_up(1000);
+        assert!(!bench.is_bootloader(NODE), "{what}");
+        assert_eq!(cell(&bench), None, "{what}");
+        bench.power_off();
+    }
+    // The image itself, for comparison.
+    load(&mut bench, &Packed::of(firmware::BOOTLOADER).flash);
+    bench.power_on();
+    bench.await_boot_up(1000);
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up(1000);
+    assert!(bench.is_bootloader(NODE));
+    assert_eq!(cell(&bench), None);
+}
+
+/// An application that crashes is started again, and the flash is left alone: there is no bootloader
+/// that it could be given up for.
+#[test]
+fn beside_a_damaged_image_a_program_is_not_given_up() {
+    let mut bench = board_with_a_program();
+    let (_, image, _) = damages().swap_remove(0);
+    load(&mut bench, &image.flash);
+    bench.power_on();
+    bench.await_boot_up(1000);
+    for reset in 1..=6 {
+        bench.machine().start_watchdog(64);
+        bench.run_ms(300);
+        assert!(!bench.is_bootloader(NODE), "after {reset}");
+        assert_eq!(cell(&bench).is_some(), reset >= 3, "after {reset}");
+    }
+    let parameters = |bench: &Bench| {
+        let mut bytes = vec![0; firmware::board().parameters[0].size as usize * 2];
+        let at = firmware::board().parameters[0].base;
+        bench.world.machine(bench.device).read_memory(at, &mut bytes).unwrap();
+        bytes
+    };
+    let before = parameters(&bench);
+    bench.machine().start_watchdog(64);
+    bench.run_ms(300);
+    assert!(parameters(&bench) == before);
+}
+
+/// Without a program there is nothing to run: the chip is reset again and again, which is to be seen
+/// at its NRST pin, and the cell says why.
+#[test]
+fn a_damaged_image_without_a_program_resets_again_and_again() {
+    for (what, image, damage) in damages() {
+        let mut bench = Bench::new();
+        load(&mut bench, &image.flash);
+        bench.power_on();
+        let mut seen = 0;
+        for _ in 0..80 {
+            bench.run_ms(5);
+            if let Some(found) = cell(&bench) {
+                assert_eq!(found, (DAMAGED, damage), "{what}");
+                seen += 1;
+            }
+        }
+        // A debugger finds it there at nearly any time.
+        assert!(seen > 70, "{what}: {seen} times of 80");
+        let resets: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+        assert!((3..=6).contains(&resets.len()), "{what}: {} resets in 400 ms", resets.len());
+        assert!(resets.iter().all(|stop| *stop == Stop::Reset(ResetCause::Software)), "{what}");
+        assert!(bench.records().is_empty(), "{what}: nothing on the bus");
+        bench.assert_nothing_unmodelled();
+    }
+}
+
+/// The streams that a hostile hand could put there, with a right CRC: whatever they say, the boot
+/// stage writes to the RAM of the image alone, and comes to an end.
+#[test]
+fn no_stream_writes_outside_the_image() {
+    let board = firmware::board();
+    let good = Packed::of(firmware::BOOTLOADER);
+    let (len, image_end) = (good.get(STORED) as usize, board.ram.base + good.get(UNPACKED));
+    // Up to the stack that is left for the boot stage.
+    let size = board.ram.end() - 4096 - image_end;
+    let pattern: Vec<u8> = (0..size).map(|i| (i.wrapping_mul(0x9E37_79B1) >> 24) as u8).collect();
+    let mut bench = Bench::new();
+    let mut refused = 0;
+    let mut random = 1_u32;
+    let mut next = move || {
+        random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        random >> 8
+    };
+    for round in 0..200 {
+        let mut image = Packed::of(firmware::BOOTLOADER);
+        let stored = image.stored();
+        match round {
+            // Zeros: numbers without an end. Ones: the shortest numbers.
+            0 => stored.fill(0),
+            1 => stored.fill(0xFF),
+            2 => stored.fill(0x55),
+            3 => stored.iter_mut().for_each(|byte| *byte = next() as u8),
+            _ => {
+                for _ in 0..1 + round % 4 {
+                    stored[next() as usize % len] ^= 1 << (next() % 8);
+                }
+            }
+        }
+        image.seal();
+        load(&mut bench, &image.flash);
+        bench.power_on();
+        bench.machine().write_ram(image_end, &pattern).unwrap();
+        // Power on: there is nothing in the cell until the boot stage puts something there.
+        // What runs may be reset by a fault of its own at once.
+        let (mut damage, mut runs) = (None, false);
+        for _ in 0..200 {
+            bench.world.run_for(Span::from_micros(100));
+            damage = cell(&bench).filter(|(request, _)| *request == DAMAGED);
+            runs = bench.machine().pc() >= board.ram.base || !bench.events().is_empty();
+            if damage.is_some() || runs {
+                break;
+            }
+        }
+        let mut found = vec![0; pattern.len()];
+        bench.machine().read_memory(image_end, &mut found).unwrap();
+        if damage.is_some() {
+            assert_eq!(damage, Some((DAMAGED, BY_STREAM)), "round {round}");
+            assert!(found == pattern, "round {round} has written behind the image");
+            refused += 1;
+        } else {
+            // A bit of a literal: the stream is whole, and another image runs.
+            assert!(runs, "round {round} does not end");
+        }
+        bench.power_off();
+    }
+    assert!(refused > 100, "{refused}");
+}
+
+/// As the linker makes it, without a CRC: what `cargo build` alone and `--unpacked` give.
+#[test]
+fn an_image_that_is_not_packed_runs() {
+    let mut image = Packed::of(firmware::BOOTLOADER_MINIMAL);
+    let ram = image.ram.clone();
+    image.flash.truncate(image.header + HEADER);
+    image.flash.extend(&ram);
+    for (word, value) in [(CRC, 0), (METHOD, 0), (STORED, ram.len() as u32)] {
+        image.set(word, value);
+    }
+    assert!(image.flash.len() <= firmware::board().bootloader.size as usize);
+    let mut bench = Bench::new();
+    load(&mut bench, &image.flash);
+    bench.power_on();
+    bench.await_boot_up(100);
+    assert!(bench.is_bootloader(NODE));
+
+    // One with a CRC is held to it.
+    image.seal();
+    load(&mut bench, &image.flash);
+    bench.power_off();
+    bench.power_on();
+    bench.await_boot_up(100);
+    image.set(CRC, image.get(CRC) ^ 1);
+    load(&mut bench, &image.flash);
+    bench.power_off();
+    bench.power_on();
+    bench.run_ms(50);
+    assert_eq!(cell(&bench), Some((DAMAGED, BY_CRC)));
+}
+
+/// The way from "call back" to the boot-up message goes by here, and masters wait for an answer
+/// across it: 5 ms at most. A chip with wait states takes 1.3 cycles an instruction (see the
+/// emulator's cpu.rs).
+#[test]
+fn the_image_is_unpacked_within_5_ms() {
+    let board = firmware::board();
+    let packed = Packed::of(firmware::BOOTLOADER);
+    let mut bench = Bench::new();
+    bench.power_on();
+    let from = bench.time();
+    let (mut begun, mut done) = (None, None);
+    // By the first word that is there, and the last.
+    let last = packed.ram.len() - 4;
+    loop {
+        bench.world.run_for(Span::from_micros(10));
+        for (at, seen) in [(0, &mut begun), (last, &mut done)] {
+            let mut word = [0; 4];
+            bench.machine().read_memory(board.ram.base + at as u32, &mut word).unwrap();
+            if seen.is_none() && word == packed.ram[at..at + 4] {
+                *seen = Some(bench.time());
+            }
+        }
+        let pc = bench.machine().pc();
+        if board.ram.contains(pc, 2) {
+            break;
+        }
+        assert!(bench.time() - from < Span::from_millis(100), "the bootloader does not start: {pc:#x}");
+    }
+    let took = done.expect("it is there before it runs") - begun.expect("and its beginning too");
+    let all = bench.time() - from;
+    println!(
+        "{}: {} bytes unpacked to {} in {} us; reset to the first instruction in RAM: {} us",
+        board.board,
+        packed.get(STORED),
+        packed.get(UNPACKED),
+        took.0 / 1_000_000,
+        all.0 / 1_000_000
+    );
+    assert!(took.0 / 10 * 13 <= Span::from_millis(5).0, "{} us", took.0 / 1_000_000);
+    // And it was unpacked, which is no matter of microseconds.
+    assert!(took >= Span::from_micros(500));
+}
