@@ -216,7 +216,7 @@ impl Lss {
 
     /// Takes a frame, whatever it is.
     pub fn handle(&mut self, frame: &Frame, now: Instant, device: &mut impl LssDevice) {
-        if frame.cob_id() != Some(CobId::LSS_REQUEST) || self.is_silent(now) || self.storing {
+        if !frame.has_cob_id(CobId::LSS_REQUEST) || self.is_silent(now) || self.storing {
             return;
         }
         let Some(bytes) = frame.exactly() else { return };
@@ -250,7 +250,7 @@ impl Lss {
             return None;
         }
         if let Some(answer) = self.answer.take() {
-            return Some(Output::Send(Frame::of(CobId::LSS_RESPONSE, &answer)));
+            return Some(Output::Send(Frame::full(CobId::LSS_RESPONSE, answer)));
         }
         self.assigned.take().map(Output::NodeId)
     }

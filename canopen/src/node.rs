@@ -127,7 +127,7 @@ impl Node {
         }
         if self.state != NmtState::Stopped {
             if let Some(emergency) = objects.next_emergency() {
-                return Some(Frame::of(CobId::emcy(self.id), &emergency));
+                return Some(Frame::full(CobId::emcy(self.id), emergency));
             }
         }
         self.heartbeat.take_due(now).then(|| nmt::state_message(self.id, self.state))

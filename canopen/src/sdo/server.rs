@@ -188,7 +188,7 @@ impl SdoServer {
 
     /// Takes a frame, whatever it is.
     pub fn handle(&mut self, frame: &Frame, now: Instant, objects: &mut impl Objects) {
-        if frame.cob_id() != Some(CobId::sdo_request(self.node)) {
+        if !frame.has_cob_id(CobId::sdo_request(self.node)) {
             return;
         }
         let Some(bytes) = frame.exactly() else { return };
@@ -227,7 +227,7 @@ impl SdoServer {
 
     fn send(&mut self, bytes: [u8; 8], now: Instant) -> Frame {
         self.moved = now;
-        Frame::of(CobId::sdo_response(self.node), &bytes)
+        Frame::full(CobId::sdo_response(self.node), bytes)
     }
 
     /// What the time brings about.
