@@ -162,7 +162,11 @@ mod app {
             node: node::Config {
                 heartbeat_ms: HEARTBEAT_MS,
                 nmt: NmtPolicy::StayPreOperational,
-                sdo: SdoConfig { unknown_request: PROFILE.unknown_request, ..SdoConfig::DEFAULT },
+                sdo: SdoConfig {
+                    block_upload: cfg!(feature = "block-upload"),
+                    unknown_request: PROFILE.unknown_request,
+                    ..SdoConfig::DEFAULT
+                },
             },
             ..slave::Config::default()
         };
