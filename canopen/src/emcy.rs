@@ -14,7 +14,7 @@ use crate::sdo::AbortCode;
 pub const HISTORY: usize = 4;
 
 /// Emergencies that may wait to be sent.
-const WAITING: usize = 4;
+const QUEUE: usize = 4;
 
 /// 1003h and 1014h. (1001h, which every device has, is in
 /// [`device::ENTRIES`](crate::device::ENTRIES).)
@@ -99,18 +99,19 @@ pub const fn driver_status(status: u16) -> [u8; 5] {
 #[derive(Clone, Debug, Default)]
 pub struct Emcy {
     register: u8,
-    /// Newest first, as 1003h reads.
+    /// Newest first, as 1003h reads; as many as `remembered` says.
     history: [u32; HISTORY],
     remembered: u8,
-    /// Oldest first.
-    waiting: [Option<Emergency>; WAITING],
+    /// Messages to be sent, oldest first; as many as `waiting` says.
+    queue: [[u8; 8]; QUEUE],
+    waiting: u8,
 }
 
 impl Emcy {
     /// No errors.
     #[must_use]
     pub const fn new() -> Self {
-        Self { register: 0, history: [0; HISTORY], remembered: 0, waiting: [None; WAITING] }
+        Self { register: 0, history: [0; HISTORY], remembered: 0, queue: [[0; 8]; QUEUE], waiting: 0 }
     }
 
     /// The value of 1001h.
@@ -123,18 +124,16 @@ impl Emcy {
     /// [`clear`](Self::clear).
     pub fn raise(&mut self, code: u16, bits: u8, detail: [u8; 5]) {
         self.register |= bits | register::GENERIC;
-        for i in (1..HISTORY).rev() {
-            self.history[i] = self.history[i - 1];
-        }
+        self.history.copy_within(..HISTORY - 1, 1);
         let [low, high] = code.to_le_bytes();
         self.history[0] = u32::from_le_bytes([low, high, detail[0], detail[1]]);
         self.remembered = (self.remembered + 1).min(HISTORY as u8);
-        self.send(Emergency { code, register: self.register, detail });
+        self.send(code, detail);
     }
 
     /// Tells something that is no error: neither the register nor 1003h change.
     pub fn announce(&mut self, code: u16, detail: [u8; 5]) {
-        self.send(Emergency { code, register: self.register, detail });
+        self.send(code, detail);
     }
 
     /// The cause of these bits has gone. The others are told with what is left; nothing is sent if
@@ -149,7 +148,7 @@ impl Emcy {
         if self.register == register::GENERIC {
             self.register = 0;
         }
-        self.send(Emergency { code: code::RESET, register: self.register, detail: [0; 5] });
+        self.send(code::RESET, [0; 5]);
     }
 
     /// Tells what happened on the line.
@@ -171,17 +170,18 @@ impl Emcy {
 
     /// The data of the next emergency to send, until there is none.
     pub fn next_message(&mut self) -> Option<[u8; 8]> {
-        let emergency = self.waiting[0].take()?;
-        for i in 1..WAITING {
-            self.waiting[i - 1] = self.waiting[i].take();
-        }
-        Some(emergency.emit())
+        self.waiting = self.waiting.checked_sub(1)?;
+        let message = self.queue[0];
+        self.queue.copy_within(1.., 0);
+        Some(message)
     }
 
-    /// What finds no room is not sent: the first errors tell most, and 1003h has the latest.
-    fn send(&mut self, emergency: Emergency) {
-        if let Some(free) = self.waiting.iter_mut().find(|place| place.is_none()) {
-            *free = Some(emergency);
+    /// A message that finds no room is not sent: the first errors tell most, and 1003h has the
+    /// latest.
+    fn send(&mut self, code: u16, detail: [u8; 5]) {
+        if let Some(free) = self.queue.get_mut(usize::from(self.waiting)) {
+            *free = Emergency { code, register: self.register, detail }.emit();
+            self.waiting += 1;
         }
     }
 
