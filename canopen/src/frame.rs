@@ -2,24 +2,25 @@
 //! 7.3.5).
 
 use core::fmt;
+use core::num::NonZeroU8;
 
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 
 /// The number of a node: 1 to 127.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct NodeId(u8);
+pub struct NodeId(NonZeroU8);
 
 impl NodeId {
-    /// The lowest and the highest node-ID.
-    pub const MIN: Self = Self(1);
-    /// The highest node-ID.
-    pub const MAX: Self = Self(127);
+    /// The lowest node-ID, 1.
+    pub const MIN: Self = Self::new(1).unwrap();
+    /// The highest node-ID, 127.
+    pub const MAX: Self = Self::new(127).unwrap();
 
     /// `None` for 0 (which addresses all nodes) and for 128 and above.
     #[must_use]
     pub const fn new(number: u8) -> Option<Self> {
-        match number {
-            1..=127 => Some(Self(number)),
+        match NonZeroU8::new(number) {
+            Some(number) if number.get() <= 127 => Some(Self(number)),
             _ => None,
         }
     }
@@ -27,7 +28,7 @@ impl NodeId {
     /// The number, 1 to 127.
     #[must_use]
     pub const fn get(self) -> u8 {
-        self.0
+        self.0.get()
     }
 }
 
@@ -68,25 +69,25 @@ impl CobId {
     /// Emergency of a node.
     #[must_use]
     pub const fn emcy(node: NodeId) -> Self {
-        Self(0x080 + node.0 as u16)
+        Self(0x080 + node.get() as u16)
     }
 
     /// SDO, server to client.
     #[must_use]
     pub const fn sdo_response(node: NodeId) -> Self {
-        Self(0x580 + node.0 as u16)
+        Self(0x580 + node.get() as u16)
     }
 
     /// SDO, client to server.
     #[must_use]
     pub const fn sdo_request(node: NodeId) -> Self {
-        Self(0x600 + node.0 as u16)
+        Self(0x600 + node.get() as u16)
     }
 
     /// Boot-up and heartbeat of a node.
     #[must_use]
     pub const fn heartbeat(node: NodeId) -> Self {
-        Self(0x700 + node.0 as u16)
+        Self(0x700 + node.get() as u16)
     }
 }
 
