@@ -151,20 +151,18 @@ impl Emcy {
         self.send(code::RESET, [0; 5]);
     }
 
-    /// Tells what happened on the line.
+    /// Reports what happened on the line.
     pub fn line_event(&mut self, event: LineEvent) {
-        match event {
-            LineEvent::Passive => self.raise(code::CAN_PASSIVE, register::COMMUNICATION, [0; 5]),
-            LineEvent::Active => self.clear(register::COMMUNICATION),
-            // Both are over when they are told.
-            LineEvent::Lost(status) => {
-                self.raise(code::CAN_OVERRUN, register::COMMUNICATION, driver_status(status));
-                self.clear(register::COMMUNICATION);
-            }
-            LineEvent::Recovered => {
-                self.raise(code::BUS_OFF_RECOVERED, register::COMMUNICATION, [0; 5]);
-                self.clear(register::COMMUNICATION);
-            }
+        let (code, status) = match event {
+            LineEvent::Active => return self.clear(register::COMMUNICATION),
+            LineEvent::Passive => (code::CAN_PASSIVE, 0),
+            LineEvent::Lost(status) => (code::CAN_OVERRUN, status),
+            LineEvent::Recovered => (code::BUS_OFF_RECOVERED, 0),
+        };
+        self.raise(code, register::COMMUNICATION, driver_status(status));
+        // Lost frames and bus-off are over when they are reported, error passive is not.
+        if event != LineEvent::Passive {
+            self.clear(register::COMMUNICATION);
         }
     }
 

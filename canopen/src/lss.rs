@@ -28,7 +28,7 @@ pub struct LssAddress {
 }
 
 impl LssAddress {
-    /// The four numbers in the order of the standard.
+    /// The four numbers in the order of the sub-indices of 1018h.
     const fn parts(&self) -> [u32; 4] {
         [self.vendor_id, self.product_code, self.revision, self.serial_number]
     }

@@ -81,8 +81,8 @@ pub struct Slave {
 enum Line {
     /// The controller has to be set to this rate.
     Down(BitRate),
-    /// The bit rate is searched; the controller is set to `set`.
-    Listening { detector: Detector, set: BitRate },
+    /// The bit rate is searched for; the controller is set to `set`.
+    Listening { detector: Detector, set: Option<BitRate> },
     /// The controller takes part in the bus.
     Up { monitor: Monitor, recover_from_bus_off: bool },
 }
@@ -166,43 +166,43 @@ impl Slave {
     /// What to do next, until there is nothing. Frames are given only while there is `room` for one
     /// in the mailboxes.
     pub fn poll(&mut self, now: Instant, room: bool, device: &mut impl SlaveDevice) -> Option<Output> {
-        if core::mem::take(&mut self.accept) {
-            return Some(Output::Accept(self.identifiers()));
-        }
-        match &mut self.line {
-            Line::Down(rate) => {
-                let rate = *rate;
-                return Some(self.bring_up(rate, now, device));
-            }
-            Line::Listening { detector, set } => {
-                if *set == detector.rate() {
-                    return None;
-                }
-                *set = detector.rate();
-                return Some(Output::Listen(*set));
-            }
-            Line::Up { recover_from_bus_off, .. } => {
-                if core::mem::take(recover_from_bus_off) {
-                    return Some(Output::RecoverFromBusOff);
-                }
-            }
-        }
-        self.lss.follow_store(device);
-        if !room {
-            return None;
-        }
-        match self.lss.poll(now) {
-            Some(lss::Output::Send(frame)) => return Some(Output::Send(frame)),
-            Some(lss::Output::BitRate(rate)) => return Some(self.bring_up(rate, now, device)),
-            Some(lss::Output::NodeId(id)) => {
-                self.restart(Some(id), device);
-                self.accept = false;
+        loop {
+            if core::mem::take(&mut self.accept) {
                 return Some(Output::Accept(self.identifiers()));
             }
-            None if self.lss.is_silent(now) => return None,
-            None => {}
+            match &mut self.line {
+                Line::Down(BitRate::Auto) => {
+                    let detector = Detector::new(BitRate::K125, now, |rate| device.supports(rate));
+                    self.line = Line::Listening { detector, set: None };
+                    continue;
+                }
+                &mut Line::Down(rate) => {
+                    self.line = Line::Up { monitor: Monitor::new(now), recover_from_bus_off: false };
+                    return Some(Output::Join(rate));
+                }
+                Line::Listening { detector, set } => {
+                    let rate = detector.rate();
+                    let is_new = set.replace(rate) != Some(rate);
+                    return is_new.then_some(Output::Listen(rate));
+                }
+                Line::Up { recover_from_bus_off, .. } => {
+                    if core::mem::take(recover_from_bus_off) {
+                        return Some(Output::RecoverFromBusOff);
+                    }
+                }
+            }
+            self.lss.follow_store(device);
+            if !room {
+                return None;
+            }
+            match self.lss.poll(now) {
+                Some(lss::Output::Send(frame)) => return Some(Output::Send(frame)),
+                Some(lss::Output::BitRate(rate)) => self.line = Line::Down(rate),
+                Some(lss::Output::NodeId(id)) => self.restart(Some(id), device),
+                None if self.lss.is_silent(now) => return None,
+                None => return self.node.as_mut()?.poll(now, device).map(Output::Send),
+            }
         }
-        self.node.as_mut()?.poll(now, device).map(Output::Send)
     }
 
     /// The identifiers of the frames that it serves.
@@ -212,17 +212,6 @@ impl Slave {
             Some(node) => [CobId::NMT, lss, CobId::sdo_request(node.id())],
             None => [lss; 3],
         }
-    }
-
-    fn bring_up(&mut self, rate: BitRate, now: Instant, device: &mut impl SlaveDevice) -> Output {
-        if rate == BitRate::Auto {
-            let detector = Detector::new(BitRate::K125, now, |rate| device.supports(rate));
-            let set = detector.rate();
-            self.line = Line::Listening { detector, set };
-            return Output::Listen(set);
-        }
-        self.line = Line::Up { monitor: Monitor::new(now), recover_from_bus_off: false };
-        Output::Join(rate)
     }
 
     /// Starts the node anew under this node-ID: a transfer ends, the boot-up is sent (again).
