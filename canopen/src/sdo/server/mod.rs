@@ -117,6 +117,12 @@ impl SdoServer {
         }
     }
 
+    /// The choices that it was made with.
+    #[must_use]
+    pub const fn config(&self) -> Config {
+        self.config
+    }
+
     /// Whether no transfer is going on and no answer waits to be fetched.
     #[must_use]
     pub const fn is_idle(&self) -> bool {
