@@ -124,9 +124,10 @@ impl Emcy {
     /// [`clear`](Self::clear).
     pub fn raise(&mut self, code: u16, bits: u8, detail: [u8; 5]) {
         self.register |= bits | register::GENERIC;
-        self.history.copy_within(..HISTORY - 1, 1);
         let [low, high] = code.to_le_bytes();
-        self.history[0] = u32::from_le_bytes([low, high, detail[0], detail[1]]);
+        let newest = u32::from_le_bytes([low, high, detail[0], detail[1]]);
+        let [a, b, c, _] = self.history;
+        self.history = [newest, a, b, c];
         self.remembered = (self.remembered + 1).min(HISTORY as u8);
         self.send(code, detail);
     }
@@ -169,9 +170,9 @@ impl Emcy {
     /// The data of the next emergency to send, until there is none.
     pub fn next_message(&mut self) -> Option<[u8; 8]> {
         self.waiting = self.waiting.checked_sub(1)?;
-        let message = self.queue[0];
-        self.queue.copy_within(1.., 0);
-        Some(message)
+        let [oldest, a, b, c] = self.queue;
+        self.queue = [a, b, c, oldest];
+        Some(oldest)
     }
 
     /// A message that finds no room is not sent: the first errors tell most, and 1003h has the
