@@ -90,11 +90,8 @@ impl Node {
     /// is said again.
     pub fn restart(&mut self, id: NodeId, objects: &mut impl Objects) {
         self.sdo.reset(objects);
-        let config = Config {
-            heartbeat_ms: self.heartbeat.period_ms(),
-            nmt: self.nmt,
-            sdo: self.sdo.config(),
-        };
+        let config =
+            Config { heartbeat_ms: self.heartbeat.period_ms(), nmt: self.nmt, sdo: self.sdo.config() };
         *self = Self::new(id, config);
     }
 

@@ -20,7 +20,7 @@ impl SdoServer {
         let receiver = Receiver::new(bytes[0] & fields::CRC != 0);
         self.state = State::BlockDownload { incoming, receiver };
         let command = scs::INITIATE_BLOCK_DOWNLOAD | fields::CRC;
-        self.answer = Some(fields::with_address(command, at, [0; 4]));
+        self.answer_initiate(command, 0);
         Ok(())
     }
 
@@ -41,7 +41,7 @@ impl SdoServer {
             self.take(&bytes[1..], objects)?;
         }
         if let Some(ackseq) = received.ackseq {
-            self.answer = Some(fields::without_address(scs::ACK_BLOCK_DOWNLOAD, ackseq, 0));
+            self.answer_transfer(scs::ACK_BLOCK_DOWNLOAD, ackseq, 0);
         }
         Ok(())
     }
@@ -62,7 +62,7 @@ impl SdoServer {
         let data = receiver.finish(fields::unused_of_blocks(bytes[0]), fields::crc(bytes))?;
         self.take(&data, objects)?;
         self.finish_download(objects)?;
-        self.answer = Some(fields::without_address(scs::END_BLOCK_DOWNLOAD, 0, 0));
+        self.answer_transfer(scs::END_BLOCK_DOWNLOAD, 0, 0);
         Ok(())
     }
 }

@@ -53,7 +53,7 @@ impl SdoServer {
         self.state = State::BlockUpload { outgoing, sender: Sender::new(blksize) };
         let told = if size.is_some() { fields::BLOCK_SIZE_TOLD } else { 0 };
         let command = scs::INITIATE_BLOCK_UPLOAD | fields::CRC | told;
-        self.answer = Some(fields::with_address(command, self.at, size.unwrap_or(0).to_le_bytes()));
+        self.answer_initiate(command, size.unwrap_or(0));
         Ok(())
     }
 

@@ -192,7 +192,7 @@ impl SdoServer {
                 if receiver.is_within() && silent_for(self.config.repeat_ms) =>
             {
                 let ackseq = receiver.close();
-                self.answer = Some(fields::without_address(scs::ACK_BLOCK_DOWNLOAD, ackseq, 0));
+                self.answer_transfer(scs::ACK_BLOCK_DOWNLOAD, ackseq, 0);
             }
             _ => {}
         }
@@ -251,7 +251,17 @@ impl SdoServer {
 
     fn abort(&mut self, code: AbortCode, objects: &mut impl Objects) {
         self.end(objects);
-        self.answer = Some(fields::with_address(fields::ABORT, self.at, code.0.to_le_bytes()));
+        self.answer_initiate(fields::ABORT, code.0);
+    }
+
+    /// An answer that names the object: to an initiate, or an abort.
+    fn answer_initiate(&mut self, command: u8, number: u32) {
+        self.answer = Some(fields::with_address(command, self.at, number.to_le_bytes()));
+    }
+
+    /// An answer within a transfer.
+    fn answer_transfer(&mut self, command: u8, a: u8, b: u8) {
+        self.answer = Some(fields::without_address(command, a, b));
     }
 
     /// Back to idle. The consumer of an unfinished domain is told.

@@ -30,7 +30,7 @@ impl SdoServer {
             self.take(&fields::data(bytes)[..size as usize], objects)?;
             self.finish_download(objects)?;
         }
-        self.answer = Some(fields::with_address(scs::INITIATE_DOWNLOAD, at, [0; 4]));
+        self.answer_initiate(scs::INITIATE_DOWNLOAD, 0);
         Ok(())
     }
 
@@ -48,7 +48,7 @@ impl SdoServer {
         if command & fields::LAST != 0 {
             self.finish_download(objects)?;
         }
-        self.answer = Some(fields::without_address(scs::DOWNLOAD_SEGMENT | command & fields::TOGGLE, 0, 0));
+        self.answer_transfer(scs::DOWNLOAD_SEGMENT | command & fields::TOGGLE, 0, 0);
         Ok(())
     }
 
@@ -77,7 +77,7 @@ impl SdoServer {
                 scs::INITIATE_UPLOAD | if size.is_some() { fields::SIZE_TOLD } else { 0 }
             }
         };
-        self.answer = Some(fields::with_address(command, self.at, data));
+        self.answer_initiate(command, u32::from_le_bytes(data));
     }
 
     pub(super) fn upload_segment(
