@@ -45,6 +45,7 @@ mod app {
     use boot_core::canopen::bit_rate::Heard;
     use boot_core::canopen::device::Device;
     use boot_core::canopen::line::{Confinement, Status, CONTROLLER_OVERRUN, QUEUE_OVERRUN};
+    use boot_core::canopen::lss;
     use boot_core::canopen::node::{self, NmtPolicy};
     use boot_core::canopen::od::{concat, Entry};
     use boot_core::canopen::program::ProgramControl;
@@ -158,9 +159,13 @@ mod app {
             node: node::Config {
                 heartbeat_ms: HEARTBEAT_MS,
                 nmt: NmtPolicy::StayPreOperational,
-                sdo: SdoConfig { unknown_request: PROFILE.unknown_request, ..SdoConfig::DEFAULT },
+                sdo: SdoConfig {
+                    block_upload: cfg!(feature = "block-upload"),
+                    unknown_request: PROFILE.unknown_request,
+                    ..SdoConfig::DEFAULT
+                },
             },
-            ..slave::Config::default()
+            lss: if cfg!(feature = "lss") { Some(lss::Config::default()) } else { None },
         };
         let mut bootloader = Bootloader::new(
             &CONFIG,

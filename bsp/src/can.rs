@@ -188,6 +188,7 @@ impl<I: MasterInstance> Port<I> {
     pub fn receive<F: Frame>(&mut self) -> Option<F> {
         loop {
             match self.can.rx0().receive() {
+                // The filters let no remote frame in.
                 Ok(frame) => return convert(&frame),
                 Err(nb::Error::WouldBlock) => return None,
                 // The frames that are there are still good.
@@ -212,7 +213,8 @@ impl<I: MasterInstance> Port<I> {
         self.waiting.is_none() && !self.boot_up
     }
 
-    /// Sends a frame. To be called only when there is room; a frame that still waits would be lost.
+    /// Sends a data frame. To be called only when there is room; a frame that still waits would be
+    /// lost.
     ///
     /// Frames of one identifier leave in order: the mailboxes take the second only when the first
     /// is on its way.
@@ -278,12 +280,8 @@ fn standard_id(raw: u16) -> StandardId {
     StandardId::new(raw & 0x7FF).unwrap_or(StandardId::MAX)
 }
 
-/// The same frame in another crate's type. Both ends are checked types, so the conversion cannot
-/// fail.
+/// The same data frame in another crate's type. Both ends are checked types, so the conversion
+/// cannot fail.
 fn convert<F: Frame, G: Frame>(frame: &F) -> Option<G> {
-    if frame.is_remote_frame() {
-        G::new_remote(frame.id(), frame.dlc())
-    } else {
-        G::new(frame.id(), frame.data())
-    }
+    G::new(frame.id(), frame.data())
 }

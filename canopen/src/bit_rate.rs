@@ -47,6 +47,14 @@ impl BitRate {
         })
     }
 
+    /// The next slower rate; behind the slowest one the fastest.
+    const fn next(self) -> Self {
+        match Self::from_index(self as u8 + 1) {
+            None | Some(Self::Auto) => Self::K1000,
+            Some(rate) => rate,
+        }
+    }
+
     /// From bit/s, as boards and handoff have it: 0 is [`BitRate::Auto`].
     #[must_use]
     pub const fn from_bits_per_second(rate: u32) -> Option<Self> {
@@ -136,7 +144,8 @@ pub enum Heard {
 /// comes round to the right rate again and finds it then.
 #[derive(Clone, Copy, Debug)]
 pub struct Detector {
-    at: usize,
+    rate: BitRate,
+    /// When it began to listen at this rate.
     since: Instant,
 }
 
@@ -151,8 +160,8 @@ impl Detector {
     /// Starts with this rate, or with the first there is; `supports` tells which of them the device
     /// can run at.
     pub fn new(first: BitRate, now: Instant, supports: impl FnMut(BitRate) -> bool) -> Self {
-        let at = BitRate::FIXED.iter().position(|rate| *rate == first).unwrap_or(0);
-        let mut detector = Self { at, since: now };
+        let rate = if first == BitRate::Auto { BitRate::K1000 } else { first };
+        let mut detector = Self { rate, since: now };
         detector.settle(supports);
         detector
     }
@@ -160,7 +169,7 @@ impl Detector {
     /// The rate to listen at.
     #[must_use]
     pub const fn rate(&self) -> BitRate {
-        BitRate::FIXED[self.at]
+        self.rate
     }
 
     /// Takes what was heard. `true` proves the rate; otherwise [`rate`](Self::rate) may have become
@@ -173,7 +182,7 @@ impl Detector {
             Heard::NeverIdle => now.since(self.since) >= NEVER_IDLE_MS,
         };
         if go_on {
-            self.at = (self.at + 1) % BitRate::FIXED.len();
+            self.rate = self.rate.next();
             self.since = now;
             self.settle(supports);
         }
@@ -184,10 +193,10 @@ impl Detector {
     /// it is.
     fn settle(&mut self, mut supports: impl FnMut(BitRate) -> bool) {
         for _ in BitRate::FIXED {
-            if supports(self.rate()) {
+            if supports(self.rate) {
                 return;
             }
-            self.at = (self.at + 1) % BitRate::FIXED.len();
+            self.rate = self.rate.next();
         }
     }
 }

@@ -65,18 +65,19 @@ impl Device {
     /// # Errors
     /// [`AbortCode::OUT_OF_MEMORY`] for a text longer than `buf`.
     pub fn read(&self, at: Address, buf: &mut [u8]) -> Option<Result<usize, AbortCode>> {
-        Some(match (at.index, at.sub) {
-            (DEVICE_TYPE, 0) => put(buf, &self.device_type.to_le_bytes()),
-            (ERROR_REGISTER, 0) => put(buf, &[0]),
-            (DEVICE_NAME, 0) => put(buf, self.name.as_bytes()),
-            (HARDWARE_VERSION, 0) => put(buf, self.hardware_version.as_bytes()),
-            (SOFTWARE_VERSION, 0) => put(buf, self.software_version.as_bytes()),
-            (HEARTBEAT_TIME, 0) => put(buf, &self.heartbeat_ms.to_le_bytes()),
-            (IDENTITY, 1) => put(buf, &self.vendor_id.to_le_bytes()),
-            (IDENTITY, 2) => put(buf, &self.product_code.to_le_bytes()),
-            (IDENTITY, 3) => put(buf, &self.revision.to_le_bytes()),
-            (IDENTITY, 4) => put(buf, &self.serial_number.to_le_bytes()),
+        let (number, len) = match (at.index, at.sub) {
+            (DEVICE_NAME, 0) => return Some(put(buf, self.name.as_bytes())),
+            (HARDWARE_VERSION, 0) => return Some(put(buf, self.hardware_version.as_bytes())),
+            (SOFTWARE_VERSION, 0) => return Some(put(buf, self.software_version.as_bytes())),
+            (DEVICE_TYPE, 0) => (self.device_type, 4),
+            (ERROR_REGISTER, 0) => (0, 1),
+            (HEARTBEAT_TIME, 0) => (self.heartbeat_ms.into(), 2),
+            (IDENTITY, 1) => (self.vendor_id, 4),
+            (IDENTITY, 2) => (self.product_code, 4),
+            (IDENTITY, 3) => (self.revision, 4),
+            (IDENTITY, 4) => (self.serial_number, 4),
             _ => return None,
-        })
+        };
+        Some(put(buf, &number.to_le_bytes()[..len]))
     }
 }

@@ -14,7 +14,7 @@ use crate::sdo::AbortCode;
 pub const HISTORY: usize = 4;
 
 /// Emergencies that may wait to be sent.
-const WAITING: usize = 4;
+const QUEUE: usize = 4;
 
 /// 1003h and 1014h. (1001h, which every device has, is in
 /// [`device::ENTRIES`](crate::device::ENTRIES).)
@@ -99,18 +99,19 @@ pub const fn driver_status(status: u16) -> [u8; 5] {
 #[derive(Clone, Debug, Default)]
 pub struct Emcy {
     register: u8,
-    /// Newest first, as 1003h reads.
+    /// Newest first, as 1003h reads; as many as `remembered` says.
     history: [u32; HISTORY],
     remembered: u8,
-    /// Oldest first.
-    waiting: [Option<Emergency>; WAITING],
+    /// Messages to be sent, oldest first; as many as `waiting` says.
+    queue: [[u8; 8]; QUEUE],
+    waiting: u8,
 }
 
 impl Emcy {
     /// No errors.
     #[must_use]
     pub const fn new() -> Self {
-        Self { register: 0, history: [0; HISTORY], remembered: 0, waiting: [None; WAITING] }
+        Self { register: 0, history: [0; HISTORY], remembered: 0, queue: [[0; 8]; QUEUE], waiting: 0 }
     }
 
     /// The value of 1001h.
@@ -123,18 +124,17 @@ impl Emcy {
     /// [`clear`](Self::clear).
     pub fn raise(&mut self, code: u16, bits: u8, detail: [u8; 5]) {
         self.register |= bits | register::GENERIC;
-        for i in (1..HISTORY).rev() {
-            self.history[i] = self.history[i - 1];
-        }
         let [low, high] = code.to_le_bytes();
-        self.history[0] = u32::from_le_bytes([low, high, detail[0], detail[1]]);
+        let newest = u32::from_le_bytes([low, high, detail[0], detail[1]]);
+        let [a, b, c, _] = self.history;
+        self.history = [newest, a, b, c];
         self.remembered = (self.remembered + 1).min(HISTORY as u8);
-        self.send(Emergency { code, register: self.register, detail });
+        self.send(code, detail);
     }
 
     /// Tells something that is no error: neither the register nor 1003h change.
     pub fn announce(&mut self, code: u16, detail: [u8; 5]) {
-        self.send(Emergency { code, register: self.register, detail });
+        self.send(code, detail);
     }
 
     /// The cause of these bits has gone. The others are told with what is left; nothing is sent if
@@ -149,39 +149,38 @@ impl Emcy {
         if self.register == register::GENERIC {
             self.register = 0;
         }
-        self.send(Emergency { code: code::RESET, register: self.register, detail: [0; 5] });
+        self.send(code::RESET, [0; 5]);
     }
 
-    /// Tells what happened on the line.
+    /// Reports what happened on the line.
     pub fn line_event(&mut self, event: LineEvent) {
-        match event {
-            LineEvent::Passive => self.raise(code::CAN_PASSIVE, register::COMMUNICATION, [0; 5]),
-            LineEvent::Active => self.clear(register::COMMUNICATION),
-            // Both are over when they are told.
-            LineEvent::Lost(status) => {
-                self.raise(code::CAN_OVERRUN, register::COMMUNICATION, driver_status(status));
-                self.clear(register::COMMUNICATION);
-            }
-            LineEvent::Recovered => {
-                self.raise(code::BUS_OFF_RECOVERED, register::COMMUNICATION, [0; 5]);
-                self.clear(register::COMMUNICATION);
-            }
+        let (code, status) = match event {
+            LineEvent::Active => return self.clear(register::COMMUNICATION),
+            LineEvent::Passive => (code::CAN_PASSIVE, 0),
+            LineEvent::Lost(status) => (code::CAN_OVERRUN, status),
+            LineEvent::Recovered => (code::BUS_OFF_RECOVERED, 0),
+        };
+        self.raise(code, register::COMMUNICATION, driver_status(status));
+        // Lost frames and bus-off are over when they are reported, error passive is not.
+        if event != LineEvent::Passive {
+            self.clear(register::COMMUNICATION);
         }
     }
 
     /// The data of the next emergency to send, until there is none.
     pub fn next_message(&mut self) -> Option<[u8; 8]> {
-        let emergency = self.waiting[0].take()?;
-        for i in 1..WAITING {
-            self.waiting[i - 1] = self.waiting[i].take();
-        }
-        Some(emergency.emit())
+        self.waiting = self.waiting.checked_sub(1)?;
+        let [oldest, a, b, c] = self.queue;
+        self.queue = [a, b, c, oldest];
+        Some(oldest)
     }
 
-    /// What finds no room is not sent: the first errors tell most, and 1003h has the latest.
-    fn send(&mut self, emergency: Emergency) {
-        if let Some(free) = self.waiting.iter_mut().find(|place| place.is_none()) {
-            *free = Some(emergency);
+    /// A message that finds no room is not sent: the first errors tell most, and 1003h has the
+    /// latest.
+    fn send(&mut self, code: u16, detail: [u8; 5]) {
+        if let Some(free) = self.queue.get_mut(usize::from(self.waiting)) {
+            *free = Emergency { code, register: self.register, detail }.emit();
+            self.waiting += 1;
         }
     }
 

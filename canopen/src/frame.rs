@@ -2,24 +2,25 @@
 //! 7.3.5).
 
 use core::fmt;
+use core::num::NonZeroU8;
 
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 
 /// The number of a node: 1 to 127.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct NodeId(u8);
+pub struct NodeId(NonZeroU8);
 
 impl NodeId {
-    /// The lowest and the highest node-ID.
-    pub const MIN: Self = Self(1);
-    /// The highest node-ID.
-    pub const MAX: Self = Self(127);
+    /// The lowest node-ID, 1.
+    pub const MIN: Self = Self::new(1).unwrap();
+    /// The highest node-ID, 127.
+    pub const MAX: Self = Self::new(127).unwrap();
 
     /// `None` for 0 (which addresses all nodes) and for 128 and above.
     #[must_use]
     pub const fn new(number: u8) -> Option<Self> {
-        match number {
-            1..=127 => Some(Self(number)),
+        match NonZeroU8::new(number) {
+            Some(number) if number.get() <= 127 => Some(Self(number)),
             _ => None,
         }
     }
@@ -27,7 +28,7 @@ impl NodeId {
     /// The number, 1 to 127.
     #[must_use]
     pub const fn get(self) -> u8 {
-        self.0
+        self.0.get()
     }
 }
 
@@ -68,25 +69,25 @@ impl CobId {
     /// Emergency of a node.
     #[must_use]
     pub const fn emcy(node: NodeId) -> Self {
-        Self(0x080 + node.0 as u16)
+        Self(0x080 + node.get() as u16)
     }
 
     /// SDO, server to client.
     #[must_use]
     pub const fn sdo_response(node: NodeId) -> Self {
-        Self(0x580 + node.0 as u16)
+        Self(0x580 + node.get() as u16)
     }
 
     /// SDO, client to server.
     #[must_use]
     pub const fn sdo_request(node: NodeId) -> Self {
-        Self(0x600 + node.0 as u16)
+        Self(0x600 + node.get() as u16)
     }
 
     /// Boot-up and heartbeat of a node.
     #[must_use]
     pub const fn heartbeat(node: NodeId) -> Self {
-        Self(0x700 + node.0 as u16)
+        Self(0x700 + node.get() as u16)
     }
 }
 
@@ -96,40 +97,57 @@ impl fmt::Display for CobId {
     }
 }
 
-impl From<CobId> for Id {
-    fn from(id: CobId) -> Self {
-        // A CobId has 11 bits, so the mask changes nothing; it spares the unreachable branch.
-        Id::Standard(StandardId::new(id.0 & 0x7FF).unwrap_or(StandardId::ZERO))
-    }
-}
-
-/// A classic CAN frame.
+/// A classic CAN frame. Data bytes behind its length are 0, so that equal frames compare equal.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Frame {
-    id: Id,
-    remote: bool,
-    dlc: u8,
+    /// The identifier with the flags [`EXTENDED`] and [`REMOTE`]. A data frame with an 11-bit
+    /// identifier has neither, so its word is its COB-ID.
+    id: u32,
+    len: u8,
     data: [u8; 8],
 }
+
+/// The identifier has 29 bits.
+const EXTENDED: u32 = 1 << 31;
+/// A remote frame.
+const REMOTE: u32 = 1 << 30;
+const FLAGS: u32 = EXTENDED | REMOTE;
 
 impl Frame {
     /// A data frame of CANopen. Bytes behind the eighth are left out.
     #[must_use]
     pub fn of(id: CobId, data: &[u8]) -> Self {
-        let len = data.len().min(8);
-        let mut bytes = [0; 8];
-        bytes[..len].copy_from_slice(&data[..len]);
-        Self { id: id.into(), remote: false, dlc: len as u8, data: bytes }
+        Self::with_word(id.0.into(), &data[..data.len().min(8)])
     }
 
-    /// The COB-ID, if this is a data frame with an 11-bit identifier. CANopen of this crate uses no
-    /// others, so that whoever dispatches by it never sees an extended or a remote frame.
+    /// A data frame of eight bytes, as all of SDO, LSS and EMCY are.
     #[must_use]
-    pub fn cob_id(&self) -> Option<CobId> {
-        match self.id {
-            Id::Standard(id) if !self.remote => Some(CobId(id.as_raw())),
-            _ => None,
+    pub const fn full(id: CobId, data: [u8; 8]) -> Self {
+        Self { id: id.0 as u32, len: 8, data }
+    }
+
+    /// `data` are at most 8 bytes.
+    fn with_word(id: u32, data: &[u8]) -> Self {
+        let mut bytes = [0; 8];
+        bytes[..data.len()].copy_from_slice(data);
+        Self { id, len: data.len() as u8, data: bytes }
+    }
+
+    /// The COB-ID of a data frame with an 11-bit identifier; `None` for extended and remote frames,
+    /// which CANopen does not use.
+    #[must_use]
+    pub const fn cob_id(&self) -> Option<CobId> {
+        if self.id <= 0x7FF {
+            Some(CobId(self.id as u16))
+        } else {
+            None
         }
+    }
+
+    /// Whether this is a data frame with this COB-ID.
+    #[must_use]
+    pub const fn has_cob_id(&self, id: CobId) -> bool {
+        self.id == id.0 as u32
     }
 
     /// The data, if this is a data frame of exactly `N` bytes.
@@ -141,48 +159,62 @@ impl Frame {
 
 impl embedded_can::Frame for Frame {
     fn new(id: impl Into<Id>, data: &[u8]) -> Option<Self> {
-        let mut bytes = [0; 8];
-        bytes.get_mut(..data.len())?.copy_from_slice(data);
-        Some(Self { id: id.into(), remote: false, dlc: data.len() as u8, data: bytes })
+        (data.len() <= 8).then(|| Self::with_word(word(id.into()), data))
     }
 
     fn new_remote(id: impl Into<Id>, dlc: usize) -> Option<Self> {
-        let dlc = u8::try_from(dlc).ok().filter(|dlc| *dlc <= 8)?;
-        Some(Self { id: id.into(), remote: true, dlc, data: [0; 8] })
+        let id = word(id.into()) | REMOTE;
+        (dlc <= 8).then_some(Self { id, len: dlc as u8, data: [0; 8] })
     }
 
     fn is_extended(&self) -> bool {
-        matches!(self.id, Id::Extended(_))
+        self.id & EXTENDED != 0
     }
 
     fn is_remote_frame(&self) -> bool {
-        self.remote
+        self.id & REMOTE != 0
     }
 
     fn id(&self) -> Id {
-        self.id
+        // Both identifiers fit, so the second choices are never taken.
+        let id = self.id & !FLAGS;
+        if self.is_extended() {
+            Id::Extended(ExtendedId::new(id).unwrap_or(ExtendedId::ZERO))
+        } else {
+            Id::Standard(StandardId::new(id as u16).unwrap_or(StandardId::ZERO))
+        }
     }
 
     fn dlc(&self) -> usize {
-        usize::from(self.dlc)
+        self.len.into()
     }
 
     /// The data; of a remote frame none, whatever its DLC asks for.
     fn data(&self) -> &[u8] {
-        let len = if self.remote { 0 } else { self.dlc };
+        let len = if self.is_remote_frame() { 0 } else { self.len };
         &self.data[..usize::from(len.min(8))]
+    }
+}
+
+/// The identifier's word in [`Frame`].
+fn word(id: Id) -> u32 {
+    match id {
+        Id::Standard(id) => id.as_raw().into(),
+        Id::Extended(id) => id.as_raw() | EXTENDED,
     }
 }
 
 /// As candump writes it: `601#4000100000000000`.
 impl fmt::Display for Frame {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self.id {
-            Id::Standard(id) => write!(f, "{:03X}#", id.as_raw())?,
-            Id::Extended(id) => write!(f, "{:08X}#", ExtendedId::as_raw(&id))?,
+        let id = self.id & !FLAGS;
+        if self.is_extended() {
+            write!(f, "{id:08X}#")?;
+        } else {
+            write!(f, "{id:03X}#")?;
         }
-        if self.remote {
-            write!(f, "R{}", self.dlc)?;
+        if self.is_remote_frame() {
+            write!(f, "R{}", self.len)?;
         }
         self.data().iter().try_for_each(|byte| write!(f, "{byte:02X}"))
     }

@@ -14,7 +14,7 @@
 //! | [`node`] | NMT, heartbeat, emergencies and SDO server of one node-ID |
 //! | [`device`] | the objects that every device has |
 //! | `debugger` | the debugger interface, 1025h (feature `debugger`) |
-//! | `emcy` | emergency producer, 1001h, 1003h, 1014h (feature `emcy`) |
+//! | [`emcy`] | emergency producer, 1001h, 1003h, 1014h |
 //! | [`lss`] | layer setting services: node-ID and bit rate over the bus |
 //! | [`bit_rate`] | the bit rates of CANopen, and how to find out one |
 //! | [`line`](mod@line) | what the CAN controller tells: error passive, bus-off, frames lost |
@@ -31,7 +31,6 @@ pub mod bit_rate;
 #[cfg(feature = "debugger")]
 pub mod debugger;
 pub mod device;
-#[cfg(feature = "emcy")]
 pub mod emcy;
 pub mod frame;
 pub mod heartbeat;

@@ -28,7 +28,7 @@ pub struct LssAddress {
 }
 
 impl LssAddress {
-    /// The four numbers in the order of the standard.
+    /// The four numbers in the order of the sub-indices of 1018h.
     const fn parts(&self) -> [u32; 4] {
         [self.vendor_id, self.product_code, self.revision, self.serial_number]
     }
@@ -91,24 +91,26 @@ pub enum Output {
 /// An LSS slave.
 #[derive(Debug)]
 pub struct Lss {
-    address: LssAddress,
+    /// Vendor-ID, product code, revision number, serial number.
+    address: [u32; 4],
     state: State,
     /// The node-ID in force.
     active: Option<NodeId>,
-    /// The node-ID that comes into force at the next opportunity.
+    /// The node-ID that was configured: comes into force with the next start of the node.
     pending: Option<NodeId>,
     /// The bit rate that was configured.
     bit_rate: Option<BitRate>,
-    /// Steps of a selective switch, and of an identification, that have matched.
+    /// How many requests of a selective switch have matched in a row.
     selected: u8,
+    /// How many requests of an identification have matched in a row.
     identified: u8,
     /// The part of the address that fastscan is at, 0 to 3.
     position: u8,
     activation: Activation,
-    /// The device is storing; its master waits for the answer and gets no other.
+    /// The device is storing. The master waits for the answer; other requests are ignored.
     storing: bool,
     answer: Option<[u8; 8]>,
-    /// A node-ID that came into force and has yet to be told.
+    /// A node-ID that came into force, which the owner has yet to be told.
     assigned: Option<NodeId>,
 }
 
@@ -166,7 +168,7 @@ impl Lss {
         let state = if config.start_in_configuration { State::Configuration } else { State::Waiting };
         let announce = config.announce && node.is_none();
         Self {
-            address,
+            address: address.parts(),
             state,
             active: node,
             pending: node,
@@ -176,7 +178,7 @@ impl Lss {
             position: 0,
             activation: Activation::None,
             storing: false,
-            answer: announce.then(|| answer(NON_CONFIGURED, [0; 2])),
+            answer: announce.then(|| answer(NON_CONFIGURED, 0)),
             assigned: None,
         }
     }
@@ -216,12 +218,12 @@ impl Lss {
 
     /// Takes a frame, whatever it is.
     pub fn handle(&mut self, frame: &Frame, now: Instant, device: &mut impl LssDevice) {
-        if frame.cob_id() != Some(CobId::LSS_REQUEST) || self.is_silent(now) || self.storing {
+        if !frame.has_cob_id(CobId::LSS_REQUEST) || self.is_silent(now) || self.storing {
             return;
         }
         let Some(bytes) = frame.exactly() else { return };
-        if let Some(answer) = self.request(bytes, now, device) {
-            self.answer = Some(answer);
+        if let Some((command, number)) = self.request(bytes, now, device) {
+            self.answer = Some(answer(command, number));
         }
     }
 
@@ -231,7 +233,7 @@ impl Lss {
         if self.storing {
             if let Poll::Ready(outcome) = device.stored() {
                 self.storing = false;
-                self.answer = Some(store_answer(outcome));
+                self.answer = Some(answer(STORE, error_code(outcome)));
             }
         }
     }
@@ -250,60 +252,60 @@ impl Lss {
             return None;
         }
         if let Some(answer) = self.answer.take() {
-            return Some(Output::Send(Frame::of(CobId::LSS_RESPONSE, &answer)));
+            return Some(Output::Send(Frame::full(CobId::LSS_RESPONSE, answer)));
         }
         self.assigned.take().map(Output::NodeId)
     }
 
-    fn request(&mut self, bytes: &[u8; 8], now: Instant, device: &mut impl LssDevice) -> Option<[u8; 8]> {
+    /// The answer to a request: its command specifier, and the number behind it.
+    fn request(&mut self, bytes: &[u8; 8], now: Instant, device: &mut impl LssDevice) -> Option<(u8, u32)> {
         let [command, a, b, c, d, ..] = *bytes;
         let number = u32::from_le_bytes([a, b, c, d]);
-        match (command, self.state) {
+        let number = match (command, self.state) {
             (SWITCH_GLOBAL, _) => {
                 self.switch_global(a);
-                None
+                return None;
             }
-            (SELECT_VENDOR..=SELECT_SERIAL, State::Waiting) => self.select(command - SELECT_VENDOR, number),
-            (IDENTIFY_VENDOR..=IDENTIFY_SERIAL_HIGH, _) => self.identify(command - IDENTIFY_VENDOR, number),
-            (IDENTIFY_NON_CONFIGURED, _) => self.is_unconfigured().then(|| answer(NON_CONFIGURED, [0; 2])),
-            (FASTSCAN, State::Waiting) if self.is_unconfigured() => self.fastscan(bytes),
+            (SELECT_VENDOR..=SELECT_SERIAL, State::Waiting) => {
+                return self.select(command - SELECT_VENDOR, number).then_some((SELECTED, 0));
+            }
+            (IDENTIFY_VENDOR..=IDENTIFY_SERIAL_HIGH, _) => {
+                return self.identify(command - IDENTIFY_VENDOR, number).then_some((IDENTIFIED, 0));
+            }
+            (IDENTIFY_NON_CONFIGURED, _) => return self.is_unconfigured().then_some((NON_CONFIGURED, 0)),
+            (FASTSCAN, State::Waiting) => return self.fastscan(bytes).then_some((IDENTIFIED, 0)),
             (CONFIGURE_NODE_ID, State::Configuration) => {
                 let known = NodeId::new(a).is_some() || a == UNCONFIGURED;
                 if known {
                     self.pending = NodeId::new(a);
                 }
-                Some(answer(CONFIGURE_NODE_ID, [u8::from(!known), 0]))
+                u32::from(!known)
             }
             (CONFIGURE_BIT_TIMING, State::Configuration) => {
                 let rate = BitRate::from_index(b).filter(|rate| a == 0 && device.supports(*rate));
                 self.bit_rate = rate.or(self.bit_rate);
-                Some(answer(CONFIGURE_BIT_TIMING, [u8::from(rate.is_none()), 0]))
+                u32::from(rate.is_none())
             }
             (ACTIVATE_BIT_TIMING, State::Configuration) => {
                 let delay_ms = u16::from_le_bytes([a, b]);
-                if let Some(rate) = self.bit_rate {
-                    let switch_at = now + u32::from(delay_ms);
-                    self.activation = Activation::Before { rate, switch_at, delay_ms };
-                }
-                None
+                let switch_at = now + u32::from(delay_ms);
+                self.activation = Activation::Before { rate: self.bit_rate?, switch_at, delay_ms };
+                return None;
             }
             (STORE, State::Configuration) => match device.store(self.pending, self.bit_rate) {
-                Poll::Ready(outcome) => Some(store_answer(outcome)),
+                Poll::Ready(outcome) => error_code(outcome),
                 Poll::Pending => {
                     self.storing = true;
-                    None
+                    return None;
                 }
             },
             (INQUIRE_VENDOR..=INQUIRE_SERIAL, State::Configuration) => {
-                let part = self.address.parts()[usize::from(command - INQUIRE_VENDOR)];
-                let [a, b, c, d] = part.to_le_bytes();
-                Some([command, a, b, c, d, 0, 0, 0])
+                self.address[usize::from(command - INQUIRE_VENDOR)]
             }
-            (INQUIRE_NODE_ID, State::Configuration) => {
-                Some(answer(INQUIRE_NODE_ID, [self.active.map_or(UNCONFIGURED, NodeId::get), 0]))
-            }
-            _ => None,
-        }
+            (INQUIRE_NODE_ID, State::Configuration) => self.active.map_or(UNCONFIGURED, NodeId::get).into(),
+            _ => return None,
+        };
+        Some((command, number))
     }
 
     /// Whether it has no node-ID and is not about to get one.
@@ -326,19 +328,20 @@ impl Lss {
         }
     }
 
-    /// Four requests in a row name a device.
-    fn select(&mut self, step: u8, number: u32) -> Option<[u8; 8]> {
-        let matches = self.address.parts()[usize::from(step)] == number;
-        if !advance(&mut self.selected, step, 3, matches) {
-            return None;
+    /// Four requests in a row name a device: whether this was the last of them.
+    fn select(&mut self, step: u8, number: u32) -> bool {
+        let matches = self.address[usize::from(step)] == number;
+        let complete = advance(&mut self.selected, step, 3, matches);
+        if complete {
+            self.state = State::Configuration;
         }
-        self.state = State::Configuration;
-        Some(answer(SELECTED, [0; 2]))
+        complete
     }
 
-    /// Six requests in a row name vendor, product, and the bounds of revision and serial number.
-    fn identify(&mut self, step: u8, number: u32) -> Option<[u8; 8]> {
-        let LssAddress { vendor_id, product_code, revision, serial_number } = self.address;
+    /// Six requests in a row name vendor, product, and the bounds of revision and serial number:
+    /// whether this was the last of them.
+    fn identify(&mut self, step: u8, number: u32) -> bool {
+        let [vendor_id, product_code, revision, serial_number] = self.address;
         let matches = match step {
             0 => number == vendor_id,
             1 => number == product_code,
@@ -347,31 +350,35 @@ impl Lss {
             4 => number <= serial_number,
             _ => number >= serial_number,
         };
-        advance(&mut self.identified, step, 5, matches).then(|| answer(IDENTIFIED, [0; 2]))
+        advance(&mut self.identified, step, 5, matches)
     }
 
-    /// One bit of the address after another: who has them as asked answers, all at once.
-    fn fastscan(&mut self, bytes: &[u8; 8]) -> Option<[u8; 8]> {
+    /// Compares one bit of the address after another: whether all up to this one are those of the
+    /// request. Slaves with a node-ID take no part.
+    fn fastscan(&mut self, bytes: &[u8; 8]) -> bool {
         let [_, a, b, c, d, bit, part, next] = *bytes;
-        let number = u32::from_le_bytes([a, b, c, d]);
+        if !self.is_unconfigured() {
+            return false;
+        }
         if bit == CONFIRM {
             self.position = 0;
-            return Some(answer(IDENTIFIED, [0; 2]));
+            return true;
         }
         if bit > 31 || next > 3 || part != self.position {
-            return None;
+            return false;
         }
         // Bits from 31 down to this one.
         let asked = u32::MAX << bit;
-        if (self.address.parts()[usize::from(part)] ^ number) & asked != 0 {
-            return None;
+        let number = u32::from_le_bytes([a, b, c, d]);
+        if (self.address[usize::from(part)] ^ number) & asked != 0 {
+            return false;
         }
         self.position = next;
-        // All of the last part was confirmed: found.
+        // All bits of the last part match: the master has found this device.
         if bit == 0 && next < part {
             self.state = State::Configuration;
         }
-        Some(answer(IDENTIFIED, [0; 2]))
+        true
     }
 }
 
@@ -384,10 +391,13 @@ fn advance(done: &mut u8, step: u8, last: u8, matches: bool) -> bool {
     complete
 }
 
-fn store_answer(outcome: Result<(), StoreError>) -> [u8; 8] {
-    answer(STORE, [outcome.err().map_or(0, |error| error as u8), 0])
+/// The error code of the answer to a store, 0 for success.
+fn error_code(outcome: Result<(), StoreError>) -> u32 {
+    outcome.err().map_or(0, |error| error as u32)
 }
 
-fn answer(command: u8, [a, b]: [u8; 2]) -> [u8; 8] {
-    [command, a, b, 0, 0, 0, 0, 0]
+/// An answer: a number, or an error code, behind the command specifier.
+const fn answer(command: u8, number: u32) -> [u8; 8] {
+    let [a, b, c, d] = number.to_le_bytes();
+    [command, a, b, c, d, 0, 0, 0]
 }

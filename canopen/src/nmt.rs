@@ -53,7 +53,7 @@ impl NmtCommand {
     /// form, is none.
     #[must_use]
     pub fn parse(frame: &Frame, node: NodeId) -> Option<Self> {
-        if frame.cob_id() != Some(CobId::NMT) {
+        if !frame.has_cob_id(CobId::NMT) {
             return None;
         }
         let [command, addressed] = *frame.exactly()?;

@@ -44,7 +44,7 @@ pub type NmtEvent = NmtCommand;
 #[derive(Debug)]
 pub struct Node {
     id: NodeId,
-    config: Config,
+    nmt: NmtPolicy,
     state: NmtState,
     heartbeat: Heartbeat,
     sdo: SdoServer,
@@ -56,7 +56,7 @@ impl Node {
     pub const fn new(id: NodeId, config: Config) -> Self {
         Self {
             id,
-            config,
+            nmt: config.nmt,
             state: NmtState::Initialisation,
             heartbeat: Heartbeat::new(config.heartbeat_ms, Instant::from_millis(0)),
             sdo: SdoServer::new(id, config.sdo),
@@ -90,7 +90,9 @@ impl Node {
     /// is said again.
     pub fn restart(&mut self, id: NodeId, objects: &mut impl Objects) {
         self.sdo.reset(objects);
-        *self = Self::new(id, Config { heartbeat_ms: self.heartbeat.period_ms(), ..self.config });
+        let config =
+            Config { heartbeat_ms: self.heartbeat.period_ms(), nmt: self.nmt, sdo: self.sdo.config() };
+        *self = Self::new(id, config);
     }
 
     /// Takes the value of 1017h: the heartbeat's period in milliseconds, 0 for none. The same value
@@ -127,7 +129,7 @@ impl Node {
         }
         if self.state != NmtState::Stopped {
             if let Some(emergency) = objects.next_emergency() {
-                return Some(Frame::of(CobId::emcy(self.id), &emergency));
+                return Some(Frame::full(CobId::emcy(self.id), emergency));
             }
         }
         self.heartbeat.take_due(now).then(|| nmt::state_message(self.id, self.state))
@@ -144,7 +146,7 @@ impl Node {
     }
 
     fn command(&mut self, command: NmtCommand, objects: &mut impl Objects) {
-        let state = match (command, self.config.nmt) {
+        let state = match (command, self.nmt) {
             (NmtCommand::Start, NmtPolicy::Follow) => NmtState::Operational,
             (NmtCommand::Stop, NmtPolicy::Follow) => {
                 // A stopped node serves no SDO, so nothing could end the transfer properly.

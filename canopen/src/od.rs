@@ -98,6 +98,7 @@ pub enum DataType {
 impl DataType {
     /// Bytes of a value; `None` where that differs from value to value.
     #[must_use]
+    #[inline(never)]
     pub const fn size(self) -> Option<u32> {
         match self {
             Self::Boolean | Self::Integer8 | Self::Unsigned8 => Some(1),

@@ -2,6 +2,7 @@
 //! TEC bootloader (manual L-1112d_10, tables 1 to 3).
 
 use core::fmt;
+use core::num::NonZeroU8;
 
 use crate::sdo::AbortCode;
 
@@ -113,14 +114,14 @@ pub enum ProgramState {
 pub struct FlashStatus {
     /// A command is being carried out.
     pub busy: bool,
-    /// How the last command ended, `None` for well.
+    /// How the last command ended; `None` if it succeeded.
     pub error: Option<FlashError>,
     /// More about the error, for the manufacturer.
     pub detail: u16,
 }
 
 impl FlashStatus {
-    /// No command runs, and the last one ended well.
+    /// No command runs, and the last one succeeded.
     pub const OK: Self = Self { busy: false, error: None, detail: 0 };
     /// A command is being carried out.
     pub const BUSY: Self = Self { busy: true, error: None, detail: 0 };
@@ -134,8 +135,7 @@ impl FlashStatus {
     /// Takes the word of 1F57h apart.
     #[must_use]
     pub const fn from_word(word: u32) -> Self {
-        let code = word as u8 & 0xFE;
-        let error = if code == 0 { None } else { Some(FlashError::from_code(code)) };
+        let error = FlashError::from_code(word as u8);
         Self { busy: word & 1 != 0, error, detail: (word >> 16) as u16 }
     }
 
@@ -150,112 +150,96 @@ impl FlashStatus {
     }
 }
 
-/// Why a command to the bootloader failed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum FlashError {
-    /// There is no valid program to start.
-    NoValidProgram,
-    /// The data written to 1F50h are not in the expected form.
-    Format,
-    /// The CRC of the data is wrong.
-    Crc,
-    /// The program's flash is not erased.
-    NotCleared,
-    /// The flash could not be written.
-    Write,
-    /// An address outside the program's flash.
-    Address,
-    /// A protected part of the flash.
-    Secured,
-    /// The non-volatile parameters could not be read or written.
-    NvData,
-    /// None of the others.
-    Unspecified,
-    /// The program is for another vendor's devices.
-    WrongVendorId,
-    /// The program is for another product.
-    WrongProductId,
-    /// Programming is not allowed, or not at present.
-    NoAccess,
-    /// Data were written while a command was still being carried out.
-    Busy,
-    /// The blocks came in a wrong order.
-    Sequence,
-    /// A code that this version does not know, as read from another device.
-    Other(u8),
-}
+/// Why a command to the bootloader failed: the error code of 1F57h where it stands in the word, so
+/// bit 0 is clear. A device may have codes that are none of the manual's.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+pub struct FlashError(NonZeroU8);
 
 impl FlashError {
-    /// The error code where it stands in the word: bit 0 is always clear.
+    /// The error with the code in the lowest byte of the word, whose bit 0 is not looked at; `None`
+    /// for no error.
     #[must_use]
-    pub const fn code(self) -> u8 {
-        match self {
-            Self::NoValidProgram => 0x02,
-            Self::Format => 0x04,
-            Self::Crc => 0x06,
-            Self::NotCleared => 0x08,
-            Self::Write => 0x0A,
-            Self::Address => 0x0C,
-            Self::Secured => 0x0E,
-            Self::NvData => 0x10,
-            Self::Unspecified => 0x7E,
-            Self::WrongVendorId => 0x80,
-            Self::WrongProductId => 0x82,
-            Self::NoAccess => 0x84,
-            Self::Busy => 0x86,
-            Self::Sequence => 0x88,
-            Self::Other(code) => code & 0xFE,
+    pub const fn from_code(byte: u8) -> Option<Self> {
+        match NonZeroU8::new(byte & 0xFE) {
+            Some(code) => Some(Self(code)),
+            None => None,
         }
     }
 
-    const fn from_code(code: u8) -> Self {
-        match code {
-            0x02 => Self::NoValidProgram,
-            0x04 => Self::Format,
-            0x06 => Self::Crc,
-            0x08 => Self::NotCleared,
-            0x0A => Self::Write,
-            0x0C => Self::Address,
-            0x0E => Self::Secured,
-            0x10 => Self::NvData,
-            0x7E => Self::Unspecified,
-            0x80 => Self::WrongVendorId,
-            0x82 => Self::WrongProductId,
-            0x84 => Self::NoAccess,
-            0x86 => Self::Busy,
-            0x88 => Self::Sequence,
-            code => Self::Other(code),
-        }
+    /// The error code where it stands in the word: 2 to FEh, bit 0 is clear.
+    #[must_use]
+    pub const fn code(self) -> u8 {
+        self.0.get()
     }
 }
 
-impl fmt::Display for FlashError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::NoValidProgram => "there is no valid program to start",
-            Self::Format => "the data are not in the expected form",
-            Self::Crc => "the CRC is wrong",
-            Self::NotCleared => "the program has to be cleared first",
-            Self::Write => "the flash could not be written",
-            Self::Address => "an address lies outside the program's flash",
-            Self::Secured => "this part of the flash is protected",
-            Self::NvData => "the non-volatile parameters could not be read or written",
-            Self::Unspecified => "unspecified error",
-            Self::WrongVendorId => "the program is for another vendor's devices",
-            Self::WrongProductId => "the program is for another product",
-            Self::NoAccess => "programming is not allowed at present",
-            Self::Busy => "a command is still being carried out",
-            Self::Sequence => "the blocks came in a wrong order",
-            Self::Other(code) => return write!(f, "unknown flash error {code:02X}h"),
-        })
-    }
+/// Names and words of the manual's codes, from one list.
+macro_rules! flash_errors {
+    ($($name:ident = $code:literal, $doc:literal, $words:literal;)*) => {
+        /// The codes of the manual, table 3.
+        #[allow(non_upper_case_globals, reason = "they are used as the variants of an open enum")]
+        impl FlashError {
+            $(#[doc = $doc] pub const $name: Self = Self(NonZeroU8::new($code).unwrap());)*
+        }
+
+        impl fmt::Debug for FlashError {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                match self.code() {
+                    $($code => f.write_str(stringify!($name)),)*
+                    code => write!(f, "FlashError({code:02X}h)"),
+                }
+            }
+        }
+
+        impl fmt::Display for FlashError {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                match self.code() {
+                    $($code => f.write_str($words),)*
+                    code => write!(f, "unknown flash error {code:02X}h"),
+                }
+            }
+        }
+    };
+}
+
+flash_errors! {
+    NoValidProgram = 0x02, "There is no valid program to start.",
+        "there is no valid program to start";
+    Format = 0x04, "The data written to 1F50h are not in the expected form.",
+        "the data are not in the expected form";
+    Crc = 0x06, "The CRC of the data is wrong.",
+        "the CRC is wrong";
+    NotCleared = 0x08, "The program's flash is not erased.",
+        "the program has to be cleared first";
+    Write = 0x0A, "The flash could not be written.",
+        "the flash could not be written";
+    Address = 0x0C, "An address outside the program's flash.",
+        "an address lies outside the program's flash";
+    Secured = 0x0E, "A protected part of the flash.",
+        "this part of the flash is protected";
+    NvData = 0x10, "The non-volatile parameters could not be read or written.",
+        "the non-volatile parameters could not be read or written";
+    Unspecified = 0x7E, "None of the others.",
+        "unspecified error";
+    WrongVendorId = 0x80, "The program is for another vendor's devices.",
+        "the program is for another vendor's devices";
+    WrongProductId = 0x82, "The program is for another product.",
+        "the program is for another product";
+    NoAccess = 0x84, "Programming is not allowed, or not at present.",
+        "programming is not allowed at present";
+    Busy = 0x86, "Data were written while a command was still being carried out.",
+        "a command is still being carried out";
+    Sequence = 0x88, "The blocks came in a wrong order.",
+        "the blocks came in a wrong order";
 }
 
 impl core::error::Error for FlashError {}
 
 #[cfg(test)]
 mod tests {
+    extern crate std;
     use super::*;
+    use std::format;
 
     /// Table 3 of the manual, copied.
     #[test]
@@ -289,7 +273,9 @@ mod tests {
     #[test]
     fn detail_busy_and_foreign_codes_survive() {
         let status = FlashStatus::from_word(0x1234_0021);
-        assert_eq!(status, FlashStatus { busy: true, error: Some(FlashError::Other(0x20)), detail: 0x1234 });
+        assert_eq!(status, FlashStatus { busy: true, error: FlashError::from_code(0x20), detail: 0x1234 });
+        assert_eq!(status.error.unwrap().code(), 0x20);
+        assert_eq!(format!("{}", status.error.unwrap()), "unknown flash error 20h");
         assert_eq!(status.to_word(), 0x1234_0021);
     }
 

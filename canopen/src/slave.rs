@@ -9,14 +9,10 @@
 //!
 //! A new slave first says how to set the controller up, so there is one place that does.
 
-use crate::bit_rate::BitRate;
-#[cfg(feature = "auto-bit-rate")]
-use crate::bit_rate::Detector;
+use crate::bit_rate::{BitRate, Detector};
 use crate::frame::{CobId, Frame, NodeId};
 use crate::line::{Consequence, LineEvent, Losses, Monitor, Status};
-#[cfg(feature = "lss")]
-use crate::lss::Lss;
-use crate::lss::{self, LssAddress, LssDevice};
+use crate::lss::{self, Lss, LssAddress, LssDevice};
 use crate::nmt::NmtCommand;
 use crate::node::{self, Node};
 use crate::od::Objects;
@@ -35,13 +31,21 @@ pub trait SlaveDevice: Objects + LssDevice {
     }
 }
 
-/// What can be chosen about a slave.
-#[derive(Clone, Copy, Debug, Default)]
+/// What can be chosen about a slave. Whether it may find out the bit rate by listening is told by
+/// [`LssDevice::supports`] of [`BitRate::Auto`].
+#[derive(Clone, Copy, Debug)]
 pub struct Config {
     /// The node's part.
     pub node: node::Config,
-    /// The part of the layer setting services.
-    pub lss: lss::Config,
+    /// The part of the layer setting services; `None` for a slave without.
+    pub lss: Option<lss::Config>,
+}
+
+impl Default for Config {
+    /// With layer setting services.
+    fn default() -> Self {
+        Self { node: node::Config::default(), lss: Some(lss::Config::default()) }
+    }
 }
 
 /// What the owner has to do.
@@ -49,14 +53,14 @@ pub struct Config {
 pub enum Output {
     /// Send this frame.
     Send(Frame),
-    /// Set the controller to this bit rate, never [`BitRate::Auto`], and take part in the bus. What
-    /// waits in the mailboxes is not sent any more.
+    /// Set the controller to this bit rate, never [`BitRate::Auto`], and take part in the bus.
+    /// Frames that wait in the mailboxes are dropped.
     Join(BitRate),
     /// Set the controller to this bit rate and listen only.
     Listen(BitRate),
     /// Bring the controller back from bus-off.
     RecoverFromBusOff,
-    /// Let in the frames of exactly these identifiers; one may be named twice.
+    /// Accept the frames of exactly these identifiers; one may be named twice.
     Accept([CobId; 3]),
 }
 
@@ -64,42 +68,34 @@ pub enum Output {
 #[derive(Debug)]
 pub struct Slave {
     config: Config,
+    /// `None` while the device has no node-ID.
     node: Option<Node>,
-    #[cfg(feature = "lss")]
     lss: Lss,
     line: Line,
     losses: Losses,
-    /// The node-ID changed: the filters have yet to follow.
+    /// The node-ID changed, and the owner has yet to set the filters to it.
     accept: bool,
 }
 
 #[derive(Debug)]
 enum Line {
-    /// To be set to this rate.
+    /// The controller has to be set to this rate.
     Down(BitRate),
-    #[cfg(feature = "auto-bit-rate")]
-    Listening {
-        detector: Detector,
-        set: BitRate,
-    },
-    Up {
-        monitor: Monitor,
-        recover_from_bus_off: bool,
-    },
+    /// The bit rate is searched for; the controller is set to `set`.
+    Listening { detector: Detector, set: Option<BitRate> },
+    /// The controller takes part in the bus.
+    Up { monitor: Monitor, recover_from_bus_off: bool },
 }
 
 impl Slave {
-    /// A device with this node-ID, or without one, on a bus of this bit rate. One without node-ID
-    /// is silent, but for layer setting services.
+    /// A device with this node-ID, or without one, on a bus of this bit rate. A device without
+    /// node-ID sends nothing but answers of layer setting services.
     #[must_use]
     pub fn new(address: LssAddress, id: Option<NodeId>, rate: BitRate, config: Config) -> Self {
-        #[cfg(not(feature = "lss"))]
-        let _ = address;
         Self {
             config,
             node: id.map(|id| Node::new(id, config.node)),
-            #[cfg(feature = "lss")]
-            lss: Lss::new(address, id, config.lss),
+            lss: Lss::new(address, id, config.lss.unwrap_or_default()),
             line: Line::Down(rate),
             losses: Losses::default(),
             accept: true,
@@ -120,28 +116,26 @@ impl Slave {
         }
     }
 
-    /// Whether nothing is on its way to a client: no transfer, no answer.
+    /// Whether no SDO transfer is going on and no SDO answer waits to be sent.
     #[must_use]
     pub fn is_idle(&self) -> bool {
         self.node.as_ref().is_none_or(Node::is_sdo_idle)
     }
 
-    /// Takes a frame, whatever it is, and tells whether the NMT master asked to restart the device.
+    /// Takes any frame received; gives whether the NMT master asked to restart the device.
     pub fn handle(&mut self, frame: &Frame, now: Instant, device: &mut impl SlaveDevice) -> bool {
-        // Who only listens is not on the bus yet, and could not answer.
+        // While the controller only listens, nothing could be answered.
         if !matches!(self.line, Line::Up { .. }) {
             return false;
         }
-        #[cfg(feature = "lss")]
-        self.lss.handle(frame, now, device);
+        if self.config.lss.is_some() {
+            self.lss.handle(frame, now, device);
+        }
         let Some(node) = &mut self.node else { return false };
         match node.handle(frame, now, device) {
             Some(NmtCommand::ResetNode) => return true,
             Some(NmtCommand::ResetCommunication) => {
-                #[cfg(feature = "lss")]
                 let id = self.lss.reset_communication();
-                #[cfg(not(feature = "lss"))]
-                let id = Some(node.id());
                 self.restart(id, device);
             }
             _ => {}
@@ -149,14 +143,13 @@ impl Slave {
         false
     }
 
-    /// Takes what the controller tells of itself.
+    /// Takes the state of the controller.
     pub fn observe(&mut self, status: Status, now: Instant, device: &mut impl SlaveDevice) {
         if let Some(lost) = self.losses.observe(status.lost, now) {
             device.line_event(LineEvent::Lost(lost));
         }
         match &mut self.line {
             Line::Down(_) => {}
-            #[cfg(feature = "auto-bit-rate")]
             Line::Listening { detector, .. } => {
                 if detector.heard(status.heard, now, |rate| device.supports(rate)) {
                     self.line = Line::Down(detector.rate());
@@ -173,72 +166,55 @@ impl Slave {
     /// What to do next, until there is nothing. Frames are given only while there is `room` for one
     /// in the mailboxes.
     pub fn poll(&mut self, now: Instant, room: bool, device: &mut impl SlaveDevice) -> Option<Output> {
-        if core::mem::take(&mut self.accept) {
-            return Some(Output::Accept(self.identifiers()));
-        }
-        match &mut self.line {
-            Line::Down(rate) => {
-                let rate = *rate;
-                return Some(self.bring_up(rate, now, device));
+        loop {
+            if core::mem::take(&mut self.accept) {
+                return Some(Output::Accept(self.identifiers()));
             }
-            #[cfg(feature = "auto-bit-rate")]
-            Line::Listening { detector, set } => {
-                if *set == detector.rate() {
-                    return None;
+            match &mut self.line {
+                Line::Down(BitRate::Auto) => {
+                    let detector = Detector::new(BitRate::K125, now, |rate| device.supports(rate));
+                    self.line = Line::Listening { detector, set: None };
+                    continue;
                 }
-                *set = detector.rate();
-                return Some(Output::Listen(*set));
-            }
-            Line::Up { recover_from_bus_off, .. } => {
-                if core::mem::take(recover_from_bus_off) {
-                    return Some(Output::RecoverFromBusOff);
+                &mut Line::Down(rate) => {
+                    self.line = Line::Up { monitor: Monitor::new(now), recover_from_bus_off: false };
+                    return Some(Output::Join(rate));
+                }
+                Line::Listening { detector, set } => {
+                    let rate = detector.rate();
+                    let is_new = set.replace(rate) != Some(rate);
+                    return is_new.then_some(Output::Listen(rate));
+                }
+                Line::Up { recover_from_bus_off, .. } => {
+                    if core::mem::take(recover_from_bus_off) {
+                        return Some(Output::RecoverFromBusOff);
+                    }
                 }
             }
-        }
-        #[cfg(feature = "lss")]
-        {
             self.lss.follow_store(device);
-            match room.then(|| self.lss.poll(now)).flatten() {
+            if !room {
+                return None;
+            }
+            match self.lss.poll(now) {
                 Some(lss::Output::Send(frame)) => return Some(Output::Send(frame)),
-                Some(lss::Output::BitRate(rate)) => return Some(self.bring_up(rate, now, device)),
-                Some(lss::Output::NodeId(id)) => {
-                    self.restart(Some(id), device);
-                    self.accept = false;
-                    return Some(Output::Accept(self.identifiers()));
-                }
+                Some(lss::Output::BitRate(rate)) => self.line = Line::Down(rate),
+                Some(lss::Output::NodeId(id)) => self.restart(Some(id), device),
                 None if self.lss.is_silent(now) => return None,
-                None => {}
+                None => return self.node.as_mut()?.poll(now, device).map(Output::Send),
             }
         }
-        if !room {
-            return None;
-        }
-        self.node.as_mut()?.poll(now, device).map(Output::Send)
     }
 
-    /// The identifiers that it serves.
+    /// The identifiers of the frames that it serves.
     fn identifiers(&self) -> [CobId; 3] {
-        let lss = if cfg!(feature = "lss") { CobId::LSS_REQUEST } else { CobId::NMT };
+        let lss = if self.config.lss.is_some() { CobId::LSS_REQUEST } else { CobId::NMT };
         match &self.node {
             Some(node) => [CobId::NMT, lss, CobId::sdo_request(node.id())],
             None => [lss; 3],
         }
     }
 
-    fn bring_up(&mut self, rate: BitRate, now: Instant, device: &mut impl SlaveDevice) -> Output {
-        #[cfg(feature = "auto-bit-rate")]
-        if rate == BitRate::Auto {
-            let detector = Detector::new(BitRate::K125, now, |rate| device.supports(rate));
-            let set = detector.rate();
-            self.line = Line::Listening { detector, set };
-            return Output::Listen(set);
-        }
-        let _ = device;
-        self.line = Line::Up { monitor: Monitor::new(now), recover_from_bus_off: false };
-        Output::Join(rate)
-    }
-
-    /// The node starts anew under this node-ID: a transfer ends, the boot-up is said (again).
+    /// Starts the node anew under this node-ID: a transfer ends, the boot-up is sent (again).
     fn restart(&mut self, id: Option<NodeId>, device: &mut impl SlaveDevice) {
         if let Some(node) = &mut self.node {
             node.end_transfer(device);

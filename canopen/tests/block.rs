@@ -346,6 +346,20 @@ fn server_switches_the_protocol_below_the_threshold() {
     ]);
 }
 
+/// A product may turn block upload off: such a request is an unknown one then.
+#[test]
+fn server_without_block_upload_refuses_it() {
+    let unknown_request = AbortCode(0x0800_0000);
+    let config = ServerConfig { block_upload: false, unknown_request, ..ServerConfig::DEFAULT };
+    let mut bench = Bench { server: SdoServer::new(node(), config), device: Device::default(), now: 0 };
+    bench.expect(&[(READ_14, &[[0x80, 0, 0, 0, 0x00, 0x00, 0x00, 0x08]])]);
+    bench.still_serves();
+    for request in [START, acked(1, 127), ENDED] {
+        bench.expect(&[(request, &[[0x80, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x08]])]);
+    }
+    bench.still_serves();
+}
+
 #[test]
 fn server_aborts_a_block_upload_that_is_wrong() {
     let abort = |code: u32| {

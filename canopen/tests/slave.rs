@@ -141,6 +141,23 @@ fn a_device_without_node_id_lets_lss_in_alone_and_boots_when_it_gets_one() {
     assert_eq!(bench.device.ids, [Some(9)]);
 }
 
+/// A product may turn layer setting services off.
+#[test]
+fn a_slave_without_lss_neither_accepts_nor_answers_its_requests() {
+    let config = Config { lss: None, ..Config::default() };
+    let slave = Slave::new(ADDRESS, NodeId::new(5), BitRate::K500, config);
+    let mut bench = Bench { slave, device: Device::default(), now: 0 };
+    let ids = [CobId::NMT, CobId::NMT, CobId::sdo_request(NodeId::new(5).unwrap())];
+    let boot_up = Output::Send(Frame::of(CobId::new(0x705).unwrap(), &[0]));
+    assert_eq!(bench.outputs(), [Output::Accept(ids), Output::Join(BitRate::K500), boot_up]);
+    // Switch state global to configuration, inquire node-ID.
+    for request in [[0x04, 1, 0, 0, 0, 0, 0, 0], [0x5E, 0, 0, 0, 0, 0, 0, 0]] {
+        let frame = Frame::full(CobId::LSS_REQUEST, request);
+        assert!(!bench.slave.handle(&frame, at(bench.now), &mut bench.device));
+        assert_eq!(bench.outputs(), []);
+    }
+}
+
 #[test]
 fn reset_communication_takes_over_what_lss_configured() {
     let mut bench = Bench::new(5, BitRate::K125);

@@ -283,8 +283,6 @@ const fn flash_error_number(error: FlashError) -> u32 {
         FlashError::Write => 0x6000_0005,
         FlashError::Address => 0x6000_0006,
         FlashError::Secured => 0x6000_0007,
-        // "An error that is unknown to the tool."
-        FlashError::Unspecified | FlashError::Other(_) => 0x6000_0008,
         // Newer than the manual's list.
         FlashError::NvData
         | FlashError::WrongVendorId
@@ -292,6 +290,8 @@ const fn flash_error_number(error: FlashError) -> u32 {
         | FlashError::NoAccess
         | FlashError::Busy
         | FlashError::Sequence => 0x6000_0100 + error.code() as u32,
+        // "An error that is unknown to the tool", or unspecified.
+        _ => 0x6000_0008,
     }
 }
 
@@ -319,9 +319,7 @@ fn failure_advice(error: FlashError) -> &'static str {
             "wait a moment and run the command again; another tool may be at work on the device"
         }
         FlashError::Sequence => "run the command again; another tool may be at work on the device",
-        FlashError::Unspecified | FlashError::Other(_) => {
-            "run the command again, or switch the device off and on first"
-        }
+        _ => "run the command again, or switch the device off and on first",
     }
 }
 

@@ -1,7 +1,8 @@
 //! What both ends of a block transfer share: the CRC, and the order of the segments (CiA 301
 //! section 7.2.4.3.9 ff.).
 
-use crate::sdo::wire::{BlockEnd, BlockSegment, Chunk};
+use crate::sdo::fields;
+use crate::sdo::wire::Chunk;
 use crate::sdo::AbortCode;
 
 /// Segments in the largest sub-block.
@@ -61,33 +62,39 @@ pub(super) struct Receiver {
     /// Segments of the sub-block that is open; 0 while none is, because an acknowledgement is still
     /// to be sent.
     blksize: u8,
-    /// The last segment that came in order.
+    /// The number of the last segment that came in order.
     ackseq: u8,
-    /// Whether anything of this sub-block came.
+    /// Whether a segment of this sub-block came.
     heard: bool,
-    /// The segment that ended the sub-block before: seen again first thing, it is a duplicate.
+    /// The number of the segment that ended the sub-block before. If it comes again before any
+    /// other, it is a duplicate.
     ended_by: u8,
-    /// The last segment of all, held back until the end tells how many of its bytes count.
-    tail: Option<[u8; SEGMENT]>,
+    /// The frame of the last segment of all: how many of its bytes are data is told by the end.
+    last: Option<[u8; 8]>,
+    /// `None` if one side cannot make a CRC.
     crc: Option<Crc16>,
 }
 
 /// What follows from a segment.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct Received {
-    /// Data to pass on: always a full segment.
-    pub data: Option<[u8; SEGMENT]>,
+    /// It came in order and is not the last: its seven bytes are data.
+    pub is_data: bool,
     /// The sub-block is over: acknowledge up to this segment.
     pub ackseq: Option<u8>,
+}
+
+impl Received {
+    const NOTHING: Self = Self { is_data: false, ackseq: None };
 }
 
 impl Receiver {
     /// A receiver without an open sub-block. It computes a CRC if both sides can.
     pub fn new(crc: bool) -> Self {
-        Self { blksize: 0, ackseq: 0, heard: false, ended_by: 0, tail: None, crc: crc.then(Crc16::new) }
+        Self { blksize: 0, ackseq: 0, heard: false, ended_by: 0, last: None, crc: crc.then(Crc16::new) }
     }
 
-    /// Opens the next sub-block, once the frame that grants it is on its way.
+    /// Opens the next sub-block, of 1 to 127 segments, once the frame that grants it is on its way.
     pub fn open(&mut self, blksize: u8) {
         self.blksize = blksize;
         self.ackseq = 0;
@@ -96,7 +103,7 @@ impl Receiver {
 
     /// Whether the last segment of all has come, so that only the end is missing.
     pub fn is_complete(&self) -> bool {
-        self.tail.is_some()
+        self.last.is_some()
     }
 
     /// Whether a sub-block has begun and not ended: if nothing more comes, its end was lost.
@@ -104,34 +111,39 @@ impl Receiver {
         self.heard && self.blksize != 0
     }
 
-    /// Ends the sub-block; gives what to acknowledge.
+    /// Ends the sub-block; gives the number of the segment to acknowledge.
     pub fn close(&mut self) -> u8 {
         self.blksize = 0;
         self.ackseq
     }
 
-    /// Takes a segment.
-    pub fn take(&mut self, segment: &BlockSegment) -> Result<Received, AbortCode> {
-        let BlockSegment { last, seqno, data } = *segment;
+    /// Takes the frame of a segment.
+    ///
+    /// # Errors
+    /// [`AbortCode::SEQUENCE_NUMBER`] for number 0 and for a number above the block size.
+    pub fn take(&mut self, frame: &[u8; 8]) -> Result<Received, AbortCode> {
+        let last = frame[0] & fields::LAST_OF_BLOCKS != 0;
+        let seqno = frame[0] & !fields::LAST_OF_BLOCKS;
+        if seqno == 0 {
+            return Err(AbortCode::SEQUENCE_NUMBER);
+        }
         let in_order = seqno == self.ackseq + 1;
         let duplicate = !in_order && !self.heard && seqno == self.ended_by;
         if self.blksize == 0 || duplicate {
-            return Ok(Received { data: None, ackseq: None });
+            return Ok(Received::NOTHING);
         }
         if seqno > self.blksize {
             return Err(AbortCode::SEQUENCE_NUMBER);
         }
         self.heard = true;
-        let mut received = Received { data: None, ackseq: None };
+        let mut received = Received::NOTHING;
         if in_order {
             self.ackseq = seqno;
             if last {
-                self.tail = Some(data);
+                self.last = Some(*frame);
             } else {
-                if let Some(crc) = &mut self.crc {
-                    crc.update(&data);
-                }
-                received.data = Some(data);
+                self.count(&frame[1..]);
+                received.is_data = true;
             }
         }
         if last || seqno == self.blksize {
@@ -141,34 +153,37 @@ impl Receiver {
         Ok(received)
     }
 
-    /// Whether a frame is the last segment of all once more, in the place where the end is
-    /// expected.
-    pub fn is_duplicate_of_tail(&self, bytes: &[u8; 8]) -> bool {
-        match (BlockSegment::parse(bytes), self.tail) {
-            (Some(segment), Some(tail)) => {
-                segment == BlockSegment { last: true, seqno: self.ended_by, data: tail }
-            }
-            _ => false,
+    fn count(&mut self, data: &[u8]) {
+        if let Some(crc) = &mut self.crc {
+            crc.update(data);
         }
     }
 
-    /// Takes the end: checks the CRC and gives the data of the last segment.
-    pub fn finish(&mut self, end: &BlockEnd) -> Result<Chunk<SEGMENT>, AbortCode> {
-        let tail = self.tail.ok_or(AbortCode::COMMAND)?;
-        let tail = Chunk::new(&tail[..SEGMENT - usize::from(end.unused.min(SEGMENT as u8))]);
-        if let Some(crc) = &mut self.crc {
-            crc.update(&tail);
-            if crc.get() != end.crc {
-                return Err(AbortCode::CRC);
-            }
+    /// Whether a frame is the last segment of all once more, where the end is expected.
+    pub fn is_last_segment(&self, frame: &[u8; 8]) -> bool {
+        self.last.as_ref() == Some(frame)
+    }
+
+    /// Takes the end, with the number of bytes of the last segment that are no data, and the CRC.
+    /// Gives the data of the last segment.
+    ///
+    /// # Errors
+    /// [`AbortCode::COMMAND`] before the last segment, [`AbortCode::CRC`] for a wrong CRC.
+    pub fn finish(&mut self, unused: u8, crc: u16) -> Result<Chunk<SEGMENT>, AbortCode> {
+        let last = self.last.ok_or(AbortCode::COMMAND)?;
+        let data = Chunk::with_unused(&last[1..], unused);
+        self.count(&data);
+        match self.crc {
+            Some(computed) if computed.get() != crc => Err(AbortCode::CRC),
+            _ => Ok(data),
         }
-        Ok(tail)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sdo::wire::BlockSegment;
 
     /// CiA 301 section 7.2.4.3.16 gives the CRC of "123456789" as 31C3h.
     #[test]
@@ -180,33 +195,34 @@ mod tests {
         assert_eq!(Crc16::new().get(), 0);
     }
 
-    fn segment(last: bool, seqno: u8) -> BlockSegment {
-        BlockSegment { last, seqno, data: [seqno; 7] }
+    fn segment(last: bool, seqno: u8) -> [u8; 8] {
+        BlockSegment { last, seqno, data: [seqno; 7] }.emit()
     }
 
-    const NOTHING: Received = Received { data: None, ackseq: None };
+    const NOTHING: Received = Received::NOTHING;
+    const DATA: Received = Received { is_data: true, ackseq: None };
 
     #[test]
     fn a_gap_is_acknowledged_up_to_the_gap_at_the_end_of_the_sub_block() {
         let mut receiver = Receiver::new(false);
         receiver.open(4);
-        assert_eq!(receiver.take(&segment(false, 1)).unwrap().data, Some([1; 7]));
+        assert_eq!(receiver.take(&segment(false, 1)), Ok(DATA));
         assert_eq!(receiver.take(&segment(false, 3)), Ok(NOTHING));
-        assert_eq!(receiver.take(&segment(false, 4)), Ok(Received { data: None, ackseq: Some(1) }));
+        assert_eq!(receiver.take(&segment(false, 4)), Ok(Received { is_data: false, ackseq: Some(1) }));
         // Between acknowledgement and the next sub-block nothing counts.
         assert_eq!(receiver.take(&segment(false, 1)), Ok(NOTHING));
         receiver.open(4);
         // The end of the old sub-block once more.
         assert_eq!(receiver.take(&segment(false, 4)), Ok(NOTHING));
         assert!(!receiver.is_within());
-        assert_eq!(receiver.take(&segment(false, 1)).unwrap().data, Some([1; 7]));
+        assert_eq!(receiver.take(&segment(false, 1)), Ok(DATA));
         assert!(receiver.is_within());
         assert_eq!(receiver.take(&segment(false, 1)), Ok(NOTHING));
-        assert_eq!(receiver.take(&segment(true, 2)), Ok(Received { data: None, ackseq: Some(2) }));
+        assert_eq!(receiver.take(&segment(true, 2)), Ok(Received { is_data: false, ackseq: Some(2) }));
         assert!(receiver.is_complete());
-        assert!(receiver.is_duplicate_of_tail(&segment(true, 2).emit()));
-        assert!(!receiver.is_duplicate_of_tail(&segment(false, 2).emit()));
-        let tail = receiver.finish(&BlockEnd { unused: 5, crc: 0xFFFF }).unwrap();
+        assert!(receiver.is_last_segment(&segment(true, 2)));
+        assert!(!receiver.is_last_segment(&segment(false, 2)));
+        let tail = receiver.finish(5, 0xFFFF).unwrap();
         assert_eq!(*tail, [2, 2]);
     }
 
@@ -215,7 +231,7 @@ mod tests {
         let mut receiver = Receiver::new(false);
         receiver.open(4);
         assert_eq!(receiver.take(&segment(false, 5)), Err(AbortCode::SEQUENCE_NUMBER));
-        assert_eq!(receiver.finish(&BlockEnd { unused: 0, crc: 0 }), Err(AbortCode::COMMAND));
+        assert_eq!(receiver.finish(0, 0), Err(AbortCode::COMMAND));
     }
 
     #[test]
@@ -224,7 +240,7 @@ mod tests {
         for _ in 0..3 {
             receiver.open(1);
             let taken = receiver.take(&segment(false, 1)).unwrap();
-            assert_eq!(taken, Received { data: Some([1; 7]), ackseq: Some(1) });
+            assert_eq!(taken, Received { is_data: true, ackseq: Some(1) });
         }
     }
 }

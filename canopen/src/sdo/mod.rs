@@ -7,6 +7,7 @@
 pub mod abort;
 pub mod block;
 pub mod client;
+mod fields;
 pub mod server;
 pub mod wire;
 

@@ -10,6 +10,7 @@
 use core::ops::Deref;
 
 use crate::od::Address;
+use crate::sdo::fields::{self, ccs, scs, with_address, without_address};
 use crate::sdo::AbortCode;
 
 /// Up to `N` bytes of data that travel in one frame.
@@ -35,7 +36,7 @@ impl<const N: usize> Chunk<N> {
     }
 
     /// From the field "n" and the bytes of the frame.
-    fn with_unused(bytes: &[u8], unused: u8) -> Self {
+    pub(super) fn with_unused(bytes: &[u8], unused: u8) -> Self {
         Self::new(&bytes[..N.saturating_sub(usize::from(unused))])
     }
 }
@@ -60,26 +61,25 @@ pub enum Payload {
 }
 
 impl Payload {
-    /// The payload that announces `size` bytes as segments.
-    const fn segmented(announced: bool, field: [u8; 4]) -> Self {
-        Self::Segmented(if announced { Some(u32::from_le_bytes(field)) } else { None })
-    }
-
-    fn parse(command: u8, field: [u8; 4]) -> Self {
-        let announced = command & 0x01 != 0;
-        match (command & 0x02 != 0, announced) {
-            (true, true) => Self::Expedited(Chunk::with_unused(&field, command >> 2 & 0x03)),
-            (true, false) => Self::Unsized(field),
-            (false, _) => Self::segmented(announced, field),
+    fn parse(bytes: &[u8; 8]) -> Self {
+        let command = bytes[0];
+        let data = fields::data(bytes);
+        match (command & fields::EXPEDITED != 0, command & fields::SIZE_TOLD != 0) {
+            (true, true) => Self::Expedited(Chunk::with_unused(&data, fields::unused_of_4(command))),
+            (true, false) => Self::Unsized(data),
+            (false, true) => Self::Segmented(Some(u32::from_le_bytes(data))),
+            (false, false) => Self::Segmented(None),
         }
     }
 
     /// The low bits of byte 0, and bytes 4 to 7.
     fn emit(&self) -> (u8, [u8; 4]) {
         match self {
-            Self::Expedited(data) => ((data.unused() & 0x03) << 2 | 0x03, data.bytes),
-            Self::Unsized(data) => (0x02, *data),
-            Self::Segmented(Some(size)) => (0x01, size.to_le_bytes()),
+            Self::Expedited(data) => {
+                ((data.unused() & 0x03) << 2 | fields::EXPEDITED | fields::SIZE_TOLD, data.bytes)
+            }
+            Self::Unsized(data) => (fields::EXPEDITED, *data),
+            Self::Segmented(Some(size)) => (fields::SIZE_TOLD, size.to_le_bytes()),
             Self::Segmented(None) => (0x00, [0; 4]),
         }
     }
@@ -98,8 +98,8 @@ pub struct Segment {
 
 impl Segment {
     fn parse(bytes: &[u8; 8]) -> Self {
-        let data = Chunk::with_unused(&bytes[1..], bytes[0] >> 1 & 0x07);
-        Self { toggle: toggle_of(bytes[0]), last: bytes[0] & 0x01 != 0, data }
+        let data = Chunk::with_unused(&bytes[1..], fields::unused_of_7(bytes[0]));
+        Self { toggle: toggle_of(bytes[0]), last: bytes[0] & fields::LAST != 0, data }
     }
 
     fn emit(&self, specifier: u8) -> [u8; 8] {
@@ -128,8 +128,8 @@ impl BlockSegment {
     #[must_use]
     pub fn parse(bytes: &[u8; 8]) -> Option<Self> {
         let [head, data @ ..] = *bytes;
-        let seqno = head & 0x7F;
-        (seqno != 0).then_some(Self { last: head & 0x80 != 0, seqno, data })
+        let seqno = head & !fields::LAST_OF_BLOCKS;
+        (seqno != 0).then_some(Self { last: head & fields::LAST_OF_BLOCKS != 0, seqno, data })
     }
 
     /// The bytes of the frame.
@@ -153,12 +153,12 @@ pub struct BlockEnd {
 
 impl BlockEnd {
     fn parse(bytes: &[u8; 8]) -> Self {
-        Self { unused: bytes[0] >> 2 & 0x07, crc: u16::from_le_bytes([bytes[1], bytes[2]]) }
+        Self { unused: fields::unused_of_blocks(bytes[0]), crc: fields::crc(bytes) }
     }
 
-    fn emit(&self) -> [u8; 8] {
+    fn emit(&self, command: u8) -> [u8; 8] {
         let [low, high] = self.crc.to_le_bytes();
-        [0xC1 | (self.unused & 0x07) << 2, low, high, 0, 0, 0, 0, 0]
+        without_address(command | (self.unused & 0x07) << 2, low, high)
     }
 }
 
@@ -169,6 +169,16 @@ pub struct BlockAck {
     pub ackseq: u8,
     /// Segments of the next sub-block, 1 to 127.
     pub blksize: u8,
+}
+
+impl BlockAck {
+    const fn parse(bytes: &[u8; 8]) -> Self {
+        Self { ackseq: bytes[1], blksize: bytes[2] }
+    }
+
+    const fn emit(self, command: u8) -> [u8; 8] {
+        without_address(command, self.ackseq, self.blksize)
+    }
 }
 
 /// What a client sends.
@@ -220,38 +230,25 @@ impl Request {
     #[must_use]
     pub fn parse(bytes: &[u8; 8]) -> Option<Self> {
         let command = bytes[0];
-        let at = address(bytes);
-        let field = field(bytes);
-        Some(match command >> 5 {
-            0 => Self::DownloadSegment(Segment::parse(bytes)),
-            1 => Self::InitiateDownload(at, Payload::parse(command, field)),
-            2 => Self::InitiateUpload(at),
-            3 => Self::UploadSegment(toggle_of(command)),
-            4 => Self::Abort(at, AbortCode(u32::from_le_bytes(field))),
-            5 => match command & 0x03 {
-                0 => Self::InitiateBlockUpload { at, crc: crc_of(command), blksize: bytes[4], pst: bytes[5] },
-                1 => Self::EndBlockUpload,
-                2 => Self::AckBlockUpload(BlockAck { ackseq: bytes[1], blksize: bytes[2] }),
-                _ => Self::StartBlockUpload,
-            },
-            6 => match command & 0x01 {
-                0 => Self::InitiateBlockDownload { at, crc: crc_of(command), size: size_of(command, field) },
-                _ => Self::EndBlockDownload(BlockEnd::parse(bytes)),
-            },
+        let at = fields::address(bytes);
+        Some(match fields::specifier(command) {
+            ccs::DOWNLOAD_SEGMENT => Self::DownloadSegment(Segment::parse(bytes)),
+            ccs::INITIATE_DOWNLOAD => Self::InitiateDownload(at, Payload::parse(bytes)),
+            ccs::INITIATE_UPLOAD => Self::InitiateUpload(at),
+            ccs::UPLOAD_SEGMENT => Self::UploadSegment(toggle_of(command)),
+            fields::ABORT => Self::Abort(at, AbortCode(fields::number(bytes))),
+            ccs::INITIATE_BLOCK_UPLOAD => {
+                Self::InitiateBlockUpload { at, crc: crc_of(command), blksize: bytes[4], pst: bytes[5] }
+            }
+            ccs::END_BLOCK_UPLOAD => Self::EndBlockUpload,
+            ccs::ACK_BLOCK_UPLOAD => Self::AckBlockUpload(BlockAck::parse(bytes)),
+            ccs::START_BLOCK_UPLOAD => Self::StartBlockUpload,
+            ccs::INITIATE_BLOCK_DOWNLOAD => {
+                Self::InitiateBlockDownload { at, crc: crc_of(command), size: size_of(bytes) }
+            }
+            ccs::END_BLOCK_DOWNLOAD => Self::EndBlockDownload(BlockEnd::parse(bytes)),
             _ => return None,
         })
-    }
-
-    /// Whether it belongs to block upload (ccs 5).
-    #[must_use]
-    pub const fn is_block_upload(&self) -> bool {
-        matches!(
-            self,
-            Self::InitiateBlockUpload { .. }
-                | Self::StartBlockUpload
-                | Self::AckBlockUpload(_)
-                | Self::EndBlockUpload
-        )
     }
 
     /// The bytes of the frame.
@@ -259,23 +256,24 @@ impl Request {
     pub fn emit(&self) -> [u8; 8] {
         match *self {
             Self::InitiateDownload(at, payload) => {
-                let (bits, field) = payload.emit();
-                with_address(0x20 | bits, at, field)
+                let (bits, data) = payload.emit();
+                with_address(ccs::INITIATE_DOWNLOAD | bits, at, data)
             }
-            Self::DownloadSegment(segment) => segment.emit(0x00),
-            Self::InitiateUpload(at) => with_address(0x40, at, [0; 4]),
-            Self::UploadSegment(toggle) => bare(0x60 | toggle_bit(toggle)),
-            Self::Abort(at, code) => with_address(0x80, at, code.0.to_le_bytes()),
+            Self::DownloadSegment(segment) => segment.emit(ccs::DOWNLOAD_SEGMENT),
+            Self::InitiateUpload(at) => with_address(ccs::INITIATE_UPLOAD, at, [0; 4]),
+            Self::UploadSegment(toggle) => without_address(ccs::UPLOAD_SEGMENT | toggle_bit(toggle), 0, 0),
+            Self::Abort(at, code) => with_address(fields::ABORT, at, code.0.to_le_bytes()),
             Self::InitiateBlockDownload { at, crc, size } => {
-                with_address(0xC0 | crc_bit(crc) | size_bit(size), at, size.unwrap_or(0).to_le_bytes())
+                let command = ccs::INITIATE_BLOCK_DOWNLOAD | crc_bit(crc) | size_bit(size);
+                with_address(command, at, size.unwrap_or(0).to_le_bytes())
             }
-            Self::EndBlockDownload(end) => end.emit(),
+            Self::EndBlockDownload(end) => end.emit(ccs::END_BLOCK_DOWNLOAD),
             Self::InitiateBlockUpload { at, crc, blksize, pst } => {
-                with_address(0xA0 | crc_bit(crc), at, [blksize, pst, 0, 0])
+                with_address(ccs::INITIATE_BLOCK_UPLOAD | crc_bit(crc), at, [blksize, pst, 0, 0])
             }
-            Self::EndBlockUpload => bare(0xA1),
-            Self::AckBlockUpload(ack) => [0xA2, ack.ackseq, ack.blksize, 0, 0, 0, 0, 0],
-            Self::StartBlockUpload => bare(0xA3),
+            Self::EndBlockUpload => without_address(ccs::END_BLOCK_UPLOAD, 0, 0),
+            Self::AckBlockUpload(ack) => ack.emit(ccs::ACK_BLOCK_UPLOAD),
+            Self::StartBlockUpload => without_address(ccs::START_BLOCK_UPLOAD, 0, 0),
         }
     }
 }
@@ -324,24 +322,22 @@ impl Response {
     #[must_use]
     pub fn parse(bytes: &[u8; 8]) -> Option<Self> {
         let command = bytes[0];
-        let at = address(bytes);
-        let field = field(bytes);
-        Some(match command >> 5 {
-            0 => Self::UploadSegment(Segment::parse(bytes)),
-            1 => Self::DownloadSegment(toggle_of(command)),
-            2 => Self::InitiateUpload(at, Payload::parse(command, field)),
-            3 => Self::InitiateDownload(at),
-            4 => Self::Abort(at, AbortCode(u32::from_le_bytes(field))),
-            5 => match command & 0x03 {
-                0 => Self::InitiateBlockDownload { at, crc: crc_of(command), blksize: bytes[4] },
-                1 => Self::EndBlockDownload,
-                2 => Self::AckBlockDownload(BlockAck { ackseq: bytes[1], blksize: bytes[2] }),
-                _ => return None,
-            },
-            6 => match command & 0x01 {
-                0 => Self::InitiateBlockUpload { at, crc: crc_of(command), size: size_of(command, field) },
-                _ => Self::EndBlockUpload(BlockEnd::parse(bytes)),
-            },
+        let at = fields::address(bytes);
+        Some(match fields::specifier(command) {
+            scs::UPLOAD_SEGMENT => Self::UploadSegment(Segment::parse(bytes)),
+            scs::DOWNLOAD_SEGMENT => Self::DownloadSegment(toggle_of(command)),
+            scs::INITIATE_UPLOAD => Self::InitiateUpload(at, Payload::parse(bytes)),
+            scs::INITIATE_DOWNLOAD => Self::InitiateDownload(at),
+            fields::ABORT => Self::Abort(at, AbortCode(fields::number(bytes))),
+            scs::INITIATE_BLOCK_DOWNLOAD => {
+                Self::InitiateBlockDownload { at, crc: crc_of(command), blksize: bytes[4] }
+            }
+            scs::END_BLOCK_DOWNLOAD => Self::EndBlockDownload,
+            scs::ACK_BLOCK_DOWNLOAD => Self::AckBlockDownload(BlockAck::parse(bytes)),
+            scs::INITIATE_BLOCK_UPLOAD => {
+                Self::InitiateBlockUpload { at, crc: crc_of(command), size: size_of(bytes) }
+            }
+            scs::END_BLOCK_UPLOAD => Self::EndBlockUpload(BlockEnd::parse(bytes)),
             _ => return None,
         })
     }
@@ -350,66 +346,62 @@ impl Response {
     #[must_use]
     pub fn emit(&self) -> [u8; 8] {
         match *self {
-            Self::InitiateDownload(at) => with_address(0x60, at, [0; 4]),
-            Self::DownloadSegment(toggle) => bare(0x20 | toggle_bit(toggle)),
+            Self::InitiateDownload(at) => with_address(scs::INITIATE_DOWNLOAD, at, [0; 4]),
+            Self::DownloadSegment(toggle) => {
+                without_address(scs::DOWNLOAD_SEGMENT | toggle_bit(toggle), 0, 0)
+            }
             Self::InitiateUpload(at, payload) => {
-                let (bits, field) = payload.emit();
-                with_address(0x40 | bits, at, field)
+                let (bits, data) = payload.emit();
+                with_address(scs::INITIATE_UPLOAD | bits, at, data)
             }
-            Self::UploadSegment(segment) => segment.emit(0x00),
-            Self::Abort(at, code) => with_address(0x80, at, code.0.to_le_bytes()),
+            Self::UploadSegment(segment) => segment.emit(scs::UPLOAD_SEGMENT),
+            Self::Abort(at, code) => with_address(fields::ABORT, at, code.0.to_le_bytes()),
             Self::InitiateBlockDownload { at, crc, blksize } => {
-                with_address(0xA0 | crc_bit(crc), at, [blksize, 0, 0, 0])
+                with_address(scs::INITIATE_BLOCK_DOWNLOAD | crc_bit(crc), at, [blksize, 0, 0, 0])
             }
-            Self::EndBlockDownload => bare(0xA1),
-            Self::AckBlockDownload(ack) => [0xA2, ack.ackseq, ack.blksize, 0, 0, 0, 0, 0],
+            Self::EndBlockDownload => without_address(scs::END_BLOCK_DOWNLOAD, 0, 0),
+            Self::AckBlockDownload(ack) => ack.emit(scs::ACK_BLOCK_DOWNLOAD),
             Self::InitiateBlockUpload { at, crc, size } => {
-                with_address(0xC0 | crc_bit(crc) | size_bit(size), at, size.unwrap_or(0).to_le_bytes())
+                let command = scs::INITIATE_BLOCK_UPLOAD | crc_bit(crc) | size_bit(size);
+                with_address(command, at, size.unwrap_or(0).to_le_bytes())
             }
-            Self::EndBlockUpload(end) => end.emit(),
+            Self::EndBlockUpload(end) => end.emit(scs::END_BLOCK_UPLOAD),
         }
     }
 }
 
-fn address(bytes: &[u8; 8]) -> Address {
-    Address { index: u16::from_le_bytes([bytes[1], bytes[2]]), sub: bytes[3] }
-}
-
-fn field(bytes: &[u8; 8]) -> [u8; 4] {
-    [bytes[4], bytes[5], bytes[6], bytes[7]]
-}
-
-fn with_address(command: u8, at: Address, field: [u8; 4]) -> [u8; 8] {
-    let [low, high] = at.index.to_le_bytes();
-    let [a, b, c, d] = field;
-    [command, low, high, at.sub, a, b, c, d]
-}
-
-const fn bare(command: u8) -> [u8; 8] {
-    [command, 0, 0, 0, 0, 0, 0, 0]
-}
-
 const fn toggle_of(command: u8) -> bool {
-    command & 0x10 != 0
+    command & fields::TOGGLE != 0
 }
 
-fn toggle_bit(toggle: bool) -> u8 {
-    u8::from(toggle) << 4
+const fn toggle_bit(toggle: bool) -> u8 {
+    if toggle {
+        fields::TOGGLE
+    } else {
+        0
+    }
 }
 
 const fn crc_of(command: u8) -> bool {
-    command & 0x04 != 0
+    command & fields::CRC != 0
 }
 
-fn crc_bit(crc: bool) -> u8 {
-    u8::from(crc) << 2
+const fn crc_bit(crc: bool) -> u8 {
+    if crc {
+        fields::CRC
+    } else {
+        0
+    }
 }
 
-/// The size that an initiate of a block transfer announces: told in bit 1, unlike elsewhere.
-fn size_of(command: u8, field: [u8; 4]) -> Option<u32> {
-    (command & 0x02 != 0).then(|| u32::from_le_bytes(field))
+/// The size that an initiate of a block transfer announces.
+fn size_of(bytes: &[u8; 8]) -> Option<u32> {
+    (bytes[0] & fields::BLOCK_SIZE_TOLD != 0).then(|| fields::number(bytes))
 }
 
-fn size_bit(size: Option<u32>) -> u8 {
-    u8::from(size.is_some()) << 1
+const fn size_bit(size: Option<u32>) -> u8 {
+    match size {
+        Some(_) => fields::BLOCK_SIZE_TOLD,
+        None => 0,
+    }
 }

@@ -175,7 +175,7 @@ impl Link {
     /// The eight bytes of an answer, if the frame is one and one is waited for.
     fn answer<'f>(&self, frame: &'f Frame) -> Option<&'f [u8; 8]> {
         let waiting = self.result.is_none() && self.request.is_none();
-        if !waiting || frame.cob_id() != Some(CobId::sdo_response(self.node)) {
+        if !waiting || !frame.has_cob_id(CobId::sdo_response(self.node)) {
             return None;
         }
         frame.exactly()
@@ -201,7 +201,7 @@ impl Link {
 
     fn send(&mut self, bytes: [u8; 8], now: Instant) -> Step {
         self.moved = now;
-        Step::Send(Frame::of(CobId::sdo_request(self.node), &bytes))
+        Step::Send(Frame::full(CobId::sdo_request(self.node), bytes))
     }
 
     /// Takes what follows from an answer.

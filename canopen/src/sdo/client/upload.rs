@@ -4,7 +4,8 @@ use crate::frame::{Frame, NodeId};
 use crate::od::Address;
 use crate::sdo::block::{Receiver, BLKSIZE_MAX};
 use crate::sdo::client::{means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer};
-use crate::sdo::wire::{BlockAck, BlockSegment, Payload, Request, Response};
+use crate::sdo::fields;
+use crate::sdo::wire::{BlockAck, Payload, Request, Response};
 use crate::sdo::AbortCode;
 use crate::time::Instant;
 
@@ -186,21 +187,17 @@ impl<S: Sink> Upload<S> {
     /// A frame within a sub-block.
     fn block_segment(&mut self, bytes: &[u8; 8]) -> Result<Next, SdoError> {
         let State::Blocks(receiver) = &mut self.state else { return Ok(Next::Ignore) };
-        let Some(segment) = BlockSegment::parse(bytes) else {
-            // No segment has sequence number 0, and an abort is the one answer that looks like
-            // this.
-            return match Response::parse(bytes) {
-                Some(Response::Abort(_, code)) => Err(SdoError::Server(code)),
-                _ => Err(SdoError::Client(AbortCode::SEQUENCE_NUMBER)),
-            };
-        };
-        let received = receiver.take(&segment).map_err(SdoError::Client)?;
+        // No segment has the number 0, so an abort can be told from one, and no other answer can.
+        if bytes[0] == fields::ABORT {
+            return Err(SdoError::Server(AbortCode(fields::number(bytes))));
+        }
+        let received = receiver.take(bytes).map_err(SdoError::Client)?;
         let next = match received.ackseq {
             Some(ackseq) => acknowledge(receiver, ackseq, self.block.blksize),
             None => Next::Wait,
         };
-        if let Some(data) = received.data {
-            self.take(&data)?;
+        if received.is_data {
+            self.take(&bytes[1..])?;
         }
         Ok(next)
     }
@@ -208,11 +205,11 @@ impl<S: Sink> Upload<S> {
     /// A frame behind the last segment.
     fn end_of_blocks(&mut self, bytes: &[u8; 8], response: Option<Response>) -> Result<Next, SdoError> {
         let State::Blocks(receiver) = &mut self.state else { return Ok(Next::Ignore) };
-        if receiver.is_duplicate_of_tail(bytes) {
+        if receiver.is_last_segment(bytes) {
             return Ok(Next::Ignore);
         }
         let Some(Response::EndBlockUpload(end)) = response else { return self.link.unexpected(response) };
-        let tail = receiver.finish(&end).map_err(SdoError::Client)?;
+        let tail = receiver.finish(end.unused, end.crc).map_err(SdoError::Client)?;
         self.take(&tail)?;
         self.check_length()?;
         Ok(Next::Done(Some(Request::EndBlockUpload)))

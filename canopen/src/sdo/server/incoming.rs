@@ -1,0 +1,106 @@
+//! Data on their way into the device.
+
+use crate::od::{Address, DataType, Objects};
+use crate::sdo::AbortCode;
+
+use super::VALUE_MAX;
+
+/// A download, however it is transferred: how many bytes have come and how many may.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Incoming {
+    data_type: DataType,
+    /// Bytes that the client announced.
+    announced: Option<u32>,
+    received: u32,
+}
+
+impl Incoming {
+    /// Starts a download. A size that does not fit the type is refused at once.
+    pub fn start(
+        at: Address,
+        data_type: DataType,
+        announced: Option<u32>,
+        objects: &mut impl Objects,
+    ) -> Result<Self, AbortCode> {
+        let incoming = Self { data_type, announced, received: 0 };
+        if incoming.is_domain() {
+            objects.download_start(at, announced)?;
+        } else if let Some(size) = announced {
+            incoming.check_length(size)?;
+        }
+        Ok(incoming)
+    }
+
+    /// Whether the data are passed on as they come, and not kept until they are complete.
+    pub fn is_domain(&self) -> bool {
+        self.data_type == DataType::Domain
+    }
+
+    /// Takes the next bytes: a domain's go to the object, those of a value into `value`.
+    pub fn take(
+        &mut self,
+        at: Address,
+        data: &[u8],
+        value: &mut [u8; VALUE_MAX],
+        objects: &mut impl Objects,
+    ) -> Result<(), AbortCode> {
+        let before = self.received;
+        let after = before.checked_add(data.len() as u32).ok_or(AbortCode::LENGTH_TOO_HIGH)?;
+        if self.announced.is_some_and(|size| after > size) {
+            return Err(AbortCode::LENGTH);
+        }
+        if !self.is_domain() {
+            let place = value.get_mut(before as usize..after as usize);
+            place.ok_or(AbortCode::LENGTH_TOO_HIGH)?.copy_from_slice(data);
+        } else if !data.is_empty() {
+            // The server slows a client down by its answers. A client that does not wait for them,
+            // or that sends expedited, is refused.
+            if objects.download_space(at, true) < data.len() {
+                return Err(AbortCode::OUT_OF_MEMORY);
+            }
+            objects.download_data(at, data)?;
+        }
+        self.received = after;
+        Ok(())
+    }
+
+    /// Whether this many bytes make a value of the type.
+    fn check_length(&self, len: u32) -> Result<(), AbortCode> {
+        let (least, most) = match self.data_type.size() {
+            Some(size) => (size, size),
+            None => (0, VALUE_MAX as u32),
+        };
+        if len > most {
+            Err(AbortCode::LENGTH_TOO_HIGH)
+        } else if len < least {
+            Err(AbortCode::LENGTH_TOO_LOW)
+        } else {
+            Ok(())
+        }
+    }
+
+    /// Whether as many bytes have come as were announced and as the type has.
+    pub fn check(&self) -> Result<(), AbortCode> {
+        if self.announced.is_some_and(|size| self.received != size) {
+            Err(AbortCode::LENGTH)
+        } else if self.is_domain() {
+            Ok(())
+        } else {
+            self.check_length(self.received)
+        }
+    }
+
+    /// All bytes have come: tells the object, which may refuse them.
+    pub fn finish(
+        &self,
+        at: Address,
+        value: &[u8; VALUE_MAX],
+        objects: &mut impl Objects,
+    ) -> Result<(), AbortCode> {
+        if self.is_domain() {
+            objects.download_end(at)
+        } else {
+            objects.write(at, &value[..self.received as usize])
+        }
+    }
+}

@@ -1,0 +1,274 @@
+//! The SDO server: one transfer at a time, for one client.
+//!
+//! - A frame that is not the request identifier's, is remote or extended, or does not have 8 bytes
+//!   is no SDO (CiA 301 section 7.2.4.3: all are 8 bytes long) and gets silence.
+//! - Every other request gets an answer or an abort; only an abort gets silence.
+//! - An initiate ends the transfer that was going on. Within a sub-block of a block download an
+//!   initiate cannot be told from a segment: there an abort ends the transfer, or the time-out.
+//! - A transfer in which the client stays silent for the time-out is aborted with 05040000h.
+//! - A block download whose sub-block stops short is acknowledged as far as it came, so that the
+//!   client repeats the rest.
+
+use crate::frame::{CobId, Frame, NodeId};
+use crate::od::{self, Address, Entry, Objects};
+use crate::sdo::block::{Receiver, BLKSIZE_MAX, SEGMENT};
+use crate::sdo::fields::{self, ccs, scs};
+use crate::sdo::AbortCode;
+use crate::time::Instant;
+
+mod block_download;
+mod block_upload;
+mod incoming;
+mod outgoing;
+mod segmented;
+
+use block_upload::Sender;
+use incoming::Incoming;
+use outgoing::Outgoing;
+
+/// The longest variable or string, in bytes. Longer things are domains.
+pub const VALUE_MAX: usize = 64;
+
+/// How long an answer is held back for want of room before the device is asked for room in its
+/// reserve, in milliseconds.
+pub const HOLD_MS: u32 = 2;
+
+/// What can be chosen about a server.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Config {
+    /// How long the client may stay silent within a transfer, in milliseconds.
+    pub timeout_ms: u32,
+    /// How long a sub-block of a block download may pause before what came is acknowledged and the
+    /// rest asked for again, in milliseconds. Longer than a client ever pauses between two
+    /// segments, shorter than it waits for an answer.
+    pub repeat_ms: u32,
+    /// Segments of a sub-block of a block download: at most 127, and no more than the receive path
+    /// can queue.
+    pub blksize: u8,
+    /// Whether block upload is served. Where it is not, such a request is an unknown one.
+    pub block_upload: bool,
+    /// The abort for a request that is none of CiA 301's, or not of this moment.
+    pub unknown_request: AbortCode,
+}
+
+impl Config {
+    /// Two seconds, half a second, 127 segments, with block upload, 05040001h.
+    pub const DEFAULT: Self = Self {
+        timeout_ms: 2000,
+        repeat_ms: 500,
+        blksize: BLKSIZE_MAX,
+        block_upload: true,
+        unknown_request: AbortCode::COMMAND,
+    };
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self::DEFAULT
+    }
+}
+
+/// An SDO server on the identifiers of the predefined connection set.
+#[derive(Debug)]
+pub struct SdoServer {
+    node: NodeId,
+    config: Config,
+    /// The object of the transfer that is going on, or of the last one.
+    at: Address,
+    state: State,
+    /// When a frame of the transfer was last received or sent.
+    moved: Instant,
+    /// The answer that waits to be fetched by [`SdoServer::poll`].
+    answer: Option<[u8; 8]>,
+    /// The variable or string that is transferred.
+    value: [u8; VALUE_MAX],
+}
+
+#[derive(Debug)]
+enum State {
+    Idle,
+    Download { incoming: Incoming, toggle: bool },
+    Upload { outgoing: Outgoing, toggle: bool },
+    BlockDownload { incoming: Incoming, receiver: Receiver },
+    BlockUpload { outgoing: Outgoing, sender: Sender },
+}
+
+impl State {
+    fn incoming(&mut self) -> Option<&mut Incoming> {
+        match self {
+            Self::Download { incoming, .. } | Self::BlockDownload { incoming, .. } => Some(incoming),
+            _ => None,
+        }
+    }
+}
+
+impl SdoServer {
+    /// The server of a node.
+    #[must_use]
+    pub const fn new(node: NodeId, config: Config) -> Self {
+        Self {
+            node,
+            config,
+            at: Address::new(0, 0),
+            state: State::Idle,
+            moved: Instant::from_millis(0),
+            answer: None,
+            value: [0; VALUE_MAX],
+        }
+    }
+
+    /// The choices that it was made with.
+    #[must_use]
+    pub const fn config(&self) -> Config {
+        self.config
+    }
+
+    /// Whether no transfer is going on and no answer waits to be fetched.
+    #[must_use]
+    pub const fn is_idle(&self) -> bool {
+        matches!(self.state, State::Idle) && self.answer.is_none()
+    }
+
+    /// When [`poll`](Self::poll) will have something to do although no frame came.
+    #[must_use]
+    pub fn next_deadline(&self) -> Option<Instant> {
+        match &self.state {
+            State::Idle => None,
+            State::BlockDownload { receiver, .. } if receiver.is_within() => {
+                Some(self.moved + self.config.repeat_ms.min(self.config.timeout_ms))
+            }
+            _ => Some(self.moved + self.config.timeout_ms),
+        }
+    }
+
+    /// Ends the transfer without telling the client, and drops an answer that waits.
+    pub fn reset(&mut self, objects: &mut impl Objects) {
+        self.end(objects);
+        self.answer = None;
+    }
+
+    /// Takes any frame received; those that are no SDO request to this server are ignored.
+    pub fn handle(&mut self, frame: &Frame, now: Instant, objects: &mut impl Objects) {
+        if !frame.has_cob_id(CobId::sdo_request(self.node)) {
+            return;
+        }
+        let Some(bytes) = frame.exactly() else { return };
+        self.moved = now;
+        let outcome = match &self.state {
+            State::BlockDownload { receiver, .. } if !receiver.is_complete() => {
+                self.block_segment(bytes, objects)
+            }
+            _ => self.request(bytes, objects),
+        };
+        if let Err(code) = outcome {
+            self.abort(code, objects);
+        }
+    }
+
+    /// The next frame to send, until there is none. A caller whose transmit queue is full asks
+    /// again when it is not.
+    pub fn poll(&mut self, now: Instant, objects: &mut impl Objects) -> Option<Frame> {
+        self.check_time(now, objects);
+        if self.answer.is_none() {
+            if let Err(code) = self.next_block_segment(objects) {
+                self.abort(code, objects);
+            }
+        }
+        if !self.may_answer(now, objects) {
+            return None;
+        }
+        let answer = self.answer.take()?;
+        self.moved = now;
+        Some(Frame::full(CobId::sdo_response(self.node), answer))
+    }
+
+    /// Ends a transfer whose client is silent, and acknowledges a sub-block that stopped short.
+    fn check_time(&mut self, now: Instant, objects: &mut impl Objects) {
+        let silent_for = |millis| now.has_reached(self.moved + millis);
+        match &mut self.state {
+            State::Idle => {}
+            _ if silent_for(self.config.timeout_ms) => self.abort(AbortCode::TIMEOUT, objects),
+            State::BlockDownload { receiver, .. }
+                if receiver.is_within() && silent_for(self.config.repeat_ms) =>
+            {
+                let ackseq = receiver.close();
+                self.answer_transfer(scs::ACK_BLOCK_DOWNLOAD, ackseq, 0);
+            }
+            _ => {}
+        }
+    }
+
+    /// Whether the answer that waits may be sent. An answer after which the client sends data waits
+    /// until there is room for a segment. If it opens a sub-block, its block size is set here.
+    fn may_answer(&mut self, now: Instant, objects: &mut impl Objects) -> bool {
+        let Some(answer) = &mut self.answer else { return false };
+        let Some(incoming) = self.state.incoming() else { return true };
+        let mut space =
+            if incoming.is_domain() { objects.download_space(self.at, false) } else { usize::MAX };
+        if space < SEGMENT && now.has_reached(self.moved + HOLD_MS) {
+            space = objects.download_space(self.at, true).min(SEGMENT);
+        }
+        let most = self.config.blksize.clamp(1, BLKSIZE_MAX);
+        let granted = (space / SEGMENT).min(usize::from(most)) as u8;
+        match &mut self.state {
+            State::BlockDownload { receiver, .. } => receiver.grant(answer, granted, most),
+            _ => granted != 0,
+        }
+    }
+
+    /// A request outside of the sub-blocks of a block download.
+    fn request(&mut self, bytes: &[u8; 8], objects: &mut impl Objects) -> Result<(), AbortCode> {
+        if self.repeats_last_segment(bytes) {
+            return Ok(());
+        }
+        match fields::specifier(bytes[0]) {
+            ccs::INITIATE_DOWNLOAD => self.initiate_download(bytes, objects),
+            ccs::DOWNLOAD_SEGMENT => self.download_segment(bytes, objects),
+            ccs::INITIATE_UPLOAD => self.initiate_upload(bytes, objects),
+            ccs::UPLOAD_SEGMENT => self.upload_segment(bytes, objects),
+            ccs::INITIATE_BLOCK_DOWNLOAD => self.initiate_block_download(bytes, objects),
+            ccs::END_BLOCK_DOWNLOAD => self.end_block_download(bytes, objects),
+            ccs::INITIATE_BLOCK_UPLOAD if self.config.block_upload => {
+                self.initiate_block_upload(bytes, objects)
+            }
+            ccs::START_BLOCK_UPLOAD => self.start_block_upload(),
+            ccs::ACK_BLOCK_UPLOAD => self.ack_block_upload(bytes),
+            ccs::END_BLOCK_UPLOAD => self.end_block_upload(),
+            fields::ABORT => {
+                self.reset(objects);
+                Ok(())
+            }
+            _ => Err(self.config.unknown_request),
+        }
+    }
+
+    /// Starts a transfer, and ends the one before. An abort from here on names this object.
+    fn begin(&mut self, at: Address, objects: &mut impl Objects) -> Result<&'static Entry, AbortCode> {
+        self.end(objects);
+        self.at = at;
+        od::find(objects.entries(), at)
+    }
+
+    fn abort(&mut self, code: AbortCode, objects: &mut impl Objects) {
+        self.end(objects);
+        self.answer_initiate(fields::ABORT, code.0);
+    }
+
+    /// An answer that names the object: to an initiate, or an abort.
+    fn answer_initiate(&mut self, command: u8, number: u32) {
+        self.answer = Some(fields::with_address(command, self.at, number.to_le_bytes()));
+    }
+
+    /// An answer within a transfer.
+    fn answer_transfer(&mut self, command: u8, a: u8, b: u8) {
+        self.answer = Some(fields::without_address(command, a, b));
+    }
+
+    /// Back to idle. The consumer of an unfinished domain is told.
+    fn end(&mut self, objects: &mut impl Objects) {
+        if self.state.incoming().is_some_and(|incoming| incoming.is_domain()) {
+            objects.download_cancel(self.at);
+        }
+        self.state = State::Idle;
+    }
+}
