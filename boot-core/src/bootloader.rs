@@ -290,6 +290,12 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         self.download.command(program, command)
     }
 
+    /// The program has brought the device back to the bootloader: from now on it starts without a
+    /// rescue window.
+    pub fn confirm(&mut self, program: u8) {
+        self.download.confirm(program);
+    }
+
     /// Whether a reset now would take back what a host was told is done or under way.
     #[must_use]
     pub fn is_finishing(&mut self) -> bool {

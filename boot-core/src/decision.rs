@@ -33,6 +33,11 @@ pub struct Policy {
     pub max_crash_resets: u32,
     /// Node-IDs with which programs may be started.
     pub node_ids: RangeInclusive<u8>,
+    /// How long a program that was never confirmed is held back when it would start by itself, in
+    /// ms; 0 for one that starts at once.
+    pub rescue_window_ms: u16,
+    /// The same for a confirmed program.
+    pub rescue_window_confirmed_ms: u16,
 }
 
 impl Policy {
@@ -106,6 +111,14 @@ impl StayReason {
 pub enum BootDecision {
     /// Bootloader mode.
     Stay(StayReason),
+    /// Bootloader mode for a while: a client that asks meanwhile keeps the device there. Then the
+    /// program starts.
+    Hold {
+        /// Its number.
+        program: u8,
+        /// How long, in ms.
+        window_ms: u16,
+    },
     /// Jump.
     Start {
         /// The program, with the proof of its checks.
@@ -121,7 +134,7 @@ pub fn decide(
     policy: &Policy,
     verify: impl FnOnce(u8) -> Result<VerifiedProgram, Invalid>,
 ) -> BootDecision {
-    use BootDecision::{Start, Stay};
+    use BootDecision::{Hold, Start, Stay};
 
     match circumstances.request {
         Some(BootRequest::Stay | BootRequest::Clear(_)) => return Stay(StayReason::Requested),
@@ -151,6 +164,15 @@ pub fn decide(
     match verify(number) {
         Err(invalid) => Stay(StayReason::Program(invalid)),
         Ok(program) if !program.signed() && !trial => Stay(StayReason::Unsigned),
-        Ok(program) => Start { trial: trial && !program.signed(), program },
+        Ok(program) => {
+            let window_ms =
+                if program.confirmed() { policy.rescue_window_confirmed_ms } else { policy.rescue_window_ms };
+            // A start that was asked for is not held back: the master that asked looks for the
+            // program at once, and would keep the device in the bootloader by that.
+            if circumstances.request.is_none() && window_ms > 0 {
+                return Hold { program: program.number(), window_ms };
+            }
+            Start { trial: trial && !program.signed(), program }
+        }
     }
 }

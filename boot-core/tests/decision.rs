@@ -15,7 +15,13 @@ use shared_abi::warm_start::BootRequest;
 const QUIET: Circumstances = Circumstances { request: None, strap: false, crash_resets: 0, node_id: 5 };
 
 fn policy() -> Policy {
-    Policy { autostart: Some(1), max_crash_resets: 3, node_ids: 1..=100 }
+    Policy {
+        autostart: Some(1),
+        max_crash_resets: 3,
+        node_ids: 1..=100,
+        rescue_window_ms: 0,
+        rescue_window_confirmed_ms: 0,
+    }
 }
 
 /// A program of 64 bytes as a download leaves it, and its verdict.

@@ -6,7 +6,9 @@
 //! | `product.rs` | the choices of a product | no |
 //! | `resident/` | what runs from flash: boot stage and callgate | jump, ABI |
 //! | `start.rs` | from the reset to the boot stage, and to `init` below | start-up |
-//! | `flash.rs` | the flash controller and the CRC unit | registers |
+//! | `flash_controller.rs` | starts flash operations and polls them | registers |
+//! | `services.rs`, `storage.rs` | what is asked of the resident part, and how | its ABI |
+//! | `boot_report.rs` | what the boot stage tells | no |
 //! | `watchdog.rs` | feeds the watchdog when all tasks are alive | no |
 //! | `log.rs`, `log/` | a few words for whoever ports it (features `log-…`) | interrupts |
 //! | `debugger.rs` | the debugger interface (feature `debugger`) | no |
@@ -16,12 +18,15 @@
 #![no_std]
 #![no_main]
 
+mod boot_report;
 mod debugger;
-mod flash;
+mod flash_controller;
 mod log;
 mod memory;
 mod product;
+mod services;
 mod start;
+mod storage;
 mod watchdog;
 
 use cortex_m::peripheral::SCB;
@@ -52,7 +57,7 @@ mod app {
     use boot_core::canopen::sdo::server::Config as SdoConfig;
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant};
-    use boot_core::download::{Policy, Step};
+    use boot_core::control::Step;
     use bsp::can::{Errors, Mode};
     use bsp::clock::Source;
     use bsp::hal::rcc::RccExt;
@@ -64,9 +69,9 @@ mod app {
 
     use super::{product, start, Mono};
     use crate::debugger::{self, Debugger};
-    use crate::flash::FlashController;
     use crate::log::{self, log};
-    use crate::product::{PROFILE, RESCUE_WINDOW_MS};
+    use crate::product::PRODUCT;
+    use crate::storage::{BootFlash, Store};
     use crate::watchdog::{self, Task, Watchdog};
     use rtic_monotonics::fugit::ExtU32;
     use rtic_monotonics::Monotonic;
@@ -74,52 +79,39 @@ mod app {
     /// Frames that may wait for the protocol task. It has a higher priority than all that takes
     /// long, so few do.
     const RX_QUEUE: usize = 32;
-    /// Bytes of blocks that may wait for the flash: what RAM is free. While a sector of 128 KiB is
-    /// erased, a bus at 1 Mbit/s brings some 55 KiB.
-    const BLOCK_QUEUE: usize = 80 * 1024;
-    /// Period of the heartbeat in ms.
-    const HEARTBEAT_MS: u16 = 1000;
     /// How often the protocol looks at its deadlines, in ms.
     const TICK_MS: u32 = 2;
-    /// How long the device stays after the answer to its leaving is on the bus, in ms: clients want
-    /// to see the answer before anything else happens.
-    const ANSWER_TO_RESET_MS: u32 = 20;
-
-    /// Whether an emergency follows each boot-up, so that a master knows the bootloader from the
-    /// application.
-    const BOOT_UP_EMERGENCY: bool = true;
-
     /// Programs of the layout, each a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
     const PROGRAMS: usize = LAYOUT.programs.len();
-    const ENTRY_COUNT: usize = entry_count_with(PROGRAMS as u8, PROFILE.extras);
-    const OWN_ENTRIES: [Entry; ENTRY_COUNT] = entries_with(PROGRAMS as u8, PROFILE.extras);
+    const ENTRY_COUNT: usize = entry_count_with(PROGRAMS as u8, PRODUCT.profile.extras);
+    const OWN_ENTRIES: [Entry; ENTRY_COUNT] = entries_with(PROGRAMS as u8, PRODUCT.profile.extras);
     static ENTRIES: [Entry; ENTRY_COUNT + debugger::ENTRIES.len()] = concat(OWN_ENTRIES, debugger::ENTRIES);
 
     static CONFIG: bootloader::Config = bootloader::Config {
         entries: &ENTRIES,
         device: Device {
-            device_type: PROFILE.device_type,
+            device_type: PRODUCT.profile.device_type,
             name: IDENTITY.device_name,
             hardware_version: IDENTITY.hardware_version,
             software_version: concat!("coboot ", env!("CARGO_PKG_VERSION")),
-            heartbeat_ms: HEARTBEAT_MS,
+            heartbeat_ms: PRODUCT.heartbeat_ms,
             vendor_id: IDENTITY.vendor_id,
             product_code: IDENTITY.product_code,
             revision: IDENTITY.revision,
             serial_number: 0,
         },
-        node_id: PROFILE.node_id,
+        node_id: PRODUCT.profile.node_id,
         layout: LAYOUT,
         supports: product::supports,
-        boot_up_emergency: BOOT_UP_EMERGENCY,
-        download: Policy { identity: Some((IDENTITY.vendor_id, IDENTITY.product_code)), ..PROFILE.download },
-        password: PROFILE.password,
+        boot_up_emergency: PRODUCT.boot_up_emergency,
+        download: PRODUCT.download(),
+        password: PRODUCT.profile.password,
     };
 
     #[shared]
     struct Shared {
         can: CanPort,
-        bootloader: Bootloader<'static, FlashController, product::Parameters, PROGRAMS>,
+        bootloader: Bootloader<'static, BootFlash, Store, PROGRAMS>,
     }
 
     #[local]
@@ -128,9 +120,9 @@ mod app {
         to_handle: Consumer<'static, Frame>,
         slave: Slave,
         debugger: Debugger,
-        leaving: PendingReset,
-        /// The program that starts at the end of the rescue window.
-        waiting: Option<u8>,
+        pending_reset: PendingReset,
+        /// The program that starts at the end of the rescue window, and its length in ms.
+        held: Option<(u8, u16)>,
         watchdog: Watchdog,
         led: bsp::Led,
     }
@@ -143,47 +135,50 @@ mod app {
         at: Option<Instant>,
     }
 
-    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; BLOCK_QUEUE] = [0; BLOCK_QUEUE]])]
+    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer]])]
     fn init(cx: init::Context) -> (Shared, Local) {
         CLOCK_TREE.speed_up(&cx.device.RCC, Source::Crystal);
         // SAFETY: the device's own are not used beside it.
-        let flash = unsafe { FlashController::steal(Some(&cx.device.RCC)) };
+        let flash = unsafe { BootFlash::steal() };
         let board = bsp::init(&mut cx.device.RCC.constrain(), cx.device.CAN1);
         #[cfg(feature = "log-uart")]
         log::uart::open(board.uart);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
-        let parameters = product::parameters(&flash);
+        let parameters = Store::open();
+        let report = start::boot_report();
         let node = product::node_parameters(&parameters, &flash);
         let slave_config = slave::Config {
             node: node::Config {
-                heartbeat_ms: HEARTBEAT_MS,
+                heartbeat_ms: PRODUCT.heartbeat_ms,
                 nmt: NmtPolicy::StayPreOperational,
                 sdo: SdoConfig {
-                    block_upload: cfg!(feature = "block-upload"),
-                    unknown_request: PROFILE.unknown_request,
+                    block_upload: PRODUCT.block_upload,
+                    unknown_request: PRODUCT.profile.unknown_request,
                     ..SdoConfig::DEFAULT
                 },
             },
-            lss: if cfg!(feature = "lss") { Some(lss::Config::default()) } else { None },
+            lss: if PRODUCT.lss { Some(lss::Config::default()) } else { None },
         };
         let mut bootloader = Bootloader::new(
             &CONFIG,
             bsp::serial_number(),
             node,
-            start::stay_reason(),
+            report.reason,
             parameters,
             flash,
             cx.local.blocks,
         );
-        if let Some(program) = start::program_to_clear() {
+        if report.clear > 0 {
             // Acknowledged by the application; what becomes of it is in 1F57h.
-            let _ = bootloader.command(program, ProgramControl::Clear);
+            let _ = bootloader.command(report.clear, ProgramControl::Clear);
+        } else if report.returned > 0 {
+            bootloader.confirm(report.returned);
         }
         let slave = Slave::new(bootloader.lss_address(), bootloader.node_id(), node.bit_rate, slave_config);
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();
-        log!("stayed in the bootloader; why", start::stay_reason().into());
+        log!("stayed in the bootloader; why", report.reason.into());
         #[cfg(not(feature = "virtual-can"))]
         let can = CanPort::new(board.can);
         #[cfg(feature = "virtual-can")]
@@ -195,8 +190,8 @@ mod app {
                 to_handle,
                 slave,
                 debugger: Debugger::new(),
-                waiting: start::program_in_waiting(),
-                leaving: PendingReset { wanted: false, request: BootRequest::PowerOn, at: None },
+                held: (report.held_program > 0).then_some((report.held_program, report.window_ms)),
+                pending_reset: PendingReset { wanted: false, request: BootRequest::PowerOn, at: None },
                 watchdog: Watchdog::new(cx.device.IWDG),
                 led: board.led,
             },
@@ -241,24 +236,23 @@ mod app {
     #[task(
         binds = CAN1_TX,
         shared = [can, bootloader],
-        local = [to_handle, slave, debugger, leaving, waiting],
+        local = [to_handle, slave, debugger, pending_reset, held],
         priority = 2
     )]
     fn protocol(cx: protocol::Context) {
         watchdog::check_in(Task::Protocol);
         let now = Instant::from_millis(Mono::now().ticks());
         let protocol::SharedResources { mut can, mut bootloader, .. } = cx.shared;
-        let protocol::LocalResources { to_handle, slave, debugger, leaving, waiting, .. } = cx.local;
-        if let Some(at) = leaving.at {
+        let protocol::LocalResources { to_handle, slave, debugger, pending_reset, held, .. } = cx.local;
+        if let Some(at) = pending_reset.at {
             // A frame that began now would be cut off by the reset.
             if now.has_reached(at) {
-                leave(leaving.request);
+                reset_with(pending_reset.request);
             }
             return;
         }
         let status = can.lock(status);
         bootloader.lock(|bootloader| {
-            #[cfg(feature = "password")]
             bootloader.set_time(now);
             let device = debugger.attach(bootloader);
             #[cfg(feature = "debugger")]
@@ -271,31 +265,31 @@ mod app {
                 log::received(&frame);
                 // The filters let nothing in but network management and what is for this device, or
                 // for layer setting services.
-                if RESCUE_WINDOW_MS.is_some() && frame.cob_id() != Some(CobId::NMT) {
-                    *waiting = None;
+                if frame.cob_id() != Some(CobId::NMT) {
+                    *held = None;
                 }
                 if slave.handle(&frame, now, device) {
-                    *leaving = PendingReset { wanted: true, request: BootRequest::PowerOn, at: None };
+                    *pending_reset = PendingReset { wanted: true, request: BootRequest::PowerOn, at: None };
                 }
                 carry_out(slave, &mut can, now, device);
             }
             if let Some(request) = bootloader.take_boot_request() {
-                *leaving = PendingReset { wanted: true, request, at: None };
+                *pending_reset = PendingReset { wanted: true, request, at: None };
             }
         });
-        if let (Some(program), Some(ms)) = (*waiting, RESCUE_WINDOW_MS) {
-            if now.has_reached(Instant::from_millis(ms.into())) {
+        if let Some((program, window_ms)) = *held {
+            if now.has_reached(Instant::from_millis(window_ms.into())) {
                 // Whether or not anybody is there to hear the boot-up.
-                *leaving =
+                *pending_reset =
                     PendingReset { wanted: true, request: BootRequest::Resume(program), at: Some(now) };
                 return;
             }
         }
         // What a host was told is done is not lost by a reset that comes too early.
         let finishing = bootloader.lock(|bootloader| bootloader.is_finishing());
-        if leaving.wanted && !finishing && slave.is_idle() && can.lock(|can| can.is_idle()) {
-            leaving.at = Some(now + ANSWER_TO_RESET_MS);
-            log!("leaving; request", WarmStart::new(leaving.request).request);
+        if pending_reset.wanted && !finishing && slave.is_idle() && can.lock(|can| can.is_idle()) {
+            pending_reset.at = Some(now + PRODUCT.answer_to_reset_ms);
+            log!("leaving; request", WarmStart::new(pending_reset.request).request);
         }
     }
 
@@ -364,7 +358,7 @@ mod app {
     }
 
     /// Out of the bootloader: the boot stage decides anew, on a clean chip.
-    fn leave(request: BootRequest) -> ! {
+    fn reset_with(request: BootRequest) -> ! {
         product::warm_start_cell().put(request);
         SCB::sys_reset()
     }

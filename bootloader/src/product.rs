@@ -1,52 +1,247 @@
-//! The choices of a product, in one place; resident part and tasks share them.
+//! The choices of a product: the only file that a product changes.
+//!
+//! Resident part and RAM part are both built from it. Names in brackets are those of the SYS TEC
+//! manual (L-1112d_10, chapter 4.6). A choice that contradicts another one fails the build, by
+//! name.
 #![allow(dead_code, reason = "each of the two programs uses some of it")]
 
 use core::ops::RangeInclusive;
 
 use boot_core::canopen::{BitRate, NodeId};
-use boot_core::decision::Policy;
-use boot_core::node::NodeParameters;
-use boot_core::parameters::Journal;
+use boot_core::control::{Erase, Policy, Verdict};
+use boot_core::crc::CrcKind;
+use boot_core::decision;
+use boot_core::flash::Flash;
 use boot_core::profile::Profile;
+use boot_core::store::{Journal, NodeParameters};
 use bsp::can::BitTiming;
-use bsp::{BIT_RATE, CAN_CLOCK, LAYOUT, NODE_ID};
+use bsp::{BIT_RATE, CAN_CLOCK, IDENTITY, LAYOUT, NODE_ID};
+use shared_abi::block_file;
 use shared_abi::warm_start::Cell;
 
-use crate::flash::FlashController;
+/// What a product may choose.
+#[derive(Clone, Debug)]
+pub struct Product {
+    /// The dialect that it speaks where dialects contradict each other (docs/dialects.md).
+    pub profile: Profile,
+    /// The program that starts by itself after a reset, 1 to the number of programs; `None` for a
+    /// device that waits for 1F51h = 1 (`BLCOP_USE_AUTOSTART_APP`, `BLCOP_APP_START_INDEX`).
+    pub autostart: Option<u8>,
+    /// So many resets in a row by which the application ended without being asked to end in the
+    /// bootloader; at least 1.
+    pub max_crash_resets: u32,
+    /// How long a program that was never confirmed is held back when it would start by itself, in
+    /// ms: an SDO request to the node or any layer setting service keeps the device in the
+    /// bootloader meanwhile. 0 for no such window.
+    pub rescue_window_ms: u16,
+    /// The same for a confirmed program.
+    pub rescue_window_confirmed_ms: u16,
+    /// Node-IDs with which programs may be started (`BLCOP_MIN_NODEID`, `BLCOP_MAX_NODEID`).
+    pub node_ids: RangeInclusive<u8>,
+    /// Whether the device may find out the bit rate by listening, where none is stored or told.
+    pub auto_bit_rate: bool,
+    /// Whether an emergency follows each boot-up, which tells a master the bootloader from the
+    /// application.
+    pub boot_up_emergency: bool,
+    /// Period of the heartbeat until a master changes it (1017h), in ms; 0 for none.
+    pub heartbeat_ms: u16,
+    /// Whether it speaks layer setting services (LSS, CiA 305).
+    pub lss: bool,
+    /// Whether objects can be read by SDO block upload.
+    pub block_upload: bool,
+    /// Whether vendor-ID and product code of a program have to be the device's
+    /// (`BLCOP_IDENTITY_CHECK`).
+    pub identity_check: bool,
+    /// The product's own check of block 0 (`TgtProcessAppInfoData`).
+    pub check: fn(program: u8, control: &block_file::Control) -> Verdict,
+    /// Whether programs may be changed now.
+    pub programming_allowed: fn() -> bool,
+    /// When CLEAR erases.
+    pub erase: Erase,
+    /// Which CRC blocks and programs carry (`BLCOP_USE_CRC16`).
+    pub crc: CrcKind,
+    /// Bytes of flash that one step of a CRC covers, at least 64: the longest that work of the same
+    /// priority waits (`BLCOP_MAX_CRC_STEP_SIZE`).
+    pub crc_step: u32,
+    /// Bytes of blocks that may wait for the flash, 1024 to what RAM is left
+    /// (`BLCOP_MAX_PROGRAM_BUFFER`). While a sector of 128 KiB is erased, a bus at 1 Mbit/s brings
+    /// some 55 KiB.
+    pub block_buffer: usize,
+    /// How long a task of the bootloader may be missing before the watchdog resets the chip, in ms,
+    /// 100 to 4000 (`BLCOP_USE_WATCHDOG`).
+    pub watchdog_ms: u16,
+    /// A program has to feed the independent watchdog within this time, in ms, 1 to 4000, from its
+    /// first instruction on; `None` for a program that is started without one.
+    pub program_watchdog_ms: Option<u16>,
+    /// How long the device stays after the answer to its leaving is on the bus, in ms, at least 10:
+    /// clients want to see the answer before anything else happens.
+    pub answer_to_reset_ms: u32,
+}
 
-/// Which dialect it speaks where they contradict each other.
-pub const PROFILE: Profile = if cfg!(feature = "profile-paulus") {
-    Profile::PAULUS
-} else if cfg!(feature = "profile-esacademy") {
-    Profile::ESACADEMY
-} else if cfg!(feature = "profile-lift") {
-    Profile::LIFT
-} else {
-    Profile::STANDARD
-};
+impl Product {
+    /// What a product is that chooses nothing.
+    pub const DEFAULT: Self = Self {
+        profile: Profile::STANDARD,
+        autostart: Some(1),
+        max_crash_resets: 3,
+        rescue_window_ms: 300,
+        rescue_window_confirmed_ms: 0,
+        node_ids: 1..=127,
+        auto_bit_rate: true,
+        boot_up_emergency: true,
+        heartbeat_ms: 1000,
+        lss: true,
+        block_upload: true,
+        identity_check: true,
+        check: |_, _| Verdict::Standard,
+        programming_allowed: || true,
+        erase: Erase::WithFirstBlock,
+        crc: CrcKind::Crc32,
+        crc_step: 1024,
+        block_buffer: 80 * 1024,
+        watchdog_ms: 1000,
+        program_watchdog_ms: None,
+        answer_to_reset_ms: 20,
+    };
+
+    /// The product of this name, for `COBOOT_PRODUCT` in the environment of a build: so the dialects
+    /// are built side by side, and tests build other choices.
+    const fn named(name: Option<&str>) -> Self {
+        let Some(name) = name else { return PRODUCT_OF_THIS_FILE };
+        let standard = PRODUCT_OF_THIS_FILE;
+        if equal(name, "paulus") {
+            Self { profile: Profile::PAULUS, ..standard }
+        } else if equal(name, "esacademy") {
+            Self { profile: Profile::ESACADEMY, ..standard }
+        } else if equal(name, "lift") {
+            Self { profile: Profile::LIFT, ..standard }
+        } else if equal(name, "crc-16") {
+            Self { crc: CrcKind::Crc16, ..standard }
+        } else if equal(name, "least") {
+            Self {
+                rescue_window_ms: 0,
+                auto_bit_rate: false,
+                boot_up_emergency: false,
+                lss: false,
+                block_upload: false,
+                ..standard
+            }
+        } else {
+            panic!("COBOOT_PRODUCT: it must be paulus, esacademy, lift, crc-16 or least")
+        }
+    }
+
+    /// Gives the product back if its choices go together; fails the build with the rule's name if
+    /// not.
+    const fn checked(self) -> Self {
+        let programs = LAYOUT.programs.len();
+        if let Some(number) = self.autostart {
+            assert!(
+                number >= 1 && number as usize <= programs,
+                "product: autostart names a program that the layout has not"
+            );
+        }
+        assert!(self.max_crash_resets >= 1, "product: max_crash_resets must be 1 or more");
+        let window = if self.rescue_window_ms > self.rescue_window_confirmed_ms {
+            self.rescue_window_ms
+        } else {
+            self.rescue_window_confirmed_ms
+        };
+        assert!(
+            window == 0 || self.autostart.is_some(),
+            "product: a rescue window needs autostart: without it no program starts by itself"
+        );
+        assert!(
+            self.heartbeat_ms == 0 || window < self.heartbeat_ms,
+            "product: the rescue window must be shorter than the heartbeat period"
+        );
+        assert!(
+            *self.node_ids.start() >= 1
+                && *self.node_ids.end() <= 127
+                && *self.node_ids.start() <= *self.node_ids.end(),
+            "product: node_ids must be a range within 1 to 127"
+        );
+        assert!(self.crc_step >= 64, "product: crc_step must be 64 bytes or more");
+        assert!(
+            self.block_buffer >= 1024 && self.block_buffer < LAYOUT.ram.size as usize,
+            "product: block_buffer must be 1024 bytes or more, and fit the RAM"
+        );
+        assert!(
+            self.watchdog_ms >= 100 && self.watchdog_ms <= 4000,
+            "product: watchdog_ms must be 100 to 4000"
+        );
+        if let Some(ms) = self.program_watchdog_ms {
+            assert!(ms >= 1 && ms <= 4000, "product: program_watchdog_ms must be 1 to 4000");
+        }
+        assert!(
+            self.answer_to_reset_ms >= 10,
+            "product: answer_to_reset_ms must be 10 or more (SYS TEC manual L-1112d_10, 4.5)"
+        );
+        if let Some(data) = self.profile.download.data {
+            assert!(
+                match self.autostart {
+                    Some(number) => number != data,
+                    None => true,
+                },
+                "product: autostart names the profile's data, which are no program"
+            );
+        }
+        assert!(
+            self.profile.download.locked == !self.profile.password.is_empty(),
+            "product: a profile that locks 1F50h needs a password, and only such a profile has one"
+        );
+        assert!(
+            self.auto_bit_rate || BIT_RATE != 0,
+            "product: the board leaves the bit rate to be found out (0), and auto_bit_rate is off"
+        );
+        self
+    }
+
+    /// How programs are downloaded: the profile's rules with the product's choices.
+    pub const fn download(&self) -> Policy {
+        Policy {
+            identity: if self.identity_check {
+                Some((IDENTITY.vendor_id, IDENTITY.product_code))
+            } else {
+                None
+            },
+            check: self.check,
+            allowed: self.programming_allowed,
+            erase: self.erase,
+            crc: self.crc,
+            crc_step: self.crc_step,
+            ..self.profile.download
+        }
+    }
+
+    /// What happens after a reset.
+    pub const fn decision(&self) -> decision::Policy {
+        decision::Policy {
+            autostart: self.autostart,
+            max_crash_resets: self.max_crash_resets,
+            node_ids: *self.node_ids.start()..=*self.node_ids.end(),
+            rescue_window_ms: self.rescue_window_ms,
+            rescue_window_confirmed_ms: self.rescue_window_confirmed_ms,
+        }
+    }
+}
+
+/// This product.
+pub const PRODUCT: Product = Product::named(option_env!("COBOOT_PRODUCT")).checked();
+
+/// **What a product changes**: name the fields that differ from the default.
+const PRODUCT_OF_THIS_FILE: Product = Product { ..Product::DEFAULT };
 
 /// Version of the bootloader: major in the upper half, minor in the lower.
 pub const VERSION: u32 = 0x0000_0001;
 
-/// What this product does after a reset.
-pub const POLICY: Policy = Policy { autostart: Some(1), max_crash_resets: 3, node_ids: NODE_IDS };
-/// Node-IDs with which programs may be started.
-const NODE_IDS: RangeInclusive<u8> = 1..=127;
-/// How long a program that would start by itself is held back, in ms, so that a master can catch
-/// the device: an SDO request to it, or any layer setting service, keeps it in the bootloader.
-/// `None` for a program that starts at once. Shorter than the heartbeat.
-pub const RESCUE_WINDOW_MS: Option<u16> = if cfg!(feature = "rescue-window") { Some(500) } else { None };
-/// A program that is started has to feed the independent watchdog within this time, in ms, from its
-/// first instruction on; `None` for a program that is started without one.
-pub const PROGRAM_WATCHDOG_MS: Option<u16> = None;
-
 /// Where this product keeps its parameters. One with an EEPROM puts its own
-/// [`boot_core::parameters::Parameters`] here.
+/// [`boot_core::store::Parameters`] here.
 pub type Parameters = Journal;
 
 /// The parameters of this device.
-pub fn parameters(flash: &FlashController) -> Parameters {
-    Journal::open(flash, LAYOUT.chip, LAYOUT.parameters)
+pub fn parameters(flash: &impl Flash) -> Parameters {
+    Journal::open(flash, LAYOUT.parameters)
 }
 
 /// Node-ID and bit rate of a device that was never told others.
@@ -60,10 +255,7 @@ const BOARD_NODE: NodeParameters = NodeParameters {
     },
     bit_rate: match BitRate::from_bits_per_second(BIT_RATE) {
         Some(rate) => {
-            assert!(
-                supports(rate),
-                "board: the clock of the CAN controller cannot make the bit rate, or nothing can find it out"
-            );
+            assert!(supports(rate), "board: the clock of the CAN controller cannot make the bit rate");
             rate
         }
         None => panic!("board: the bit rate must be one of CANopen's, or 0 to find it out"),
@@ -73,15 +265,19 @@ const BOARD_NODE: NodeParameters = NodeParameters {
 pub const NO_NODE_ID: u8 = 255;
 
 /// Node-ID and bit rate in force from this reset on.
-pub fn node_parameters(parameters: &Parameters, flash: &FlashController) -> NodeParameters {
-    let default = PROFILE.default_node.map(|(id, bit_rate)| NodeParameters { id: Some(id), bit_rate });
+pub fn node_parameters<F: Flash>(
+    parameters: &impl boot_core::store::Parameters,
+    flash: &F,
+) -> NodeParameters {
+    let default =
+        PRODUCT.profile.default_node.map(|(id, bit_rate)| NodeParameters { id: Some(id), bit_rate });
     NodeParameters::load(parameters, flash, default.unwrap_or(BOARD_NODE), supports)
 }
 
 /// Whether the board's CAN controller can run at this bit rate.
 pub const fn supports(rate: BitRate) -> bool {
     match rate {
-        BitRate::Auto => cfg!(feature = "auto-bit-rate"),
+        BitRate::Auto => PRODUCT.auto_bit_rate,
         rate => TIMINGS[rate as usize].is_some(),
     }
 }
@@ -94,4 +290,19 @@ pub fn warm_start_cell() -> Cell {
     // SAFETY: the layout's warm-start region, checked to be RAM of that size that the linker keeps
     // out of every image.
     unsafe { Cell::at(LAYOUT.warm_start.base as *mut _) }
+}
+
+const fn equal(a: &str, b: &str) -> bool {
+    let (a, b) = (a.as_bytes(), b.as_bytes());
+    if a.len() != b.len() {
+        return false;
+    }
+    let mut i = 0;
+    while i < a.len() {
+        if a[i] != b[i] {
+            return false;
+        }
+        i += 1;
+    }
+    true
 }

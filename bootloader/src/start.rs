@@ -2,13 +2,14 @@
 //! are in RAM, and `init` follows.
 
 use core::arch::global_asm;
-use core::sync::atomic::{AtomicU32, Ordering};
+use core::cell::UnsafeCell;
+use core::mem::MaybeUninit;
 
 use shared_abi::callgate;
 use shared_abi::geometry::CORE_VECTORS;
 use shared_abi::ram_image::{self, Method};
 
-use crate::product::RESCUE_WINDOW_MS;
+use crate::boot_report::BootReport;
 
 const BYTES: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/resident.bin"));
 
@@ -74,12 +75,11 @@ global_asm!(
     "str r1, [r0]",
     "dsb",
     "isb",
-    "ldr r1, ={resident}",
-    "ldr r1, [r1, {stage}]",
+    "ldr r2, ={resident}",
+    "ldr r2, [r2, {stage}]",
+    "ldr r1, ={report}",
     "ldr r0, =__ram_image",
-    "blx r1",
-    "ldr r1, ={reason}",
-    "str r0, [r1]",
+    "blx r2",
     "ldr r0, =0xE000ED08", // VTOR (ARMv7-M B3.2.5)
     "ldr r1, =__vector_table",
     "str r1, [r0]",
@@ -89,26 +89,21 @@ global_asm!(
     ".ltorg",
     resident = sym RESIDENT,
     stage = const STAGE,
-    reason = sym STAY_REASON,
+    report = sym BOOT_REPORT,
 );
 
-/// Why the bootloader stayed, for `init`. It lies where the start-up clears nothing.
-#[link_section = ".uninit.stay_reason"]
-static STAY_REASON: AtomicU32 = AtomicU32::new(0);
+/// For `init`. It lies where the start-up clears nothing; before `init` the boot stage writes it.
+#[link_section = ".uninit.boot_report"]
+static BOOT_REPORT: Report = Report(UnsafeCell::new(MaybeUninit::uninit()));
 
-/// Why the bootloader stayed ([`StayReason::code`](boot_core::decision::StayReason::code)).
-pub fn stay_reason() -> u8 {
-    STAY_REASON.load(Ordering::Relaxed) as u8
-}
+#[repr(transparent)]
+struct Report(UnsafeCell<MaybeUninit<BootReport>>);
 
-/// The program whose CLEAR was asked of the application.
-pub fn program_to_clear() -> Option<u8> {
-    let program = (STAY_REASON.load(Ordering::Relaxed) >> 16) as u8;
-    (program > 0).then_some(program)
-}
+// SAFETY: nothing writes it when Rust code of the RAM part runs.
+unsafe impl Sync for Report {}
 
-/// The program that starts when the rescue window is over.
-pub fn program_in_waiting() -> Option<u8> {
-    let program = (STAY_REASON.load(Ordering::Relaxed) >> 8) as u8;
-    (RESCUE_WINDOW_MS.is_some() && program > 0).then_some(program)
+/// What the boot stage tells.
+pub fn boot_report() -> BootReport {
+    // SAFETY: `__pre_init` has handed its address to the boot stage, which has written it.
+    unsafe { (*BOOT_REPORT.0.get()).assume_init() }
 }

@@ -8,9 +8,7 @@ use core::sync::atomic::{AtomicBool, Ordering};
 
 use bsp::{pac, watchdog};
 
-/// How long a task may be missing, in ms. The longest that any is kept from running is a few of
-/// them: a block of 16 KiB being judged.
-const TIMEOUT_MS: u16 = 1000;
+use crate::product::PRODUCT;
 
 /// Who has to check in.
 #[derive(Clone, Copy)]
@@ -34,7 +32,7 @@ pub struct Watchdog(pac::IWDG);
 impl Watchdog {
     /// Takes it and starts it.
     pub fn new(registers: pac::IWDG) -> Self {
-        watchdog::start(&registers, TIMEOUT_MS);
+        watchdog::start(&registers, PRODUCT.watchdog_ms);
         Self(registers)
     }
 

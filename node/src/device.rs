@@ -31,7 +31,13 @@ const ANSWER_TO_RESET_MS: u32 = 20;
 /// The file is never older than this while the flash changes.
 const SAVE_AFTER: Duration = Duration::from_millis(250);
 /// What the device does after a reset: the firmware's policy. Nothing here can crash.
-const POLICY: Policy = Policy { autostart: Some(1), max_crash_resets: 3, node_ids: 1..=127 };
+const POLICY: Policy = Policy {
+    autostart: Some(1),
+    max_crash_resets: 3,
+    node_ids: 1..=127,
+    rescue_window_ms: 0,
+    rescue_window_confirmed_ms: 0,
+};
 /// Stands for no node-ID (CiA 305).
 const NO_NODE_ID: u8 = 255;
 

@@ -3,6 +3,7 @@
 //! map"). Nothing here is a choice of ours; the choices are in [`crate::layout`].
 
 /// A half-open range of addresses: `base..base + size`.
+#[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Region {
     /// First address.
@@ -42,6 +43,7 @@ impl Region {
 }
 
 /// One erasable unit of the flash.
+#[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Sector {
     /// Its number in the manual's table; [`Geometry::sector_code`] makes of it what goes into

@@ -43,7 +43,11 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         // A new beginning does not wait for the end of the old one.
         let own = self.programmer.program().is_none_or(|of| of == program);
         let restarts = command == Clear && own && self.programmer.is_abortable();
-        if self.boot_request.is_some() || (self.busy() && !restarts) {
+        let busy = match command {
+            SetSignature | ClrSignature => self.busy(),
+            _ => self.programmer.has_work(),
+        };
+        if self.boot_request.is_some() || (busy && !restarts) {
             return Err(self.refuse(program, Refusal::untimely(FlashError::Busy)));
         }
         let changes = matches!(command, Clear | SetSignature | ClrSignature);
@@ -61,7 +65,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 state.session = Session::Cleared { just: true };
                 self.transfer = None;
                 // A sector that is still being erased for the old download is waited for.
-                let at_once = (again || erase == Erase::AtOnce) && !self.busy();
+                let at_once = (again || erase == Erase::AtOnce) && !busy;
                 self.programmer.select(program);
                 self.programmer.abort();
                 if at_once {
@@ -88,7 +92,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let Some(record) = self.program(program).and_then(|state| state.record) else { return };
         if !record.confirmed && !self.busy() {
             let record = ProgramRecord { confirmed: true, ..record };
-            self.programmer.record(&mut self.parameters, program, record);
+            self.programmer.confirm(&mut self.parameters, program, record);
         }
     }
 

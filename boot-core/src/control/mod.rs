@@ -172,7 +172,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// through yet: a reset now would take that back.
     #[must_use]
     pub fn is_finishing(&self) -> bool {
-        self.programmer.finishing().is_some()
+        self.programmer.finishing().is_some() || self.programmer.is_storing()
     }
 
     /// Stores node-ID and bit rate in the background.
@@ -388,6 +388,11 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                         self.programmer.record(&mut self.parameters, program, record);
                     }
                     Err(error) => self.end(program, Err(error)),
+                }
+            }
+            Some(Event::Confirmed(program, record)) => {
+                if let Some(state) = self.program_mut(program) {
+                    state.record = Some(record);
                 }
             }
             Some(Event::Recorded(program, record)) => {

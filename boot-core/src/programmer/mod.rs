@@ -49,6 +49,8 @@ pub(crate) enum Event {
     Written { program: u8, expected: Expected, crc: u32 },
     /// The record of a program is stored.
     Recorded(u8, ProgramRecord),
+    /// The record of a program says that it is confirmed.
+    Confirmed(u8, ProgramRecord),
     /// Node-ID and bit rate are stored, or not.
     NodeStored(Result<(), StoreError>),
     /// The work on a program failed. `erasing`: an erasure did.
@@ -85,6 +87,8 @@ enum Job {
 enum Change {
     Void(u8),
     Record(u8, ProgramRecord),
+    /// As `Record`, but nobody waits for it.
+    Confirm(u8, ProgramRecord),
     Node,
 }
 
@@ -182,6 +186,13 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
         self.job = Some(Job::Store(Change::Record(program, record)));
     }
 
+    /// The record of a program becomes this one, which says that it is confirmed. Other work is
+    /// accepted meanwhile. Nothing may be on its way into the store.
+    pub(crate) fn confirm(&mut self, parameters: &mut impl Parameters, program: u8, record: ProgramRecord) {
+        parameters.store(Key::Program(program), record.value());
+        self.job = Some(Job::Store(Change::Confirm(program, record)));
+    }
+
     /// Node-ID and bit rate become these.
     pub(crate) fn store_node(&mut self, parameters: &mut impl Parameters, node: NodeParameters) {
         parameters.store(Key::Node, node.value());
@@ -213,10 +224,20 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
         self.targets.get_mut(usize::from(self.current).wrapping_sub(1))?.as_mut()
     }
 
-    /// Whether there is work for [`step`](Self::step).
+    /// Whether there is work for [`step`](Self::step). The flash cannot be read meanwhile.
     pub(crate) fn is_busy(&self) -> bool {
-        self.job.is_some()
-            || self.running.is_some()
+        self.has_work() || self.is_storing()
+    }
+
+    /// Whether a value is on its way into the store.
+    pub(crate) fn is_storing(&self) -> bool {
+        matches!(self.job, Some(Job::Store(_)))
+    }
+
+    /// Whether there is work that a command has to wait for.
+    pub(crate) fn has_work(&self) -> bool {
+        let confirming = matches!(self.job, Some(Job::Store(Change::Confirm(..))));
+        (self.job.is_some() || self.running.is_some()) && !confirming
             || self.voids != 0
             || !self.queue.is_empty()
             || self.target().is_some_and(|target| target.expected.is_some() || target.erased < target.ahead)
@@ -345,6 +366,9 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
                 Some(Event::Voided(program))
             }
             (Job::Store(Change::Record(program, record)), Ok(())) => Some(Event::Recorded(program, record)),
+            (Job::Store(Change::Confirm(program, record)), Ok(())) => Some(Event::Confirmed(program, record)),
+            // It costs a rescue window, no more.
+            (Job::Store(Change::Confirm(..)), Err(_)) => None,
             (Job::Store(Change::Void(program) | Change::Record(program, _)), Err(_)) => {
                 // A record that does not go protects its data: nothing of them is touched.
                 self.voids &= !(1 << program.saturating_sub(1));

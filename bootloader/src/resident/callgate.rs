@@ -7,10 +7,9 @@ use core::ffi::c_void;
 use core::task::Poll;
 
 use boot_core::canopen::{BitRate, NodeId};
+use boot_core::flash::run;
 use boot_core::flash::Flash;
-use boot_core::node::NodeParameters;
-use boot_core::parameters::{Key, Parameters as _, Value};
-use boot_core::program::ProgramRecord;
+use boot_core::store::{Key, NodeParameters, Parameters as _, ProgramRecord, Value};
 use bsp::{pac, LAYOUT};
 use shared_abi::callgate::{
     Crc32Args, NodeArgs, ProgramArgs, Selector, Status, PROGRAM_INSTALLED, PROGRAM_SIGNED,
@@ -18,7 +17,8 @@ use shared_abi::callgate::{
 use shared_abi::geometry::Region;
 
 use crate::caches::Caches;
-use crate::flash::FlashController;
+use crate::flash::ResidentFlash;
+use crate::flash_controller::FlashController;
 use crate::product::{self, NO_NODE_ID};
 
 /// One way in for all services: the argument structure is looked at, the flash is taken once, the
@@ -38,7 +38,8 @@ pub unsafe extern "C" fn entry(selector: u32, args: *mut c_void) -> i32 {
         return Status::BadPointer as i32;
     }
     // Before the CRC unit gets its clock.
-    if FlashController::is_in_use() {
+    // SAFETY: two registers are read, which has no effect on their owner.
+    if unsafe { FlashController::steal() }.is_in_use() {
         return Status::Busy as i32;
     }
     // SAFETY: the application calls one service at a time and does not use the flash controller
@@ -46,7 +47,7 @@ pub unsafe extern "C" fn entry(selector: u32, args: *mut c_void) -> i32 {
     let rcc = unsafe { pac::RCC::steal() };
     let crc_is_free = rcc.ahb1enr().read().crcen().is_disabled();
     // SAFETY: as above; the CRC unit only where its clock is off.
-    let mut flash = unsafe { FlashController::steal(crc_is_free.then_some(&rcc)) };
+    let mut flash = unsafe { ResidentFlash::steal(crc_is_free.then_some(&rcc)) };
     // SAFETY: the caller vouches for the structure, and it lies in RAM, aligned.
     let outcome = unsafe {
         match selector {
@@ -70,7 +71,7 @@ fn is_in_ram(address: u32, size: u32) -> bool {
     address.is_multiple_of(4) && (chip.sram.contains(address, size) || chip.ccm.contains(address, size))
 }
 
-fn crc32(flash: &FlashController, args: &mut Crc32Args) -> Result<(), Status> {
+fn crc32(flash: &ResidentFlash, args: &mut Crc32Args) -> Result<(), Status> {
     if args.len == 0 || !LAYOUT.chip.flash.contains(args.address, args.len) {
         return Err(Status::BadRange);
     }
@@ -78,7 +79,7 @@ fn crc32(flash: &FlashController, args: &mut Crc32Args) -> Result<(), Status> {
     Ok(())
 }
 
-fn read_node(flash: &FlashController, args: &mut NodeArgs) -> Result<(), Status> {
+fn read_node(flash: &ResidentFlash, args: &mut NodeArgs) -> Result<(), Status> {
     let node = product::node_parameters(&product::parameters(flash), flash);
     *args = NodeArgs {
         node_id: node.id.map_or(NO_NODE_ID, NodeId::get).into(),
@@ -87,7 +88,7 @@ fn read_node(flash: &FlashController, args: &mut NodeArgs) -> Result<(), Status>
     Ok(())
 }
 
-fn store_node(flash: &mut FlashController, args: &NodeArgs) -> Result<(), Status> {
+fn store_node(flash: &mut ResidentFlash, args: &NodeArgs) -> Result<(), Status> {
     let id = match u8::try_from(args.node_id) {
         Ok(NO_NODE_ID) => None,
         Ok(id) => Some(NodeId::new(id).ok_or(Status::BadArgument)?),
@@ -98,7 +99,7 @@ fn store_node(flash: &mut FlashController, args: &NodeArgs) -> Result<(), Status
     store(flash, Key::Node, node.value())
 }
 
-fn program_info(flash: &FlashController, args: &mut ProgramArgs) -> Result<(), Status> {
+fn program_info(flash: &ResidentFlash, args: &mut ProgramArgs) -> Result<(), Status> {
     let record = ProgramRecord::load(&product::parameters(flash), flash, program(args)?);
     *args = ProgramArgs { number: args.number, ..ProgramArgs::default() };
     if let Some(record) = record {
@@ -110,14 +111,16 @@ fn program_info(flash: &FlashController, args: &mut ProgramArgs) -> Result<(), S
     Ok(())
 }
 
-/// Sets the signature of a program or takes it away. Whoever is signed has not crashed.
-fn sign(flash: &mut FlashController, args: &ProgramArgs, signed: bool) -> Result<(), Status> {
+/// Confirms a program, which releases it for autostart, or takes both away. A confirmed program has
+/// not crashed.
+fn sign(flash: &mut ResidentFlash, args: &ProgramArgs, signed: bool) -> Result<(), Status> {
     let number = program(args)?;
     let parameters = product::parameters(flash);
     let record = ProgramRecord::load(&parameters, flash, number).ok_or(Status::NoProgram)?;
     let crashes = parameters.get(flash, Key::CrashCount).is_some_and(|[count, ..]| count > 0);
-    if record.signed != signed {
-        store(flash, Key::Program(number), ProgramRecord { signed, ..record }.value())?;
+    let told = ProgramRecord { signed, confirmed: signed, ..record };
+    if record != told {
+        store(flash, Key::Program(number), told.value())?;
     }
     if signed && crashes {
         store(flash, Key::CrashCount, [0; 4])?;
@@ -132,16 +135,12 @@ fn program(args: &ProgramArgs) -> Result<u8, Status> {
 }
 
 /// Stores a value and waits for it.
-fn store(flash: &mut FlashController, key: Key, value: Value) -> Result<(), Status> {
+fn store(flash: &mut ResidentFlash, key: Key, value: Value) -> Result<(), Status> {
     // They would show words as they were before they were programmed.
     // SAFETY: the application calls one service at a time and does not use the flash controller
     // meanwhile.
     let _caches = unsafe { Caches::off() };
     let mut parameters = product::parameters(flash);
     parameters.store(key, value);
-    loop {
-        if let Poll::Ready(outcome) = parameters.poll(flash) {
-            return outcome.map_err(|_| Status::Failed);
-        }
-    }
+    run(flash, |flash, outcome| parameters.next(flash, outcome)).map_err(|_| Status::Failed)
 }

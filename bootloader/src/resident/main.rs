@@ -6,6 +6,8 @@
 //! | `main.rs` | the header at the layout's fixed address | no |
 //! | `stage.rs` | from the reset to the jump, or to the rest of the bootloader | jump, handoff |
 //! | `callgate.rs` | services for the application | its ABI |
+//! | `service_table.rs` | services for the RAM part: the one owner of what is non-volatile | their ABI |
+//! | `flash.rs` | the flash with sectors and CRC unit | registers |
 //! | `ram_image.rs` | the rest of the bootloader, checked and unpacked to RAM | memory |
 //! | `unpack.rs` | the unpacker of ZX0 | assembly |
 //! | `caches.rs` | the caches of the flash, off or on for a while | registers |
@@ -16,15 +18,21 @@
 #![no_std]
 #![no_main]
 
+#[path = "../boot_report.rs"]
+mod boot_report;
 mod caches;
 mod callgate;
-#[path = "../flash.rs"]
 mod flash;
+#[path = "../flash_controller.rs"]
+mod flash_controller;
 #[path = "../memory.rs"]
 mod memory;
 #[path = "../product.rs"]
 mod product;
 mod ram_image;
+mod service_table;
+#[path = "../services.rs"]
+mod services;
 mod stage;
 mod unpack;
 
@@ -36,9 +44,11 @@ use shared_abi::warm_start::BootRequest;
 #[repr(C)]
 struct Header {
     callgate: Table<Entry>,
-    stage: unsafe extern "C" fn(*const shared_abi::ram_image::Header) -> u32,
+    stage: unsafe extern "C" fn(*const shared_abi::ram_image::Header, *mut boot_report::BootReport),
     fault: extern "C" fn() -> !,
+    services: services::Services,
 }
+const _: () = assert!(core::mem::offset_of!(Header, services) == services::OFFSET as usize);
 
 #[no_mangle]
 #[link_section = ".header"]
@@ -52,6 +62,7 @@ static HEADER: Header = Header {
     },
     stage: stage::stage,
     fault,
+    services: service_table::SERVICES,
 };
 const _: () = assert!(size_of::<Table<Entry>>() == TABLE_SIZE as usize);
 

@@ -7,7 +7,7 @@ use bsp::LAYOUT;
 use shared_abi::geometry::Region;
 use shared_abi::ram_image::{Damage, Header, Method, LEAST_STACK};
 
-use crate::flash::FlashController;
+use crate::flash::ResidentFlash;
 use crate::unpack::unpack;
 
 /// Checks the image and unpacks it to the start of the RAM.
@@ -18,7 +18,7 @@ use crate::unpack::unpack;
 /// # Safety
 /// `header` must be the address of the image's header in the bootloader's flash, aligned. Nobody
 /// may use the RAM but for the last [`LEAST_STACK`] bytes of it.
-pub unsafe fn load(header: *const Header, flash: &FlashController) -> Result<(), Damage> {
+pub unsafe fn load(header: *const Header, flash: &ResidentFlash) -> Result<(), Damage> {
     let at = header as u32;
     // SAFETY: the caller vouches for it; any bits make a `Header`.
     let header = unsafe { &*header };

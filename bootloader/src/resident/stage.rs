@@ -5,8 +5,9 @@
 
 use boot_core::canopen::NodeId;
 use boot_core::decision::{decide, BootDecision, Circumstances, StayReason};
-use boot_core::parameters::{Key, Parameters as _};
+use boot_core::flash::run;
 use boot_core::program::verify;
+use boot_core::store::{Key, Parameters as _};
 use bsp::clock::{Source, HSI};
 use bsp::{pac, CLOCK_TREE, LAYOUT};
 use cortex_m::peripheral::SCB;
@@ -14,24 +15,25 @@ use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
 use shared_abi::ram_image::Header;
 use shared_abi::warm_start::BootRequest;
 
+use crate::boot_report::BootReport;
 use crate::caches::Caches;
-use crate::flash::FlashController;
-use crate::product::{self, NO_NODE_ID, POLICY, PROGRAM_WATCHDOG_MS, RESCUE_WINDOW_MS};
+use crate::flash::ResidentFlash;
+use crate::product::{self, NO_NODE_ID, PRODUCT};
 use crate::ram_image;
 
 /// About how long the warm-start cell can be read in peace between two resets where nothing can run.
 const RESET_PERIOD_MS: u32 = 100;
 
-/// Decides. Comes back if the bootloader stays, with the rest of it in RAM; tells why it stays
-/// ([`StayReason::code`]), in the next byte which program waits for the end of the rescue window,
-/// and in the one behind that which is to be cleared.
+/// Decides. Comes back if the bootloader stays, with the rest of it in RAM, and tells in `report`
+/// what there is to do.
 ///
 /// A RAM image that is damaged does not run: it is told in the warm-start cell, and a program starts
 /// that would start by itself. Without one the chip is reset again and again.
 ///
 /// # Safety
-/// `image` must be the address of the RAM image's header, and nothing else may run yet.
-pub unsafe extern "C" fn stage(image: *const Header) -> u32 {
+/// `image` must be the address of the RAM image's header, and `report` writable behind the image's
+/// RAM; nothing else may run yet.
+pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
     // SAFETY: nothing else runs yet; the rest of the bootloader takes them after this has returned.
     let (rcc, iwdg) = unsafe { (pac::RCC::steal(), pac::IWDG::steal()) };
 
@@ -45,7 +47,7 @@ pub unsafe extern "C" fn stage(image: *const Header) -> u32 {
     // CRCs and unpacking want speed. Exact it need not be, and the crystal would take its time.
     CLOCK_TREE.speed_up(&rcc, Source::Internal);
     // SAFETY: as above.
-    let mut flash = unsafe { FlashController::steal(Some(&rcc)) };
+    let mut flash = unsafe { ResidentFlash::steal(Some(&rcc)) };
     let mut parameters = product::parameters(&flash);
     let crash_resets = count_crash_resets(&mut parameters, &mut flash, reset_cause, request);
     // SAFETY: as above; nothing is programmed from here on.
@@ -53,34 +55,31 @@ pub unsafe extern "C" fn stage(image: *const Header) -> u32 {
 
     let node = product::node_parameters(&parameters, &flash);
     let node_id = node.id.map_or(NO_NODE_ID, NodeId::get);
-    let choose = |circumstances: &Circumstances| {
-        decide(circumstances, &POLICY, |number| verify(&flash, &parameters, LAYOUT, number))
+    let choose = |request| {
+        let circumstances = Circumstances { request, strap, crash_resets, node_id };
+        let verified = |number| verify(&flash, &parameters, LAYOUT, PRODUCT.crc, number);
+        decide(&circumstances, &DECISION, verified)
     };
-    let mut decision = choose(&Circumstances { request, strap, crash_resets, node_id });
-    let mut stay = match &decision {
-        BootDecision::Stay(reason) => {
-            let clear = if let Some(BootRequest::Clear(program)) = request { program } else { 0 };
-            Some(u32::from(reason.code()) | u32::from(clear) << 16)
-        }
-        BootDecision::Start { program, .. } if RESCUE_WINDOW_MS.is_some() && request.is_none() => {
-            Some(u32::from(StayReason::Rescue.code()) | u32::from(program.number()) << 8)
-        }
-        BootDecision::Start { .. } => None,
-    };
-    if stay.is_some() {
+    let mut decision = choose(request);
+    let mut stays = !matches!(decision, BootDecision::Start { .. });
+    if stays {
         // SAFETY: the caller vouches for the address; of the RAM nothing is in use but the stack.
         if let Err(damage) = unsafe { ram_image::load(image, &flash) } {
             cell.put(BootRequest::Damaged(damage));
-            stay = None;
-            decision = choose(&Circumstances { request: None, strap: false, crash_resets: 0, node_id });
+            stays = false;
+            // What would start by itself starts at once: a window would need the RAM image.
+            let resume = PRODUCT.autostart.map(BootRequest::Resume);
+            decision = if strap { decision } else { choose(resume) };
         }
     }
     // Whoever runs next finds the chip as after a reset, but the bootloader finds it fast: it clears
     // its memory first of all.
     drop(caches);
     flash.release(&rcc);
-    if let Some(reason) = stay {
-        return reason;
+    if stays {
+        // SAFETY: the caller vouches for the address.
+        unsafe { report.write(boot_report(&decision, request)) };
+        return;
     }
     CLOCK_TREE.slow_down(&rcc);
     let BootDecision::Start { program, trial } = decision else {
@@ -97,7 +96,7 @@ pub unsafe extern "C" fn stage(image: *const Header) -> u32 {
         bootloader_version: product::VERSION,
         serial_number: bsp::serial_number(),
     });
-    if let Some(ms) = PROGRAM_WATCHDOG_MS {
+    if let Some(ms) = PRODUCT.program_watchdog_ms {
         bsp::watchdog::start(&iwdg, ms);
     }
     // SAFETY: the layout's handoff region, checked to be RAM of that size in no image. No interrupt
@@ -108,20 +107,44 @@ pub unsafe extern "C" fn stage(image: *const Header) -> u32 {
     }
 }
 
+/// What the RAM part is told.
+fn boot_report(decision: &BootDecision, request: Option<BootRequest>) -> BootReport {
+    let (reason, held_program, window_ms) = match decision {
+        BootDecision::Stay(reason) => (*reason, 0, 0),
+        BootDecision::Hold { program, window_ms } => (StayReason::Rescue, *program, *window_ms),
+        BootDecision::Start { program, .. } => (StayReason::Rescue, program.number(), 0),
+    };
+    // An application that asks for the bootloader has shown that it can be called back. Which one
+    // it was stands in the handoff, which nobody has written since.
+    let returns = matches!(request, Some(BootRequest::Stay | BootRequest::Clear(_)));
+    // SAFETY: the layout's handoff region, checked to be RAM of that size in no image.
+    let handoff = unsafe { Handoff::read(LAYOUT.handoff.base as *const Handoff) };
+    BootReport {
+        reason: reason.code(),
+        held_program,
+        window_ms,
+        clear: if let Some(BootRequest::Clear(program)) = request { program } else { 0 },
+        returned: handoff.filter(|_| returns).map_or(0, |info| info.program),
+    }
+}
+
+/// The product's policy.
+const DECISION: boot_core::decision::Policy = PRODUCT.decision();
+
 /// Keeps the number of resets in a row by which an application ended without being asked to.
 fn count_crash_resets(
     parameters: &mut product::Parameters,
-    flash: &mut FlashController,
+    flash: &mut ResidentFlash,
     reset_cause: ResetCause,
     request: Option<BootRequest>,
 ) -> u32 {
     let before = parameters.get(flash, Key::CrashCount).map_or(0, |[count, ..]| count);
-    let now = POLICY.crash_resets(before, reset_cause, request);
+    let now = DECISION.crash_resets(before, reset_cause, request);
     if now != before {
         parameters.store(Key::CrashCount, [now, 0, 0, 0]);
         // Nothing else runs that could be kept waiting. A store that fails costs the count, not the
         // start.
-        while parameters.poll(flash).is_pending() {}
+        let _ = run(flash, |flash, outcome| parameters.next(flash, outcome));
     }
     now
 }

@@ -84,8 +84,13 @@ static ESACADEMY: Config = Config {
 };
 static HASTY: Config = Config { download: Policy { erase: Erase::AtOnce, ..CONFIG.download }, ..CONFIG };
 
-const DECISION: decision::Policy =
-    decision::Policy { autostart: Some(1), max_crash_resets: 3, node_ids: 1..=127 };
+const DECISION: decision::Policy = decision::Policy {
+    autostart: Some(1),
+    max_crash_resets: 3,
+    node_ids: 1..=127,
+    rescue_window_ms: 0,
+    rescue_window_confirmed_ms: 0,
+};
 
 /// Node-ID and bit rate of a device that was never told others.
 pub const BOARD_NODE: NodeParameters = NodeParameters { id: NodeId::new(1), bit_rate: BitRate::K125 };

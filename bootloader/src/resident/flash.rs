@@ -1,0 +1,113 @@
+//! The flash as the resident part sees it: all of it, with sectors, CRC unit (RM0090 section 4) and
+//! blank check. The RAM part asks for these through [`services`](crate::services).
+
+use core::task::Poll;
+
+use boot_core::crc;
+use boot_core::flash::{crc32_by_software, Flash, FlashFault, Operation};
+use bsp::{pac, LAYOUT};
+use shared_abi::geometry::{Region, Sector};
+
+use crate::flash_controller::{FlashController, FLASH};
+
+/// The controller, and the CRC unit where it is not somebody else's.
+pub struct ResidentFlash {
+    controller: FlashController,
+    crc: Option<pac::CRC>,
+}
+
+impl ResidentFlash {
+    /// Takes the controller, and the CRC unit if `rcc` is there to switch it on.
+    ///
+    /// # Safety
+    /// Nobody else may use the two until this is dropped.
+    pub unsafe fn steal(rcc: Option<&pac::RCC>) -> Self {
+        let crc = rcc.map(|rcc| {
+            rcc.ahb1enr().modify(|_, w| w.crcen().enabled());
+            // SAFETY: the caller vouches for it.
+            unsafe { pac::CRC::steal() }
+        });
+        // SAFETY: the caller vouches for it.
+        Self { controller: unsafe { FlashController::steal() }, crc }
+    }
+
+    /// Leaves both as after a reset.
+    pub fn release(self, rcc: &pac::RCC) {
+        if let Some(crc) = &self.crc {
+            crc.cr().write(|w| w.reset().set_bit());
+            rcc.ahb1enr().modify(|_, w| w.crcen().disabled());
+        }
+        self.controller.clear_flags();
+    }
+}
+
+impl Flash for ResidentFlash {
+    fn read(&self, address: u32, buffer: &mut [u8]) {
+        self.controller.read(address, buffer);
+    }
+
+    fn read_word(&self, address: u32) -> u32 {
+        self.controller.read_word(address)
+    }
+
+    fn sector_at(&self, address: u32) -> Option<Sector> {
+        LAYOUT.chip.sector_at(address)
+    }
+
+    /// By the unit. It has the polynomial, but takes words with the most significant bit first, and
+    /// starts anew: what went before comes back as one word that leaves it in the same state.
+    fn crc32(&self, crc: u32, region: Region) -> u32 {
+        let Some(unit) = &self.crc else { return crc32_by_software(self, crc, region) };
+        if !region.base.is_multiple_of(4) || !FLASH.contains(region.base, region.size) {
+            return crc32_by_software(self, crc, region);
+        }
+        let words = region.size / 4;
+        let (control, unit) = (unit.cr(), unit.dr());
+        // SAFETY: every word may be written to DR.
+        let feed = |word: u32| unit.write(|w| unsafe { w.bits(word) });
+        control.write(|w| w.reset().set_bit());
+        if crc != 0 {
+            feed(u32::MAX ^ word_before((!crc).reverse_bits()));
+        }
+        // SAFETY: the region was checked to be inside the memory-mapped flash, which is always
+        // readable.
+        let feed_from =
+            |address: u32| feed(unsafe { (address as *const u32).read_volatile() }.reverse_bits());
+        let (mut address, end) = (region.base, region.base + words * 4);
+        // Four at a time: on the way from reset to a large program this loop is most of the time.
+        while end - address >= 16 {
+            feed_from(address);
+            feed_from(address + 4);
+            feed_from(address + 8);
+            feed_from(address + 12);
+            address += 16;
+        }
+        while address < end {
+            feed_from(address);
+            address += 4;
+        }
+        let crc = !unit.read().bits().reverse_bits();
+        let mut tail = [0; 3];
+        let tail = &mut tail[..region.size as usize % 4];
+        self.read(region.base + words * 4, tail);
+        crc::resume(crc, tail)
+    }
+
+    fn start(&mut self, operation: Operation) -> Result<(), FlashFault> {
+        self.controller.start(operation)
+    }
+
+    fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
+        self.controller.poll()
+    }
+}
+
+/// The word that takes the CRC unit from 0 to this state: its 32 steps backwards.
+fn word_before(mut state: u32) -> u32 {
+    /// The polynomial of the unit.
+    const POLYNOMIAL: u32 = 0x04C1_1DB7;
+    for _ in 0..32 {
+        state = if state & 1 != 0 { (state ^ POLYNOMIAL) >> 1 | 1 << 31 } else { state >> 1 };
+    }
+    state
+}

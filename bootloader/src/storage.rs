@@ -1,0 +1,118 @@
+//! The flash and the store as the RAM part sees them: operations are started and polled here, all
+//! else is asked of the resident part ([`services`](crate::services)).
+
+use core::mem::MaybeUninit;
+use core::task::Poll;
+
+use boot_core::flash::{Flash, FlashFault, Next, Operation};
+use boot_core::store::{Key, Parameters, StoreError, Value};
+use bsp::LAYOUT;
+use shared_abi::geometry::{Region, Sector};
+
+use crate::flash_controller::FlashController;
+use crate::services::{outcome_code, Services, StoreState, StoreStep, OFFSET, STORE_STATE_WORDS};
+
+/// The resident part's services.
+fn services() -> &'static Services {
+    // SAFETY: the linker script holds the resident part to the callgate's address, and its header
+    // has the table at this offset.
+    let services = unsafe { &*((LAYOUT.callgate() + OFFSET) as *const Services) };
+    // The boot stage has compared the versions; this finds a table at another place.
+    debug_assert_eq!(services.size as usize, size_of::<Services>());
+    services
+}
+
+/// The flash.
+pub struct BootFlash(FlashController);
+
+impl BootFlash {
+    /// Takes the flash controller.
+    ///
+    /// # Safety
+    /// Nobody else may use it, or the CRC unit, until this is dropped.
+    pub unsafe fn steal() -> Self {
+        // SAFETY: the caller vouches for it.
+        Self(unsafe { FlashController::steal() })
+    }
+
+    /// The services, to be called while the flash is idle: code in flash stalls otherwise, and all
+    /// interrupts with it.
+    fn idle_services(&self) -> &'static Services {
+        debug_assert!(!self.0.is_busy(), "a service was called while the flash works");
+        services()
+    }
+}
+
+impl Flash for BootFlash {
+    fn read(&self, address: u32, buffer: &mut [u8]) {
+        self.0.read(address, buffer);
+    }
+
+    fn read_word(&self, address: u32) -> u32 {
+        self.0.read_word(address)
+    }
+
+    fn start(&mut self, operation: Operation) -> Result<(), FlashFault> {
+        self.0.start(operation)
+    }
+
+    fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
+        self.0.poll()
+    }
+
+    fn sector_at(&self, address: u32) -> Option<Sector> {
+        let mut sector = MaybeUninit::uninit();
+        // SAFETY: the service writes the sector where it says that there is one.
+        unsafe {
+            (self.idle_services().sector_at)(address, sector.as_mut_ptr()).then(|| sector.assume_init())
+        }
+    }
+
+    fn crc32(&self, crc: u32, region: Region) -> u32 {
+        (self.idle_services().crc32)(crc, region.base, region.size)
+    }
+
+    fn is_blank(&self, region: Region) -> bool {
+        (self.idle_services().is_blank)(region.base, region.size)
+    }
+}
+
+/// What is stored.
+pub struct Store(StoreState);
+
+impl Store {
+    /// Finds what is stored. The flash must be idle.
+    pub fn open() -> Self {
+        let mut store = Self(StoreState([0; STORE_STATE_WORDS]));
+        // SAFETY: the state is ours alone.
+        unsafe { (services().open)(&mut store.0) };
+        store
+    }
+}
+
+impl Parameters for Store {
+    fn get<F: Flash>(&self, _flash: &F, key: Key) -> Option<Value> {
+        let mut value = [0; 4];
+        // SAFETY: the state comes from `open`.
+        unsafe { (services().get)(&self.0, key.tag(), &mut value).then_some(value) }
+    }
+
+    fn store(&mut self, key: Key, value: Value) {
+        // SAFETY: the state comes from `open`.
+        unsafe { (services().store)(&mut self.0, key.tag(), &value) };
+    }
+
+    fn next<F: Flash>(&mut self, _flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
+        let mut operation = MaybeUninit::uninit();
+        // SAFETY: the state comes from `open`; the service writes the operation where it says that
+        // there is one.
+        unsafe {
+            match (services().next)(&mut self.0, outcome_code(outcome), operation.as_mut_ptr()) {
+                StoreStep::Start => Next::Start(operation.assume_init()),
+                StoreStep::Again => Next::Again,
+                StoreStep::Done => Next::Done(Ok(())),
+                StoreStep::Failed => Next::Done(Err(StoreError::Device)),
+            }
+        }
+    }
+}
