@@ -43,21 +43,20 @@ pub struct Variant {
 
 /// All of them, in the order in which they are built.
 pub const VARIANTS: &[Variant] = &[
-    bootloader("bootloader", STANDARD),
-    bootloader("bootloader-complete", "complete"),
-    bootloader("bootloader-minimal", ""),
-    bootloader("bootloader-rescue", "emcy,lss,raw-image,rescue-window"),
-    bootloader("bootloader-paulus", "profile-paulus"),
-    bootloader("bootloader-esacademy", "profile-esacademy"),
-    // The second program's place takes the set of parameters.
-    Variant { least_programs: 2, ..bootloader("bootloader-lift", "profile-lift") },
+    bootloader("bootloader", ""),
+    product("bootloader-paulus", "paulus"),
+    product("bootloader-esacademy", "esacademy"),
+    product("bootloader-lift", "lift"),
+    product("bootloader-crc-16", "crc-16"),
+    // Everything that a product may switch off is off.
+    product("bootloader-least", "least"),
     // They tell what they do, each in a way of its own (`cargo xtask emulate --log=WAY`).
-    bootloader("bootloader-log-rtt", "emcy,lss,log-rtt"),
-    bootloader("bootloader-log-defmt", "emcy,lss,log-defmt"),
-    bootloader("bootloader-log-uart", "emcy,lss,log-uart"),
-    bootloader("bootloader-virtual-can", "emcy,lss,virtual-can"),
+    bootloader("bootloader-log-rtt", "log-rtt"),
+    bootloader("bootloader-log-defmt", "log-defmt"),
+    bootloader("bootloader-log-uart", "log-uart"),
+    bootloader("bootloader-virtual-can", "virtual-can"),
     // With the debugger interface, for the tests alone: never ship it.
-    bootloader("bootloader-debugger", "emcy,debugger"),
+    bootloader("bootloader-debugger", "debugger"),
     application("app-debugger", "debugger"),
     // Version 1 is the template as it stands.
     application("app-v1", ""),
@@ -73,6 +72,11 @@ pub const MAIN: [&str; 3] = ["bootloader", "app-v1", "app-v2"];
 
 const fn bootloader(name: &'static str, features: &'static str) -> Variant {
     Variant { name, package: "bootloader", features, product: None, program: 0, least_programs: 1 }
+}
+
+/// The bootloader with the choices of a product of this name (`Product::named`).
+const fn product(name: &'static str, product: &'static str) -> Variant {
+    Variant { product: Some(product), ..bootloader(name, "") }
 }
 
 const fn application(name: &'static str, features: &'static str) -> Variant {
@@ -221,22 +225,6 @@ fn rust_lld() -> Outcome<PathBuf> {
     let tools = Path::new(sysroot.trim()).join("lib/rustlib").join(host).join("bin");
     Ok(tools.join("rust-lld").with_extension(std::env::consts::EXE_EXTENSION))
 }
-
-/// The bootloader's features that a product may go without.
-pub const OPTIONAL: [&str; 9] = [
-    "emcy",
-    "lss",
-    "raw-image",
-    "intel-hex",
-    "auto-bit-rate",
-    "block-upload",
-    "rescue-window",
-    "password",
-    "read-back",
-];
-/// Those of them that a product usually has: this bootloader is the one that is measured against
-/// the budget.
-const STANDARD: &str = "standard";
 
 /// Builds a bootloader to look at; gives its ELF file.
 ///

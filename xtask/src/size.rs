@@ -16,7 +16,7 @@ use crate::{build, pack, symbols, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask size [--board BOARD] [--yes]
 
-Builds the bootloader, prints its flash by section, by crate and by optional feature, and fails when
+Builds the bootloader, prints its flash by section, by part and by variant, and fails when
 it is over the budget. What runs from RAM lies in flash packed: sizes are told as they are unpacked (raw)
 and as the flash has them (packed). A share of what is packed is an estimate: as much of it as of the raw.
 
@@ -38,7 +38,7 @@ pub fn run(mut args: Args) -> Outcome {
     let flash = Flash::of(&elf, board.bootloader)?;
     print!("\n{}", flash.table());
     print!("\n{}", by_crate(&elf));
-    print!("\n{}", by_feature(board)?);
+    print!("\n{}", by_variant(board)?);
     println!(
         "\nbootloader: {} of {} bytes ({} of flash kept for it); {} if nothing were packed",
         flash.used,
@@ -165,21 +165,13 @@ impl Flash {
     }
 }
 
-/// What each optional feature costs on top of a bootloader without any, and what whole bootloaders
-/// take.
-fn by_feature(board: &Layout) -> Outcome<String> {
+/// What the bootloaders of other products take, and those with what no product has.
+fn by_variant(board: &Layout) -> Outcome<String> {
     let measure = |features: &str, product| -> Outcome<Flash> {
         Flash::of(&Elf::parse(&build::to_look_at(board, features, product)?)?, board.bootloader)
     };
-    let bare = measure("", None)?;
-    let mut text = String::from("feature                         packed     raw, on top of none\n");
-    let over = |with: u32, without: u32| i64::from(with) - i64::from(without);
-    for feature in build::OPTIONAL {
-        let with = measure(feature, None)?;
-        let (packed, raw) = (over(with.used, bare.used), over(with.raw(), bare.raw()));
-        let _ = writeln!(text, "{feature:<31} {packed:>6}  {raw:>6}");
-    }
-    let _ = writeln!(text, "\nbootloader                      packed     raw");
+    let mut text = String::new();
+    let _ = writeln!(text, "bootloader                      packed     raw");
     for variant in build::Variant::of(board).filter(|variant| variant.is_bootloader()) {
         let flash = measure(variant.features, variant.product)?;
         let _ = writeln!(text, "{:<31} {:>6}  {:>6}", variant.name, flash.used, flash.raw());

@@ -51,10 +51,6 @@ pub fn run(mut args: Args) -> Outcome {
         suite.run(board, &[build::tests_args(board), chosen].concat())?;
     } else if chosen.is_empty() {
         suite.run(board, &[])?;
-        // What can be built differently by choice.
-        let other_crc =
-            ["--package=boot-core", "--features=crc-16,crc-table", "--test=download", "--test=streams"];
-        suite.run(board, &other_crc.map(String::from))?;
         for other in BOARDS.iter().filter(|other| other.chip.chip != board.chip.chip) {
             build::all(other)?;
             build::c_applications(other)?;
