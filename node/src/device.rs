@@ -203,8 +203,12 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
             node_id: node.id.map_or(NO_NODE_ID, NodeId::get),
         };
         let verified = |number| verify(&flash, &journal, config.layout, config.download.crc, number);
-        match decide(&circumstances, &POLICY, verified) {
-            BootDecision::Stay(reason) => {
+        let decision = decide(&circumstances, &POLICY, verified);
+        match decision {
+            // A program that is held back: the policy has no rescue window.
+            BootDecision::Stay(_) | BootDecision::Hold { .. } => {
+                let reason =
+                    if let BootDecision::Stay(reason) = decision { reason } else { StayReason::Rescue };
                 let mut device =
                     Bootloader::new(config, serial_number, node, reason.code(), journal, flash, buffer);
                 if let Some(BootRequest::Clear(program)) = request {

@@ -53,7 +53,7 @@ impl Bench {
     /// A board whose bootloader has every option.
     #[must_use]
     pub fn complete() -> Self {
-        Self::of(firmware::BOOTLOADER_COMPLETE, vec![Options::default()])
+        Self::of(firmware::BOOTLOADER, vec![Options::default()])
     }
 
     /// A board with this bootloader.
@@ -77,7 +77,7 @@ impl Bench {
                 ..Options::default()
             }
         };
-        Self::of(firmware::BOOTLOADER_COMPLETE, (0..count).map(options).collect())
+        Self::of(firmware::BOOTLOADER, (0..count).map(options).collect())
     }
 
     fn of(bootloader: &str, chips: Vec<Options>) -> Self {

@@ -10,12 +10,10 @@ use shared_abi::layout::{self, Layout};
 
 /// The images by the names that `cargo xtask build` gives them.
 pub const BOOTLOADER: &str = "bootloader.elf";
-/// The bootloader with every option.
-pub const BOOTLOADER_COMPLETE: &str = "bootloader-complete.elf";
-/// The one without any option: no emergencies, no layer setting services.
-pub const BOOTLOADER_MINIMAL: &str = "bootloader-minimal.elf";
-/// The standard one with a rescue window of half a second.
-pub const BOOTLOADER_RESCUE: &str = "bootloader-rescue.elf";
+/// The one in which everything is off that a product may switch off.
+pub const BOOTLOADER_LEAST: &str = "bootloader-least.elf";
+/// The one whose blocks and programs carry CRC-16.
+pub const BOOTLOADER_CRC_16: &str = "bootloader-crc-16.elf";
 /// The one for masters that know Paulus, and the one for those that know the boot loader of
 /// ESAcademy.
 pub const BOOTLOADER_PAULUS: &str = "bootloader-paulus.elf";

@@ -93,7 +93,7 @@ const UNPACKED: usize = 5;
 
 #[test]
 fn what_is_packed_is_what_was_linked() {
-    for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_MINIMAL] {
+    for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_LEAST] {
         let mut packed = Packed::of(image);
         let (stored, ram) = (packed.stored().to_vec(), packed.ram.len());
         assert_eq!(packed.get(MAGIC), u32::from_le_bytes(*b"CBI1"));
@@ -423,7 +423,7 @@ fn no_stream_writes_outside_the_image() {
 /// As the linker makes it, without a CRC: what `cargo build` alone and `--unpacked` give.
 #[test]
 fn an_image_that_is_not_packed_runs() {
-    let mut image = Packed::of(firmware::BOOTLOADER_MINIMAL);
+    let mut image = Packed::of(firmware::BOOTLOADER_LEAST);
     let ram = image.ram.clone();
     image.flash.truncate(image.header + HEADER);
     image.flash.extend(&ram);

@@ -171,7 +171,7 @@ fn store_by_lss(bench: &mut Bench, node: u8, rate: Option<BitRate>) {
 /// does.
 #[test]
 fn node_id_and_bit_rate_are_shared() {
-    for bootloader in [firmware::BOOTLOADER, firmware::BOOTLOADER_MINIMAL] {
+    for bootloader in [firmware::BOOTLOADER, firmware::BOOTLOADER_LEAST] {
         let mut bench = Bench::of_image(bootloader);
         bench.power_on();
         bench.await_boot_up(100);
@@ -186,7 +186,7 @@ fn node_id_and_bit_rate_are_shared() {
         bench.await_boot_up_of(9, 1000);
         assert!(bench.is_bootloader(9));
         assert_eq!(bench.session_with(9).read_number(Address::new(0x1018, 4)).unwrap(), serial);
-        if bootloader == firmware::BOOTLOADER_MINIMAL {
+        if bootloader == firmware::BOOTLOADER_LEAST {
             continue;
         }
         // And from the bootloader: the program has it from the handoff.
@@ -264,7 +264,7 @@ fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
 /// in time has it.
 #[test]
 fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
-    let mut bench = Bench::of_image(firmware::BOOTLOADER_RESCUE);
+    let mut bench = Bench::of_image(firmware::BOOTLOADER);
     bench.power_on();
     bench.await_boot_up(100);
     install(&mut bench, NODE, firmware::APP_V1);
