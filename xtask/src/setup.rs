@@ -17,7 +17,7 @@ usage: cargo xtask setup [--yes]
 
 Brings the machine to where every other job runs: the Rust target thumbv7em-none-eabihf, rustfmt and
 clippy (by rustup); cmake, make, pkg-config and libclang to build the emulator's CPU, clang for the application
-in C, python3 with venv (by apt-get); and a Python environment in target/python with tests/python/requirements.txt.
+in C, gdb-multiarch, python3 with venv (by apt-get); and a Python environment in target/python with tests/python/requirements.txt.
 
 The other jobs do this themselves, each for what it needs. As root it installs what is missing; for
 anyone else it stops with the line to run, or, with --yes, runs that line.
@@ -36,6 +36,8 @@ pub enum Part {
     Emulator,
     /// The third-party CANopen client: a Python environment.
     Python,
+    /// The debugger that loads the images in a test.
+    Gdb,
     /// Formatter and linter.
     Lint,
 }
@@ -49,7 +51,7 @@ pub struct Setup {
 pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     args.none_left()?;
-    setup.prepare(&[Part::Firmware, Part::C, Part::Emulator, Part::Python, Part::Lint])?;
+    setup.prepare(&[Part::Firmware, Part::C, Part::Emulator, Part::Python, Part::Gdb, Part::Lint])?;
     println!("Everything is there.");
     Ok(())
 }
@@ -148,6 +150,7 @@ enum Tool {
     Clang,
     Python,
     Venv,
+    Gdb,
 }
 
 impl Tool {
@@ -162,6 +165,7 @@ impl Tool {
             Self::Clang => "clang",
             Self::Python => "python3",
             Self::Venv => "python3-venv",
+            Self::Gdb => "gdb-multiarch",
         }
     }
 
@@ -188,6 +192,7 @@ impl Tool {
             Self::Python => process::succeeds("python3", &["--version"]),
             // Debian's python3 comes without ensurepip.
             Self::Venv => process::succeeds("python3", &["-c", "import venv, ensurepip"]),
+            Self::Gdb => process::succeeds("gdb-multiarch", &["--version"]),
         }
     }
 }
@@ -199,6 +204,7 @@ fn missing_packages(parts: &[Part], is_there: impl Fn(Tool) -> bool) -> Vec<&'st
         tools.extend_from_slice(match part {
             Part::Emulator => &[Tool::CCompiler, Tool::Make, Tool::Cmake, Tool::PkgConfig, Tool::Libclang],
             Part::C => &[Tool::Clang],
+            Part::Gdb => &[Tool::Gdb],
             Part::Python if !python_environment_is_there() => &[Tool::Python, Tool::Venv],
             Part::Python | Part::Firmware | Part::Lint => &[],
         });

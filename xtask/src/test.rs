@@ -31,7 +31,7 @@ pub fn run(mut args: Args) -> Outcome {
     let chosen_board = args.has("--board");
     let board = workspace::board(&mut args)?;
     let setup = Setup::from(&mut args);
-    setup.prepare(&[Part::Firmware, Part::C, Part::Emulator, Part::Python])?;
+    setup.prepare(&[Part::Firmware, Part::C, Part::Emulator, Part::Python, Part::Gdb])?;
     build::all(board)?;
     build::c_applications(board)?;
     // And one board with room for two programs, for the tests of that.
@@ -79,8 +79,18 @@ pub fn run(mut args: Args) -> Outcome {
 
 /// The test programs that every board goes through each time: what a port can get wrong shows in
 /// them.
-const MAIN_TESTS: [&str; 9] =
-    ["main_job", "device", "watchdog", "boot_time", "abi", "c_application", "handover", "log", "virtual_can"];
+const MAIN_TESTS: [&str; 10] = [
+    "main_job",
+    "device",
+    "watchdog",
+    "boot_time",
+    "abi",
+    "image",
+    "c_application",
+    "handover",
+    "log",
+    "virtual_can",
+];
 
 /// What has been tested so far, and what the tests need to know.
 struct Suite {
