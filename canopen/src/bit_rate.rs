@@ -1,8 +1,8 @@
-//! The bit rates of CANopen, and how a device finds out which one a bus runs at.
+//! The bit rates of CANopen, and how a device finds out the one of its bus.
 
 use crate::time::Instant;
 
-/// The bit rates of table 0, with their index (CiA 305 table 1).
+/// The bit rates of CiA 305 table 1; the values are their index there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum BitRate {
@@ -24,12 +24,12 @@ pub enum BitRate {
     K20 = 7,
     /// 10 kbit/s.
     K10 = 8,
-    /// The device finds it out.
+    /// The device finds it out by listening.
     Auto = 9,
 }
 
 impl BitRate {
-    /// From the index in table 0.
+    /// From the index in CiA 305 table 1; `None` for an index that it does not have.
     #[must_use]
     pub const fn from_index(index: u8) -> Option<Self> {
         Some(match index {
@@ -55,7 +55,7 @@ impl BitRate {
         }
     }
 
-    /// From bit/s, as boards and handoff have it: 0 is [`BitRate::Auto`].
+    /// From bit/s, with 0 for [`BitRate::Auto`]; `None` for a rate that CANopen does not have.
     #[must_use]
     pub const fn from_bits_per_second(rate: u32) -> Option<Self> {
         if rate == 0 {
@@ -91,7 +91,7 @@ impl BitRate {
         }
     }
 
-    /// All that can be set, from fast to slow.
+    /// All rates that a controller can be set to, from fast to slow.
     pub const FIXED: [Self; 9] = [
         Self::K1000,
         Self::K800,
@@ -122,26 +122,26 @@ impl BitRate {
     }
 }
 
-/// What a controller that only listens made of the bus since it was last asked.
+/// What a controller that only listens received since it was last asked.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Heard {
     /// Nothing.
     #[default]
     Nothing,
-    /// It found no beginning: the bus was never idle for 11 bits (ISO 11898-1).
+    /// It did not synchronise: the bus was never idle for 11 bits (ISO 11898-1).
     NeverIdle,
-    /// A good frame was the last thing.
+    /// Last of all, a good frame.
     Frame,
-    /// An error was the last thing.
+    /// Last of all, an error.
     Error,
 }
 
 /// Finds the bit rate of a bus by listening (in the manner of CiA 801): a good frame proves a rate,
 /// an error disproves it.
 ///
-/// On a bus where nobody else acknowledges, the lone sender's frames come out bad even at the right
-/// rate, until it is error passive and its error flags no longer show (ISO 11898-1): the search
-/// comes round to the right rate again and finds it then.
+/// On a bus where no other node acknowledges, the frames of a lone sender are bad even at the right
+/// rate, until it is error passive and its error flags are recessive (ISO 11898-1). The search
+/// tries all rates in turn, so it tries the right one again and finds it then.
 #[derive(Clone, Copy, Debug)]
 pub struct Detector {
     rate: BitRate,
@@ -149,16 +149,15 @@ pub struct Detector {
     since: Instant,
 }
 
-/// How long the bus may not be idle before the next rate gets its turn, in milliseconds. At the
-/// right rate it is idle behind each frame, and no frame takes longer than 14 ms at 10 kbit/s.
+/// After this time without idle bus the next rate is tried, in milliseconds. At the right rate the
+/// bus is idle behind each frame, and no frame takes longer than 14 ms at 10 kbit/s.
 const NEVER_IDLE_MS: u32 = 50;
-/// How long silence is listened to before the next rate gets its turn, in milliseconds: more than a
-/// usual heartbeat. Slow sampling of a fast bus may hear nothing at all.
+/// After this time of silence the next rate is tried, in milliseconds: more than the period of a
+/// usual heartbeat. A controller that samples a fast bus slowly may receive nothing at all.
 const DWELL_MS: u32 = 1500;
 
 impl Detector {
-    /// Starts with this rate, or with the first there is; `supports` tells which of them the device
-    /// can run at.
+    /// Starts with this rate, or with the next one that the device `supports`.
     pub fn new(first: BitRate, now: Instant, supports: impl FnMut(BitRate) -> bool) -> Self {
         let rate = if first == BitRate::Auto { BitRate::K1000 } else { first };
         let mut detector = Self { rate, since: now };
@@ -172,8 +171,8 @@ impl Detector {
         self.rate
     }
 
-    /// Takes what was heard. `true` proves the rate; otherwise [`rate`](Self::rate) may have become
-    /// another one.
+    /// Takes what was heard; gives whether it proves the rate. If not, [`rate`](Self::rate) may
+    /// have changed.
     pub fn heard(&mut self, heard: Heard, now: Instant, supports: impl FnMut(BitRate) -> bool) -> bool {
         let go_on = match heard {
             Heard::Frame => return true,
@@ -189,8 +188,7 @@ impl Detector {
         false
     }
 
-    /// Passes over the rates that the device cannot run at. If there is none at all, it stays where
-    /// it is.
+    /// Skips the rates that the device does not support. If it supports none, the rate stays.
     fn settle(&mut self, mut supports: impl FnMut(BitRate) -> bool) {
         for _ in BitRate::FIXED {
             if supports(self.rate) {

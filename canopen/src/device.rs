@@ -1,4 +1,4 @@
-//! The objects that every device has: what it is and who made it.
+//! The objects that every device has: device type, names and versions, identity.
 //!
 //! A device puts [`ENTRIES`] into its table with [`concat`](crate::od::concat) and asks
 //! [`Device::read`] first.
@@ -25,7 +25,7 @@ pub const ENTRIES: [Entry; 11] = [
     Entry::sub(IDENTITY, 4, "Serial number", DataType::Unsigned32, Access::Const),
 ];
 
-/// What a device says of itself.
+/// The values of these objects.
 #[derive(Clone, Copy, Debug)]
 pub struct Device {
     /// 1000h.
@@ -49,7 +49,7 @@ pub struct Device {
 }
 
 impl Device {
-    /// Who it is, for layer setting services.
+    /// The address of the device for layer setting services.
     #[must_use]
     pub const fn lss_address(&self) -> LssAddress {
         LssAddress {

@@ -1,7 +1,7 @@
 //! Emergency producer (CiA 301 section 7.2.7) and the objects that go with it.
 //!
-//! A device keeps an [`Emcy`] beside its other values: it asks [`Emcy::read`] and [`Emcy::write`]
-//! first, before what else has 1001h, and passes [`Emcy::next_message`] on as
+//! A device keeps an [`Emcy`] beside its other values. It asks [`Emcy::read`] and [`Emcy::write`]
+//! before all others that know 1001h, and passes [`Emcy::next_message`] on as
 //! [`Objects::next_emergency`](crate::Objects::next_emergency).
 
 use crate::frame::{CobId, NodeId};
@@ -45,7 +45,7 @@ pub mod code {
     pub const CAN_PASSIVE: u16 = 0x8120;
     /// The CAN controller was off the bus and is back.
     pub const BUS_OFF_RECOVERED: u16 = 0x8140;
-    /// What the manufacturer likes to tell.
+    /// Defined by the manufacturer.
     pub const DEVICE_SPECIFIC: u16 = 0xFF00;
 }
 
@@ -59,14 +59,14 @@ pub mod register {
     pub const MANUFACTURER: u8 = 1 << 7;
 }
 
-/// What an emergency says.
+/// The content of an emergency message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Emergency {
     /// What happened.
     pub code: u16,
     /// The error register, 1001h.
     pub register: u8,
-    /// More about it, for the manufacturer.
+    /// Defined by the manufacturer.
     pub detail: [u8; 5],
 }
 
@@ -132,13 +132,13 @@ impl Emcy {
         self.send(code, detail);
     }
 
-    /// Tells something that is no error: neither the register nor 1003h change.
+    /// Sends a message that is no error: neither the error register nor 1003h change.
     pub fn announce(&mut self, code: u16, detail: [u8; 5]) {
         self.send(code, detail);
     }
 
-    /// The cause of these bits has gone. The others are told with what is left; nothing is sent if
-    /// none was set.
+    /// The cause of these bits has gone. A message reports the bits that are left; none is sent if
+    /// no bit was set.
     pub fn clear(&mut self, bits: u8) {
         let bits = bits & self.register & !register::GENERIC;
         let only_generic = self.register == register::GENERIC;
@@ -175,8 +175,8 @@ impl Emcy {
         Some(oldest)
     }
 
-    /// A message that finds no room is not sent: the first errors tell most, and 1003h has the
-    /// latest.
+    /// Queues a message. If the queue is full it is dropped: the first errors matter most, and
+    /// 1003h has the latest.
     fn send(&mut self, code: u16, detail: [u8; 5]) {
         if let Some(free) = self.queue.get_mut(usize::from(self.waiting)) {
             *free = Emergency { code, register: self.register, detail }.emit();

@@ -2,7 +2,7 @@
 
 use crate::time::Instant;
 
-/// When the next heartbeat is due.
+/// The heartbeat of a node: when the next one is due.
 #[derive(Clone, Copy, Debug)]
 pub struct Heartbeat {
     period_ms: u16,
@@ -39,8 +39,8 @@ impl Heartbeat {
 
     /// Whether one is due; it counts as sent.
     ///
-    /// The period runs from due time to due time, so that a late call does not shift those to come.
-    /// Whoever comes a whole period late has lost heartbeats; they are not made up for.
+    /// The period runs from due time to due time, so a late call does not shift the heartbeats to
+    /// come. If the call is a whole period late or more, the heartbeats missed are not sent.
     pub fn take_due(&mut self, now: Instant) -> bool {
         let Some(due) = self.deadline().filter(|due| now.has_reached(*due)) else { return false };
         let late = now.since(due) >= u32::from(self.period_ms);

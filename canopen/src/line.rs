@@ -1,34 +1,33 @@
-//! The CAN controller as a slave sees it: error passive, bus-off, frames lost (CiA 301 section
-//! 7.2.7.1, ISO 11898-1).
+//! State of the CAN controller: error passive, bus-off, frames lost (CiA 301 section 7.2.7.1, ISO
+//! 11898-1).
 //!
-//! A controller that went bus-off stays off until it is told to come back. It is told after a
-//! while, and after a longer one each time it fails again soon: a device that disturbs its bus
-//! shall not do so without end, and one that suffered from somebody else's disturbance shall be
-//! back by itself.
+//! A controller that went bus-off stays off until the owner brings it back. [`Monitor`] asks for
+//! that after a wait, which doubles each time the controller fails again soon. So a device that
+//! disturbs its bus does so rarely, and a device that was disturbed returns by itself.
 
 use crate::bit_rate::Heard;
 use crate::time::Instant;
 
-/// How much the controller still trusts itself (ISO 11898-1 fault confinement).
+/// The state of fault confinement (ISO 11898-1).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Confinement {
-    /// All is well.
+    /// Error active: few errors.
     #[default]
     Active,
-    /// Many errors: it no longer destroys frames of others.
+    /// Error passive: many errors; its error flags no longer destroy frames.
     Passive,
-    /// Too many: it has left the bus.
+    /// Bus-off: too many errors; it takes no part in the bus.
     BusOff,
 }
 
-/// What the controller tells when it is asked.
+/// The state of the controller, as its owner reads it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Status {
     /// Its fault confinement.
     pub confinement: Confinement,
-    /// What it heard since it was last asked; matters only while it listens.
+    /// What it heard since it was last asked; used only while it listens.
     pub heard: Heard,
-    /// Frames that were lost since it was last asked, as driver status bits
+    /// Whether frames were lost since it was last asked, as driver status bits
     /// ([`CONTROLLER_OVERRUN`], [`QUEUE_OVERRUN`]); 0 for none.
     pub lost: u16,
 }
@@ -38,7 +37,7 @@ pub const CONTROLLER_OVERRUN: u16 = 0x0020;
 /// Driver status: the receive queue was full.
 pub const QUEUE_OVERRUN: u16 = 0x1000;
 
-/// What a device may want to tell of its line, by an emergency.
+/// An event that a device may report by an emergency.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LineEvent {
     /// Frames were lost; with the driver status bits.
@@ -51,34 +50,35 @@ pub enum LineEvent {
     Recovered,
 }
 
-/// First wait before a controller comes back, in milliseconds. Longer than the 128 × 11 bits that
-/// coming back takes at 10 kbit/s.
+/// First wait in bus-off, in milliseconds. Longer than the 128 × 11 bits that recovery takes at 10
+/// kbit/s.
 const FIRST_WAIT_MS: u32 = 200;
-/// The longest wait.
+/// The longest wait, in milliseconds.
 const LONGEST_WAIT_MS: u32 = 5000;
-/// Who was on the bus for so long has recovered: the next wait is the first one again.
+/// After this time on the bus, in milliseconds, the next wait is the first one again.
 const RECOVERED_MS: u32 = 10_000;
 
-/// Lost frames are told at most once in this time, in milliseconds: a flood shall not cause another
-/// one.
+/// Lost frames are reported at most once in this time, in milliseconds: a flood of frames must not
+/// cause a flood of emergencies.
 const LOST_INHIBIT_MS: u32 = 1000;
 
-/// Frames that were lost and have yet to be told.
+/// Frames that were lost and are still to be reported.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Losses {
     status: u16,
-    told: Option<Instant>,
+    /// The time of the last report.
+    reported: Option<Instant>,
 }
 
 impl Losses {
-    /// Takes the driver status bits of frames lost, 0 for none; gives those to be told now.
+    /// Takes the driver status bits of frames lost, 0 for none; gives the bits to report now.
     pub fn observe(&mut self, lost: u16, now: Instant) -> Option<u16> {
         self.status |= lost;
-        let inhibited = self.told.is_some_and(|told| now.since(told) < LOST_INHIBIT_MS);
+        let inhibited = self.reported.is_some_and(|reported| now.since(reported) < LOST_INHIBIT_MS);
         if self.status == 0 || inhibited {
             return None;
         }
-        self.told = Some(now);
+        self.reported = Some(now);
         Some(core::mem::take(&mut self.status))
     }
 }
@@ -95,16 +95,16 @@ pub struct Monitor {
 enum State {
     /// On the bus since then.
     On { passive: bool, since: Instant },
-    /// Bus-off; `told` says that the controller was told to come back before.
-    Off { come_back_at: Instant, told: bool },
+    /// Bus-off; `recovering` once the owner was asked to bring the controller back.
+    Off { recover_at: Instant, recovering: bool },
 }
 
 /// What follows from a status.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Consequence {
-    /// To be told.
+    /// The device is to report this event.
     Tell(LineEvent),
-    /// The controller is to come back onto the bus.
+    /// The owner is to bring the controller back from bus-off.
     RecoverFromBusOff,
 }
 
@@ -115,7 +115,7 @@ impl Monitor {
         Self { state: State::On { passive: false, since: now }, wait_ms: FIRST_WAIT_MS }
     }
 
-    /// Takes what the controller tells.
+    /// Takes the state of fault confinement; gives what follows from it.
     pub fn observe(&mut self, confinement: Confinement, now: Instant) -> Option<Consequence> {
         let is_passive = confinement == Confinement::Passive;
         match self.state {
@@ -123,7 +123,7 @@ impl Monitor {
                 if now.since(since) >= RECOVERED_MS {
                     self.wait_ms = FIRST_WAIT_MS;
                 }
-                self.state = State::Off { come_back_at: now + self.wait_ms, told: false };
+                self.state = State::Off { recover_at: now + self.wait_ms, recovering: false };
                 None
             }
             State::On { passive, since } if passive != is_passive => {
@@ -131,14 +131,15 @@ impl Monitor {
                 Some(Consequence::Tell(if is_passive { LineEvent::Passive } else { LineEvent::Active }))
             }
             State::On { .. } => None,
-            State::Off { told: true, .. } if confinement != Confinement::BusOff => {
+            State::Off { recovering: true, .. } if confinement != Confinement::BusOff => {
                 self.state = State::On { passive: is_passive, since: now };
                 Some(Consequence::Tell(LineEvent::Recovered))
             }
-            // Told again after a while: it may have come back and left again between two looks.
-            State::Off { come_back_at, .. } if now.has_reached(come_back_at) => {
+            // Asked again after a wait: the controller may have recovered and failed between two
+            // calls.
+            State::Off { recover_at, .. } if now.has_reached(recover_at) => {
                 self.wait_ms = (self.wait_ms * 2).min(LONGEST_WAIT_MS);
-                self.state = State::Off { come_back_at: now + self.wait_ms, told: true };
+                self.state = State::Off { recover_at: now + self.wait_ms, recovering: true };
                 Some(Consequence::RecoverFromBusOff)
             }
             State::Off { .. } => None,

@@ -1,12 +1,12 @@
 //! Layer setting services of a slave (CiA 305): node-ID and bit rate over the bus, for a device
 //! without switches.
 //!
-//! [`Lss`] decides, its owner acts: [`Lss::handle`] takes frames, [`Lss::poll`] gives answers to
-//! send and tells when a node-ID or a bit rate comes into force. What the device can do and where
-//! it stores is behind [`LssDevice`].
+//! [`Lss::handle`] takes frames, [`Lss::poll`] gives what the owner has to do: answers to send, a
+//! node-ID or a bit rate that comes into force. [`LssDevice`] is what the services need of the
+//! device.
 //!
 //! Frames that are no LSS request, requests in a state that does not serve them and requests for
-//! other slaves get silence, as the standard has it.
+//! other slaves are not answered, as the standard requires.
 
 use core::task::Poll;
 
@@ -14,7 +14,7 @@ pub use crate::bit_rate::BitRate;
 use crate::frame::{CobId, Frame, NodeId};
 use crate::time::Instant;
 
-/// Who a device is: the identity object 1018h. No two devices in the world share it.
+/// The LSS address of a device: its identity object 1018h, which no other device has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LssAddress {
     /// 1018h/1.
@@ -34,7 +34,7 @@ impl LssAddress {
     }
 }
 
-/// Why a device did not store; the values are the error codes of the answer.
+/// Why a device could not store; the values are the error codes of the answer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum StoreError {
@@ -46,21 +46,22 @@ pub enum StoreError {
 
 /// What LSS needs of the device.
 pub trait LssDevice {
-    /// Whether the device can run at this bit rate.
+    /// Whether the device can run at this bit rate; of [`BitRate::Auto`], whether it may find the
+    /// rate out by listening.
     fn supports(&mut self, rate: BitRate) -> bool;
 
-    /// Stores what was configured, for the next start. No node-ID makes the device one without
-    /// (FFh); no bit rate leaves the stored one as it is. A device that needs time for it
-    /// (`Pending`) is asked by [`stored`](Self::stored).
+    /// Stores node-ID and bit rate for the next start. `None` as node-ID makes it a device without
+    /// node-ID (FFh); `None` as bit rate leaves the stored one as it is. A device that needs time
+    /// gives `Pending` and is then asked by [`stored`](Self::stored).
     ///
     /// # Errors
-    /// The error code that the master gets.
+    /// Sent to the master as error code.
     fn store(&mut self, node: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>>;
 
-    /// How the last [`store`](Self::store) came out.
+    /// The outcome of the last [`store`](Self::store); `Pending` while it goes on.
     ///
     /// # Errors
-    /// The error code that the master gets.
+    /// Sent to the master as error code.
     fn stored(&mut self) -> Poll<Result<(), StoreError>> {
         Poll::Ready(Ok(()))
     }
@@ -69,11 +70,11 @@ pub trait LssDevice {
 /// What can be chosen about an LSS slave.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Config {
-    /// Start in LSS configuration state. Not of the standard: for a bus with one device to be
-    /// configured.
+    /// Start in LSS configuration state, for a bus with one device to configure. Not part of the
+    /// standard. Default: no.
     pub start_in_configuration: bool,
-    /// Without a node-ID, say "non-configured slave" once after the start in place of the boot-up
-    /// message. Not of the standard either.
+    /// Without a node-ID, send "non-configured slave" once after the start in place of the boot-up
+    /// message. Not part of the standard. Default: no.
     pub announce: bool,
 }
 
@@ -82,7 +83,7 @@ pub struct Config {
 pub enum Output {
     /// Send this frame.
     Send(Frame),
-    /// A device that had no node-ID has this one from now on: start the node, say its boot-up.
+    /// A device that had no node-ID has this one from now on: start the node, send its boot-up.
     NodeId(NodeId),
     /// Set the CAN controller to this bit rate now.
     BitRate(BitRate),
@@ -124,13 +125,13 @@ enum State {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Activation {
     None,
-    /// All nodes finish what they are sending.
+    /// First delay: all nodes finish what they are sending.
     Before {
         rate: BitRate,
         switch_at: Instant,
         delay_ms: u16,
     },
-    /// All nodes change over.
+    /// Second delay: all nodes change to the new bit rate.
     After {
         until: Instant,
     },
@@ -158,7 +159,7 @@ const INQUIRE_NODE_ID: u8 = 0x5E;
 /// The node-ID of a device without one.
 const UNCONFIGURED: u8 = 0xFF;
 
-/// Fastscan: all that have no node-ID are asked, and start at the first part.
+/// Fastscan: all slaves without node-ID answer, and start at the first part of the address.
 const CONFIRM: u8 = 0x80;
 
 impl Lss {
@@ -189,8 +190,8 @@ impl Lss {
         self.active
     }
 
-    /// NMT Reset communication: the node-ID that was configured comes into force. Without one the
-    /// node is not started, and waits for LSS again.
+    /// NMT Reset communication: the node-ID that was configured comes into force; gives it. Without
+    /// one the node is not started and waits for LSS again.
     pub fn reset_communication(&mut self) -> Option<NodeId> {
         self.active = self.pending;
         self.active
@@ -206,7 +207,7 @@ impl Lss {
         }
     }
 
-    /// When [`poll`](Self::poll) will have something to do although no frame came.
+    /// When [`poll`](Self::poll) has to be called although no frame came; `None` for never.
     #[must_use]
     pub const fn next_deadline(&self) -> Option<Instant> {
         match self.activation {
@@ -216,7 +217,7 @@ impl Lss {
         }
     }
 
-    /// Takes a frame, whatever it is.
+    /// Takes any frame received; those that are no LSS request are ignored.
     pub fn handle(&mut self, frame: &Frame, now: Instant, device: &mut impl LssDevice) {
         if !frame.has_cob_id(CobId::LSS_REQUEST) || self.is_silent(now) || self.storing {
             return;
@@ -227,8 +228,8 @@ impl Lss {
         }
     }
 
-    /// Asks a device that is storing whether it is done, so that the master gets its answer. To be
-    /// called before [`poll`](Self::poll) where the device needs time to store.
+    /// Asks a device that is storing for the outcome, so that the master gets its answer. To be
+    /// called before [`poll`](Self::poll) if the device needs time to store.
     pub fn follow_store(&mut self, device: &mut impl LssDevice) {
         if self.storing {
             if let Poll::Ready(outcome) = device.stored() {
@@ -382,7 +383,7 @@ impl Lss {
     }
 }
 
-/// A row of requests, of which each must match: whether this one was the last of them.
+/// Counts a sequence of requests, each of which must match; gives whether this was the last one.
 fn advance(done: &mut u8, step: u8, last: u8, matches: bool) -> bool {
     let in_order = step == 0 || step == *done;
     let good = in_order && matches;

@@ -4,11 +4,11 @@ use embedded_can::Frame as _;
 
 use crate::frame::{CobId, Frame, NodeId};
 
-/// The state of a node, with the byte that boot-up and heartbeat carry.
+/// The state of a node; the values are the byte in boot-up and heartbeat.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum NmtState {
-    /// Seen on the bus once, as the boot-up message.
+    /// The node starts; on the bus it shows as the boot-up message.
     Initialisation = 0x00,
     /// Neither SDO nor PDO are served.
     Stopped = 0x04,
@@ -19,7 +19,8 @@ pub enum NmtState {
 }
 
 impl NmtState {
-    /// From the byte of a heartbeat; the toggle bit of node guarding is not looked at.
+    /// From the byte of a heartbeat; the toggle bit of node guarding is ignored. `None` for a value
+    /// that is no state.
     #[must_use]
     pub const fn from_byte(byte: u8) -> Option<Self> {
         match byte & 0x7F {
@@ -32,7 +33,7 @@ impl NmtState {
     }
 }
 
-/// What a master asks of a node, with the command specifier.
+/// A command of the NMT master; the values are the command specifiers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum NmtCommand {
@@ -44,13 +45,12 @@ pub enum NmtCommand {
     EnterPreOperational = 0x80,
     /// Restart the device.
     ResetNode = 0x81,
-    /// Restart communication: a new node-ID comes into force.
+    /// Restart communication: a node-ID that was configured comes into force.
     ResetCommunication = 0x82,
 }
 
 impl NmtCommand {
-    /// The command in a frame that addresses `node` or all nodes. Every other frame, of whatever
-    /// form, is none.
+    /// The command in a frame that addresses `node` or all nodes; `None` for every other frame.
     #[must_use]
     pub fn parse(frame: &Frame, node: NodeId) -> Option<Self> {
         if !frame.has_cob_id(CobId::NMT) {
@@ -89,7 +89,7 @@ pub fn state_message(node: NodeId, state: NmtState) -> Frame {
     Frame::of(CobId::heartbeat(node), &[state as u8])
 }
 
-/// The node and the state in a boot-up or heartbeat message, for whoever listens to them.
+/// The node and its state in a boot-up or heartbeat message; `None` for every other frame.
 #[must_use]
 pub fn parse_state_message(frame: &Frame) -> Option<(NodeId, NmtState)> {
     let id = frame.cob_id()?.get();

@@ -11,11 +11,10 @@ use crate::od::Objects;
 use crate::sdo::server::{Config as SdoConfig, SdoServer};
 use crate::time::Instant;
 
-/// What Start and Stop of the NMT master do to the node.
+/// What Start, Stop and EnterPreOperational of the NMT master do to the node.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum NmtPolicy {
-    /// It stays PRE-OPERATIONAL, as a bootloader does: there is nothing to operate, and SDO must be
-    /// served.
+    /// It stays PRE-OPERATIONAL, as a bootloader does: SDO has to be served all the time.
     #[default]
     StayPreOperational,
     /// It follows the master.
@@ -27,17 +26,17 @@ pub enum NmtPolicy {
 pub struct Config {
     /// Period of the heartbeat in milliseconds, 0 for none.
     pub heartbeat_ms: u16,
-    /// Whether it follows Start and Stop.
+    /// Whether it follows the commands of the NMT master that change its state.
     pub nmt: NmtPolicy,
     /// The SDO server's part.
     pub sdo: SdoConfig,
 }
 
-/// What the NMT master asked for.
+/// A command of the NMT master to this node.
 ///
-/// The node has already done its own part of Start, Stop and `EnterPreOperational`. The two resets
-/// are the owner's: it restarts the device, or calls [`Node::restart`] with the node-ID that is now
-/// in force.
+/// The node itself has carried out Start, Stop and `EnterPreOperational`. The owner carries out the
+/// two resets: it restarts the device, or calls [`Node::restart`] with the node-ID that is now in
+/// force.
 pub type NmtEvent = NmtCommand;
 
 /// A slave on the bus.
@@ -51,7 +50,7 @@ pub struct Node {
 }
 
 impl Node {
-    /// A node that has yet to say its boot-up.
+    /// A node that has yet to send its boot-up.
     #[must_use]
     pub const fn new(id: NodeId, config: Config) -> Self {
         Self {
@@ -75,19 +74,19 @@ impl Node {
         self.state
     }
 
-    /// Whether the SDO server has nothing in hand: no transfer, no answer to be fetched.
+    /// Whether no SDO transfer is going on and no SDO answer waits to be fetched.
     #[must_use]
     pub const fn is_sdo_idle(&self) -> bool {
         self.sdo.is_idle()
     }
 
-    /// Ends a transfer that is going on, without a word to the client.
+    /// Ends an SDO transfer that is going on, without telling the client.
     pub fn end_transfer(&mut self, objects: &mut impl Objects) {
         self.sdo.reset(objects);
     }
 
     /// Starts anew under this node-ID, as after Reset communication: a transfer ends, the boot-up
-    /// is said again.
+    /// is sent again.
     pub fn restart(&mut self, id: NodeId, objects: &mut impl Objects) {
         self.sdo.reset(objects);
         let config =
@@ -101,9 +100,9 @@ impl Node {
         self.heartbeat.set_period(period_ms, now);
     }
 
-    /// Takes a frame, whatever it is, and tells what the NMT master asked for.
+    /// Takes any frame received; gives the command, if it is one of the NMT master to this node.
     pub fn handle(&mut self, frame: &Frame, now: Instant, objects: &mut impl Objects) -> Option<NmtEvent> {
-        // Before its boot-up a node takes part in nothing.
+        // Before its boot-up a node serves nothing.
         if self.state == NmtState::Initialisation {
             return None;
         }
@@ -135,8 +134,7 @@ impl Node {
         self.heartbeat.take_due(now).then(|| nmt::state_message(self.id, self.state))
     }
 
-    /// When [`poll`](Self::poll) will have something to do although no frame came; `None` for
-    /// never.
+    /// When [`poll`](Self::poll) has to be called although no frame came; `None` for never.
     #[must_use]
     pub fn next_deadline(&self) -> Option<Instant> {
         match (self.sdo.next_deadline(), self.heartbeat.deadline()) {
@@ -149,7 +147,7 @@ impl Node {
         let state = match (command, self.nmt) {
             (NmtCommand::Start, NmtPolicy::Follow) => NmtState::Operational,
             (NmtCommand::Stop, NmtPolicy::Follow) => {
-                // A stopped node serves no SDO, so nothing could end the transfer properly.
+                // A stopped node serves no SDO, so no request could end the transfer.
                 self.sdo.reset(objects);
                 NmtState::Stopped
             }

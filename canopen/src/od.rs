@@ -1,4 +1,4 @@
-//! The object dictionary: declared once as a table, its values behind a trait.
+//! The object dictionary: its entries as a table, its values behind the trait [`Objects`].
 //!
 //! ```
 //! use canopen::od::{Access, Address, DataType, Entry, Objects};
@@ -43,17 +43,17 @@ use core::fmt;
 
 use crate::sdo::AbortCode;
 
-/// Index and sub-index: the "multiplexer" of an SDO.
+/// Index and sub-index of a value: the multiplexer of an SDO.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Address {
-    /// The object.
+    /// Index of the object.
     pub index: u16,
-    /// Its part; 0 for an object without parts.
+    /// Sub-index of the value; 0 for an object of one value.
     pub sub: u8,
 }
 
 impl Address {
-    /// The address of a value.
+    /// The value with this index and sub-index.
     #[must_use]
     pub const fn new(index: u16, sub: u8) -> Self {
         Self { index, sub }
@@ -96,8 +96,9 @@ pub enum DataType {
 }
 
 impl DataType {
-    /// Bytes of a value; `None` where that differs from value to value.
+    /// Bytes of a value; `None` for types of any length.
     #[must_use]
+    // One table in the code: inlined it would be one for each caller.
     #[inline(never)]
     pub const fn size(self) -> Option<u32> {
         match self {
@@ -110,10 +111,10 @@ impl DataType {
     }
 }
 
-/// What a client may do with a value (CiA 301 table 43).
+/// Access of a client to a value (CiA 301 table 43).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Access {
-    /// Read; it never changes.
+    /// Read; the value never changes.
     Const,
     /// Read.
     Ro,
@@ -137,7 +138,7 @@ impl Access {
     }
 }
 
-/// What an entry is part of.
+/// The part of an object that an entry is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
     /// An object of one value (VAR, or DOMAIN by its type).
@@ -151,11 +152,11 @@ pub enum Kind {
     Sub,
 }
 
-/// The value that an object has before anyone writes it.
+/// The value before the first write.
 #[cfg(feature = "names")]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DefaultValue {
-    /// None is given.
+    /// Not given.
     None,
     /// A number.
     Number(u64),
@@ -166,19 +167,18 @@ pub enum DefaultValue {
 /// One value of the object dictionary.
 #[derive(Clone, Copy, Debug)]
 pub struct Entry {
-    /// Where it is.
+    /// Index and sub-index.
     pub at: Address,
-    /// How its bytes are to be read.
+    /// Type of the value.
     pub data_type: DataType,
-    /// What a client may do with it.
+    /// Access of a client to it.
     pub access: Access,
-    /// What it is part of.
+    /// The part of an object that it is.
     pub kind: Kind,
-    /// What it is called. For [`Kind::Array`] and [`Kind::Record`] it is the name of the whole
-    /// object.
+    /// Name, of the whole object for [`Kind::Array`] and [`Kind::Record`].
     #[cfg(feature = "names")]
     pub name: &'static str,
-    /// The value before anyone writes it.
+    /// The value before the first write.
     #[cfg(feature = "names")]
     pub default: DefaultValue,
 }
@@ -205,28 +205,27 @@ impl Entry {
         Self::new(Address::new(index, 0), name, data_type, access, Kind::Var)
     }
 
-    /// The head of an object with parts of one type: its sub-index 0. The server answers it from
-    /// the table.
+    /// Sub-index 0 of an object with values of one type. The server answers it from the table.
     #[must_use]
     pub const fn array(index: u16, name: &'static str, highest: u8) -> Self {
         Self::new(Address::new(index, 0), name, DataType::Unsigned8, Access::Const, Kind::Array(highest))
     }
 
-    /// The head of an object with parts of different types: its sub-index 0. The server answers it
-    /// from the table.
+    /// Sub-index 0 of an object with values of different types. The server answers it from the
+    /// table.
     #[must_use]
     pub const fn record(index: u16, name: &'static str, highest: u8) -> Self {
         Self::new(Address::new(index, 0), name, DataType::Unsigned8, Access::Const, Kind::Record(highest))
     }
 
-    /// A part of an array or record; it follows its head in the table.
+    /// A value of an array or record; in the table it follows sub-index 0.
     #[must_use]
     pub const fn sub(index: u16, sub: u8, name: &'static str, data_type: DataType, access: Access) -> Self {
         Self::new(Address::new(index, sub), name, data_type, access, Kind::Sub)
     }
 
-    /// With another access. A head that is not `const` is read from and written to the
-    /// implementation (1003h/0).
+    /// With another access. A sub-index 0 that is not `const`, such as 1003h/0, is read from and
+    /// written to the implementation of [`Objects`].
     #[must_use]
     pub const fn access(mut self, access: Access) -> Self {
         self.access = access;
@@ -260,7 +259,7 @@ impl Entry {
     }
 }
 
-/// Looks an entry up.
+/// Finds the entry of a value.
 ///
 /// # Errors
 /// [`AbortCode::NO_OBJECT`] if no entry has the index, [`AbortCode::NO_SUB_INDEX`] if none of those
@@ -278,7 +277,10 @@ pub fn find(entries: &[Entry], at: Address) -> Result<&Entry, AbortCode> {
     Err(code)
 }
 
-/// One table of two, in the order given. `N` is the length of both together.
+/// Both tables as one, in the order given. `N` is the length of both together.
+///
+/// # Panics
+/// If `N` is another number; in a constant, compilation fails.
 #[must_use]
 pub const fn concat<const A: usize, const B: usize, const N: usize>(
     a: [Entry; A],
@@ -294,7 +296,7 @@ pub const fn concat<const A: usize, const B: usize, const N: usize>(
     entries
 }
 
-/// Puts a value to the front of `buf`: the last line of most arms of [`Objects::read`].
+/// Copies a value to the start of `buf` and gives its length, as [`Objects::read`] has to.
 ///
 /// # Errors
 /// [`AbortCode::OUT_OF_MEMORY`] if it does not fit.
@@ -309,9 +311,9 @@ pub fn put(buf: &mut [u8], value: &[u8]) -> Result<usize, AbortCode> {
 /// as a whole by the server. An error becomes the SDO abort that the client gets.
 ///
 /// A domain download is `download_start`, `download_data` any number of times, and then exactly one
-/// of `download_end` and `download_cancel`: the latter if the client aborts or begins something
-/// else, if the time is up, if an earlier call returned an error or the sizes do not match. After
-/// an error of `download_start` neither comes.
+/// of `download_end` and `download_cancel`. `download_cancel` is called if the client aborts or
+/// starts another transfer, after a time-out, after an error of `download_data`, or if the sizes do
+/// not match. After an error of `download_start` neither is called.
 pub trait Objects {
     /// The table.
     fn entries(&self) -> &'static [Entry];
@@ -319,32 +321,31 @@ pub trait Objects {
     /// Reads a variable (little-endian) or string into `buf` and gives its length.
     ///
     /// # Errors
-    /// The abort that the client gets.
+    /// Sent to the client as abort.
     fn read(&mut self, at: Address, buf: &mut [u8]) -> Result<usize, AbortCode>;
 
     /// Writes a variable (little-endian) or string. The length of a variable is that of its type.
     ///
     /// # Errors
-    /// The abort that the client gets.
+    /// Sent to the client as abort.
     fn write(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
         let _ = (at, data);
         Err(AbortCode::UNSUPPORTED_ACCESS)
     }
 
-    /// A domain is about to be written, with this many bytes where the client tells.
+    /// Starts a download of a domain, of `size` bytes if the client announced it.
     ///
     /// # Errors
-    /// The abort that the client gets.
+    /// Sent to the client as abort.
     fn download_start(&mut self, at: Address, size: Option<u32>) -> Result<(), AbortCode> {
         let _ = (at, size);
         Err(AbortCode::UNSUPPORTED_ACCESS)
     }
 
-    /// Bytes that [`download_data`](Self::download_data) could take at present. The server holds
-    /// its answer back, and with it the client, until there is room for a segment (7 bytes). It
-    /// asks with `held` once it has done so for [`HOLD_MS`](crate::sdo::server::HOLD_MS): what is
-    /// told then should come out of a reserve, so that the client is slowed down but never left
-    /// without an answer.
+    /// Bytes that [`download_data`](Self::download_data) could take at present. Until there is room
+    /// for a segment (7 bytes) the server holds its answer back, and with it the client. After
+    /// [`HOLD_MS`](crate::sdo::server::HOLD_MS) it asks with `held`: the implementation should then
+    /// give room from a reserve, so that the client is slowed down but still answered.
     fn download_space(&mut self, at: Address, held: bool) -> usize {
         let _ = (at, held);
         usize::MAX
@@ -353,45 +354,46 @@ pub trait Objects {
     /// The next bytes of the domain.
     ///
     /// # Errors
-    /// The abort that the client gets.
+    /// Sent to the client as abort.
     fn download_data(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
         let _ = (at, data);
         Err(AbortCode::UNSUPPORTED_ACCESS)
     }
 
-    /// The domain is complete. An error becomes the abort in place of the last acknowledgement.
+    /// The domain is complete. An error is sent as abort in place of the last acknowledgement.
     ///
     /// # Errors
-    /// The abort that the client gets.
+    /// Sent to the client as abort.
     fn download_end(&mut self, at: Address) -> Result<(), AbortCode> {
         let _ = at;
         Ok(())
     }
 
-    /// The domain stays incomplete.
+    /// The download ended before the domain was complete.
     fn download_cancel(&mut self, at: Address) {
         let _ = at;
     }
 
-    /// The data of the next emergency to send, until there is none (`emcy::Emcy` makes them).
+    /// The data of the next emergency to send, until there is none ([`Emcy`](crate::emcy::Emcy)
+    /// keeps them).
     fn next_emergency(&mut self) -> Option<[u8; 8]> {
         None
     }
 
-    /// A domain is about to be read; gives its size where it is known.
+    /// Starts an upload of a domain; gives its size in bytes if it is known.
     ///
     /// # Errors
-    /// The abort that the client gets.
+    /// Sent to the client as abort.
     fn upload_start(&mut self, at: Address) -> Result<Option<u32>, AbortCode> {
         let _ = at;
         Err(AbortCode::UNSUPPORTED_ACCESS)
     }
 
-    /// Bytes of the domain from `offset` on. It fills `buf`, unless the domain ends before; 0 is
-    /// the end. The same offset can be asked for again, when a block transfer has to be repeated.
+    /// Reads the domain from `offset` on. Fills `buf` unless the domain ends before, and gives the
+    /// number of bytes; 0 is the end. A block upload may ask for the same offset again.
     ///
     /// # Errors
-    /// The abort that the client gets.
+    /// Sent to the client as abort.
     fn upload_data(&mut self, at: Address, offset: u32, buf: &mut [u8]) -> Result<usize, AbortCode> {
         let _ = (at, offset, buf);
         Err(AbortCode::UNSUPPORTED_ACCESS)

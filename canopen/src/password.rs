@@ -1,26 +1,26 @@
-//! A password in front of something, counted and slowed down.
+//! A password check that slows down guessing: each wrong password makes the next wait longer.
 
 use crate::sdo::AbortCode;
 use crate::time::Instant;
 
-/// How long nobody may try again behind the first wrong password, in milliseconds. It doubles with
-/// each further one.
+/// How long no password is taken after the first wrong one, in milliseconds. It doubles with each
+/// further wrong one.
 pub const FIRST_DELAY_MS: u32 = 500;
-/// Wrong passwords behind which the delay grows no more: half a minute then.
+/// Wrong passwords after which the wait no longer grows; it is half a minute then.
 const MOST_FAILURES: u32 = 6;
 
-/// The lock and who has tried to open it.
+/// A lock with its password, and the attempts to open it.
 #[derive(Clone, Copy, Debug)]
 pub struct Lock {
     password: &'static [u8],
     /// Wrong passwords since the last right one.
     failures: u32,
-    /// Nobody may try before.
+    /// No password is taken before this time.
     closed_until: Option<Instant>,
 }
 
 impl Lock {
-    /// Opens to this password.
+    /// A lock that this password opens.
     #[must_use]
     pub const fn new(password: &'static [u8]) -> Self {
         Self { password, failures: 0, closed_until: None }
@@ -32,11 +32,12 @@ impl Lock {
         self.failures
     }
 
-    /// Whether nobody may try at present; to be asked at least every few weeks. Who restarts the
-    /// device to get rid of that waits until it is over.
+    /// Whether no password is taken at present. To be called at least every three weeks, since
+    /// instants wrap. A device that is to restart waits until this is over: a restart would end the
+    /// wait.
     #[must_use]
     pub fn is_waiting(&mut self, now: Instant) -> bool {
-        // Forgotten when it is over: instants wrap.
+        // Dropped when it is over, since instants wrap.
         self.closed_until = self.closed_until.filter(|until| !now.has_reached(*until));
         self.closed_until.is_some()
     }
@@ -44,13 +45,14 @@ impl Lock {
     /// Tries a password.
     ///
     /// # Errors
-    /// [`AbortCode::INVALID_VALUE`] for a wrong one; [`AbortCode::DEVICE_STATE`], whatever it is,
-    /// for one that comes too early.
+    /// [`AbortCode::INVALID_VALUE`] for a wrong password; [`AbortCode::DEVICE_STATE`] for any
+    /// password that comes too early.
     pub fn open(&mut self, given: &[u8], now: Instant) -> Result<(), AbortCode> {
         if self.is_waiting(now) {
             return Err(AbortCode::DEVICE_STATE);
         }
-        // All of it is looked at, however early it differs: the time that it takes tells nothing.
+        // All bytes are compared, so that the time it takes does not depend on the first that
+        // differs.
         let differs = given.iter().zip(self.password).fold(0, |sum, (a, b)| sum | (a ^ b));
         if differs == 0 && given.len() == self.password.len() {
             self.failures = 0;
@@ -81,7 +83,7 @@ mod tests {
         assert_eq!(Lock::new(b"INIT").open(b"INIT", Instant::from_millis(0)), Ok(()));
     }
 
-    /// Half a second, one, two … half a minute; within that not even the right one opens.
+    /// Half a second, one, two … half a minute; within that even the right one is refused.
     #[test]
     fn wrong_ones_are_slowed_down() {
         let mut lock = Lock::new(b"INIT");

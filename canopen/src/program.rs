@@ -1,4 +1,4 @@
-//! Program download: the words of CiA 302-3 that both sides share, with the additions of the SYS
+//! Program download: indices and values of CiA 302-3, for both sides, with the additions of the SYS
 //! TEC bootloader (manual L-1112d_10, tables 1 to 3).
 
 use core::fmt;
@@ -36,32 +36,29 @@ pub const FLASH_STATUS: u16 = 0x1F57;
 /// Password of a lift device (CiA 417; CiA 814-1 clause 6.3): sub-index [`UNLOCK_FIRMWARE`] of
 /// "Lock/unlock parameters".
 pub const UNLOCK: u16 = 0x6005;
-/// "Firmware update". CiA 814-1 names object and purpose, not the sub-index; this is where coboot
-/// has it.
+/// "Firmware update". CiA 814-1 names object and purpose but no sub-index; this one is coboot's.
 pub const UNLOCK_FIRMWARE: u8 = 1;
 /// Enable flash programming (ESAcademy): the password of a program; the sub-index is the program's
 /// number.
 pub const ENABLE_FLASH: u16 = 0x7F50;
 
-/// What 1000h of the bootloader reads. An application has another value: this is how a host tells
-/// them apart.
+/// 1000h of the bootloader. An application has another value, so a host can distinguish them.
 pub const BOOTLOADER_DEVICE_TYPE: u32 = 0x1000_0000;
 
-/// What 1000h reads of a boot loader as ESAcademy describes it ("BOOT"), and of older lift
-/// bootloaders.
+/// 1000h of a boot loader as ESAcademy describes it ("BOOT"), and of older lift bootloaders.
 pub const ESACADEMY_DEVICE_TYPE: u32 = 0x424F_4F54;
-/// What 1000h reads of a lift bootloader (CiA 814-1 clause 6.3).
+/// 1000h of a lift bootloader (CiA 814-1 clause 6.3).
 pub const LIFT_DEVICE_TYPE: u32 = 0xFE00_01A1;
 /// The node-ID of a lift bootloader (CiA 814-1 clause 5).
 pub const LIFT_NODE_ID: u8 = 126;
 /// The default node-ID of a boot loader as ESAcademy describes it.
 pub const ESACADEMY_NODE_ID: u8 = 64;
 
-/// What can be written to 1F51h.
+/// A command, written to 1F51h.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum ProgramControl {
-    /// Stop the program. A bootloader runs none: acknowledged, nothing happens.
+    /// Stop the program. The bootloader acknowledges it and does nothing.
     Stop = 0x00,
     /// Start the program.
     Start = 0x01,
@@ -77,7 +74,7 @@ pub enum ProgramControl {
     ClrSignature = 0x84,
 }
 
-/// The error is what an SDO server answers to such a value: 06090030h.
+/// The error is the abort for such a value: 06090030h.
 impl TryFrom<u8> for ProgramControl {
     type Error = AbortCode;
 
@@ -95,7 +92,7 @@ impl TryFrom<u8> for ProgramControl {
     }
 }
 
-/// What reading 1F51h of a program gives (CiA 302-3): whether it runs.
+/// The state of a program, read from 1F51h (CiA 302-3).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum ProgramState {
@@ -103,7 +100,7 @@ pub enum ProgramState {
     Stopped = 0,
     /// It runs: this is the application.
     Running = 1,
-    /// There is none to run.
+    /// There is no program.
     Absent = 3,
 }
 

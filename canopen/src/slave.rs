@@ -1,13 +1,13 @@
 //! A device on the bus: its [`Node`], layer setting services, bit rate detection and the state of
-//! its line tied together.
+//! its line in one state machine.
 //!
 //! The owner of the CAN controller
 //!
 //! 1. passes every frame received to [`Slave::handle`],
-//! 2. tells the controller's state by [`Slave::observe`], every few milliseconds,
-//! 3. then does what [`Slave::poll`] says until it says nothing.
+//! 2. passes the controller's state to [`Slave::observe`], every few milliseconds,
+//! 3. then carries out what [`Slave::poll`] gives, until it gives nothing.
 //!
-//! A new slave first says how to set the controller up, so there is one place that does.
+//! The first outputs of a new slave set filters and bit rate, so the owner does that in one place.
 
 use crate::bit_rate::{BitRate, Detector};
 use crate::frame::{CobId, Frame, NodeId};
@@ -20,7 +20,7 @@ use crate::time::Instant;
 
 /// What a slave needs of its device.
 pub trait SlaveDevice: Objects + LssDevice {
-    /// Something happened on the line that an emergency may tell of.
+    /// Something happened on the line; the device may report it by an emergency.
     fn line_event(&mut self, event: LineEvent) {
         let _ = event;
     }
@@ -31,7 +31,7 @@ pub trait SlaveDevice: Objects + LssDevice {
     }
 }
 
-/// What can be chosen about a slave. Whether it may find out the bit rate by listening is told by
+/// What can be chosen about a slave. Whether it may find out the bit rate by listening is chosen by
 /// [`LssDevice::supports`] of [`BitRate::Auto`].
 #[derive(Clone, Copy, Debug)]
 pub struct Config {

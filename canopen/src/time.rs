@@ -1,4 +1,4 @@
-//! Time as the state machines see it: milliseconds in 32 bits that wrap after 49 days.
+//! Time: milliseconds in 32 bits, which wrap after 49 days.
 
 use core::ops::Add;
 

@@ -2,11 +2,11 @@
 
 use core::fmt;
 
-/// The code in an SDO abort.
+/// The code in an SDO abort. A device may send codes that are not in the table.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub struct AbortCode(pub u32);
 
-/// Names and words of the standard's codes, from one list.
+/// Names and texts of the standard's codes, from one list.
 macro_rules! abort_codes {
     ($($name:ident = $code:literal, $words:literal;)*) => {
         impl AbortCode {
@@ -14,7 +14,7 @@ macro_rules! abort_codes {
         }
 
         impl fmt::Display for AbortCode {
-            /// The code and, where CiA 301 knows it, what it means.
+            /// The code, and its meaning if CiA 301 gives one.
             fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
                 let words = match self.0 {
                     $($code => $words,)*

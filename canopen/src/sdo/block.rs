@@ -1,5 +1,5 @@
-//! What both ends of a block transfer share: the CRC, and the order of the segments (CiA 301
-//! section 7.2.4.3.9 ff.).
+//! Block transfer, for server and client: the CRC, and the receiving end (CiA 301 section 7.2.4.3.9
+//! ff.).
 
 use crate::sdo::fields;
 use crate::sdo::wire::Chunk;
@@ -23,8 +23,8 @@ impl Crc16 {
         Self(0)
     }
 
-    /// Takes more data in. Bit by bit: 88 bytes of code where a table takes 512, and 60 kB/s of CAN
-    /// at most.
+    /// Adds data. Bit by bit: this takes 88 bytes of code where a table takes 512, and a CAN bus
+    /// brings at most 60 kB/s.
     pub fn update(&mut self, data: &[u8]) {
         for byte in data {
             self.0 ^= u16::from(*byte) << 8;
@@ -45,7 +45,7 @@ impl Crc16 {
     }
 }
 
-/// Checks that a block size is one: 1 to 127.
+/// Checks that a block size is valid: 1 to 127.
 pub(super) fn check_blksize(blksize: u8) -> Result<u8, AbortCode> {
     match blksize {
         1..=BLKSIZE_MAX => Ok(blksize),
@@ -53,10 +53,10 @@ pub(super) fn check_blksize(blksize: u8) -> Result<u8, AbortCode> {
     }
 }
 
-/// The receiving end: takes segments that come in order and tells when to acknowledge.
+/// The receiving end: takes segments that come in order, and decides when to acknowledge.
 ///
-/// A segment out of order is left for the repetition that the acknowledgement of the sub-block asks
-/// for.
+/// A segment out of order is ignored. The acknowledgement of the sub-block makes the other side
+/// send it again.
 #[derive(Debug)]
 pub(super) struct Receiver {
     /// Segments of the sub-block that is open; 0 while none is, because an acknowledgement is still
@@ -69,7 +69,8 @@ pub(super) struct Receiver {
     /// The number of the segment that ended the sub-block before. If it comes again before any
     /// other, it is a duplicate.
     ended_by: u8,
-    /// The frame of the last segment of all: how many of its bytes are data is told by the end.
+    /// The frame of the last segment of all; the end of the transfer has the number of its data
+    /// bytes.
     last: Option<[u8; 8]>,
     /// `None` if one side cannot make a CRC.
     crc: Option<Crc16>,
@@ -106,7 +107,7 @@ impl Receiver {
         self.last.is_some()
     }
 
-    /// Whether a sub-block has begun and not ended: if nothing more comes, its end was lost.
+    /// Whether a sub-block has begun and not ended. If no more segments come, its end was lost.
     pub fn is_within(&self) -> bool {
         self.heard && self.blksize != 0
     }

@@ -1,8 +1,8 @@
-//! Where the fields of an SDO frame's eight bytes stand (CiA 301 section 7.2.4.3), for the server,
-//! which works on the bytes, and for [`wire`](crate::sdo::wire), which names all of them.
+//! The layout of the eight bytes of an SDO frame (CiA 301 section 7.2.4.3), for the server, which
+//! works on the bytes, and for [`wire`](crate::sdo::wire), which names all fields.
 //!
-//! Byte 0 starts with the command specifier: its top three bits, for block transfers the lowest
-//! ones as well. Reserved bits are sent as 0 and ignored when received.
+//! The command specifier is in byte 0: the top three bits, in block transfers also the lowest one
+//! or two. Reserved bits are sent as 0 and ignored when received.
 
 use crate::od::Address;
 
@@ -38,17 +38,17 @@ pub const ABORT: u8 = 0x80;
 
 /// Initiate, "e": the data are in the frame itself.
 pub const EXPEDITED: u8 = 0x02;
-/// Initiate, "s": the size is told.
+/// Initiate, "s": the frame has the size.
 pub const SIZE_TOLD: u8 = 0x01;
-/// Initiate of a block transfer: the size is told. Another bit than elsewhere.
+/// Initiate of a block transfer, "s": the frame has the size. It is another bit than elsewhere.
 pub const BLOCK_SIZE_TOLD: u8 = 0x02;
 /// Initiate of a block transfer: this side can make a CRC.
 pub const CRC: u8 = 0x04;
-/// Segment: alternates, starting with 0.
+/// Segment, "t": alternates, starting with 0.
 pub const TOGGLE: u8 = 0x10;
 /// Segment, "c": no more follow.
 pub const LAST: u8 = 0x01;
-/// Segment of a block transfer: no more follow. The other bits of byte 0 are its number.
+/// Segment of a block transfer, "c": no more follow. The other bits of byte 0 are its number.
 pub const LAST_OF_BLOCKS: u8 = 0x80;
 
 /// The command specifier in byte 0 without the other fields: of a request one of [`ccs`], of an
@@ -92,7 +92,8 @@ pub const fn unused_of_7(command: u8) -> u8 {
     command >> 1 & 0x07
 }
 
-/// How many of the seven bytes of the last segment of a block transfer are no data ("n" of its end).
+/// How many of the seven bytes of the last segment of a block transfer are no data ("n" of its
+/// end).
 #[must_use]
 pub const fn unused_of_blocks(command: u8) -> u8 {
     command >> 2 & 0x07

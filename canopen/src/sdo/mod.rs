@@ -1,8 +1,8 @@
 //! Service data objects (CiA 301 section 7.2.4): access to the object dictionary of a node.
 //!
-//! **Download** is the client writing, **upload** the client reading. Up to four bytes go
-//! *expedited* in one frame, more go *segmented* with an answer to each seven bytes, or as *blocks*
-//! with an answer to up to 127 times seven bytes and a CRC over everything.
+//! **Download**: the client writes. **Upload**: the client reads. Up to four bytes are transferred
+//! *expedited*, in one frame; more are transferred *segmented*, with an answer to each seven bytes,
+//! or as *blocks*, with an answer to up to 127 times seven bytes and a CRC over all data.
 
 pub mod abort;
 pub mod block;

@@ -13,7 +13,7 @@ use crate::od::Address;
 use crate::sdo::fields::{self, ccs, scs, with_address, without_address};
 use crate::sdo::AbortCode;
 
-/// Up to `N` bytes of data that travel in one frame.
+/// Up to `N` bytes of data of one frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Chunk<const N: usize> {
     bytes: [u8; N],
@@ -30,7 +30,7 @@ impl<const N: usize> Chunk<N> {
         Self { bytes, len: len as u8 }
     }
 
-    /// How many of the `N` bytes carry no data: the field "n" of the standard.
+    /// How many of the `N` bytes are no data: the field "n" of the standard.
     const fn unused(&self) -> u8 {
         N as u8 - self.len
     }
@@ -49,14 +49,14 @@ impl<const N: usize> Deref for Chunk<N> {
     }
 }
 
-/// What an initiate frame carries besides the address.
+/// The data of an initiate, or how they follow.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Payload {
     /// All of the data, 1 to 4 bytes (e = 1, s = 1).
     Expedited(Chunk<4>),
-    /// All of the data; how many bytes of the four count is not told (e = 1, s = 0).
+    /// All of the data; how many of the four bytes count is not given (e = 1, s = 0).
     Unsized([u8; 4]),
-    /// Segments follow (e = 0), of this many bytes altogether where it is told (s = 1).
+    /// Segments follow (e = 0), of this many bytes altogether if the size is given (s = 1).
     Segmented(Option<u32>),
 }
 
@@ -88,7 +88,7 @@ impl Payload {
 /// One segment of a segmented transfer, in either direction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Segment {
-    /// Starts at 0 and alternates.
+    /// Toggle bit: starts with 0 and alternates.
     pub toggle: bool,
     /// No more segments follow ("c").
     pub last: bool,
@@ -110,21 +110,21 @@ impl Segment {
     }
 }
 
-/// One segment of a block transfer, in either direction. Whether all seven bytes of the last one
-/// count is told by the end of the transfer.
+/// One segment of a block transfer, in either direction. How many of the seven bytes of the last
+/// one count is in the end of the transfer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BlockSegment {
     /// No more segments follow ("c").
     pub last: bool,
-    /// Its place in the sub-block, 1 to 127.
+    /// Its number in the sub-block, 1 to 127.
     pub seqno: u8,
     /// The data.
     pub data: [u8; 7],
 }
 
 impl BlockSegment {
-    /// `None` for sequence number 0, which no segment has: this is how an abort (80h) stays
-    /// recognisable between them.
+    /// `None` for sequence number 0, which no segment has, so that an abort (80h) differs from all
+    /// segments.
     #[must_use]
     pub fn parse(bytes: &[u8; 8]) -> Option<Self> {
         let [head, data @ ..] = *bytes;
@@ -147,7 +147,7 @@ impl BlockSegment {
 pub struct BlockEnd {
     /// Bytes of the last segment that are no data, 0 to 7 ("n").
     pub unused: u8,
-    /// CRC over all data, 0 where it was not agreed on.
+    /// CRC over all data, 0 if one side cannot make it.
     pub crc: u16,
 }
 
@@ -162,10 +162,10 @@ impl BlockEnd {
     }
 }
 
-/// How far the receiver of a block transfer got, and what it takes next.
+/// The acknowledgement of a sub-block, and the size of the next one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BlockAck {
-    /// The last segment of the sub-block that arrived in order; 0 for none.
+    /// Number of the last segment of the sub-block that arrived in order; 0 for none.
     pub ackseq: u8,
     /// Segments of the next sub-block, 1 to 127.
     pub blksize: u8,
@@ -181,7 +181,7 @@ impl BlockAck {
     }
 }
 
-/// What a client sends.
+/// A frame of the client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Request {
     /// Initiate download (ccs 1).
@@ -200,7 +200,7 @@ pub enum Request {
         at: Address,
         /// The client can make a CRC.
         crc: bool,
-        /// Bytes to come, where told.
+        /// Bytes to come, if given.
         size: Option<u32>,
     },
     /// End block download (ccs 6, cs 1).
@@ -278,7 +278,7 @@ impl Request {
     }
 }
 
-/// What a server sends.
+/// A frame of the server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Response {
     /// Initiate download (scs 3).
@@ -310,7 +310,7 @@ pub enum Response {
         at: Address,
         /// The server makes a CRC.
         crc: bool,
-        /// Bytes to come, where told.
+        /// Bytes to come, if given.
         size: Option<u32>,
     },
     /// End block upload (scs 6, ss 1).

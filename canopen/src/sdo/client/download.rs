@@ -8,11 +8,10 @@ use crate::sdo::wire::{BlockAck, BlockEnd, BlockSegment, Chunk, Payload, Request
 use crate::sdo::AbortCode;
 use crate::time::Instant;
 
-/// Sub-blocks in a row of which nothing arrives, until the transfer is given up.
+/// After this many sub-blocks in a row of which no segment arrived, the transfer is aborted.
 const HOPELESS: u8 = 10;
 
-/// Writes a value: expedited up to four bytes; above that segmented, or as blocks where that is
-/// asked for.
+/// Writes a value: expedited up to four bytes, else segmented or as blocks.
 #[derive(Debug)]
 pub struct Download<D> {
     link: Link,
@@ -24,16 +23,16 @@ pub struct Download<D> {
 enum State {
     Initiating,
     Segments {
-        /// Of the segment that is on its way.
+        /// Toggle bit of the segment that was sent last.
         toggle: bool,
-        /// Where the data end that are on their way.
+        /// Bytes sent.
         sent: usize,
     },
     InitiatingBlock {
         fallback: bool,
     },
     Blocks(SubBlock),
-    /// All data have arrived; the server checks them.
+    /// All data have arrived; the server has to confirm the end.
     EndingBlock,
 }
 
@@ -43,11 +42,11 @@ struct SubBlock {
     /// The server checks a CRC.
     crc: bool,
     blksize: u8,
-    /// Where its data begin.
+    /// Offset of its first byte in the data.
     base: usize,
-    /// The last segment sent.
+    /// Number of the last segment sent, 0 before the first one.
     seqno: u8,
-    /// Sub-blocks before this one of which nothing arrived.
+    /// Sub-blocks in a row before this one of which no segment arrived.
     in_vain: u8,
 }
 
@@ -139,7 +138,7 @@ fn initiate(at: Address, data: &[u8]) -> Request {
     Request::InitiateDownload(at, payload)
 }
 
-/// The segment from `start` on, and where its data end.
+/// The segment from offset `start` on, and the offset where its data end.
 fn segment(data: &[u8], start: usize, toggle: bool) -> (Segment, usize) {
     let chunk = Chunk::new(&data[start..]);
     let end = start + chunk.len();
@@ -147,7 +146,7 @@ fn segment(data: &[u8], start: usize, toggle: bool) -> (Segment, usize) {
 }
 
 impl SubBlock {
-    /// Where the data end that were sent.
+    /// The offset where the data end that were sent.
     fn sent(&self, data: &[u8]) -> usize {
         (self.base + usize::from(self.seqno) * SEGMENT).min(data.len())
     }
@@ -165,8 +164,8 @@ impl SubBlock {
         BlockSegment { last: self.sent(data) == data.len(), seqno: self.seqno, data: bytes }
     }
 
-    /// On with the next sub-block, from behind the last segment that arrived. If that was the last
-    /// of all it gives the CRC over all data, 0 where it is not wanted.
+    /// Goes on with the next sub-block, behind the last segment that arrived. If that was the last
+    /// of all, gives the CRC over all data, 0 if the server does not check it.
     fn acknowledged(&mut self, ack: BlockAck, data: &[u8]) -> Result<Option<u16>, AbortCode> {
         let blksize = check_blksize(ack.blksize)?;
         if ack.ackseq > self.seqno {

@@ -1,7 +1,7 @@
 //! The SDO client: one value per transfer, [`Download`] or [`Upload`].
 //!
-//! A transfer is driven through [`Transfer`]: [`handle`](Transfer::handle) takes frames, whatever
-//! they are, and [`poll`](Transfer::poll) tells what to do next. A blocking caller loops over one
+//! A transfer is driven through [`Transfer`]: [`handle`](Transfer::handle) takes any frame
+//! received, and [`poll`](Transfer::poll) gives what to do next. A blocking caller loops over one
 //! transfer, a caller with many nodes keeps one transfer per node and passes every frame to all of
 //! them.
 //!
@@ -30,9 +30,9 @@
 //! # assert_eq!(result, Err(canopen::sdo::SdoError::NoAnswer));
 //! ```
 //!
-//! A block transfer has many frames to send, or to receive, between two answers. A caller should
-//! take in what has arrived between two [`Step::Send`], so that a refusal in the middle is heard in
-//! the middle.
+//! A block transfer sends, or receives, many frames between two answers. Between two [`Step::Send`]
+//! a caller should take the frames that have arrived, so that an abort in the middle ends the
+//! transfer at once.
 
 use core::fmt;
 
@@ -52,7 +52,7 @@ pub use upload::{Buffer, Sink, Upload};
 /// What can be chosen about a transfer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Config {
-    /// How long the server may take for an answer, in milliseconds.
+    /// How long to wait for an answer of the server, in milliseconds.
     pub timeout_ms: u32,
 }
 
@@ -66,14 +66,15 @@ impl Default for Config {
 /// What can be chosen about a block transfer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Block {
-    /// Whether to go on segmented if the server does not know block transfer.
+    /// Whether to start again segmented if the server does not support block transfer.
     pub fallback: bool,
     /// Upload: segments of a sub-block, 1 to 127.
     pub blksize: u8,
-    /// Upload: up to this many bytes the server may answer without blocks; 0 for never.
+    /// Upload: protocol switch threshold. Up to this many bytes the server may answer without
+    /// blocks; 0 for never.
     pub pst: u8,
-    /// Upload: how long a sub-block may pause before what came is acknowledged and the rest asked
-    /// for again, in milliseconds. Less than the server's time-out.
+    /// Upload: how long a sub-block may pause before it is acknowledged as far as it came, in
+    /// milliseconds. Less than the server's time-out.
     pub repeat_ms: u32,
 }
 
@@ -115,34 +116,34 @@ pub enum Step {
     Send(Frame),
     /// Wait for frames, until then at the latest.
     Wait(Instant),
-    /// It is over; the answer stays the same from now on.
+    /// It is over; from now on this is the answer to each call.
     Done(Result<(), SdoError>),
 }
 
 /// A transfer that is going on.
 pub trait Transfer {
-    /// Takes a frame, whatever it is.
+    /// Takes any frame received; those that are no answer to this transfer are ignored.
     fn handle(&mut self, frame: &Frame, now: Instant);
 
-    /// Tells what to do next.
+    /// Gives what to do next.
     fn poll(&mut self, now: Instant) -> Step;
 
-    /// Bytes of data that have arrived at the other side for certain, or have arrived here.
+    /// Bytes of data that the server has acknowledged, or that have arrived here.
     fn progress(&self) -> u32;
 
-    /// Gives up: the server is sent this abort.
+    /// Ends the transfer: the server is sent this abort.
     fn abort(&mut self, code: AbortCode);
 }
 
-/// What both directions share: the server, the clock, and the frame that waits to be sent.
+/// What download and upload share: the server, the time-out, and the request to be sent.
 #[derive(Debug)]
 struct Link {
     node: NodeId,
     at: Address,
     timeout_ms: u32,
-    /// Waits to be fetched by `poll`.
+    /// Waits to be sent by `poll`.
     request: Option<Request>,
-    /// When something last moved.
+    /// When a frame was last sent or received.
     moved: Instant,
     result: Option<Result<(), SdoError>>,
     progress: u32,
@@ -152,10 +153,10 @@ struct Link {
 enum Next {
     Send(Request),
     Wait,
-    /// It was nothing: it does not count as life, or a stranger's answers would keep a transfer
-    /// from its time-out.
+    /// The frame is ignored. It does not restart the time-out, or answers to another client could
+    /// keep this transfer waiting for ever.
     Ignore,
-    /// Well done; with a last word to the server, where it wants one.
+    /// The transfer succeeded; with a last request to the server, if the protocol has one.
     Done(Option<Request>),
 }
 
@@ -172,7 +173,7 @@ impl Link {
         }
     }
 
-    /// The eight bytes of an answer, if the frame is one and one is waited for.
+    /// The eight bytes of an answer, if the frame is one and the transfer waits for one.
     fn answer<'f>(&self, frame: &'f Frame) -> Option<&'f [u8; 8]> {
         let waiting = self.result.is_none() && self.request.is_none();
         if !waiting || !frame.has_cob_id(CobId::sdo_response(self.node)) {
@@ -204,7 +205,7 @@ impl Link {
         Step::Send(Frame::full(CobId::sdo_request(self.node), bytes))
     }
 
-    /// Takes what follows from an answer.
+    /// Carries out what follows from an answer.
     fn advance(&mut self, next: Result<Next, SdoError>, now: Instant) {
         if !matches!(next, Ok(Next::Ignore)) {
             self.moved = now;
@@ -228,8 +229,8 @@ impl Link {
         }
     }
 
-    /// An answer that has no place here. The late answer to an earlier transfer's initiate says
-    /// nothing about this one.
+    /// An answer that has no place here. A late answer to the initiate of an earlier transfer is
+    /// ignored.
     fn unexpected(&self, response: Option<Response>) -> Result<Next, SdoError> {
         match response {
             Some(Response::Abort(_, code)) => Err(SdoError::Server(code)),
@@ -244,8 +245,8 @@ impl Link {
     }
 }
 
-/// Whether this is how a server says that it does not know block transfer. Some use the general
-/// error for it.
+/// Whether this is the abort of a server that does not support block transfer. Some servers use the
+/// general error for it.
 fn means_unknown(code: AbortCode) -> bool {
     matches!(code, AbortCode::COMMAND | AbortCode::UNSUPPORTED_ACCESS | AbortCode::GENERAL)
 }

@@ -9,12 +9,12 @@ use crate::sdo::wire::{BlockAck, Payload, Request, Response};
 use crate::sdo::AbortCode;
 use crate::time::Instant;
 
-/// Where an upload goes.
+/// The target of an upload.
 pub trait Sink {
-    /// The server announces this many bytes. Not called where it does not.
+    /// The server announces this many bytes. Not called if it announces none.
     ///
     /// # Errors
-    /// The abort that the server gets.
+    /// Sent to the server as abort.
     fn announce(&mut self, size: u32) -> Result<(), AbortCode> {
         let _ = size;
         Ok(())
@@ -23,7 +23,7 @@ pub trait Sink {
     /// The next bytes.
     ///
     /// # Errors
-    /// The abort that the server gets.
+    /// Sent to the server as abort.
     fn write(&mut self, data: &[u8]) -> Result<(), AbortCode>;
 }
 
@@ -37,7 +37,7 @@ impl<S: Sink + ?Sized> Sink for &mut S {
     }
 }
 
-/// A borrowed buffer as the target of an upload. What does not fit aborts it with 05040005h.
+/// A borrowed buffer as the target of an upload. Data that do not fit abort it with 05040005h.
 #[derive(Debug)]
 pub struct Buffer<'b> {
     bytes: &'b mut [u8],
@@ -50,7 +50,7 @@ impl<'b> Buffer<'b> {
         Self { bytes, len: 0 }
     }
 
-    /// What has arrived.
+    /// The data that have arrived.
     #[must_use]
     pub fn filled(&self) -> &[u8] {
         &self.bytes[..self.len]
@@ -73,7 +73,7 @@ impl Sink for Buffer<'_> {
     }
 }
 
-/// It grows with what really arrives; what a server merely announces takes no memory.
+/// It grows with the data that arrive; a size that a server announces takes no memory.
 #[cfg(feature = "alloc")]
 impl Sink for alloc::vec::Vec<u8> {
     fn write(&mut self, data: &[u8]) -> Result<(), AbortCode> {
@@ -82,12 +82,12 @@ impl Sink for alloc::vec::Vec<u8> {
     }
 }
 
-/// Reads a value, as the server wants to send it.
+/// Reads a value, expedited, segmented or as blocks, as the server sends it.
 #[derive(Debug)]
 pub struct Upload<S> {
     link: Link,
     sink: S,
-    /// How many bytes the server told.
+    /// Bytes that the server announced.
     announced: Option<u32>,
     state: State,
     block: Block,
@@ -97,7 +97,7 @@ pub struct Upload<S> {
 enum State {
     Initiating,
     Segments {
-        /// Of the segment that was asked for.
+        /// Toggle bit of the segment that was requested.
         toggle: bool,
     },
     InitiatingBlock,
@@ -121,12 +121,12 @@ impl<S: Sink> Upload<S> {
         upload
     }
 
-    /// What has arrived; all of it once the transfer is done and well.
+    /// The target: all data are in it once the transfer is done without an error.
     pub fn sink(&self) -> &S {
         &self.sink
     }
 
-    /// The target back.
+    /// Gives the target back.
     pub fn into_sink(self) -> S {
         self.sink
     }
@@ -187,7 +187,7 @@ impl<S: Sink> Upload<S> {
     /// A frame within a sub-block.
     fn block_segment(&mut self, bytes: &[u8; 8]) -> Result<Next, SdoError> {
         let State::Blocks(receiver) = &mut self.state else { return Ok(Next::Ignore) };
-        // No segment has the number 0, so an abort can be told from one, and no other answer can.
+        // No segment has the number 0, so an abort differs from all segments. No other answer does.
         if bytes[0] == fields::ABORT {
             return Err(SdoError::Server(AbortCode(fields::number(bytes))));
         }
@@ -223,7 +223,7 @@ impl<S: Sink> Upload<S> {
         }
     }
 
-    /// Passes data on; more than was announced are refused.
+    /// Passes data on. More bytes than were announced are refused.
     fn take(&mut self, data: &[u8]) -> Result<(), SdoError> {
         let total = self.link.progress.checked_add(data.len() as u32);
         let total = total.filter(|total| *total <= self.announced.unwrap_or(u32::MAX));

@@ -30,7 +30,8 @@ impl SdoServer {
         bytes: &[u8; 8],
         objects: &mut impl Objects,
     ) -> Result<(), AbortCode> {
-        // No segment has the number 0, so an abort can be told from one, and no other request can.
+        // No segment has the number 0, so an abort differs from all segments. No other request
+        // does.
         if bytes[0] == fields::ABORT {
             self.reset(objects);
             return Ok(());

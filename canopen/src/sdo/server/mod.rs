@@ -1,13 +1,13 @@
 //! The SDO server: one transfer at a time, for one client.
 //!
-//! - A frame that is not the request identifier's, is remote or extended, or does not have 8 bytes
-//!   is no SDO (CiA 301 section 7.2.4.3: all are 8 bytes long) and gets silence.
-//! - Every other request gets an answer or an abort; only an abort gets silence.
-//! - An initiate ends the transfer that was going on. Within a sub-block of a block download an
-//!   initiate cannot be told from a segment: there an abort ends the transfer, or the time-out.
-//! - A transfer in which the client stays silent for the time-out is aborted with 05040000h.
-//! - A block download whose sub-block stops short is acknowledged as far as it came, so that the
-//!   client repeats the rest.
+//! - A frame of another identifier, a remote or extended frame and a frame of other than 8 bytes
+//!   are no SDO requests (CiA 301 section 7.2.4.3: all have 8 bytes) and are ignored.
+//! - Every request is answered or aborted, except for an abort.
+//! - An initiate ends the transfer before. Within a sub-block of a block download an initiate
+//!   cannot be distinguished from a segment: there an abort ends the transfer, or the time-out.
+//! - If the client is silent for the time-out, the transfer is aborted with 05040000h.
+//! - If a sub-block of a block download stops short, the segments that came are acknowledged, and
+//!   the client repeats the rest.
 
 use crate::frame::{CobId, Frame, NodeId};
 use crate::od::{self, Address, Entry, Objects};
@@ -26,7 +26,7 @@ use block_upload::Sender;
 use incoming::Incoming;
 use outgoing::Outgoing;
 
-/// The longest variable or string, in bytes. Longer things are domains.
+/// The longest variable or string, in bytes. A longer value has to be a domain.
 pub const VALUE_MAX: usize = 64;
 
 /// How long an answer is held back for want of room before the device is asked for room in its
@@ -36,18 +36,18 @@ pub const HOLD_MS: u32 = 2;
 /// What can be chosen about a server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Config {
-    /// How long the client may stay silent within a transfer, in milliseconds.
+    /// How long the client may be silent within a transfer, in milliseconds; then it is aborted.
     pub timeout_ms: u32,
-    /// How long a sub-block of a block download may pause before what came is acknowledged and the
-    /// rest asked for again, in milliseconds. Longer than a client ever pauses between two
-    /// segments, shorter than it waits for an answer.
+    /// How long a sub-block of a block download may pause before it is acknowledged as far as it
+    /// came, in milliseconds. Longer than a client pauses between two segments, shorter than it
+    /// waits for an answer.
     pub repeat_ms: u32,
-    /// Segments of a sub-block of a block download: at most 127, and no more than the receive path
-    /// can queue.
+    /// Segments of a sub-block of a block download: 1 to 127, and no more than the receive queue
+    /// takes.
     pub blksize: u8,
-    /// Whether block upload is served. Where it is not, such a request is an unknown one.
+    /// Whether block upload is served. If not, its requests are unknown ones.
     pub block_upload: bool,
-    /// The abort for a request that is none of CiA 301's, or not of this moment.
+    /// The abort for a request that CiA 301 does not have, or that has no place in the transfer.
     pub unknown_request: AbortCode,
 }
 
@@ -129,7 +129,7 @@ impl SdoServer {
         matches!(self.state, State::Idle) && self.answer.is_none()
     }
 
-    /// When [`poll`](Self::poll) will have something to do although no frame came.
+    /// When [`poll`](Self::poll) has to be called although no frame came; `None` for never.
     #[must_use]
     pub fn next_deadline(&self) -> Option<Instant> {
         match &self.state {

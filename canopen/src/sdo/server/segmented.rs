@@ -149,7 +149,7 @@ impl SdoServer {
     pub(super) fn finish_download(&mut self, objects: &mut impl Objects) -> Result<(), AbortCode> {
         let incoming = *self.state.incoming().ok_or(AbortCode::COMMAND)?;
         incoming.check()?;
-        // From here on the consumer is not cancelled any more: it is told the end itself.
+        // The object is told the end, so it must not be told a cancellation any more.
         self.state = State::Idle;
         incoming.finish(self.at, &self.value, objects)
     }

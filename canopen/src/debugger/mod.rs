@@ -1,8 +1,8 @@
 //! The debugger interface, object 1025h (ESAcademy "CANopen compliant bootloader and debugger
 //! cores"; feature `debugger`).
 //!
-//! **Whoever reaches the bus reads and writes the memory of a device that has this.** It is for the
-//! bench, never for a device that leaves it.
+//! **With it, every node on the bus can read and write the memory of the device.** It is for the
+//! bench, never for a product.
 //!
 //! | sub-index | |
 //! |---|---|
@@ -23,8 +23,10 @@
 //! | does anything of it to a device whose memory is locked | 08000022h |
 //!
 //! A device composes [`ENTRIES`] into its table, keeps a [`Debugger`] beside its own state and
-//! hands [`Debugger::attach`] to its slave in place of itself. When the program stops, it says so
-//! by [`Debugger::stopped`].
+//! hands [`Debugger::attach`] to its slave in place of itself. When the program stops, it reports
+//! that by [`Debugger::stopped`].
+
+mod command;
 
 use core::task::Poll;
 
@@ -37,11 +39,13 @@ use crate::program::ERROR_REGISTER;
 use crate::sdo::AbortCode;
 use crate::slave::SlaveDevice;
 
-/// The object.
+pub use command::{Command, Kind, Stop, USER_SOFTWARE};
+
+/// Index of the object.
 pub const DEBUGGER: u16 = 0x1025;
-/// Its command.
+/// The command, written.
 pub const COMMAND: Address = Address::new(DEBUGGER, 1);
-/// What became of the command.
+/// The state of the command, one of [`status`].
 pub const STATUS: Address = Address::new(DEBUGGER, 2);
 /// The bytes of the memory.
 pub const DATA: Address = Address::new(DEBUGGER, 4);
@@ -56,122 +60,42 @@ pub const ENTRIES: [Entry; 4] = [
 
 /// Values of the status (CiA 301, objects 1023h and 1025h).
 pub mod status {
-    /// The last command is done, without an error.
+    /// The last command ended without an error.
     pub const DONE: u8 = 0;
     /// The same, and there are data.
     pub const REPLY: u8 = 1;
-    /// The last command was refused, or its data were.
+    /// The last command or its data were refused.
     pub const ERROR: u8 = 2;
     /// The command waits for its data.
     pub const EXECUTING: u8 = 0xFF;
 }
 
-/// The error code of the emergency that tells of a stop: user software (CiA 301 table 26).
-pub const USER_SOFTWARE: u16 = 0x6200;
-
-/// Why the program stopped: the first of the five bytes of that emergency; the address follows.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u8)]
-pub enum Stop {
-    /// A code breakpoint: the instruction at the address is the next one.
-    Breakpoint = 1,
-    /// A single step is done; the instruction at the address is the next one. (From 80h on, the
-    /// types are our own.)
-    Step = 0x80,
-    /// The breakpoint at the address lies in code that cannot be stopped: breakpoints are off, and
-    /// the program runs on.
-    OutOfReach = 0x81,
-}
-
-impl Stop {
-    /// The stop of this number.
-    #[must_use]
-    pub const fn from_number(number: u8) -> Option<Self> {
-        match number {
-            1 => Some(Self::Breakpoint),
-            0x80 => Some(Self::Step),
-            0x81 => Some(Self::OutOfReach),
-            _ => None,
-        }
-    }
-}
-
-/// What is done to memory.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
-    /// It is read.
-    Read,
-    /// It is written.
-    Write,
-}
-
-/// What the interface is asked to do.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Command {
-    /// What to do.
-    pub kind: Kind,
-    /// Where it begins.
-    pub address: u32,
-    /// How many bytes.
-    pub len: u16,
-}
-
-impl Command {
-    /// Takes the eight bytes apart; `None` for what is neither a read nor a write.
-    #[must_use]
-    pub const fn parse(bytes: [u8; 8]) -> Option<Self> {
-        let [kind, _reserved, len_low, len_high, a, b, c, d] = bytes;
-        let kind = match kind {
-            0 => Kind::Read,
-            1 => Kind::Write,
-            _ => return None,
-        };
-        Some(Self {
-            kind,
-            address: u32::from_le_bytes([a, b, c, d]),
-            len: u16::from_le_bytes([len_low, len_high]),
-        })
-    }
-
-    /// The eight bytes.
-    #[must_use]
-    pub const fn emit(&self) -> [u8; 8] {
-        let kind = match self.kind {
-            Kind::Read => 0,
-            Kind::Write => 1,
-        };
-        let [len_low, len_high] = self.len.to_le_bytes();
-        let [a, b, c, d] = self.address.to_le_bytes();
-        [kind, 0, len_low, len_high, a, b, c, d]
-    }
-}
-
 /// The memory behind the interface.
 ///
-/// It is asked for pieces of at most [`PIECE`] bytes of what it has allowed, each a multiple of
-/// `PIECE` behind the command's address.
+/// It is read and written in pieces of at most [`PIECE`] bytes within a command that it has
+/// allowed. Each piece starts at a multiple of `PIECE` behind the command's address.
 pub trait Memory {
-    /// Whether the device keeps its memory to itself.
+    /// Whether the device refuses all access to its memory.
     fn is_locked(&mut self) -> bool;
 
-    /// Whether all of these bytes may be touched. Any address and any length may come.
+    /// Whether all bytes of this command may be accessed. Address and length may have any value.
     fn allows(&mut self, command: &Command) -> bool;
 
-    /// Reads.
+    /// Reads a piece.
     ///
     /// # Errors
-    /// The abort that the client gets, if they cannot be read at present.
+    /// Sent to the client as abort, if the bytes cannot be read at present.
     fn read(&mut self, address: u32, bytes: &mut [u8]) -> Result<(), AbortCode>;
 
-    /// Writes.
+    /// Writes a piece.
     ///
     /// # Errors
-    /// The abort that the client gets, if they cannot be written at present.
+    /// Sent to the client as abort, if the bytes cannot be written at present.
     fn write(&mut self, address: u32, bytes: &[u8]) -> Result<(), AbortCode>;
 }
 
 /// Bytes that are read or written at once. A longer read or write is carried out piece by piece
-/// while it is transferred; of a shorter write nothing is done before all of it is there.
+/// while it is transferred; a shorter write is carried out when all of its data have come.
 pub const PIECE: usize = 128;
 
 /// The state of the interface.
@@ -184,7 +108,7 @@ pub struct Debugger<M> {
     stop: Option<(Stop, u32)>,
 }
 
-/// What the last command was, and how far its data are.
+/// The last command, and how much of its data is transferred.
 #[derive(Clone, Copy, Debug)]
 enum State {
     Idle,
@@ -212,12 +136,13 @@ impl<M: Memory> Debugger<M> {
         &mut self.memory
     }
 
-    /// The program has stopped at this address. It is told by an emergency; the latest stop counts.
+    /// The program has stopped at this address. This is reported by an emergency, of the latest
+    /// stop only.
     pub fn stopped(&mut self, stop: Stop, address: u32) {
         self.stop = Some((stop, address));
     }
 
-    /// The device with this interface in front of it: what its slave talks to.
+    /// The device with this interface in front of it, for its slave.
     pub fn attach<'a, D>(&'a mut self, device: &'a mut D) -> Debugged<'a, D, M> {
         Debugged { device, debugger: self }
     }
@@ -230,7 +155,7 @@ impl<M: Memory> Debugger<M> {
         }
     }
 
-    /// Keeps the status up to date with what became of something.
+    /// Takes note of an error in the status.
     fn noted<T>(&mut self, outcome: Result<T, AbortCode>) -> Result<T, AbortCode> {
         if outcome.is_err() {
             self.status = status::ERROR;
@@ -317,7 +242,7 @@ impl<M: Memory> Debugger<M> {
             if received == len {
                 return Err(AbortCode::LENGTH_TOO_HIGH);
             }
-            // Only now, when it is known that more follows.
+            // The last piece is written by `download_end`, so this one only when more follows.
             if received > 0 && received.is_multiple_of(PIECE as u32) {
                 self.flush()?;
             }
@@ -427,7 +352,7 @@ impl<D: Objects, M: Memory> Objects for Debugged<'_, D, M> {
 
     fn next_emergency(&mut self) -> Option<[u8; 8]> {
         let Some((stop, address)) = self.debugger.stop.take() else { return self.device.next_emergency() };
-        // A stop is no error of the device: its error register is told as it is.
+        // A stop is no error of the device: the message has the error register as it is.
         let mut register = [0];
         let _ = self.device.read(Address::new(ERROR_REGISTER, 0), &mut register);
         let [low, high] = USER_SOFTWARE.to_le_bytes();
