@@ -12,7 +12,7 @@ use boot_core::canopen::node::{self, NmtPolicy};
 use boot_core::canopen::od::Entry;
 use boot_core::canopen::program::ProgramControl;
 use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
-use boot_core::canopen::{BitRate, Frame, Instant, NodeId};
+use boot_core::canopen::{Frame, Instant, NodeId};
 use boot_core::control::Step;
 use boot_core::decision::{decide, BootDecision, Circumstances, Policy, StayReason};
 use boot_core::program::verify;
@@ -22,6 +22,7 @@ use shared_abi::warm_start::BootRequest;
 
 use crate::file_flash::FileFlash;
 use crate::stand_in::StandIn;
+use crate::supports;
 
 /// Bytes of blocks that may wait for the flash, as in the firmware for the STM32F407.
 pub const BUFFER: usize = 80 * 1024;
@@ -40,13 +41,6 @@ const POLICY: Policy = Policy {
 };
 /// Stands for no node-ID (CiA 305).
 const NO_NODE_ID: u8 = 255;
-
-/// Whether a device can be set to this bit rate. The bus has none of its own, so any can be; there
-/// is nothing to find out.
-#[must_use]
-pub fn supports(rate: BitRate) -> bool {
-    rate != BitRate::Auto
-}
 
 /// What does not change in a device's life.
 #[derive(Clone, Copy, Debug)]

@@ -18,3 +18,12 @@ pub mod device;
 pub mod file_flash;
 pub mod server;
 pub mod stand_in;
+
+use boot_core::canopen::BitRate;
+
+/// Whether a device can be set to this bit rate. The bus has none of its own, so any can be; there
+/// is nothing to find out.
+#[must_use]
+pub fn supports(rate: BitRate) -> bool {
+    rate != BitRate::Auto
+}

@@ -15,10 +15,11 @@ use boot_core::control::Policy;
 use boot_core::profile::Profile;
 use boot_core::store::NodeParameters;
 use clap::{Parser, ValueEnum};
-use coboot_node::device::{supports, Device, Event, Setup, BUFFER};
+use coboot_node::device::{Device, Event, Setup, BUFFER};
 use coboot_node::file_flash::{FileFlash, Speed};
 use coboot_node::server::Server;
 use coboot_node::stand_in::StandIn;
+use coboot_node::supports;
 use coflash::adapter::{self, Adapter};
 use shared_abi::layout::{self, Layout};
 

@@ -103,7 +103,7 @@ impl Objects for StandIn {
 
 impl LssDevice for StandIn {
     fn supports(&mut self, rate: BitRate) -> bool {
-        crate::device::supports(rate)
+        crate::supports(rate)
     }
 
     /// Storing is the bootloader's.

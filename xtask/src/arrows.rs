@@ -13,14 +13,15 @@ use std::path::{Path, PathBuf};
 
 use crate::args::Args;
 use crate::json::Value;
-use crate::{process, workspace, Outcome};
+use crate::{process, rooms, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask arrows
 
 Checks the dependencies between the crates against the rules in xtask/src/arrows.rs; that the
-emulator takes nothing but the geometry of the silicon from shared-abi; and that the pure crates
-forbid unsafe code.
+emulator takes nothing but the geometry of the silicon from shared-abi; that the pure crates
+forbid unsafe code; and that the modules of a crate do not use each other in circles, those of
+boot-core no others than xtask/src/rooms.rs allows.
 ";
 
 /// What one of our crates may depend on, of ours. Dev- and build-dependencies are held to the same
@@ -83,6 +84,16 @@ pub fn run(args: Args) -> Outcome {
                 broken.push(format!("{}: {FORBID} is missing", workspace::shown(root)));
             }
         }
+    }
+    for package in &packages {
+        let root = package.folder.join("src");
+        let mut files = Vec::new();
+        for path in sources(&package.folder)? {
+            if let Ok(inside) = path.strip_prefix(&root) {
+                files.push((inside.to_string_lossy().replace('\\', "/"), read(&path)?));
+            }
+        }
+        broken.extend(rooms::broken(&package.name, &rooms::graph(&files)));
     }
     if broken.is_empty() {
         println!("{} crates, and every arrow points where it may.", packages.len());

@@ -28,6 +28,7 @@ mod pack;
 mod portable;
 mod powercut;
 mod process;
+mod rooms;
 mod setup;
 mod size;
 mod symbols;
