@@ -18,9 +18,11 @@
 
 use std::fs;
 use std::path::Path;
+use std::time::Duration;
 
 use canopen::sdo::wire::Request;
 use canopen::{AbortCode, Address};
+use coflash::adapter::Adapter;
 use coflash::session::{Doing, Transfers};
 use emulator::time::{Span, Time};
 
@@ -154,5 +156,7 @@ impl Player<'_> {
         }
         self.bench.post(request, &Request::Abort(DATA, AbortCode::GENERAL).emit());
         self.bench.run_ms(5);
+        // The answers were looked at on the bus; no session shall take them for its own.
+        while self.bench.receive(Duration::ZERO).is_ok_and(|frame| frame.is_some()) {}
     }
 }

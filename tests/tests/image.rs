@@ -190,6 +190,7 @@ fn board_with_a_program() -> Bench {
     bench.await_boot_up(100);
     flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
         .unwrap();
+    bench.confirm_program();
     bench.power_off();
     bench
 }

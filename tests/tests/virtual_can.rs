@@ -221,7 +221,7 @@ fn python_canopen_flashes_the_device_through_its_serial_port() {
 fn a_release_has_nothing_of_it() {
     let has = |image| firmware::elf(image).windows(5).any(|part| part == b"V1013");
     assert!(has(firmware::BOOTLOADER_VIRTUAL_CAN) && has(firmware::APP_VIRTUAL_CAN));
-    for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_LIFT, firmware::APP_V1] {
+    for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_PAULUS, firmware::APP_V1] {
         assert!(!has(image), "{image}");
     }
 }
