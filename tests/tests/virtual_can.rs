@@ -170,7 +170,8 @@ fn never_silent_during_an_erase() {
     session_.command(1, ProgramControl::Clear).unwrap();
     drop(adapter);
     // The adapter has closed the channel as it went.
-    assert_eq!(ask(&mut bench, b"O\r", 10), "\r\r");
+    // A heartbeat may fall into these 10 ms.
+    assert_eq!(ask(&mut bench, b"O\r", 10).replace("t70117F\r", ""), "\r\r");
     let answers = (0..100).filter(|_| is_answered(&mut bench)).count();
     assert_eq!(answers, 100);
     assert!(
