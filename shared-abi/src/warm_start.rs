@@ -93,8 +93,8 @@ impl WarmStart {
             (8, Some(damage)) => BootRequest::Damaged(Damage::from_number(damage)?),
             _ => return None,
         };
-        // One encoder decides what is well-formed: magic, words and check must be exactly its.
-        (*self == Self::new(request)).then_some(request)
+        // One encoder decides what is well-formed: magic and check must be exactly its.
+        (*self == Self::encode(self.request, self.argument)).then_some(request)
     }
 }
 
