@@ -2,7 +2,6 @@
 
 use boot_core::flash::{Flash, Next, Operation};
 use boot_core::store::{Key, Parameters as _, Value};
-use bsp::pac;
 use shared_abi::geometry::{Region, Sector};
 use shared_abi::ram_image::SERVICES_VERSION;
 
@@ -28,11 +27,11 @@ const _: () = assert!(
     "product: the parameters need more than services.rs has room for: raise STORE_STATE_WORDS"
 );
 
-/// The flash, for one call.
+/// The flash, for one call. The boot stage has left the CRC unit its clock.
 fn flash() -> ResidentFlash {
     // SAFETY: the RAM part, which owns the chip, calls one service at a time from one priority,
     // while no operation runs, and does not use the controller or the CRC unit meanwhile.
-    unsafe { ResidentFlash::steal(Some(&pac::RCC::steal())) }
+    unsafe { ResidentFlash::steal(true) }
 }
 
 /// # Safety
