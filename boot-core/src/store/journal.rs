@@ -36,16 +36,21 @@ const ATTEMPTS: u8 = 8;
 /// addresses.
 #[derive(Debug)]
 pub struct Journal {
-    regions: [Region; 2],
-    /// Index of the valid region; of the second one while there is none, so that the first one is
-    /// written first.
-    active: usize,
+    valid: Region,
+    /// The region that is not.
+    other: Region,
     header: Header,
     /// A region has a header of a newer format: nothing is stored.
     newer: bool,
     sequence: u32,
     /// The first slot of the valid region behind the last one that is not blank.
     free: u32,
+    storing: Storing,
+}
+
+/// A value on its way into the journal.
+#[derive(Debug, Default)]
+struct Storing {
     step: Step,
     attempts: u8,
     /// The new record.
@@ -73,9 +78,10 @@ enum Header {
 }
 
 /// What a store is at.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 enum Step {
     /// Nothing is stored.
+    #[default]
     Idle,
     /// Nothing was done yet.
     Begin,
@@ -94,46 +100,35 @@ enum Step {
 impl Journal {
     /// Finds the valid region and its end.
     pub fn open<F: Flash>(flash: &F, regions: [Region; 2]) -> Self {
-        let mut journal = Self {
-            regions,
-            active: 1,
-            header: Header::Absent,
-            newer: false,
-            sequence: 0,
-            free: regions[1].base + SLOT_SIZE,
-            step: Step::Idle,
-            attempts: 0,
-            record: [0; SLOT_WORDS],
-            slot: [0; SLOT_WORDS],
-            words: ProgramWords::new(0),
-            sectors: EraseSectors::new(Region::new(0, 0)),
-            from: 0,
-            to: 0,
-        };
-        for (index, region) in regions.iter().enumerate() {
-            let [sequence, inverted, format] = [4, 8, 12].map(|offset| flash.read_word(region.base + offset));
-            if !is_sound(flash, region.base, HEADER_MAGIC) || inverted != !sequence {
+        // While no region is valid, the first one is the one to write to.
+        let [mut other, mut valid] = regions;
+        let (mut header, mut newer, mut sequence) = (Header::Absent, false, 0);
+        for region in regions {
+            let word = |index: u32| flash.read_word(region.base + 4 * index);
+            let (found, format) = (word(1), word(3));
+            if !is_sound(flash, region.base, HEADER_MAGIC) || word(2) != !found {
                 continue;
             }
             if format > FORMAT {
-                journal.newer = true;
+                newer = true;
                 continue;
             }
-            let age = journal.sequence.wrapping_sub(sequence) as i32;
-            if journal.header != Header::Absent && age >= 0 {
+            if header != Header::Absent && found.wrapping_sub(sequence) as i32 <= 0 {
                 continue;
             }
-            journal.active = index;
-            journal.header = if format == FORMAT { Header::Found } else { Header::Older };
-            journal.sequence = sequence;
-            journal.free = end_of(flash, region);
+            header = if format == FORMAT { Header::Found } else { Header::Older };
+            sequence = found;
+            if region.base == other.base {
+                core::mem::swap(&mut valid, &mut other);
+            }
         }
-        journal
+        let free = if header == Header::Absent { first_slot(&valid) } else { end_of(flash, &valid) };
+        Self { valid, other, header, newer, sequence, free, storing: Storing::default() }
     }
 
     /// The latest sound record of a tag.
     fn latest<F: Flash>(&self, flash: &F, tag: u32) -> Option<u32> {
-        let first = self.regions[self.active].base + SLOT_SIZE;
+        let first = first_slot(&self.valid);
         let mut at = self.free;
         while at > first {
             at -= SLOT_SIZE;
@@ -148,13 +143,14 @@ impl Journal {
 impl Parameters for Journal {
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value> {
         let at = self.latest(flash, key.tag())?;
-        Some([4, 8, 12, 16].map(|offset| flash.read_word(at + offset)))
+        let word = |index: u32| flash.read_word(at + 4 * index);
+        Some([word(1), word(2), word(3), word(4)])
     }
 
     fn store(&mut self, key: Key, value: Value) {
-        self.record = slot(key.tag(), value);
-        self.attempts = 0;
-        self.step = Step::Begin;
+        self.storing.record = slot(key.tag(), value);
+        self.storing.attempts = 0;
+        self.storing.step = Step::Begin;
     }
 
     fn next<F: Flash>(&mut self, flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
@@ -162,7 +158,7 @@ impl Parameters for Journal {
         if let Ok(Some(operation)) = next {
             return Next::Start(operation);
         }
-        self.step = Step::Idle;
+        self.storing.step = Step::Idle;
         Next::Done(next.map(|_| ()))
     }
 }
@@ -175,25 +171,25 @@ impl Journal {
         mut outcome: Result<(), FlashFault>,
     ) -> Result<Option<Operation>, StoreError> {
         loop {
-            let next = match (outcome, self.step) {
+            let next = match (outcome, self.storing.step) {
                 (Err(fault), _) => Err(fault),
                 (_, Step::Idle | Step::Begin) => Ok(None),
-                (_, Step::Erase) => self.sectors.next(flash),
-                _ => self.words.next(flash, SLOT_WORDS, |i| self.slot[i]),
+                (_, Step::Erase) => self.storing.sectors.next(flash),
+                _ => self.storing.words.next(flash, SLOT_WORDS, |i| self.storing.slot[i]),
             };
             outcome = Ok(());
-            match (next, self.step) {
+            match (next, self.storing.step) {
                 (Ok(Some(_)), _) | (Ok(None), Step::Idle) => return next.map_err(StoreError::Flash),
                 (Ok(None), Step::Begin) => self.begin(flash)?,
                 (Ok(None), Step::Erase) => self.collect(flash),
                 (Ok(None), Step::Copy) => {
-                    self.to += SLOT_SIZE;
+                    self.storing.to += SLOT_SIZE;
                     self.collect(flash);
                 }
                 (Ok(None), Step::Commit) => {
-                    self.active = 1 - self.active;
+                    core::mem::swap(&mut self.valid, &mut self.other);
                     self.sequence = self.sequence.wrapping_add(1);
-                    self.free = self.to;
+                    self.free = self.storing.to;
                     self.header = Header::Firm;
                     self.append()?;
                 }
@@ -203,7 +199,7 @@ impl Journal {
                 }
                 (Ok(None), Step::Append) => {
                     self.free += SLOT_SIZE;
-                    self.step = Step::Idle;
+                    self.storing.step = Step::Idle;
                 }
                 // A slot does not read back: left between 0 and 1 by a power cut, or worn. Another
                 // slot, another region, or this one erased.
@@ -226,10 +222,10 @@ impl Journal {
             Header::Firm => return self.append(),
             Header::Found => {
                 let header = header_slot(self.sequence);
-                self.write(Step::Refresh, self.regions[self.active].base, header);
+                self.write(Step::Refresh, self.valid.base, header);
             }
             // A new device: its master shall not wait for an erase that changes nothing.
-            Header::Absent if flash.is_blank(self.other()) => {
+            Header::Absent if flash.is_blank(self.other) => {
                 self.rewind();
                 self.collect(flash);
             }
@@ -240,24 +236,24 @@ impl Journal {
 
     /// Copies the next living record; behind the last one the other region gets its header.
     fn collect<F: Flash>(&mut self, flash: &F) {
-        while self.from < self.free {
-            let from = self.from;
-            self.from += SLOT_SIZE;
+        while self.storing.from < self.free {
+            let from = self.storing.from;
+            self.storing.from += SLOT_SIZE;
             let words = [0, 4, 8, 12, 16, CHECK].map(|offset| flash.read_word(from + offset));
             if self.latest(flash, words[0]) == Some(from) {
-                return self.write(Step::Copy, self.to, words);
+                return self.write(Step::Copy, self.storing.to, words);
             }
         }
         let header = header_slot(self.sequence.wrapping_add(1));
-        self.write(Step::Commit, self.other().base, header);
+        self.write(Step::Commit, self.other.base, header);
     }
 
     /// To the first free slot, or to a region that has some.
     fn append(&mut self) -> Result<(), StoreError> {
-        if self.free + SLOT_SIZE > self.regions[self.active].end() {
+        if self.free + SLOT_SIZE > self.valid.end() {
             return self.change_over();
         }
-        self.write(Step::Append, self.free, self.record);
+        self.write(Step::Append, self.free, self.storing.record);
         Ok(())
     }
 
@@ -265,32 +261,27 @@ impl Journal {
     fn change_over(&mut self) -> Result<(), StoreError> {
         self.attempt()?;
         self.rewind();
-        self.sectors = EraseSectors::new(self.other());
-        self.step = Step::Erase;
+        self.storing.sectors = EraseSectors::new(self.other);
+        self.storing.step = Step::Erase;
         Ok(())
     }
 
     /// To the first record that may have to be copied.
     fn rewind(&mut self) {
-        self.from = self.regions[self.active].base + SLOT_SIZE;
-        self.to = self.other().base + SLOT_SIZE;
-    }
-
-    /// The region that is not the active one.
-    fn other(&self) -> Region {
-        self.regions[1 - self.active]
+        self.storing.from = first_slot(&self.valid);
+        self.storing.to = first_slot(&self.other);
     }
 
     fn write(&mut self, step: Step, address: u32, slot: Slot) {
-        self.step = step;
-        self.words = ProgramWords::new(address);
-        self.slot = slot;
+        self.storing.step = step;
+        self.storing.words = ProgramWords::new(address);
+        self.storing.slot = slot;
     }
 
     /// Counts the tries of one store, so that it comes to an end.
     fn attempt(&mut self) -> Result<(), StoreError> {
-        self.attempts += 1;
-        if self.attempts > ATTEMPTS {
+        self.storing.attempts += 1;
+        if self.storing.attempts > ATTEMPTS {
             return Err(StoreError::WornOut);
         }
         Ok(())
@@ -302,14 +293,19 @@ fn is_sound<F: Flash>(flash: &F, at: u32, tag: u32) -> bool {
     flash.read_word(at) == tag && flash.crc32(0, Region::new(at, CHECK)) == flash.read_word(at + CHECK)
 }
 
-/// The slot behind the last word that is not blank; a word at a time, because this is on the way of
+const fn first_slot(region: &Region) -> u32 {
+    region.base + SLOT_SIZE
+}
+
+/// The slot behind the last one that is not blank; a word at a time, because this is on the way of
 /// every start.
 fn end_of<F: Flash>(flash: &F, region: &Region) -> u32 {
-    let mut words = region.size / SLOT_SIZE * SLOT_WORDS as u32;
-    while words > SLOT_WORDS as u32 && flash.read_word(region.base + 4 * (words - 1)) == ERASED {
-        words -= 1;
+    let mut end = region.end() - region.size % SLOT_SIZE;
+    while end > first_slot(region) && (1..=SLOT_WORDS as u32).all(|i| flash.read_word(end - 4 * i) == ERASED)
+    {
+        end -= SLOT_SIZE;
     }
-    region.base + words.div_ceil(SLOT_WORDS as u32) * SLOT_SIZE
+    end
 }
 
 fn slot(tag: u32, [a, b, c, d]: Value) -> Slot {

@@ -43,8 +43,7 @@ unsafe extern "C" fn open(state: *mut StoreState) {
 
 /// # Safety
 /// `state` must come from [`open`]; `value` must be writable.
-unsafe extern "C" fn get(state: *const StoreState, tag: u32, value: *mut Value) -> bool {
-    let Some(key) = Key::from_tag(tag) else { return false };
+unsafe extern "C" fn get(state: *const StoreState, key: Key, value: *mut Value) -> bool {
     // SAFETY: the caller vouches for both.
     unsafe {
         let Some(found) = (*state.cast::<Parameters>()).get(&flash(), key) else { return false };
@@ -55,8 +54,7 @@ unsafe extern "C" fn get(state: *const StoreState, tag: u32, value: *mut Value) 
 
 /// # Safety
 /// `state` must come from [`open`]; `value` must be readable.
-unsafe extern "C" fn store(state: *mut StoreState, tag: u32, value: *const Value) {
-    let Some(key) = Key::from_tag(tag) else { return };
+unsafe extern "C" fn store(state: *mut StoreState, key: Key, value: *const Value) {
     // SAFETY: the caller vouches for both.
     unsafe { (*state.cast::<Parameters>()).store(key, *value) };
 }

@@ -109,16 +109,15 @@ fn boot_report(decision: &BootDecision, request: Option<BootRequest>) -> BootRep
     };
     // An application that asks for the bootloader has shown that it can be called back. Which one
     // it was stands in the handoff, which nobody has written since.
-    let returns = matches!(request, Some(BootRequest::Stay | BootRequest::Clear(_)));
-    // SAFETY: the layout's handoff region, checked to be RAM of that size in no image.
-    let started = unsafe { Handoff::read_program(LAYOUT.handoff.base as *const Handoff) };
-    BootReport {
-        reason: reason.code(),
-        held_program,
-        window_ms,
-        clear: if let Some(BootRequest::Clear(program)) = request { program } else { 0 },
-        returned: if returns { started } else { 0 },
-    }
+    let returned = match request {
+        // SAFETY: the layout's handoff region, checked to be RAM of that size in no image.
+        Some(BootRequest::Stay | BootRequest::Clear(_)) => unsafe {
+            Handoff::read_program(LAYOUT.handoff.base as *const Handoff)
+        },
+        _ => 0,
+    };
+    let clear = if let Some(BootRequest::Clear(program)) = request { program } else { 0 };
+    BootReport { reason: reason.code(), held_program, window_ms, clear, returned }
 }
 
 /// The product's policy.
