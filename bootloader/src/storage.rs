@@ -94,12 +94,12 @@ impl Parameters for Store {
     fn get<F: Flash>(&self, _flash: &F, key: Key) -> Option<Value> {
         let mut value = [0; 4];
         // SAFETY: the state comes from `open`.
-        unsafe { (services().get)(&self.0, key.tag(), &mut value).then_some(value) }
+        unsafe { (services().get)(&self.0, key, &mut value).then_some(value) }
     }
 
     fn store(&mut self, key: Key, value: Value) {
         // SAFETY: the state comes from `open`.
-        unsafe { (services().store)(&mut self.0, key.tag(), &value) };
+        unsafe { (services().store)(&mut self.0, key, &value) };
     }
 
     fn next<F: Flash>(&mut self, _flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {

@@ -10,7 +10,7 @@ pub const MAGIC: u32 = u32::from_le_bytes(*b"CBI1");
 
 /// Version of what the resident part and the RAM part of the bootloader tell each other in RAM and
 /// by calls. A change of that raises it.
-pub const SERVICES_VERSION: u32 = 1;
+pub const SERVICES_VERSION: u32 = 2;
 
 /// Bytes of RAM behind the bootloader's variables that are left for its stack, at least. The boot
 /// stage, which unpacks the image, is at home there.
