@@ -2,7 +2,7 @@
 //! controller (RM0090 section 32).
 
 use bxcan::filter::ListEntry16;
-use bxcan::{Can, Fifo, Interrupts, Mailbox, MasterInstance, OverrunError, StandardId};
+use bxcan::{Can, Fifo, Interrupts, MasterInstance, OverrunError, StandardId};
 use embedded_can::Frame;
 
 /// A bit timing that bxCAN can be set to (RM0090 section 32.7.7).
@@ -92,12 +92,15 @@ pub struct Errors {
 /// Offsets of registers that `bxcan` keeps to itself, in bytes (RM0090 section 32.9.5).
 const MCR: usize = 0x00;
 const MSR: usize = 0x04;
+const TSR: usize = 0x08;
 const RF0R: usize = 0x0C;
 const ESR: usize = 0x18;
 /// `CAN_MCR`: bus-off is left without being told to.
 const ABOM: u32 = 1 << 6;
 /// `CAN_MSR`: initialisation and sleep mode are left with the first 11 recessive bits.
 const INAK_SLAK: u32 = 0b11;
+/// `CAN_TSR`: whether the frames of the three mailboxes are to be dropped; set until they are.
+const ABRQ: u32 = 1 << 7 | 1 << 15 | 1 << 23;
 /// `CAN_RF0R`: a frame was lost because the FIFO was full; written with 1, it is cleared.
 const FOVR0: u32 = 1 << 4;
 const EPVF: u32 = 1 << 1;
@@ -150,9 +153,8 @@ impl<I: MasterInstance> Port<I> {
         // Only now: while a frame is under way that nobody acknowledges, an abort would wait for
         // it.
         self.waiting = None;
-        for mailbox in [Mailbox::Mailbox0, Mailbox::Mailbox1, Mailbox::Mailbox2] {
-            self.can.abort(mailbox);
-        }
+        self.write(TSR, ABRQ);
+        while self.read(TSR) & ABRQ != 0 {}
         self.join();
     }
 
@@ -171,17 +173,12 @@ impl<I: MasterInstance> Port<I> {
 
     /// Sets the acceptance filters to exactly these identifiers (data frames, 11 bits), all into
     /// FIFO 0.
-    pub fn accept(&mut self, identifiers: impl Iterator<Item = u16>) {
-        let mut identifiers = identifiers.map(standard_id).peekable();
+    pub fn accept(&mut self, [a, b, c]: [u16; 3]) {
         let mut filters = self.can.modify_filters();
         filters.clear();
-        let mut bank = 0;
-        while let Some(&first) = identifiers.peek() {
-            // A bank lists four identifiers; a shorter row repeats its first one.
-            let row = [(); 4].map(|()| ListEntry16::data_frames_with_id(identifiers.next().unwrap_or(first)));
-            filters.enable_bank(bank, Fifo::Fifo0, row);
-            bank += 1;
-        }
+        // A bank lists four identifiers; one may stand there twice.
+        let bank = [a, b, c, c].map(|id| ListEntry16::data_frames_with_id(standard_id(id)));
+        filters.enable_bank(0, Fifo::Fifo0, bank);
     }
 
     /// The next frame from the FIFO, `None` when it is empty.
