@@ -252,7 +252,7 @@ mod app {
             return;
         }
         let status = can.lock(status);
-        bootloader.lock(|bootloader| {
+        let finishing = bootloader.lock(|bootloader| {
             bootloader.set_time(now);
             let device = debugger.attach(bootloader);
             #[cfg(feature = "debugger")]
@@ -276,6 +276,7 @@ mod app {
             if let Some(request) = bootloader.take_boot_request() {
                 *pending_reset = PendingReset { wanted: true, request, at: None };
             }
+            bootloader.is_finishing()
         });
         if let Some((program, window_ms)) = *held {
             if now.has_reached(Instant::from_millis(window_ms.into())) {
@@ -286,8 +287,7 @@ mod app {
             }
         }
         // What a host was told is done is not lost by a reset that comes too early.
-        let finishing = bootloader.lock(|bootloader| bootloader.is_finishing());
-        if pending_reset.wanted && !finishing && slave.is_idle() && can.lock(|can| can.is_idle()) {
+        if pending_reset.wanted && !finishing && slave.is_idle() && can.lock(CanPort::is_idle) {
             pending_reset.at = Some(now + PRODUCT.answer_to_reset_ms);
             log!("leaving; request", WarmStart::new(pending_reset.request).request);
         }
@@ -300,24 +300,26 @@ mod app {
         now: Instant,
         device: &mut impl SlaveDevice,
     ) {
-        while let Some(output) = slave.poll(now, can.lock(|can| can.has_room()), device) {
-            match output {
-                Output::Send(frame) => {
-                    log::sent(&frame);
-                    can.lock(|can| can.send(&frame));
-                }
+        loop {
+            let room = can.lock(CanPort::has_room);
+            let Some(output) = slave.poll(now, room, device) else { return };
+            if let Output::Send(frame) = &output {
+                log::sent(frame);
+            }
+            can.lock(|can| match output {
+                Output::Send(frame) => can.send(&frame),
                 Output::Join(rate) => configure(can, rate, Mode::Normal),
                 Output::Listen(rate) => configure(can, rate, Mode::Silent),
-                Output::RecoverFromBusOff => can.lock(|can| can.recover_from_bus_off()),
-                Output::Accept(ids) => can.lock(|can| can.accept(ids.into_iter().map(CobId::get))),
-            }
+                Output::RecoverFromBusOff => can.recover_from_bus_off(),
+                Output::Accept(ids) => can.accept(ids.map(CobId::get)),
+            });
         }
     }
 
-    fn configure(can: &mut impl Mutex<T = CanPort>, rate: BitRate, mode: Mode) {
+    fn configure(can: &mut CanPort, rate: BitRate, mode: Mode) {
         // Another rate is asked for by nobody: `product::supports` says so.
         if let Some(Some(timing)) = product::TIMINGS.get(rate as usize) {
-            can.lock(|can| can.configure(*timing, mode));
+            can.configure(*timing, mode);
         }
     }
 

@@ -48,6 +48,8 @@ impl Flash for BootFlash {
         self.0.read(address, buffer);
     }
 
+    // Asked for in many places, and checked each time.
+    #[inline(never)]
     fn read_word(&self, address: u32) -> u32 {
         self.0.read_word(address)
     }

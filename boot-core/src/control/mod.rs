@@ -265,7 +265,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// # Errors
     /// The abort that ends the transfer.
     pub fn download_data(&mut self, data: &[u8]) -> Result<(), AbortCode> {
-        self.take(|intake, to| intake.data(data, to)).map(drop)
+        self.take(Some(data)).map(drop)
     }
 
     /// 1F50h: the transfer is complete. Judges it in full and leaves the work behind.
@@ -273,7 +273,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// # Errors
     /// The abort that answers instead of the last acknowledgement.
     pub fn download_end(&mut self) -> Result<(), AbortCode> {
-        let program = self.take(Intake::end)?;
+        let program = self.take(None)?;
         self.transfer = None;
         if let Some(state) = self.program_mut(program) {
             state.error = None;
@@ -294,14 +294,12 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         }
     }
 
-    /// Hands something to the format of the open transfer and carries out what it leads to; gives
-    /// the program that it is about.
-    fn take(
-        &mut self,
-        hand: impl FnOnce(&mut Intake, &mut Destination<'_, 'b>) -> Result<(), Refusal>,
-    ) -> Result<u8, AbortCode> {
-        let Some(Transfer { program, mut intake }) = self.transfer.take() else { return Err(self.fault) };
-        let state = self.program(program).ok_or(self.fault)?;
+    /// Hands the next bytes to the format of the open transfer, or the end (`None`), and carries out
+    /// what it leads to; gives the program that it is about.
+    fn take(&mut self, data: Option<&[u8]>) -> Result<u8, AbortCode> {
+        let Some(Transfer { program, intake }) = &mut self.transfer else { return Err(self.fault) };
+        let program = *program;
+        let Some(state) = self.programs.get(usize::from(program) - 1) else { return Err(self.fault) };
         let judge = Judge {
             layout: self.layout,
             policy: self.policy,
@@ -310,11 +308,13 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             installed: state.record.is_some(),
         };
         let mut to = Destination { judge, queue: self.programmer.queue_mut(), progress: Progress::default() };
-        let outcome = hand(&mut intake, &mut to);
+        let outcome = match data {
+            Some(bytes) => intake.data(bytes, &mut to),
+            None => intake.end(&mut to),
+        };
         let progress = to.progress;
         let streaming = intake.may_be_stream();
         let is_stream = intake.is_stream();
-        self.transfer = Some(Transfer { program, intake });
         match outcome {
             Ok(()) => {
                 self.proceed(program, is_stream, progress);
