@@ -41,7 +41,9 @@ pub struct Header {
 pub enum Method {
     /// As they are in RAM.
     Raw = 0,
-    /// As a ZX0 stream, format version 2 (Einar Saukas).
+    /// As a ZX0 stream, format version 2 (Einar Saukas), of the image with absolute calls: in each
+    /// pair of half-words 11110… 11111… (`BL`) the 22 bits that are left of both are the distance in
+    /// half-words, to which half the address of the second half-word was added.
     Zx0 = 1,
 }
 

@@ -8,7 +8,7 @@ use shared_abi::geometry::Region;
 use shared_abi::ram_image::{Damage, Header, Method, LEAST_STACK};
 
 use crate::flash::ResidentFlash;
-use crate::unpack::unpack;
+use crate::unpack::{restore_calls, unpack};
 
 /// Checks the image and unpacks it to the start of the RAM.
 ///
@@ -39,7 +39,7 @@ pub unsafe fn load(header: *const Header, flash: &ResidentFlash) -> Result<(), D
         // SAFETY: the two slices, which `check` has found to be of one length.
         Method::Raw => unsafe { stored.as_ptr().copy_to_nonoverlapping(ram.as_mut_ptr(), stored.len()) },
         Method::Zx0 if !unpack(stored, ram) => return Err(Damage::Stream),
-        Method::Zx0 => {}
+        Method::Zx0 => restore_calls(ram),
     }
     Ok(())
 }
