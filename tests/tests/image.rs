@@ -16,6 +16,7 @@ use object::elf::{FileHeader32, PT_LOAD};
 use object::read::elf::{ElfFile32, FileHeader, ProgramHeader};
 use object::{Endianness, Object, ObjectSection};
 use shared_abi::geometry::Region;
+use shared_abi::ram_image::SERVICES_VERSION;
 
 /// Bytes of the header (shared_abi::ram_image, typed again).
 const HEADER: usize = 24;
