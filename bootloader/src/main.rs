@@ -71,6 +71,7 @@ mod app {
     use crate::debugger::{self, Debugger};
     use crate::log::{self, log};
     use crate::product::PRODUCT;
+    use crate::services::{StoreState, STORE_STATE_WORDS};
     use crate::storage::{BootFlash, Store};
     use crate::watchdog::{self, Task, Watchdog};
     use rtic_monotonics::fugit::ExtU32;
@@ -135,7 +136,7 @@ mod app {
         at: Option<Instant>,
     }
 
-    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer]])]
+    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer], store: StoreState = StoreState([0; STORE_STATE_WORDS])])]
     fn init(cx: init::Context) -> (Shared, Local) {
         CLOCK_TREE.speed_up(&cx.device.RCC, Source::Crystal);
         // SAFETY: the device's own are not used beside it.
@@ -145,7 +146,7 @@ mod app {
         log::uart::open(board.uart);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
-        let parameters = Store::open();
+        let parameters = Store::open(cx.local.store);
         let report = start::boot_report();
         let node = product::node_parameters(&parameters, &flash);
         let slave_config = slave::Config {
