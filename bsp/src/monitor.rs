@@ -154,7 +154,7 @@ pub fn release_program() {
     change_demcr(MON_EN | MON_STEP | MON_REQ, 0);
 }
 
-fn tell(kind: u8, address: u32) {
+fn notify(kind: u8, address: u32) {
     ADDRESS.store(address, Ordering::Relaxed);
     TYPE.store(kind.into(), Ordering::Release);
     pend_teller();
@@ -223,7 +223,7 @@ unsafe extern "C" fn on_fault(frame: *const Frame) {
     store(DFSR, DFSR_ALL);
     // SAFETY: a debug event did not come from a broken stack; what the entry passes is the frame on
     // it.
-    tell(OUT_OF_REACH, unsafe { (*frame).pc });
+    notify(OUT_OF_REACH, unsafe { (*frame).pc });
     synchronize();
 }
 

@@ -85,7 +85,7 @@ impl Slcan {
     }
 
     /// A byte from the host. The end of a line gives the answer to it, and the frame that it was.
-    pub fn hear<F: Frame>(&mut self, byte: u8) -> Option<(Answer, Option<F>)> {
+    pub fn receive<F: Frame>(&mut self, byte: u8) -> Option<(Answer, Option<F>)> {
         match byte {
             END => {
                 let len = core::mem::take(&mut self.len);

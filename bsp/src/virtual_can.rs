@@ -58,11 +58,11 @@ impl Port {
     /// The next frame that is for this device, `None` when there is none.
     pub fn receive<F: Frame>(&mut self) -> Option<F> {
         while let Some(byte) = RECEIVED.take() {
-            let Some((answer, frame)) = self.slcan.hear::<F>(byte) else { continue };
+            let Some((answer, frame)) = self.slcan.receive::<F>(byte) else { continue };
             let text = answer.text();
             // A host that does not read has no use for more.
             if TO_SEND.room() >= FOR_FRAMES + text.len() {
-                self.say(text.iter().copied());
+                self.send_text(text.iter().copied());
             }
             let frame = frame.inspect(|_| self.heard = true);
             let accepted = frame.filter(|frame| match frame.id() {
@@ -99,7 +99,7 @@ impl Port {
         }
     }
 
-    fn say(&mut self, text: impl Iterator<Item = u8>) {
+    fn send_text(&mut self, text: impl Iterator<Item = u8>) {
         for byte in text {
             TO_SEND.put(byte);
         }

@@ -602,10 +602,10 @@ impl Bus {
     fn succeed(&mut self, flight: Flight, end: Time, nodes: &mut [&mut dyn BusNode]) {
         self.frames += 1;
         for party in &flight.transmitters {
-            self.tell(party, BusEvent::Transmitted, nodes);
+            self.notify(party, BusEvent::Transmitted, nodes);
         }
         for party in flight.receivers.iter().filter(|party| !party.in_tune) {
-            self.tell(party, BusEvent::ReceiveFailed { kind: ErrorKind::Stuff, first: false }, nodes);
+            self.notify(party, BusEvent::ReceiveFailed { kind: ErrorKind::Stuff, first: false }, nodes);
         }
         if let Some(origin) = flight.from {
             let (frame, bit) = (flight.frame, flight.bit);
@@ -644,7 +644,7 @@ impl Bus {
                 && nodes
                     .get(party.node)
                     .is_some_and(|node| node.confinement().state() == ErrorState::Passive);
-            self.tell(party, BusEvent::TransmitFailed { kind: error.transmit, exempt }, nodes);
+            self.notify(party, BusEvent::TransmitFailed { kind: error.transmit, exempt }, nodes);
         }
         for party in &flight.receivers {
             let event = match party.in_tune {
@@ -655,7 +655,7 @@ impl Bus {
                     first: party.flags_at == Some(error.at),
                 },
             };
-            self.tell(party, event, nodes);
+            self.notify(party, event, nodes);
         }
         if let Some(held) = flight.gateway {
             // The gateway repeats it.
@@ -691,7 +691,7 @@ impl Bus {
     }
 
     /// Tells the party, if it is still the one that the frame began with.
-    fn tell(&self, party: &Party, event: BusEvent, nodes: &mut [&mut dyn BusNode]) {
+    fn notify(&self, party: &Party, event: BusEvent, nodes: &mut [&mut dyn BusNode]) {
         if let Some(node) = nodes.get_mut(party.node).filter(|node| node.epoch() == party.epoch) {
             node.event(event, self.now);
         }

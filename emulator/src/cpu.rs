@@ -1032,7 +1032,7 @@ fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
         }
     }
     let state = uc.get_data_mut();
-    let block = state.notes.blocks.look(&state.chip, address, size);
+    let block = state.notes.blocks.inspect_block(&state.chip, address, size);
     let chip = &mut state.chip;
     if block.fpu.is_some() && !chip.scs.fpu_enabled() {
         state.notes.fpu_instruction = block.fpu;
@@ -1066,7 +1066,7 @@ impl Default for Blocks {
 impl Blocks {
     const SIZE: usize = 4096;
 
-    fn look(&mut self, chip: &Chip, address: u32, size: u32) -> Block {
+    fn inspect_block(&mut self, chip: &Chip, address: u32, size: u32) -> Block {
         let slot = &mut self.0[(address >> 1) as usize % Self::SIZE];
         if (slot.0, slot.1) != (address, size) {
             *slot = (address, size, count_instructions(chip, address, size));

@@ -92,7 +92,7 @@ impl Serial {
         let now = machine.now();
         let powered = machine.is_powered();
         let Some(usart) = machine.usart_mut(self.usart) else { return 0 };
-        self.unread.extend(usart.take_heard().iter().map(|character| character.byte));
+        self.unread.extend(usart.take_sent().iter().map(|character| character.byte));
         let too_many = self.unread.len().saturating_sub(MOST_UNREAD);
         self.unread.drain(..too_many);
         if self.unheard.len() < MOST_UNHEARD {
@@ -101,7 +101,7 @@ impl Serial {
             self.unheard.extend(&bytes[..len]);
         }
         if powered {
-            let taken = usart.hear(self.unheard.make_contiguous(), now);
+            let taken = usart.receive(self.unheard.make_contiguous(), now);
             self.unheard.drain(..taken);
         } else {
             self.unheard.clear();

@@ -80,7 +80,7 @@ impl Credit {
         !self.closed.load(Ordering::Relaxed)
     }
 
-    fn give_back(&self) {
+    fn release(&self) {
         let mut used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
         *used = used.saturating_sub(1);
         self.changed.notify_one();
@@ -168,9 +168,9 @@ impl Server {
     /// number of frames that clients got.
     pub fn exchange<M: Computer>(&mut self, world: &mut World<M>, port: PortId) -> usize {
         while let Some(event) = self.early.pop_front().or_else(|| self.events.try_recv().ok()) {
-            self.take_in(event, world, port);
+            self.handle_event(event, world, port);
         }
-        self.give_out(world, port)
+        self.send_queued(world, port)
     }
 
     /// Sleeps until a client wants something, for `longest` at most.
@@ -183,7 +183,7 @@ impl Server {
         }
     }
 
-    fn take_in<M: Computer>(&mut self, event: Event, world: &mut World<M>, port: PortId) {
+    fn handle_event<M: Computer>(&mut self, event: Event, world: &mut World<M>, port: PortId) {
         match event {
             Event::Connected { id, peer, out, stream, credit } => {
                 self.notices.push(format!("client {id} connected from {peer}"));
@@ -207,7 +207,7 @@ impl Server {
         }
     }
 
-    fn give_out<M: Computer>(&mut self, world: &mut World<M>, port: PortId) -> usize {
+    fn send_queued<M: Computer>(&mut self, world: &mut World<M>, port: PortId) -> usize {
         let port = world.port_mut(port);
         let mut frames = Vec::new();
         while let Some((at, frame)) = port.receive() {
@@ -216,7 +216,7 @@ impl Server {
         while let Some((at, ticket, frame)) = port.sent() {
             let owner = self.owners.remove(&ticket);
             if let Some(client) = owner.and_then(|id| self.clients.get(&id)) {
-                client.credit.give_back();
+                client.credit.release();
             }
             frames.push((at, owner, frame));
         }

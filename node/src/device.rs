@@ -81,11 +81,11 @@ pub enum Event {
 /// A device with `PROGRAMS` programs.
 pub struct Device<'b, const PROGRAMS: usize> {
     setup: Setup,
-    life: Life<'b, PROGRAMS>,
+    phase: Phase<'b, PROGRAMS>,
 }
 
 /// What runs between two resets.
-enum Life<'b, const PROGRAMS: usize> {
+enum Phase<'b, const PROGRAMS: usize> {
     Bootloader(Box<Running<Bootloader<'b, FileFlash, Journal, PROGRAMS>>>),
     StandIn(Box<Running<StandIn>>, Idle<'b>),
     Silent(Idle<'b>),
@@ -103,12 +103,12 @@ struct Idle<'b> {
 struct Running<D> {
     device: D,
     slave: Slave,
-    leaving: Option<Leaving>,
+    pending_reset: Option<PendingReset>,
 }
 
 /// The device is about to reset.
 #[derive(Clone, Copy)]
-struct Leaving {
+struct PendingReset {
     request: Option<BootRequest>,
     /// When; set once the answer is on the bus.
     at: Option<Instant>,
@@ -118,17 +118,17 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
     /// Switches a device on.
     #[must_use]
     pub fn new(setup: Setup, flash: FileFlash, buffer: &'b mut [u8]) -> (Self, Event) {
-        let mut device = Self { setup, life: Life::None };
+        let mut device = Self { setup, phase: Phase::None };
         let event = device.reset(Idle { flash, buffer }, None);
         (device, event)
     }
 
     /// Takes a frame of the bus, whatever it is.
     pub fn handle(&mut self, frame: &Frame, now: Instant) {
-        match &mut self.life {
-            Life::Bootloader(running) => running.handle(frame, now),
-            Life::StandIn(running, _) => running.handle(frame, now),
-            Life::Silent(_) | Life::None => {}
+        match &mut self.phase {
+            Phase::Bootloader(running) => running.handle(frame, now),
+            Phase::StandIn(running, _) => running.handle(frame, now),
+            Phase::Silent(_) | Phase::None => {}
         }
     }
 
@@ -143,10 +143,10 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         send: &mut impl FnMut(Frame),
         tell: &mut impl FnMut(Event),
     ) -> io::Result<bool> {
-        let leave;
+        let reset;
         let mut more = false;
-        match &mut self.life {
-            Life::Bootloader(running) => {
+        match &mut self.phase {
+            Phase::Bootloader(running) => {
                 running.device.set_time(now);
                 more = running.device.step() == Step::Again;
                 // What is finished is in the file before anybody is told of it.
@@ -156,27 +156,27 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                     flash.save()?;
                 }
                 if let Some(request) = running.device.take_boot_request() {
-                    running.leaving = Some(Leaving { request: Some(request), at: None });
+                    running.pending_reset = Some(PendingReset { request: Some(request), at: None });
                 }
                 let finishing = running.device.is_finishing();
-                leave = running.talk(now, !finishing, send);
+                reset = running.exchange(now, !finishing, send);
             }
-            Life::StandIn(running, _) => {
-                if running.device.is_called_back() && running.leaving.is_none() {
-                    running.leaving = Some(Leaving { request: Some(BootRequest::Stay), at: None });
+            Phase::StandIn(running, _) => {
+                if running.device.is_called_back() && running.pending_reset.is_none() {
+                    running.pending_reset = Some(PendingReset { request: Some(BootRequest::Stay), at: None });
                 }
-                leave = running.talk(now, true, send);
+                reset = running.exchange(now, true, send);
             }
-            Life::Silent(_) | Life::None => return Ok(false),
+            Phase::Silent(_) | Phase::None => return Ok(false),
         }
-        if let Some(request) = leave {
-            let idle = match std::mem::replace(&mut self.life, Life::None) {
-                Life::Bootloader(running) => {
+        if let Some(request) = reset {
+            let idle = match std::mem::replace(&mut self.phase, Phase::None) {
+                Phase::Bootloader(running) => {
                     let (flash, buffer) = running.device.into_parts();
                     Idle { flash, buffer }
                 }
-                Life::StandIn(_, idle) | Life::Silent(idle) => idle,
-                Life::None => return Ok(false),
+                Phase::StandIn(_, idle) | Phase::Silent(idle) => idle,
+                Phase::None => return Ok(false),
             };
             tell(self.reset(idle, request));
             more = true;
@@ -212,7 +212,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                 let address = device.lss_address();
                 let node = NodeParameters { id: device.node_id(), ..node };
                 let slave = slave(address, node, config.device.heartbeat_ms, NmtPolicy::StayPreOperational);
-                self.life = Life::Bootloader(Box::new(Running { device, slave, leaving: None }));
+                self.phase = Phase::Bootloader(Box::new(Running { device, slave, pending_reset: None }));
                 Event::Bootloader { node: node.id, reason }
             }
             BootDecision::Start { program, trial } => {
@@ -221,14 +221,14 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                 let crcs = (1..=PROGRAMS as u8).map(|number| record(number).map_or(0, |record| record.crc));
                 let crcs = crcs.collect();
                 let idle = Idle { flash, buffer };
-                self.life = match stand_in {
-                    None => Life::Silent(idle),
+                self.phase = match stand_in {
+                    None => Phase::Silent(idle),
                     Some(entries) => {
                         let says = boot_core::canopen::device::Device { serial_number, ..config.device };
                         let device = StandIn::new(entries, says, number, crcs);
                         let address = device.lss_address();
                         let slave = slave(address, node, config.device.heartbeat_ms, NmtPolicy::Follow);
-                        Life::StandIn(Box::new(Running { device, slave, leaving: None }), idle)
+                        Phase::StandIn(Box::new(Running { device, slave, pending_reset: None }), idle)
                     }
                 };
                 Event::Program { number, trial, node: node.id }
@@ -253,22 +253,22 @@ fn slave(
 impl<D: SlaveDevice> Running<D> {
     fn handle(&mut self, frame: &Frame, now: Instant) {
         // Who is about to reset takes nothing on.
-        if self.leaving.is_some_and(|leaving| leaving.at.is_some()) {
+        if self.pending_reset.is_some_and(|pending_reset| pending_reset.at.is_some()) {
             return;
         }
         if self.slave.handle(frame, now, &mut self.device) {
-            self.leaving = Some(Leaving { request: None, at: None });
+            self.pending_reset = Some(PendingReset { request: None, at: None });
         }
     }
 
     /// Sends what there is to send. The request with which the device resets, once it is time.
-    fn talk(
+    fn exchange(
         &mut self,
         now: Instant,
-        may_leave: bool,
+        may_reset: bool,
         send: &mut impl FnMut(Frame),
     ) -> Option<Option<BootRequest>> {
-        if let Some(Leaving { request, at: Some(at) }) = self.leaving {
+        if let Some(PendingReset { request, at: Some(at) }) = self.pending_reset {
             return now.has_reached(at).then_some(request);
         }
         while let Some(output) = self.slave.poll(now, true, &mut self.device) {
@@ -278,8 +278,9 @@ impl<D: SlaveDevice> Running<D> {
                 Output::Join(_) | Output::Listen(_) | Output::RecoverFromBusOff | Output::Accept(_) => {}
             }
         }
-        if let Some(leaving) = self.leaving.as_mut().filter(|_| may_leave && self.slave.is_idle()) {
-            leaving.at = Some(now + ANSWER_TO_RESET_MS);
+        if let Some(pending_reset) = self.pending_reset.as_mut().filter(|_| may_reset && self.slave.is_idle())
+        {
+            pending_reset.at = Some(now + ANSWER_TO_RESET_MS);
         }
         None
     }

@@ -217,7 +217,7 @@ fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, B
     let mut devices = Vec::new();
     for ((setup, flash), buffer) in setups.into_iter().zip(flashes).zip(&mut buffers) {
         let (device, event) = Device::<PROGRAMS>::new(setup, flash, buffer);
-        tell(setup.serial_number, event);
+        log_event(setup.serial_number, event);
         devices.push((setup.serial_number, device));
     }
     let mut more = true;
@@ -238,7 +238,7 @@ fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, B
                 }
             };
             more |= device
-                .work(now, &mut send, &mut |event| tell(*serial, event))
+                .work(now, &mut send, &mut |event| log_event(*serial, event))
                 .map_err(|error| format!("the file of serial number {serial} cannot be written: {error}"))?;
             sent?;
         }
@@ -291,7 +291,7 @@ fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
 }
 
 /// Says what came of a reset.
-fn tell(serial: u32, event: Event) {
+fn log_event(serial: u32, event: Event) {
     let (node, what) = match event {
         Event::Bootloader { node, reason } => (node, format!("bootloader ({reason:?})")),
         Event::Program { number, trial, node } => {

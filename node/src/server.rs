@@ -88,7 +88,7 @@ impl Server {
                     return None;
                 }
                 self.clients.insert(number, Client { stream, mode: Mode::NoBus });
-                self.say(number, "< hi >");
+                self.send_text(number, "< hi >");
                 None
             }
             Event::Gone(number) => {
@@ -97,7 +97,7 @@ impl Server {
             }
             Event::Message(number, message) => {
                 let frame = self.message(number, &message)?;
-                self.give_out(&frame, Some(number));
+                self.broadcast(&frame, Some(number));
                 Some(frame)
             }
         }
@@ -131,12 +131,12 @@ impl Server {
             },
             _ => "< error unknown command, here are open, rawmode, bcmmode, send and echo >".to_owned(),
         };
-        self.say(number, &answer);
+        self.send_text(number, &answer);
         None
     }
 
     /// Says something to a client; who does not listen is disconnected.
-    fn say(&mut self, number: u64, message: &str) {
+    fn send_text(&mut self, number: u64, message: &str) {
         let Some(client) = self.clients.get_mut(&number) else { return };
         if client.stream.write_all(message.as_bytes()).is_err() {
             // Its thread sees the end of the connection.
@@ -146,7 +146,7 @@ impl Server {
     }
 
     /// Brings a frame to all clients but the one that sent it.
-    fn give_out(&mut self, frame: &Frame, from: Option<u64>) {
+    fn broadcast(&mut self, frame: &Frame, from: Option<u64>) {
         let message = frame_message(frame, self.started.elapsed());
         let mut listeners = Vec::new();
         for (number, client) in &mut self.clients {
@@ -158,7 +158,7 @@ impl Server {
             }
         }
         for number in listeners {
-            self.say(number, &message);
+            self.send_text(number, &message);
         }
     }
 
@@ -177,7 +177,7 @@ impl Server {
             }
         }
         for (number, messages) in due {
-            self.say(number, &messages);
+            self.send_text(number, &messages);
         }
         next
     }
@@ -186,7 +186,7 @@ impl Server {
 impl Adapter for Server {
     fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
         self.release();
-        self.give_out(frame, None);
+        self.broadcast(frame, None);
         Ok(())
     }
 

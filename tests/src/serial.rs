@@ -33,7 +33,7 @@ impl Read for SerialLine<'_> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let deadline = self.now() + self.timeout;
         loop {
-            self.come.extend(self.bench.usart().take_heard().iter().map(|character| character.byte));
+            self.come.extend(self.bench.usart().take_sent().iter().map(|character| character.byte));
             if !self.come.is_empty() {
                 return self.come.read(buffer);
             }
@@ -48,7 +48,7 @@ impl Read for SerialLine<'_> {
 impl Write for SerialLine<'_> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let now = self.bench.time();
-        Ok(self.bench.usart().hear(bytes, now))
+        Ok(self.bench.usart().receive(bytes, now))
     }
 
     fn flush(&mut self) -> io::Result<()> {

@@ -42,7 +42,7 @@ impl Listener {
 /// most.
 fn heard(machine: &mut Machine) -> Vec<Character> {
     let usarts = machine.usarts_mut().iter_mut();
-    let heard: Vec<_> = usarts.flat_map(|usart| usart.take_heard()).collect();
+    let heard: Vec<_> = usarts.flat_map(|usart| usart.take_sent()).collect();
     assert!(heard.iter().all(|character| character.bit_rate.abs_diff(115_200) < 2_304), "{heard:?}");
     heard
 }

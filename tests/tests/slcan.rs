@@ -9,7 +9,7 @@ use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 fn say(slcan: &mut Slcan, text: &[u8]) -> (String, Vec<Frame>) {
     let (mut answers, mut frames) = (String::new(), Vec::new());
     for &byte in text {
-        if let Some((answer, frame)) = slcan.hear::<Frame>(byte) {
+        if let Some((answer, frame)) = slcan.receive::<Frame>(byte) {
             answers += std::str::from_utf8(answer.text()).expect("ASCII");
             frames.extend(frame);
         }

@@ -27,14 +27,14 @@ fn empty_board() -> Bench {
 
 /// What the board has said on its line, and when the last of it was.
 fn said(bench: &mut Bench) -> String {
-    String::from_utf8(bench.usart().take_heard().iter().map(|character| character.byte).collect())
+    String::from_utf8(bench.usart().take_sent().iter().map(|character| character.byte).collect())
         .expect("ASCII")
 }
 
 /// Says text to the board and gives what it says within the next `ms`.
 fn ask(bench: &mut Bench, text: &[u8], ms: u64) -> String {
     let now = bench.time();
-    assert_eq!(bench.usart().hear(text, now), text.len());
+    assert_eq!(bench.usart().receive(text, now), text.len());
     bench.run_ms(ms);
     said(bench)
 }

@@ -107,7 +107,7 @@ impl<L: Line> Slcan<L> {
         let mut adapter = Self::opened(line, name);
         // Whatever was under way before: end it, and close the bus. A bus that is closed already is
         // refused, which is well.
-        adapter.say("\r\rC\r")?;
+        adapter.send_text("\r\rC\r")?;
         adapter.settle()?;
         if let Some(rate) = bit_rate {
             let Some(number) = BIT_RATES.iter().position(|known| *known == rate) else {
@@ -126,7 +126,7 @@ impl<L: Line> Slcan<L> {
 
     /// Gives a command and waits for the answer, if one comes.
     fn command(&mut self, text: &str, what: &str) -> Result<(), AdapterError> {
-        self.say(text)?;
+        self.send_text(text)?;
         let deadline = self.line.now() + ANSWER;
         loop {
             match self.message(deadline)? {
@@ -151,7 +151,7 @@ impl<L: Line> Slcan<L> {
         Ok(())
     }
 
-    fn say(&mut self, text: &str) -> Result<(), AdapterError> {
+    fn send_text(&mut self, text: &str) -> Result<(), AdapterError> {
         let done = self.line.write_all(text.as_bytes()).and_then(|()| self.line.flush());
         done.map_err(|error| self.lost(error))
     }
@@ -223,13 +223,13 @@ impl<L: Line> Drop for Slcan<L> {
     /// Closes the bus, so that the adapter does not fill up while nobody listens. If it is gone, so
     /// be it.
     fn drop(&mut self) {
-        let _ = self.say("C\r");
+        let _ = self.send_text("C\r");
     }
 }
 
 impl<L: Line> Adapter for Slcan<L> {
     fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        self.say(&text_of(frame))
+        self.send_text(&text_of(frame))
     }
 
     fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {

@@ -39,9 +39,9 @@ impl Socketcand {
         stream.set_write_timeout(Some(PATIENCE)).map_err(open)?;
         let mut adapter = Self { stream, name, opened: Instant::now(), messages: Messages::default() };
         adapter.expect("hi")?;
-        adapter.say(&format!("< open {bus} >"))?;
+        adapter.send_text(&format!("< open {bus} >"))?;
         adapter.expect("ok")?;
-        adapter.say("< rawmode >")?;
+        adapter.send_text("< rawmode >")?;
         adapter.expect("ok")?;
         Ok(adapter)
     }
@@ -62,7 +62,7 @@ impl Socketcand {
         }
     }
 
-    fn say(&mut self, message: &str) -> Result<(), AdapterError> {
+    fn send_text(&mut self, message: &str) -> Result<(), AdapterError> {
         self.stream.write_all(message.as_bytes()).map_err(|error| self.lost(error))
     }
 
@@ -118,7 +118,7 @@ impl Socketcand {
 
 impl Adapter for Socketcand {
     fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        self.say(&send_message(frame))
+        self.send_text(&send_message(frame))
     }
 
     fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {

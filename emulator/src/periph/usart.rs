@@ -235,7 +235,7 @@ impl Usart {
 
     /// The outside sends bytes, one behind the other, from `now` on. Gives how many it takes; the
     /// rest has to come again.
-    pub fn hear(&mut self, bytes: &[u8], now: Time) -> usize {
+    pub fn receive(&mut self, bytes: &[u8], now: Time) -> usize {
         let room = MOST_WAITING - self.outside.waiting.len();
         let taken = bytes.len().min(room);
         self.outside.waiting.extend(&bytes[..taken]);
@@ -252,7 +252,7 @@ impl Usart {
     }
 
     /// What the chip has sent since the last time; the oldest is lost where nobody asked for long.
-    pub fn take_heard(&mut self) -> Vec<Character> {
+    pub fn take_sent(&mut self) -> Vec<Character> {
         self.outside.heard.drain(..).collect()
     }
 
@@ -531,7 +531,7 @@ mod tests {
     }
 
     fn text(usart: &mut Usart) -> Vec<u8> {
-        usart.take_heard().iter().map(|character| character.byte).collect()
+        usart.take_sent().iter().map(|character| character.byte).collect()
     }
 
     /// The two examples of section 30.3.4: 27.75 is 1BCh with 16 samples a bit, and 1B6h with 8.
@@ -575,7 +575,7 @@ mod tests {
         assert_eq!(usart.read(SR, Time(1087 * MICRO)), Ok(0x80));
         usart.advance(Time(2000 * MICRO));
         assert_eq!(usart.read(SR, Time(2000 * MICRO)), Ok(0xC0));
-        let heard = usart.take_heard();
+        let heard = usart.take_sent();
         assert_eq!(heard.iter().map(|c| c.byte).collect::<Vec<_>>(), *b"ac");
         assert_eq!((heard[0].bit_rate, heard[1].end), (115_068, start + Span(2 * 86_904_762)));
     }
@@ -591,7 +591,7 @@ mod tests {
         usart.write(CR1, 1 << 13 | 1 << 3, Time(0)).unwrap();
         usart.write(DR, 0x55, Time(0)).unwrap();
         usart.advance(Time(100 * MICRO));
-        let heard = usart.take_heard();
+        let heard = usart.take_sent();
         assert_eq!(heard, [Character { end: Time(22 * MICRO), byte: 0x55, bit_rate: 1_000_000 }]);
     }
 
@@ -605,7 +605,7 @@ mod tests {
             assert_eq!(line(&usart), if active { vec![38] } else { vec![] }, "{enable:x}");
         }
         usart.write(CR1, 1 << 13 | 1 << 3 | 1 << 2 | 1 << 5, Time(0)).unwrap();
-        usart.hear(b"x", Time(200 * MICRO));
+        usart.receive(b"x", Time(200 * MICRO));
         usart.advance(Time(400 * MICRO));
         assert_eq!(line(&usart), [38]);
         assert_eq!(usart.read(DR, Time(400 * MICRO)), Ok(b'x'.into()));
@@ -617,7 +617,7 @@ mod tests {
     #[test]
     fn a_character_that_nobody_took_stays_and_the_next_is_lost() {
         let mut usart = on(1 << 5);
-        assert_eq!(usart.hear(b"abc", Time(100 * MICRO)), 3);
+        assert_eq!(usart.receive(b"abc", Time(100 * MICRO)), 3);
         let late = Time(1000 * MICRO);
         usart.advance(late);
         assert_eq!(usart.waiting(), 0);
@@ -626,7 +626,7 @@ mod tests {
         assert_eq!(usart.read(SR, late).unwrap() & 0x28, 0x08);
         assert_eq!(usart.read(DR, late), Ok(b'a'.into()));
         assert_eq!(usart.read(SR, late), Ok(0xC0));
-        usart.hear(b"d", late);
+        usart.receive(b"d", late);
         usart.advance(Time(2000 * MICRO));
         assert_eq!(usart.read(DR, late), Ok(b'd'.into()));
     }
@@ -638,7 +638,7 @@ mod tests {
         {
             let mut usart = on(0);
             usart.set_outside_bit_rate(rate);
-            usart.hear(b"U", Time(0));
+            usart.receive(b"U", Time(0));
             usart.advance(Time(2000 * MICRO));
             assert_eq!(usart.read(SR, Time(0)).unwrap() & 2 == 0, readable, "{rate}");
             assert_eq!(usart.read(DR, Time(0)) == Ok(b'U'.into()), readable, "{rate}");
@@ -650,14 +650,14 @@ mod tests {
     fn nothing_comes_or_goes_without_pins_or_switches() {
         let mut usart = on(0);
         usart.set_wired(false, false);
-        usart.hear(b"a", Time(100 * MICRO));
+        usart.receive(b"a", Time(100 * MICRO));
         assert!(usart.write(DR, b'b'.into(), Time(100 * MICRO)).unwrap_err().0.contains("PA2, PD5"));
         usart.advance(Time(1000 * MICRO));
         assert!(text(&mut usart).is_empty());
         assert_eq!(usart.read(SR, Time(1000 * MICRO)).unwrap() & 0x20, 0);
         usart.set_wired(true, true);
         usart.write(CR1, 0, Time(1000 * MICRO)).unwrap();
-        usart.hear(b"a", Time(1000 * MICRO));
+        usart.receive(b"a", Time(1000 * MICRO));
         assert!(usart.write(DR, b'b'.into(), Time(1000 * MICRO)).is_err());
         usart.advance(Time(2000 * MICRO));
         assert!(text(&mut usart).is_empty());
@@ -684,13 +684,13 @@ mod tests {
     #[test]
     fn the_outside_knows_of_no_reset() {
         let mut usart = on(0);
-        usart.hear(b"ab", Time(100 * MICRO));
+        usart.receive(b"ab", Time(100 * MICRO));
         usart.reset();
         assert_eq!(usart.waiting(), 2);
         usart.advance(Time(1000 * MICRO));
         assert_eq!(usart.waiting(), 0);
         assert_eq!(usart.read(SR, Time(1000 * MICRO)), Ok(0xC0));
-        usart.hear(b"ab", Time(1000 * MICRO));
+        usart.receive(b"ab", Time(1000 * MICRO));
         usart.lose_power();
         assert_eq!((usart.waiting(), usart.next_event()), (0, None));
     }

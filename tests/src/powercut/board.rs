@@ -165,7 +165,7 @@ impl Story {
         let run = story.power_on_and_update(&mut bench, None);
         run.outcome?;
         story.operations = run.operations;
-        match story.look(&mut bench)? {
+        match story.inspect(&mut bench)? {
             Outcome::New => Ok(story),
             other => Err(format!("without a cut: {}", other.name())),
         }
@@ -186,7 +186,7 @@ impl Story {
     }
 
     /// What the device does when the power comes on.
-    fn look(&self, bench: &mut Bench) -> Result<Outcome, String> {
+    fn inspect(&self, bench: &mut Bench) -> Result<Outcome, String> {
         bench.events();
         let from = bench.time();
         bench.power_on();
@@ -235,7 +235,7 @@ impl Story {
                 // A recovery may be shorter than the update: then it has to have worked.
                 run.outcome.map_err(|error| format!("no cut at {}, and yet: {error}", at.operation))?;
             }
-            let found = self.look(&mut bench)?;
+            let found = self.inspect(&mut bench)?;
             let untouched = at.operation == 0 && at.kind == 0;
             if untouched && found != last {
                 return Err(format!("nothing was changed, and {} became {}", last.name(), found.name()));
@@ -252,7 +252,7 @@ impl Story {
         }
         let run = self.power_on_and_update(&mut bench, None);
         run.outcome.map_err(|error| format!("the update does not complete: {error}"))?;
-        match self.look(&mut bench)? {
+        match self.inspect(&mut bench)? {
             Outcome::New => Ok(all),
             other => Err(format!("after the recovery: {}", other.name())),
         }

@@ -288,7 +288,7 @@ impl Host<'_, '_> {
     /// # Errors
     /// The abort or the status.
     pub fn command(&mut self, program: u8, command: u8) -> Result<(), String> {
-        self.node.write(Address::new(0x1F51, program), &[command]).map_err(told)?;
+        self.node.write(Address::new(0x1F51, program), &[command]).map_err(abort_text)?;
         self.settle();
         self.ended(program)
     }
@@ -299,17 +299,17 @@ impl Host<'_, '_> {
     /// The abort or the status.
     pub fn block(&mut self, program: u8, block: &[u8]) -> Result<(), String> {
         let at = Address::new(0x1F50, program);
-        self.node.download_start(at, Some(block.len() as u32)).map_err(told)?;
+        self.node.download_start(at, Some(block.len() as u32)).map_err(abort_text)?;
         for segment in block.chunks(7) {
             while self.node.download_space(at, false) < segment.len() {
                 self.node.step();
             }
             if let Err(abort) = self.node.download_data(at, segment) {
                 self.node.download_cancel(at);
-                return Err(told(abort));
+                return Err(abort_text(abort));
             }
         }
-        self.node.download_end(at).map_err(told)?;
+        self.node.download_end(at).map_err(abort_text)?;
         self.settle();
         self.ended(program)
     }
@@ -322,9 +322,9 @@ impl Host<'_, '_> {
     pub fn password(&mut self, program: u8) -> Result<(), String> {
         let lift = self.node.entries().iter().any(|entry| entry.at == LIFT_PASSWORD);
         if lift {
-            self.node.write(LIFT_PASSWORD, Profile::LIFT.password).map_err(told)
+            self.node.write(LIFT_PASSWORD, Profile::LIFT.password).map_err(abort_text)
         } else {
-            self.node.write(Address::new(0x7F50, program), Profile::ESACADEMY.password).map_err(told)
+            self.node.write(Address::new(0x7F50, program), Profile::ESACADEMY.password).map_err(abort_text)
         }
     }
 
@@ -335,14 +335,14 @@ impl Host<'_, '_> {
     /// The abort.
     pub fn broken_off(&mut self, program: u8, data: &[u8], sent: usize, steps: u32) -> Result<(), String> {
         let at = Address::new(0x1F50, program);
-        self.node.download_start(at, Some(data.len() as u32)).map_err(told)?;
+        self.node.download_start(at, Some(data.len() as u32)).map_err(abort_text)?;
         for segment in data[..sent].chunks(7) {
             while self.node.download_space(at, false) < segment.len() {
                 self.node.step();
             }
             if let Err(abort) = self.node.download_data(at, segment) {
                 self.node.download_cancel(at);
-                return Err(told(abort));
+                return Err(abort_text(abort));
             }
         }
         for _ in 0..steps {
@@ -376,7 +376,7 @@ impl Host<'_, '_> {
     }
 }
 
-fn told(abort: AbortCode) -> String {
+fn abort_text(abort: AbortCode) -> String {
     format!("abort {abort:?}")
 }
 

@@ -173,7 +173,7 @@ fn run_script(
 }
 
 /// What the device does now, if that is allowed, whenever one looks.
-fn look(device: &Device, allowed: &Allowed) -> Result<Outcome, String> {
+fn inspect(device: &Device, allowed: &Allowed) -> Result<Outcome, String> {
     let mut last = Outcome::Bootloader;
     for _ in 0..LOOKS {
         device.records_are_true()?;
@@ -207,7 +207,7 @@ fn completes(scenario: &Scenario, device: &Device, from: &Allowed) -> Result<(Ou
     let mut device = device.clone();
     let run = run_script(scenario, Scenario::recover, &mut device, from.clone(), None);
     run.outcome.map_err(|error| format!("the recovery does not complete: {error}"))?;
-    let outcome = look(&device, &scenario.end()).map_err(|what| format!("after the recovery: {what}"))?;
+    let outcome = inspect(&device, &scenario.end()).map_err(|what| format!("after the recovery: {what}"))?;
     Ok((outcome, run.operations))
 }
 
@@ -220,7 +220,7 @@ fn at_operation(scenario: &Scenario, device: &Device, operation: u32, every_kind
         let mut device = device.clone();
         let run = run_script(scenario, Scenario::act, &mut device, start.clone(), Some(first));
         let point = Point { scenario: scenario.name, first, second: None };
-        let found = look(&device, &run.allowed);
+        let found = inspect(&device, &run.allowed);
         let recovery = completes(scenario, &device, &run.allowed);
         let sound = found.and_then(|found| recovery.clone().map(|_| found));
         if !report.count(&point, sound) {
@@ -235,7 +235,7 @@ fn at_operation(scenario: &Scenario, device: &Device, operation: u32, every_kind
                 let run =
                     run_script(scenario, Scenario::recover, &mut device, run.allowed.clone(), Some(second));
                 let point = Point { second: Some(second), ..point.clone() };
-                let found = look(&device, &run.allowed)
+                let found = inspect(&device, &run.allowed)
                     .and_then(|found| completes(scenario, &device, &run.allowed).map(|_| found));
                 report.count(&point, found);
             }
@@ -289,7 +289,7 @@ fn run_until(
     let run = run_script(scenario, Scenario::act, &mut through, start, None);
     let operations = run.operations;
     run.outcome?;
-    look(&through, &run.allowed)?;
+    inspect(&through, &run.allowed)?;
     completes(scenario, &through, &run.allowed)?;
 
     let next = AtomicU32::new(1);
@@ -352,7 +352,7 @@ pub fn reproduce(point: &Point) -> String {
         } else {
             format!("no cut: there is no operation {operation}, {} are all\n", run.operations)
         };
-        text += &match look(&device, &allowed) {
+        text += &match inspect(&device, &allowed) {
             Ok(outcome) => format!("  power on: {outcome:?}, node {:?}\n", device.node()),
             Err(what) => format!("  VIOLATION: {what}\n"),
         };

@@ -208,7 +208,7 @@ fn run(args: &Args) -> Result<()> {
     bench.power_on()?;
     let outcome = bench.live(args, &end);
     // What has happened is told and written down even if something went wrong.
-    let told = bench.tell();
+    let told = bench.print_report();
     let flushed = bench.flush();
     outcome.and(told).and(flushed)?;
     bench.sum_up()
@@ -309,7 +309,7 @@ impl Watched {
         let mut said = Vec::new();
         for usart in machine.usarts_mut() {
             let name = usart.instance().name;
-            for Character { end, byte, bit_rate } in usart.take_heard() {
+            for Character { end, byte, bit_rate } in usart.take_sent() {
                 let line = self.serial.entry((name, bit_rate)).or_default();
                 if byte != b'\n' && line.len() < LONGEST_LINE {
                     line.push(byte);
@@ -443,7 +443,7 @@ impl Bench {
                 }
             }
             self.exchange(&mut pacer);
-            self.tell()?;
+            self.print_report()?;
             if flushed.elapsed() > FLUSH {
                 self.flush()?;
                 flushed = Instant::now();
@@ -472,7 +472,7 @@ impl Bench {
     }
 
     /// Says what has happened since the last time, in the order in which it did.
-    fn tell(&mut self) -> Result<()> {
+    fn print_report(&mut self) -> Result<()> {
         let mut lines = std::mem::take(&mut *self.said.borrow_mut());
         while let Some(news) = self.world.news() {
             let n = self.boards.iter().position(|board| board.id == news.machine).unwrap_or(0);
