@@ -25,13 +25,13 @@ mod layout;
 mod lint;
 mod new_board;
 mod pack;
+mod parts;
 mod portable;
 mod powercut;
 mod process;
 mod rooms;
 mod setup;
 mod size;
-mod symbols;
 mod test;
 mod workspace;
 

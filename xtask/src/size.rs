@@ -1,6 +1,6 @@
 //! `cargo xtask size`: the bootloader's flash against its budget.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::Path;
 use std::{cmp, fs};
@@ -9,9 +9,9 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
 use crate::args::Args;
-use crate::elf::{Elf, Section};
+use crate::elf::Elf;
 use crate::setup::{Part, Setup};
-use crate::{build, pack, symbols, workspace, Outcome};
+use crate::{build, pack, parts, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask size [--board BOARD] [--yes]
@@ -34,10 +34,13 @@ pub fn run(mut args: Args) -> Outcome {
     args.none_left()?;
     setup.prepare(&[Part::Firmware])?;
     let dir = build::images(board, &["bootloader"])?;
-    let elf = read(&dir.join("bootloader.elf"))?;
+    let path = dir.join("bootloader.elf");
+    let elf = read(&path)?;
     let flash = Flash::of(&elf, board.bootloader)?;
     print!("\n{}", flash.table());
-    print!("\n{}", by_crate(&elf));
+    let image = elf.sections.iter().find(|section| section.name == pack::IMAGE);
+    let image = image.ok_or("the bootloader has no RAM image.")?;
+    print!("\n{}", by_part(&elf, parts::of(&path, image.address, image.size)?));
     print!("\n{}", by_variant(board)?);
     println!(
         "\nbootloader: {} of {} bytes ({} of flash kept for it); {} if nothing were packed",
@@ -179,56 +182,22 @@ fn by_variant(board: &Layout) -> Outcome<String> {
     Ok(text)
 }
 
-/// Flash by crate, as the symbols tell: raw, and the share of what is packed. Code that was inlined
-/// counts for the crate it ended up in.
-fn by_crate(elf: &Elf) -> String {
-    /// Bytes that are in flash as they are, and bytes that are packed.
-    #[derive(Clone, Copy, Default)]
-    struct Bytes {
-        plain: u32,
-        packed: u32,
-    }
-    impl Bytes {
-        fn add(&mut self, size: u32, is_packed: bool) {
-            *(if is_packed { &mut self.packed } else { &mut self.plain }) += size;
-        }
-    }
-
+/// Flash by part: raw, and the share of what is packed. `image` tells the parts of the RAM image;
+/// what runs from flash is told by its section.
+fn by_part(elf: &Elf, image: BTreeMap<String, u32>) -> String {
     let packed = Packed::of(elf);
-    let is_packed = |section: &Section| packed.is_some() && section.name == pack::IMAGE;
-    let mut seen = HashSet::new();
-    let mut crates: BTreeMap<&str, Bytes> = BTreeMap::new();
-    let mut named = Bytes::default();
-    for symbol in &elf.symbols {
-        let Some(section) = elf.sections.get(symbol.section).filter(|section| section.loaded) else {
-            continue;
-        };
-        // Aliases (the default handlers are many names of one function) count once.
-        if symbol.size > 0 && seen.insert(symbol.address & !1) {
-            let name = match symbols::crate_of(&symbol.name) {
-                Some(name) => name,
-                // Tasks, handlers and memcpy carry plain names; the large ones are worth a row.
-                None if symbol.size >= 64 => &symbol.name,
-                None => "(small symbols)",
-            };
-            crates.entry(name).or_default().add(symbol.size, is_packed(section));
-            named.add(symbol.size, is_packed(section));
-        }
-    }
-    let mut all = Bytes::default();
-    for section in elf.sections.iter().filter(|section| section.loaded && section.name != pack::PACKED) {
-        all.add(section.size, is_packed(section));
-    }
-    let unnamed = Bytes {
-        plain: all.plain.saturating_sub(named.plain),
-        packed: all.packed.saturating_sub(named.packed),
-    };
-    let mut rows: Vec<_> = crates.into_iter().chain([("(no symbol)", unnamed), ("(all)", all)]).collect();
-    rows.sort_by_key(|(_, Bytes { plain, packed })| cmp::Reverse(plain + packed));
-    let mut text = String::from("crate, or plain symbol             raw  packed (share)\n");
-    for (name, Bytes { plain, packed: raw }) in rows {
-        let share = plain + packed.map_or(0, |packed| packed.share(raw));
-        let _ = writeln!(text, "{name:<31} {:>6}  {share:>6}", plain + raw);
+    let share = |raw| packed.as_ref().map_or(raw, |packed| packed.share(raw));
+    let plain = elf.sections.iter().filter(|section| section.loaded);
+    let plain = plain.filter(|section| section.name != pack::PACKED && section.name != pack::IMAGE);
+    let plain = plain.map(|section| (format!("{} (in flash)", section.name), section.size, section.size));
+    let mut rows: Vec<_> =
+        image.into_iter().map(|(part, raw)| (part, raw, share(raw))).chain(plain).collect();
+    let all = rows.iter().fold((0, 0), |all, (_, raw, share)| (all.0 + raw, all.1 + share));
+    rows.push(("(all)".to_owned(), all.0, all.1));
+    rows.sort_by_key(|(_, raw, _)| cmp::Reverse(*raw));
+    let mut text = String::from("part                               raw  packed (share)\n");
+    for (name, raw, share) in rows {
+        let _ = writeln!(text, "{name:<31} {raw:>6}  {share:>6}");
     }
     text
 }
@@ -286,21 +255,6 @@ mod tests {
         assert!(Flash::of(&empty, REGION).unwrap_err().contains("nothing"));
     }
 
-    #[test]
-    fn crates_and_what_no_symbol_claims_add_up() {
-        let mut elf = Elf::parse(&by_hand()).unwrap();
-        let alias = elf.symbols[0].clone();
-        elf.symbols.push(alias);
-        elf.symbols[1].name = "alias".into();
-        let table = by_crate(&elf);
-        // 0x20 + 8 bytes are loaded, 0x10 of them are `start`, counted once.
-        assert!(table.contains("(no symbol)                         24      24\n"), "{table}");
-        assert!(table.contains("(small symbols)                     16      16\n"), "{table}");
-        assert!(table.contains("(all)                               40      40\n"), "{table}");
-        elf.symbols[0].size = 64;
-        assert!(by_crate(&elf).contains("start                               64      64\n"), "{table}");
-    }
-
     /// Of 40 bytes in RAM 10 are in flash: a quarter of each part, rounded up.
     #[test]
     fn what_is_packed_counts_by_its_share() {
@@ -310,16 +264,14 @@ mod tests {
         assert_eq!(flash.raw(), 130);
 
         let mut elf = Elf::parse(&by_hand()).unwrap();
-        // `.data` of 8 bytes, which the first symbol is moved into.
-        elf.symbols[0].section = 2;
-        elf.symbols[0].size = 6;
+        // `.data` of 8 bytes is the image, of which 4 are stored.
         let mut stored = elf.sections[1].clone();
         (stored.name, stored.size) = (pack::PACKED.into(), 4);
         elf.sections.push(stored);
-        let table = by_crate(&elf);
-        assert!(table.contains("(small symbols)                      6       3\n"), "{table}");
-        // The other two of `.data`, and all of `.vectors`.
-        assert!(table.contains("(no symbol)                         34      33\n"), "{table}");
+        let table = by_part(&elf, [("a/b".to_owned(), 6), ("core".to_owned(), 2)].into());
+        assert!(table.contains("a/b                                  6       3\n"), "{table}");
+        assert!(table.contains("core                                 2       1\n"), "{table}");
+        assert!(table.contains(".vectors (in flash)                 32      32\n"), "{table}");
         assert!(table.contains("(all)                               40      36\n"), "{table}");
     }
 }

@@ -1,0 +1,73 @@
+//! Which part of the house each byte of a program comes from, as its debug information tells.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use addr2line::Loader;
+
+use crate::{workspace, Outcome};
+
+/// Bytes by part of the code and data at these addresses of an ELF file. A part is a module of one
+/// of our crates (`boot-core/intake`), or somebody else's crate.
+///
+/// # Errors
+/// When the file has no debug information that can be read.
+pub fn of(elf: &Path, address: u32, size: u32) -> Outcome<BTreeMap<String, u32>> {
+    /// The length of the shortest instruction.
+    const STEP: usize = 2;
+    let unreadable = |error: &dyn std::fmt::Display| {
+        format!("the debug information of {} cannot be read: {error}.", workspace::shown(elf))
+    };
+    let loader = Loader::new(elf).map_err(|error| unreadable(&error))?;
+    let root = workspace::root();
+    let mut parts = BTreeMap::new();
+    for at in (address..address + size).step_by(STEP) {
+        let mut frames = loader.find_frames(at.into()).map_err(|error| unreadable(&error))?;
+        let mut files = Vec::new();
+        while let Some(frame) = frames.next().map_err(|error| unreadable(&error))? {
+            files.extend(frame.location.and_then(|location| location.file).map(str::to_owned));
+        }
+        *parts.entry(part(&files, &root)).or_default() += STEP as u32;
+    }
+    Ok(parts)
+}
+
+/// The part that code belongs to: the innermost file of ours, else the outermost file.
+fn part(files: &[String], root: &Path) -> String {
+    let ours = files.iter().find_map(|file| {
+        // The build of the firmware may name files relative to the workspace.
+        let file = Path::new(file).strip_prefix(root).unwrap_or(Path::new(file));
+        let mut names = file.iter().filter_map(|name| name.to_str());
+        let (krate, src, module) = (names.next()?, names.next()?, names.next()?);
+        (src == "src").then(|| format!("{krate}/{}", module.trim_end_matches(".rs")))
+    });
+    let theirs = || {
+        let file = files.last()?;
+        // A crate of a registry (…/registry/src/HOST/NAME-VERSION/…), or the standard library.
+        let behind = file.split_once("/registry/src/").map(|(_, rest)| rest)?;
+        let name = behind.split('/').nth(1)?;
+        Some(name.rsplit_once('-').map_or(name, |(name, _)| name).to_owned())
+    };
+    let nobodys = || (if files.is_empty() { "(data, vectors, assembly)" } else { "core" }).to_owned();
+    ours.or_else(theirs).unwrap_or_else(nobodys)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn code_counts_for_the_innermost_file_of_ours() {
+        let root = Path::new("/house");
+        let part =
+            |files: &[&str]| super::part(&files.iter().map(ToString::to_string).collect::<Vec<_>>(), root);
+        assert_eq!(part(&[]), "(data, vectors, assembly)");
+        assert_eq!(part(&["/rustc/1/library/core/src/option.rs"]), "core");
+        let bxcan = "/home/me/.cargo/registry/src/index-1/bxcan-0.8.0/src/lib.rs";
+        assert_eq!(part(&["/rustc/1/library/core/src/option.rs", bxcan]), "bxcan");
+        let files = [bxcan, "/house/bsp/src/can.rs", "/house/bootloader/src/main.rs"];
+        assert_eq!(part(&files), "bsp/can");
+        assert_eq!(part(&["/house/boot-core/src/intake/ihex.rs"]), "boot-core/intake");
+        assert_eq!(part(&["canopen/src/lss.rs"]), "canopen/lss");
+    }
+}
