@@ -97,7 +97,7 @@ fn what_is_packed_is_what_was_linked() {
         let mut packed = Packed::of(image);
         let (stored, ram) = (packed.stored().to_vec(), packed.ram.len());
         assert_eq!(packed.get(MAGIC), u32::from_le_bytes(*b"CBI1"));
-        assert_eq!([packed.get(SERVICES), packed.get(METHOD)], [1, 1]);
+        assert_eq!([packed.get(SERVICES), packed.get(METHOD)], [2, 1]);
         assert_eq!([packed.get(STORED), packed.get(UNPACKED)], [stored.len() as u32, ram as u32]);
         assert_eq!(packed.get(CRC), crc32(&packed.flash[packed.header + 8..]));
         // By somebody else's unpacker.
@@ -232,7 +232,7 @@ fn damages() -> Vec<(&'static str, Packed, u32)> {
         ("as many as there can be", damaged(&|image| image.set(STORED, !0)), BY_HEADER),
         ("more bytes than RAM", damaged(&|image| image.set(UNPACKED, ram - 4092)), BY_HEADER),
         ("packed told as raw", damaged(&|image| image.set(METHOD, 0)), BY_HEADER),
-        ("other services", damaged(&|image| image.set(SERVICES, 2)), BY_SERVICES),
+        ("other services", damaged(&|image| image.set(SERVICES, 3)), BY_SERVICES),
         ("a bit of the CRC", damaged(&|image| image.flash[image.header + 5] ^= 0x10), BY_CRC),
         ("no CRC", damaged(&|image| image.set(CRC, 0)), BY_CRC),
         ("one byte less", damaged(&|image| image.set(STORED, image.get(STORED) - 1)), BY_CRC),
