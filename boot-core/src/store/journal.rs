@@ -20,8 +20,6 @@ use crate::sequence::{EraseSectors, ProgramWords};
 const SLOT_WORDS: usize = 6;
 const SLOT_SIZE: u32 = SLOT_WORDS as u32 * 4;
 type Slot = [u32; SLOT_WORDS];
-/// Offset of the last word of a slot, the CRC over the others.
-const CHECK: u32 = SLOT_SIZE - 4;
 
 /// Tells a region's header ("CBNV" read as little-endian bytes).
 const HEADER_MAGIC: u32 = u32::from_le_bytes(*b"CBNV");
@@ -104,9 +102,10 @@ impl Journal {
         let [mut other, mut valid] = regions;
         let (mut header, mut newer, mut sequence) = (Header::Absent, false, 0);
         for region in regions {
-            let word = |index: u32| flash.read_word(region.base + 4 * index);
-            let (found, format) = (word(1), word(3));
-            if !is_sound(flash, region.base, HEADER_MAGIC) || word(2) != !found {
+            let Some([_, found, inverted, format, ..]) = sound_slot(flash, region.base, HEADER_MAGIC) else {
+                continue;
+            };
+            if inverted != !found {
                 continue;
             }
             if format > FORMAT {
@@ -126,14 +125,14 @@ impl Journal {
         Self { valid, other, header, newer, sequence, free, storing: Storing::default() }
     }
 
-    /// The latest sound record of a tag.
-    fn latest<F: Flash>(&self, flash: &F, tag: u32) -> Option<u32> {
+    /// The latest sound record of a tag, and where it is.
+    fn latest<F: Flash>(&self, flash: &F, tag: u32) -> Option<(u32, Slot)> {
         let first = first_slot(&self.valid);
         let mut at = self.free;
         while at > first {
             at -= SLOT_SIZE;
-            if is_sound(flash, at, tag) {
-                return Some(at);
+            if let Some(slot) = sound_slot(flash, at, tag) {
+                return Some((at, slot));
             }
         }
         None
@@ -142,9 +141,8 @@ impl Journal {
 
 impl Parameters for Journal {
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value> {
-        let at = self.latest(flash, key.tag())?;
-        let word = |index: u32| flash.read_word(at + 4 * index);
-        Some([word(1), word(2), word(3), word(4)])
+        let (_, [_, a, b, c, d, _]) = self.latest(flash, key.tag())?;
+        Some([a, b, c, d])
     }
 
     fn store(&mut self, key: Key, value: Value) {
@@ -239,9 +237,10 @@ impl Journal {
         while self.storing.from < self.free {
             let from = self.storing.from;
             self.storing.from += SLOT_SIZE;
-            let words = [0, 4, 8, 12, 16, CHECK].map(|offset| flash.read_word(from + offset));
-            if self.latest(flash, words[0]) == Some(from) {
-                return self.write(Step::Copy, self.storing.to, words);
+            let tag = flash.read_word(from);
+            match self.latest(flash, tag) {
+                Some((at, slot)) if at == from => return self.write(Step::Copy, self.storing.to, slot),
+                _ => {}
             }
         }
         let header = header_slot(self.sequence.wrapping_add(1));
@@ -288,9 +287,15 @@ impl Journal {
     }
 }
 
-/// Whether there is a sound record of this tag at an address.
-fn is_sound<F: Flash>(flash: &F, at: u32, tag: u32) -> bool {
-    flash.read_word(at) == tag && flash.crc32(0, Region::new(at, CHECK)) == flash.read_word(at + CHECK)
+/// The slot at an address, if it is a sound record of this tag. It is read once: what a power cut
+/// left between 0 and 1 may read otherwise the next time.
+fn sound_slot<F: Flash>(flash: &F, at: u32, tag: u32) -> Option<Slot> {
+    let mut found = [0; SLOT_WORDS];
+    for (word, address) in found.iter_mut().zip((at..).step_by(4)) {
+        *word = flash.read_word(address);
+    }
+    let [found_tag, a, b, c, d, _] = found;
+    (found_tag == tag && found == slot(tag, [a, b, c, d])).then_some(found)
 }
 
 const fn first_slot(region: &Region) -> u32 {
