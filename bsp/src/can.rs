@@ -197,9 +197,7 @@ impl<I: MasterInstance> Port<I> {
     /// there is room for one now.
     pub fn has_room(&mut self) -> bool {
         self.can.clear_tx_interrupt();
-        if let Some(frame) = self.waiting.take() {
-            self.put(frame);
-        }
+        self.put_waiting();
         self.boot_up &= !self.can.is_transmitter_idle();
         self.waiting.is_none() && !self.boot_up
     }
@@ -214,15 +212,16 @@ impl<I: MasterInstance> Port<I> {
             return;
         };
         self.boot_up = id.as_raw() & 0x780 == BOOT_UP && data[..] == [0];
-        self.put(bxcan::Frame::new_data(standard_id(id.as_raw()), data));
+        self.waiting = Some(bxcan::Frame::new_data(standard_id(id.as_raw()), data));
+        self.put_waiting();
     }
 
-    fn put(&mut self, frame: bxcan::Frame) {
-        self.waiting = match self.can.transmit(&frame) {
+    /// Moves the frame that waits, if any, into a mailbox if there is one for it.
+    fn put_waiting(&mut self) {
+        if let Some(Ok(status)) = self.waiting.as_ref().map(|frame| self.can.transmit(frame)) {
             // A frame of lower priority may have had to leave its mailbox: it goes next.
-            Ok(status) => status.dequeued_frame().cloned(),
-            Err(_) => Some(frame),
-        };
+            self.waiting = status.dequeued_frame().cloned();
+        }
     }
 
     /// Whether everything given to it is on the bus and acknowledged.
