@@ -53,6 +53,8 @@ fn resident(package: &Path, out: &Path) {
     for used in ["bootloader/src", "boot-core/src", "bsp/src", "canopen/src", "shared-abi/src", ".cargo"] {
         println!("cargo:rerun-if-changed={}", workspace.join(used).display());
     }
+    // The resident part is of the same product as the RAM part (bootloader/src/product.rs).
+    println!("cargo:rerun-if-env-changed=COBOOT_PRODUCT");
     let features = env::vars().filter_map(|(name, _)| {
         let feature = name.strip_prefix("CARGO_FEATURE_")?.to_lowercase().replace('_', "-");
         (feature != "default").then_some(feature)
