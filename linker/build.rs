@@ -29,6 +29,8 @@ fn main() {
     let package = PathBuf::from(env::var_os("CARGO_MANIFEST_DIR").expect("cargo sets it"));
     let templates = package.join("../linker");
     println!("cargo:rerun-if-changed={}", templates.display());
+    // The resident part is of the same product as the rest (bootloader/src/product.rs).
+    println!("cargo:rerun-if-env-changed=COBOOT_PRODUCT");
     println!("cargo:rustc-link-search={}", out.display());
     println!("cargo:rustc-link-search={}", templates.display());
     println!("cargo:rustc-link-arg-bins=-T{template}");
@@ -53,8 +55,6 @@ fn resident(package: &Path, out: &Path) {
     for used in ["bootloader/src", "boot-core/src", "bsp/src", "canopen/src", "shared-abi/src", ".cargo"] {
         println!("cargo:rerun-if-changed={}", workspace.join(used).display());
     }
-    // The resident part is of the same product as the RAM part (bootloader/src/product.rs).
-    println!("cargo:rerun-if-env-changed=COBOOT_PRODUCT");
     let features = env::vars().filter_map(|(name, _)| {
         let feature = name.strip_prefix("CARGO_FEATURE_")?.to_lowercase().replace('_', "-");
         (feature != "default").then_some(feature)

@@ -5,6 +5,7 @@ use std::cell::{Cell, RefCell};
 use std::rc::Rc;
 use std::time::Duration;
 
+use canopen::program::ProgramControl;
 use canopen::{Address, BitRate, NodeId};
 use coflash::adapter::{Adapter, AdapterError};
 use coflash::session::{Session, Timing};
@@ -16,6 +17,9 @@ use emulator::time::{Span, Time};
 use emulator::world::{MachineId, PortId, World};
 
 use crate::firmware;
+
+/// How long a program that was never confirmed is held back (`bootloader/src/product.rs`), in ms.
+pub const RESCUE_WINDOW_MS: u64 = 300;
 
 /// The node-ID and bit rate of a board that was never told others (bsp's board file).
 pub const NODE: u8 = 1;
@@ -184,6 +188,43 @@ impl Bench {
                 }
             }
         }
+    }
+
+    /// Runs until the program runs that starts by itself; gives the time of its boot-up. The boot-up
+    /// of a bootloader that holds it back for a rescue window comes before.
+    ///
+    /// # Panics
+    /// If the first boot-up takes more than `within_ms`.
+    pub fn await_program_of(&mut self, node: u8, within_ms: u64) -> Time {
+        let first = self.await_boot_up_of(node, within_ms);
+        let deadline = first + Span::from_millis(RESCUE_WINDOW_MS + 50);
+        while let Some((at, frame)) = self.world.run_until_frame_or(self.port, deadline) {
+            if frame.raw_id() == 0x700 + u32::from(node) && frame.data() == [0] {
+                return at;
+            }
+        }
+        first
+    }
+
+    /// The same for the board's own node-ID.
+    ///
+    /// # Panics
+    /// As [`await_program_of`](Self::await_program_of).
+    pub fn await_program(&mut self, within_ms: u64) -> Time {
+        self.await_program_of(NODE, within_ms)
+    }
+
+    /// Has the program that runs bring the device back to the bootloader, which confirms it, and
+    /// starts it again.
+    ///
+    /// # Panics
+    /// If it does not come back, or does not start.
+    pub fn confirm_program(&mut self) {
+        self.session().command(1, ProgramControl::StartBootloader).expect("it is answered");
+        self.await_boot_up(1000);
+        self.run_ms(20);
+        self.session().command(1, ProgramControl::Start).expect("it is answered");
+        self.await_boot_up(1000);
     }
 
     /// Every good frame that began at or after a point of time, as identifier and data.

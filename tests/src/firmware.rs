@@ -125,7 +125,7 @@ pub fn elf(name: &str) -> Vec<u8> {
     let path = dir().join(name);
     fs::read(&path).unwrap_or_else(|error| {
         panic!(
-            "{}: {error}. Build the firmware first: `cargo xtask build`, or run `cargo xtask test`.",
+            "{}: {error}. Build the firmware first: `cargo xtask build --all`, or run `cargo xtask test`.",
             path.display()
         )
     })

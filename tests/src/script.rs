@@ -24,9 +24,11 @@
 use std::collections::HashMap;
 use std::fs;
 use std::path::Path;
+use std::time::Duration;
 
 use canopen::sdo::wire::Request;
 use canopen::{AbortCode, Address};
+use coflash::adapter::Adapter;
 use coflash::session::{Doing, Session, Transfers};
 use emulator::time::{Span, Time};
 use shared_abi::layout::Layout;
@@ -83,6 +85,8 @@ impl Wire for Bench {
     }
 
     fn session_with(&mut self, node: u8) -> Session<'_> {
+        // What came was looked at on the bus; no session shall take it for an answer of its own.
+        while self.receive(Duration::ZERO).is_ok_and(|frame| frame.is_some()) {}
         self.session_with(node)
     }
 }

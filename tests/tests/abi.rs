@@ -113,7 +113,7 @@ fn the_layout_of_the_stm32f407_is_the_documented_one() {
 fn the_warm_start_cell_is_the_last_of_the_ram_and_in_no_image() {
     let layout = firmware::board();
     assert_eq!(layout.warm_start.end(), layout.chip.sram.end());
-    for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_LIFT, firmware::APP_V1, firmware::APP_V2] {
+    for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_PAULUS, firmware::APP_V1, firmware::APP_V2] {
         for (address, size) in memory_ranges(&firmware::elf(image)) {
             for cell in [layout.warm_start, layout.handoff] {
                 assert!(!Region::new(address, size).overlaps(&cell), "{image}: {address:#x}+{size:#x}");

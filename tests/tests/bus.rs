@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 
 use canopen::program::ProgramControl;
 use canopen::{Address, BitRate};
-use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::bench::{Bench, NODE, RESCUE_WINDOW_MS};
 use coboot_tests::firmware;
 use coflash::flash::{flash, Event, FlashOptions};
 use coflash::session::{Doing, Session};
@@ -111,7 +111,8 @@ fn three_devices_are_updated_one_after_the_other_and_one_of_them_had_no_node_id(
     bench.power_off();
     bench.run_ms(100);
     bench.power_on();
-    bench.run_ms(200);
+    // None of the programs was confirmed.
+    bench.run_ms(RESCUE_WINDOW_MS + 200);
     for (node, serial) in [2, 3, 4].into_iter().zip(serials) {
         assert_eq!(running(&mut bench, node), Some("application"), "node {node}");
         let mut session = bench.session_with(node);

@@ -90,7 +90,7 @@ fn power_cycle(bench: &mut Bench) {
     bench.power_off();
     bench.run_ms(100);
     bench.power_on();
-    bench.await_boot_up(1000);
+    bench.await_program(1000);
     bench.events();
 }
 
@@ -505,7 +505,7 @@ fn a_node_id_that_it_stores_is_in_force_from_the_next_reset_on() {
     bench.run_ms(100);
     bench.set_host_bit_rate(500_000);
     bench.power_on();
-    bench.await_boot_up_of(42, 1000);
+    bench.await_program_of(42, 1000);
     assert!(!bench.is_bootloader(42));
     bench.session_with(42).command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up_of(42, 1000);

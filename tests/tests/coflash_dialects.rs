@@ -49,7 +49,7 @@ fn power_cycle(bench: &mut Bench, node: u8) {
     bench.power_off();
     bench.run_ms(100);
     bench.power_on();
-    bench.await_boot_up_of(node, 1000);
+    bench.await_program_of(node, 1000);
 }
 
 #[test]

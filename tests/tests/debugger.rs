@@ -55,6 +55,7 @@ fn application() -> Bench {
     bench.await_boot_up(100);
     let file = firmware::blocks(firmware::APP_DEBUGGER);
     flash(&mut bench.session(), &file, &FlashOptions::default(), &mut |_| {}).unwrap();
+    bench.confirm_program();
     bench.events();
     bench
 }

@@ -169,7 +169,7 @@ fn a_transfer_that_breaks_off_does_not_block_the_next_one() {
 #[test]
 fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
     let mut untouched = 0;
-    for after_ms in [5, 10, 30, 60, 200, 400, 600, 800, 1200, 1800, 2300] {
+    for after_ms in [5, 10, 30, 60, 200, 400, 600, 800, 1200, 1800, 2200] {
         let mut bench = running_board();
         call_back(&mut bench);
         let file = firmware::blocks(firmware::APP_V2);
@@ -189,7 +189,7 @@ fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
         bench.power_off();
         bench.run_ms(100);
         bench.power_on();
-        bench.await_boot_up(1000);
+        bench.await_program(1000);
         if !bench.session().device_type().unwrap().unwrap().is_bootloader() {
             assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0", "cut at {after_ms} ms");
             untouched += 1;
@@ -311,7 +311,7 @@ fn the_entry_strap_holds_the_device_in_the_bootloader() {
     bench.machine().set_pin(port, pin, Some(!pressed));
     bench.power_off();
     bench.power_on();
-    bench.await_boot_up(1000);
+    bench.await_program(1000);
     assert!(!bench.session().device_type().unwrap().unwrap().is_bootloader());
 }
 
@@ -348,7 +348,7 @@ fn noise_in_the_ram_is_no_request() {
         let mut bench = Bench::with(Options { seed, ..Options::default() });
         bench.machine().load_bin(firmware::board().chip.flash.base, &flash_image).unwrap();
         bench.power_on();
-        bench.await_boot_up(1000);
+        bench.await_program(1000);
         let running = bench.session().device_type().unwrap().unwrap();
         assert!(!running.is_bootloader(), "seed {seed}: the program starts as after any power-on");
     }

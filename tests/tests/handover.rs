@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use canopen::program::ProgramControl;
 use canopen::Address;
-use coboot_tests::bench::Bench;
+use coboot_tests::bench::{Bench, RESCUE_WINDOW_MS};
 use coboot_tests::firmware;
 use coflash::convert::{blocks_of, Options};
 use coflash::flash::{flash, FlashOptions};
@@ -125,7 +125,7 @@ fn the_application_finds_the_chip_as_after_a_reset() {
     let options = FlashOptions { start: false, ..FlashOptions::default() };
     flash(&mut bench.session(), &blocks, &options, &mut |_| {}).unwrap();
     bench.machine().reset_pin();
-    bench.run_ms(100);
+    bench.run_ms(RESCUE_WINDOW_MS + 100);
     assert_eq!(bench.machine().pc(), first, "it was started");
     let found = registers(&mut bench);
     let mut reset = after_a_reset(&mut bench);

@@ -190,6 +190,7 @@ fn board_with_a_program() -> Bench {
     bench.await_boot_up(100);
     flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
         .unwrap();
+    bench.confirm_program();
     bench.power_off();
     bench
 }
@@ -475,7 +476,6 @@ fn no_stream_writes_outside_the_image() {
             assert_eq!(damage, Some((DAMAGED, BY_STREAM)), "round {round}");
             assert!(found == pattern, "round {round} has written behind the image");
             refused += 1;
-        } else {
         }
         // Else it was a bit of a literal: the stream is whole, and another image runs.
         bench.power_off();

@@ -147,7 +147,7 @@ fn a_release_has_nothing_of_it() {
     assert_eq!(has(firmware::BOOTLOADER_LOG_RTT), (true, false, true));
     assert_eq!(has(firmware::BOOTLOADER_LOG_UART), (false, false, true));
     assert_eq!(has(firmware::BOOTLOADER_LOG_DEFMT), (true, true, true));
-    for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_LIFT, firmware::BOOTLOADER_LEAST] {
+    for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_PAULUS, firmware::BOOTLOADER_LEAST] {
         assert_eq!(has(image), (false, false, false), "{image}");
         let mut bench = Bench::of_image(image);
         bench.power_on();

@@ -51,7 +51,7 @@ fn the_main_job() {
     bench.power_off();
     bench.run_ms(500);
     bench.power_on();
-    bench.await_boot_up(1000);
+    bench.await_program(1000);
     assert_eq!(bench.session().read_text(Address::new(0x100A, 0)).unwrap(), "2.0.0");
     bench.assert_nothing_unmodelled();
 }

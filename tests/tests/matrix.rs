@@ -76,14 +76,6 @@ fn play(wire: &mut dyn Wire, dialect: &Dialect, application: &str, image: &dyn F
         session.await_idle(1, Doing::Block(0)).unwrap();
         session.command(1, ProgramControl::ResetStat).unwrap();
         wire.run_ms(500);
-        // It has brought the device back once, so that it starts at once from then on.
-        let mut session = wire.session_with(NODE);
-        write(&mut session, 0x6005, 1, shared_abi::LIFT_PASSWORD);
-        session.command(1, ProgramControl::ResetStat).unwrap();
-        wire.run_ms(500);
-        let mut session = wire.session_with(LIFT.node);
-        session.command(1, ProgramControl::ResetStat).unwrap();
-        wire.run_ms(500);
     }
     play_on(wire, dialect.session, &LAYOUT, image);
 }

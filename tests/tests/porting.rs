@@ -144,7 +144,7 @@ fn a_board_is_made_as_the_guide_says() {
     let app_c = images.join("app-c.elf");
     // Of an earlier run.
     let _ = fs::remove_file(&app_c);
-    copy.succeed(&["run", "-q", "-p", "xtask", "--", "build", "--board", "my-board"]);
+    copy.succeed(&["run", "-q", "-p", "xtask", "--", "build", "--all", "--board", "my-board"]);
     assert!(app_c.exists(), "no application in C");
     // The main job, in the emulator: on a chip and a map that are those of another board.
     let mut demo = Command::new(env!("CARGO_BIN_EXE_demo"));

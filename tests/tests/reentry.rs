@@ -40,7 +40,7 @@ fn power_cycle(bench: &mut Bench) {
     bench.power_off();
     bench.run_ms(100);
     bench.power_on();
-    bench.await_boot_up(1000);
+    bench.await_program(1000);
     bench.events();
 }
 

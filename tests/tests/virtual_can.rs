@@ -170,7 +170,8 @@ fn never_silent_during_an_erase() {
     session_.command(1, ProgramControl::Clear).unwrap();
     drop(adapter);
     // The adapter has closed the channel as it went.
-    assert_eq!(ask(&mut bench, b"O\r", 10), "\r\r");
+    // A heartbeat may fall into these 10 ms.
+    assert_eq!(ask(&mut bench, b"O\r", 10).replace("t70117F\r", ""), "\r\r");
     let answers = (0..100).filter(|_| is_answered(&mut bench)).count();
     assert_eq!(answers, 100);
     assert!(
@@ -221,7 +222,7 @@ fn python_canopen_flashes_the_device_through_its_serial_port() {
 fn a_release_has_nothing_of_it() {
     let has = |image| firmware::elf(image).windows(5).any(|part| part == b"V1013");
     assert!(has(firmware::BOOTLOADER_VIRTUAL_CAN) && has(firmware::APP_VIRTUAL_CAN));
-    for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_LIFT, firmware::APP_V1] {
+    for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_PAULUS, firmware::APP_V1] {
         assert!(!has(image), "{image}");
     }
 }

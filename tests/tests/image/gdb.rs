@@ -101,7 +101,8 @@ impl Stub {
             }
         }
         // The checksum: the line is a good one.
-        (self.byte()?, self.byte()?);
+        self.byte()?;
+        self.byte()?;
         Some(packet)
     }
 
@@ -131,11 +132,9 @@ impl Stub {
             self.memory.retain(|at, _| *at < address || *at >= address + size);
             return "OK".into();
         }
-        if text.starts_with("vFlashWrite:") {
+        if let Some(rest) = text.strip_prefix("vFlashWrite:") {
             let data = packet.splitn(3, |byte| *byte == b':').nth(2).unwrap_or_default();
-            let Some(address) = numbers(&text["vFlashWrite:".len()..]).first().copied() else {
-                return "E01".into();
-            };
+            let Some(address) = numbers(rest).first().copied() else { return "E01".into() };
             self.memory.extend((address..).zip(data.iter().copied()));
             return "OK".into();
         }
