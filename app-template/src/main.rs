@@ -182,7 +182,7 @@ mod app {
                 Output::Join(rate) => configure(can, rate, Mode::Normal),
                 Output::Listen(rate) => configure(can, rate, Mode::Silent),
                 Output::RecoverFromBusOff => can.lock(|can| can.recover_from_bus_off()),
-                Output::Accept(ids) => can.lock(|can| can.accept(ids.into_iter().map(CobId::get))),
+                Output::Accept(ids) => can.lock(|can| can.accept(ids.map(CobId::get))),
             }
         }
     }

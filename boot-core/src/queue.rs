@@ -71,16 +71,20 @@ impl<'b> Queue<'b> {
         true
     }
 
-    /// The first bytes of the open piece, and its address; `None` while there are not as many.
-    pub(crate) fn open_start<const N: usize>(&self, offset: usize) -> Option<(u32, [u8; N])> {
-        if self.open_size() < offset + N {
-            return None;
+    /// Copies bytes of the open piece; whether there are as many.
+    pub(crate) fn read_open(&self, offset: usize, bytes: &mut [u8]) -> bool {
+        if self.open_size() < offset + bytes.len() {
+            return false;
         }
-        let mut bytes = [0; N];
         for (i, byte) in bytes.iter_mut().enumerate() {
             *byte = self.byte(self.queued + PIECE_HEADER + offset + i);
         }
-        Some((self.word(self.queued), bytes))
+        true
+    }
+
+    /// Where the open piece goes.
+    pub(crate) fn open_address(&self) -> u32 {
+        self.word(self.queued)
     }
 
     /// The open piece is good: it joins the queue.
@@ -162,8 +166,10 @@ mod tests {
             assert!(queue.push(address, &[round; 3]));
             assert!(queue.push(0, &[round, 99, round]), "the address is that of the first bytes");
             assert_eq!(queue.open_size(), 6);
-            assert_eq!(queue.open_start::<2>(3), Some((address, [round, 99])));
-            assert_eq!(queue.open_start::<2>(5), None, "there are 6");
+            let mut bytes = [0; 2];
+            assert!(queue.read_open(3, &mut bytes));
+            assert_eq!((queue.open_address(), bytes), (address, [round, 99]));
+            assert!(!queue.read_open(5, &mut bytes), "there are 6");
             assert!(queue.is_empty(), "not before it is judged");
             assert_eq!(queue.first(), None);
             queue.commit();

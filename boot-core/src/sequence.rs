@@ -6,7 +6,7 @@ use shared_abi::geometry::Region;
 use crate::flash::{Flash, FlashFault, Operation};
 
 /// Words being programmed one after the other, each read back.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ProgramWords {
     address: u32,
     written: usize,
@@ -45,7 +45,7 @@ impl ProgramWords {
 }
 
 /// Whole sectors being erased one after the other.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct EraseSectors {
     next: u32,
     end: u32,

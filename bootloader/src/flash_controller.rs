@@ -22,7 +22,6 @@ pub const FLASH: Region = LAYOUT.chip.flash;
 /// operation runs.
 pub struct FlashController {
     registers: pac::FLASH,
-    running: bool,
 }
 
 #[allow(dead_code, reason = "each of the two programs uses some of it")]
@@ -37,7 +36,7 @@ impl FlashController {
     /// Nobody else may use it until this is dropped.
     pub unsafe fn steal() -> Self {
         // SAFETY: the caller vouches for it.
-        Self { registers: unsafe { pac::FLASH::steal() }, running: false }
+        Self { registers: unsafe { pac::FLASH::steal() } }
     }
 
     /// Whether an operation runs.
@@ -53,17 +52,23 @@ impl FlashController {
     /// Copies bytes; addresses outside the flash read FFh.
     pub fn read(&self, address: u32, buffer: &mut [u8]) {
         for (byte, address) in buffer.iter_mut().zip(address..) {
-            *byte = if FLASH.contains(address, 1) {
-                // SAFETY: the address is inside the memory-mapped flash, which is always readable;
-                // volatile, because the controller changes it behind the compiler's back.
-                unsafe { (address as *const u8).read_volatile() }
-            } else {
-                u8::MAX
-            };
+            *byte = self.read_byte(address);
+        }
+    }
+
+    /// The byte at an address, FFh outside the flash.
+    pub fn read_byte(&self, address: u32) -> u8 {
+        if FLASH.contains(address, 1) {
+            // SAFETY: the address is inside the memory-mapped flash, which is always readable;
+            // volatile, because the controller changes it behind the compiler's back.
+            unsafe { (address as *const u8).read_volatile() }
+        } else {
+            u8::MAX
         }
     }
 
     /// The word at a word-aligned address, FFFFFFFFh elsewhere.
+    #[inline(never)]
     pub fn read_word(&self, address: u32) -> u32 {
         if FLASH.contains(address, 4) && address.is_multiple_of(4) {
             // SAFETY: as above, and aligned.
@@ -99,20 +104,15 @@ impl FlashController {
                 unsafe { (address as *mut u32).write_volatile(word) };
             }
         }
-        self.running = true;
         Ok(())
     }
 
-    /// The outcome of the running operation, `Ready(Ok(()))` when none runs.
+    /// The outcome of the operation that was started last; to be asked for once.
     pub fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
-        if !self.running {
-            return Poll::Ready(Ok(()));
-        }
         let status = self.registers.sr().read();
         if status.bsy().bit_is_set() {
             return Poll::Pending;
         }
-        self.running = false;
         self.clear_flags();
         self.registers.cr().write(|w| w.lock().set_bit());
         Poll::Ready(if status.wrperr().bit_is_set() {

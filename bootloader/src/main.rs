@@ -71,6 +71,7 @@ mod app {
     use crate::debugger::{self, Debugger};
     use crate::log::{self, log};
     use crate::product::PRODUCT;
+    use crate::services::{StoreState, STORE_STATE_WORDS};
     use crate::storage::{BootFlash, Store};
     use crate::watchdog::{self, Task, Watchdog};
     use rtic_monotonics::fugit::ExtU32;
@@ -135,7 +136,7 @@ mod app {
         at: Option<Instant>,
     }
 
-    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer]])]
+    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer], store: StoreState = StoreState([0; STORE_STATE_WORDS])])]
     fn init(cx: init::Context) -> (Shared, Local) {
         CLOCK_TREE.speed_up(&cx.device.RCC, Source::Crystal);
         // SAFETY: the device's own are not used beside it.
@@ -145,7 +146,7 @@ mod app {
         log::uart::open(board.uart);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
-        let parameters = Store::open();
+        let parameters = Store::open(cx.local.store);
         let report = start::boot_report();
         let node = product::node_parameters(&parameters, &flash);
         let slave_config = slave::Config {
@@ -252,7 +253,7 @@ mod app {
             return;
         }
         let status = can.lock(status);
-        bootloader.lock(|bootloader| {
+        let finishing = bootloader.lock(|bootloader| {
             bootloader.set_time(now);
             let device = debugger.attach(bootloader);
             #[cfg(feature = "debugger")]
@@ -276,6 +277,7 @@ mod app {
             if let Some(request) = bootloader.take_boot_request() {
                 *pending_reset = PendingReset { wanted: true, request, at: None };
             }
+            bootloader.is_finishing()
         });
         if let Some((program, window_ms)) = *held {
             if now.has_reached(Instant::from_millis(window_ms.into())) {
@@ -286,8 +288,7 @@ mod app {
             }
         }
         // What a host was told is done is not lost by a reset that comes too early.
-        let finishing = bootloader.lock(|bootloader| bootloader.is_finishing());
-        if pending_reset.wanted && !finishing && slave.is_idle() && can.lock(|can| can.is_idle()) {
+        if pending_reset.wanted && !finishing && slave.is_idle() && can.lock(CanPort::is_idle) {
             pending_reset.at = Some(now + PRODUCT.answer_to_reset_ms);
             log!("leaving; request", WarmStart::new(pending_reset.request).request);
         }
@@ -300,24 +301,26 @@ mod app {
         now: Instant,
         device: &mut impl SlaveDevice,
     ) {
-        while let Some(output) = slave.poll(now, can.lock(|can| can.has_room()), device) {
-            match output {
-                Output::Send(frame) => {
-                    log::sent(&frame);
-                    can.lock(|can| can.send(&frame));
-                }
+        loop {
+            let room = can.lock(CanPort::has_room);
+            let Some(output) = slave.poll(now, room, device) else { return };
+            if let Output::Send(frame) = &output {
+                log::sent(frame);
+            }
+            can.lock(|can| match output {
+                Output::Send(frame) => can.send(&frame),
                 Output::Join(rate) => configure(can, rate, Mode::Normal),
                 Output::Listen(rate) => configure(can, rate, Mode::Silent),
-                Output::RecoverFromBusOff => can.lock(|can| can.recover_from_bus_off()),
-                Output::Accept(ids) => can.lock(|can| can.accept(ids.into_iter().map(CobId::get))),
-            }
+                Output::RecoverFromBusOff => can.recover_from_bus_off(),
+                Output::Accept(ids) => can.accept(ids.map(CobId::get)),
+            });
         }
     }
 
-    fn configure(can: &mut impl Mutex<T = CanPort>, rate: BitRate, mode: Mode) {
+    fn configure(can: &mut CanPort, rate: BitRate, mode: Mode) {
         // Another rate is asked for by nobody: `product::supports` says so.
         if let Some(Some(timing)) = product::TIMINGS.get(rate as usize) {
-            can.lock(|can| can.configure(*timing, mode));
+            can.configure(*timing, mode);
         }
     }
 

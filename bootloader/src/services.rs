@@ -9,7 +9,7 @@
 //! of another version.
 
 use boot_core::flash::{FlashFault, Operation};
-use boot_core::store::Value;
+use boot_core::store::{Key, Value};
 use shared_abi::callgate::TABLE_SIZE;
 use shared_abi::geometry::Sector;
 
@@ -27,10 +27,10 @@ pub struct Services {
     pub size: u32,
     /// Finds what is stored.
     pub open: unsafe extern "C" fn(*mut StoreState),
-    /// The value of a key, told by its tag; whether there is one.
-    pub get: unsafe extern "C" fn(*const StoreState, u32, *mut Value) -> bool,
+    /// The value of a key; whether there is one.
+    pub get: unsafe extern "C" fn(*const StoreState, Key, *mut Value) -> bool,
     /// Begins to store a value.
-    pub store: unsafe extern "C" fn(*mut StoreState, u32, *const Value),
+    pub store: unsafe extern "C" fn(*mut StoreState, Key, *const Value),
     /// Goes on with it, told how the operation before ended ([`outcome_code`]).
     pub next: unsafe extern "C" fn(*mut StoreState, u32, *mut Operation) -> StoreStep,
     /// CRC-32 over a region of the flash, behind data whose CRC is the first argument.
@@ -71,6 +71,7 @@ const _: () = {
     assert!(offset_of!(Services, open) == 8);
     assert!(size_of::<StoreState>() == 4 * STORE_STATE_WORDS);
     assert!(size_of::<Sector>() == 12 && size_of::<Operation>() == 16);
+    assert!(size_of::<Key>() == 2);
     assert!(size_of::<Value>() == 16 && size_of::<StoreStep>() == 4);
 };
 

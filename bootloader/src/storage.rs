@@ -10,7 +10,7 @@ use bsp::LAYOUT;
 use shared_abi::geometry::{Region, Sector};
 
 use crate::flash_controller::FlashController;
-use crate::services::{outcome_code, Services, StoreState, StoreStep, OFFSET, STORE_STATE_WORDS};
+use crate::services::{outcome_code, Services, StoreState, StoreStep, OFFSET};
 
 /// The resident part's services.
 fn services() -> &'static Services {
@@ -48,6 +48,8 @@ impl Flash for BootFlash {
         self.0.read(address, buffer);
     }
 
+    // Asked for in many places, and checked each time.
+    #[inline(never)]
     fn read_word(&self, address: u32) -> u32 {
         self.0.read_word(address)
     }
@@ -78,15 +80,14 @@ impl Flash for BootFlash {
 }
 
 /// What is stored.
-pub struct Store(StoreState);
+pub struct Store(&'static mut StoreState);
 
 impl Store {
     /// Finds what is stored. The flash must be idle.
-    pub fn open() -> Self {
-        let mut store = Self(StoreState([0; STORE_STATE_WORDS]));
+    pub fn open(state: &'static mut StoreState) -> Self {
         // SAFETY: the state is ours alone.
-        unsafe { (services().open)(&mut store.0) };
-        store
+        unsafe { (services().open)(state) };
+        Self(state)
     }
 }
 
@@ -94,12 +95,12 @@ impl Parameters for Store {
     fn get<F: Flash>(&self, _flash: &F, key: Key) -> Option<Value> {
         let mut value = [0; 4];
         // SAFETY: the state comes from `open`.
-        unsafe { (services().get)(&self.0, key.tag(), &mut value).then_some(value) }
+        unsafe { (services().get)(&*self.0, key, &mut value).then_some(value) }
     }
 
     fn store(&mut self, key: Key, value: Value) {
         // SAFETY: the state comes from `open`.
-        unsafe { (services().store)(&mut self.0, key.tag(), &value) };
+        unsafe { (services().store)(&mut *self.0, key, &value) };
     }
 
     fn next<F: Flash>(&mut self, _flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
@@ -107,7 +108,7 @@ impl Parameters for Store {
         // SAFETY: the state comes from `open`; the service writes the operation where it says that
         // there is one.
         unsafe {
-            match (services().next)(&mut self.0, outcome_code(outcome), operation.as_mut_ptr()) {
+            match (services().next)(&mut *self.0, outcome_code(outcome), operation.as_mut_ptr()) {
                 StoreStep::Start => Next::Start(operation.assume_init()),
                 StoreStep::Again => Next::Again,
                 StoreStep::Done => Next::Done(Ok(())),

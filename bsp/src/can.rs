@@ -2,7 +2,7 @@
 //! controller (RM0090 section 32).
 
 use bxcan::filter::ListEntry16;
-use bxcan::{Can, Fifo, Interrupts, Mailbox, MasterInstance, OverrunError, StandardId};
+use bxcan::{Can, Data, Fifo, Interrupts, MasterInstance, OverrunError, StandardId};
 use embedded_can::Frame;
 
 /// A bit timing that bxCAN can be set to (RM0090 section 32.7.7).
@@ -92,12 +92,15 @@ pub struct Errors {
 /// Offsets of registers that `bxcan` keeps to itself, in bytes (RM0090 section 32.9.5).
 const MCR: usize = 0x00;
 const MSR: usize = 0x04;
+const TSR: usize = 0x08;
 const RF0R: usize = 0x0C;
 const ESR: usize = 0x18;
 /// `CAN_MCR`: bus-off is left without being told to.
 const ABOM: u32 = 1 << 6;
 /// `CAN_MSR`: initialisation and sleep mode are left with the first 11 recessive bits.
 const INAK_SLAK: u32 = 0b11;
+/// `CAN_TSR`: whether the frames of the three mailboxes are to be dropped; set until they are.
+const ABRQ: u32 = 1 << 7 | 1 << 15 | 1 << 23;
 /// `CAN_RF0R`: a frame was lost because the FIFO was full; written with 1, it is cleared.
 const FOVR0: u32 = 1 << 4;
 const EPVF: u32 = 1 << 1;
@@ -114,13 +117,8 @@ pub struct Port<I: MasterInstance> {
     lost: Lost,
 }
 
-/// Whether this is what a node says first (CiA 301 section 7.2.8.3.3): a state of 0 on 700h +
-/// node-ID.
-fn is_boot_up(frame: &bxcan::Frame) -> bool {
-    let boot_up = |data: &bxcan::Data| data[..] == [0];
-    matches!(frame.id(), bxcan::Id::Standard(id) if id.as_raw() & 0x780 == 0x700)
-        && frame.data().is_some_and(boot_up)
-}
+/// What a node says first is a state of 0 on this and its node-ID (CiA 301 section 7.2.8.3.3).
+const BOOT_UP: u16 = 0x700;
 
 /// Where frames were lost.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -150,9 +148,8 @@ impl<I: MasterInstance> Port<I> {
         // Only now: while a frame is under way that nobody acknowledges, an abort would wait for
         // it.
         self.waiting = None;
-        for mailbox in [Mailbox::Mailbox0, Mailbox::Mailbox1, Mailbox::Mailbox2] {
-            self.can.abort(mailbox);
-        }
+        self.write(TSR, ABRQ);
+        while self.read(TSR) & ABRQ != 0 {}
         self.join();
     }
 
@@ -171,25 +168,19 @@ impl<I: MasterInstance> Port<I> {
 
     /// Sets the acceptance filters to exactly these identifiers (data frames, 11 bits), all into
     /// FIFO 0.
-    pub fn accept(&mut self, identifiers: impl Iterator<Item = u16>) {
-        let mut identifiers = identifiers.map(standard_id).peekable();
+    pub fn accept(&mut self, [a, b, c]: [u16; 3]) {
         let mut filters = self.can.modify_filters();
         filters.clear();
-        let mut bank = 0;
-        while let Some(&first) = identifiers.peek() {
-            // A bank lists four identifiers; a shorter row repeats its first one.
-            let row = [(); 4].map(|()| ListEntry16::data_frames_with_id(identifiers.next().unwrap_or(first)));
-            filters.enable_bank(bank, Fifo::Fifo0, row);
-            bank += 1;
-        }
+        // A bank lists four identifiers; one may stand there twice.
+        let bank = [a, b, c, c].map(|id| ListEntry16::data_frames_with_id(standard_id(id)));
+        filters.enable_bank(0, Fifo::Fifo0, bank);
     }
 
     /// The next frame from the FIFO, `None` when it is empty.
     pub fn receive<F: Frame>(&mut self) -> Option<F> {
         loop {
             match self.can.rx0().receive() {
-                // The filters let no remote frame in.
-                Ok(frame) => return convert(&frame),
+                Ok(frame) => return received(&frame),
                 Err(nb::Error::WouldBlock) => return None,
                 // The frames that are there are still good.
                 Err(nb::Error::Other(OverrunError { .. })) => self.lost.in_controller = true,
@@ -213,16 +204,17 @@ impl<I: MasterInstance> Port<I> {
         self.waiting.is_none() && !self.boot_up
     }
 
-    /// Sends a data frame. To be called only when there is room; a frame that still waits would be
+    /// Sends a data frame with an identifier of 11 bits. To be called only when there is room; a frame that still waits would be
     /// lost.
     ///
     /// Frames of one identifier leave in order: the mailboxes take the second only when the first
     /// is on its way.
     pub fn send<F: Frame>(&mut self, frame: &F) {
-        if let Some(frame) = convert(frame) {
-            self.boot_up = is_boot_up(&frame);
-            self.put(frame);
-        }
+        let (embedded_can::Id::Standard(id), Some(data)) = (frame.id(), Data::new(frame.data())) else {
+            return;
+        };
+        self.boot_up = id.as_raw() & 0x780 == BOOT_UP && data[..] == [0];
+        self.put(bxcan::Frame::new_data(standard_id(id.as_raw()), data));
     }
 
     fn put(&mut self, frame: bxcan::Frame) {
@@ -275,13 +267,14 @@ impl<I: MasterInstance> Port<I> {
     }
 }
 
+/// A frame from the FIFO in another crate's type. The filters let in data frames with identifiers of
+/// 11 bits alone.
+fn received<F: Frame>(frame: &bxcan::Frame) -> Option<F> {
+    let bxcan::Id::Standard(id) = frame.id() else { return None };
+    F::new(embedded_can::StandardId::new(id.as_raw())?, frame.data()?)
+}
+
 /// The identifier of this value; only its 11 bits count.
 fn standard_id(raw: u16) -> StandardId {
     StandardId::new(raw & 0x7FF).unwrap_or(StandardId::MAX)
-}
-
-/// The same data frame in another crate's type. Both ends are checked types, so the conversion
-/// cannot fail.
-fn convert<F: Frame, G: Frame>(frame: &F) -> Option<G> {
-    G::new(frame.id(), frame.data())
 }

@@ -18,14 +18,12 @@ static RECEIVED: Inbox<256> = Inbox::new();
 static TO_SEND: Ring<512> = Ring::new();
 /// What answers leave free for frames: a host that asks and asks cannot silence the device.
 const FOR_FRAMES: usize = 4 * FRAME_TEXT;
-/// Identifiers that a slave wants to hear.
-const ACCEPTED: usize = 4;
 
 /// The UART, and the adapter on it.
 pub struct Port {
     uart: uart::Port<UartController>,
     slcan: Slcan,
-    accepted: [Option<u16>; ACCEPTED],
+    accepted: Option<[u16; 3]>,
     lost: Lost,
     /// A good frame came since the question before.
     heard: bool,
@@ -37,7 +35,7 @@ impl Port {
         let mut port = Self {
             uart,
             slcan: Slcan::new(crate::serial_number() as u16),
-            accepted: [None; ACCEPTED],
+            accepted: None,
             lost: Lost::default(),
             heard: false,
         };
@@ -53,11 +51,8 @@ impl Port {
     pub fn recover_from_bus_off(&mut self) {}
 
     /// Sets the identifiers (data frames, 11 bits) that are taken.
-    pub fn accept(&mut self, identifiers: impl Iterator<Item = u16>) {
-        self.accepted = [None; ACCEPTED];
-        for (place, identifier) in self.accepted.iter_mut().zip(identifiers) {
-            *place = Some(identifier);
-        }
+    pub fn accept(&mut self, identifiers: [u16; 3]) {
+        self.accepted = Some(identifiers);
     }
 
     /// The next frame that is for this device, `None` when there is none.
@@ -71,8 +66,10 @@ impl Port {
             }
             let frame = frame.inspect(|_| self.heard = true);
             let accepted = frame.filter(|frame| match frame.id() {
-                Id::Standard(id) => !frame.is_remote_frame() && self.accepted.contains(&Some(id.as_raw())),
-                Id::Extended(_) => false,
+                Id::Standard(id) if !frame.is_remote_frame() => {
+                    self.accepted.is_some_and(|accepted| accepted.contains(&id.as_raw()))
+                }
+                _ => false,
             });
             if accepted.is_some() {
                 return accepted;

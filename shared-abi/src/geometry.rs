@@ -233,12 +233,21 @@ impl Geometry {
     /// The sector that holds `address`, if it is in flash.
     #[must_use]
     pub const fn sector_at(&self, address: u32) -> Option<Sector> {
-        let mut number = 0;
-        while let Some(sector) = self.sector(number) {
-            if sector.region.contains(address, 1) {
-                return Some(sector);
+        let (mut number, mut base) = (0, self.flash.base);
+        let mut run = 0;
+        while run < self.sectors.len() {
+            let SectorRun { count, size } = self.sectors[run];
+            let mut left = count;
+            while left > 0 {
+                let region = Region::new(base, size);
+                if region.contains(address, 1) {
+                    return Some(Sector { number, region });
+                }
+                base += size;
+                number += 1;
+                left -= 1;
             }
-            number += 1;
+            run += 1;
         }
         None
     }

@@ -58,30 +58,25 @@ impl ResetCause {
     /// telling flag wins.
     #[must_use]
     pub const fn from_rcc_csr(csr: u32) -> Self {
-        const LPWRRSTF: u32 = 1 << 31;
-        const WWDGRSTF: u32 = 1 << 30;
-        const IWDGRSTF: u32 = 1 << 29;
-        const SFTRSTF: u32 = 1 << 28;
-        const PORRSTF: u32 = 1 << 27;
-        const PINRSTF: u32 = 1 << 26;
-        const BORRSTF: u32 = 1 << 25;
-        if csr & PORRSTF != 0 {
-            Self::PowerOn
-        } else if csr & BORRSTF != 0 {
-            Self::BrownOut
-        } else if csr & IWDGRSTF != 0 {
-            Self::IndependentWatchdog
-        } else if csr & WWDGRSTF != 0 {
-            Self::WindowWatchdog
-        } else if csr & LPWRRSTF != 0 {
-            Self::LowPower
-        } else if csr & SFTRSTF != 0 {
-            Self::Software
-        } else if csr & PINRSTF != 0 {
-            Self::Pin
-        } else {
-            Self::Unknown
+        /// By bit, the most telling one first.
+        const FLAGS: [(u8, ResetCause); 7] = [
+            (27, ResetCause::PowerOn),             // PORRSTF
+            (25, ResetCause::BrownOut),            // BORRSTF
+            (29, ResetCause::IndependentWatchdog), // IWDGRSTF
+            (30, ResetCause::WindowWatchdog),      // WWDGRSTF
+            (31, ResetCause::LowPower),            // LPWRRSTF
+            (28, ResetCause::Software),            // SFTRSTF
+            (26, ResetCause::Pin),                 // PINRSTF
+        ];
+        let mut i = 0;
+        while i < FLAGS.len() {
+            let (bit, cause) = FLAGS[i];
+            if csr >> bit & 1 != 0 {
+                return cause;
+            }
+            i += 1;
         }
+        Self::Unknown
     }
 }
 
@@ -138,32 +133,27 @@ impl Handoff {
     /// The record that tells this.
     #[must_use]
     pub const fn new(info: &BootInfo) -> Self {
-        let mut handoff = Self {
-            magic: MAGIC,
-            version: VERSION,
-            length: size_of::<Self>() as u16,
-            node_id: info.node_id,
-            program: info.program,
-            reset_cause: info.reset_cause as u8,
-            trial: info.trial as u8,
-            bit_rate: info.bit_rate,
-            bootloader_version: info.bootloader_version,
-            serial_number: info.serial_number,
-            reserved: [0; 5],
-            check: 0,
-        };
-        handoff.check = handoff.expected_check();
-        handoff
+        let mut words = [0; WORDS];
+        words[0] = MAGIC;
+        words[1] = VERSION as u32 | (size_of::<Self>() as u32) << 16;
+        words[2] = u32::from_le_bytes([info.node_id, info.program, info.reset_cause as u8, info.trial as u8]);
+        words[3] = info.bit_rate;
+        words[4] = info.bootloader_version;
+        words[5] = info.serial_number;
+        words[WORDS - 1] = check_of(&words);
+        // SAFETY: both are 48 bytes, and any bits make a `Handoff`.
+        unsafe { core::mem::transmute(words) }
     }
 
     /// What it tells, or `None` where no bootloader left a sound one (a debugger started the
     /// application, say).
     #[must_use]
     pub fn info(&self) -> Option<BootInfo> {
-        let sound = self.magic == MAGIC
+        // SAFETY: both are 48 bytes, and any bits make words.
+        let words = unsafe { core::mem::transmute::<Self, [u32; WORDS]>(*self) };
+        let sound = is_sound(&words)
             && self.version >= VERSION
             && usize::from(self.length) == size_of::<Self>()
-            && self.check == self.expected_check()
             && matches!(self.node_id, 1..=127);
         sound.then_some(BootInfo {
             node_id: self.node_id,
@@ -174,23 +164,6 @@ impl Handoff {
             bootloader_version: self.bootloader_version,
             serial_number: self.serial_number,
         })
-    }
-
-    const fn expected_check(&self) -> u32 {
-        let [r0, r1, r2, r3, r4] = self.reserved;
-        check_word(&[
-            self.magic,
-            self.version as u32 | (self.length as u32) << 16,
-            u32::from_le_bytes([self.node_id, self.program, self.reset_cause, self.trial]),
-            self.bit_rate,
-            self.bootloader_version,
-            self.serial_number,
-            r0,
-            r1,
-            r2,
-            r3,
-            r4,
-        ])
     }
 
     /// Reads the handoff that the bootloader left.
@@ -204,6 +177,22 @@ impl Handoff {
         unsafe { address.read_volatile() }.info()
     }
 
+    /// The program that the handoff names, for the bootloader, which needs no more of what it has
+    /// left itself; 0 where there is no sound one.
+    ///
+    /// # Safety
+    /// As for [`read`](Self::read).
+    #[must_use]
+    pub unsafe fn read_program(address: *const Self) -> u8 {
+        // SAFETY: the caller vouches for the address; nothing writes there while this reads.
+        let words = unsafe { &*address.cast::<[u32; WORDS]>() };
+        if is_sound(words) {
+            words[2].to_le_bytes()[1]
+        } else {
+            0
+        }
+    }
+
     /// Leaves the handoff for the application.
     ///
     /// # Safety
@@ -213,6 +202,19 @@ impl Handoff {
         // SAFETY: the caller vouches for the address.
         unsafe { address.write_volatile(self) };
     }
+}
+
+/// Words of the record.
+const WORDS: usize = size_of::<Handoff>() / 4;
+
+/// The check word of a record: over all words but the last.
+const fn check_of(words: &[u32; WORDS]) -> u32 {
+    let (rest, _) = words.split_at(WORDS - 1);
+    check_word(rest)
+}
+
+const fn is_sound(words: &[u32; WORDS]) -> bool {
+    words[0] == MAGIC && words[WORDS - 1] == check_of(words)
 }
 
 #[cfg(test)]

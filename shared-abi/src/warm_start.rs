@@ -12,27 +12,30 @@ use crate::ram_image::Damage;
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBW1");
 
 /// What the next start of the bootloader is asked to do.
+///
+/// The discriminants are the numbers in the cell.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
 pub enum BootRequest {
     /// Stay in the bootloader, whatever program is valid (1F51h = 80h, START_BOOTLOADER).
-    Stay,
+    Stay = 1,
     /// Start program `n` once although it may carry no signature; the next reset ends in the
     /// bootloader.
-    Trial(u8),
+    Trial(u8) = 2,
     /// Start program `n` as the autostart would.
-    Start(u8),
+    Start(u8) = 3,
     /// Stay, because the bootloader itself had a fault or a panic; it asks this of itself.
-    Fault,
+    Fault = 4,
     /// Start as after a power-on: what an NMT reset asks for. Whoever asks has not crashed.
-    PowerOn,
+    PowerOn = 5,
     /// Go on with the start of program `n`, which was held back for a rescue window; the bootloader
     /// asks this of itself.
-    Resume(u8),
+    Resume(u8) = 6,
     /// Stay, and carry out CLEAR of program `n`, which was asked of the application (1F51h = 3).
-    Clear(u8),
+    Clear(u8) = 7,
     /// The bootloader mode cannot run, because its part of the flash is damaged. The boot stage
     /// leaves this for a debugger to see, and starts as after a power-on.
-    Damaged(Damage),
+    Damaged(Damage) = 8,
 }
 
 /// The cell as it lies in RAM: 16 bytes, little-endian.
@@ -93,8 +96,8 @@ impl WarmStart {
             (8, Some(damage)) => BootRequest::Damaged(Damage::from_number(damage)?),
             _ => return None,
         };
-        // One encoder decides what is well-formed: magic, words and check must be exactly its.
-        (*self == Self::new(request)).then_some(request)
+        // One encoder decides what is well-formed: magic and check must be exactly its.
+        (*self == Self::encode(self.request, self.argument)).then_some(request)
     }
 }
 
@@ -114,6 +117,7 @@ impl Cell {
     }
 
     /// Reads the request and empties the cell, so that no later reset finds it again.
+    #[inline(never)]
     pub fn take(&mut self) -> Option<BootRequest> {
         // SAFETY: `at` vouches for the address; volatile, because another image wrote the cell.
         let found = unsafe { self.0.read_volatile() };

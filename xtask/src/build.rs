@@ -252,8 +252,8 @@ fn rust_lld() -> Outcome<PathBuf> {
 /// # Errors
 /// When it does not build.
 pub fn to_look_at(board: &Layout, features: &str, product: Option<&str>) -> Outcome<Vec<u8>> {
-    let mut cargo = process::cargo("build");
-    cargo.arg("--quiet").args(firmware_args("bootloader", board, features));
+    let mut cargo = cargo_for("bootloader", board, features);
+    cargo.env("CARGO_TERM_QUIET", "true");
     process::run(with_product(&mut cargo, product))?;
     pack::pack(&built("bootloader")?)
 }
@@ -283,10 +283,27 @@ pub fn tests_args(board: &Layout) -> Vec<String> {
     ["--package=coboot-tests", "--no-default-features", &features].map(str::to_owned).to_vec()
 }
 
+/// What the compiler is told beside `.cargo/config.toml` where the code is packed: to write the same
+/// thing in the same way. No calls in the place of short pieces of code that stand several times,
+/// the first register that is free, and no reordering behind that. A bootloader gets larger by that
+/// as it runs from RAM, and some 500 bytes smaller in flash (found by trial).
+const PACKS_WELL: &str = "-Cllvm-args=--enable-machine-outliner=never --regalloc=basic --disable-post-ra=1";
+
+/// A call of cargo that builds an image. What it adds to the compiler's arguments holds for the last
+/// crate; code for the chip is made there and nowhere else (`lto`).
+fn cargo_for(package: &str, board: &Layout, features: &str) -> Command {
+    let is_packed = package == "bootloader";
+    let mut cargo = process::cargo(if is_packed { "rustc" } else { "build" });
+    cargo.args(firmware_args(package, board, features));
+    if is_packed {
+        cargo.args(["--bin", package, "--", PACKS_WELL]);
+    }
+    cargo
+}
+
 /// Builds an image; gives its ELF file as the linker made it.
 fn build(board: &Layout, variant: &Variant) -> Outcome<Vec<u8>> {
-    let mut cargo = process::cargo("build");
-    cargo.args(firmware_args(variant.package, board, variant.features));
+    let mut cargo = cargo_for(variant.package, board, variant.features);
     process::run(with_product(&mut cargo, variant.product))?;
     built(variant.package)
 }

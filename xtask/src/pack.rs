@@ -47,7 +47,7 @@ pub fn pack(file: &[u8]) -> Outcome<Vec<u8>> {
         return Err(format!("{HEADER} is not what the bootloader's start.rs puts there."));
     }
 
-    let packed = compressed(contents(image));
+    let packed = compressed(&with_absolute_calls(contents(image), image.address));
     // The words behind the CRC, which runs over them too.
     let rest = bytes(&[SERVICES_VERSION, Method::Zx0 as u32, word(packed.len())?, image.size]);
     let crc = Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(&[&rest[..], &packed].concat());
@@ -56,6 +56,27 @@ pub fn pack(file: &[u8]) -> Outcome<Vec<u8>> {
     let mut out = file.to_vec();
     out[header.offset as usize..][..packed_header.len()].copy_from_slice(&packed_header);
     load_instead(out, image, behind_header, &packed)
+}
+
+/// The image, which stands at this address, with absolute calls (`shared_abi::ram_image::Method`):
+/// two calls of one function are the same bytes then, and pack better.
+fn with_absolute_calls(image: &[u8], address: u32) -> Vec<u8> {
+    let mut out = image.to_vec();
+    let mut at = 0;
+    while at + 4 <= out.len() {
+        let [first, second] = [0, 2].map(|i| u32::from(u16::from_le_bytes([out[at + i], out[at + i + 1]])));
+        at += 2;
+        if first >> 11 != 0b11110 || second >> 11 != 0b11111 {
+            continue;
+        }
+        let target = ((first & 0x7FF) << 11 | second & 0x7FF) + (address + at as u32) / 2;
+        let call = [0xF000 | target >> 11 & 0x7FF, 0xF800 | target & 0x7FF];
+        for (bytes, half) in out[at - 2..].chunks_exact_mut(2).zip(call) {
+            bytes.copy_from_slice(&(half as u16).to_le_bytes());
+        }
+        at += 2;
+    }
+    out
 }
 
 /// Compresses, the best that the format can do. That takes seconds, so what was compressed before

@@ -5,7 +5,7 @@ use canopen::program::{FlashError, ProgramControl};
 use canopen::sdo::AbortCode;
 use shared_abi::warm_start::BootRequest;
 
-use super::{Downloader, Program};
+use super::{find, Downloader, Program, NOWHERE};
 use crate::policy::Erase;
 use crate::refusal::Refusal;
 use crate::session::Session;
@@ -20,7 +20,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub fn command(&mut self, program: u8, command: ProgramControl) -> Result<(), AbortCode> {
         use ProgramControl::{Clear, ClrSignature, ResetStat, SetSignature, Start, StartBootloader, Stop};
 
-        let &Program { streamed, locked, .. } = self.program(program).ok_or(AbortCode::NO_SUB_INDEX)?;
+        let state = find(&mut self.programs, program).ok_or(AbortCode::NO_SUB_INDEX)?;
         if matches!(command, Stop | StartBootloader) {
             // No program runs, and the bootloader does: both are so already.
             return Ok(());
@@ -28,14 +28,13 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         // Who sends a program in one go means by 2 what CiA 302-3 says: reset the program, which
         // starts it.
         let command = match command {
-            ResetStat if streamed || self.policy.reset_starts => Start,
+            ResetStat if state.streamed || self.policy.reset_starts => Start,
             command => command,
         };
         // Data are never started.
         let data = self.policy.data == Some(program);
-        if command == Start && streamed && !data && self.boot_request.is_none() {
-            let finishing = self.programmer.finishing() == Some(program);
-            if let (true, Some(state)) = (finishing, self.program_mut(program)) {
+        if command == Start && state.streamed && !data && self.boot_request.is_none() {
+            if self.programmer.finishing() == Some(program) {
                 state.start_when_verified = true;
                 return Ok(());
             }
@@ -44,18 +43,16 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let own = self.programmer.program().is_none_or(|of| of == program);
         let restarts = command == Clear && own && self.programmer.is_abortable();
         let busy = match command {
-            SetSignature | ClrSignature => self.busy(),
+            SetSignature | ClrSignature => self.programmer.is_busy(),
             _ => self.programmer.has_work(),
         };
         if self.boot_request.is_some() || (busy && !restarts) {
-            return Err(self.refuse(program, Refusal::untimely(FlashError::Busy)));
+            return Err(state.refuse(Refusal::untimely(FlashError::Busy)));
         }
         let changes = matches!(command, Clear | SetSignature | ClrSignature);
-        if changes && (locked || !(self.policy.allowed)()) {
-            return Err(self.refuse(program, Refusal::untimely(FlashError::NoAccess)));
+        if changes && (state.locked || !(self.policy.allowed)()) {
+            return Err(state.refuse(Refusal::untimely(FlashError::NoAccess)));
         }
-        let (erase, region) = (self.policy.erase, self.region(program));
-        let Some(state) = self.program_mut(program) else { return Err(AbortCode::NO_SUB_INDEX) };
         state.error = None;
         state.streamed = false;
         let record = state.record.filter(|_| !data);
@@ -65,14 +62,14 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 state.session = Session::Cleared { just: true };
                 self.transfer = None;
                 // A sector that is still being erased for the old download is waited for.
-                let at_once = (again || erase == Erase::AtOnce) && !busy;
+                let at_once = (again || self.policy.erase == Erase::AtOnce) && !busy;
                 self.programmer.select(program);
                 self.programmer.abort();
                 if at_once {
-                    self.programmer.erase_all(program, region);
+                    self.programmer.erase_all(program, self.layout.program(program).unwrap_or(NOWHERE));
                 }
             }
-            (Start, Some(record)) => self.start(program, record),
+            (Start, Some(record)) => self.boot_request = Some(start_request(program, record)),
             (SetSignature | ClrSignature, Some(record)) => {
                 // Also where it is so already: after a power cut it may read so now and otherwise
                 // later.
@@ -103,22 +100,20 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// # Errors
     /// If other work goes on.
     pub fn unlock(&mut self, program: u8, at_once: bool) -> Result<(), AbortCode> {
-        if !self.has(program) {
-            return Err(AbortCode::NO_SUB_INDEX);
-        }
+        let Some(state) = find(&mut self.programs, program) else { return Err(AbortCode::NO_SUB_INDEX) };
         if self.boot_request.is_some() || !self.programmer.is_abortable() {
-            return Err(self.refuse(program, Refusal::untimely(FlashError::Busy)));
+            return Err(state.refuse(Refusal::untimely(FlashError::Busy)));
         }
         self.download_cancel();
-        if let Some(other) = self.programmer.program().filter(|of| *of != program) {
-            if let Some(Session::Open { .. }) = self.session(other) {
-                self.set_session(other, Session::Failed);
-            }
+        let other = self.programmer.program().filter(|of| *of != program).unwrap_or(0);
+        if let Some(Program { session: session @ Session::Open { .. }, .. }) = find(&mut self.programs, other)
+        {
+            *session = Session::Failed;
         }
         self.programmer.abort();
         self.programmer.select(program);
         self.programmer.abort();
-        if let Some(state) = self.program_mut(program) {
+        if let Some(state) = find(&mut self.programs, program) {
             state.locked = false;
             state.error = None;
             state.streamed = false;
@@ -129,10 +124,13 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
         Ok(())
     }
+}
 
-    /// Asks for the program to be started; unsigned, on trial.
-    pub(super) fn start(&mut self, program: u8, record: ProgramRecord) {
-        let request = if record.signed { BootRequest::Start } else { BootRequest::Trial };
-        self.boot_request = Some(request(program));
+/// The request that starts a program; unsigned, on trial.
+pub(super) fn start_request(program: u8, record: ProgramRecord) -> BootRequest {
+    if record.signed {
+        BootRequest::Start(program)
+    } else {
+        BootRequest::Trial(program)
     }
 }

@@ -29,7 +29,8 @@ use crate::program::{check_vectors, Expected};
 use crate::programmer::{Event, Programmer};
 use crate::refusal::Refusal;
 use crate::session::Session;
-use crate::store::{NodeParameters, Parameters, ProgramRecord, StoreError};
+use crate::store::{NodeParameters, Parameters, ProgramRecord};
+use commands::start_request;
 
 pub use crate::policy::{Erase, Policy, Verdict};
 pub use crate::programmer::Step;
@@ -75,7 +76,7 @@ pub struct Downloader<'b, P, const PROGRAMS: usize> {
     /// How a piece of work on a program ended, or a block that was damaged; to be reported.
     outcome: Option<(u8, Result<(), FlashError>)>,
     /// How the last storing of node-ID and bit rate ended.
-    node_stored: Result<(), StoreError>,
+    node_stored: Result<(), FlashError>,
 }
 
 impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
@@ -188,7 +189,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     }
 
     /// How the last [`store_node`](Self::store_node) ended.
-    pub fn node_stored(&self) -> Poll<Result<(), StoreError>> {
+    pub fn node_stored(&self) -> Poll<Result<(), FlashError>> {
         if self.programmer.is_storing_node() {
             Poll::Pending
         } else {
@@ -224,29 +225,27 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// The abort that answers it.
     pub fn download_start(&mut self, program: u8, size: Option<u32>) -> Result<(), AbortCode> {
         self.download_cancel();
-        let Some(state) = self.program(program) else { return Err(AbortCode::NO_SUB_INDEX) };
-        let others = self.busy() && self.programmer.program().is_some_and(|of| of != program);
-        let refusal =
-            if self.boot_request.is_some() || others || !self.programmer.is_abortable() || !self.has_room() {
-                Some(Refusal::untimely(FlashError::Busy))
-            } else if state.locked {
-                Some(Refusal::untimely(FlashError::NoAccess))
-            } else if size.is_some_and(|size| size < FRAMING as u32) && self.policy.data != Some(program) {
-                Some(Refusal(FlashError::Format, AbortCode::LENGTH_TOO_LOW))
-            } else {
-                None
-            };
+        let room = self.has_room();
+        let Some(state) = find(&mut self.programs, program) else { return Err(AbortCode::NO_SUB_INDEX) };
+        let others = self.programmer.is_busy() && self.programmer.program().is_some_and(|of| of != program);
+        let refusal = if self.boot_request.is_some() || others || !self.programmer.is_abortable() || !room {
+            Some(Refusal::untimely(FlashError::Busy))
+        } else if state.locked {
+            Some(Refusal::untimely(FlashError::NoAccess))
+        } else if size.is_some_and(|size| size < FRAMING as u32) && self.policy.data != Some(program) {
+            Some(Refusal(FlashError::Format, AbortCode::LENGTH_TOO_LOW))
+        } else {
+            None
+        };
         if let Some(refusal) = refusal {
-            return Err(self.refuse(program, refusal));
+            return Err(state.refuse(refusal));
         }
-        if let Some(state) = self.program_mut(program) {
-            // A second CLEAR erases all, but not behind a block: it may come from a host that tries
-            // the same wrong file again.
-            if let Session::Cleared { just } = &mut state.session {
-                *just = false;
-            }
-            state.streamed = false;
+        // A second CLEAR erases all, but not behind a block: it may come from a host that tries the
+        // same wrong file again.
+        if let Session::Cleared { just } = &mut state.session {
+            *just = false;
         }
+        state.streamed = false;
         self.programmer.select(program);
         self.transfer = Some(Transfer { program, intake: Intake::new(size) });
         Ok(())
@@ -265,7 +264,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// # Errors
     /// The abort that ends the transfer.
     pub fn download_data(&mut self, data: &[u8]) -> Result<(), AbortCode> {
-        self.take(|intake, to| intake.data(data, to)).map(drop)
+        self.take(Some(data)).map(drop)
     }
 
     /// 1F50h: the transfer is complete. Judges it in full and leaves the work behind.
@@ -273,9 +272,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// # Errors
     /// The abort that answers instead of the last acknowledgement.
     pub fn download_end(&mut self) -> Result<(), AbortCode> {
-        let program = self.take(Intake::end)?;
+        let program = self.take(None)?;
         self.transfer = None;
-        if let Some(state) = self.program_mut(program) {
+        if let Some(state) = find(&mut self.programs, program) {
             state.error = None;
         }
         Ok(())
@@ -286,7 +285,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     pub fn download_cancel(&mut self) {
         let Some(Transfer { program, intake }) = self.transfer.take() else { return };
         self.programmer.queue_mut().discard();
-        let Some(state) = self.program_mut(program) else { return };
+        let Some(state) = find(&mut self.programs, program) else { return };
         if intake.is_stream() && matches!(state.session, Session::Open { .. }) {
             state.session = Session::Failed;
             state.error.get_or_insert(FlashError::Format);
@@ -294,14 +293,12 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         }
     }
 
-    /// Hands something to the format of the open transfer and carries out what it leads to; gives
-    /// the program that it is about.
-    fn take(
-        &mut self,
-        hand: impl FnOnce(&mut Intake, &mut Destination<'_, 'b>) -> Result<(), Refusal>,
-    ) -> Result<u8, AbortCode> {
-        let Some(Transfer { program, mut intake }) = self.transfer.take() else { return Err(self.fault) };
-        let state = self.program(program).ok_or(self.fault)?;
+    /// Hands the next bytes to the format of the open transfer, or the end (`None`), and carries out
+    /// what it leads to; gives the program that it is about.
+    fn take(&mut self, data: Option<&[u8]>) -> Result<u8, AbortCode> {
+        let Some(Transfer { program, intake }) = &mut self.transfer else { return Err(self.fault) };
+        let program = *program;
+        let Some(state) = find(&mut self.programs, program) else { return Err(self.fault) };
         let judge = Judge {
             layout: self.layout,
             policy: self.policy,
@@ -310,11 +307,13 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             installed: state.record.is_some(),
         };
         let mut to = Destination { judge, queue: self.programmer.queue_mut(), progress: Progress::default() };
-        let outcome = hand(&mut intake, &mut to);
+        let outcome = match data {
+            Some(bytes) => intake.data(bytes, &mut to),
+            None => intake.end(&mut to),
+        };
         let progress = to.progress;
         let streaming = intake.may_be_stream();
         let is_stream = intake.is_stream();
-        self.transfer = Some(Transfer { program, intake });
         match outcome {
             Ok(()) => {
                 self.proceed(program, is_stream, progress);
@@ -328,7 +327,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 if refusal.0 == FlashError::Crc || streaming {
                     self.outcome = Some((program, Err(refusal.0)));
                 }
-                let abort = self.refuse(program, refusal);
+                let abort = state.refuse(refusal);
                 self.download_cancel();
                 Err(abort)
             }
@@ -337,27 +336,24 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
 
     /// What accepted bytes lead to.
     fn proceed(&mut self, program: u8, is_stream: bool, progress: Progress) {
-        let (policy, region) = (self.policy, self.region(program));
-        let Some(state) = self.program_mut(program) else { return };
+        let Some(state) = find(&mut self.programs, program) else { return };
         if let Some(begin) = progress.begins {
             state.version = begin.version;
             // A sequence of blocks that begins anew goes on over what is there.
             if !matches!(state.session, Session::Open { .. }) {
-                let erase = state.session.erases(policy);
-                self.programmer.open(program, region, erase, begin.size);
+                let region = self.layout.program(program).unwrap_or(NOWHERE);
+                self.programmer.open(program, region, state.session.erases(self.policy), begin.size);
             }
-            self.set_session(program, Session::Open { next: 1 });
+            state.session = Session::Open { next: 1 };
         }
-        if progress.block {
-            if let Some(Session::Open { next }) = self.session(program) {
-                self.set_session(program, Session::Open { next: next.wrapping_add(1) });
-            }
+        if let (true, Session::Open { next }) = (progress.block, &mut state.session) {
+            *next = next.wrapping_add(1);
         }
         if let Some(expected) = progress.complete {
             self.programmer.complete(expected);
-            if let (Some(state), true) = (self.program_mut(program), is_stream) {
+            if is_stream {
                 state.streamed = true;
-                state.start_when_verified = policy.starts_by_itself;
+                state.start_when_verified = self.policy.starts_by_itself;
             }
         }
     }
@@ -368,15 +364,21 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         match event {
             None => {}
             Some(Event::NodeStored(outcome)) => self.node_stored = outcome,
-            Some(Event::Voided(program)) => {
-                if let Some(state) = self.program_mut(program) {
-                    state.record = None;
-                    state.identification = 0;
+            Some(Event::Stored { program, ends }) => {
+                let record = ProgramRecord::load(&self.parameters, flash, program);
+                if let Some(state) = find(&mut self.programs, program) {
+                    state.record = record;
+                    if record.is_none() {
+                        state.identification = 0;
+                    }
+                }
+                if ends {
+                    self.end(program, Ok(()));
                 }
             }
             Some(Event::Erased(program)) => self.end(program, Ok(())),
             Some(Event::Written { program, expected, crc }) => {
-                if let Some(state) = self.program_mut(program) {
+                if let Some(state) = find(&mut self.programs, program) {
                     state.identification = crc;
                     state.session = Session::Idle;
                 }
@@ -389,17 +391,6 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     }
                     Err(error) => self.end(program, Err(error)),
                 }
-            }
-            Some(Event::Confirmed(program, record)) => {
-                if let Some(state) = self.program_mut(program) {
-                    state.record = Some(record);
-                }
-            }
-            Some(Event::Recorded(program, record)) => {
-                if let Some(state) = self.program_mut(program) {
-                    state.record = Some(record);
-                }
-                self.end(program, Ok(()));
             }
             Some(Event::Failed { program, error, erasing }) => {
                 self.fault = if erasing { AbortCode::GENERAL } else { AbortCode::HARDWARE };
@@ -451,7 +442,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             self.transfer = None;
             self.programmer.queue_mut().clear();
         }
-        let Some(state) = self.program_mut(program) else { return };
+        let Some(state) = find(&mut self.programs, program) else { return };
         let start = core::mem::take(&mut state.start_when_verified);
         state.error = outcome.err();
         if outcome.is_err() {
@@ -460,19 +451,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 state.session = Session::Failed;
             }
         } else if let (true, Some(record)) = (start, state.record) {
-            self.start(program, record);
+            self.boot_request = Some(start_request(program, record));
         }
         self.outcome = Some((program, outcome));
-    }
-
-    /// Shows why something was refused. The error that ended a session stays to be seen.
-    fn refuse(&mut self, program: u8, Refusal(error, abort): Refusal) -> AbortCode {
-        if let Some(state) = self.program_mut(program) {
-            if !matches!(state.session, Session::Failed) || state.error.is_none() {
-                state.error = Some(error);
-            }
-        }
-        abort
     }
 
     /// Whether the queue takes another transfer.
@@ -485,22 +466,25 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         self.programs.get(usize::from(program).checked_sub(1)?)
     }
 
-    /// See [`program`](Self::program).
-    fn program_mut(&mut self, program: u8) -> Option<&mut Program> {
-        self.programs.get_mut(usize::from(program).checked_sub(1)?)
-    }
-
-    fn session(&self, program: u8) -> Option<Session> {
-        self.program(program).map(|state| state.session)
-    }
-
-    fn set_session(&mut self, program: u8, session: Session) {
-        if let Some(state) = self.program_mut(program) {
-            state.session = session;
-        }
-    }
-
     fn region(&self, program: u8) -> Region {
-        self.layout.program(program).unwrap_or(Region::new(0, 0))
+        self.layout.program(program).unwrap_or(NOWHERE)
+    }
+}
+
+/// A program, if there is one of this number.
+fn find(programs: &mut [Program], number: u8) -> Option<&mut Program> {
+    programs.get_mut(usize::from(number).wrapping_sub(1))
+}
+
+/// The place of a program that is none of the layout's.
+const NOWHERE: Region = Region::new(0, 0);
+
+impl Program {
+    /// Shows why something was refused. The error that ended a session stays to be seen.
+    fn refuse(&mut self, Refusal(error, abort): Refusal) -> AbortCode {
+        if !matches!(self.session, Session::Failed) || self.error.is_none() {
+            self.error = Some(error);
+        }
+        abort
     }
 }

@@ -7,8 +7,7 @@
 use canopen::program::FlashError;
 use canopen::sdo::AbortCode;
 use shared_abi::block_file::{
-    Control, Header, Last, CONTROL_MAX, CRC_SIZE, FRAMING, HEADER_SIZE, MAX_BLOCK_SIZE, NUMBER_CONTROL,
-    NUMBER_LAST,
+    Control, Header, Last, CONTROL_MAX, FRAMING, HEADER_SIZE, MAX_BLOCK_SIZE, NUMBER_CONTROL, NUMBER_LAST,
 };
 use shared_abi::geometry::Region;
 
@@ -24,11 +23,12 @@ const TOO_LONG: Refusal = Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH
 pub(super) struct BlockFile {
     /// Bytes that came.
     len: usize,
-    header: [u8; HEADER_SIZE],
-    /// The data of the first and of the last block; those of the others go to the queue.
-    fields: [u8; CONTROL_MAX],
-    /// The CRC as the block tells it.
-    told: [u8; CRC_SIZE],
+    /// Known when its bytes are there; zeros before.
+    header: Header,
+    /// The first bytes: the header, and all data of the first and of the last block.
+    start: [u8; HEADER_SIZE + CONTROL_MAX],
+    /// The last four bytes behind the data: the CRC as the block tells it.
+    told: u32,
     /// Over what came of header and data.
     crc: u32,
 }
@@ -48,9 +48,9 @@ impl Format for BlockFile {
         }
         Recognition::Yes(Self {
             len: 0,
-            header: [0; HEADER_SIZE],
-            fields: [0; CONTROL_MAX],
-            told: [0; CRC_SIZE],
+            header: Header { number: 0, flash_address: 0, size: 0 },
+            start: [0; HEADER_SIZE + CONTROL_MAX],
+            told: 0,
             crc: 0,
         })
     }
@@ -62,58 +62,26 @@ impl Format for BlockFile {
         Ok(())
     }
 
-    fn data(&mut self, mut bytes: &[u8], to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
+    fn data(&mut self, bytes: &[u8], to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
         if self.len + bytes.len() > largest(to.queue) {
             return Err(TOO_LONG);
         }
-        while !bytes.is_empty() {
-            let header = Header::parse(&self.header);
-            let data_end = HEADER_SIZE + if self.len < HEADER_SIZE { 0 } else { header.size as usize };
-            let end = if self.len < HEADER_SIZE { HEADER_SIZE } else { data_end };
-            let (part, rest) = bytes.split_at(bytes.len().min(end.saturating_sub(self.len)));
-            if part.is_empty() {
-                // The CRC; what is more than that is told by its length.
-                for (byte, at) in bytes.iter().zip(self.len - data_end..CRC_SIZE) {
-                    self.told[at] = *byte;
-                }
-                self.len += bytes.len();
-                return Ok(());
-            }
-            self.crc = to.judge.policy.crc.resume(self.crc, part);
-            if self.len < HEADER_SIZE {
-                self.header[self.len..self.len + part.len()].copy_from_slice(part);
-            } else if is_data(&header) {
-                if !to.queue.push(header.flash_address, part) {
-                    return Err(TOO_LONG);
-                }
-            } else {
-                let at = self.len - HEADER_SIZE;
-                for (byte, place) in part.iter().zip(self.fields.iter_mut().skip(at)) {
-                    *place = *byte;
-                }
-            }
-            self.len += part.len();
-            if self.len == HEADER_SIZE {
-                judge_header(Header::parse(&self.header), to)?;
-            }
-            bytes = rest;
-        }
-        Ok(())
+        bytes.iter().try_for_each(|byte| self.push(*byte, to))
     }
 
     fn end(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
-        let header = Header::parse(&self.header);
+        let header = self.header;
         if self.len < HEADER_SIZE {
             return Err(Refusal(FlashError::Format, AbortCode::LENGTH_TOO_LOW));
         }
         if self.len != FRAMING + header.size as usize {
             return Err(Refusal(FlashError::Format, AbortCode::LENGTH));
         }
-        if self.crc != u32::from_le_bytes(self.told) {
+        if self.crc != self.told {
             return Err(Refusal::unfit(FlashError::Crc));
         }
         let malformed = Refusal::unfit(FlashError::Format);
-        let fields = self.fields.get(..header.size as usize);
+        let fields = self.start[HEADER_SIZE..].get(..header.size as usize);
         match header.number {
             NUMBER_CONTROL => {
                 let control = fields.and_then(Control::parse).ok_or(malformed)?;
@@ -141,6 +109,34 @@ impl Format for BlockFile {
             }
         }
         Ok(())
+    }
+}
+
+impl BlockFile {
+    /// Takes the next byte.
+    fn push(&mut self, byte: u8, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
+        let at = self.len;
+        self.len += 1;
+        if at >= HEADER_SIZE + self.header.size as usize {
+            // The CRC; what is more than that is told by its length.
+            self.told = self.told >> 8 | u32::from(byte) << 24;
+            return Ok(());
+        }
+        self.crc = to.judge.policy.crc.resume(self.crc, &[byte]);
+        if let Some(place) = self.start.get_mut(at) {
+            *place = byte;
+        }
+        if at >= HEADER_SIZE {
+            let joins = !is_data(&self.header) || to.queue.push(self.header.flash_address, &[byte]);
+            return if joins { Ok(()) } else { Err(TOO_LONG) };
+        }
+        match self.start.first_chunk() {
+            Some(header) if self.len == HEADER_SIZE => {
+                self.header = Header::parse(header);
+                judge_header(self.header, to)
+            }
+            _ => Ok(()),
+        }
     }
 }
 

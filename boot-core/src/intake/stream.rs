@@ -107,19 +107,17 @@ impl Stream {
 /// Judges the first piece, where it is the start of the program. A HEX file may begin anywhere; its
 /// vectors and its label are then looked at when all is in flash.
 fn judge_start(to: &Destination<'_, '_>) -> Result<(), Refusal> {
-    if to.judge.is_data() {
+    if to.judge.is_data() || to.queue.open_address() != to.judge.region().base {
         return Ok(());
     }
-    let base = to.judge.region().base;
-    if let Some((address, [a, b, c, d, e, f, g, h])) = to.queue.open_start(0) {
-        if address == base {
-            to.judge.check_vectors([[a, b, c, d], [e, f, g, h]].map(u32::from_le_bytes))?;
-        }
+    let mut vectors = [0; 8];
+    if to.queue.read_open(0, &mut vectors) {
+        let [a, b, c, d, e, f, g, h] = vectors;
+        to.judge.check_vectors([[a, b, c, d], [e, f, g, h]].map(u32::from_le_bytes))?;
     }
-    if let Some((address, label)) = to.queue.open_start(label::OFFSET as usize) {
-        if address == base {
-            to.judge.check_label(&label)?;
-        }
+    let mut label = [0; label::SIZE];
+    if to.queue.read_open(label::OFFSET as usize, &mut label) {
+        to.judge.check_label(&label)?;
     }
     Ok(())
 }

@@ -16,14 +16,13 @@ use core::task::Poll;
 
 use canopen::program::FlashError;
 use shared_abi::block_file::MAX_BLOCK_SIZE;
-use shared_abi::geometry::Region;
+use shared_abi::geometry::{Region, Sector};
 
 use crate::crc::CrcKind;
 use crate::flash::{Flash, FlashFault, Next, Operation};
 use crate::program::{Expected, FlashCrc};
 use crate::queue::Queue;
-use crate::sequence::EraseSectors;
-use crate::store::{Key, NodeParameters, Parameters, ProgramRecord, StoreError};
+use crate::store::{Key, NodeParameters, Parameters, ProgramRecord};
 use write::WritePiece;
 
 /// What came of a step.
@@ -41,18 +40,14 @@ pub enum Step {
 
 /// A piece of work that is over.
 pub(crate) enum Event {
-    /// The record of a program is gone.
-    Voided(u8),
+    /// The record of a program is stored, or gone; whether that ends a piece of work.
+    Stored { program: u8, ends: bool },
     /// All of a program's flash is erased, as [`Programmer::erase_all`] was told to.
     Erased(u8),
     /// A program was written completely; its CRC over flash.
     Written { program: u8, expected: Expected, crc: u32 },
-    /// The record of a program is stored.
-    Recorded(u8, ProgramRecord),
-    /// The record of a program says that it is confirmed.
-    Confirmed(u8, ProgramRecord),
     /// Node-ID and bit rate are stored, or not.
-    NodeStored(Result<(), StoreError>),
+    NodeStored(Result<(), FlashError>),
     /// The work on a program failed. `erasing`: an erasure did.
     Failed { program: u8, error: FlashError, erasing: bool },
 }
@@ -73,10 +68,10 @@ struct Target {
 
 /// What is being done.
 enum Job {
-    /// A value is on its way into the store.
-    Store(Change),
-    /// Sectors up to `until`.
-    Erase { sectors: EraseSectors, until: u32 },
+    /// A value is on its way into the store; the program that it is about.
+    Store(Change, u8),
+    /// A sector, until its erasure was started, and its end.
+    Erase { sector: Option<Sector>, until: u32 },
     /// The piece at the front of the queue.
     Write(WritePiece),
     /// Is the flash what the host meant?
@@ -84,11 +79,15 @@ enum Job {
 }
 
 /// What changes in the store.
+#[derive(Clone, Copy, PartialEq, Eq)]
 enum Change {
-    Void(u8),
-    Record(u8, ProgramRecord),
+    /// The record of a program goes.
+    Void,
+    /// It becomes another one.
+    Record,
     /// As `Record`, but nobody waits for it.
-    Confirm(u8, ProgramRecord),
+    Confirm,
+    /// Node-ID and bit rate.
     Node,
 }
 
@@ -183,20 +182,20 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
     /// The record of a program becomes this.
     pub(crate) fn record(&mut self, parameters: &mut impl Parameters, program: u8, record: ProgramRecord) {
         parameters.store(Key::Program(program), record.value());
-        self.job = Some(Job::Store(Change::Record(program, record)));
+        self.job = Some(Job::Store(Change::Record, program));
     }
 
     /// The record of a program becomes this one, which says that it is confirmed. Other work is
     /// accepted meanwhile. Nothing may be on its way into the store.
     pub(crate) fn confirm(&mut self, parameters: &mut impl Parameters, program: u8, record: ProgramRecord) {
         parameters.store(Key::Program(program), record.value());
-        self.job = Some(Job::Store(Change::Confirm(program, record)));
+        self.job = Some(Job::Store(Change::Confirm, program));
     }
 
     /// Node-ID and bit rate become these.
     pub(crate) fn store_node(&mut self, parameters: &mut impl Parameters, node: NodeParameters) {
         parameters.store(Key::Node, node.value());
-        self.job = Some(Job::Store(Change::Node));
+        self.job = Some(Job::Store(Change::Node, 0));
     }
 
     /// What was received is not wanted any more. What is on its way into the store goes on.
@@ -206,7 +205,7 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
             *target = None;
         }
         self.current = 0;
-        if !matches!(self.job, Some(Job::Store(_))) {
+        if !self.is_storing() {
             self.job = None;
         }
     }
@@ -231,12 +230,12 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
 
     /// Whether a value is on its way into the store.
     pub(crate) fn is_storing(&self) -> bool {
-        matches!(self.job, Some(Job::Store(_)))
+        matches!(self.job, Some(Job::Store(..)))
     }
 
     /// Whether there is work that a command has to wait for.
     pub(crate) fn has_work(&self) -> bool {
-        let confirming = matches!(self.job, Some(Job::Store(Change::Confirm(..))));
+        let confirming = matches!(self.job, Some(Job::Store(Change::Confirm, _)));
         (self.job.is_some() || self.running.is_some()) && !confirming
             || self.voids != 0
             || !self.queue.is_empty()
@@ -248,7 +247,7 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
     pub(crate) fn is_busy_with(&self, program: u8) -> bool {
         let current = self.current == program;
         let ending = match self.job {
-            Some(Job::Store(Change::Record(of, _))) => of == program,
+            Some(Job::Store(Change::Record, of)) => of == program,
             Some(Job::Verify { .. }) => current,
             _ => false,
         };
@@ -260,7 +259,7 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
     /// told is done, and a reset now would take back.
     pub(crate) fn finishing(&self) -> Option<u8> {
         match self.job {
-            Some(Job::Store(Change::Record(of, _))) => Some(of),
+            Some(Job::Store(Change::Record, of)) => Some(of),
             Some(Job::Verify { .. }) => self.program(),
             _ => self.program().filter(|_| self.target().is_some_and(|target| target.expected.is_some())),
         }
@@ -274,7 +273,7 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
 
     /// Whether node-ID and bit rate are on their way.
     pub(crate) fn is_storing_node(&self) -> bool {
-        matches!(self.job, Some(Job::Store(Change::Node)))
+        matches!(self.job, Some(Job::Store(Change::Node, _)))
     }
 
     /// Whether the queue takes a block of the largest size. (One that is not even as large takes
@@ -328,11 +327,17 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
         parameters: &mut impl Parameters,
         flash: &F,
         outcome: Result<(), FlashFault>,
-    ) -> Next<Failure> {
+    ) -> Next<FlashError> {
         let next = match (&mut self.job, outcome) {
-            (Some(Job::Store(_)), outcome) => return store_next(parameters.next(flash, outcome)),
+            (Some(Job::Store(..)), outcome) => {
+                return match parameters.next(flash, outcome) {
+                    Next::Start(operation) => Next::Start(operation),
+                    Next::Again => Next::Again,
+                    Next::Done(result) => Next::Done(result.map_err(|_| FlashError::NvData)),
+                };
+            }
             (_, Err(fault)) => Err(fault),
-            (Some(Job::Erase { sectors, .. }), _) => sectors.next(flash),
+            (Some(Job::Erase { sector, .. }), _) => Ok(sector.take().map(Operation::Erase)),
             (Some(Job::Write(write)), _) => write.next(flash, &self.queue),
             (Some(Job::Verify { crc, .. }), _) => {
                 return match crc.step(flash, self.crc_kind, self.crc_step) {
@@ -345,40 +350,33 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
         match next {
             Ok(Some(operation)) => Next::Start(operation),
             Ok(None) => Next::Done(Ok(())),
-            Err(fault) => Next::Done(Err(Failure::Flash(fault))),
+            Err(FlashFault::Protected) => Next::Done(Err(FlashError::Secured)),
+            Err(_) => Next::Done(Err(FlashError::Write)),
         }
     }
 
     /// The job is over.
-    fn done(&mut self, result: Result<(), Failure>) -> Option<Event> {
-        let job = self.job.take()?;
-        let erasing = matches!(job, Job::Erase { .. });
-        match (job, result) {
-            (Job::Store(Change::Node), result) => Some(Event::NodeStored(result.map_err(|failure| {
-                if let Failure::Store(error) = failure {
-                    error
-                } else {
-                    StoreError::Device
+    fn done(&mut self, result: Result<(), FlashError>) -> Option<Event> {
+        match (self.job.take()?, result) {
+            (Job::Store(Change::Node, _), result) => Some(Event::NodeStored(result)),
+            (Job::Store(change, program), result) => {
+                if change == Change::Void {
+                    self.voids &= !(1 << program.saturating_sub(1));
                 }
-            }))),
-            (Job::Store(Change::Void(program)), Ok(())) => {
-                self.voids &= !(1 << program.saturating_sub(1));
-                Some(Event::Voided(program))
-            }
-            (Job::Store(Change::Record(program, record)), Ok(())) => Some(Event::Recorded(program, record)),
-            (Job::Store(Change::Confirm(program, record)), Ok(())) => Some(Event::Confirmed(program, record)),
-            // It costs a rescue window, no more.
-            (Job::Store(Change::Confirm(..)), Err(_)) => None,
-            (Job::Store(Change::Void(program) | Change::Record(program, _)), Err(_)) => {
-                // A record that does not go protects its data: nothing of them is touched.
-                self.voids &= !(1 << program.saturating_sub(1));
-                if self.current == program {
-                    self.abort();
+                match result {
+                    Ok(()) => Some(Event::Stored { program, ends: change == Change::Record }),
+                    // It costs a rescue window, no more.
+                    Err(_) if change == Change::Confirm => None,
+                    Err(error) => {
+                        // A record that does not go protects its data: nothing of them is touched.
+                        if self.current == program {
+                            self.abort();
+                        }
+                        Some(Event::Failed { program, error, erasing: false })
+                    }
                 }
-                Some(Event::Failed { program, error: FlashError::NvData, erasing })
             }
-            (_, Err(Failure::Flash(FlashFault::Protected))) => self.fail(FlashError::Secured, erasing),
-            (_, Err(_)) => self.fail(FlashError::Write, erasing),
+            (job, Err(error)) => self.fail(error, matches!(job, Job::Erase { .. })),
             (Job::Erase { until, .. }, Ok(())) => {
                 let program = self.current;
                 let target = self.target_mut()?;
@@ -414,14 +412,14 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
         if self.voids != 0 {
             let program = self.voids.trailing_zeros() as u8 + 1;
             parameters.store(Key::Program(program), ProgramRecord::NONE);
-            return Ok(Some(Job::Store(Change::Void(program))));
+            return Ok(Some(Job::Store(Change::Void, program)));
         }
         let piece = self.queue.first();
         let Some(target) = self.target_mut() else { return Ok(None) };
         let needed = piece.map_or(target.ahead, |piece| piece.address + piece.size);
         if target.erased < needed {
-            let sector = flash.sector_at(target.erased).ok_or(FlashError::Address)?.region;
-            return Ok(Some(Job::Erase { sectors: EraseSectors::new(sector), until: sector.end() }));
+            let sector = flash.sector_at(target.erased).ok_or(FlashError::Address)?;
+            return Ok(Some(Job::Erase { sector: Some(sector), until: sector.region.end() }));
         }
         if let Some(piece) = piece {
             let write = WritePiece::new(flash, piece).ok_or(FlashError::NotCleared)?;
@@ -431,19 +429,5 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
             let crc = FlashCrc::new(Region::new(target.region.base, expected.size));
             Job::Verify { expected, crc }
         }))
-    }
-}
-
-/// Why a job failed.
-enum Failure {
-    Flash(FlashFault),
-    Store(StoreError),
-}
-
-fn store_next(next: Next<StoreError>) -> Next<Failure> {
-    match next {
-        Next::Start(operation) => Next::Start(operation),
-        Next::Again => Next::Again,
-        Next::Done(result) => Next::Done(result.map_err(Failure::Store)),
     }
 }

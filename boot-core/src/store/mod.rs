@@ -22,6 +22,7 @@ use crate::flash::{Flash, FlashFault, Next};
 
 /// What a stored value is about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
 pub enum Key {
     /// The record of a program (1 to 254), see [`ProgramRecord`].
     Program(u8),
@@ -39,17 +40,6 @@ impl Key {
             Self::Program(number) => 0x0001_0000 | number as u32,
             Self::CrashCount => 0x0002_0000,
             Self::Node => 0x0003_0000,
-        }
-    }
-
-    /// The key of this word.
-    #[must_use]
-    pub const fn from_tag(tag: u32) -> Option<Self> {
-        match tag {
-            0x0001_0001..=0x0001_00FE => Some(Self::Program(tag as u8)),
-            0x0002_0000 => Some(Self::CrashCount),
-            0x0003_0000 => Some(Self::Node),
-            _ => None,
         }
     }
 }

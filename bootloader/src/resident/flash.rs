@@ -4,7 +4,7 @@
 use core::task::Poll;
 
 use boot_core::crc;
-use boot_core::flash::{crc32_by_software, Flash, FlashFault, Operation};
+use boot_core::flash::{Flash, FlashFault, Operation};
 use bsp::{pac, LAYOUT};
 use shared_abi::geometry::{Region, Sector};
 
@@ -13,28 +13,29 @@ use crate::flash_controller::{FlashController, FLASH};
 /// The controller, and the CRC unit where it is not somebody else's.
 pub struct ResidentFlash {
     controller: FlashController,
-    crc: Option<pac::CRC>,
+    has_crc_unit: bool,
 }
 
 impl ResidentFlash {
-    /// Takes the controller, and the CRC unit if `rcc` is there to switch it on.
+    /// Takes the controller, and the CRC unit if it has its clock for us.
     ///
     /// # Safety
     /// Nobody else may use the two until this is dropped.
-    pub unsafe fn steal(rcc: Option<&pac::RCC>) -> Self {
-        let crc = rcc.map(|rcc| {
-            rcc.ahb1enr().modify(|_, w| w.crcen().enabled());
-            // SAFETY: the caller vouches for it.
-            unsafe { pac::CRC::steal() }
-        });
+    pub unsafe fn steal(has_crc_unit: bool) -> Self {
         // SAFETY: the caller vouches for it.
-        Self { controller: unsafe { FlashController::steal() }, crc }
+        Self { controller: unsafe { FlashController::steal() }, has_crc_unit }
+    }
+
+    /// Switches the clock of the CRC unit on.
+    pub fn switch_crc_unit_on(rcc: &pac::RCC) {
+        rcc.ahb1enr().modify(|_, w| w.crcen().enabled());
     }
 
     /// Leaves both as after a reset.
     pub fn release(self, rcc: &pac::RCC) {
-        if let Some(crc) = &self.crc {
-            crc.cr().write(|w| w.reset().set_bit());
+        if self.has_crc_unit {
+            // SAFETY: `steal` has taken it.
+            unsafe { pac::CRC::steal() }.cr().write(|w| w.reset().set_bit());
             rcc.ahb1enr().modify(|_, w| w.crcen().disabled());
         }
         self.controller.clear_flags();
@@ -54,43 +55,46 @@ impl Flash for ResidentFlash {
         LAYOUT.chip.sector_at(address)
     }
 
-    /// By the unit. It has the polynomial, but takes words with the most significant bit first, and
-    /// starts anew: what went before comes back as one word that leaves it in the same state.
-    fn crc32(&self, crc: u32, region: Region) -> u32 {
-        let Some(unit) = &self.crc else { return crc32_by_software(self, crc, region) };
-        if !region.base.is_multiple_of(4) || !FLASH.contains(region.base, region.size) {
-            return crc32_by_software(self, crc, region);
+    fn is_blank(&self, region: Region) -> bool {
+        (region.base..region.end()).all(|address| self.controller.read_byte(address) == u8::MAX)
+    }
+
+    /// Whole words by the unit, the rest without. The unit has the polynomial, but takes words with
+    /// the most significant bit first, and starts anew: what went before comes back as one word
+    /// that leaves it in the same state.
+    #[inline(never)]
+    fn crc32(&self, mut crc: u32, region: Region) -> u32 {
+        let (mut address, end) = (region.base, region.end());
+        if self.has_crc_unit && address.is_multiple_of(4) && FLASH.contains(address, region.size) {
+            // SAFETY: `steal` has taken it.
+            let unit = unsafe { pac::CRC::steal() };
+            let (control, unit) = (unit.cr(), unit.dr());
+            // SAFETY: every word may be written to DR.
+            let feed = |word: u32| unit.write(|w| unsafe { w.bits(word) });
+            control.write(|w| w.reset().set_bit());
+            if crc != 0 {
+                feed(u32::MAX ^ word_before((!crc).reverse_bits()));
+            }
+            // SAFETY: the region was checked to be inside the memory-mapped flash, which is always
+            // readable.
+            let feed_from =
+                |address: u32| feed(unsafe { (address as *const u32).read_volatile() }.reverse_bits());
+            // Four at a time: on the way from reset to a large program this loop is most of the
+            // time.
+            while end - address >= 16 {
+                feed_from(address);
+                feed_from(address + 4);
+                feed_from(address + 8);
+                feed_from(address + 12);
+                address += 16;
+            }
+            while end - address >= 4 {
+                feed_from(address);
+                address += 4;
+            }
+            crc = !unit.read().bits().reverse_bits();
         }
-        let words = region.size / 4;
-        let (control, unit) = (unit.cr(), unit.dr());
-        // SAFETY: every word may be written to DR.
-        let feed = |word: u32| unit.write(|w| unsafe { w.bits(word) });
-        control.write(|w| w.reset().set_bit());
-        if crc != 0 {
-            feed(u32::MAX ^ word_before((!crc).reverse_bits()));
-        }
-        // SAFETY: the region was checked to be inside the memory-mapped flash, which is always
-        // readable.
-        let feed_from =
-            |address: u32| feed(unsafe { (address as *const u32).read_volatile() }.reverse_bits());
-        let (mut address, end) = (region.base, region.base + words * 4);
-        // Four at a time: on the way from reset to a large program this loop is most of the time.
-        while end - address >= 16 {
-            feed_from(address);
-            feed_from(address + 4);
-            feed_from(address + 8);
-            feed_from(address + 12);
-            address += 16;
-        }
-        while address < end {
-            feed_from(address);
-            address += 4;
-        }
-        let crc = !unit.read().bits().reverse_bits();
-        let mut tail = [0; 3];
-        let tail = &mut tail[..region.size as usize % 4];
-        self.read(region.base + words * 4, tail);
-        crc::resume(crc, tail)
+        (address..end).fold(crc, |crc, address| crc::resume(crc, &[self.controller.read_byte(address)]))
     }
 
     fn start(&mut self, operation: Operation) -> Result<(), FlashFault> {

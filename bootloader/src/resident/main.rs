@@ -8,6 +8,7 @@
 //! | `callgate.rs` | services for the application | its ABI |
 //! | `service_table.rs` | services for the RAM part: the one owner of what is non-volatile | their ABI |
 //! | `flash.rs` | the flash with sectors and CRC unit | registers |
+//! | `storing.rs` | a value stored while nothing else runs | no |
 //! | `ram_image.rs` | the rest of the bootloader, checked and unpacked to RAM | memory |
 //! | `unpack.rs` | the unpacker of ZX0 | assembly |
 //! | `caches.rs` | the caches of the flash, off or on for a while | registers |
@@ -34,6 +35,7 @@ mod service_table;
 #[path = "../services.rs"]
 mod services;
 mod stage;
+mod storing;
 mod unpack;
 
 use shared_abi::callgate::{Entry, Table, ABI_VERSION, MAGIC, TABLE_SIZE};

@@ -8,7 +8,7 @@ use shared_abi::geometry::Region;
 use shared_abi::ram_image::{Damage, Header, Method, LEAST_STACK};
 
 use crate::flash::ResidentFlash;
-use crate::unpack::unpack;
+use crate::unpack::{restore_calls, unpack};
 
 /// Checks the image and unpacks it to the start of the RAM.
 ///
@@ -36,14 +36,10 @@ pub unsafe fn load(header: *const Header, flash: &ResidentFlash) -> Result<(), D
     // SAFETY: `check` has found this to be RAM, and the caller vouches that nobody else uses it.
     let ram = unsafe { slice::from_raw_parts_mut(LAYOUT.ram.base as *mut u8, header.unpacked as usize) };
     match method {
-        // `check` has found them to be of one length, which the compiler does not know.
-        Method::Raw => {
-            for (to, from) in ram.iter_mut().zip(stored) {
-                *to = *from;
-            }
-        }
+        // SAFETY: the two slices, which `check` has found to be of one length.
+        Method::Raw => unsafe { stored.as_ptr().copy_to_nonoverlapping(ram.as_mut_ptr(), stored.len()) },
         Method::Zx0 if !unpack(stored, ram) => return Err(Damage::Stream),
-        Method::Zx0 => {}
+        Method::Zx0 => restore_calls(ram),
     }
     Ok(())
 }

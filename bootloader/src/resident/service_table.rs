@@ -2,7 +2,6 @@
 
 use boot_core::flash::{Flash, Next, Operation};
 use boot_core::store::{Key, Parameters as _, Value};
-use bsp::pac;
 use shared_abi::geometry::{Region, Sector};
 use shared_abi::ram_image::SERVICES_VERSION;
 
@@ -28,11 +27,11 @@ const _: () = assert!(
     "product: the parameters need more than services.rs has room for: raise STORE_STATE_WORDS"
 );
 
-/// The flash, for one call.
+/// The flash, for one call. The boot stage has left the CRC unit its clock.
 fn flash() -> ResidentFlash {
     // SAFETY: the RAM part, which owns the chip, calls one service at a time from one priority,
     // while no operation runs, and does not use the controller or the CRC unit meanwhile.
-    unsafe { ResidentFlash::steal(Some(&pac::RCC::steal())) }
+    unsafe { ResidentFlash::steal(true) }
 }
 
 /// # Safety
@@ -44,8 +43,7 @@ unsafe extern "C" fn open(state: *mut StoreState) {
 
 /// # Safety
 /// `state` must come from [`open`]; `value` must be writable.
-unsafe extern "C" fn get(state: *const StoreState, tag: u32, value: *mut Value) -> bool {
-    let Some(key) = Key::from_tag(tag) else { return false };
+unsafe extern "C" fn get(state: *const StoreState, key: Key, value: *mut Value) -> bool {
     // SAFETY: the caller vouches for both.
     unsafe {
         let Some(found) = (*state.cast::<Parameters>()).get(&flash(), key) else { return false };
@@ -56,8 +54,7 @@ unsafe extern "C" fn get(state: *const StoreState, tag: u32, value: *mut Value) 
 
 /// # Safety
 /// `state` must come from [`open`]; `value` must be readable.
-unsafe extern "C" fn store(state: *mut StoreState, tag: u32, value: *const Value) {
-    let Some(key) = Key::from_tag(tag) else { return };
+unsafe extern "C" fn store(state: *mut StoreState, key: Key, value: *const Value) {
     // SAFETY: the caller vouches for both.
     unsafe { (*state.cast::<Parameters>()).store(key, *value) };
 }

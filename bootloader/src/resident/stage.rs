@@ -5,9 +5,8 @@
 
 use boot_core::canopen::NodeId;
 use boot_core::decision::{decide, BootDecision, Circumstances, StayReason};
-use boot_core::flash::run;
 use boot_core::program::verify;
-use boot_core::store::{Key, Parameters as _};
+use boot_core::store::Key;
 use bsp::clock::{Source, HSI};
 use bsp::{pac, CLOCK_TREE, LAYOUT};
 use cortex_m::peripheral::SCB;
@@ -19,7 +18,7 @@ use crate::boot_report::BootReport;
 use crate::caches::Caches;
 use crate::flash::ResidentFlash;
 use crate::product::{self, NO_NODE_ID, PRODUCT};
-use crate::ram_image;
+use crate::{ram_image, storing};
 
 /// About how long the warm-start cell can be read in peace between two resets where nothing can run.
 const RESET_PERIOD_MS: u32 = 100;
@@ -47,7 +46,8 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
     // CRCs and unpacking want speed. Exact it need not be, and the crystal would take its time.
     CLOCK_TREE.speed_up(&rcc, Source::Internal);
     // SAFETY: as above.
-    let mut flash = unsafe { ResidentFlash::steal(Some(&rcc)) };
+    let mut flash = unsafe { ResidentFlash::steal(true) };
+    ResidentFlash::switch_crc_unit_on(&rcc);
     let mut parameters = product::parameters(&flash);
     let crash_resets = count_crash_resets(&mut parameters, &mut flash, reset_cause, request);
     // SAFETY: as above; nothing is programmed from here on.
@@ -55,56 +55,49 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
 
     let node = product::node_parameters(&parameters, &flash);
     let node_id = node.id.map_or(NO_NODE_ID, NodeId::get);
-    let choose = |request| {
+    // A bootloader that cannot run resumes what would start by itself, at once: a rescue window would
+    // need the RAM image.
+    for request in [request, PRODUCT.autostart.map(BootRequest::Resume)] {
         let circumstances = Circumstances { request, strap, crash_resets, node_id };
         let verified = |number| verify(&flash, &parameters, LAYOUT, PRODUCT.crc, number);
-        decide(&circumstances, &DECISION, verified)
-    };
-    let mut decision = choose(request);
-    let mut stays = !matches!(decision, BootDecision::Start { .. });
-    if stays {
+        let decision = decide(&circumstances, &DECISION, verified);
+        if let BootDecision::Start { program, trial } = decision {
+            drop(caches);
+            flash.release(&rcc);
+            CLOCK_TREE.slow_down(&rcc);
+            let handoff = Handoff::new(&BootInfo {
+                node_id,
+                bit_rate: node.bit_rate.or_zero(),
+                program: program.number(),
+                reset_cause,
+                trial,
+                bootloader_version: product::VERSION,
+                serial_number: bsp::serial_number(),
+            });
+            if let Some(ms) = PRODUCT.program_watchdog_ms {
+                bsp::watchdog::start(&iwdg, ms);
+            }
+            // SAFETY: the layout's handoff region, checked to be RAM of that size in no image. No
+            // interrupt was enabled and no bus master started since the reset.
+            unsafe {
+                handoff.write(LAYOUT.handoff.base as *mut Handoff);
+                program.vectors().jump()
+            }
+        }
         // SAFETY: the caller vouches for the address; of the RAM nothing is in use but the stack.
-        if let Err(damage) = unsafe { ram_image::load(image, &flash) } {
-            cell.put(BootRequest::Damaged(damage));
-            stays = false;
-            // What would start by itself starts at once: a window would need the RAM image.
-            let resume = PRODUCT.autostart.map(BootRequest::Resume);
-            decision = if strap { decision } else { choose(resume) };
+        match unsafe { ram_image::load(image, &flash) } {
+            Ok(()) => {
+                // SAFETY: the caller vouches for the address.
+                unsafe { report.write(boot_report(&decision, request)) };
+                return;
+            }
+            Err(damage) => cell.put(BootRequest::Damaged(damage)),
         }
     }
-    // Whoever runs next finds the chip as after a reset, but the bootloader finds it fast: it clears
-    // its memory first of all.
-    drop(caches);
-    flash.release(&rcc);
-    if stays {
-        // SAFETY: the caller vouches for the address.
-        unsafe { report.write(boot_report(&decision, request)) };
-        return;
-    }
     CLOCK_TREE.slow_down(&rcc);
-    let BootDecision::Start { program, trial } = decision else {
-        // A round of the loop takes three cycles.
-        cortex_m::asm::delay(HSI / 1000 * RESET_PERIOD_MS / 3);
-        SCB::sys_reset()
-    };
-    let handoff = Handoff::new(&BootInfo {
-        node_id,
-        bit_rate: node.bit_rate.or_zero(),
-        program: program.number(),
-        reset_cause,
-        trial,
-        bootloader_version: product::VERSION,
-        serial_number: bsp::serial_number(),
-    });
-    if let Some(ms) = PRODUCT.program_watchdog_ms {
-        bsp::watchdog::start(&iwdg, ms);
-    }
-    // SAFETY: the layout's handoff region, checked to be RAM of that size in no image. No interrupt
-    // was enabled and no bus master started since the reset.
-    unsafe {
-        handoff.write(LAYOUT.handoff.base as *mut Handoff);
-        program.vectors().jump()
-    }
+    // A round of the loop takes three cycles.
+    cortex_m::asm::delay(HSI / 1000 * RESET_PERIOD_MS / 3);
+    SCB::sys_reset()
 }
 
 /// What the RAM part is told.
@@ -116,16 +109,15 @@ fn boot_report(decision: &BootDecision, request: Option<BootRequest>) -> BootRep
     };
     // An application that asks for the bootloader has shown that it can be called back. Which one
     // it was stands in the handoff, which nobody has written since.
-    let returns = matches!(request, Some(BootRequest::Stay | BootRequest::Clear(_)));
-    // SAFETY: the layout's handoff region, checked to be RAM of that size in no image.
-    let handoff = unsafe { Handoff::read(LAYOUT.handoff.base as *const Handoff) };
-    BootReport {
-        reason: reason.code(),
-        held_program,
-        window_ms,
-        clear: if let Some(BootRequest::Clear(program)) = request { program } else { 0 },
-        returned: handoff.filter(|_| returns).map_or(0, |info| info.program),
-    }
+    let returned = match request {
+        // SAFETY: the layout's handoff region, checked to be RAM of that size in no image.
+        Some(BootRequest::Stay | BootRequest::Clear(_)) => unsafe {
+            Handoff::read_program(LAYOUT.handoff.base as *const Handoff)
+        },
+        _ => 0,
+    };
+    let clear = if let Some(BootRequest::Clear(program)) = request { program } else { 0 };
+    BootReport { reason: reason.code(), held_program, window_ms, clear, returned }
 }
 
 /// The product's policy.
@@ -138,13 +130,11 @@ fn count_crash_resets(
     reset_cause: ResetCause,
     request: Option<BootRequest>,
 ) -> u32 {
-    let before = parameters.get(flash, Key::CrashCount).map_or(0, |[count, ..]| count);
+    let before = storing::crash_count(parameters, flash);
     let now = DECISION.crash_resets(before, reset_cause, request);
     if now != before {
-        parameters.store(Key::CrashCount, [now, 0, 0, 0]);
-        // Nothing else runs that could be kept waiting. A store that fails costs the count, not the
-        // start.
-        let _ = run(flash, |flash, outcome| parameters.next(flash, outcome));
+        // A store that fails costs the count, not the start.
+        let _ = storing::store(parameters, flash, Key::CrashCount, [now, 0, 0, 0]);
     }
     now
 }

@@ -10,6 +10,7 @@ use core::arch::global_asm;
 
 extern "C" {
     fn zx0_unpack(packed: *const u8, packed_end: *const u8, to: *mut u8, to_end: *mut u8) -> u32;
+    fn calls_to_relative(image: *mut u8, end: *mut u8);
 }
 
 /// Unpacks a stream into all of `to`, and takes all of `packed` for it; whether that went well.
@@ -22,6 +23,15 @@ pub fn unpack(packed: &[u8], to: &mut [u8]) -> bool {
     // second between its own: `literals`, `another` and `refill` compare with the end of the
     // first, `copy` with that of the second, and `match` with its start.
     unsafe { zx0_unpack(packed.start, packed.end, to.start, to.end) == 0 }
+}
+
+/// Puts calls back as the core wants them. Before the image was packed, the target of each `BL` was
+/// made absolute, so that two calls of one function are the same bytes (`xtask/src/pack.rs`).
+pub fn restore_calls(image: &mut [u8]) {
+    let image = image.as_mut_ptr_range();
+    // SAFETY: the slice. The code reads and writes half-words while four bytes are left; the image
+    // is in RAM, aligned.
+    unsafe { calls_to_relative(image.start, image.end) };
 }
 
 // r0 next byte of the stream, r1 its end; r2 next byte of the output, r3 its end, r4 its start;
@@ -128,4 +138,38 @@ global_asm!(
     ".Lzx0_taken:",
     "bx lr",
     ".size zx0_unpack, . - zx0_unpack",
+);
+
+// r0 next half-word of the image, r1 its end; r2 the first half-word of a call, r12 the second one,
+// then the target in half-words; r3 is free. (BL, encoding T1, as ARMv6-M has it: a call that far
+// is all that a RAM image has.)
+global_asm!(
+    ".section .text.calls_to_relative, \"ax\"",
+    ".syntax unified",
+    ".global calls_to_relative",
+    ".type calls_to_relative,%function",
+    ".thumb_func",
+    "calls_to_relative:",
+    "subs r2, r1, r0",
+    "cmp r2, #4",
+    "blo .Lcalls_end",
+    "ldrh r2, [r0], #2",
+    "lsrs r3, r2, #11",
+    "cmp r3, #0b11110",
+    "bne calls_to_relative",
+    "ldrh r12, [r0]",
+    "lsr r3, r12, #11",
+    "cmp r3, #0b11111",
+    "bne calls_to_relative",
+    "bfi r12, r2, #11, #11",
+    "sub r12, r12, r0, lsr #1",
+    "ubfx r2, r12, #11, #11",
+    "orr r2, r2, #0xF000",
+    "strh r2, [r0, #-2]",
+    "orr r12, r12, #0xF800",
+    "strh r12, [r0], #2",
+    "b calls_to_relative",
+    ".Lcalls_end:",
+    "bx lr",
+    ".size calls_to_relative, . - calls_to_relative",
 );
