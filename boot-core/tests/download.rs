@@ -8,7 +8,7 @@ use boot_core::control::{Downloader, Policy, Step, Verdict};
 use boot_core::crc::CrcKind;
 use boot_core::flash::{Flash, FlashFault, Next};
 use boot_core::program::{verify, Invalid};
-use boot_core::store::{Key, Parameters, StoreError, Value};
+use boot_core::store::{Journal, Key, Parameters, StoreError, Value};
 use canopen::od::{Address, Objects};
 use canopen::program::{FlashError, ProgramControl};
 use canopen::AbortCode;
@@ -38,6 +38,97 @@ fn a_program_goes_in_block_by_block_and_survives_a_restart() {
 fn the_crc_is_the_one_of_the_catalogue() {
     assert_eq!(boot_core::crc32(b"123456789"), 0xCBF4_3926);
     assert_eq!(crc32(b"123456789"), 0xCBF4_3926);
+}
+
+/// A product whose blocks and programs carry CRC-16 (`BLCOP_USE_CRC16`).
+const CRC_16: Policy = Policy { crc: CrcKind::Crc16, ..Policy::DEFAULT };
+
+/// The same block with the other CRC, in the lower half of the word.
+fn with_crc16(mut block: Vec<u8>) -> Vec<u8> {
+    let body = block.len() - 4;
+    let crc = crc16(&block[..body]);
+    block[body..].copy_from_slice(&crc.to_le_bytes());
+    block
+}
+
+fn file_with_crc16(program: &[u8], chunk: usize) -> Vec<Vec<u8>> {
+    let mut file = block_file(program, chunk);
+    let size = program.len() as u32;
+    let last = block(u32::MAX, 0, &[size.to_le_bytes(), crc16(program).to_le_bytes()].concat());
+    *file.last_mut().unwrap() = last;
+    file.into_iter().map(with_crc16).collect()
+}
+
+/// Whether the boot stage of a product with this CRC would start it.
+fn starts(flash: &ModelFlash, kind: CrcKind) -> Result<bool, Invalid> {
+    let journal = Journal::open(flash, LAYOUT.parameters);
+    verify(flash, &journal, LAYOUT_REF, kind, 1).map(|program| program.signed())
+}
+
+/// CRC-16 of the digits 1 to 9, from the CRC catalogue (CRC-16/XMODEM, "check"): by the code of the
+/// device and by that of these tests.
+#[test]
+fn the_crc_16_is_the_one_of_the_catalogue() {
+    assert_eq!(CrcKind::Crc16.resume(0, b"123456789"), 0x31C3);
+    assert_eq!(CrcKind::Crc16.resume(CrcKind::Crc16.resume(0, b"1234"), b"56789"), 0x31C3);
+    assert_eq!(crc16(b"123456789"), 0x31C3);
+}
+
+#[test]
+fn a_product_with_crc_16_takes_blocks_and_programs_that_carry_it() {
+    let image = program(1000, 0x11);
+    // Also where the CRC over the program is computed in many steps.
+    for crc_step in [64, 1024] {
+        let mut flash = ModelFlash::new(&CHIP);
+        let mut bench = Bench::with(&mut flash, Policy { crc_step, ..CRC_16 });
+        assert_eq!(bench.command(CLEAR), 0);
+        let good = file_with_crc16(&image, 96);
+        // The other CRC, and one with something in the upper half.
+        let mut upper = good[0].clone();
+        *upper.last_mut().unwrap() = 1;
+        for wrong in [&block_file(&image, 96)[0], &upper] {
+            assert_eq!(bench.block(wrong), (Err(AbortCode(0x0800_0020)), 0x06));
+        }
+        for block in &good {
+            bench.good(block);
+        }
+        assert_eq!(bench.word(IDENTIFICATION), crc16(&image));
+        assert_eq!(bench.command(SET_SIGNATURE), 0);
+        assert_eq!(starts(&flash, CrcKind::Crc16), Ok(true));
+        assert_eq!(starts(&flash, CrcKind::Crc32), Err(Invalid::Crc));
+        flash.poke(PROGRAM.base + 500, &[!image[500]]);
+        assert_eq!(starts(&flash, CrcKind::Crc16), Err(Invalid::Crc));
+    }
+}
+
+/// The last block tells another CRC than the program has: the right one of the wrong kind.
+#[test]
+fn a_product_with_crc_16_finds_no_program_where_the_crc_over_it_is_wrong() {
+    let image = program(96, 0x22);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with(&mut flash, CRC_16);
+    assert_eq!(bench.command(CLEAR), 0);
+    let good = file_with_crc16(&image, 96);
+    bench.good(&good[0]);
+    bench.good(&good[1]);
+    assert_eq!(bench.block(&with_crc16(last(&image))), (Ok(()), 0x02));
+    assert_eq!(bench.command(SET_SIGNATURE), 0x02);
+    assert_eq!(starts(&flash, CrcKind::Crc16), Err(Invalid::Absent));
+}
+
+/// What carries no CRC gets the product's own.
+#[test]
+fn a_product_with_crc_16_takes_raw_images_and_keeps_their_crc_16() {
+    let image = program(3001, 0x33);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with(&mut flash, CRC_16);
+    assert_eq!(bench.command(CLEAR), 0);
+    assert_eq!(bench.stream(&image, Some(3001), 7), (Ok(()), 0));
+    assert_eq!(bench.word(IDENTIFICATION), crc16(&image));
+    assert_eq!(bench.command(START), 0);
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
+    assert_eq!(starts(&flash, CrcKind::Crc16), Ok(true));
+    assert_eq!(starts(&flash, CrcKind::Crc32), Err(Invalid::Crc));
 }
 
 #[test]

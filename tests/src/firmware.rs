@@ -95,10 +95,18 @@ pub fn blocks(name: &str) -> BlockFile {
 /// If it was not built, or does not begin there.
 #[must_use]
 pub fn raw(name: &str) -> Vec<u8> {
+    raw_from(board().programs[0].base, name)
+}
+
+/// The same from the start of any program on.
+///
+/// # Panics
+/// As [`raw`].
+#[must_use]
+pub fn raw_from(base: u32, name: &str) -> Vec<u8> {
     let Firmware::Image(image) = read(&elf(name), None, None).expect("an ELF of ours") else {
         panic!("an ELF is no block file");
     };
-    let base = board().programs[0].base;
     let mut bytes = Vec::new();
     for (address, data) in image.segments() {
         let at = (address - base) as usize;

@@ -6,6 +6,7 @@ pub mod eds;
 pub mod endpoint;
 pub mod firmware;
 pub mod ihex;
+pub mod listener;
 pub mod powercut;
 pub mod script;
 pub mod serial;

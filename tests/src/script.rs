@@ -9,13 +9,19 @@
 //! | `; words` | nothing |
 //! | `@raw IMAGE` | the master writes the image to 1F50h/1 in one segmented SDO download |
 //! | `@hex IMAGE` | the same as Intel HEX |
+//! | `@hex IMAGE PROGRAM` | the same to 1F50h/PROGRAM |
 //! | `@part BYTES IMAGE` | the same, but the master aborts when so many bytes were acknowledged |
 //! | `@wait MS` | time passes |
 //! | `@idle` | the master reads 1F57h/1 until it is not busy |
 //! | `@power` | off and on |
 //!
-//! In the data of the device's frames `..` is any byte: what differs from board to board.
+//! In the data of the device's frames `..` is any byte: what differs from board to board. A letter
+//! behind F and a digit, `s0`, is a byte that has a name: any byte the first time, and the same one
+//! from then on, also in what the master sends. `p0` is the number of programs of the board.
+//!
+//! The frames are on the CAN bus, or text on a board's UART: that is [`Wire`].
 
+use std::collections::HashMap;
 use std::fs;
 use std::path::Path;
 use std::time::Duration;
@@ -23,8 +29,9 @@ use std::time::Duration;
 use canopen::sdo::wire::Request;
 use canopen::{AbortCode, Address};
 use coflash::adapter::Adapter;
-use coflash::session::{Doing, Transfers};
+use coflash::session::{Doing, Session, Transfers};
 use emulator::time::{Span, Time};
+use shared_abi::layout::Layout;
 
 use crate::bench::Bench;
 use crate::firmware;
@@ -34,14 +41,74 @@ const DATA: Address = Address::new(0x1F50, 1);
 /// The longest that the device may take to answer.
 const PATIENCE_MS: u64 = 3000;
 
+/// What is between the master of a session and the device.
+pub trait Wire {
+    /// Virtual time.
+    fn time(&self) -> Time;
+    /// Lets time pass.
+    fn run_ms(&mut self, ms: u64);
+    /// Switches the device off.
+    fn power_off(&mut self);
+    /// Switches the device on.
+    fn power_on(&mut self);
+    /// Sends a frame of the master, and waits for nothing.
+    fn send(&mut self, id: u16, data: &[u8]);
+    /// The frames that began at or after a point of time, as end, identifier and data.
+    fn frames_since(&self, from: Time) -> Vec<(Time, u32, Vec<u8>)>;
+    /// A host's session with a node.
+    fn session_with(&mut self, node: u8) -> Session<'_>;
+}
+
+impl Wire for Bench {
+    fn time(&self) -> Time {
+        self.time()
+    }
+
+    fn run_ms(&mut self, ms: u64) {
+        self.run_ms(ms);
+    }
+
+    fn power_off(&mut self) {
+        self.power_off();
+    }
+
+    fn power_on(&mut self) {
+        self.power_on();
+    }
+
+    fn send(&mut self, id: u16, data: &[u8]) {
+        self.post(id, data);
+    }
+
+    fn frames_since(&self, from: Time) -> Vec<(Time, u32, Vec<u8>)> {
+        self.frames_since(from)
+    }
+
+    fn session_with(&mut self, node: u8) -> Session<'_> {
+        // What came was looked at on the bus; no session shall take it for an answer of its own.
+        while self.receive(Duration::ZERO).is_ok_and(|frame| frame.is_some()) {}
+        self.session_with(node)
+    }
+}
+
 /// Plays a script of `tests/expected`.
 ///
 /// # Panics
 /// Where the device does something else; the message names the line.
 pub fn play(bench: &mut Bench, script: &str) {
+    play_on(bench, script, firmware::board(), &|image| image.to_owned());
+}
+
+/// The same on any wire, with a board of any layout. `image` gives the file for the name of an image
+/// in the script.
+///
+/// # Panics
+/// As [`play`].
+pub fn play_on(wire: &mut dyn Wire, script: &str, board: &Layout, image: &dyn Fn(&str) -> String) {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("expected").join(script);
     let text = fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-    let mut player = Player { seen: bench.time(), node: 1, bench };
+    let named = HashMap::from([("p0".to_owned(), board.programs.len() as u8)]);
+    let mut player = Player { seen: wire.time(), node: 1, wire, board, image, named };
     for (number, line) in (1..).zip(text.lines()) {
         let place = format!("{script}, line {number}: {line}");
         match line.trim() {
@@ -54,11 +121,32 @@ pub fn play(bench: &mut Bench, script: &str) {
 }
 
 struct Player<'b> {
-    bench: &'b mut Bench,
+    wire: &'b mut dyn Wire,
+    board: &'b Layout,
+    image: &'b dyn Fn(&str) -> String,
     /// Frames up to here were looked at.
     seen: Time,
     /// The node that was asked last.
     node: u8,
+    /// The bytes that have a name.
+    named: HashMap<String, u8>,
+}
+
+/// A byte in the data of a frame.
+enum Byte {
+    Is(u8),
+    Any,
+    Named(String),
+}
+
+impl Byte {
+    fn parse(text: &str) -> Self {
+        match text.as_bytes() {
+            b".." => Self::Any,
+            [b'g'..=b'z', b'0'..=b'9'] => Self::Named(text.to_owned()),
+            _ => Self::Is(u8::from_str_radix(text, 16).expect("hexadecimal digits")),
+        }
+    }
 }
 
 impl Player<'_> {
@@ -66,86 +154,107 @@ impl Player<'_> {
         let frame = line.split_whitespace().nth(2).and_then(|frame| frame.split_once('#'));
         let (id, data) = frame.unwrap_or_else(|| panic!("{place}: this is no line of a candump log"));
         let id = u16::from_str_radix(id, 16).unwrap_or_else(|_| panic!("{place}: no identifier"));
-        let bytes: Vec<Option<u8>> = (0..data.len() / 2)
-            .map(|i| &data[2 * i..2 * i + 2])
-            .map(|byte| (byte != "..").then(|| u8::from_str_radix(byte, 16).expect("hexadecimal digits")))
-            .collect();
+        let bytes: Vec<Byte> = (0..data.len() / 2).map(|i| Byte::parse(&data[2 * i..2 * i + 2])).collect();
         if matches!(id, 0 | 0x601..=0x67F | 0x7E5) {
             if id > 0x600 && id < 0x680 {
                 self.node = (id - 0x600) as u8;
             }
-            self.seen = self.bench.time();
-            let data: Vec<u8> =
-                bytes.into_iter().map(|byte| byte.expect("the master knows what it sends")).collect();
-            self.bench.post(id, &data);
+            self.seen = self.wire.time();
+            let known =
+                |byte: &Byte| self.value(byte).unwrap_or_else(|| panic!("{place}: the master knows it not"));
+            let data: Vec<u8> = bytes.iter().map(known).collect();
+            self.wire.send(id, &data);
         } else {
             self.expect(id.into(), &bytes, place);
         }
     }
 
+    /// What a byte has to be; `None` where it may be any.
+    fn value(&self, byte: &Byte) -> Option<u8> {
+        match byte {
+            Byte::Is(byte) => Some(*byte),
+            Byte::Any => None,
+            Byte::Named(name) => self.named.get(name).copied(),
+        }
+    }
+
     /// The next frame of the device; heartbeats are passed over unless one is expected.
-    fn expect(&mut self, id: u32, bytes: &[Option<u8>], place: &str) {
-        let deadline = self.bench.time() + Span::from_millis(PATIENCE_MS);
+    fn expect(&mut self, id: u32, bytes: &[Byte], place: &str) {
+        let deadline = self.wire.time() + Span::from_millis(PATIENCE_MS);
         loop {
-            let frames = self.bench.frames_since(self.seen);
+            let frames = self.wire.frames_since(self.seen);
             let of_device = |(_, id, _): &&(Time, u32, Vec<u8>)| !matches!(id, 0 | 0x601..=0x67F | 0x7E5);
             for (at, found, data) in frames.iter().filter(of_device) {
                 self.seen = *at;
-                let matches = data.len() == bytes.len()
-                    && data.iter().zip(bytes).all(|(found, byte)| byte.is_none_or(|byte| byte == *found));
-                if *found == id && matches {
+                let fits = |(found, byte): (&u8, &Byte)| self.value(byte).is_none_or(|byte| byte == *found);
+                if *found == id && data.len() == bytes.len() && data.iter().zip(bytes).all(fits) {
+                    for (found, byte) in data.iter().zip(bytes) {
+                        if let Byte::Named(name) = byte {
+                            self.named.insert(name.clone(), *found);
+                        }
+                    }
                     return;
                 }
                 let heartbeat = (0x701..=0x77F).contains(found) && data[..] != [0];
                 assert!(heartbeat, "{place}: the device sent {found:03X}#{data:02X?}");
             }
-            assert!(self.bench.time() < deadline, "{place}: the device is silent");
-            self.bench.run_ms(1);
+            assert!(self.wire.time() < deadline, "{place}: the device is silent");
+            self.wire.run_ms(1);
         }
+    }
+
+    /// The bytes of an image, and the address of the first.
+    fn program(&self, number: u8, image: &str) -> (u32, Vec<u8>) {
+        let base = self.board.program(number).expect("a program of the board").base;
+        (base, firmware::raw_from(base, &(self.image)(image)))
     }
 
     fn carry_out(&mut self, directive: &str, place: &str) {
         let words: Vec<&str> = directive.split_whitespace().collect();
         let number = |word: &str| word.parse().unwrap_or_else(|_| panic!("{place}: no number"));
         match words[..] {
-            ["@raw", image] => self.download(&firmware::raw(image)),
-            ["@hex", image] => {
-                let base = firmware::board().programs[0].base;
-                self.download(intel_hex(base, &firmware::raw(image)).as_bytes());
-            }
-            ["@part", bytes, image] => self.part(&firmware::raw(image)[..number(bytes) as usize]),
-            ["@wait", ms] => self.bench.run_ms(number(ms)),
+            ["@raw", image] => self.download(1, &self.program(1, image).1),
+            ["@hex", image] => self.hex(1, image),
+            ["@hex", image, program] => self.hex(number(program) as u8, image),
+            ["@part", bytes, image] => self.part(&self.program(1, image).1[..number(bytes) as usize]),
+            ["@wait", ms] => self.wire.run_ms(number(ms)),
             ["@idle"] => {
-                let status = self.bench.session_with(self.node).await_idle(1, Doing::Read(DATA));
+                let status = self.wire.session_with(self.node).await_idle(1, Doing::Read(DATA));
                 assert!(status.is_ok(), "{place}: {status:?}");
             }
             ["@power"] => {
-                self.bench.power_off();
-                self.bench.run_ms(100);
-                self.seen = self.bench.time();
-                self.bench.power_on();
+                self.wire.power_off();
+                self.wire.run_ms(100);
+                self.seen = self.wire.time();
+                self.wire.power_on();
             }
             _ => panic!("{place}: nobody knows what that is"),
         }
         // What came meanwhile was looked at.
         if words[0] != "@power" {
-            self.seen = self.bench.time();
+            self.seen = self.wire.time();
         }
     }
 
-    fn download(&mut self, data: &[u8]) {
-        let mut session = self.bench.session_with(self.node);
+    fn hex(&mut self, number: u8, image: &str) {
+        let (base, bytes) = self.program(number, image);
+        self.download(number, intel_hex(base, &bytes).as_bytes());
+    }
+
+    fn download(&mut self, number: u8, data: &[u8]) {
+        let mut session = self.wire.session_with(self.node);
         session.transfer_by(Transfers::Segments);
-        session.write(DATA, data, Doing::Block(0), &mut |_| {}).expect("the device takes the program");
+        let at = Address::new(0x1F50, number);
+        session.write(at, data, Doing::Block(0), &mut |_| {}).expect("the device takes the program");
     }
 
     /// The beginning of a download, with an abort behind it.
     fn part(&mut self, data: &[u8]) {
         let (request, response) = (0x600 + u16::from(self.node), 0x580 + u32::from(self.node));
         let mut ask = |bytes: &[u8; 8], answer: [u8; 8]| {
-            self.seen = self.bench.time();
-            self.bench.post(request, bytes);
-            self.expect(response, &answer.map(Some), "@part");
+            self.seen = self.wire.time();
+            self.wire.send(request, bytes);
+            self.expect(response, &answer.map(Byte::Is), "@part");
         };
         ask(&[0x20, 0x50, 0x1F, 1, 0, 0, 0, 0], [0x60, 0x50, 0x1F, 1, 0, 0, 0, 0]);
         for (i, segment) in data.chunks_exact(7).enumerate() {
@@ -154,9 +263,7 @@ impl Player<'_> {
             bytes[1..].copy_from_slice(segment);
             ask(&bytes, [0x20 | toggle, 0, 0, 0, 0, 0, 0, 0]);
         }
-        self.bench.post(request, &Request::Abort(DATA, AbortCode::GENERAL).emit());
-        self.bench.run_ms(5);
-        // The answers were looked at on the bus; no session shall take them for its own.
-        while self.bench.receive(Duration::ZERO).is_ok_and(|frame| frame.is_some()) {}
+        self.wire.send(request, &Request::Abort(DATA, AbortCode::GENERAL).emit());
+        self.wire.run_ms(5);
     }
 }

@@ -4,10 +4,15 @@ use std::collections::VecDeque;
 use std::io::{self, ErrorKind, Read, Write};
 use std::time::{Duration, Instant};
 
+use canopen::NodeId;
 use coflash::adapter::slcan::Line;
-use emulator::time::Span;
+use coflash::adapter::{Adapter, AdapterError};
+use coflash::session::{Session, Timing};
+use embedded_can::{Frame as _, Id, StandardId};
+use emulator::time::{Span, Time};
 
 use crate::bench::Bench;
+use crate::script::Wire;
 
 /// How far the board goes on between two looks at the line.
 const LOOK: Span = Span::from_micros(100);
@@ -64,5 +69,129 @@ impl Line for SerialLine<'_> {
 
     fn now(&self) -> Instant {
         self.epoch + Duration::from_nanos(self.bench.time().0 / 1000)
+    }
+}
+
+/// A board's UART as a bus: frames as text, as the CAN232's manual has them. What coflash makes of
+/// that text has no part in it.
+pub struct TextBus {
+    /// The bench of the board.
+    pub bench: Bench,
+    /// What has come of a line, and when the first character of it ended.
+    line: (Time, String),
+    heard: Vec<Heard>,
+    /// Frames up to here were given to the host's session.
+    given: usize,
+}
+
+/// A frame of the device.
+struct Heard {
+    start: Time,
+    end: Time,
+    id: u16,
+    data: Vec<u8>,
+}
+
+impl TextBus {
+    /// The UART of the first board of a bench.
+    #[must_use]
+    pub fn new(bench: Bench) -> Self {
+        Self { bench, line: (Time(0), String::new()), heard: Vec::new(), given: 0 }
+    }
+
+    fn run(&mut self, span: Span) {
+        self.bench.world.run_for(span);
+        let usarts = self.bench.machine().usarts_mut().iter_mut();
+        for character in usarts.flat_map(|usart| usart.take_sent()).collect::<Vec<_>>() {
+            let (start, line) = &mut self.line;
+            if line.is_empty() {
+                *start = character.end;
+            }
+            match character.byte {
+                b'\r' => {
+                    let line = std::mem::take(line);
+                    self.heard.extend(frame(*start, character.end, &line));
+                }
+                byte => line.push(byte.into()),
+            }
+        }
+    }
+}
+
+/// The frame in a line of text; a line without one acknowledges what the host said.
+fn frame(start: Time, end: Time, line: &str) -> Option<Heard> {
+    let text = match line.strip_prefix('t') {
+        Some(text) => text,
+        None if line.is_empty() || line == "z" => return None,
+        None => panic!("the device said {line:?}"),
+    };
+    let number = |digits: &str| u16::from_str_radix(digits, 16).expect("hexadecimal digits");
+    let (id, len) = (number(&text[..3]), number(&text[3..4]));
+    let data: Vec<u8> = (4..text.len()).step_by(2).map(|i| number(&text[i..i + 2]) as u8).collect();
+    assert_eq!(data.len(), usize::from(len), "the device said {line:?}");
+    Some(Heard { start, end, id, data })
+}
+
+impl Wire for TextBus {
+    fn time(&self) -> Time {
+        self.bench.time()
+    }
+
+    fn run_ms(&mut self, ms: u64) {
+        self.run(Span::from_millis(ms));
+    }
+
+    fn power_off(&mut self) {
+        self.bench.power_off();
+        self.line.1.clear();
+    }
+
+    fn power_on(&mut self) {
+        self.bench.power_on();
+    }
+
+    fn send(&mut self, id: u16, data: &[u8]) {
+        let data_text: String = data.iter().map(|byte| format!("{byte:02X}")).collect();
+        let text = format!("t{id:03X}{}{data_text}\r", data.len());
+        let now = self.bench.time();
+        assert_eq!(self.bench.usart().receive(text.as_bytes(), now), text.len());
+    }
+
+    fn frames_since(&self, from: Time) -> Vec<(Time, u32, Vec<u8>)> {
+        let since = self.heard.iter().filter(|frame| frame.start >= from);
+        since.map(|frame| (frame.end, frame.id.into(), frame.data.clone())).collect()
+    }
+
+    fn session_with(&mut self, node: u8) -> Session<'_> {
+        self.given = self.heard.len();
+        Session::new(self, NodeId::new(node).expect("1 to 127"), Timing::default())
+    }
+}
+
+impl Adapter for TextBus {
+    fn send(&mut self, frame: &canopen::Frame) -> Result<(), AdapterError> {
+        let Id::Standard(id) = frame.id() else { panic!("CANopen has 11 bits") };
+        Wire::send(self, id.as_raw(), frame.data());
+        Ok(())
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<canopen::Frame>, AdapterError> {
+        let nanos = u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX / 1000);
+        let deadline = self.bench.time() + Span::from_nanos(nanos);
+        loop {
+            if let Some(Heard { id, data, .. }) = self.heard.get(self.given) {
+                self.given += 1;
+                let id = StandardId::new(*id).expect("11 bits");
+                return Ok(canopen::Frame::new(id, data));
+            }
+            if self.bench.time() >= deadline {
+                return Ok(None);
+            }
+            self.run(LOOK);
+        }
+    }
+
+    fn now(&self) -> Duration {
+        Duration::from_nanos(self.bench.time().0 / 1000)
     }
 }

@@ -4,62 +4,18 @@
 use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
+use coboot_tests::listener::{decoder, heard, Listener};
 use coflash::flash::{flash, FlashOptions};
 use emulator::defmt::Decoder;
-use emulator::machine::Machine;
-use emulator::periph::usart::Character;
 use emulator::peripheral::Peripheral;
-use emulator::rtt::Reader;
 use object::{Object, ObjectSection, ObjectSymbol};
-
-/// Who reads it.
-enum Listener {
-    /// A debug probe.
-    Probe(Reader),
-    /// A terminal: what of a line it has.
-    Terminal(Vec<u8>),
-}
-
-impl Listener {
-    fn told(&mut self, bench: &mut Bench) -> Vec<String> {
-        match self {
-            Self::Probe(reader) => reader.lines(bench.machine(), firmware::board().chip.sram),
-            Self::Terminal(line) => {
-                line.extend(heard(bench.machine()).iter().map(|character| character.byte));
-                let text = std::mem::take(line);
-                let text = String::from_utf8(text).expect("text");
-                let mut lines: Vec<_> = text.split_inclusive("\r\n").map(str::to_owned).collect();
-                if let Some(part) = lines.pop_if(|line| !line.ends_with("\r\n")) {
-                    *line = part.into_bytes();
-                }
-                lines.iter().map(|line| line.trim_end().to_owned()).collect()
-            }
-        }
-    }
-}
-
-/// What has come out of the board's UARTs; a terminal at 115 200 bit/s reads what is 2 % off at
-/// most.
-fn heard(machine: &mut Machine) -> Vec<Character> {
-    let usarts = machine.usarts_mut().iter_mut();
-    let heard: Vec<_> = usarts.flat_map(|usart| usart.take_sent()).collect();
-    assert!(heard.iter().all(|character| character.bit_rate.abs_diff(115_200) < 2_304), "{heard:?}");
-    heard
-}
-
-fn decoder(image: &str) -> Decoder {
-    Decoder::of_elf(&firmware::elf(image)).expect("words that are understood").expect("words")
-}
 
 /// The images that tell, with who listens to each.
 fn ways() -> [(&'static str, Listener); 3] {
     [
-        (firmware::BOOTLOADER_LOG_RTT, Listener::Probe(Reader::default())),
-        (
-            firmware::BOOTLOADER_LOG_DEFMT,
-            Listener::Probe(Reader::with(Some(decoder(firmware::BOOTLOADER_LOG_DEFMT)))),
-        ),
-        (firmware::BOOTLOADER_LOG_UART, Listener::Terminal(Vec::new())),
+        (firmware::BOOTLOADER_LOG_RTT, Listener::probe()),
+        (firmware::BOOTLOADER_LOG_DEFMT, Listener::probe_of(firmware::BOOTLOADER_LOG_DEFMT)),
+        (firmware::BOOTLOADER_LOG_UART, Listener::terminal()),
     ]
 }
 
@@ -146,7 +102,7 @@ fn the_uart_speaks_while_the_flash_erases() {
     bench.session().command(1, ProgramControl::Clear).unwrap();
     bench.run_ms(50);
     heard(bench.machine());
-    let mut terminal = Listener::Terminal(Vec::new());
+    let mut terminal = Listener::terminal();
     for _ in 0..20 {
         bench.post(0x600 + u16::from(NODE), &[0x2F, 0x51, 0x1F, 0x01, 0x7F, 0, 0, 0]);
         // Two frames at 125 kbit/s, 2 ms; 67 characters, 5.9 ms.

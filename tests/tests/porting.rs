@@ -33,11 +33,19 @@ impl Copy {
     }
 
     fn cargo(&self, words: &[&str]) -> Output {
+        self.cargo_for(None, words)
+    }
+
+    /// The same for a product by name.
+    fn cargo_for(&self, product: Option<&str>, words: &[&str]) -> Output {
         // Firmware goes where `cargo xtask build` has it built.
         let firmware = words.contains(&TARGET);
         let target = if firmware { self.target.join("fw") } else { self.target.clone() };
         let mut cargo = Command::new(env!("CARGO"));
         cargo.current_dir(&self.root).args(words).env("CARGO_TARGET_DIR", target);
+        if let Some(name) = product {
+            cargo.env("COBOOT_PRODUCT", name);
+        }
         cargo.output().expect("cargo can be started")
     }
 
@@ -175,12 +183,21 @@ enum By {
     Board,
     /// `cargo check` of the board file for the chip.
     Drivers,
+    /// `cargo check` of the resident part, the smaller one of the two that the choices of a product
+    /// are built into; for the product of this name, if one is named.
+    Product(Option<&'static str>),
     /// The linker.
     Image,
 }
 
 const LAYOUT: &str = "shared-abi/src/layout/nucleo_f446re.rs";
 const BOARD: &str = "bsp/src/nucleo_f446re.rs";
+
+/// A choice that a product makes in place of the default.
+const fn product(wrong: &'static str, says: &'static str) -> Mistake {
+    let file = "bootloader/src/product.rs";
+    Mistake { file, right: "Product { ..Product::DEFAULT }", wrong, by: By::Product(None), says }
+}
 
 const MISTAKES: &[Mistake] = &[
     Mistake {
@@ -285,6 +302,63 @@ const MISTAKES: &[Mistake] = &[
         by: By::Drivers,
         says: "board: the clock of the UART cannot make UART_BIT_RATE",
     },
+    // Choices that contradict each other, or the layout, which has one program.
+    product(
+        "Product { autostart: Some(2), ..Product::DEFAULT }",
+        "product: autostart names a program that the layout has not",
+    ),
+    product(
+        "Product { max_crash_resets: 0, ..Product::DEFAULT }",
+        "product: max_crash_resets must be 1 or more",
+    ),
+    product(
+        "Product { autostart: None, ..Product::DEFAULT }",
+        "product: a rescue window needs autostart: without it no program starts by itself",
+    ),
+    product(
+        "Product { rescue_window_confirmed_ms: 1000, ..Product::DEFAULT }",
+        "product: the rescue window must be shorter than the heartbeat period",
+    ),
+    product(
+        "Product { node_ids: 1..=128, ..Product::DEFAULT }",
+        "product: node_ids must be a range within 1 to 127",
+    ),
+    product("Product { crc_step: 63, ..Product::DEFAULT }", "product: crc_step must be 64 bytes or more"),
+    product(
+        "Product { block_buffer: 1023, ..Product::DEFAULT }",
+        "product: block_buffer must be 1024 bytes or more, and fit the RAM",
+    ),
+    product("Product { watchdog_ms: 4001, ..Product::DEFAULT }", "product: watchdog_ms must be 100 to 4000"),
+    product(
+        "Product { program_watchdog_ms: Some(0), ..Product::DEFAULT }",
+        "product: program_watchdog_ms must be 1 to 4000",
+    ),
+    product(
+        "Product { answer_to_reset_ms: 9, ..Product::DEFAULT }",
+        "product: answer_to_reset_ms must be 10 or more",
+    ),
+    product(
+        "Product {
+            profile: Profile {
+                download: Policy { data: Some(1), ..Policy::DEFAULT },
+                ..Profile::STANDARD
+            },
+            ..Product::DEFAULT
+        }",
+        "product: autostart names the profile's data, which are no program",
+    ),
+    product(
+        "Product { profile: Profile { password: b\"\", ..Profile::LIFT }, ..Product::DEFAULT }",
+        "product: a profile that locks 1F50h needs a password, and only such a profile has one",
+    ),
+    // This product does not find out the bit rate.
+    Mistake {
+        file: BOARD,
+        right: "BIT_RATE: u32 = 125_000",
+        wrong: "BIT_RATE: u32 = 0",
+        by: By::Product(Some("least")),
+        says: "product: the board leaves the bit rate to be found out (0), and auto_bit_rate is off",
+    },
     Mistake {
         file: "bsp/Cargo.toml",
         right: "stm32f4xx-hal/stm32f446",
@@ -306,13 +380,18 @@ fn a_mistake_in_a_port_fails_the_build_and_is_named() {
             let features = format!("{board},uart");
             copy.cargo(&[&["check", "-p", "bsp", &features][..], &triple].concat())
         }
+        By::Product(name) => {
+            let words = ["check", "-p", "bootloader", "--bin=resident", "--no-default-features"];
+            let features = format!("{board},resident");
+            copy.cargo_for(name, &[&words[..], &[&features], &triple].concat())
+        }
         By::Image => {
             let words = ["build", "-p", "bootloader", "--no-default-features", board];
             copy.cargo(&[&words[..], &triple].concat())
         }
     };
     // Without a mistake there is none.
-    for by in [By::Layout, By::Board, By::Drivers, By::Image] {
+    for by in [By::Layout, By::Board, By::Drivers, By::Product(None), By::Product(Some("least")), By::Image] {
         let output = look(by);
         assert!(output.status.success(), "{}", text(&output));
     }

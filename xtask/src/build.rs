@@ -41,8 +41,20 @@ pub struct Variant {
     pub least_programs: usize,
 }
 
+/// Rows as they stand, and behind them one for each feature with each product, on boards with two
+/// programs.
+macro_rules! table {
+    ($($row:expr,)+; $($feature:literal with $($product:literal),+;)+) => {
+        &[$($row,)+ $($(Variant {
+            product: Some($product),
+            least_programs: 2,
+            ..bootloader(concat!("bootloader-", $feature, "-", $product), $feature)
+        },)+)+]
+    };
+}
+
 /// All of them, in the order in which they are built.
-pub const VARIANTS: &[Variant] = &[
+pub const VARIANTS: &[Variant] = table![
     bootloader("bootloader", ""),
     product("bootloader-paulus", "paulus"),
     product("bootloader-esacademy", "esacademy"),
@@ -65,6 +77,15 @@ pub const VARIANTS: &[Variant] = &[
     Variant { program: 2, least_programs: 2, ..application("app-program-2", "version-2,program-2") },
     Variant { least_programs: 2, ..application("app-lift", "lift") },
     Variant { least_programs: 2, ..application("app-lift-v2", "lift,version-2") },
+    // What the sessions of the dialects need over UART (tests/tests/matrix.rs).
+    Variant { least_programs: 2, ..application("app-virtual-can-v2", "virtual-can,version-2") },
+    Variant { least_programs: 2, ..application("app-virtual-can-lift", "virtual-can,lift") },
+    ;
+    // Each log and the serial transport with each dialect, `bootloader-log-rtt-paulus` for one.
+    "log-rtt" with "paulus", "esacademy", "lift";
+    "log-defmt" with "paulus", "esacademy", "lift";
+    "log-uart" with "paulus", "esacademy", "lift";
+    "virtual-can" with "paulus", "esacademy", "lift";
 ];
 
 /// What the main job needs.

@@ -55,7 +55,9 @@ const LOG: &str = "bootloader-log-";
 fn log(args: &mut Args) -> Outcome<Option<&'static str>> {
     let wanted = if args.flag("--log") { Some("rtt".to_owned()) } else { args.value("--log")? };
     let Some(wanted) = wanted else { return Ok(None) };
-    let ways = || VARIANTS.iter().filter_map(|variant| Some((variant.name.strip_prefix(LOG)?, variant.name)));
+    // Those with another dialect are for the tests.
+    let standard = || VARIANTS.iter().filter(|variant| variant.product.is_none());
+    let ways = || standard().filter_map(|variant| Some((variant.name.strip_prefix(LOG)?, variant.name)));
     let found = ways().find(|(way, _)| *way == wanted);
     found.map(|(_, name)| Some(name)).ok_or_else(|| {
         let ways: Vec<_> = ways().map(|(way, _)| way).collect();
@@ -77,6 +79,6 @@ mod tests {
         assert_eq!(asked("--log --verbose"), Ok(Some("bootloader-log-rtt")));
         assert_eq!(asked("--log=uart"), Ok(Some("bootloader-log-uart")));
         assert_eq!(asked("--log=defmt"), Ok(Some("bootloader-log-defmt")));
-        assert!(asked("--log=smoke").unwrap_err().contains("rtt, defmt, uart"));
+        assert!(asked("--log=smoke").unwrap_err().ends_with("rtt, defmt, uart."));
     }
 }
