@@ -256,7 +256,7 @@ fn damages() -> Vec<(&'static str, Packed, u32)> {
         ("as many as there can be", damaged(&|image| image.set(STORED, !0)), BY_HEADER),
         ("more bytes than RAM", damaged(&|image| image.set(UNPACKED, ram - 4092)), BY_HEADER),
         ("packed told as raw", damaged(&|image| image.set(METHOD, 0)), BY_HEADER),
-        ("other services", damaged(&|image| image.set(SERVICES, 3)), BY_SERVICES),
+        ("other services", damaged(&|image| image.set(SERVICES, SERVICES_VERSION + 1)), BY_SERVICES),
         ("a bit of the CRC", damaged(&|image| image.flash[image.header + 5] ^= 0x10), BY_CRC),
         ("no CRC", damaged(&|image| image.set(CRC, 0)), BY_CRC),
         ("one byte less", damaged(&|image| image.set(STORED, image.get(STORED) - 1)), BY_CRC),

@@ -2,7 +2,7 @@
 
 use canopen::program::ProgramControl;
 use canopen::{AbortCode, Address, BitRate};
-use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::bench::{Bench, NODE, RESCUE_WINDOW_MS};
 use coboot_tests::{call_back, firmware};
 use coflash::error::Error;
 use coflash::flash::{flash, FlashOptions};
@@ -28,6 +28,7 @@ fn running_board() -> Bench {
     bench.power_on();
     bench.await_boot_up(100);
     install(&mut bench, NODE, firmware::APP_V1);
+    bench.confirm_program();
     bench.events();
     bench
 }
@@ -180,7 +181,7 @@ fn node_id_and_bit_rate_are_shared() {
 
         store_by_lss(&mut bench, 9, Some(BitRate::K250));
         bench.set_host_bit_rate(250_000);
-        bench.await_boot_up_of(9, 1000);
+        bench.await_program_of(9, 1000);
         assert!(!bench.is_bootloader(9));
         bench.session_with(9).command(1, ProgramControl::StartBootloader).unwrap();
         bench.await_boot_up_of(9, 1000);
@@ -260,6 +261,34 @@ fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
     }
 }
 
+/// A program has to show once that the device can be called back from it, or to confirm itself; the
+/// next program anew.
+#[test]
+fn a_program_that_was_confirmed_starts_without_a_rescue_window() {
+    let boot_ups = |bench: &mut Bench| {
+        bench.power_off();
+        bench.run_ms(100);
+        let from = bench.time();
+        bench.power_on();
+        bench.run_ms(RESCUE_WINDOW_MS + 200);
+        let id = 0x700 + u32::from(NODE);
+        bench.frames_since(from).iter().filter(|(_, of, data)| *of == id && data[..] == [0]).count()
+    };
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    install(&mut bench, NODE, firmware::APP_V1);
+    assert_eq!(boot_ups(&mut bench), 2, "the bootloader's, then the program's");
+    assert_eq!(boot_ups(&mut bench), 2, "a window that passes confirms nothing");
+    bench.confirm_program();
+    assert_eq!(boot_ups(&mut bench), 1, "it was called back");
+    install(&mut bench, NODE, firmware::APP_V2);
+    assert_eq!(boot_ups(&mut bench), 2, "another program");
+    write(&mut bench, CONFIRMATION, SIGNED as u8).unwrap();
+    assert_eq!(boot_ups(&mut bench), 1, "it has confirmed itself");
+    bench.assert_nothing_unmodelled();
+}
+
 /// With a rescue window a program that never answers is no dead end: whoever speaks to the device
 /// in time has it.
 #[test]
@@ -270,7 +299,7 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     install(&mut bench, NODE, firmware::APP_V1);
     bench.events();
 
-    // Nobody speaks: half a second, then the program, by way of a reset.
+    // Nobody speaks: 300 ms, then the program, by way of a reset.
     bench.power_off();
     bench.run_ms(100);
     let from = bench.time();
@@ -278,7 +307,7 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     let window = bench.await_boot_up(100);
     let program = bench.await_boot_up(1000);
     assert!(
-        (400..700).contains(&((program - window).0 / 1_000_000_000)),
+        (290..340).contains(&((program - window).0 / 1_000_000_000)),
         "{} ms",
         (program - window).0 / 1_000_000_000
     );

@@ -66,7 +66,7 @@ fn a_program_in_one_download_starts_by_reset_program() {
         // Valid without a signature: it starts by itself.
         bench.power_off();
         bench.power_on();
-        bench.await_boot_up(1000);
+        bench.await_program(1000);
         assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0");
         bench.assert_nothing_unmodelled();
     }
