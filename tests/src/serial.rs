@@ -16,6 +16,9 @@ use crate::script::Wire;
 
 /// How far the board goes on between two looks at the line.
 const LOOK: Span = Span::from_micros(100);
+/// Shorter than a character at 115 200 bit/s (87 us): a session that ends with a frame ends before
+/// the first character of the next one is complete, which is then still to be looked at.
+const SHORT_LOOK: Span = Span::from_micros(50);
 
 /// The host's end of the line of a board's UART. Whoever reads lets the board run.
 pub struct SerialLine<'b> {
@@ -187,7 +190,7 @@ impl Adapter for TextBus {
             if self.bench.time() >= deadline {
                 return Ok(None);
             }
-            self.run(LOOK);
+            self.run(SHORT_LOOK);
         }
     }
 
