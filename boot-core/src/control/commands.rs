@@ -33,11 +33,10 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         };
         // Data are never started.
         let data = self.policy.data == Some(program);
-        if command == Start && state.streamed && !data && self.boot_request.is_none() {
-            if self.programmer.finishing() == Some(program) {
-                state.start_when_verified = true;
-                return Ok(());
-            }
+        let may_start = command == Start && state.streamed && !data && self.boot_request.is_none();
+        if may_start && self.programmer.finishing() == Some(program) {
+            state.start_when_verified = true;
+            return Ok(());
         }
         // A new beginning does not wait for the end of the old one.
         let own = self.programmer.program().is_none_or(|of| of == program);
