@@ -1,7 +1,8 @@
 //! The boot stage: from the reset to the jump into a program, or to the rest of the bootloader.
 //!
 //! It runs before any peripheral but the reset flags, the warm-start cell, the flash controller,
-//! the CRC unit and the entry strap was touched, and leaves those as after a reset.
+//! the CRC unit and the entry strap was touched, and leaves those to a program as after a reset. The
+//! rest of the bootloader gets the CRC unit switched on, for the services.
 
 use boot_core::canopen::NodeId;
 use boot_core::decision::{decide, BootDecision, Circumstances, StayReason};
