@@ -188,7 +188,7 @@ impl Product {
             );
         }
         assert!(
-            self.profile.download.locked == !self.profile.password.is_empty(),
+            self.profile.download.locked != self.profile.password.is_empty(),
             "product: a profile that locks 1F50h needs a password, and only such a profile has one"
         );
         assert!(

@@ -245,7 +245,7 @@ unsafe extern "C" fn on_debug_event(saved: *mut Saved) {
     let stopped_at = unsafe { pc.read_volatile() };
     change_demcr(MON_STEP, MON_REQ);
     store(DCRDR, saved as u32);
-    tell(if cause & BKPT != 0 { BREAKPOINT } else { STEP }, stopped_at);
+    notify(if cause & BKPT != 0 { BREAKPOINT } else { STEP }, stopped_at);
     while load(DEMCR) & MON_REQ != 0 {
         // The tasks that serve the bus want to look at their deadlines; who does that otherwise may
         // be what is stopped.

@@ -302,15 +302,20 @@ const fn first_slot(region: &Region) -> u32 {
     region.base + SLOT_SIZE
 }
 
-/// The slot behind the last one that is not blank; a word at a time, because this is on the way of
-/// every start.
+/// The slot behind the last one that is not blank, found by halves: this is on the way of every
+/// start.
 fn end_of<F: Flash>(flash: &F, region: &Region) -> u32 {
-    let mut end = region.end() - region.size % SLOT_SIZE;
-    while end > first_slot(region) && (1..=SLOT_WORDS as u32).all(|i| flash.read_word(end - 4 * i) == ERASED)
-    {
-        end -= SLOT_SIZE;
+    let end = region.end() - region.size % SLOT_SIZE;
+    let (mut used, mut free) = (first_slot(region), end);
+    while used < free {
+        let middle = used + (free - used) / SLOT_SIZE / 2 * SLOT_SIZE;
+        if flash.is_blank(Region::new(middle, end - middle)) {
+            free = middle;
+        } else {
+            used = middle + SLOT_SIZE;
+        }
     }
-    end
+    free
 }
 
 fn slot(tag: u32, [a, b, c, d]: Value) -> Slot {
