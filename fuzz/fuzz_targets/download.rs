@@ -24,7 +24,7 @@ const LAST: u32 = u32::MAX;
 fuzz_target!(|bytes: &[u8]| {
     let mut flash = ModelFlash::new(&CHIP);
     let mut buffer = [0; BUFFER];
-    let journal = Journal::open(&flash, &CHIP, LAYOUT.parameters);
+    let journal = Journal::open(&flash, LAYOUT.parameters);
     let mut device: Downloader<'_, _, 1> =
         Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer);
     let mut input = Input::new(bytes);
@@ -69,26 +69,26 @@ fuzz_target!(|bytes: &[u8]| {
             // Any bytes, in pieces as the bus brings them.
             120..=139 => {
                 if open {
-                    device.block_cancel();
+                    device.download_cancel();
                 }
                 let size = (action & 1 != 0).then_some(u32::from(action) * 3);
-                open = device.block_start(1, size).is_ok();
+                open = device.download_start(1, size).is_ok();
             }
             140..=159 => {
                 let data = input.take(usize::from(action % 8));
-                if open && !data.is_empty() && device.block_data(data).is_err() {
-                    device.block_cancel();
+                if open && !data.is_empty() && device.download_data(data).is_err() {
+                    device.download_cancel();
                     open = false;
                 }
             }
             160..=169 => {
                 if std::mem::take(&mut open) {
-                    let _ = device.block_end();
+                    let _ = device.download_end();
                 }
             }
             170..=179 => {
                 if std::mem::take(&mut open) {
-                    device.block_cancel();
+                    device.download_cancel();
                 }
             }
             180..=219 => drop(device.step(&mut flash)),
@@ -108,7 +108,7 @@ fuzz_target!(|bytes: &[u8]| {
     }
 
     let mut buffer = [0; BUFFER];
-    let journal = Journal::open(&flash, &CHIP, LAYOUT.parameters);
+    let journal = Journal::open(&flash, LAYOUT.parameters);
     let mut device: Downloader<'_, _, 1> =
         Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer);
     device.command(1, ProgramControl::Clear).expect("CLEAR");
@@ -135,15 +135,15 @@ fuzz_target!(|bytes: &[u8]| {
 
 /// What the SDO server does with a block.
 fn send(device: &mut Downloader<'_, Journal, 1>, block: &[u8]) -> Result<(), canopen::AbortCode> {
-    device.block_cancel();
-    device.block_start(1, Some(block.len() as u32))?;
+    device.download_cancel();
+    device.download_start(1, Some(block.len() as u32))?;
     for piece in block.chunks(7) {
-        if let Err(code) = device.block_data(piece) {
-            device.block_cancel();
+        if let Err(code) = device.download_data(piece) {
+            device.download_cancel();
             return Err(code);
         }
     }
-    device.block_end()
+    device.download_end()
 }
 
 /// Lets the flash's work come to its end.

@@ -4,8 +4,7 @@
 //! and after the next start, and the other one stays as it was.
 #![no_main]
 
-use std::task::Poll;
-
+use boot_core::flash::run;
 use boot_core::store::{Journal, Key, Parameters};
 use coboot_fuzz::model::ModelFlash;
 use coboot_fuzz::Input;
@@ -31,21 +30,22 @@ fuzz_target!(|bytes: &[u8]| {
         let most = (0x400 - at).min(len.into()) as usize;
         flash.poke(0x0800_0000 + at, input.take(most));
     }
-    let mut journal = Journal::open(&flash, &CHIP, REGIONS);
+    let mut journal = Journal::open(&flash, REGIONS);
     for i in 0..stores {
         let Some([which, byte]) = input.array() else { break };
         let key = KEYS[usize::from(which) % KEYS.len()];
         let value = [u32::from(byte), u32::from(i), u32::MAX, 0];
         let before = KEYS.map(|key| journal.get(&flash, key));
         journal.store(key, value);
-        let outcome = (0..100_000).find_map(|_| match journal.poll(&mut flash) {
-            Poll::Pending => None,
-            Poll::Ready(outcome) => Some(outcome),
+        let mut operations = 0;
+        let outcome = run(&mut flash, |flash, outcome| {
+            operations += 1;
+            assert!(operations < 100_000, "a store that never ends");
+            journal.next(flash, outcome)
         });
-        let outcome = outcome.expect("a store that never ends");
         if which & 0x80 != 0 {
             flash.power_on();
-            journal = Journal::open(&flash, &CHIP, REGIONS);
+            journal = Journal::open(&flash, REGIONS);
         }
         for (other, before) in KEYS.into_iter().zip(before) {
             let now = journal.get(&flash, other);

@@ -95,7 +95,7 @@ fuzz_target!(|bytes: &[u8]| {
 type Model<'b, 'f> = Bootloader<'b, &'f mut ModelFlash, Journal, PROGRAMS>;
 
 fn device<'b, 'f>(config: &'static Config, flash: &'f mut ModelFlash, buffer: &'b mut [u8]) -> Model<'b, 'f> {
-    let parameters = Journal::open(flash, &CHIP, LAYOUT.parameters);
+    let parameters = Journal::open(flash, LAYOUT.parameters);
     let node = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
     Bootloader::new(config, 0, node, 0, parameters, flash, buffer)
 }
