@@ -1,5 +1,6 @@
 //! How long a device takes from its reset to the first instruction of its application.
 
+use canopen::program::ProgramControl;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
 use coflash::block_file::BlockFile;
@@ -58,4 +59,26 @@ fn a_program_of_400_kib_is_checked_and_started_within_5_ms() {
     assert!(took <= Span::from_millis(5), "{} us", took.0 / 1_000_000);
     // The CRC takes its part of it: without one it would be there in no time.
     assert!(took >= Span::from_millis(1), "{} us", took.0 / 1_000_000);
+}
+
+/// How soon the bootloader is there: from power-on to the end of its boot-up message, and from the
+/// answer to 1F51h = 80h. The RAM image is unpacked on the way.
+#[test]
+fn the_bootloader_is_there_soon_after_a_power_on_and_a_call_back() {
+    let mut bench = Bench::new();
+    bench.power_on();
+    let power_on = bench.await_boot_up(100) - Time(0);
+    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
+        .unwrap();
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    let answered = bench.time();
+    let call_back = bench.await_boot_up(1000) - answered;
+    println!(
+        "boot-up of the bootloader: {} us after power-on, {} us after the answer to 80h",
+        power_on.0 / 1_000_000,
+        call_back.0 / 1_000_000
+    );
+    assert!(power_on <= Span::from_millis(15), "{} us", power_on.0 / 1_000_000);
+    // 11 ms of it are the application's (SYS TEC manual L-1112d_10, 4.5: 10 at least).
+    assert!(call_back <= Span::from_millis(30), "{} us", call_back.0 / 1_000_000);
 }

@@ -169,7 +169,7 @@ fn a_transfer_that_breaks_off_does_not_block_the_next_one() {
 #[test]
 fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
     let mut untouched = 0;
-    for after_ms in [5, 10, 30, 60, 200, 400, 600, 800, 1200, 1800, 2200] {
+    for after_ms in [5, 10, 30, 60, 200, 400, 600, 800, 1200, 1800, 2100] {
         let mut bench = running_board();
         call_back(&mut bench);
         let file = firmware::blocks(firmware::APP_V2);

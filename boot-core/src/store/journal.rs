@@ -309,7 +309,8 @@ fn end_of<F: Flash>(flash: &F, region: &Region) -> u32 {
     let (mut used, mut free) = (first_slot(region), end);
     while used < free {
         let middle = used + (free - used) / SLOT_SIZE / 2 * SLOT_SIZE;
-        if flash.is_blank(Region::new(middle, end - middle)) {
+        // Behind `free` all is known to be blank.
+        if flash.is_blank(Region::new(middle, free - middle)) {
             free = middle;
         } else {
             used = middle + SLOT_SIZE;

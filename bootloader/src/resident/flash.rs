@@ -56,20 +56,25 @@ impl Flash for ResidentFlash {
     }
 
     fn is_blank(&self, region: Region) -> bool {
+        let blank = |address| self.controller.read_byte(address) == u8::MAX;
         let (mut address, end) = (region.base, region.end());
-        while address < end {
-            // By words, where they are: a journal is looked through on the way of every start.
-            let (blank, size) = if address.is_multiple_of(4) && end - address >= 4 {
-                (self.controller.read_word(address) == u32::MAX, 4)
-            } else {
-                (self.controller.read_byte(address) == u8::MAX, 1)
-            };
-            if !blank {
+        while address < end && !address.is_multiple_of(4) {
+            if !blank(address) {
                 return false;
             }
-            address += size;
+            address += 1;
         }
-        true
+        if FLASH.contains(address, end - address) {
+            // By words, in a short loop: a journal is looked through on the way of every start.
+            while end - address >= 4 {
+                // SAFETY: inside the memory-mapped flash, which is always readable, and aligned.
+                if unsafe { (address as *const u32).read_volatile() } != u32::MAX {
+                    return false;
+                }
+                address += 4;
+            }
+        }
+        (address..end).all(blank)
     }
 
     /// Whole words by the unit, the rest without. The unit has the polynomial, but takes words with
@@ -81,31 +86,42 @@ impl Flash for ResidentFlash {
         if self.has_crc_unit && address.is_multiple_of(4) && FLASH.contains(address, region.size) {
             // SAFETY: `steal` has taken it.
             let unit = unsafe { pac::CRC::steal() };
-            let (control, unit) = (unit.cr(), unit.dr());
-            // SAFETY: every word may be written to DR.
-            let feed = |word: u32| unit.write(|w| unsafe { w.bits(word) });
-            control.write(|w| w.reset().set_bit());
-            if crc != 0 {
-                feed(u32::MAX ^ word_before((!crc).reverse_bits()));
+            unit.cr().write(|w| w.reset().set_bit());
+            let data = unit.dr().as_ptr();
+            // SAFETY: every word may be written to DR. The region was checked to be inside the
+            // memory-mapped flash, which is always readable, and is aligned.
+            unsafe {
+                if crc != 0 {
+                    data.write_volatile(u32::MAX ^ word_before((!crc).reverse_bits()));
+                }
+                // Four at a time, and in assembly: on the way from reset to a large program this
+                // loop is most of the time, and the compiler would make a function of its body.
+                while end - address >= 16 {
+                    core::arch::asm!(
+                        "ldmia {from}!, {{r2, r3, r4, r5}}",
+                        "rbit r2, r2",
+                        "str r2, [{data}]",
+                        "rbit r3, r3",
+                        "str r3, [{data}]",
+                        "rbit r4, r4",
+                        "str r4, [{data}]",
+                        "rbit r5, r5",
+                        "str r5, [{data}]",
+                        from = inout(reg) address,
+                        data = in(reg) data,
+                        out("r2") _,
+                        out("r3") _,
+                        out("r4") _,
+                        out("r5") _,
+                        options(nostack, preserves_flags),
+                    );
+                }
+                while end - address >= 4 {
+                    data.write_volatile((address as *const u32).read_volatile().reverse_bits());
+                    address += 4;
+                }
+                crc = !data.read_volatile().reverse_bits();
             }
-            // SAFETY: the region was checked to be inside the memory-mapped flash, which is always
-            // readable.
-            let feed_from =
-                |address: u32| feed(unsafe { (address as *const u32).read_volatile() }.reverse_bits());
-            // Four at a time: on the way from reset to a large program this loop is most of the
-            // time.
-            while end - address >= 16 {
-                feed_from(address);
-                feed_from(address + 4);
-                feed_from(address + 8);
-                feed_from(address + 12);
-                address += 16;
-            }
-            while end - address >= 4 {
-                feed_from(address);
-                address += 4;
-            }
-            crc = !unit.read().bits().reverse_bits();
         }
         (address..end).fold(crc, |crc, address| crc::resume(crc, &[self.controller.read_byte(address)]))
     }
