@@ -50,6 +50,7 @@ fn python_canopen_commissions_three_devices_and_works_with_them() {
     }
 
     let bench = &mut endpoint.bench;
+    let off = bench.time();
     bench.power_off();
     bench.run_ms(100);
     bench.set_host_bit_rate(250_000);
@@ -67,6 +68,9 @@ fn python_canopen_commissions_three_devices_and_works_with_them() {
         let running = session.device_type().unwrap().expect("an answer");
         assert_eq!(running.is_bootloader(), *node != 12, "node {node}");
     }
-    assert!(bench.records().iter().all(|record| record.outcome == Outcome::Good), "nobody disturbed anybody");
+    // But for a frame that was on its way when the power went.
+    let mut disturbed = bench.records();
+    disturbed.retain(|record| record.outcome != Outcome::Good && !(record.start..=record.end).contains(&off));
+    assert!(disturbed.is_empty(), "nobody disturbed anybody: {disturbed:?}");
     bench.assert_nothing_unmodelled();
 }
