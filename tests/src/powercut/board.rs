@@ -14,10 +14,10 @@ use std::sync::Mutex;
 use canopen::{Address, BitRate};
 use coflash::block_file::BlockFile;
 use coflash::flash::{flash, FlashOptions};
-use emulator::machine::{Cut, FlashCut, Machine, Options, Stop};
+use emulator::machine::{Cut, FlashCut, Machine, Options, ResetCause, Stop};
 
 use super::points::{Report, TOLD};
-use crate::bench::{Bench, NODE};
+use crate::bench::{Bench, NODE, RESCUE_WINDOW_MS};
 use crate::firmware;
 
 const VERSION: Address = Address::new(0x100A, 0);
@@ -25,8 +25,8 @@ const VERSION: Address = Address::new(0x100A, 0);
 /// parameters uses: one that answers has kept them.
 const RATE: BitRate = BitRate::K1000;
 const BIT_RATE: u32 = 1_000_000;
-/// A board with a program says its boot-up within this time; in ms.
-const BOOT_MS: u64 = 200;
+/// A board with a program, confirmed or not, runs it within this time; in ms.
+const BOOT_MS: u64 = RESCUE_WINDOW_MS + 250;
 /// The name before the numbers of a point.
 pub const NAME: &str = "board";
 /// The first and last operations of an update, which are those on the parameters: a sample has all
@@ -191,6 +191,11 @@ impl Story {
         let from = bench.time();
         bench.power_on();
         bench.run_ms(BOOT_MS);
+        // A program that was never confirmed starts by a reset, at the end of the rescue window.
+        let resets = bench.events();
+        if !matches!(resets[..], [] | [(_, Stop::Reset(ResetCause::Software))]) {
+            return Err(format!("it starts with {resets:?}"));
+        }
         let boot_up = (0x700 + u32::from(NODE), vec![0]);
         if !bench.frames_since(from).into_iter().any(|(_, id, data)| (id, data) == boot_up) {
             return Err(format!("no boot-up within {BOOT_MS} ms"));
