@@ -45,7 +45,7 @@ fn restart(bench: &mut Bench) {
     bench.power_off();
     bench.run_ms(10);
     bench.power_on();
-    bench.await_boot_up(1000);
+    bench.await_program(1000);
     bench.run_ms(20);
 }
 

@@ -97,6 +97,7 @@ fn an_application_that_the_watchdog_ends_again_and_again_is_given_up() {
     bench.await_boot_up(100);
     let file = firmware::blocks(firmware::APP_V1);
     flash(&mut bench.session(), &file, &FlashOptions::default(), &mut |_| {}).unwrap();
+    bench.confirm_program();
     for crash in 1..=3 {
         bench.events();
         // An application that started the watchdog and hangs: LSI / 4, 8 ms.
