@@ -154,6 +154,8 @@ impl Story {
         bench.power_on();
         bench.run_ms(BOOT_MS);
         write(&mut bench, &firmware::blocks(firmware::APP_V1))?;
+        // A request that the cut left on its way to the device would hold it in a rescue window.
+        bench.confirm_program();
         bench.power_off();
         let mut story = Self {
             start: bench.machine().flash().to_vec(),
