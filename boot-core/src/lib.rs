@@ -3,9 +3,9 @@
 //! | module | what it does | knows |
 //! |---|---|---|
 //! | [`decision`] | bootloader or program, after every reset | records, no flash |
-//! | [`intake`] | what arrives in 1F50h: bytes in, judged and placed pieces out | formats, no flash |
-//! | [`queue`] | the pieces between the two | |
-//! | [`programmer`] | erase, write, read back, verify | pieces and flash, no format, no object |
+//! | `intake` | what arrives in 1F50h: bytes in, judged and placed pieces out | formats, no flash |
+//! | `queue` | the pieces between the two | |
+//! | `programmer` | erase, write, read back, verify | pieces and flash, no format, no object |
 //! | [`store`] | everything non-volatile | the journal |
 //! | [`control`] | 1F51h, 1F57h, sessions: the rules that tie the three together | all of them |
 //! | [`bootloader`] | the object dictionary over it | objects |

@@ -1,7 +1,7 @@
 //! Why something is refused: what 1F57h shows, and what the client is answered.
 
 use canopen::program::FlashError;
-use canopen::sdo::AbortCode;
+use canopen::AbortCode;
 
 /// The status that 1F57h shows, and the SDO abort that the client gets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

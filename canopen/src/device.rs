@@ -3,12 +3,12 @@
 //! A device puts [`ENTRIES`] into its table with [`concat`](crate::od::concat) and asks
 //! [`Device::read`] first.
 
+use crate::abort::AbortCode;
 use crate::lss::LssAddress;
 use crate::od::{put, Access, Address, DataType, Entry};
 use crate::program::{
     DEVICE_NAME, DEVICE_TYPE, ERROR_REGISTER, HARDWARE_VERSION, HEARTBEAT_TIME, IDENTITY, SOFTWARE_VERSION,
 };
-use crate::sdo::AbortCode;
 
 /// 1000h, 1001h, 1008h–100Ah, 1017h, 1018h/0–4 (CiA 301 clause 7.5.2).
 pub const ENTRIES: [Entry; 11] = [

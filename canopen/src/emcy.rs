@@ -4,11 +4,11 @@
 //! before all others that know 1001h, and passes [`Emcy::next_message`] on as
 //! [`Objects::next_emergency`](crate::Objects::next_emergency).
 
+use crate::abort::AbortCode;
 use crate::frame::{CobId, NodeId};
 use crate::line::LineEvent;
 use crate::od::{put, Access, Address, DataType, Entry};
 use crate::program::{COB_ID_EMCY, ERROR_FIELD, ERROR_REGISTER};
-use crate::sdo::AbortCode;
 
 /// Errors that 1003h remembers.
 pub const HISTORY: usize = 4;

@@ -27,6 +27,7 @@
 #[cfg(feature = "alloc")]
 extern crate alloc;
 
+mod abort;
 pub mod bit_rate;
 #[cfg(feature = "debugger")]
 pub mod debugger;
@@ -45,8 +46,8 @@ pub mod sdo;
 pub mod slave;
 pub mod time;
 
+pub use abort::AbortCode;
 pub use bit_rate::BitRate;
 pub use frame::{CobId, Frame, NodeId};
 pub use od::{Address, Objects};
-pub use sdo::AbortCode;
 pub use time::Instant;

@@ -41,7 +41,7 @@
 
 use core::fmt;
 
-use crate::sdo::AbortCode;
+use crate::abort::AbortCode;
 
 /// Index and sub-index of a value: the multiplexer of an SDO.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]

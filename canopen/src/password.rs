@@ -1,6 +1,6 @@
 //! A password check that slows down guessing: each wrong password makes the next wait longer.
 
-use crate::sdo::AbortCode;
+use crate::abort::AbortCode;
 use crate::time::Instant;
 
 /// How long no password is taken after the first wrong one, in milliseconds. It doubles with each

@@ -4,7 +4,7 @@
 use core::fmt;
 use core::num::NonZeroU8;
 
-use crate::sdo::AbortCode;
+use crate::abort::AbortCode;
 
 /// Device type.
 pub const DEVICE_TYPE: u16 = 0x1000;

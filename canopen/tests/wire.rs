@@ -2,7 +2,7 @@
 //! is taken apart and put together.
 
 use canopen::sdo::wire::{BlockAck, BlockEnd, BlockSegment, Chunk, Payload, Request, Response, Segment};
-use canopen::sdo::AbortCode;
+use canopen::AbortCode;
 use canopen::Address;
 
 const AT: Address = Address::new(0x1F50, 2);

@@ -4,7 +4,7 @@ use std::fmt;
 use std::time::Duration;
 
 use canopen::program::{FlashError, FlashStatus};
-use canopen::sdo::AbortCode;
+use canopen::AbortCode;
 use canopen::NodeId;
 
 use crate::adapter::AdapterError;

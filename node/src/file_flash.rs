@@ -259,7 +259,7 @@ mod tests {
         let mut flash = open(&path);
         for address in [0x0801_0001, 0x07FF_FFFC, 0x0810_0000, u32::MAX - 3] {
             assert_eq!(
-                flash.start(Operation::Program { address: address, word: 0 }),
+                flash.start(Operation::Program { address, word: 0 }),
                 Err(FlashFault::Failed),
                 "{address:08X}h"
             );

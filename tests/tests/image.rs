@@ -94,7 +94,7 @@ fn restore_calls(image: &mut [u8], base: u32) -> usize {
             let target = u64::from(pair & 0x7FF) * 0x800 + u64::from(pair >> 16 & 0x7FF);
             let here = (u64::from(base) + at as u64 + 2) / 2;
             let distance = ((1 << 44) + target - here) % (1 << 22);
-            let pair = 0xF800_F000 | (distance % 0x800) << 16 | distance / 0x800;
+            let pair = 0xF800_F000 | (distance % 0x800) << 16 | (distance / 0x800);
             image[at..at + 4].copy_from_slice(&(pair as u32).to_le_bytes());
             (at, calls) = (at + 2, calls + 1);
         }

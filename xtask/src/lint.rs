@@ -35,7 +35,7 @@ pub fn run(mut args: Args) -> Outcome {
     for variant in build::Variant::of(board) {
         clippy(&build::firmware_args(variant.package, board, variant.features));
     }
-    let mut resident = build::firmware_args("bootloader", board, "standard,resident");
+    let mut resident = build::firmware_args("bootloader", board, "resident");
     resident.push("--bin=resident".to_owned());
     clippy(&resident);
     let mut doc = process::cargo("doc");

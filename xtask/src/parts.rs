@@ -27,7 +27,7 @@ pub fn of(elf: &Path, address: u32, size: u32) -> Outcome<BTreeMap<String, u32>>
         while let Some(frame) = frames.next().map_err(|error| unreadable(&error))? {
             files.extend(frame.location.and_then(|location| location.file).map(str::to_owned));
         }
-        *parts.entry(part(&files, &root)).or_default() += STEP as u32;
+        *parts.entry(part(&files, root)).or_default() += STEP as u32;
     }
     Ok(parts)
 }

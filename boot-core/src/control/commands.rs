@@ -2,7 +2,7 @@
 //! the right to a download, and one of them takes the place of CLEAR.
 
 use canopen::program::{FlashError, ProgramControl};
-use canopen::sdo::AbortCode;
+use canopen::AbortCode;
 use shared_abi::warm_start::BootRequest;
 
 use super::{find, Downloader, Program, NOWHERE};

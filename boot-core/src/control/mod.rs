@@ -1,8 +1,8 @@
 //! Program download: 1F50h takes the data, 1F51h the commands, 1F57h tells what became of them.
 //!
-//! Here stand the rules that tie the rooms together. The [intake](crate::intake) judges what comes
+//! Here stand the rules that tie the rooms together. The `intake` judges what comes
 //! in: it is refused at once, with an abort and a status, or accepted. The
-//! [programmer](crate::programmer) carries through what was accepted ([`Downloader::step`]). The two
+//! `programmer` carries through what was accepted ([`Downloader::step`]). The two
 //! never wait for each other; between them lies a queue. While it has room for another block the
 //! status is not busy, although the flash works: a host that looks at the status between blocks
 //! sends the next one while those before are being programmed.
@@ -16,7 +16,7 @@ mod commands;
 use core::task::Poll;
 
 use canopen::program::{FlashError, FlashStatus, ProgramState};
-use canopen::sdo::AbortCode;
+use canopen::AbortCode;
 use shared_abi::block_file::FRAMING;
 use shared_abi::geometry::Region;
 use shared_abi::label;

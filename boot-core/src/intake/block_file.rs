@@ -5,7 +5,7 @@
 //! that is there, and as a whole by its CRC.
 
 use canopen::program::FlashError;
-use canopen::sdo::AbortCode;
+use canopen::AbortCode;
 use shared_abi::block_file::{
     Control, Header, Last, CONTROL_MAX, FRAMING, HEADER_SIZE, MAX_BLOCK_SIZE, NUMBER_CONTROL, NUMBER_LAST,
 };

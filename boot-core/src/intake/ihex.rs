@@ -6,7 +6,7 @@
 //! [`Event::Good`].
 
 use canopen::program::FlashError;
-use canopen::sdo::AbortCode;
+use canopen::AbortCode;
 
 use super::stream::Stream;
 use super::{Destination, Format, Judge, Recognition};

@@ -17,7 +17,7 @@ mod raw;
 mod stream;
 
 use canopen::program::FlashError;
-use canopen::sdo::AbortCode;
+use canopen::AbortCode;
 
 use crate::queue::Queue;
 use crate::refusal::Refusal;

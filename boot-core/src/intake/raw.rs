@@ -1,7 +1,7 @@
 //! A raw image: the program's bytes from the start of its flash on, and nothing else.
 
 use canopen::program::FlashError;
-use canopen::sdo::AbortCode;
+use canopen::AbortCode;
 use shared_abi::vectors::VectorTable;
 
 use super::stream::Stream;

@@ -2,7 +2,7 @@
 //! and the first piece is judged before anything is lost.
 
 use canopen::program::FlashError;
-use canopen::sdo::AbortCode;
+use canopen::AbortCode;
 use shared_abi::geometry::Region;
 use shared_abi::label;
 

@@ -30,13 +30,13 @@ mod command;
 
 use core::task::Poll;
 
+use crate::abort::AbortCode;
 use crate::bit_rate::BitRate;
 use crate::frame::NodeId;
 use crate::line::LineEvent;
 use crate::lss::{LssDevice, StoreError};
 use crate::od::{put, Access, Address, DataType, Entry, Objects};
 use crate::program::ERROR_REGISTER;
-use crate::sdo::AbortCode;
 use crate::slave::SlaveDevice;
 
 pub use command::{Command, Kind, Stop, USER_SOFTWARE};

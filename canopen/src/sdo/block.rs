@@ -1,9 +1,9 @@
 //! Block transfer, for server and client: the CRC, and the receiving end (CiA 301 section 7.2.4.3.9
 //! ff.).
 
+use crate::abort::AbortCode;
 use crate::sdo::fields;
 use crate::sdo::wire::Chunk;
-use crate::sdo::AbortCode;
 
 /// Segments in the largest sub-block.
 pub const BLKSIZE_MAX: u8 = 127;

@@ -4,13 +4,11 @@
 //! *expedited*, in one frame; more are transferred *segmented*, with an answer to each seven bytes,
 //! or as *blocks*, with an answer to up to 127 times seven bytes and a CRC over all data.
 
-pub mod abort;
 pub mod block;
 pub mod client;
 mod fields;
 pub mod server;
 pub mod wire;
 
-pub use abort::AbortCode;
 pub use client::{Download, SdoError, Step, Transfer, Upload};
 pub use server::SdoServer;

@@ -9,9 +9,9 @@
 
 use core::ops::Deref;
 
+use crate::abort::AbortCode;
 use crate::od::Address;
 use crate::sdo::fields::{self, ccs, scs, with_address, without_address};
-use crate::sdo::AbortCode;
 
 /// Up to `N` bytes of data of one frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

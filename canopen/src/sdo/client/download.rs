@@ -1,11 +1,11 @@
 //! Writing a value.
 
+use crate::abort::AbortCode;
 use crate::frame::{Frame, NodeId};
 use crate::od::Address;
 use crate::sdo::block::{check_blksize, Crc16, SEGMENT};
 use crate::sdo::client::{means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer};
 use crate::sdo::wire::{BlockAck, BlockEnd, BlockSegment, Chunk, Payload, Request, Response, Segment};
-use crate::sdo::AbortCode;
 use crate::time::Instant;
 
 /// After this many sub-blocks in a row of which no segment arrived, the transfer is aborted.

@@ -36,11 +36,11 @@
 
 use core::fmt;
 
+use crate::abort::AbortCode;
 use crate::frame::{CobId, Frame, NodeId};
 use crate::od::Address;
 use crate::sdo::block::BLKSIZE_MAX;
 use crate::sdo::wire::{Request, Response};
-use crate::sdo::AbortCode;
 use crate::time::Instant;
 
 mod download;

@@ -1,12 +1,12 @@
 //! Reading a value.
 
+use crate::abort::AbortCode;
 use crate::frame::{Frame, NodeId};
 use crate::od::Address;
 use crate::sdo::block::{Receiver, BLKSIZE_MAX};
 use crate::sdo::client::{means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer};
 use crate::sdo::fields;
 use crate::sdo::wire::{BlockAck, Payload, Request, Response};
-use crate::sdo::AbortCode;
 use crate::time::Instant;
 
 /// The target of an upload.

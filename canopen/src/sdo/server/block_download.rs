@@ -1,9 +1,9 @@
 //! Block download.
 
+use crate::abort::AbortCode;
 use crate::od::Objects;
 use crate::sdo::block::Receiver;
 use crate::sdo::fields::{self, scs};
-use crate::sdo::AbortCode;
 
 use super::{Incoming, SdoServer, State};
 

@@ -1,9 +1,9 @@
 //! Block upload.
 
+use crate::abort::AbortCode;
 use crate::od::Objects;
 use crate::sdo::block::{check_blksize, Crc16, SEGMENT};
 use crate::sdo::fields::{self, scs};
-use crate::sdo::AbortCode;
 
 use super::{Outgoing, SdoServer, State};
 

@@ -1,7 +1,7 @@
 //! Data on their way into the device.
 
+use crate::abort::AbortCode;
 use crate::od::{Address, DataType, Objects};
-use crate::sdo::AbortCode;
 
 use super::VALUE_MAX;
 

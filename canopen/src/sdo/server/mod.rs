@@ -9,11 +9,11 @@
 //! - If a sub-block of a block download stops short, the segments that came are acknowledged, and
 //!   the client repeats the rest.
 
+use crate::abort::AbortCode;
 use crate::frame::{CobId, Frame, NodeId};
 use crate::od::{self, Address, Entry, Objects};
 use crate::sdo::block::{Receiver, BLKSIZE_MAX, SEGMENT};
 use crate::sdo::fields::{self, ccs, scs};
-use crate::sdo::AbortCode;
 use crate::time::Instant;
 
 mod block_download;

@@ -1,8 +1,8 @@
 //! Data on their way out of the device.
 
+use crate::abort::AbortCode;
 use crate::od::{Address, Objects};
 use crate::sdo::block::SEGMENT;
-use crate::sdo::AbortCode;
 
 use super::VALUE_MAX;
 

@@ -1,8 +1,8 @@
 //! Expedited and segmented transfers.
 
+use crate::abort::AbortCode;
 use crate::od::{self, Access, Address, DataType, Entry, Kind, Objects};
 use crate::sdo::fields::{self, scs};
-use crate::sdo::AbortCode;
 
 use super::{Incoming, Outgoing, SdoServer, State, VALUE_MAX};
 
