@@ -48,7 +48,7 @@ pub enum Next<E> {
 /// waiting for it.
 ///
 /// Everything but [`poll`](Self::poll) may only be called while no operation runs, because on the
-/// F4 a read from busy flash stalls the core. The [programmer](crate::programmer) sees to it.
+/// F4 a read from busy flash stalls the core. The programmer sees to it.
 pub trait Flash {
     /// Copies `buffer.len()` bytes from `address` on. Addresses outside the flash read FFh.
     fn read(&self, address: u32, buffer: &mut [u8]);

@@ -9,7 +9,7 @@
 //!
 //! Nothing of an installed program is lost before the first block of another one was judged good:
 //! CLEAR is carried out with it (SYS TEC manual L-1112d_10, figure 12), see
-//! [`Erase`](crate::policy::Erase).
+//! [`Erase`].
 
 mod commands;
 
