@@ -12,19 +12,19 @@
 //! [`Erase`].
 
 mod commands;
+mod transfer;
 
 use core::task::Poll;
 
 use canopen::program::{FlashError, FlashStatus, ProgramState};
 use canopen::AbortCode;
-use shared_abi::block_file::FRAMING;
 use shared_abi::geometry::Region;
 use shared_abi::label;
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
 use crate::flash::Flash;
-use crate::intake::{Destination, Intake, Judge, Progress};
+use crate::intake::{Intake, Judge};
 use crate::program::{check_vectors, Expected};
 use crate::programmer::{Event, Programmer};
 use crate::refusal::Refusal;
@@ -217,145 +217,6 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     pub(crate) fn installed(&self, program: u8) -> Option<(Region, u32)> {
         let record = self.program(program)?.record?;
         Some((Region::new(self.region(program).base, record.size), record.crc))
-    }
-
-    /// 1F50h: the client announces a transfer, and its size if it knows it.
-    ///
-    /// # Errors
-    /// The abort that answers it.
-    pub fn download_start(&mut self, program: u8, size: Option<u32>) -> Result<(), AbortCode> {
-        self.download_cancel();
-        let room = self.has_room();
-        let Some(state) = find(&mut self.programs, program) else { return Err(AbortCode::NO_SUB_INDEX) };
-        let others = self.programmer.is_busy() && self.programmer.program().is_some_and(|of| of != program);
-        let refusal = if self.boot_request.is_some() || others || !self.programmer.is_abortable() || !room {
-            Some(Refusal::untimely(FlashError::Busy))
-        } else if state.locked {
-            Some(Refusal::untimely(FlashError::NoAccess))
-        } else if size.is_some_and(|size| size < FRAMING as u32) && self.policy.data != Some(program) {
-            Some(Refusal(FlashError::Format, AbortCode::LENGTH_TOO_LOW))
-        } else {
-            None
-        };
-        if let Some(refusal) = refusal {
-            return Err(state.refuse(refusal));
-        }
-        // A second CLEAR erases all, but not behind a block: it may come from a host that tries the
-        // same wrong file again.
-        if let Session::Cleared { just } = &mut state.session {
-            *just = false;
-        }
-        state.streamed = false;
-        self.programmer.select(program);
-        self.transfer = Some(Transfer { program, intake: Intake::new(size) });
-        Ok(())
-    }
-
-    /// Bytes that [`download_data`](Self::download_data) takes at present. `held` for a client whose
-    /// answer is already being held back, which may use a reserve.
-    #[must_use]
-    pub fn space(&self, held: bool) -> usize {
-        let room = |transfer: &Transfer| transfer.intake.room(self.programmer.queue(), held);
-        self.transfer.as_ref().map_or(usize::MAX, room)
-    }
-
-    /// 1F50h: the next bytes of the transfer.
-    ///
-    /// # Errors
-    /// The abort that ends the transfer.
-    pub fn download_data(&mut self, data: &[u8]) -> Result<(), AbortCode> {
-        self.take(Some(data)).map(drop)
-    }
-
-    /// 1F50h: the transfer is complete. Judges it in full and leaves the work behind.
-    ///
-    /// # Errors
-    /// The abort that answers instead of the last acknowledgement.
-    pub fn download_end(&mut self) -> Result<(), AbortCode> {
-        let program = self.take(None)?;
-        self.transfer = None;
-        if let Some(state) = find(&mut self.programs, program) {
-            state.error = None;
-        }
-        Ok(())
-    }
-
-    /// 1F50h: the transfer ended before its end. A block may be sent again; of a stream half a
-    /// program is left, if any.
-    pub fn download_cancel(&mut self) {
-        let Some(Transfer { program, intake }) = self.transfer.take() else { return };
-        self.programmer.queue_mut().discard();
-        let Some(state) = find(&mut self.programs, program) else { return };
-        if intake.is_stream() && matches!(state.session, Session::Open { .. }) {
-            state.session = Session::Failed;
-            state.error.get_or_insert(FlashError::Format);
-            self.programmer.abort();
-        }
-    }
-
-    /// Hands the next bytes to the format of the open transfer, or the end (`None`), and carries out
-    /// what it leads to; gives the program that it is about.
-    fn take(&mut self, data: Option<&[u8]>) -> Result<u8, AbortCode> {
-        let Some(Transfer { program, intake }) = &mut self.transfer else { return Err(self.fault) };
-        let program = *program;
-        let Some(state) = find(&mut self.programs, program) else { return Err(self.fault) };
-        let judge = Judge {
-            layout: self.layout,
-            policy: self.policy,
-            program,
-            session: state.session,
-            installed: state.record.is_some(),
-        };
-        let mut to = Destination { judge, queue: self.programmer.queue_mut(), progress: Progress::default() };
-        let outcome = match data {
-            Some(bytes) => intake.data(bytes, &mut to),
-            None => intake.end(&mut to),
-        };
-        let progress = to.progress;
-        let streaming = intake.may_be_stream();
-        let is_stream = intake.is_stream();
-        match outcome {
-            Ok(()) => {
-                self.proceed(program, is_stream, progress);
-                Ok(program)
-            }
-            Err(refusal) => {
-                if progress.begins.is_some() && !matches!(judge.session, Session::Open { .. }) {
-                    // Its pieces are of a download that does not begin.
-                    self.programmer.queue_mut().clear();
-                }
-                if refusal.0 == FlashError::Crc || streaming {
-                    self.outcome = Some((program, Err(refusal.0)));
-                }
-                let abort = state.refuse(refusal);
-                self.download_cancel();
-                Err(abort)
-            }
-        }
-    }
-
-    /// What accepted bytes lead to.
-    fn proceed(&mut self, program: u8, is_stream: bool, progress: Progress) {
-        let Some(state) = find(&mut self.programs, program) else { return };
-        if let Some(begin) = progress.begins {
-            state.version = begin.version;
-            // A sequence of blocks that begins anew goes on over what is there.
-            if !matches!(state.session, Session::Open { .. }) {
-                let region = self.layout.program(program).unwrap_or(NOWHERE);
-                self.programmer.open(program, region, state.session.erases(self.policy), begin.size);
-            }
-            state.session = Session::Open { next: 1 };
-        }
-        if let (true, Session::Open { next }) = (progress.block, &mut state.session) {
-            *next = next.wrapping_add(1);
-        }
-        if let Some(expected) = progress.complete {
-            self.programmer.complete(expected);
-            if is_stream {
-                state.streamed = true;
-                state.start_when_verified = self.policy.starts_by_itself;
-            }
-        }
     }
 
     /// Carries the work on.
