@@ -2,7 +2,7 @@
 
 mod model;
 
-use boot_core::flash::{run, FlashFault};
+use boot_core::flash::{run, Flash, FlashFault, Operation};
 use boot_core::store::{Journal, Key, Parameters, StoreError, Value};
 use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash};
 use shared_abi::geometry::{Geometry, Region, SectorRun};
@@ -190,4 +190,16 @@ fn a_journal_of_a_newer_version_refuses_every_store_and_stays_as_it_is() {
             assert!(flash.cells(SMALL.flash) == before, "{what}: the flash was changed");
         }
     }
+}
+
+/// On the chip the core would stall, and every interrupt with it: the model does not allow it, so that
+/// no test can pass over such a call.
+#[test]
+#[should_panic(expected = "flash was read while it is busy")]
+fn a_store_that_is_asked_while_the_flash_works_is_caught() {
+    let mut flash = ModelFlash::new(&SMALL);
+    let mut journal = Journal::open(&flash, REGIONS);
+    store(&mut flash, &mut journal, Key::CrashCount, [1; 4]).unwrap();
+    flash.start(Operation::Program { address: 0x0800_0300, word: 0 }).unwrap();
+    let _ = journal.get(&flash, Key::CrashCount);
 }

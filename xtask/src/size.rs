@@ -24,9 +24,10 @@ and as the flash has them (packed). A share of what is packed is an estimate: as
   --yes           installs what is missing with sudo
 ";
 
-/// What the bootloader may take on any board, in bytes, with every dialect and option in it. The
-/// region has 32 KiB; sealed images will want the rest.
-pub const BUDGET: u32 = 23 * 1024 + 512;
+/// What the bootloader may take on any board, in bytes, with every dialect and option in it: what
+/// was reached. The budget is 22 KiB and the aim 20; the region has 32, of which sealed images will
+/// want the rest.
+pub const BUDGET: u32 = 23 * 1024 + 128;
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
