@@ -23,7 +23,7 @@ pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     args.none_left()?;
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
-    let images = build::images(board, &["bootloader", "bootloader-complete", "app-v1"])?;
+    let images = build::images(board, &["bootloader", "app-v1"])?;
     let mut bench = process::cargo("run");
     bench.args(build::tests_args(board)).args(["--bin", "bench"]);
     bench.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", images);
