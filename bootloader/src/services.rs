@@ -89,8 +89,8 @@ pub const fn outcome_code(outcome: Result<(), FlashFault>) -> u32 {
 pub const fn outcome_of(code: u32) -> Result<(), FlashFault> {
     match code {
         0 => Ok(()),
-        1 => Err(FlashFault::Protected),
-        3 => Err(FlashFault::Verify),
+        code if code == outcome_code(Err(FlashFault::Protected)) => Err(FlashFault::Protected),
+        code if code == outcome_code(Err(FlashFault::Verify)) => Err(FlashFault::Verify),
         _ => Err(FlashFault::Failed),
     }
 }

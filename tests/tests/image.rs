@@ -336,6 +336,17 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
         assert_eq!(cell(&bench), None, "{what}");
         bench.power_off();
     }
+    // Nor does the entry strap keep a program from starting that has no bootloader beside it.
+    let (_, image, damage) = damages().swap_remove(0);
+    load(&mut bench, &image.flash);
+    let (port, pin, pressed) = bsp::ENTRY_STRAP;
+    bench.machine().set_pin(port, pin, Some(pressed));
+    bench.power_on();
+    bench.await_boot_up(1000);
+    assert!(!bench.is_bootloader(NODE));
+    assert_eq!(cell(&bench), Some((DAMAGED, damage)));
+    bench.machine().set_pin(port, pin, Some(!pressed));
+    bench.power_off();
     // The image itself, for comparison.
     load(&mut bench, &Packed::of(firmware::BOOTLOADER).flash);
     bench.power_on();

@@ -57,8 +57,8 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
     let node = product::node_parameters(&parameters, &flash);
     let node_id = node.id.map_or(NO_NODE_ID, NodeId::get);
     // A bootloader that cannot run resumes what would start by itself, at once: a rescue window would
-    // need the RAM image.
-    for request in [request, PRODUCT.autostart.map(BootRequest::Resume)] {
+    // need the RAM image, and the strap asks for what is not there.
+    for (request, strap) in [(request, strap), (PRODUCT.autostart.map(BootRequest::Resume), false)] {
         let circumstances = Circumstances { request, strap, crash_resets, node_id };
         let verified = |number| verify(&flash, &parameters, LAYOUT, PRODUCT.crc, number);
         let decision = decide(&circumstances, &DECISION, verified);
