@@ -10,7 +10,7 @@ pub const MAGIC: u32 = u32::from_le_bytes(*b"CBI1");
 
 /// Version of what the resident part and the RAM part of the bootloader tell each other in RAM and
 /// by calls. A change of that raises it.
-pub const SERVICES_VERSION: u32 = 2;
+pub const SERVICES_VERSION: u32 = 3;
 
 /// Bytes of RAM behind the bootloader's variables that are left for its stack, at least. The boot
 /// stage, which unpacks the image, is at home there.
@@ -41,11 +41,15 @@ pub struct Header {
 pub enum Method {
     /// As they are in RAM.
     Raw = 0,
-    /// As a ZX0 stream, format version 2 (Einar Saukas), of the image with absolute calls: in each
-    /// pair of half-words 11110… 11111… (`BL`) the 22 bits that are left of both are the distance in
-    /// half-words, to which half the address of the second half-word was added.
+    /// As a ZX0 stream, format version 2 (Einar Saukas), with offsets in units of [`OFFSET_UNIT`], of
+    /// the image with absolute calls: in each pair of half-words 11110… 11111… (`BL`) the 22 bits
+    /// that are left of both are the distance in half-words, to which half the address of the second
+    /// half-word was added.
     Zx0 = 1,
 }
+
+/// Bytes that the offsets of a packed image count: half-words, which Thumb code consists of.
+pub const OFFSET_UNIT: usize = 2;
 
 /// Why the RAM image cannot run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -3,6 +3,8 @@
 
 #[path = "image/gdb.rs"]
 mod gdb;
+#[path = "image/zx0.rs"]
+mod zx0;
 
 use canopen::program::ProgramControl;
 use canopen::Address;
@@ -111,6 +113,18 @@ const METHOD: usize = 3;
 const STORED: usize = 4;
 const UNPACKED: usize = 5;
 
+/// With offsets in bytes our reading of the format is that of somebody else's unpacker.
+#[test]
+fn the_format() {
+    // Four literals; 5 from two before; one literal; 2 from the last offset; the end.
+    let stream = [0x0E, b'a', b'b', b'c', b'd', 126 << 1, 0x28, b'X', 0xD5, 0x55, 0x60];
+    let unpacked = zx0decompress::decompress(&mut stream.as_slice()).unwrap();
+    assert_eq!(unpacked, b"abcdcdcdcXcX");
+    assert_eq!(zx0::unpack(&stream, 1), Some(unpacked));
+    assert_eq!(zx0::unpack(&stream, 2).as_deref(), Some(&b"abcdabcdaXcd"[..]));
+    assert_eq!(zx0::unpack(&stream[..10], 1), None, "without its end");
+}
+
 #[test]
 fn what_is_packed_is_what_was_linked() {
     for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_LEAST] {
@@ -120,8 +134,8 @@ fn what_is_packed_is_what_was_linked() {
         assert_eq!([packed.get(SERVICES), packed.get(METHOD)], [SERVICES_VERSION, 1]);
         assert_eq!([packed.get(STORED), packed.get(UNPACKED)], [stored.len() as u32, ram as u32]);
         assert_eq!(packed.get(CRC), crc32(&packed.flash[packed.header + 8..]));
-        // By somebody else's unpacker, with the calls put back.
-        let mut unpacked = zx0decompress::decompress(&mut stored.as_slice()).unwrap();
+        // By the format's description, with offsets in half-words and the calls put back.
+        let mut unpacked = zx0::unpack(&stored, 2).unwrap();
         let calls = restore_calls(&mut unpacked, firmware::board().ram.base);
         assert!(unpacked == packed.ram, "{image}");
         assert!(calls > 100, "{image}: {calls} calls");
@@ -430,25 +444,25 @@ fn outcome(bench: &mut Bench) -> Option<(u32, u32)> {
 /// A copy from in front of the image is refused, though the stream ends where it should.
 #[test]
 fn an_offset_in_front_of_the_image_is_damage() {
-    // Bits 1 (one literal), 1 (then a copy from another offset), 1 (upper part 1); the lower part is
-    // 127 in seven bits, for an offset of 1, and a 1 (two bytes); 1 (another offset), and 256 for
-    // the end, inverted: 01 eight times, 1.
-    let stream = [0b1111_0101, b'A', 127 << 1 | 1, 0b0101_0101, 0b0101_1000];
+    // Bits 0 0 1 (two literals), 1 (then a copy from another offset), 1 (upper part 1); the lower part
+    // is 127 in seven bits, for an offset of one half-word, and a 1 (two bytes); 1 (another offset),
+    // and 256 for the end, inverted: 01 eight times, 1.
+    let stream = [0b0011_1101, b'A', b'B', 127 << 1 | 1, 0b0101_0101, 0b0101_0110];
     let mut bench = Bench::new();
     for (lower, damage) in [(127 << 1 | 1, None), (126 << 1 | 1, Some((DAMAGED, BY_STREAM)))] {
         let mut image = Packed::of(firmware::BOOTLOADER);
         image.flash.truncate(image.header + HEADER);
         image.flash.extend(stream);
-        image.stored()[2] = lower;
-        image.set(STORED, 5);
-        image.set(UNPACKED, 3);
+        image.stored()[3] = lower;
+        image.set(STORED, 6);
+        image.set(UNPACKED, 4);
         image.seal();
         load(&mut bench, &image.flash);
         bench.power_on();
         assert_eq!(outcome(&mut bench), damage);
-        let mut found = [0; 3];
+        let mut found = [0; 4];
         bench.machine().read_memory(firmware::board().ram.base, &mut found).unwrap();
-        assert_eq!(found == *b"AAA", damage.is_none(), "{found:x?}");
+        assert_eq!(found == *b"ABAB", damage.is_none(), "{found:x?}");
         bench.power_off();
     }
 }

@@ -1,0 +1,69 @@
+//! The packed image's format by its description, slowly: a ZX0 stream whose offsets count units of
+//! some bytes.
+
+/// What a stream unpacks to; `None` when it ends too early, reads what is not there, or goes on behind
+/// its end.
+pub fn unpack(stream: &[u8], unit: usize) -> Option<Vec<u8>> {
+    let mut bits = Bits { stream: stream.iter(), byte: 0, left: 0 };
+    let (mut out, mut offset) = (Vec::new(), 1);
+    loop {
+        for _ in 0..bits.number(1, false)? {
+            out.push(*bits.stream.next()?);
+        }
+        let mut from_another = bits.bit()?;
+        if !from_another {
+            let length = bits.number(1, false)?;
+            copy(&mut out, offset * unit, length)?;
+            from_another = bits.bit()?;
+        }
+        while from_another {
+            let upper = bits.number(1, true)?;
+            if upper == 256 {
+                return bits.stream.next().is_none().then_some(out);
+            }
+            let lower = usize::from(*bits.stream.next()?);
+            offset = upper * 128 - lower / 2;
+            // The last bit of the byte is the first one of the length: whether that is 1.
+            let length = if lower % 2 == 1 { 1 } else { bits.digits(1, false)? };
+            copy(&mut out, offset * unit, length + 1)?;
+            from_another = bits.bit()?;
+        }
+    }
+}
+
+fn copy(out: &mut Vec<u8>, offset: usize, length: usize) -> Option<()> {
+    for _ in 0..length {
+        out.push(*out.get(out.len().checked_sub(offset)?)?);
+    }
+    Some(())
+}
+
+struct Bits<'s> {
+    stream: std::slice::Iter<'s, u8>,
+    byte: u8,
+    left: u32,
+}
+
+impl Bits<'_> {
+    fn bit(&mut self) -> Option<bool> {
+        if self.left == 0 {
+            (self.byte, self.left) = (*self.stream.next()?, 8);
+        }
+        self.left -= 1;
+        Some(self.byte >> self.left & 1 == 1)
+    }
+
+    /// An interlaced Elias gamma code.
+    fn number(&mut self, so_far: usize, inverted: bool) -> Option<usize> {
+        if self.bit()? {
+            return Some(so_far);
+        }
+        self.digits(so_far, inverted)
+    }
+
+    /// The same behind a 0.
+    fn digits(&mut self, so_far: usize, inverted: bool) -> Option<usize> {
+        let digit = self.bit()? != inverted;
+        self.number(so_far.checked_mul(2)? + usize::from(digit), inverted)
+    }
+}

@@ -1,0 +1,262 @@
+//! The smallest ZX0 stream (format version 2, Einar Saukas) of some bytes.
+//!
+//! A stream is literals and copies in turn: literals; a copy from the last offset, behind literals
+//! alone; a copy from another offset. Numbers are interlaced Elias gamma codes. Which of them to
+//! take is found by trying all: for each prefix of the input, what is the cheapest stream of it?
+//!
+//! The format counts offsets in bytes. Thumb code consists of half-words, and nearly every copy in
+//! it comes from an even offset; so the *unit* of an offset is a choice here. With 2 a bootloader is
+//! some 460 bytes smaller (docs/adr/0011-packed-ram-image.md).
+
+/// The upper part of an offset that stands for the end of the stream.
+const END: usize = 256;
+/// Values of the lower part of an offset.
+const LOW: usize = 128;
+
+/// A piece of a stream: literals, or a copy.
+#[derive(Clone, Copy)]
+struct Piece {
+    /// Bits of the stream up to its end.
+    bits: u32,
+    /// Bytes of the input up to its end.
+    end: usize,
+    /// 0 for literals; else from how many units before a copy comes.
+    offset: usize,
+    /// The piece before it.
+    before: usize,
+}
+
+/// What is known of one offset.
+#[derive(Clone, Copy, Default)]
+struct Offset {
+    /// How many bytes up to here equal those that far before.
+    equal: usize,
+    /// The cheapest stream whose last copy came from here: that copy.
+    copy: Option<usize>,
+    /// The same with literals behind it, up to where the equal bytes begin.
+    literals: Option<usize>,
+}
+
+/// Packs some bytes, at least one, with offsets in units of so many bytes.
+pub fn compress(input: &[u8], unit: usize) -> Vec<u8> {
+    write(input, unit, &cheapest(input, unit))
+}
+
+/// The pieces of the smallest stream, in order.
+fn cheapest(input: &[u8], unit: usize) -> Vec<Piece> {
+    // Before the first byte the last offset is 1, and the flag in front of the first literals is
+    // left out.
+    const START: usize = 0;
+    let mut pieces = vec![Piece { bits: u32::MAX, end: 0, offset: 1, before: START }];
+    // For each prefix, the last piece of its cheapest stream.
+    let mut best = vec![START; input.len() + 1];
+    let mut offsets = vec![Offset::default(); input.len() / unit + 2];
+    offsets[1].copy = Some(START);
+    // For each number of equal bytes, how many of them a copy should take.
+    let mut lengths = vec![2; input.len() + 3];
+
+    for end in 1..=input.len() {
+        let mut known = 2;
+        let mut cheapest: Option<usize> = None;
+        for offset in 1..=((end - 1) / unit).max(1) {
+            let state = &mut offsets[offset];
+            let here = end - 1;
+            let is_equal = here >= offset * unit && input[here] == input[here - offset * unit];
+            let mut candidate = None;
+            if is_equal {
+                if state.equal == 0 {
+                    state.literals = state.copy.map(|copy| {
+                        let bits = with_literals(&pieces[copy], here);
+                        pieces.push(Piece { bits, end: here, offset: 0, before: copy });
+                        pieces.len() - 1
+                    });
+                }
+                state.equal += 1;
+                if let Some(literals) = state.literals {
+                    let bits = pieces[literals].bits + 1 + number_bits(end - pieces[literals].end);
+                    candidate = Some(Piece { bits, end, offset, before: literals });
+                }
+                if state.equal > 1 {
+                    let cost =
+                        |length: usize| pieces[best[end - length]].bits.wrapping_add(number_bits(length - 1));
+                    while known < state.equal {
+                        known += 1;
+                        let shorter = lengths[known - 1];
+                        lengths[known] = if cost(known) <= cost(shorter) { known } else { shorter };
+                    }
+                    let length = lengths[state.equal];
+                    let bits = cost(length) + 8 + number_bits((offset - 1) / LOW + 1);
+                    if candidate.is_none_or(|other| bits < other.bits) {
+                        candidate = Some(Piece { bits, end, offset, before: best[end - length] });
+                    }
+                }
+                if let Some(piece) = candidate {
+                    pieces.push(piece);
+                    state.copy = Some(pieces.len() - 1);
+                }
+            } else {
+                state.equal = 0;
+                candidate = state.copy.map(|copy| {
+                    let bits = with_literals(&pieces[copy], end);
+                    Piece { bits, end, offset: 0, before: copy }
+                });
+            }
+            if let Some(piece) = candidate {
+                if cheapest.is_none_or(|other| piece.bits < pieces[other].bits) {
+                    if !is_equal {
+                        pieces.push(piece);
+                    }
+                    cheapest = Some(pieces.len() - 1);
+                }
+            }
+        }
+        best[end] = cheapest.expect("literals alone are always a stream");
+    }
+
+    let mut found = Vec::new();
+    let mut last = best[input.len()];
+    while last != START {
+        found.push(pieces[last]);
+        last = pieces[last].before;
+    }
+    found.reverse();
+    found
+}
+
+/// Bits of a stream that ends with this copy, with literals behind it up to `end`.
+fn with_literals(copy: &Piece, end: usize) -> u32 {
+    let length = end - copy.end;
+    copy.bits.wrapping_add(1 + number_bits(length) + 8 * length as u32)
+}
+
+/// Bits of a number, from 1 on.
+fn number_bits(number: usize) -> u32 {
+    2 * number.ilog2() + 1
+}
+
+/// Writes the pieces down.
+fn write(input: &[u8], unit: usize, pieces: &[Piece]) -> Vec<u8> {
+    let mut stream = Stream { bytes: Vec::new(), bits: 0, left: 0, in_last: false };
+    let (mut at, mut offset) = (0, 1);
+    let mut before = None;
+    for piece in pieces {
+        let length = piece.end - at;
+        match (before, piece.offset) {
+            (None, 0) => stream.number(length, false),
+            (_, 0) => {
+                stream.bit(false);
+                stream.number(length, false);
+            }
+            (Some(0), same) if same == offset => {
+                stream.bit(false);
+                stream.number(length, false);
+            }
+            (_, other) => {
+                offset = other;
+                stream.bit(true);
+                stream.number((offset - 1) / LOW + 1, true);
+                // Downwards from 127; the last bit of the byte is the first one of the length.
+                stream.bytes.push(((LOW - 1 - (offset - 1) % LOW) << 1) as u8);
+                stream.in_last = true;
+                stream.number(length - 1, false);
+            }
+        }
+        if piece.offset == 0 {
+            stream.bytes.extend(&input[at..piece.end]);
+        }
+        (at, before) = (piece.end, Some(piece.offset));
+    }
+    debug_assert!(at == input.len() && unit > 0);
+    stream.bit(true);
+    stream.number(END, true);
+    stream.bytes
+}
+
+/// Bytes, with bytes of bits between them.
+struct Stream {
+    bytes: Vec<u8>,
+    /// Where the byte of bits stands, and how many of its bits are free.
+    bits: usize,
+    left: u32,
+    /// The next bit is the last one of the byte that was written last.
+    in_last: bool,
+}
+
+impl Stream {
+    fn bit(&mut self, bit: bool) {
+        if std::mem::take(&mut self.in_last) {
+            *self.bytes.last_mut().expect("a byte was written") |= u8::from(bit);
+            return;
+        }
+        if self.left == 0 {
+            (self.bits, self.left) = (self.bytes.len(), 8);
+            self.bytes.push(0);
+        }
+        self.left -= 1;
+        self.bytes[self.bits] |= u8::from(bit) << self.left;
+    }
+
+    /// An interlaced Elias gamma code: in front of each binary digit behind the first one a 0, and a
+    /// 1 at the end. `inverted`: the digits are.
+    fn number(&mut self, number: usize, inverted: bool) {
+        for digit in (0..number.ilog2()).rev() {
+            self.bit(false);
+            self.bit((number >> digit & 1 == 1) != inverted);
+        }
+        self.bit(true);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Bytes with repetitions at all kinds of offsets, from a fixed seed.
+    fn sample(seed: u32, len: usize) -> Vec<u8> {
+        let mut state = seed;
+        let mut random = move || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 16) as usize
+        };
+        let mut bytes = vec![seed as u8];
+        while bytes.len() < len {
+            let (from, count) = (random() % bytes.len(), random() % 20);
+            match random() % 3 {
+                0 => bytes.extend((0..count).map(|_| random() as u8)),
+                1 => bytes.extend(vec![bytes[from]; count]),
+                _ => (from..bytes.len().min(from + count)).for_each(|at| bytes.push(bytes[at])),
+            }
+        }
+        bytes
+    }
+
+    /// With bytes as the unit it is the format itself: somebody else's unpacker reads it, and
+    /// somebody else's packer, which finds the smallest stream too, finds none that is smaller.
+    #[test]
+    fn with_offsets_in_bytes_it_is_the_format() {
+        for (seed, len) in [(1, 1), (2, 2), (3, 40), (4, 1000), (5, 6000)] {
+            let input = sample(seed, len);
+            let stream = compress(&input, 1);
+            assert_eq!(zx0decompress::decompress(&mut stream.as_slice()).unwrap(), input, "seed {seed}");
+            assert_eq!(stream.len(), zx0::compress(&input).len(), "seed {seed}");
+        }
+    }
+
+    /// By hand, with offsets in half-words.
+    #[test]
+    fn with_offsets_in_half_words() {
+        let bits = [
+            // Four literals. A copy of 5 from two units before: 1, the upper part 1, and of 4 the bits
+            // behind the first one, which is in the byte of the lower part.
+            0b0000_1110,
+            // Its last bits. One literal. A copy of 2 from the last offset.
+            0b0010_1000,
+            // Its last bit. The end: 1, and 256 with inverted digits.
+            0b1101_0101,
+            0b0101_0101,
+            0b0110_0000,
+        ];
+        let stream = [bits[0], b'a', b'b', b'c', b'd', 126 << 1, bits[1], b'X', bits[2], bits[3], bits[4]];
+        assert_eq!(compress(b"abcdabcdaXcd", 2), stream);
+    }
+}
