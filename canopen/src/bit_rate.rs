@@ -29,6 +29,13 @@ pub enum BitRate {
 }
 
 impl BitRate {
+    /// Whether a frame takes so long that pauses between frames have to be given more time:
+    /// 20 kbit/s and below, where eight bytes take 5 ms and more.
+    #[must_use]
+    pub const fn is_slow(self) -> bool {
+        matches!(self, Self::K20 | Self::K10)
+    }
+
     /// From the index in CiA 305 table 1; `None` for an index that it does not have.
     #[must_use]
     pub const fn from_index(index: u8) -> Option<Self> {

@@ -72,6 +72,13 @@ impl CobId {
         Self(0x080 + node.get() as u16)
     }
 
+    /// A COB-ID and the node-ID on top of it, as in the predefined connection set; `None` if that is
+    /// more than 11 bits.
+    #[must_use]
+    pub const fn from_base(base: u16, node: NodeId) -> Option<Self> {
+        Self::new(base + node.get() as u16)
+    }
+
     /// SDO, server to client.
     #[must_use]
     pub const fn sdo_response(node: NodeId) -> Self {

@@ -28,6 +28,7 @@
 extern crate alloc;
 
 mod abort;
+pub mod application;
 pub mod bit_rate;
 #[cfg(feature = "debugger")]
 pub mod debugger;

@@ -94,6 +94,8 @@ pub enum Output {
 pub struct Lss {
     /// Vendor-ID, product code, revision number, serial number.
     address: [u32; 4],
+    /// The state in which it starts.
+    initial: State,
     state: State,
     /// The node-ID in force.
     active: Option<NodeId>,
@@ -166,11 +168,12 @@ impl Lss {
     /// A slave with this node-ID, or without one.
     #[must_use]
     pub fn new(address: LssAddress, node: Option<NodeId>, config: Config) -> Self {
-        let state = if config.start_in_configuration { State::Configuration } else { State::Waiting };
+        let initial = if config.start_in_configuration { State::Configuration } else { State::Waiting };
         let announce = config.announce && node.is_none();
         Self {
             address: address.parts(),
-            state,
+            initial,
+            state: initial,
             active: node,
             pending: node,
             bit_rate: None,
@@ -192,7 +195,12 @@ impl Lss {
 
     /// NMT Reset communication: the node-ID that was configured comes into force; gives it. Without
     /// one the node is not started and waits for LSS again.
+    ///
+    /// The state is that of the start again, LSS waiting: the node passes through INITIALISATION, and
+    /// the state machine is entered anew with PRE-OPERATIONAL, or with a reset of communication without
+    /// a node-ID (CiA 305, LSS FSA, transition 1). Other changes of the NMT state leave it alone.
     pub fn reset_communication(&mut self) -> Option<NodeId> {
+        self.state = self.initial;
         self.active = self.pending;
         self.active
     }

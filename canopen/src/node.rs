@@ -4,6 +4,7 @@
 //! [`Node::poll`] until there are none, and does the latter again at least once every few
 //! milliseconds (or at [`Node::next_deadline`]).
 
+use crate::abort::AbortCode;
 use crate::frame::{CobId, Frame, NodeId};
 use crate::heartbeat::Heartbeat;
 use crate::nmt::{self, NmtCommand, NmtState};
@@ -22,14 +23,23 @@ pub enum NmtPolicy {
 }
 
 /// What can be chosen about a node.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Config {
+    /// Whether it says by a message that it is up (CiA 301 clause 7.3.2.2.3).
+    pub boot_up: bool,
     /// Period of the heartbeat in milliseconds, 0 for none.
     pub heartbeat_ms: u16,
     /// Whether it follows the commands of the NMT master that change its state.
     pub nmt: NmtPolicy,
     /// The SDO server's part.
     pub sdo: SdoConfig,
+}
+
+impl Default for Config {
+    /// With a boot-up message, without heartbeat; it stays PRE-OPERATIONAL.
+    fn default() -> Self {
+        Self { boot_up: true, heartbeat_ms: 0, nmt: NmtPolicy::default(), sdo: SdoConfig::DEFAULT }
+    }
 }
 
 /// A command of the NMT master to this node.
@@ -43,6 +53,7 @@ pub type NmtEvent = NmtCommand;
 #[derive(Debug)]
 pub struct Node {
     id: NodeId,
+    boot_up: bool,
     nmt: NmtPolicy,
     state: NmtState,
     heartbeat: Heartbeat,
@@ -55,6 +66,7 @@ impl Node {
     pub const fn new(id: NodeId, config: Config) -> Self {
         Self {
             id,
+            boot_up: config.boot_up,
             nmt: config.nmt,
             state: NmtState::Initialisation,
             heartbeat: Heartbeat::new(config.heartbeat_ms, Instant::from_millis(0)),
@@ -80,6 +92,28 @@ impl Node {
         self.sdo.is_idle()
     }
 
+    /// Whether an SDO answer waits to be fetched.
+    #[must_use]
+    pub const fn has_sdo_answer(&self) -> bool {
+        self.sdo.has_answer()
+    }
+
+    /// Whether frames take long on this bus, see
+    /// [`slow_bus`](crate::sdo::server::Config::slow_bus).
+    pub fn set_slow_bus(&mut self, slow_bus: bool) {
+        self.sdo.set_slow_bus(slow_bus);
+    }
+
+    /// Takes the SDO answer that waits back, if it is this one; tells whether it was.
+    pub fn withdraw_answer(&mut self, answer: &[u8; 8]) -> bool {
+        self.sdo.withdraw_answer(answer)
+    }
+
+    /// Turns the SDO answer that waits into an abort of the object that it is about.
+    pub fn refuse(&mut self, code: AbortCode) {
+        self.sdo.refuse(code);
+    }
+
     /// Ends an SDO transfer that is going on, without telling the client.
     pub fn end_transfer(&mut self, objects: &mut impl Objects) {
         self.sdo.reset(objects);
@@ -89,8 +123,12 @@ impl Node {
     /// is sent again.
     pub fn restart(&mut self, id: NodeId, objects: &mut impl Objects) {
         self.sdo.reset(objects);
-        let config =
-            Config { heartbeat_ms: self.heartbeat.period_ms(), nmt: self.nmt, sdo: self.sdo.config() };
+        let config = Config {
+            boot_up: self.boot_up,
+            heartbeat_ms: self.heartbeat.period_ms(),
+            nmt: self.nmt,
+            sdo: self.sdo.config(),
+        };
         *self = Self::new(id, config);
     }
 
@@ -121,7 +159,9 @@ impl Node {
         if self.state == NmtState::Initialisation {
             self.state = NmtState::PreOperational;
             self.heartbeat = Heartbeat::new(self.heartbeat.period_ms(), now);
-            return Some(nmt::boot_up(self.id));
+            if self.boot_up {
+                return Some(nmt::boot_up(self.id));
+            }
         }
         if let Some(answer) = self.sdo.poll(now, objects) {
             return Some(answer);

@@ -9,6 +9,7 @@
 //!
 //! The first outputs of a new slave set filters and bit rate, so the owner does that in one place.
 
+use crate::abort::AbortCode;
 use crate::bit_rate::{BitRate, Detector};
 use crate::frame::{CobId, Frame, NodeId};
 use crate::line::{Consequence, LineEvent, Losses, Monitor, Status};
@@ -116,13 +117,28 @@ impl Slave {
         }
     }
 
-    /// Whether no SDO transfer is going on and no SDO answer waits to be sent.
-    #[must_use]
-    pub fn is_idle(&self) -> bool {
-        self.node.as_ref().is_none_or(Node::is_sdo_idle)
+    /// Takes the SDO answer that waits to be sent back, if it is this one; tells whether it was. The
+    /// device owes it to the client from then on.
+    pub fn withdraw_answer(&mut self, answer: &[u8; 8]) -> bool {
+        self.node.as_mut().is_some_and(|node| node.withdraw_answer(answer))
     }
 
-    /// Takes any frame received; gives whether the NMT master asked to restart the device.
+    /// Turns the SDO answer that waits to be sent into an abort of the object that it is about.
+    pub fn refuse(&mut self, code: AbortCode) {
+        if let Some(node) = &mut self.node {
+            node.refuse(code);
+        }
+    }
+
+    /// Whether no SDO answer waits to be sent: a device that is to restart owes nobody anything. It
+    /// does not wait for the end of a transfer, which is its client's to choose.
+    #[must_use]
+    pub fn is_idle(&self) -> bool {
+        self.node.as_ref().is_none_or(|node| !node.has_sdo_answer())
+    }
+
+    /// Takes any frame received; gives whether the NMT master asked to restart the device. Then a
+    /// transfer that was going on has ended, and an answer that waited is gone.
     pub fn handle(&mut self, frame: &Frame, now: Instant, device: &mut impl SlaveDevice) -> bool {
         // While the controller only listens, nothing could be answered.
         if !matches!(self.line, Line::Up { .. }) {
@@ -133,7 +149,10 @@ impl Slave {
         }
         let Some(node) = &mut self.node else { return false };
         match node.handle(frame, now, device) {
-            Some(NmtCommand::ResetNode) => return true,
+            Some(NmtCommand::ResetNode) => {
+                node.end_transfer(device);
+                return true;
+            }
             Some(NmtCommand::ResetCommunication) => {
                 let id = self.lss.reset_communication();
                 self.restart(id, device);
@@ -177,6 +196,11 @@ impl Slave {
                     continue;
                 }
                 &mut Line::Down(rate) => {
+                    let slow_bus = rate.is_slow();
+                    self.config.node.sdo.slow_bus = slow_bus;
+                    if let Some(node) = &mut self.node {
+                        node.set_slow_bus(slow_bus);
+                    }
                     self.line = Line::Up { monitor: Monitor::new(now), recover_from_bus_off: false };
                     return Some(Output::Join(rate));
                 }
@@ -209,7 +233,7 @@ impl Slave {
     fn identifiers(&self) -> [CobId; 3] {
         let lss = if self.config.lss.is_some() { CobId::LSS_REQUEST } else { CobId::NMT };
         match &self.node {
-            Some(node) => [CobId::NMT, lss, CobId::sdo_request(node.id())],
+            Some(node) => [CobId::NMT, lss, self.config.node.sdo.request(node.id())],
             None => [lss; 3],
         }
     }

@@ -13,7 +13,10 @@ use canopen::{AbortCode, Address, BitRate, CobId, Frame, NodeId};
 use common::at;
 
 const ADDRESS: LssAddress = LssAddress { vendor_id: 1, product_code: 2, revision: 3, serial_number: 4 };
-static ENTRIES: [Entry; 1] = [Entry::var(0x1000, "Device type", DataType::Unsigned32, Access::Const)];
+static ENTRIES: [Entry; 2] = [
+    Entry::var(0x1000, "Device type", DataType::Unsigned32, Access::Const),
+    Entry::var(0x2000, "Domain", DataType::Domain, Access::Rw),
+];
 
 /// A device whose memory takes its time.
 #[derive(Default)]
@@ -22,6 +25,9 @@ struct Device {
     ids: Vec<Option<u8>>,
     stored: Option<(Option<NodeId>, Option<BitRate>)>,
     outcome: Option<Result<(), StoreError>>,
+    /// Room for data of the domain.
+    space: Option<usize>,
+    cancelled: u32,
 }
 
 impl Objects for Device {
@@ -32,6 +38,30 @@ impl Objects for Device {
     fn read(&mut self, _: Address, buf: &mut [u8]) -> Result<usize, AbortCode> {
         buf[..4].copy_from_slice(&[1, 2, 3, 4]);
         Ok(4)
+    }
+
+    fn download_start(&mut self, _: Address, _: Option<u32>) -> Result<(), AbortCode> {
+        Ok(())
+    }
+
+    fn download_space(&mut self, _: Address, _: bool) -> usize {
+        self.space.unwrap_or(usize::MAX)
+    }
+
+    fn download_data(&mut self, _: Address, _: &[u8]) -> Result<(), AbortCode> {
+        Ok(())
+    }
+
+    fn download_cancel(&mut self, _: Address) {
+        self.cancelled += 1;
+    }
+
+    fn upload_start(&mut self, _: Address) -> Result<Option<u32>, AbortCode> {
+        Ok(None)
+    }
+
+    fn upload_data(&mut self, _: Address, _: u32, buf: &mut [u8]) -> Result<usize, AbortCode> {
+        Ok(buf.len())
     }
 }
 
@@ -166,9 +196,109 @@ fn reset_communication_takes_over_what_lss_configured() {
     bench.ask(0x7E5, &[0x11, 9, 0, 0, 0, 0, 0, 0]);
     let outputs = bench.ask(0x000, &[0x82, 5]);
     assert_eq!(outputs, [accept([0x000, 0x7E5, 0x609]), send(0x709, &[0])]);
+    bench.ask(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
     bench.ask(0x7E5, &[0x11, 0xFF, 0, 0, 0, 0, 0, 0]);
     assert_eq!(bench.ask(0x000, &[0x82, 0]), [accept([0x7E5; 3])], "and falls silent without one");
     assert_eq!(bench.device.ids, [Some(9), None]);
+}
+
+/// CiA 305: the state machine is entered anew, in LSS waiting, when communication was reset; the
+/// change between PRE-OPERATIONAL and STOPPED is none of its transitions.
+#[test]
+fn reset_communication_ends_the_configuration_state() {
+    let inquire = [0x5E, 0, 0, 0, 0, 0, 0, 0];
+    let mut bench = Bench::new(5, BitRate::K125);
+    bench.outputs();
+    bench.ask(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+    for command in [0x01, 0x02, 0x80] {
+        assert_eq!(bench.ask(0x000, &[command, 5]), []);
+        assert_eq!(bench.ask(0x7E5, &inquire), [send(0x7E4, &[0x5E, 5, 0, 0, 0, 0, 0, 0])]);
+    }
+    assert_eq!(bench.ask(0x000, &[0x82, 6]), [], "of another node");
+    assert_eq!(bench.ask(0x7E5, &inquire).len(), 1);
+    bench.ask(0x000, &[0x82, 5]);
+    assert_eq!(bench.ask(0x7E5, &inquire), [], "inquire node-ID is not served in LSS waiting");
+    // A device that starts in configuration (which the standard does not know) is there again.
+    let lss = Some(canopen::lss::Config { start_in_configuration: true, ..Default::default() });
+    let slave = Slave::new(ADDRESS, NodeId::new(5), BitRate::K125, Config { lss, ..Config::default() });
+    let mut bench = Bench { slave, device: Device::default(), now: 0 };
+    bench.outputs();
+    bench.ask(0x7E5, &[0x04, 0, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(bench.ask(0x7E5, &inquire), []);
+    bench.ask(0x000, &[0x82, 5]);
+    assert_eq!(bench.ask(0x7E5, &inquire).len(), 1);
+}
+
+/// What an open transfer looks like: block download, in a sub-block and with its acknowledgement held
+/// back; segmented download; segmented and block upload.
+#[test]
+fn reset_node_ends_a_transfer_at_once() {
+    const INITIATE: [u8; 8] = [0xC2, 0x00, 0x20, 0, 0, 1, 0, 0];
+    const SEGMENT: [u8; 8] = [1, 1, 2, 3, 4, 5, 6, 7];
+    let transfers: [(Option<usize>, &[[u8; 8]]); 6] = [
+        (None, &[INITIATE]),
+        (None, &[INITIATE, SEGMENT]),
+        (Some(0), &[INITIATE]),
+        (None, &[[0x20, 0x00, 0x20, 0, 0, 0, 0, 0]]),
+        (None, &[[0x40, 0x00, 0x20, 0, 0, 0, 0, 0]]),
+        (None, &[[0xA0, 0x00, 0x20, 0, 127, 0, 0, 0], [0xA3, 0, 0, 0, 0, 0, 0, 0]]),
+    ];
+    for (space, requests) in transfers {
+        let mut bench = Bench::new(5, BitRate::K125);
+        bench.outputs();
+        bench.device.space = space;
+        for request in requests {
+            bench.ask(0x605, request);
+        }
+        assert_eq!(bench.slave.is_idle(), space.is_none(), "an answer is owed or not: {requests:02X?}");
+        assert!(bench.put(0x000, &[0x81, 5]));
+        assert!(bench.slave.is_idle());
+        assert_eq!(bench.outputs(), []);
+        let download = matches!(requests[0][0], 0x20 | 0xC2);
+        assert_eq!(bench.device.cancelled, u32::from(download), "{requests:02X?}");
+        // Who waits for the restart is served until then.
+        let answer = bench.ask(0x605, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]);
+        assert_eq!(answer, [send(0x585, &[0x43, 0, 0x10, 0, 1, 2, 3, 4])]);
+    }
+}
+
+/// Frames of eight bytes take some 5 ms at 20 kbit/s.
+#[test]
+fn a_sub_block_may_pause_for_longer_on_a_slow_bus() {
+    for (index, rate, pause) in
+        [(0, BitRate::K1000, 50), (6, BitRate::K50, 50), (7, BitRate::K20, 100), (8, BitRate::K10, 100)]
+    {
+        // Where it starts so, and where layer setting services change over to it.
+        for (from, anew) in [
+            (rate, false),
+            (rate, true),
+            (BitRate::K125, false),
+            (BitRate::K125, true),
+            (BitRate::K10, false),
+            (BitRate::K10, true),
+        ] {
+            let mut bench = Bench::new(5, from);
+            bench.outputs();
+            if from != rate {
+                bench.ask(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+                bench.ask(0x7E5, &[0x13, 0, index, 0, 0, 0, 0, 0]);
+                bench.ask(0x7E5, &[0x15, 0, 0, 0, 0, 0, 0, 0]);
+            }
+            if anew {
+                bench.ask(0x000, &[0x82, 5]);
+            }
+            bench.ask(0x605, &[0xC2, 0x00, 0x20, 0, 0, 1, 0, 0]);
+            assert_eq!(bench.ask(0x605, &[1, 1, 2, 3, 4, 5, 6, 7]), []);
+            bench.now = pause - 1;
+            assert_eq!(bench.outputs(), [], "{from:?} to {rate:?}");
+            bench.now = pause;
+            assert_eq!(
+                bench.outputs(),
+                [send(0x585, &[0xA2, 1, 127, 0, 0, 0, 0, 0])],
+                "{from:?} to {rate:?}"
+            );
+        }
+    }
 }
 
 #[test]

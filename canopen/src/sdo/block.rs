@@ -64,14 +64,18 @@ pub(super) struct Receiver {
     blksize: u8,
     /// The number of the last segment that came in order.
     ackseq: u8,
-    /// Whether a segment of this sub-block came.
-    heard: bool,
-    /// The number of the segment that ended the sub-block before. If it comes again before any
-    /// other, it is a duplicate.
-    ended_by: u8,
-    /// The frame of the last segment of all; the end of the transfer has the number of its data
-    /// bytes.
-    last: Option<[u8; 8]>,
+    /// The number of the last segment of this sub-block that came at all; 0 before the first one.
+    seen: u8,
+    /// Numbers, the first and the last, that until the first segment of this sub-block has come
+    /// belong to the sub-block before: its last segment once more; or its rest, if it was
+    /// acknowledged early and the other side does not look at that before it has sent all.
+    old: (u8, u8),
+    /// The frame that came last.
+    pub frame: [u8; 8],
+    /// It may be no segment at all.
+    pub is_doubtful: bool,
+    /// It is the last segment of all. The end of the transfer has the number of its data bytes.
+    is_complete: bool,
     /// `None` if one side cannot make a CRC.
     crc: Option<Crc16>,
 }
@@ -92,64 +96,99 @@ impl Received {
 impl Receiver {
     /// A receiver without an open sub-block. It computes a CRC if both sides can.
     pub fn new(crc: bool) -> Self {
-        Self { blksize: 0, ackseq: 0, heard: false, ended_by: 0, last: None, crc: crc.then(Crc16::new) }
+        Self {
+            blksize: 0,
+            ackseq: 0,
+            seen: 0,
+            old: (0, 0),
+            frame: [0; 8],
+            is_doubtful: false,
+            is_complete: false,
+            crc: crc.then(Crc16::new),
+        }
     }
 
     /// Opens the next sub-block, of 1 to 127 segments, once the frame that grants it is on its way.
     pub fn open(&mut self, blksize: u8) {
         self.blksize = blksize;
         self.ackseq = 0;
-        self.heard = false;
+        self.seen = 0;
     }
 
     /// Whether the last segment of all has come, so that only the end is missing.
     pub fn is_complete(&self) -> bool {
-        self.last.is_some()
+        self.is_complete
     }
 
     /// Whether a sub-block has begun and not ended. If no more segments come, its end was lost.
     pub fn is_within(&self) -> bool {
-        self.heard && self.blksize != 0
+        self.seen != 0 && self.blksize != 0
     }
 
-    /// Ends the sub-block; gives the number of the segment to acknowledge.
+    /// Ends the sub-block before its end; gives the number of the segment to acknowledge.
     pub fn close(&mut self) -> u8 {
+        self.old = (self.seen + 1, self.blksize);
         self.blksize = 0;
+        self.is_doubtful = false;
         self.ackseq
     }
 
     /// Takes the frame of a segment.
     ///
+    /// The other side sends the segments of a sub-block in a row: the next one to be taken, the one
+    /// behind the last one that came, or the last one of the sub-block. (Before the first one it may
+    /// still be at the sub-block before.) For a server, which has to expect an initiate, another frame
+    /// that reads as one is `doubtful`; if it is a segment after all, the next one follows it in the
+    /// row.
+    ///
     /// # Errors
     /// [`AbortCode::SEQUENCE_NUMBER`] for number 0 and for a number above the block size.
-    pub fn take(&mut self, frame: &[u8; 8]) -> Result<Received, AbortCode> {
+    pub fn take(&mut self, frame: &[u8; 8], doubtful: bool) -> Result<Received, AbortCode> {
         let last = frame[0] & fields::LAST_OF_BLOCKS != 0;
         let seqno = frame[0] & !fields::LAST_OF_BLOCKS;
         if seqno == 0 {
             return Err(AbortCode::SEQUENCE_NUMBER);
         }
         let in_order = seqno == self.ackseq + 1;
-        let duplicate = !in_order && !self.heard && seqno == self.ended_by;
-        if self.blksize == 0 || duplicate {
+        // CAN sends a frame once more if the end of it was disturbed.
+        if !in_order && self.frame == *frame {
+            return Ok(Received::NOTHING);
+        }
+        self.frame = *frame;
+        let next = if self.seen == 0 { self.old.0 } else { self.seen + 1 };
+        let in_row = in_order || seqno == next || seqno == self.blksize;
+        self.is_doubtful = doubtful && !in_row && fields::may_initiate(frame[0]);
+        if self.is_doubtful {
+            if self.seen != 0 {
+                self.seen = seqno;
+            }
+            return Ok(Received::NOTHING);
+        }
+        let old = !in_order && self.seen == 0 && (self.old.0..=self.old.1).contains(&seqno);
+        if old {
+            self.old.0 = self.old.1.min(seqno + 1);
+        }
+        if self.blksize == 0 || old {
             return Ok(Received::NOTHING);
         }
         if seqno > self.blksize {
             return Err(AbortCode::SEQUENCE_NUMBER);
         }
-        self.heard = true;
+        self.seen = seqno;
         let mut received = Received::NOTHING;
         if in_order {
             self.ackseq = seqno;
             if last {
-                self.last = Some(*frame);
+                self.is_complete = true;
             } else {
                 self.count(&frame[1..]);
                 received.is_data = true;
             }
         }
         if last || seqno == self.blksize {
-            self.ended_by = seqno;
-            received.ackseq = Some(self.close());
+            self.blksize = 0;
+            self.old = (seqno, seqno);
+            received.ackseq = Some(self.ackseq);
         }
         Ok(received)
     }
@@ -162,7 +201,7 @@ impl Receiver {
 
     /// Whether a frame is the last segment of all once more, where the end is expected.
     pub fn is_last_segment(&self, frame: &[u8; 8]) -> bool {
-        self.last.as_ref() == Some(frame)
+        self.is_complete && self.frame == *frame
     }
 
     /// Takes the end, with the number of bytes of the last segment that are no data, and the CRC.
@@ -171,8 +210,10 @@ impl Receiver {
     /// # Errors
     /// [`AbortCode::COMMAND`] before the last segment, [`AbortCode::CRC`] for a wrong CRC.
     pub fn finish(&mut self, unused: u8, crc: u16) -> Result<Chunk<SEGMENT>, AbortCode> {
-        let last = self.last.ok_or(AbortCode::COMMAND)?;
-        let data = Chunk::with_unused(&last[1..], unused);
+        if !self.is_complete {
+            return Err(AbortCode::COMMAND);
+        }
+        let data = Chunk::with_unused(&self.frame[1..], unused);
         self.count(&data);
         match self.crc {
             Some(computed) if computed.get() != crc => Err(AbortCode::CRC),
@@ -207,19 +248,19 @@ mod tests {
     fn a_gap_is_acknowledged_up_to_the_gap_at_the_end_of_the_sub_block() {
         let mut receiver = Receiver::new(false);
         receiver.open(4);
-        assert_eq!(receiver.take(&segment(false, 1)), Ok(DATA));
-        assert_eq!(receiver.take(&segment(false, 3)), Ok(NOTHING));
-        assert_eq!(receiver.take(&segment(false, 4)), Ok(Received { is_data: false, ackseq: Some(1) }));
+        assert_eq!(receiver.take(&segment(false, 1), true), Ok(DATA));
+        assert_eq!(receiver.take(&segment(false, 3), true), Ok(NOTHING));
+        assert_eq!(receiver.take(&segment(false, 4), true), Ok(Received { is_data: false, ackseq: Some(1) }));
         // Between acknowledgement and the next sub-block nothing counts.
-        assert_eq!(receiver.take(&segment(false, 1)), Ok(NOTHING));
+        assert_eq!(receiver.take(&segment(false, 1), true), Ok(NOTHING));
         receiver.open(4);
         // The end of the old sub-block once more.
-        assert_eq!(receiver.take(&segment(false, 4)), Ok(NOTHING));
+        assert_eq!(receiver.take(&segment(false, 4), true), Ok(NOTHING));
         assert!(!receiver.is_within());
-        assert_eq!(receiver.take(&segment(false, 1)), Ok(DATA));
+        assert_eq!(receiver.take(&segment(false, 1), true), Ok(DATA));
         assert!(receiver.is_within());
-        assert_eq!(receiver.take(&segment(false, 1)), Ok(NOTHING));
-        assert_eq!(receiver.take(&segment(true, 2)), Ok(Received { is_data: false, ackseq: Some(2) }));
+        assert_eq!(receiver.take(&segment(false, 1), true), Ok(NOTHING));
+        assert_eq!(receiver.take(&segment(true, 2), true), Ok(Received { is_data: false, ackseq: Some(2) }));
         assert!(receiver.is_complete());
         assert!(receiver.is_last_segment(&segment(true, 2)));
         assert!(!receiver.is_last_segment(&segment(false, 2)));
@@ -231,7 +272,7 @@ mod tests {
     fn a_number_above_the_block_size_is_none() {
         let mut receiver = Receiver::new(false);
         receiver.open(4);
-        assert_eq!(receiver.take(&segment(false, 5)), Err(AbortCode::SEQUENCE_NUMBER));
+        assert_eq!(receiver.take(&segment(false, 5), true), Err(AbortCode::SEQUENCE_NUMBER));
         assert_eq!(receiver.finish(0, 0), Err(AbortCode::COMMAND));
     }
 
@@ -240,7 +281,7 @@ mod tests {
         let mut receiver = Receiver::new(false);
         for _ in 0..3 {
             receiver.open(1);
-            let taken = receiver.take(&segment(false, 1)).unwrap();
+            let taken = receiver.take(&segment(false, 1), true).unwrap();
             assert_eq!(taken, Received { is_data: true, ackseq: Some(1) });
         }
     }

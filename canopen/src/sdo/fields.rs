@@ -62,6 +62,13 @@ pub const fn specifier(command: u8) -> u8 {
     }
 }
 
+/// Whether byte 0 may be that of a request with an address, an initiate: 1, 2, 5 or 6 in the top three
+/// bits. (5 and 6 have other requests as well.)
+#[must_use]
+pub const fn may_initiate(command: u8) -> bool {
+    0b0110_0110 >> (command >> 5) & 1 != 0
+}
+
 /// Index and sub-index of an initiate or abort.
 #[must_use]
 pub const fn address(bytes: &[u8; 8]) -> Address {

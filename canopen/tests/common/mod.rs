@@ -60,6 +60,8 @@ pub struct Device {
     /// Whether an upload tells the size.
     pub tells_size: bool,
     pub incoming: Option<Vec<u8>>,
+    /// All data of downloads to a domain, whatever became of them.
+    pub taken: Vec<u8>,
     pub events: Vec<Event>,
     /// Room left for domain data; `None` for any.
     pub space: Option<usize>,
@@ -120,6 +122,7 @@ impl Objects for Device {
         if let Some(space) = &mut self.space {
             *space = space.checked_sub(data.len()).expect("data in spite of no space");
         }
+        self.taken.extend(data);
         self.incoming.as_mut().expect("data outside a download").extend(data);
         Ok(())
     }

@@ -191,7 +191,7 @@ impl<S: Sink> Upload<S> {
         if bytes[0] == fields::ABORT {
             return Err(SdoError::Server(AbortCode(fields::number(bytes))));
         }
-        let received = receiver.take(bytes).map_err(SdoError::Client)?;
+        let received = receiver.take(bytes, false).map_err(SdoError::Client)?;
         let next = match received.ackseq {
             Some(ackseq) => acknowledge(receiver, ackseq, self.block.blksize),
             None => Next::Wait,

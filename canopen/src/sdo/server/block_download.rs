@@ -1,9 +1,31 @@
 //! Block download.
+//!
+//! # Requests between segments
+//!
+//! Byte 0 of a segment is its number, 1 to 127, with bit 7 in the last one of all. The command
+//! specifiers of the initiates (20h, 40h, A0h, C0h with their flags) are such numbers as well, and
+//! CiA 301 gives no rule to tell the two apart. Yet a client that was switched off in the middle of a
+//! download must not keep others from the device until the time-out is over. So a frame is taken for a
+//! request if
+//!
+//! 1. it does not come in its turn: a client sends the segments of a sub-block in a row, and CAN
+//!    neither lets one overtake another nor repeats one behind a later one ([`Receiver::take`]),
+//! 2. it has the command specifier of an initiate, and index and sub-index of an object that this
+//!    device has, and
+//! 3. for as long as a sub-block may pause no segment follows it.
+//!
+//! Then it ends the download and is carried out. A segment is mistaken for a request if the segment
+//! before it was lost, nothing follows it (it is the last of all, or the rest of the sub-block was
+//! lost, too), and three bytes of its data are the address of an object by chance. A request is
+//! mistaken for a segment if it comes when just its number is due: then the CRC of the transfer, or of
+//! the block, does not match, and the request is answered when it is made once more. A client that goes
+//! on with its download is not disturbed by one that asks between its segments.
 
 use crate::abort::AbortCode;
-use crate::od::Objects;
+use crate::od::{self, Objects};
 use crate::sdo::block::Receiver;
 use crate::sdo::fields::{self, scs};
+use crate::time::Instant;
 
 use super::{Incoming, SdoServer, State};
 
@@ -28,23 +50,55 @@ impl SdoServer {
     pub(super) fn block_segment(
         &mut self,
         bytes: &[u8; 8],
+        now: Instant,
         objects: &mut impl Objects,
     ) -> Result<(), AbortCode> {
-        // No segment has the number 0, so an abort differs from all segments. No other request
-        // does.
+        // No segment has the number 0, so an abort differs from all segments.
         if bytes[0] == fields::ABORT {
             self.reset(objects);
             return Ok(());
         }
         let State::BlockDownload { receiver, .. } = &mut self.state else { return Err(AbortCode::COMMAND) };
-        let received = receiver.take(bytes)?;
+        let doubted = receiver.is_doubtful;
+        let received = receiver.take(bytes, true)?;
+        // Who asks again and again is not put off by that.
+        if !(doubted && receiver.is_doubtful) {
+            self.heard = now;
+        }
         if received.is_data {
+            self.moved = now;
             self.take(&bytes[1..], objects)?;
         }
         if let Some(ackseq) = received.ackseq {
             self.answer_transfer(scs::ACK_BLOCK_DOWNLOAD, ackseq, 0);
         }
         Ok(())
+    }
+
+    /// Whether it waits for more segments of a sub-block that has begun, or for none behind what may
+    /// be a request.
+    pub(super) fn is_within(&self) -> bool {
+        matches!(&self.state, State::BlockDownload { receiver, .. }
+            if receiver.is_within() || receiver.is_doubtful)
+    }
+
+    /// How long.
+    pub(super) fn repeat_ms(&self) -> u32 {
+        self.config.repeat_ms << u32::from(self.config.slow_bus)
+    }
+
+    /// It has waited long enough: no segment will come.
+    pub(super) fn pause(&mut self, now: Instant, objects: &mut impl Objects) {
+        let State::BlockDownload { receiver, .. } = &mut self.state else { return };
+        let frame = receiver.frame;
+        if receiver.is_doubtful && od::find(objects.entries(), fields::address(&frame)).is_ok() {
+            self.serve(&frame, now, objects);
+        } else if receiver.is_within() {
+            let ackseq = receiver.close();
+            self.answer_transfer(scs::ACK_BLOCK_DOWNLOAD, ackseq, 0);
+        } else {
+            receiver.is_doubtful = false;
+        }
     }
 
     /// Whether this is the last segment once more, where the end is expected.

@@ -3,9 +3,10 @@
 //! - A frame of another identifier, a remote or extended frame and a frame of other than 8 bytes
 //!   are no SDO requests (CiA 301 section 7.2.4.3: all have 8 bytes) and are ignored.
 //! - Every request is answered or aborted, except for an abort.
-//! - An initiate ends the transfer before. Within a sub-block of a block download an initiate
-//!   cannot be distinguished from a segment: there an abort ends the transfer, or the time-out.
-//! - If the client is silent for the time-out, the transfer is aborted with 05040000h.
+//! - An initiate ends the transfer before. Within a sub-block of a block download it has to be told
+//!   from a segment first, see `block_download.rs`.
+//! - If the client does not go on for the time-out, the transfer is aborted with 05040000h. In a block
+//!   download that counts from the last segment that was taken, whatever else comes.
 //! - If a sub-block of a block download stops short, the segments that came are acknowledged, and
 //!   the client repeats the rest.
 
@@ -40,8 +41,11 @@ pub struct Config {
     pub timeout_ms: u32,
     /// How long a sub-block of a block download may pause before it is acknowledged as far as it
     /// came, in milliseconds. Longer than a client pauses between two segments, shorter than it
-    /// waits for an answer.
+    /// waits for an answer: 300 to 500 ms by default in most clients.
     pub repeat_ms: u32,
+    /// The bus is slow (20 kbit/s and below): a frame takes so long that `repeat_ms` is doubled. A
+    /// [`Slave`](crate::slave::Slave) sets it when it joins the bus.
+    pub slow_bus: bool,
     /// Segments of a sub-block of a block download: 1 to 127, and no more than the receive queue
     /// takes.
     pub blksize: u8,
@@ -49,17 +53,45 @@ pub struct Config {
     pub block_upload: bool,
     /// The abort for a request that CiA 301 does not have, or that has no place in the transfer.
     pub unknown_request: AbortCode,
+    /// Requests come on this COB-ID and the node-ID on top: 600h in the predefined connection set.
+    /// With the largest node-ID it must be a COB-ID, at most 7FFh; so must the next one.
+    pub request_base: u16,
+    /// Answers go to this one and the node-ID on top: 580h in the predefined connection set.
+    pub response_base: u16,
 }
 
 impl Config {
-    /// Two seconds, half a second, 127 segments, with block upload, 05040001h.
+    /// Two seconds, 50 ms, 127 segments, with block upload, 05040001h.
     pub const DEFAULT: Self = Self {
         timeout_ms: 2000,
-        repeat_ms: 500,
+        repeat_ms: 50,
+        slow_bus: false,
         blksize: BLKSIZE_MAX,
         block_upload: true,
         unknown_request: AbortCode::COMMAND,
+        request_base: 0x600,
+        response_base: 0x580,
     };
+
+    /// Where the requests to a node come.
+    #[must_use]
+    pub const fn request(&self, node: NodeId) -> CobId {
+        from_base(self.request_base, node)
+    }
+
+    /// Where the answers of a node go.
+    #[must_use]
+    pub const fn response(&self, node: NodeId) -> CobId {
+        from_base(self.response_base, node)
+    }
+}
+
+/// What cannot be a COB-ID is NMT's, which no server has.
+const fn from_base(base: u16, node: NodeId) -> CobId {
+    match CobId::from_base(base, node) {
+        Some(id) => id,
+        None => CobId::NMT,
+    }
 }
 
 impl Default for Config {
@@ -76,8 +108,11 @@ pub struct SdoServer {
     /// The object of the transfer that is going on, or of the last one.
     at: Address,
     state: State,
-    /// When a frame of the transfer was last received or sent.
+    /// When the transfer last made progress: the time-out counts from here.
     moved: Instant,
+    /// When a segment of a block download was last received, or something sent: the pause of a
+    /// sub-block counts from here.
+    heard: Instant,
     /// The answer that waits to be fetched by [`SdoServer::poll`].
     answer: Option<[u8; 8]>,
     /// The variable or string that is transferred.
@@ -112,6 +147,7 @@ impl SdoServer {
             at: Address::new(0, 0),
             state: State::Idle,
             moved: Instant::from_millis(0),
+            heard: Instant::from_millis(0),
             answer: None,
             value: [0; VALUE_MAX],
         }
@@ -129,15 +165,38 @@ impl SdoServer {
         matches!(self.state, State::Idle) && self.answer.is_none()
     }
 
+    /// Whether an answer waits to be fetched.
+    #[must_use]
+    pub const fn has_answer(&self) -> bool {
+        self.answer.is_some()
+    }
+
+    /// Takes the value of [`Config::slow_bus`].
+    pub fn set_slow_bus(&mut self, slow_bus: bool) {
+        self.config.slow_bus = slow_bus;
+    }
+
     /// When [`poll`](Self::poll) has to be called although no frame came; `None` for never.
     #[must_use]
     pub fn next_deadline(&self) -> Option<Instant> {
+        let timeout = self.moved + self.config.timeout_ms;
         match &self.state {
             State::Idle => None,
-            State::BlockDownload { receiver, .. } if receiver.is_within() => {
-                Some(self.moved + self.config.repeat_ms.min(self.config.timeout_ms))
-            }
-            _ => Some(self.moved + self.config.timeout_ms),
+            _ if self.is_within() => Some(timeout.earlier(self.heard + self.repeat_ms())),
+            _ => Some(timeout),
+        }
+    }
+
+    /// Takes the answer that waits back, if it is this one; tells whether it was. Who does that owes
+    /// it to the client.
+    pub fn withdraw_answer(&mut self, answer: &[u8; 8]) -> bool {
+        self.answer.take_if(|waiting| waiting == answer).is_some()
+    }
+
+    /// Turns the answer that waits into an abort of the object that it is about.
+    pub fn refuse(&mut self, code: AbortCode) {
+        if self.answer.is_some() {
+            self.answer_initiate(fields::ABORT, code.0);
         }
     }
 
@@ -149,18 +208,27 @@ impl SdoServer {
 
     /// Takes any frame received; those that are no SDO request to this server are ignored.
     pub fn handle(&mut self, frame: &Frame, now: Instant, objects: &mut impl Objects) {
-        if !frame.has_cob_id(CobId::sdo_request(self.node)) {
+        if !frame.has_cob_id(self.config.request(self.node)) {
             return;
         }
         let Some(bytes) = frame.exactly() else { return };
-        self.moved = now;
-        let outcome = match &self.state {
+        match &self.state {
             State::BlockDownload { receiver, .. } if !receiver.is_complete() => {
-                self.block_segment(bytes, objects)
+                if let Err(code) = self.block_segment(bytes, now, objects) {
+                    self.abort(code, objects);
+                }
             }
-            _ => self.request(bytes, objects),
-        };
-        if let Err(code) = outcome {
+            _ => self.serve(bytes, now, objects),
+        }
+    }
+
+    /// Carries a request out.
+    fn serve(&mut self, bytes: &[u8; 8], now: Instant, objects: &mut impl Objects) {
+        if self.repeats_last_segment(bytes) {
+            return;
+        }
+        self.moved = now;
+        if let Err(code) = self.request(bytes, objects) {
             self.abort(code, objects);
         }
     }
@@ -178,23 +246,23 @@ impl SdoServer {
             return None;
         }
         let answer = self.answer.take()?;
-        self.moved = now;
-        Some(Frame::full(CobId::sdo_response(self.node), answer))
+        self.heard = now;
+        // To ask for all of a sub-block once more is no progress.
+        if answer[..2] != [scs::ACK_BLOCK_DOWNLOAD, 0] {
+            self.moved = now;
+        }
+        Some(Frame::full(self.config.response(self.node), answer))
     }
 
-    /// Ends a transfer whose client is silent, and acknowledges a sub-block that stopped short.
+    /// Ends a transfer whose client does not go on, and acknowledges a sub-block that stopped short.
     fn check_time(&mut self, now: Instant, objects: &mut impl Objects) {
-        let silent_for = |millis| now.has_reached(self.moved + millis);
-        match &mut self.state {
-            State::Idle => {}
-            _ if silent_for(self.config.timeout_ms) => self.abort(AbortCode::TIMEOUT, objects),
-            State::BlockDownload { receiver, .. }
-                if receiver.is_within() && silent_for(self.config.repeat_ms) =>
-            {
-                let ackseq = receiver.close();
-                self.answer_transfer(scs::ACK_BLOCK_DOWNLOAD, ackseq, 0);
-            }
-            _ => {}
+        if matches!(self.state, State::Idle) {
+            return;
+        }
+        if now.has_reached(self.moved + self.config.timeout_ms) {
+            self.abort(AbortCode::TIMEOUT, objects);
+        } else if self.is_within() && now.has_reached(self.heard + self.repeat_ms()) {
+            self.pause(now, objects);
         }
     }
 
@@ -218,9 +286,6 @@ impl SdoServer {
 
     /// A request outside of the sub-blocks of a block download.
     fn request(&mut self, bytes: &[u8; 8], objects: &mut impl Objects) -> Result<(), AbortCode> {
-        if self.repeats_last_segment(bytes) {
-            return Ok(());
-        }
         match fields::specifier(bytes[0]) {
             ccs::INITIATE_DOWNLOAD => self.initiate_download(bytes, objects),
             ccs::DOWNLOAD_SEGMENT => self.download_segment(bytes, objects),
