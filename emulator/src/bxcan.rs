@@ -1,12 +1,16 @@
-//! The bxCAN controller CAN1 (RM0090 rev 19, section 32 "Controller area network (bxCAN)"),
-//! registers and behaviour taken from the manual.
+//! The bxCAN controllers CAN1 and CAN2 (RM0090 rev 19, section 32 "Controller area network
+//! (bxCAN)"), registers and behaviour taken from the manual.
+//!
+//! CAN1 is the master: it has the filter registers of both, and manages the memory that both have
+//! their mailboxes, FIFOs and filters in. Without its clock CAN2 receives nothing, and its
+//! mailboxes are not to be reached.
 //!
 //! The controller itself never decides what is on the wire. It offers frames and counters to the
 //! [`Bus`](crate::bus::Bus) through [`BusNode`], and the bus tells it what happened and when. As
 //! long as no bus has looked at it, it behaves like a controller whose transceiver hears a
 //! recessive line: it can be set up and comes out of initialisation, and its frames wait.
 //!
-//! Not modelled, and reported when asked for: time-triggered mode, CAN2. MSR.SAMP and MSR.RX always
+//! Not modelled, and reported when asked for: time-triggered mode. MSR.SAMP and MSR.RX always
 //! read recessive.
 
 pub mod filters;
@@ -20,19 +24,25 @@ use crate::bus::node::{BusEvent, BusNode, ErrorKind, Line, Wait};
 use crate::frame::{ExtendedId, Frame, Id, StandardId};
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::{Span, Time};
-use filters::Filters;
+use filters::{Filters, Share};
 
-/// Interrupt lines of CAN1 (RM0090, table 61).
-pub mod lines {
+/// Interrupt lines of a controller (RM0090, table 61).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Lines {
     /// A transmit request has been performed.
-    pub const TX: u16 = 19;
+    pub tx: u16,
     /// FIFO 0.
-    pub const RX0: u16 = 20;
+    pub rx0: u16,
     /// FIFO 1.
-    pub const RX1: u16 = 21;
+    pub rx1: u16,
     /// Status change and error.
-    pub const SCE: u16 = 22;
+    pub sce: u16,
 }
+
+/// Those of CAN1.
+pub const CAN1_LINES: Lines = Lines { tx: 19, rx0: 20, rx1: 21, sce: 22 };
+/// Those of CAN2.
+pub const CAN2_LINES: Lines = Lines { tx: 63, rx0: 64, rx1: 65, sce: 66 };
 
 /// CAN_MCR.
 mod mcr {
@@ -314,9 +324,12 @@ impl Fifo {
     }
 }
 
-/// The controller CAN1.
+/// A controller: CAN1 or CAN2.
 #[derive(Clone, Debug)]
 pub struct BxCan {
+    share: Share,
+    /// Whether CAN1, which manages the memory, has a clock; CAN1 is not asked without one.
+    master_clocked: bool,
     clock_hz: u32,
     on_bus: bool,
     attention: Option<Time>,
@@ -350,6 +363,8 @@ impl BxCan {
     #[must_use]
     pub fn new() -> Self {
         Self {
+            share: Share::Can1,
+            master_clocked: true,
             clock_hz: 0,
             on_bus: false,
             attention: None,
@@ -368,6 +383,40 @@ impl BxCan {
             requests: 0,
             fifos: [Fifo::default(), Fifo::default()],
             filters: Filters::default(),
+        }
+    }
+
+    /// CAN2 behind a reset, without a clock, and with a master that has none.
+    #[must_use]
+    pub fn slave() -> Self {
+        Self { share: Share::Can2, master_clocked: false, ..Self::new() }
+    }
+
+    /// CAN2 hears of its master: the filters as they are now, and whether there is a clock.
+    pub fn follow(&mut self, master: &Self, clocked: bool) {
+        self.filters.clone_from(&master.filters);
+        self.master_clocked = clocked;
+    }
+
+    /// Its interrupt lines.
+    #[must_use]
+    pub fn lines(&self) -> Lines {
+        match self.share {
+            Share::Can1 => CAN1_LINES,
+            Share::Can2 => CAN2_LINES,
+        }
+    }
+
+    /// Whether `offset` is one of a register that this controller has; which it has not is told.
+    fn check(&self, offset: u32) -> Result<(), Unmodelled> {
+        match (self.share, offset) {
+            (Share::Can2, 0x200..) => Err(Unmodelled(format!(
+                "CAN2 has no filter registers (offset {offset:#x}): its banks are set in CAN1's"
+            ))),
+            (Share::Can2, 0x180..=0x1CC) if !self.master_clocked => Err(Unmodelled(format!(
+                "CAN1 has no clock (RCC enables it): CAN2 does not reach its mailboxes (offset {offset:#x})"
+            ))),
+            _ => Ok(()),
         }
     }
 
@@ -628,10 +677,17 @@ impl BxCan {
     // --------------------------------------------------------------------------------------
 
     fn store(&mut self, frame: &Frame) {
-        if let Some(found) = self.filters.accept(frame) {
+        if !self.master_clocked {
+            return;
+        }
+        if let Some(found) = self.filters.accept(self.share, frame) {
             let locked = self.mcr & mcr::RFLM != 0;
             self.fifos[found.fifo].store(RxMailbox::new(frame, found.index), locked);
         }
+    }
+
+    fn no_register(&self, offset: u32) -> Unmodelled {
+        Unmodelled(format!("{} has no register at offset {offset:#x}", self.name()))
     }
 
     fn esr_flags(&self) -> u32 {
@@ -718,11 +774,15 @@ fn mail(offset: u32) -> Option<Mail> {
 
 impl Peripheral for BxCan {
     fn name(&self) -> &'static str {
-        "CAN1"
+        match self.share {
+            Share::Can1 => "CAN1",
+            Share::Can2 => "CAN2",
+        }
     }
 
     fn read(&mut self, offset: u32, now: Time) -> Result<u32, Unmodelled> {
         self.advance(now);
+        self.check(offset)?;
         Ok(match offset {
             0x00 => self.mcr,
             0x04 => self.read_msr(),
@@ -753,13 +813,14 @@ impl Peripheral for BxCan {
                         _ => output.rdhr,
                     }
                 }
-                None => return Err(Unmodelled(format!("CAN1 has no register at offset {offset:#x}"))),
+                None => return Err(self.no_register(offset)),
             },
         })
     }
 
     fn write(&mut self, offset: u32, value: u32, now: Time) -> Result<(), Unmodelled> {
         self.advance(now);
+        self.check(offset)?;
         match offset {
             0x00 => {
                 if value & mcr::RESET != 0 {
@@ -812,7 +873,7 @@ impl Peripheral for BxCan {
                         "receive mailbox {n} is written: its registers are read-only"
                     )))
                 }
-                None => return Err(Unmodelled(format!("CAN1 has no register at offset {offset:#x}"))),
+                None => return Err(self.no_register(offset)),
             },
         }
         Ok(())
@@ -837,19 +898,32 @@ impl Peripheral for BxCan {
         let status = [(ier::ERRIE, msr::ERRI), (ier::WKUIE, msr::WKUI), (ier::SLKIE, msr::SLAKI)]
             .into_iter()
             .any(|(enable, flag)| self.ier & enable != 0 && self.msr_flags & flag != 0);
+        let Lines { tx, rx0, rx1, sce } = self.lines();
         let lines = [
-            (self.ier & ier::TMEIE != 0 && transmitted, lines::TX),
-            (self.fifos[0].interrupt(self.ier), lines::RX0),
-            (self.fifos[1].interrupt(self.ier >> 3), lines::RX1),
-            (status, lines::SCE),
+            (self.ier & ier::TMEIE != 0 && transmitted, tx),
+            (self.fifos[0].interrupt(self.ier), rx0),
+            (self.fifos[1].interrupt(self.ier >> 3), rx1),
+            (status, sce),
         ];
         active.extend(lines.into_iter().filter(|(set, _)| *set).map(|(_, line)| line));
     }
 
     fn reset(&mut self) {
         self.reset_state();
-        let fresh = Self::new();
-        *self = Self { clock_hz: self.clock_hz, on_bus: self.on_bus, epoch: self.epoch, ..fresh };
+        // The filters are reset with the master alone.
+        let filters = match self.share {
+            Share::Can1 => Filters::default(),
+            Share::Can2 => self.filters.clone(),
+        };
+        *self = Self {
+            share: self.share,
+            master_clocked: self.master_clocked,
+            clock_hz: self.clock_hz,
+            on_bus: self.on_bus,
+            epoch: self.epoch,
+            filters,
+            ..Self::new()
+        };
     }
 }
 

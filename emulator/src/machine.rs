@@ -34,6 +34,9 @@ pub struct Options {
     pub flash_times: FlashTimes,
     /// The 96-bit unique ID.
     pub unique_id: [u32; 3],
+    /// The CAN controller whose pins the board's transceiver is at: 0 is CAN1, 1 is CAN2. The other
+    /// one hears a recessive line.
+    pub transceiver: usize,
 }
 
 impl Default for Options {
@@ -43,6 +46,7 @@ impl Default for Options {
             hse_hz: 8_000_000,
             flash_times: FlashTimes::Typical,
             unique_id: [0x0034_0025, 0x3137_470C, 0x3338_3235],
+            transceiver: 0,
         }
     }
 }
@@ -218,8 +222,10 @@ impl Machine {
             let seed = self.options.seed ^ self.power_cycles;
             let chip = self.cpu.chip_mut();
             chip.flash.lose_power(seed);
-            // Off, CAN1 is recessive: as behind a reset.
-            crate::peripheral::Peripheral::reset(&mut chip.can1);
+            // Off, a controller is recessive: as behind a reset.
+            for can in &mut chip.can {
+                can.reset();
+            }
             for usart in &mut chip.usarts {
                 usart.lose_power();
             }
@@ -444,13 +450,20 @@ impl Machine {
         self.cpu.chip_mut().flash.preset_read_protection(rdp);
     }
 
-    /// CAN controller `n`; 0 is CAN1, the only one.
+    /// CAN controller `n`; 0 is CAN1, 1 is CAN2.
     ///
     /// # Panics
     /// When there is no such controller.
     pub fn can_mut(&mut self, n: usize) -> &mut BxCan {
-        assert_eq!(n, 0, "CAN2 is not modelled");
-        &mut self.cpu.chip_mut().can1
+        &mut self.cpu.chip_mut().can[n]
+    }
+
+    /// The CAN controller that the board's transceiver is at ([`Options::transceiver`]).
+    ///
+    /// # Panics
+    /// When there is no such controller.
+    pub fn wired_can_mut(&mut self) -> &mut BxCan {
+        self.can_mut(self.options.transceiver)
     }
 
     /// The USART with this name (`"USART2"`); `None` where the chip has no such one.

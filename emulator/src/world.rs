@@ -147,7 +147,7 @@ impl Computer for Machine {
     }
 
     fn can(&mut self) -> &mut BxCan {
-        self.can_mut(0)
+        self.wired_can_mut()
     }
 
     fn is_news(stop: &Stop) -> bool {

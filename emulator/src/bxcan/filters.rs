@@ -22,6 +22,15 @@ pub struct Match {
     pub index: u8,
 }
 
+/// Whose banks: those below CAN2SB are CAN1's, those from it on CAN2's.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Share {
+    /// The master's.
+    Can1,
+    /// The slave's.
+    Can2,
+}
+
 /// The filter registers.
 #[derive(Clone, Debug)]
 pub struct Filters {
@@ -172,17 +181,22 @@ impl Filters {
         }
     }
 
-    /// Where CAN1 puts the frame; `None` if no filter lets it through or the filters are being set
-    /// up.
+    /// Where a controller puts the frame; `None` if no filter of its share lets it through or the
+    /// filters are being set up. Filters are numbered from the first bank of the share on; the
+    /// manual's example is one of CAN1 alone.
     #[must_use]
-    pub fn accept(&self, frame: &Frame) -> Option<Match> {
+    pub fn accept(&self, share: Share, frame: &Frame) -> Option<Match> {
         if self.fmr & FINIT != 0 {
             return None;
         }
-        let can1_banks = ((self.fmr & CAN2SB) >> 8) as usize;
+        let start = (((self.fmr & CAN2SB) >> 8) as usize).min(BANKS);
+        let banks = match share {
+            Share::Can1 => 0..start,
+            Share::Can2 => start..BANKS,
+        };
         let mut next_index = [0u8; 2];
         let mut best: Option<(u8, Match)> = None;
-        for bank in 0..can1_banks.min(BANKS) {
+        for bank in banks {
             let kind = self.kind(bank);
             let fifo = (self.fifo >> bank & 1) as usize;
             // A bank keeps its numbers whether it is active or not.
@@ -249,7 +263,7 @@ mod tests {
     }
 
     fn index(filters: &Filters, frame: &Frame) -> Option<u8> {
-        filters.accept(frame).map(|found| found.index)
+        filters.accept(Share::Can1, frame).map(|found| found.index)
     }
 
     #[test]
@@ -259,11 +273,11 @@ mod tests {
         assert_eq!(filters.read(FA1R), Ok(0));
         filters.write(FS1R, 1).unwrap();
         filters.write(FA1R, 1).unwrap();
-        assert_eq!(filters.accept(&standard(1)), None, "FINIT is set");
+        assert_eq!(filters.accept(Share::Can1, &standard(1)), None, "FINIT is set");
         filters.write(FMR, 0x2A1C_0E00).unwrap();
         assert_eq!(index(&filters, &standard(1)), Some(0), "mask 0 lets everything through");
         filters.write(FA1R, 0).unwrap();
-        assert_eq!(filters.accept(&standard(1)), None, "no active bank");
+        assert_eq!(filters.accept(Share::Can1, &standard(1)), None, "no active bank");
     }
 
     #[test]
@@ -353,7 +367,7 @@ mod tests {
         }
         for (bank, fifo, _, is_active, number) in example {
             let expected = is_active.then_some(Match { fifo: fifo as usize, index: number });
-            assert_eq!(filters.accept(&standard(0x100 + bank as u16)), expected, "bank {bank}");
+            assert_eq!(filters.accept(Share::Can1, &standard(0x100 + bank as u16)), expected, "bank {bank}");
         }
     }
 
@@ -371,7 +385,7 @@ mod tests {
         filters.write(FMR, 28 << 8).unwrap();
         let mut accept = |active, id| {
             filters.write(FA1R, active).unwrap();
-            filters.accept(&standard(id)).map(|found| (found.fifo, found.index))
+            filters.accept(Share::Can1, &standard(id)).map(|found| (found.fifo, found.index))
         };
         // Numbers in FIFO 0: bank 0 has 0, 1; bank 2 has 2 to 5; bank 3 has 6.
         assert_eq!(accept(0b1111, 0x123), Some((0, 6)));
@@ -381,12 +395,46 @@ mod tests {
         assert_eq!(accept(0b1111, 0x124), Some((0, 0)));
     }
 
+    /// CAN2SB "defines the start bank for the CAN2 interface (slave)" (RM0090, 32.9.4): the bank of
+    /// this number is the slave's, the one before it the master's.
     #[test]
-    fn banks_of_can2_are_not_can1s() {
-        let mut filters = one_bank(0, 1, [0, 0]);
-        assert!(filters.accept(&standard(5)).is_some());
-        filters.write(FMR, 0).unwrap();
-        assert_eq!(filters.accept(&standard(5)), None, "CAN2SB = 0: every bank is CAN2's");
+    fn can2sb_is_the_border_of_the_shares() {
+        let mut filters = Filters::default();
+        // Banks 13 and 14: 16-bit lists of 081h and 181h, bank 14 to FIFO 1.
+        for (offset, value) in [
+            (FM1R, 3 << 13),
+            (FFA1R, 1 << 14),
+            (0x240 + 8 * 13, 0x081 << 5 | (0x081 << 5) << 16),
+            (0x244 + 8 * 13, 0x081 << 5 | (0x081 << 5) << 16),
+            (0x240 + 8 * 14, 0x181 << 5 | (0x181 << 5) << 16),
+            (0x244 + 8 * 14, 0x181 << 5 | (0x181 << 5) << 16),
+            (FA1R, 3 << 13),
+        ] {
+            filters.write(offset, value).unwrap();
+        }
+        let mut taken = |can2sb: u32| {
+            filters.write(FMR, can2sb << 8).unwrap();
+            let by = |share, id| filters.accept(share, &standard(id)).map(|found| found.fifo);
+            [by(Share::Can1, 0x081), by(Share::Can1, 0x181), by(Share::Can2, 0x081), by(Share::Can2, 0x181)]
+        };
+        assert_eq!(taken(14), [Some(0), None, None, Some(1)], "the value behind a reset");
+        assert_eq!(taken(15), [Some(0), Some(1), None, None]);
+        assert_eq!(taken(13), [None, None, Some(0), Some(1)]);
+        assert_eq!(taken(0), [None, None, Some(0), Some(1)], "every bank is CAN2's");
+        assert_eq!(taken(28), [Some(0), Some(1), None, None], "CAN2 has none");
+        assert_eq!(taken(0x3F), [Some(0), Some(1), None, None], "there are no more than 28");
+    }
+
+    #[test]
+    fn set_up_of_the_filters_stops_both_controllers() {
+        let mut filters = Filters::default();
+        filters.write(FA1R, 1 << 13 | 1 << 14).unwrap();
+        filters.write(FMR, 14 << 8 | 1).unwrap();
+        assert_eq!(filters.accept(Share::Can1, &standard(1)), None);
+        assert_eq!(filters.accept(Share::Can2, &standard(1)), None);
+        filters.write(FMR, 14 << 8).unwrap();
+        assert!(filters.accept(Share::Can1, &standard(1)).is_some());
+        assert!(filters.accept(Share::Can2, &standard(1)).is_some());
     }
 
     #[test]

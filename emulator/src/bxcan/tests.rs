@@ -497,3 +497,94 @@ fn what_is_not_there_says_so() {
         assert!(bench.can.read(offset, bench.now).is_err(), "{offset:#x}");
     }
 }
+
+// --- CAN2
+// -----------------------------------------------------------------------------------------------------------
+
+/// CAN2 in normal mode, CAN1 with these filters.
+fn running_slave(filters: &[(u32, u32)]) -> (Bench, BxCan) {
+    let mut master = Bench::new();
+    for &(offset, value) in filters {
+        master.write(offset, value);
+    }
+    let mut can = BxCan::slave();
+    can.set_clock(42_000_000);
+    can.resolved(Time(0));
+    can.follow(&master.can, true);
+    let mut bench = Bench { can, now: Time(0) };
+    bench.write(MCR, 0x1_0001);
+    bench.write(BTR, 0x001C_0014);
+    bench.write(MCR, 0x1_0000);
+    bench.event(BusEvent::Recessive { sequences: 1 });
+    assert_eq!(bench.read(MSR) & 3, 0, "neither INAK nor SLAK");
+    (bench, master.can)
+}
+
+/// Bank 14, CAN2's first behind a reset: lets everything through, into FIFO 0.
+const EVERYTHING_FOR_CAN2: [(u32, u32); 3] = [(FS1R, 1 << 14), (FA1R, 1 << 14), (FMR, 0x0E00)];
+
+#[test]
+fn can2_receives_by_its_share_of_the_filters_and_has_none_of_its_own() {
+    let (mut bench, _) = running_slave(&EVERYTHING_FOR_CAN2);
+    bench.receive(0x601);
+    assert_eq!(bench.read(RF0R) & 3, 1);
+    assert_eq!(bench.read(RI0R), 0x601 << 21);
+    let (mut bench, _) = running_slave(&[(FS1R, 1), (FA1R, 1), (FMR, 0x0E00)]);
+    bench.receive(0x601);
+    assert_eq!(bench.read(RF0R) & 3, 0, "bank 0 is CAN1's");
+    for offset in [FMR, FS1R, FA1R, 0x240, 0x31C] {
+        let error = bench.can.write(offset, 0, bench.now).unwrap_err();
+        assert!(error.0.contains("CAN2 has no filter registers"), "{offset:#x}: {error:?}");
+        assert!(bench.can.read(offset, bench.now).is_err(), "{offset:#x}");
+    }
+}
+
+/// RM0090, table 61: CAN2_TX 63, CAN2_RX0 64, CAN2_RX1 65, CAN2_SCE 66.
+#[test]
+fn can2_has_interrupts_of_its_own() {
+    let (mut bench, _) = running_slave(&EVERYTHING_FOR_CAN2);
+    bench.write(IER, 1 << 1 | 1); // FMPIE0, TMEIE
+    bench.receive(1);
+    assert_eq!(bench.lines(), [64]);
+    bench.write(RF0R, 0x20);
+    bench.transmit(0, 0x581);
+    bench.start();
+    bench.event(BusEvent::Transmitted);
+    assert_eq!(bench.lines(), [63]);
+    let fifo_1 = [(FS1R, 1 << 14), (FFA1R, 1 << 14), (FA1R, 1 << 14), (FMR, 0x0E00)];
+    let (mut bench, _) = running_slave(&fifo_1);
+    bench.write(IER, 1 << 4 | 1 << 15 | 1 << 11); // FMPIE1, ERRIE, LECIE
+    bench.receive(1);
+    assert_eq!(bench.lines(), [65]);
+    bench.event(BusEvent::ReceiveFailed { kind: ErrorKind::Crc, first: true });
+    assert_eq!(bench.lines(), [65, 66]);
+}
+
+/// CAN1 "manages the communication between a Slave bxCAN and the 512-byte SRAM memory" (RM0090,
+/// 32.3.3): mailboxes, FIFOs and filters.
+#[test]
+fn can2_reaches_its_memory_only_while_can1_has_a_clock() {
+    let (mut bench, master) = running_slave(&EVERYTHING_FOR_CAN2);
+    bench.can.follow(&master, false);
+    bench.receive(0x601);
+    assert_eq!(bench.read(RF0R) & 3, 0, "nowhere to put it");
+    for offset in [TI0R, TI0R + 4, RI0R] {
+        let error = bench.can.write(offset, 0, bench.now).unwrap_err();
+        assert!(error.0.contains("CAN1 has no clock"), "{offset:#x}: {error:?}");
+    }
+    bench.can.follow(&master, true);
+    bench.receive(0x601);
+    assert_eq!(bench.read(RF0R) & 3, 1);
+}
+
+#[test]
+fn a_reset_of_can2_leaves_the_filters_alone() {
+    let (mut bench, master) = running_slave(&EVERYTHING_FOR_CAN2);
+    bench.can.reset();
+    assert_eq!(bench.can.name(), "CAN2");
+    assert!(bench.can.filters.accept(Share::Can2, &Frame::standard(1, &[]).unwrap()).is_some());
+    let mut master = master;
+    master.reset();
+    bench.can.follow(&master, true);
+    assert!(bench.can.filters.accept(Share::Can2, &Frame::standard(1, &[]).unwrap()).is_none());
+}

@@ -62,6 +62,7 @@ enum Block {
     Pwr,
     Syscfg,
     Can1,
+    Can2,
     Usart(usize),
 }
 
@@ -91,13 +92,14 @@ enum Place {
 type ClockEnable = Option<(u32, u32)>;
 
 /// Start, block, and its clock.
-const BLOCKS: [(u32, Block, ClockEnable); 24] = [
+const BLOCKS: [(u32, Block, ClockEnable); 25] = [
     (0x4000_3000, Block::Iwdg, None),
     (0x4000_4400, Block::Usart(1), Some((rcc::APB1ENR, 17))),
     (0x4000_4800, Block::Usart(2), Some((rcc::APB1ENR, 18))),
     (0x4000_4C00, Block::Usart(3), Some((rcc::APB1ENR, 19))),
     (0x4000_5000, Block::Usart(4), Some((rcc::APB1ENR, 20))),
     (0x4000_6400, Block::Can1, Some((rcc::APB1ENR, 25))),
+    (0x4000_6800, Block::Can2, Some((rcc::APB1ENR, 26))),
     (0x4000_7000, Block::Pwr, Some((rcc::APB1ENR, 28))),
     (0x4001_1000, Block::Usart(0), Some((rcc::APB2ENR, 4))),
     (0x4001_1400, Block::Usart(5), Some((rcc::APB2ENR, 5))),
@@ -122,7 +124,7 @@ const BLOCK_SIZE: u32 = 0x400;
 const RCC_CFGR: u32 = 0x4002_3808;
 
 /// Names of blocks that are not modelled, for reports (RM0090 table 1).
-const UNMODELLED: [(u32, &str); 38] = [
+const UNMODELLED: [(u32, &str); 37] = [
     (0x4000_0000, "TIM2"),
     (0x4000_0400, "TIM3"),
     (0x4000_0800, "TIM4"),
@@ -141,7 +143,6 @@ const UNMODELLED: [(u32, &str); 38] = [
     (0x4000_5400, "I2C1"),
     (0x4000_5800, "I2C2"),
     (0x4000_5C00, "I2C3"),
-    (0x4000_6800, "CAN2"),
     (0x4000_7400, "DAC"),
     (0x4001_0000, "TIM1"),
     (0x4001_0400, "TIM8"),
@@ -203,8 +204,8 @@ pub struct Chip {
     pub iwdg: Iwdg,
     /// The ports.
     pub gpio: Vec<Gpio>,
-    /// CAN1.
-    pub can1: BxCan,
+    /// CAN1 and CAN2.
+    pub can: [BxCan; 2],
     /// The USARTs, as in [`usart::INSTANCES`].
     pub usarts: [Usart; 6],
     pwr: Pwr,
@@ -287,7 +288,7 @@ impl Chip {
             rcc,
             iwdg: Iwdg::default(),
             gpio: ('A'..='K').take(variant.ports).map(Gpio::new).collect(),
-            can1: BxCan::new(),
+            can: [BxCan::new(), BxCan::slave()],
             usarts: usart::INSTANCES.each_ref().map(Usart::new),
             pwr: Pwr::new(variant),
             crc: Crc::default(),
@@ -339,8 +340,11 @@ impl Chip {
         self.rcc.note_reset(cause);
         let (crc, pwr, syscfg): (&mut dyn Peripheral, _, _) =
             (&mut self.crc, &mut self.pwr, &mut self.syscfg);
-        for block in [crc, pwr, syscfg, &mut self.rcc, &mut self.flash, &mut self.iwdg, &mut self.can1] {
+        for block in [crc, pwr, syscfg, &mut self.rcc, &mut self.flash, &mut self.iwdg] {
             block.reset();
+        }
+        for can in &mut self.can {
+            can.reset();
         }
         for port in &mut self.gpio {
             port.reset();
@@ -388,15 +392,27 @@ impl Chip {
         let now = self.now();
         self.clock.set_hz(self.clocks.hclk);
         self.scs.systick.set_clock(self.clocks.hclk.into(), now);
-        let can_clocked = self.rcc.plain(rcc::APB1ENR) & 1 << 25 != 0;
-        self.can1.set_clock(if can_clocked { self.clocks.pclk1 } else { 0 });
         for (_, block, enable) in BLOCKS {
-            let Block::Usart(index) = block else { continue };
-            let clocked = self.has_clock(enable);
-            let usart = &mut self.usarts[index];
-            let clock = if usart.instance().apb2 { self.clocks.pclk2 } else { self.clocks.pclk1 };
-            usart.set_clock(if clocked { clock } else { 0 });
+            let clock_of = |clock: u32| if self.has_clock(enable) { clock } else { 0 };
+            let (pclk1, pclk2) = (clock_of(self.clocks.pclk1), clock_of(self.clocks.pclk2));
+            match block {
+                Block::Can1 => self.can[0].set_clock(pclk1),
+                Block::Can2 => self.can[1].set_clock(pclk1),
+                Block::Usart(index) => {
+                    let usart = &mut self.usarts[index];
+                    usart.set_clock(if usart.instance().apb2 { pclk2 } else { pclk1 });
+                }
+                _ => {}
+            }
         }
+        self.tell_slave();
+    }
+
+    /// After a change of CAN1's filters or clock: CAN2 has them from there.
+    fn tell_slave(&mut self) {
+        let clocked = self.rcc.plain(rcc::APB1ENR) & 1 << 25 != 0;
+        let [master, slave] = &mut self.can;
+        slave.follow(master, clocked);
     }
 
     /// Looks which pins the program has given to the USARTs.
@@ -458,7 +474,9 @@ impl Chip {
         self.flash.advance(now);
         self.settle_flash();
         self.iwdg.advance(now);
-        self.can1.advance(now);
+        for can in &mut self.can {
+            can.advance(now);
+        }
         for usart in &mut self.usarts {
             usart.advance(now);
         }
@@ -476,7 +494,9 @@ impl Chip {
         let mut lines = std::mem::take(&mut self.lines);
         lines.clear();
         self.flash.interrupts(&mut lines);
-        self.can1.interrupts(&mut lines);
+        for can in &self.can {
+            can.interrupts(&mut lines);
+        }
         for usart in &self.usarts {
             usart.interrupts(&mut lines);
         }
@@ -502,7 +522,8 @@ impl Chip {
         [
             self.flash.next_event(),
             self.iwdg.next_event(),
-            self.can1.next_event(),
+            self.can[0].next_event(),
+            self.can[1].next_event(),
             self.rcc.next_event(),
             self.scs.systick.next_event(),
         ]
@@ -623,7 +644,8 @@ impl Chip {
             Block::Iwdg => &mut self.iwdg,
             Block::Pwr => &mut self.pwr,
             Block::Syscfg => &mut self.syscfg,
-            Block::Can1 => &mut self.can1,
+            Block::Can1 => &mut self.can[0],
+            Block::Can2 => &mut self.can[1],
             Block::Usart(index) => &mut self.usarts[index],
         }
     }
@@ -730,9 +752,14 @@ impl Chip {
                 self.settle_flash();
             }
             Block::Gpio(_) => self.wire_usarts(),
-            Block::Can1 if self.can1.wants_attention() => {
-                self.attention = true;
-                self.leave = true;
+            Block::Can1 | Block::Can2 => {
+                if block == Block::Can1 {
+                    self.tell_slave();
+                }
+                if self.can.iter().any(BxCan::wants_attention) {
+                    self.attention = true;
+                    self.leave = true;
+                }
             }
             _ => {}
         }
@@ -791,6 +818,7 @@ impl Chip {
             // Ports that the chip does not have have no reset bit either.
             if after[index] && !before[index] {
                 self.block_mut(block).reset();
+                self.tell_slave();
             }
         }
     }

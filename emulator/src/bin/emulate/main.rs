@@ -112,6 +112,8 @@ struct Board {
     pulled_up: &'static [(char, u8)],
     /// The USART that is led out.
     usart: &'static str,
+    /// The CAN controller that the transceiver is at, as in `Options`.
+    transceiver: usize,
 }
 
 const BOARDS: &[Board] = &[
@@ -121,6 +123,7 @@ const BOARDS: &[Board] = &[
         hse_hz: 8_000_000,
         pulled_up: &[],
         usart: "USART2",
+        transceiver: 0,
     },
     Board {
         name: "stm32f407g-disc1-two",
@@ -128,6 +131,15 @@ const BOARDS: &[Board] = &[
         hse_hz: 8_000_000,
         pulled_up: &[],
         usart: "USART2",
+        transceiver: 0,
+    },
+    Board {
+        name: "stm32f407g-disc1-can2",
+        chip: &STM32F407VG,
+        hse_hz: 8_000_000,
+        pulled_up: &[],
+        usart: "USART2",
+        transceiver: 1,
     },
     // B1 (UM1724).
     Board {
@@ -136,6 +148,7 @@ const BOARDS: &[Board] = &[
         hse_hz: 8_000_000,
         pulled_up: &[('C', 13)],
         usart: "USART2",
+        transceiver: 0,
     },
     Board {
         name: "stm32f429i-disc1",
@@ -143,6 +156,7 @@ const BOARDS: &[Board] = &[
         hse_hz: 8_000_000,
         pulled_up: &[],
         usart: "USART1",
+        transceiver: 0,
     },
 ];
 
@@ -344,6 +358,7 @@ impl Bench {
                     hse_hz: args.board.hse_hz,
                     flash_times: if args.worst_flash { FlashTimes::Worst } else { FlashTimes::Typical },
                     unique_id,
+                    transceiver: args.board.transceiver,
                 },
             );
             let mut machine = machine.context("setting up the board")?;
