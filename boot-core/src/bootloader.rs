@@ -175,6 +175,8 @@ pub struct Config {
     /// the application: its code FF00h (device specific, CiA 301 table 26), "BOOT", and why the
     /// device stayed ([`StayReason::code`](crate::decision::StayReason::code)).
     pub boot_up_emergency: bool,
+    /// Whether layer setting services may store node-ID and bit rate.
+    pub lss_store: bool,
     /// How programs are downloaded.
     pub download: Policy,
     /// What opens 1F50h where [`Policy::locked`] says that something has to; it is written where
@@ -415,6 +417,9 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> LssDevice for Bootloader<'_
     }
 
     fn store(&mut self, id: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {
+        if !self.config.lss_store {
+            return Poll::Ready(Err(StoreError::Unsupported));
+        }
         let node = NodeParameters { id, bit_rate: rate.unwrap_or(self.node.bit_rate) };
         match self.download.store_node(node) {
             Ok(()) => {

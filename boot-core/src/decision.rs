@@ -38,6 +38,8 @@ pub struct Policy {
     pub rescue_window_ms: u16,
     /// The same for a confirmed program.
     pub rescue_window_confirmed_ms: u16,
+    /// Whether a program may be started now, signed or on trial.
+    pub start_allowed: fn(program: u8) -> bool,
 }
 
 impl Policy {
@@ -137,7 +139,7 @@ pub fn decide(
     use BootDecision::{Hold, Start, Stay};
 
     match circumstances.request {
-        Some(BootRequest::Stay | BootRequest::Clear(_)) => return Stay(StayReason::Requested),
+        Some(BootRequest::Stay | BootRequest::Owed(_)) => return Stay(StayReason::Requested),
         Some(BootRequest::Fault) => return Stay(StayReason::Fault),
         _ => {}
     }
@@ -146,7 +148,7 @@ pub fn decide(
     }
     let (number, trial) = match circumstances.request {
         // A request is new: whoever makes it knows of the crashes before.
-        Some(BootRequest::Trial(number)) => (number, true),
+        Some(BootRequest::Trial(number) | BootRequest::Fresh(number)) => (number, true),
         Some(BootRequest::Start(number) | BootRequest::Resume(number)) => (number, false),
         _ => {
             if circumstances.crash_resets >= policy.max_crash_resets {
@@ -163,7 +165,9 @@ pub fn decide(
     }
     match verify(number) {
         Err(invalid) => Stay(StayReason::Program(invalid)),
-        Ok(program) if !program.signed() && !trial => Stay(StayReason::Unsigned),
+        Ok(program) if !(program.signed() || trial) || !(policy.start_allowed)(number) => {
+            Stay(StayReason::Unsigned)
+        }
         Ok(program) => {
             let window_ms =
                 if program.confirmed() { policy.rescue_window_confirmed_ms } else { policy.rescue_window_ms };

@@ -39,8 +39,8 @@ pub struct Policy {
     pub check: fn(program: u8, control: &Control) -> Verdict,
     /// Whether programs may be changed now; where not, the status is `NO_ACCESS`.
     pub allowed: fn() -> bool,
-    /// When CLEAR erases.
-    pub erase: Erase,
+    /// When CLEAR of a program erases (`TgtCheckEraseApp` of the manual).
+    pub erase: fn(program: u8) -> Erase,
     /// Whether a complete raw image or Intel HEX download is valid without the signature (83h) that
     /// those who send it know nothing of.
     pub valid_without_signature: bool,
@@ -73,7 +73,7 @@ impl Policy {
         identity: None,
         check: |_, _| Verdict::Standard,
         allowed: || true,
-        erase: Erase::WithFirstBlock,
+        erase: |_| Erase::WithFirstBlock,
         valid_without_signature: true,
         reset_starts: false,
         starts_by_itself: false,

@@ -49,6 +49,7 @@ impl<'b> Queue<'b> {
     }
 
     /// Data bytes of the open piece.
+    #[inline(never)]
     pub(crate) fn open_size(&self) -> usize {
         self.open.saturating_sub(PIECE_HEADER)
     }
@@ -141,6 +142,7 @@ impl<'b> Queue<'b> {
     }
 
     /// Offsets are less than twice the ring.
+    #[inline(never)]
     fn place(&self, offset: usize) -> usize {
         let at = self.front + offset;
         if at >= self.buffer.len() {

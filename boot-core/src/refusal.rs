@@ -14,6 +14,7 @@ impl Refusal {
     }
 
     /// The data or the command may be right, but not in this state of the device (08000022h).
+    #[inline(never)]
     pub(crate) const fn untimely(error: FlashError) -> Self {
         Self(error, AbortCode::DEVICE_STATE)
     }

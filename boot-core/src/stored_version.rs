@@ -19,8 +19,10 @@ const STEP: u32 = 512;
 /// The search, or what it found.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct StoredVersion {
-    /// What was searched, or is being, and its CRC: one stored anew is another one.
-    image: Option<(Region, u32)>,
+    /// What was searched, or is being; of no bytes for nothing.
+    image: Region,
+    /// Its CRC: an image that is stored anew is another one.
+    crc: u32,
     /// Offset of the next byte to look at.
     at: u32,
     text: [u8; LONGEST],
@@ -29,7 +31,7 @@ pub(crate) struct StoredVersion {
 
 impl StoredVersion {
     pub(crate) const fn new() -> Self {
-        Self { image: None, at: 0, text: [0; LONGEST], len: 0 }
+        Self { image: Region::new(0, 0), crc: 0, at: 0, text: [0; LONGEST], len: 0 }
     }
 
     /// The version; `None` where none was found.
@@ -38,11 +40,13 @@ impl StoredVersion {
     }
 
     /// Carries the search on. The flash must be idle.
-    pub(crate) fn step<F: Flash>(&mut self, flash: &F, image: Option<(Region, u32)>) -> Step {
-        if self.image != image {
-            *self = Self { image, ..Self::new() };
+    pub(crate) fn step<F: Flash>(&mut self, flash: &F, (image, crc): (Region, u32)) -> Step {
+        if self.image != image || self.crc != crc {
+            (self.image, self.crc, self.at, self.len) = (image, crc, 0, 0);
         }
-        let Some((image, _)) = image.filter(|(image, _)| self.at < image.size) else { return Step::Idle };
+        if self.at >= image.size {
+            return Step::Idle;
+        }
         let end = (self.at + STEP).min(image.size);
         while self.at < end {
             let mut mark = [0; MARK.len()];

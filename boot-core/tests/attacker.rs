@@ -879,9 +879,12 @@ impl Attack {
         rule(asked, Rule::StartsWhatWasAsked, what)?;
         let record = self.stored.records[usize::from(program) - 1];
         let signed = record.map(|(_, _, signed, _)| signed);
-        rule(signed == Some(matches!(request, BootRequest::Start(_))), Rule::StartsWhatWasAsked, || {
-            format!("{request:?}, and its record is {record:?}")
-        })
+        let fits = match request {
+            // Behind a download in one go, signed or on trial.
+            BootRequest::Fresh(_) => signed.is_some(),
+            _ => signed == Some(matches!(request, BootRequest::Start(_))),
+        };
+        rule(fits, Rule::StartsWhatWasAsked, || format!("{request:?}, and its record is {record:?}"))
     }
 
     /// A host that knows nothing of what happened installs each program and starts it.
@@ -976,7 +979,9 @@ impl Setup {
 /// The program that is to be started.
 fn number(request: BootRequest) -> Option<u8> {
     match request {
-        BootRequest::Start(program) | BootRequest::Trial(program) => Some(program),
+        BootRequest::Start(program) | BootRequest::Trial(program) | BootRequest::Fresh(program) => {
+            Some(program)
+        }
         _ => None,
     }
 }

@@ -10,7 +10,7 @@ use boot_core::store::{Journal, Key, Parameters, ProgramRecord};
 use model::ModelFlash;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::vectors::VectorFault;
-use shared_abi::warm_start::BootRequest;
+use shared_abi::warm_start::{BootRequest, Owed};
 
 const QUIET: Circumstances = Circumstances { request: None, strap: false, crash_resets: 0, node_id: 5 };
 
@@ -21,6 +21,7 @@ fn policy() -> Policy {
         node_ids: 1..=100,
         rescue_window_ms: 0,
         rescue_window_confirmed_ms: 0,
+        start_allowed: |_| true,
     }
 }
 
@@ -32,8 +33,14 @@ fn check(signed: bool, damage: impl FnOnce(&mut ModelFlash)) -> Result<VerifiedP
     bytes[4..8].copy_from_slice(&0x0801_0189_u32.to_le_bytes());
     flash.poke(0x0801_0000, &bytes);
     let mut journal = Journal::open(&flash, LAYOUT.parameters);
-    let record =
-        ProgramRecord { size: 64, crc: boot_core::crc32(&bytes), signed, confirmed: false, version: 0 };
+    let record = ProgramRecord {
+        size: 64,
+        crc: boot_core::crc32(&bytes),
+        signed,
+        confirmed: false,
+        version: 0,
+        half_erased: false,
+    };
     journal.store(Key::Program(1), record.value());
     run(&mut flash, |flash, outcome| journal.next(flash, outcome)).unwrap();
     damage(&mut flash);
@@ -68,8 +75,9 @@ fn what_asks_for_the_bootloader_wins() {
         start => panic!("{start:?}"),
     };
     let request = |request| Circumstances { request: Some(request), ..QUIET };
+    let owed = BootRequest::Owed(Owed { program: 1, value: 3, node_id: 5 });
     assert_eq!(stay(request(BootRequest::Stay), policy()), StayReason::Requested);
-    assert_eq!(stay(request(BootRequest::Clear(1)), policy()), StayReason::Requested);
+    assert_eq!(stay(request(owed), policy()), StayReason::Requested);
     assert_eq!(stay(Circumstances { strap: true, ..QUIET }, policy()), StayReason::Strap);
     assert_eq!(
         stay(Circumstances { strap: true, ..request(BootRequest::Start(1)) }, policy()),
@@ -87,12 +95,14 @@ fn without_signature_a_program_starts_as_a_trial_alone() {
     assert_eq!(decide(&QUIET, &policy(), |_| unsigned()), BootDecision::Stay(StayReason::Unsigned));
     let start = Circumstances { request: Some(BootRequest::Start(1)), ..QUIET };
     assert_eq!(decide(&start, &policy(), |_| unsigned()), BootDecision::Stay(StayReason::Unsigned));
-    let trial = Circumstances { request: Some(BootRequest::Trial(1)), crash_resets: 9, ..QUIET };
     let policy = Policy { autostart: None, ..policy() };
-    let expected = BootDecision::Start { program: unsigned().unwrap(), trial: true };
-    assert_eq!(decide(&trial, &policy, |_| unsigned()), expected);
-    let expected = BootDecision::Start { program: signed().unwrap(), trial: false };
-    assert_eq!(decide(&trial, &policy, |_| signed()), expected, "a signed program is on no trial");
+    for request in [BootRequest::Trial(1), BootRequest::Fresh(1)] {
+        let trial = Circumstances { request: Some(request), crash_resets: 9, ..QUIET };
+        let expected = BootDecision::Start { program: unsigned().unwrap(), trial: true };
+        assert_eq!(decide(&trial, &policy, |_| unsigned()), expected);
+        let expected = BootDecision::Start { program: signed().unwrap(), trial: false };
+        assert_eq!(decide(&trial, &policy, |_| signed()), expected, "a signed program is on no trial");
+    }
 }
 
 #[test]

@@ -126,7 +126,7 @@ fn a_product_with_crc_16_takes_raw_images_and_keeps_their_crc_16() {
     assert_eq!(bench.stream(&image, Some(3001), 7), (Ok(()), 0));
     assert_eq!(bench.word(IDENTIFICATION), crc16(&image));
     assert_eq!(bench.command(START), 0);
-    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)));
     assert_eq!(starts(&flash, CrcKind::Crc16), Ok(true));
     assert_eq!(starts(&flash, CrcKind::Crc32), Err(Invalid::Crc));
 }
@@ -145,9 +145,16 @@ fn blocks_may_begin_and_end_at_any_byte() {
     }
 }
 
+/// A flash in which all of the program's sectors have to be erased.
+fn full() -> ModelFlash {
+    let mut flash = ModelFlash::new(&CHIP);
+    flash.poke(PROGRAM.base, &vec![0; PROGRAM.size as usize]);
+    flash
+}
+
 #[test]
 fn status_is_busy_from_the_acknowledgement_to_the_end_of_the_work() {
-    let mut flash = ModelFlash::new(&CHIP);
+    let mut flash = full();
     let mut bench = Bench::new(&mut flash);
     // Twice in a row, which erases at once.
     bench.node.write(CONTROL, &[CLEAR]).unwrap();
@@ -346,14 +353,14 @@ fn faults_of_the_flash_are_told_and_clear_begins_anew() {
     for (fault, status) in
         [(FlashFault::Failed, 0x0A), (FlashFault::Verify, 0x0A), (FlashFault::Protected, 0x0E)]
     {
-        // Two CLEARs take the record away, and erase then: the last operation is that of a sector.
-        let mut flash = ModelFlash::new(&CHIP);
+        // Two CLEARs take the record away, and erase then.
+        let mut flash = full();
         let mut bench = Bench::new(&mut flash);
         assert_eq!((bench.command(CLEAR), bench.command(CLEAR)), (0, 0));
-        let operations = bench.node.flash().operations;
-        let mut flash = ModelFlash::new(&CHIP);
+        let last = bench.node.flash().touched.iter().rposition(|region| region.size > 4).unwrap();
+        let mut flash = full();
         let mut bench = Bench::new(&mut flash);
-        bench.node.flash().fail = Some((operations, fault));
+        bench.node.flash().fail = Some((last as u32 + 1, fault));
         assert_eq!(bench.command(CLEAR), 0);
         assert_eq!(bench.command(CLEAR), status);
         assert_eq!(bench.command(CLEAR), 0);
@@ -469,7 +476,7 @@ fn while_programming_is_not_allowed_nothing_is_changed() {
 #[test]
 fn a_start_or_a_block_during_an_erase_is_told_to_wait() {
     let image = program(96, 0x11);
-    let mut flash = ModelFlash::new(&CHIP);
+    let mut flash = full();
     let mut bench = Bench::new(&mut flash);
     bench.install(&image);
     assert_eq!(bench.command(CLEAR), 0);
@@ -676,4 +683,33 @@ fn parameters_may_be_kept_in_an_eeprom() {
         verify(&flash, &&mut eeprom, &LAYOUT, CrcKind::Crc32, 1).unwrap().signed(),
         "the old value is still there"
     );
+}
+
+/// The last block of the older manual (L-1112e_5, chapter 5.1): data size 8, which does not count the
+/// 32 reserved bytes in front of size and CRC. Also with a size that counts them.
+#[test]
+fn the_last_block_of_2008_is_taken() {
+    let image = program(1000, 0x22);
+    for size in [8_u32, 40] {
+        let mut flash = ModelFlash::new(&CHIP);
+        let mut bench = Bench::new(&mut flash);
+        assert_eq!(bench.command(CLEAR), 0);
+        let mut file = block_file(&image, 96);
+        file.pop();
+        for block in file {
+            bench.good(&block);
+        }
+        let mut last = [u32::MAX, 0, size].map(u32::to_le_bytes).concat();
+        last.extend([0xEE; 32]);
+        last.extend(1000_u32.to_le_bytes());
+        last.extend(block_crc(&image).to_le_bytes());
+        last.extend(block_crc(&last).to_le_bytes());
+        // Cut off it is no block.
+        let (refused, status) = bench.block(&last[..55]);
+        assert_eq!((refused, status), (Err(AbortCode::LENGTH), 0x04), "size {size}");
+        bench.good(&last);
+        assert_eq!(bench.word(IDENTIFICATION), block_crc(&image), "size {size}");
+        assert_eq!(bench.command(SET_SIGNATURE), 0);
+        assert_eq!(autostart(&flash), Ok(0x22));
+    }
 }

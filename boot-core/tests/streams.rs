@@ -51,7 +51,7 @@ fn a_raw_image_is_stored_is_valid_and_starts() {
         assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
         assert_eq!(bench.read_state(), 0, "stopped");
         assert_eq!(bench.command(START), 0);
-        assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
+        assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)));
         assert_eq!(&flash.cells(PROGRAM)[..3001], image);
         assert!(flash.cells(PROGRAM)[3001..].iter().all(|byte| *byte == 0xFF));
         assert_eq!(autostart(&flash), Ok(0x11));
@@ -106,6 +106,32 @@ fn hex_may_have_gaps_and_any_order() {
 }
 
 /// CiA 302-3: 2 resets the program, which starts it; for block files it is RESET_STAT.
+/// Fresh is what is started right behind its download: a signature in between is a master that does
+/// not confirm by 80h, and a program that came in blocks has one that signs.
+#[test]
+fn a_program_is_fresh_only_right_behind_a_stream() {
+    let image = program(500, 0x45);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = cleared(&mut flash);
+    assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
+    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    assert_eq!(bench.command(START), 0);
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
+    // What is read in between changes nothing, and neither does a second START.
+    assert_eq!(bench.command(CLEAR), 0);
+    assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
+    assert_eq!((bench.status(), bench.read_state()), (0, 0));
+    assert_eq!(bench.command(START), 0);
+    assert_eq!(bench.node.write(CONTROL, &[START]), Err(AbortCode(0x0800_0022)), "it leaves");
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)));
+
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = cleared(&mut flash);
+    bench.install(&image);
+    assert_eq!(bench.command(START), 0);
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Trial(1)));
+}
+
 #[test]
 fn command_2_starts_behind_a_stream_alone() {
     let image = program(500, 0x44);
@@ -113,7 +139,7 @@ fn command_2_starts_behind_a_stream_alone() {
     let mut bench = cleared(&mut flash);
     assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
     assert_eq!(bench.command(RESET_STAT), 0);
-    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)));
 
     let mut bench = Bench::new(&mut flash);
     assert_eq!(bench.command(RESET_STAT), 0);
@@ -142,13 +168,13 @@ fn a_profile_may_start_always_or_by_itself_or_want_a_signature() {
     let mut bench = Bench::with(&mut flash, Policy { starts_by_itself: true, ..Policy::DEFAULT });
     assert_eq!(bench.command(CLEAR), 0);
     assert_eq!(bench.stream(hex(&image, 16, "\n").as_bytes(), None, 7), (Ok(()), 0));
-    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)));
 
     let mut bench = Bench::with(&mut flash, Policy { valid_without_signature: false, ..Policy::DEFAULT });
     assert_eq!(bench.command(CLEAR), 0);
     assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
     assert_eq!(bench.command(START), 0);
-    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Trial(1)));
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)));
 }
 
 /// Hosts that poll nothing: START right behind the last segment waits for the verification.
@@ -165,7 +191,7 @@ fn start_right_behind_the_last_segment_waits_for_the_verification() {
         assert_eq!(bench.node.take_boot_request(), None);
         bench.settle();
         assert!(!bench.node.is_finishing());
-        assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
+        assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)));
     }
     // What cannot be verified does not start.
     let mut flash = ModelFlash::new(&CHIP);
@@ -389,7 +415,7 @@ fn a_password_opens_1f50_and_a_wrong_one_is_slowed_down() {
     assert_eq!(at(2499, b"TINI"), (Err(STATE), true));
     assert_eq!(at(2500, b"TINI"), (Ok(()), false));
     assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
-    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)), "by itself");
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)), "by itself");
     // The next password voids it at once.
     let mut bench = Bench::with_config(
         &mut flash,

@@ -1,8 +1,7 @@
 //! What every board does with its bxCAN: bit timing, filters, frames, and the state of the
 //! controller (RM0090 section 32).
 
-use bxcan::filter::ListEntry16;
-use bxcan::{Can, Data, Fifo, Interrupts, MasterInstance, OverrunError, StandardId};
+use bxcan::{Can, Data, Instance, Interrupts, OverrunError, RegisterBlock, StandardId};
 use embedded_can::Frame;
 
 /// A bit timing that bxCAN can be set to (RM0090 section 32.7.7).
@@ -108,8 +107,31 @@ const BOFF: u32 = 1 << 2;
 /// The last error code; 7 is written by software alone, 0 is a good frame.
 const LEC: u32 = 7 << 4;
 
+/// The same of the filters, which the master has for itself and for the slave.
+const FMR: usize = 0x200;
+const FM1R: usize = 0x204;
+const FS1R: usize = 0x20C;
+const FFA1R: usize = 0x214;
+const FA1R: usize = 0x21C;
+const F0R1: usize = 0x240;
+/// `CAN_FMR`: the filters are being set, and nothing is received.
+const FINIT: u32 = 1 << 0;
+
+/// A controller, and where its acceptance filters are (RM0090 section 32.7.4).
+///
+/// # Safety
+/// `MASTER` is the base of the registers of the controller that has the filters, which has a clock;
+/// whoever owns this controller owns its share of them.
+pub unsafe trait Controller: Instance {
+    /// The master of two controllers: this one or the other.
+    const MASTER: *mut RegisterBlock;
+    /// Whether it is the slave: the filter banks from `CAN_FMR.CAN2SB` on are its, those below are
+    /// the master's.
+    const IS_SLAVE: bool;
+}
+
 /// A bxCAN controller and the one frame that may wait for its mailboxes.
-pub struct Port<I: MasterInstance> {
+pub struct Port<I: Controller> {
     can: Can<I>,
     waiting: Option<bxcan::Frame>,
     /// A boot-up is on its way, which nothing may overtake, whatever its priority.
@@ -129,7 +151,7 @@ pub struct Lost {
     pub in_queue: bool,
 }
 
-impl<I: MasterInstance> Port<I> {
+impl<I: Controller> Port<I> {
     /// Takes the controller. It hears and says nothing before [`configure`](Self::configure) and
     /// [`accept`](Self::accept). Interrupts of receive FIFO 0 and of the mailboxes are on.
     pub fn new(controller: I) -> Self {
@@ -167,13 +189,34 @@ impl<I: MasterInstance> Port<I> {
     }
 
     /// Sets the acceptance filters to exactly these identifiers (data frames, 11 bits), all into
-    /// FIFO 0.
+    /// FIFO 0. The other controller's filters stay as they are.
+    #[inline(never)]
     pub fn accept(&mut self, [a, b, c]: [u16; 3]) {
-        let mut filters = self.can.modify_filters();
-        filters.clear();
-        // A bank lists four identifiers; one may stand there twice.
-        let bank = [a, b, c, c].map(|id| ListEntry16::data_frames_with_id(standard_id(id)));
-        filters.enable_bank(0, Fifo::Fifo0, bank);
+        let change = |offset: usize, clear: u32, set: u32| {
+            // SAFETY: the offset is one of a register above, in the registers of the master; of
+            // its bits those change that belong to this controller, which this port owns.
+            unsafe {
+                let register = I::MASTER.cast::<u32>().byte_add(offset);
+                let before = register.read_volatile();
+                register.write_volatile(before & !clear | set);
+                before
+            }
+        };
+        let border = change(FMR, 0, FINIT) >> 8 & 31;
+        let from_border = u32::MAX << border;
+        let (bank, share) = if I::IS_SLAVE { (border, from_border) } else { (0, !from_border) };
+        change(FA1R, share, 0);
+        // A list of four identifiers of 16 bits each; one may stand there twice. STID is at 15:5,
+        // and RTR and IDE are clear.
+        change(FM1R, 0, 1 << bank);
+        change(FS1R, 1 << bank, 0);
+        change(FFA1R, 1 << bank, 0);
+        let pair = |low: u16, high: u16| u32::from(low) << 5 | u32::from(high) << 21;
+        let words = F0R1 + 8 * bank as usize;
+        change(words, u32::MAX, pair(a, b));
+        change(words + 4, u32::MAX, pair(c, c));
+        change(FA1R, 0, 1 << bank);
+        change(FMR, FINIT, 0);
     }
 
     /// The next frame from the FIFO, `None` when it is empty.
@@ -207,6 +250,7 @@ impl<I: MasterInstance> Port<I> {
     ///
     /// Frames of one identifier leave in order: the mailboxes take the second only when the first
     /// is on its way.
+    #[inline(never)]
     pub fn send<F: Frame>(&mut self, frame: &F) {
         let (embedded_can::Id::Standard(id), Some(data)) = (frame.id(), Data::new(frame.data())) else {
             return;

@@ -1,14 +1,10 @@
 //! What is done to every board in the same way; the board file has the numbers and the pins.
 
-use stm32f4xx_hal::can::Can;
 use stm32f4xx_hal::pac;
 use stm32f4xx_hal::prelude::*;
 use stm32f4xx_hal::rcc::{Config, Rcc, RccExt};
 
-use crate::{Led, CAN_CLOCK, CLOCK_TREE, ENTRY_STRAP, SYSCLK};
-
-/// The CAN controller that coboot talks through.
-pub type CanController = Can<pac::CAN1>;
+use crate::{CanController, Led, CAN_CLOCK, CLOCK_TREE, ENTRY_STRAP, LAYOUT, SYSCLK};
 
 /// The board's parts, set up by its `init`.
 pub struct Board {
@@ -32,21 +28,33 @@ pub fn clocks(rcc: pac::RCC) -> Rcc {
 /// Whether the entry strap ([`ENTRY_STRAP`]) asks for the bootloader. Leaves its port as after a
 /// reset.
 #[must_use]
-pub fn entry_strap(rcc: &pac::RCC) -> bool {
-    const PORT: u32 = ENTRY_STRAP.0 as u32 - 'A' as u32;
-    /// The ports lie behind one another (RM0090 and RM0390, register boundary addresses), and the
-    /// switches of their clocks in the same order (RCC_AHB1ENR).
-    const IDR: *const u32 = (0x4002_0010 + 0x400 * PORT) as *const u32;
+pub fn entry_strap() -> bool {
+    (inputs(ENTRY_STRAP.0) & 1 << ENTRY_STRAP.1 != 0) == ENTRY_STRAP.2
+}
+
+/// The levels of the 16 pins of a port, `'A'` and on; of a port that the chip has not, all low. For
+/// the boot stage: no pin was set up since the reset, and the port is left as it was. What has to be
+/// pulled up or down is so on the board.
+#[must_use]
+pub fn inputs(port: char) -> u16 {
+    let port = (port as u32).wrapping_sub('A' as u32);
+    if port >= LAYOUT.chip.ports.into() {
+        return 0;
+    }
+    // The ports lie behind one another (RM0090 and RM0390, register boundary addresses), and the
+    // switches of their clocks in the same order (RCC_AHB1ENR).
+    let idr = (0x4002_0010 + 0x400 * port) as *const u32;
+    // SAFETY: the boot stage runs alone; a clock is switched, and what it was is put back.
+    let rcc = unsafe { pac::RCC::steal() };
     let clocks = rcc.ahb1enr();
     let before = clocks.read().bits();
     // SAFETY: the clock of a port in addition to those that are on.
-    clocks.write(|w| unsafe { w.bits(before | 1 << PORT) });
+    clocks.write(|w| unsafe { w.bits(before | 1 << port) });
     // It needs two cycles before the first access: reading back waits that long.
     let _ = clocks.read();
-    // SAFETY: the inputs of a port that the chip has (`lib.rs` looks) are read, and nothing is
-    // changed.
-    let inputs = unsafe { IDR.read_volatile() };
+    // SAFETY: the inputs of a port that the chip has are read, and nothing is changed.
+    let inputs = unsafe { idr.read_volatile() };
     // SAFETY: what it was.
     clocks.write(|w| unsafe { w.bits(before) });
-    (inputs & 1 << ENTRY_STRAP.1 != 0) == ENTRY_STRAP.2
+    inputs as u16
 }

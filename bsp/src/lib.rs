@@ -8,6 +8,8 @@
 #![no_std]
 
 pub mod can;
+#[cfg(target_arch = "arm")]
+pub mod can_controllers;
 pub mod clock;
 #[cfg(all(target_arch = "arm", feature = "debugger"))]
 pub mod debugger;
@@ -38,6 +40,43 @@ macro_rules! take_port {
     }};
 }
 
+/// The CAN controller that a board talks through, CAN1 or CAN2.
+///
+/// The tasks of a program are bound to CAN1's interrupts, whichever it is: those of CAN2 have
+/// handlers that are the tasks' entries, too. `init` of such a board makes them the same priority
+/// ([`can_controllers::take_can2`]), so that neither interrupts the other.
+macro_rules! can_controller {
+    (CAN1) => {
+        can_controller!(1, CAN1);
+    };
+    (CAN2) => {
+        can_controller!(2, CAN2);
+        can_controller!(CAN2_TX is CAN1_TX);
+        can_controller!(CAN2_RX0 is CAN1_RX0);
+    };
+    ($number:literal, $can:ident) => {
+        /// The number of the CAN controller that coboot talks through.
+        pub const CAN_CONTROLLER: u8 = $number;
+
+        /// The CAN controller that coboot talks through.
+        #[cfg(target_arch = "arm")]
+        pub type CanController = stm32f4xx_hal::can::Can<stm32f4xx_hal::pac::$can>;
+    };
+    ($interrupt:ident is $task:ident) => {
+        #[cfg(target_arch = "arm")]
+        #[no_mangle]
+        #[allow(non_snake_case)]
+        extern "C" fn $interrupt() {
+            extern "C" {
+                fn $task();
+            }
+            // SAFETY: the handler of the program, called as the core would call it: at the
+            // priority of its own interrupt.
+            unsafe { $task() }
+        }
+    };
+}
+
 /// The USART that a board talks through; its interrupt has the same name.
 #[cfg(target_arch = "arm")]
 macro_rules! uart {
@@ -59,6 +98,10 @@ use shared_abi::{geometry::Geometry, layout::Layout};
 
 #[cfg(any(feature = "board-stm32f407g-disc1", feature = "board-stm32f407g-disc1-two"))]
 #[path = "stm32f407g_disc1.rs"]
+mod board;
+
+#[cfg(feature = "board-stm32f407g-disc1-can2")]
+#[path = "stm32f407g_disc1_can2.rs"]
 mod board;
 
 #[cfg(feature = "board-nucleo-f446re")]
@@ -97,7 +140,7 @@ const _: () = assert!(
 );
 
 #[cfg(target_arch = "arm")]
-pub use drivers::{clocks, entry_strap, Board, CanController};
+pub use drivers::{clocks, entry_strap, inputs, Board};
 /// What frames go through: the CAN controller, or the UART in its place.
 #[cfg(all(target_arch = "arm", not(feature = "virtual-can")))]
 pub type CanPort = can::Port<CanController>;

@@ -50,6 +50,8 @@ pub const ENTRY_STRAP: (char, u8, bool) = ('C', 13, false);
 /// Bit rate of the UART, in bit/s.
 pub const UART_BIT_RATE: u32 = 115_200;
 
+can_controller!(CAN1);
+
 #[cfg(target_arch = "arm")]
 pub use pins::*;
 

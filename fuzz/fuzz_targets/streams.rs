@@ -49,6 +49,7 @@ macro_rules! config {
             layout: &LAYOUT,
             supports: |_| true,
             boot_up_emergency: false,
+            lss_store: true,
             download: Policy { identity: Some((1, 2)), ..PROFILE.download },
             password: PROFILE.password,
         };

@@ -139,12 +139,19 @@ pub struct Last {
 
 /// Bytes of [`Last`].
 pub const LAST_SIZE: usize = 8;
+/// The same as the manual of 2008 has it (L-1112e_5, 5.1): 32 reserved bytes in front. The size in the
+/// block's header stays [`LAST_SIZE`].
+pub const LAST_SIZE_2008: usize = 32 + LAST_SIZE;
 
 impl Last {
-    /// Takes the data of the last block apart; `None` for a wrong length.
+    /// Takes the data of the last block apart, with or without reserved bytes in front; `None` for a
+    /// wrong length.
     #[must_use]
     pub fn parse(data: &[u8]) -> Option<Self> {
-        let data: &[u8; LAST_SIZE] = data.try_into().ok()?;
+        if data.len() != LAST_SIZE && data.len() != LAST_SIZE_2008 {
+            return None;
+        }
+        let data: &[u8; LAST_SIZE] = data.last_chunk()?;
         let [program_size, program_crc] = words(data);
         Some(Self { program_size, program_crc })
     }

@@ -9,9 +9,19 @@ use crate::check_word;
 /// Tells a handoff ("CBHO" read as little-endian bytes).
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBHO");
 
-/// The layout version of this page. A reader accepts every version that is not older than the one
-/// it knows: later versions only give names to reserved words.
-pub const VERSION: u16 = 1;
+/// The layout version of this page. Later versions only give names to reserved words, which are 0
+/// before, so a reader accepts every version from [`OLDEST`] on.
+///
+/// | version | new in it |
+/// |---|---|
+/// | 1 | |
+/// | 2 | [`Handoff::flags`] |
+pub const VERSION: u16 = 2;
+/// The oldest version that a reader accepts.
+pub const OLDEST: u16 = 1;
+
+/// In [`Handoff::flags`]: [`BootInfo::fresh`].
+pub const FLAG_FRESH: u32 = 1 << 0;
 
 /// Why the chip left reset, from `RCC_CSR` (RM0090 section 7.3.21).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -93,6 +103,9 @@ pub struct BootInfo {
     pub reset_cause: ResetCause,
     /// The program carries no signature yet: after the next reset the bootloader stays.
     pub trial: bool,
+    /// The program was started right behind its download as a raw image, Intel HEX or a sealed image:
+    /// the first 1F51h = 80h confirms it, and does not call the bootloader.
+    pub fresh: bool,
     /// Version of the bootloader as in 1018h/3: major in the upper half, minor in the lower.
     pub bootloader_version: u32,
     /// Serial number as in 1018h/4.
@@ -123,8 +136,10 @@ pub struct Handoff {
     pub bootloader_version: u32,
     /// Serial number of the device.
     pub serial_number: u32,
+    /// [`FLAG_FRESH`]; the other bits are 0. Since version 2.
+    pub flags: u32,
     /// 0; names for these words come with later versions.
-    pub reserved: [u32; 5],
+    pub reserved: [u32; 4],
     /// [`check_word`] over the eleven words before.
     pub check: u32,
 }
@@ -140,6 +155,7 @@ impl Handoff {
         words[3] = info.bit_rate;
         words[4] = info.bootloader_version;
         words[5] = info.serial_number;
+        words[6] = if info.fresh { FLAG_FRESH } else { 0 };
         words[WORDS - 1] = check_of(&words);
         // SAFETY: both are 48 bytes, and any bits make a `Handoff`.
         unsafe { core::mem::transmute(words) }
@@ -152,7 +168,7 @@ impl Handoff {
         // SAFETY: both are 48 bytes, and any bits make words.
         let words = unsafe { core::mem::transmute::<Self, [u32; WORDS]>(*self) };
         let sound = is_sound(&words)
-            && self.version >= VERSION
+            && self.version >= OLDEST
             && usize::from(self.length) == size_of::<Self>()
             && matches!(self.node_id, 1..=127);
         sound.then_some(BootInfo {
@@ -161,6 +177,7 @@ impl Handoff {
             program: self.program,
             reset_cause: ResetCause::from_byte(self.reset_cause),
             trial: self.trial != 0,
+            fresh: self.flags & FLAG_FRESH != 0,
             bootloader_version: self.bootloader_version,
             serial_number: self.serial_number,
         })
@@ -227,6 +244,7 @@ mod tests {
         program: 1,
         reset_cause: ResetCause::Software,
         trial: true,
+        fresh: true,
         bootloader_version: 0x0001_0002,
         serial_number: 0xDEAD_BEEF,
     };
@@ -236,12 +254,31 @@ mod tests {
         assert_eq!(Handoff::new(&INFO).info(), Some(INFO));
     }
 
+    /// A bootloader of version 1 tells nothing about it, and so does a newer one with bits that
+    /// nobody knows yet.
+    #[test]
+    fn an_older_version_is_read_and_is_never_fresh() {
+        let mut words = [0; WORDS];
+        words[..6].copy_from_slice(&[MAGIC, 0x0030_0001, 0x0103_0105, 125_000, 0x0001_0002, 0xDEAD_BEEF]);
+        words[WORDS - 1] = check_of(&words);
+        // SAFETY: both are 48 bytes, and any bits make a `Handoff`.
+        let old: Handoff = unsafe { core::mem::transmute(words) };
+        assert_eq!(old.info(), Some(BootInfo { fresh: false, ..INFO }));
+        words[1] = 0x0030_0003;
+        words[6] = 0xFFFF_FFFE;
+        words[WORDS - 1] = check_of(&words);
+        // SAFETY: as above.
+        let newer: Handoff = unsafe { core::mem::transmute(words) };
+        assert_eq!(newer.info(), Some(BootInfo { fresh: false, ..INFO }));
+    }
+
     #[test]
     fn any_damage_is_seen() {
         let good = Handoff::new(&INFO);
         assert_eq!(Handoff { node_id: 6, ..good }.info(), None);
         assert_eq!(Handoff { trial: 0, ..good }.info(), None);
-        assert_eq!(Handoff { reserved: [0, 0, 0, 0, 1], ..good }.info(), None);
+        assert_eq!(Handoff { flags: 0, ..good }.info(), None);
+        assert_eq!(Handoff { reserved: [0, 0, 0, 1], ..good }.info(), None);
         assert_eq!(Handoff { check: !good.check, ..good }.info(), None);
         let unusable = Handoff::new(&BootInfo { node_id: 0, ..INFO });
         assert_eq!(unusable.info(), None, "an application cannot use node-ID 0");

@@ -12,6 +12,7 @@ use crate::{callgate, handoff, label, ram_image, warm_start};
 
 pub mod nucleo_f446re;
 pub mod stm32f407g_disc1;
+pub mod stm32f407g_disc1_can2;
 pub mod stm32f407g_disc1_two;
 pub mod stm32f429i_disc1;
 
@@ -19,6 +20,7 @@ pub mod stm32f429i_disc1;
 pub const BOARDS: &[&Layout] = &[
     &stm32f407g_disc1::LAYOUT,
     &stm32f407g_disc1_two::LAYOUT,
+    &stm32f407g_disc1_can2::LAYOUT,
     &nucleo_f446re::LAYOUT,
     &stm32f429i_disc1::LAYOUT,
 ];
@@ -212,6 +214,7 @@ impl fmt::Display for LinkerScript<'_> {
             ("__handoff", layout.handoff.base),
             ("__warm_start", layout.warm_start.base),
             ("__sram_end", layout.chip.sram.end()),
+            ("__programs", layout.programs.len() as u32),
         ] {
             writeln!(f, "{symbol} = {value:#010x};")?;
         }

@@ -31,11 +31,34 @@ pub enum BootRequest {
     /// Go on with the start of program `n`, which was held back for a rescue window; the bootloader
     /// asks this of itself.
     Resume(u8) = 6,
-    /// Stay, and carry out CLEAR of program `n`, which was asked of the application (1F51h = 3).
-    Clear(u8) = 7,
+    /// Stay, and answer: a command was written to 1F51h of the application, which left the SDO answer
+    /// owed. The bootloader serves the request behind its boot-up as if it had just come.
+    Owed(Owed) = 7,
     /// The bootloader mode cannot run, because its part of the flash is damaged. The boot stage
     /// leaves this for a debugger to see, and starts as after a power-on.
     Damaged(Damage) = 8,
+    /// Start program `n`, which has just been downloaded as a raw image, Intel HEX or a sealed image:
+    /// as a [`Trial`](Self::Trial), and the handoff tells the program that it is fresh. The
+    /// bootloader asks this of itself.
+    Fresh(u8) = 9,
+}
+
+/// A write of 1F51h whose SDO answer is owed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(C)]
+pub struct Owed {
+    /// The sub-index, 1 to 254.
+    pub program: u8,
+    /// What was written: 0 STOP or 3 CLEAR.
+    pub value: u8,
+    /// The node that was asked, 1 to 127. A bootloader that comes up with another node-ID does not
+    /// answer in its place.
+    pub node_id: u8,
+}
+
+impl Owed {
+    /// No answer is owed.
+    pub const NOTHING: Self = Self { program: 0, value: 0, node_id: 0 };
 }
 
 /// The cell as it lies in RAM: 16 bytes, little-endian.
@@ -44,10 +67,12 @@ pub enum BootRequest {
 pub struct WarmStart {
     /// [`MAGIC`].
     pub magic: u32,
-    /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume, 7 clear, 8 damaged.
+    /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume, 7 owed, 8 damaged,
+    /// 9 fresh.
     pub request: u32,
-    /// The program number of a trial, start, resume or clear (1 to 254); the number of a
-    /// [`Damage`]; 0 otherwise.
+    /// The program number (1 to 254) of a trial, start, resume or fresh start; the number of a
+    /// [`Damage`]; of an owed answer the program number in bits 0 to 7, the value in bits 8 to 15 and
+    /// the node-ID in bits 16 to 22; 0 otherwise.
     pub argument: u32,
     /// [`check_word`] over the three words before.
     pub check: u32,
@@ -67,8 +92,11 @@ impl WarmStart {
             BootRequest::Fault => (4, 0),
             BootRequest::PowerOn => (5, 0),
             BootRequest::Resume(program) => (6, program as u32),
-            BootRequest::Clear(program) => (7, program as u32),
+            BootRequest::Owed(Owed { program, value, node_id }) => {
+                (7, u32::from_le_bytes([program, value, node_id, 0]))
+            }
             BootRequest::Damaged(damage) => (8, damage as u32),
+            BootRequest::Fresh(program) => (9, program as u32),
         };
         Self::encode(request, argument)
     }
@@ -84,20 +112,21 @@ impl WarmStart {
     /// request or an argument out of its range.
     #[must_use]
     pub fn request(&self) -> Option<BootRequest> {
-        let argument = u8::try_from(self.argument).ok();
-        let request = match (self.request, argument) {
-            (1, Some(0)) => BootRequest::Stay,
-            (2, Some(program @ 1..=254)) => BootRequest::Trial(program),
-            (3, Some(program @ 1..=254)) => BootRequest::Start(program),
-            (4, Some(0)) => BootRequest::Fault,
-            (5, Some(0)) => BootRequest::PowerOn,
-            (6, Some(program @ 1..=254)) => BootRequest::Resume(program),
-            (7, Some(program @ 1..=254)) => BootRequest::Clear(program),
-            (8, Some(damage)) => BootRequest::Damaged(Damage::from_number(damage)?),
+        let [program, value, node_id, _] = self.argument.to_le_bytes();
+        let request = match (self.request, program) {
+            (1, _) => BootRequest::Stay,
+            (2, 1..=254) => BootRequest::Trial(program),
+            (3, 1..=254) => BootRequest::Start(program),
+            (4, _) => BootRequest::Fault,
+            (5, _) => BootRequest::PowerOn,
+            (6, 1..=254) => BootRequest::Resume(program),
+            (7, 1..=254) => BootRequest::Owed(Owed { program, value, node_id }),
+            (8, damage) => BootRequest::Damaged(Damage::from_number(damage)?),
+            (9, 1..=254) => BootRequest::Fresh(program),
             _ => return None,
         };
-        // One encoder decides what is well-formed: magic and check must be exactly its.
-        (*self == Self::encode(self.request, self.argument)).then_some(request)
+        // One encoder decides what is well-formed: all four words must be exactly its.
+        (*self == Self::new(request)).then_some(request)
     }
 }
 
@@ -157,9 +186,11 @@ mod tests {
             BootRequest::Fault,
             BootRequest::PowerOn,
             BootRequest::Resume(2),
-            BootRequest::Clear(3),
             BootRequest::Damaged(Damage::Header),
             BootRequest::Damaged(Damage::Stream),
+            BootRequest::Fresh(1),
+            BootRequest::Owed(Owed { program: 3, value: 3, node_id: 1 }),
+            BootRequest::Owed(Owed { program: 254, value: 0, node_id: 127 }),
         ];
         for request in requests {
             let mut ram = WarmStart::EMPTY;
@@ -173,7 +204,8 @@ mod tests {
 
     #[test]
     fn any_single_bit_error_reads_as_no_request() {
-        for request in [BootRequest::Stay, BootRequest::Trial(3), BootRequest::Start(254)] {
+        let owed = BootRequest::Owed(Owed { program: 1, value: 3, node_id: 5 });
+        for request in [BootRequest::Stay, BootRequest::Trial(3), BootRequest::Start(254), owed] {
             let good = WarmStart::new(request);
             for bit in 0..32 {
                 let flip = 1 << bit;
@@ -205,10 +237,14 @@ mod tests {
             (4, 1),
             (5, 1),
             (6, 0),
-            (7, 0),
+            (7, 0x0001_0000),
+            (7, 0x0001_00FF),
+            (7, 0x0101_0001),
             (8, 0),
             (8, 5),
-            (9, 1),
+            (9, 0),
+            (9, 0x0101),
+            (10, 1),
         ] {
             let check = check_word(&[MAGIC, request, argument]);
             let cell = WarmStart { magic: MAGIC, request, argument, check };

@@ -5,7 +5,7 @@ use canopen::program::{FlashError, ProgramControl};
 use canopen::AbortCode;
 use shared_abi::warm_start::BootRequest;
 
-use super::{find, Downloader, Program, NOWHERE};
+use super::{find, Downloader};
 use crate::policy::Erase;
 use crate::refusal::Refusal;
 use crate::session::Session;
@@ -53,28 +53,30 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             return Err(state.refuse(Refusal::untimely(FlashError::NoAccess)));
         }
         state.error = None;
-        state.streamed = false;
+        let fresh = core::mem::take(&mut state.streamed);
         let record = state.record.filter(|_| !data);
         match (command, record) {
             (Clear, _) => {
+                let region = state.region;
                 let again = matches!(state.session, Session::Cleared { just: true });
+                // Before the transfer is broken off, which fails a session that is open.
                 state.session = Session::Cleared { just: true };
-                self.transfer = None;
                 // A sector that is still being erased for the old download is waited for.
-                let at_once = (again || self.policy.erase == Erase::AtOnce) && !busy;
-                self.programmer.select(program);
+                let at_once = (again || (self.policy.erase)(program) == Erase::AtOnce) && !busy;
+                self.download_cancel();
                 self.programmer.abort();
                 if at_once {
-                    self.programmer.erase_all(program, self.layout.program(program).unwrap_or(NOWHERE));
+                    self.programmer.erase_all(program, region);
                 }
             }
-            (Start, Some(record)) => self.boot_request = Some(start_request(program, record)),
+            (Start, Some(_)) if fresh => self.boot_request = Some(BootRequest::Fresh(program)),
+            (Start, Some(record)) => self.boot_request = Some(start_request(program, record.signed)),
             (SetSignature | ClrSignature, Some(record)) => {
                 // Also where it is so already: after a power cut it may read so now and otherwise
                 // later.
                 let signed = command == SetSignature;
                 let record = ProgramRecord { signed, ..record };
-                self.programmer.record(&mut self.parameters, program, record);
+                self.programmer.record(&mut self.parameters, program, record, false);
             }
             (Start | SetSignature, None) => state.error = Some(FlashError::NoValidProgram),
             (Stop | StartBootloader | ResetStat | ClrSignature, _) => {}
@@ -88,7 +90,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let Some(record) = self.program(program).and_then(|state| state.record) else { return };
         if !record.confirmed && !self.busy() {
             let record = ProgramRecord { confirmed: true, ..record };
-            self.programmer.confirm(&mut self.parameters, program, record);
+            self.programmer.record(&mut self.parameters, program, record, true);
         }
     }
 
@@ -104,13 +106,6 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             return Err(state.refuse(Refusal::untimely(FlashError::Busy)));
         }
         self.download_cancel();
-        let other = self.programmer.program().filter(|of| *of != program).unwrap_or(0);
-        if let Some(Program { session: session @ Session::Open { .. }, .. }) = find(&mut self.programs, other)
-        {
-            *session = Session::Failed;
-        }
-        self.programmer.abort();
-        self.programmer.select(program);
         self.programmer.abort();
         if let Some(state) = find(&mut self.programs, program) {
             state.locked = false;
@@ -126,8 +121,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
 }
 
 /// The request that starts a program; unsigned, on trial.
-pub(super) fn start_request(program: u8, record: ProgramRecord) -> BootRequest {
-    if record.signed {
+fn start_request(program: u8, signed: bool) -> BootRequest {
+    if signed {
         BootRequest::Start(program)
     } else {
         BootRequest::Trial(program)

@@ -30,7 +30,6 @@ use crate::programmer::{Event, Programmer};
 use crate::refusal::Refusal;
 use crate::session::Session;
 use crate::store::{NodeParameters, Parameters, ProgramRecord};
-use commands::start_request;
 
 pub use crate::policy::{Erase, Policy, Verdict};
 pub use crate::programmer::Step;
@@ -38,6 +37,8 @@ pub use crate::programmer::Step;
 /// One program as the objects 1F50h–1F57h show it.
 #[derive(Clone, Copy, Debug)]
 struct Program {
+    /// Its flash.
+    region: Region,
     /// What the store holds; kept here because the flash cannot be read while it is busy.
     record: Option<ProgramRecord>,
     /// 1F56h: the CRC that was computed last, or the stored one.
@@ -67,7 +68,7 @@ pub struct Downloader<'b, P, const PROGRAMS: usize> {
     policy: &'static Policy,
     parameters: P,
     programs: [Program; PROGRAMS],
-    programmer: Programmer<'b, PROGRAMS>,
+    programmer: Programmer<'b>,
     transfer: Option<Transfer>,
     /// The abort for a client that goes on sending when the flash has failed.
     fault: AbortCode,
@@ -94,6 +95,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             number += 1;
             let record = ProgramRecord::load(&parameters, flash, number);
             Program {
+                region: layout.program(number).unwrap_or(Region::new(0, 0)),
                 record,
                 identification: record.map_or(0, |record| record.crc),
                 error: None,
@@ -172,6 +174,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// Whether a program was sent completely, or a command acknowledged, and it is not carried
     /// through yet: a reset now would take that back.
     #[must_use]
+    #[inline(never)]
     pub fn is_finishing(&self) -> bool {
         self.programmer.finishing().is_some() || self.programmer.is_storing()
     }
@@ -210,13 +213,20 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         if state.locked || self.busy() {
             return Err(AbortCode::DEVICE_STATE);
         }
-        self.installed(program).map(|(place, _)| place).ok_or(AbortCode::NO_DATA)
+        match self.installed(program) {
+            (Region { size: 0, .. }, _) => Err(AbortCode::NO_DATA),
+            (place, _) => Ok(place),
+        }
     }
 
-    /// Where a program is stored, and its CRC.
-    pub(crate) fn installed(&self, program: u8) -> Option<(Region, u32)> {
-        let record = self.program(program)?.record?;
-        Some((Region::new(self.region(program).base, record.size), record.crc))
+    /// Where a program is stored, and its CRC; no bytes for none.
+    pub(crate) fn installed(&self, program: u8) -> (Region, u32) {
+        match self.program(program) {
+            Some(Program { region, record: Some(record), .. }) => {
+                (Region::new(region.base, record.size), record.crc)
+            }
+            _ => (Region::new(0, 0), 0),
+        }
     }
 
     /// Carries the work on.
@@ -237,7 +247,6 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     self.end(program, Ok(()));
                 }
             }
-            Some(Event::Erased(program)) => self.end(program, Ok(())),
             Some(Event::Written { program, expected, crc }) => {
                 if let Some(state) = find(&mut self.programs, program) {
                     state.identification = crc;
@@ -247,8 +256,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     Ok(version) => {
                         let signed = expected.crc.is_none() && self.policy.valid_without_signature;
                         let size = expected.size;
-                        let record = ProgramRecord { size, crc, signed, confirmed: false, version };
-                        self.programmer.record(&mut self.parameters, program, record);
+                        let half_erased = self.programmer.is_half_erased();
+                        let record =
+                            ProgramRecord { size, crc, signed, confirmed: false, version, half_erased };
+                        self.programmer.record(&mut self.parameters, program, record, false);
                     }
                     Err(error) => self.end(program, Err(error)),
                 }
@@ -269,8 +280,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         expected: &Expected,
         crc: u32,
     ) -> Result<u32, FlashError> {
-        let region = self.region(program);
         let Some(state) = self.program(program) else { return Err(FlashError::Unspecified) };
+        let region = state.region;
         if self.policy.data == Some(program) {
             return Ok(state.version);
         }
@@ -290,6 +301,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             layout: self.layout,
             policy: self.policy,
             program,
+            region,
             session: state.session,
             installed: false,
         };
@@ -311,8 +323,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             if !matches!(state.session, Session::Idle) {
                 state.session = Session::Failed;
             }
-        } else if let (true, Some(record)) = (start, state.record) {
-            self.boot_request = Some(start_request(program, record));
+        } else if start && state.record.is_some() {
+            self.boot_request = Some(BootRequest::Fresh(program));
         }
         self.outcome = Some((program, outcome));
     }
@@ -324,21 +336,33 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
 
     /// A program, if there is one of this number.
     fn program(&self, program: u8) -> Option<&Program> {
-        self.programs.get(usize::from(program).checked_sub(1)?)
-    }
-
-    fn region(&self, program: u8) -> Region {
-        self.layout.program(program).unwrap_or(NOWHERE)
+        if PROGRAMS == 1 {
+            self.programs.first().filter(|_| program == 1)
+        } else {
+            one_of_many(&self.programs, program)
+        }
     }
 }
 
 /// A program, if there is one of this number.
-fn find(programs: &mut [Program], number: u8) -> Option<&mut Program> {
-    programs.get_mut(usize::from(number).wrapping_sub(1))
+fn find<const PROGRAMS: usize>(programs: &mut [Program; PROGRAMS], number: u8) -> Option<&mut Program> {
+    // To look at one is shorter than a call; to compute the place of one of many is not.
+    if PROGRAMS == 1 {
+        programs.first_mut().filter(|_| number == 1)
+    } else {
+        find_of_many(programs, number)
+    }
 }
 
-/// The place of a program that is none of the layout's.
-const NOWHERE: Region = Region::new(0, 0);
+#[inline(never)]
+fn one_of_many(programs: &[Program], number: u8) -> Option<&Program> {
+    programs.get(usize::from(number).wrapping_sub(1))
+}
+
+#[inline(never)]
+fn find_of_many(programs: &mut [Program], number: u8) -> Option<&mut Program> {
+    programs.get_mut(usize::from(number).wrapping_sub(1))
+}
 
 impl Program {
     /// Shows why something was refused. The error that ended a session stays to be seen.

@@ -4,7 +4,7 @@ use canopen::program::FlashError;
 use canopen::AbortCode;
 use shared_abi::block_file::FRAMING;
 
-use super::{find, Downloader, Transfer, NOWHERE};
+use super::{find, Downloader, Transfer};
 use crate::intake::{Destination, Intake, Judge, Progress};
 use crate::refusal::Refusal;
 use crate::session::Session;
@@ -19,6 +19,14 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         self.download_cancel();
         let room = self.has_room();
         let Some(state) = find(&mut self.programs, program) else { return Err(AbortCode::NO_SUB_INDEX) };
+        if PROGRAMS > 1
+            && matches!(state.session, Session::Open { .. })
+            && self.programmer.program() != Some(program)
+        {
+            // The programmer knows how far the flash is of one program at a time. The download of
+            // another one that began meanwhile has ended this one.
+            state.session = Session::Failed;
+        }
         let others = self.programmer.is_busy() && self.programmer.program().is_some_and(|of| of != program);
         let refusal = if self.boot_request.is_some() || others || !self.programmer.is_abortable() || !room {
             Some(Refusal::untimely(FlashError::Busy))
@@ -38,7 +46,6 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             *just = false;
         }
         state.streamed = false;
-        self.programmer.select(program);
         self.transfer = Some(Transfer { program, intake: Intake::new(size) });
         Ok(())
     }
@@ -46,6 +53,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// Bytes that [`download_data`](Self::download_data) takes at present. `held` for a client whose
     /// answer is already being held back, which may use a reserve.
     #[must_use]
+    #[inline(never)]
     pub fn space(&self, held: bool) -> usize {
         let room = |transfer: &Transfer| transfer.intake.room(self.programmer.queue(), held);
         self.transfer.as_ref().map_or(usize::MAX, room)
@@ -95,6 +103,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             layout: self.layout,
             policy: self.policy,
             program,
+            region: state.region,
             session: state.session,
             installed: state.record.is_some(),
         };
@@ -133,8 +142,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             state.version = begin.version;
             // A sequence of blocks that begins anew goes on over what is there.
             if !matches!(state.session, Session::Open { .. }) {
-                let region = self.layout.program(program).unwrap_or(NOWHERE);
-                self.programmer.open(program, region, state.session.erases(self.policy), begin.size);
+                self.programmer.open(program, state.region, state.session.erases(self.policy), begin.size);
             }
             state.session = Session::Open { next: 1 };
         }

@@ -7,7 +7,8 @@
 use canopen::program::FlashError;
 use canopen::AbortCode;
 use shared_abi::block_file::{
-    Control, Header, Last, CONTROL_MAX, FRAMING, HEADER_SIZE, MAX_BLOCK_SIZE, NUMBER_CONTROL, NUMBER_LAST,
+    Control, Header, Last, FRAMING, HEADER_SIZE, LAST_SIZE, LAST_SIZE_2008, MAX_BLOCK_SIZE, NUMBER_CONTROL,
+    NUMBER_LAST,
 };
 use shared_abi::geometry::Region;
 
@@ -26,7 +27,9 @@ pub(super) struct BlockFile {
     /// Known when its bytes are there; zeros before.
     header: Header,
     /// The first bytes: the header, and all data of the first and of the last block.
-    start: [u8; HEADER_SIZE + CONTROL_MAX],
+    start: [u8; HEADER_SIZE + LAST_SIZE_2008],
+    /// Bytes that the client announced.
+    announced: Option<u32>,
     /// The last four bytes behind the data: the CRC as the block tells it.
     told: u32,
     /// Over what came of header and data.
@@ -49,7 +52,8 @@ impl Format for BlockFile {
         Recognition::Yes(Self {
             len: 0,
             header: Header { number: 0, flash_address: 0, size: 0 },
-            start: [0; HEADER_SIZE + CONTROL_MAX],
+            start: [0; HEADER_SIZE + LAST_SIZE_2008],
+            announced: None,
             told: 0,
             crc: 0,
         })
@@ -59,6 +63,7 @@ impl Format for BlockFile {
         if size.is_some_and(|size| size as usize > largest(queue)) {
             return Err(TOO_LONG);
         }
+        self.announced = size;
         Ok(())
     }
 
@@ -97,7 +102,7 @@ impl Format for BlockFile {
                 if last.program_size < SMALLEST_PROGRAM {
                     return Err(malformed);
                 }
-                if last.program_size > to.judge.region().size {
+                if last.program_size > to.judge.region.size {
                     return Err(Refusal::unfit(FlashError::Address));
                 }
                 to.progress.complete =
@@ -133,6 +138,13 @@ impl BlockFile {
         match self.start.first_chunk() {
             Some(header) if self.len == HEADER_SIZE => {
                 self.header = Header::parse(header);
+                if self.header.number == NUMBER_LAST
+                    && self.header.size == LAST_SIZE as u32
+                    && self.announced == Some((FRAMING + LAST_SIZE_2008) as u32)
+                {
+                    // The manual of 2008 does not count the reserved bytes.
+                    self.header.size = LAST_SIZE_2008 as u32;
+                }
                 judge_header(self.header, to)
             }
             _ => Ok(()),

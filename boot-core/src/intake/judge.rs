@@ -20,6 +20,8 @@ pub(crate) struct Judge<'a> {
     pub policy: &'a Policy,
     /// The program, 1 to 254.
     pub program: u8,
+    /// The program's flash.
+    pub region: Region,
     /// How far its download is.
     pub session: Session,
     /// Whether there is a program.
@@ -27,12 +29,8 @@ pub(crate) struct Judge<'a> {
 }
 
 impl Judge<'_> {
-    /// The program's flash.
-    pub(crate) fn region(&self) -> Region {
-        self.layout.program(self.program).unwrap_or(Region::new(0, 0))
-    }
-
     /// Whether the program is none, but data of the application.
+    #[inline(never)]
     pub(crate) fn is_data(&self) -> bool {
         self.policy.data == Some(self.program)
     }
@@ -58,7 +56,7 @@ impl Judge<'_> {
 
     /// Whether data of this program may go there.
     pub(crate) fn check_place(&self, place: Region) -> Result<(), Refusal> {
-        if self.region().contains(place.base, place.size) {
+        if self.region.contains(place.base, place.size) {
             return Ok(());
         }
         let secured = [self.layout.bootloader, self.layout.parameters[0], self.layout.parameters[1]];
@@ -72,7 +70,7 @@ impl Judge<'_> {
 
     /// Whether the first two vectors are those of a program at this place.
     pub(crate) fn check_vectors(&self, words: [u32; 2]) -> Result<(), Refusal> {
-        VectorTable::check(words, self.region(), self.layout)
+        VectorTable::check(words, self.region, self.layout)
             .map(drop)
             .map_err(|_| Refusal::unfit(FlashError::Format))
     }

@@ -32,7 +32,7 @@ impl Format for Raw {
         if judge.has_begun() {
             return judge.may_begin();
         }
-        if size > judge.region().size {
+        if size > judge.region.size {
             return Err(Refusal(FlashError::Address, AbortCode::LENGTH_TOO_HIGH));
         }
         self.0.set_size(size);

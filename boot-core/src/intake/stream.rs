@@ -40,7 +40,7 @@ pub(super) struct Stream {
 
 impl Stream {
     pub(super) fn new(judge: &Judge<'_>) -> Self {
-        let base = judge.region().base;
+        let base = judge.region.base;
         Self { next: base, end: base, size: 0 }
     }
 
@@ -85,7 +85,7 @@ impl Stream {
 
     /// All is sent.
     pub(super) fn end(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
-        let size = self.end - to.judge.region().base;
+        let size = self.end - to.judge.region.base;
         if size < if to.judge.is_data() { 1 } else { SMALLEST_PROGRAM } {
             return Err(Refusal::unfit(FlashError::Format));
         }
@@ -107,7 +107,7 @@ impl Stream {
 /// Judges the first piece, where it is the start of the program. A HEX file may begin anywhere; its
 /// vectors and its label are then looked at when all is in flash.
 fn judge_start(to: &Destination<'_, '_>) -> Result<(), Refusal> {
-    if to.judge.is_data() || to.queue.open_address() != to.judge.region().base {
+    if to.judge.is_data() || to.queue.open_address() != to.judge.region.base {
         return Ok(());
     }
     let mut vectors = [0; 8];

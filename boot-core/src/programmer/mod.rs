@@ -22,7 +22,7 @@ use crate::crc::CrcKind;
 use crate::flash::{Flash, FlashFault, Next, Operation};
 use crate::program::{Expected, FlashCrc};
 use crate::queue::Queue;
-use crate::store::{Key, NodeParameters, Parameters, ProgramRecord};
+use crate::store::{Key, NodeParameters, Parameters, ProgramRecord, Value};
 use write::WritePiece;
 
 /// What came of a step.
@@ -38,12 +38,14 @@ pub enum Step {
     Again,
 }
 
+/// Bytes that are looked at in one step for whether they are erased; each sector has a multiple of it.
+/// A CRC over as many takes about as long.
+const BLANK_STEP: u32 = 1024;
+
 /// A piece of work that is over.
 pub(crate) enum Event {
     /// The record of a program is stored, or gone; whether that ends a piece of work.
     Stored { program: u8, ends: bool },
-    /// All of a program's flash is erased, as [`Programmer::erase_all`] was told to.
-    Erased(u8),
     /// A program was written completely; its CRC over flash.
     Written { program: u8, expected: Expected, crc: u32 },
     /// Node-ID and bit rate are stored, or not.
@@ -52,9 +54,10 @@ pub(crate) enum Event {
     Failed { program: u8, error: FlashError, erasing: bool },
 }
 
-/// How far the flash of a program is.
+/// The program whose pieces are taken, and how far its flash is.
 #[derive(Clone, Copy, Debug)]
 struct Target {
+    program: u8,
     region: Region,
     /// Up to here the flash is erased.
     erased: u32,
@@ -62,6 +65,8 @@ struct Target {
     ahead: u32,
     /// All of it is being erased for a command.
     clearing: bool,
+    /// See [`ProgramRecord::half_erased`]; without what is being done now.
+    half_erased: bool,
     /// To be verified when the queue is empty.
     expected: Option<Expected>,
 }
@@ -70,7 +75,8 @@ struct Target {
 enum Job {
     /// A value is on its way into the store; the program that it is about.
     Store(Change, u8),
-    /// A sector, until its erasure was started, and its end.
+    /// A sector, until its erasure was started, and its end; or none, and how far the flash was looked
+    /// at and found to be erased.
     Erase { sector: Option<Sector>, until: u32 },
     /// The piece at the front of the queue.
     Write(WritePiece),
@@ -92,13 +98,11 @@ enum Change {
 }
 
 /// The flash half. It starts operations and polls them, and never waits for one.
-pub(crate) struct Programmer<'b, const PROGRAMS: usize> {
+pub(crate) struct Programmer<'b> {
     queue: Queue<'b>,
     crc_kind: CrcKind,
     crc_step: u32,
-    targets: [Option<Target>; PROGRAMS],
-    /// Whose pieces are in the queue; 0 for nobody's.
-    current: u8,
+    target: Option<Target>,
     /// Bit n: the record of program n + 1 has to go before anything is erased or written.
     voids: u32,
     job: Option<Job>,
@@ -106,7 +110,7 @@ pub(crate) struct Programmer<'b, const PROGRAMS: usize> {
     running: Option<Step>,
 }
 
-impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
+impl<'b> Programmer<'b> {
     /// The larger `buffer`, the further the flash may lag behind the bus. One step of a CRC covers
     /// `crc_step` bytes.
     pub(crate) fn new(buffer: &'b mut [u8], crc_kind: CrcKind, crc_step: u32) -> Self {
@@ -114,8 +118,7 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
             queue: Queue::new(buffer),
             crc_kind,
             crc_step,
-            targets: [None; PROGRAMS],
-            current: 0,
+            target: None,
             voids: 0,
             job: None,
             running: None,
@@ -136,60 +139,55 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
         &mut self.queue
     }
 
-    /// Pieces of this program will come. `erase`: its record goes and its sectors are erased, those
-    /// of the first `size` bytes before there are data for them; otherwise each piece has to find
-    /// its place blank.
+    /// Pieces of this program will come, and of no other. `erase`: its record goes and its sectors
+    /// are erased, those of the first `size` bytes before there are data for them; otherwise each
+    /// piece has to find its place blank.
     pub(crate) fn open(&mut self, program: u8, region: Region, erase: bool, size: u32) {
+        self.void(program);
         let (erased, ahead) = if erase {
-            self.void(program);
             (region.base, region.base + size.min(region.size))
         } else {
             (region.end(), region.end())
         };
-        self.select(program);
-        if let Some(target) = self.targets.get_mut(usize::from(program).wrapping_sub(1)) {
-            *target = Some(Target { region, erased, ahead, clearing: false, expected: None });
-        }
+        let (clearing, half_erased, expected) = (false, false, None);
+        self.target = Some(Target { program, region, erased, ahead, clearing, half_erased, expected });
     }
 
-    /// The next pieces are of this program. Nothing may be left to do for another one.
-    pub(crate) fn select(&mut self, program: u8) {
-        self.current = program;
-    }
-
-    /// The record of a program goes, then all its sectors are erased.
+    /// The record of a program goes, then all its sectors are erased that are not.
     pub(crate) fn erase_all(&mut self, program: u8, region: Region) {
         self.open(program, region, true, region.size);
-        if let Some(target) = self.target_mut() {
+        if let Some(target) = &mut self.target {
             target.clearing = true;
         }
     }
 
-    /// The record of a program goes.
+    /// The record of a program goes. That of the target says that it is half erased, until the work on
+    /// it has come to its end.
     pub(crate) fn void(&mut self, program: u8) {
         self.voids |= 1 << program.saturating_sub(1);
     }
 
     /// The program was sent completely.
     pub(crate) fn complete(&mut self, expected: Expected) {
-        if let Some(target) = self.target_mut() {
+        if let Some(target) = &mut self.target {
             target.expected = Some(expected);
             // What no piece has written belongs to the program all the same, and reads FFh.
             target.ahead = target.ahead.max(target.region.base + expected.size);
         }
     }
 
-    /// The record of a program becomes this.
-    pub(crate) fn record(&mut self, parameters: &mut impl Parameters, program: u8, record: ProgramRecord) {
-        parameters.store(Key::Program(program), record.value());
-        self.job = Some(Job::Store(Change::Record, program));
-    }
-
-    /// The record of a program becomes this one, which says that it is confirmed. Other work is
-    /// accepted meanwhile. Nothing may be on its way into the store.
-    pub(crate) fn confirm(&mut self, parameters: &mut impl Parameters, program: u8, record: ProgramRecord) {
-        parameters.store(Key::Program(program), record.value());
-        self.job = Some(Job::Store(Change::Confirm, program));
+    /// The record of a program becomes this. `confirms`: it says so of a program that brought the
+    /// device back; nobody waits for it, and other work is accepted meanwhile. Nothing may be on its
+    /// way into the store.
+    pub(crate) fn record(
+        &mut self,
+        parameters: &mut impl Parameters,
+        program: u8,
+        record: ProgramRecord,
+        confirms: bool,
+    ) {
+        let change = if confirms { Change::Confirm } else { Change::Record };
+        self.job = Some(store(parameters, change, program, record.value()));
     }
 
     /// Node-ID and bit rate become these.
@@ -201,26 +199,20 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
     /// What was received is not wanted any more. What is on its way into the store goes on.
     pub(crate) fn abort(&mut self) {
         self.queue.clear();
-        if let Some(target) = self.targets.get_mut(usize::from(self.current).wrapping_sub(1)) {
-            *target = None;
-        }
-        self.current = 0;
+        self.target = None;
         if !self.is_storing() {
             self.job = None;
         }
     }
 
+    /// [`ProgramRecord::half_erased`] of a program that has just been written.
+    pub(crate) fn is_half_erased(&self) -> bool {
+        self.target.as_ref().is_none_or(|target| target.half_erased)
+    }
+
     /// The program whose pieces are taken.
     pub(crate) fn program(&self) -> Option<u8> {
-        (self.current > 0).then_some(self.current)
-    }
-
-    fn target(&self) -> Option<&Target> {
-        self.targets.get(usize::from(self.current).wrapping_sub(1))?.as_ref()
-    }
-
-    fn target_mut(&mut self) -> Option<&mut Target> {
-        self.targets.get_mut(usize::from(self.current).wrapping_sub(1))?.as_mut()
+        self.target.map(|target| target.program)
     }
 
     /// Whether there is work for [`step`](Self::step). The flash cannot be read meanwhile.
@@ -239,20 +231,22 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
         (self.job.is_some() || self.running.is_some()) && !confirming
             || self.voids != 0
             || !self.queue.is_empty()
-            || self.target().is_some_and(|target| target.expected.is_some() || target.erased < target.ahead)
+            || self.target.as_ref().is_some_and(|target| {
+                target.clearing || target.expected.is_some() || target.erased < target.ahead
+            })
     }
 
     /// Whether it works on a command or on the end of a program, so that no further block of that
-    /// program can be taken.
+    /// program can be taken; or for nobody any more, so that no command can.
     pub(crate) fn is_busy_with(&self, program: u8) -> bool {
-        let current = self.current == program;
+        let current = self.program() == Some(program);
         let ending = match self.job {
             Some(Job::Store(Change::Record, of)) => of == program,
             Some(Job::Verify { .. }) => current,
             _ => false,
         };
         let waiting = |target: &Target| target.clearing || target.expected.is_some() || !self.has_room();
-        ending || current && self.target().is_some_and(waiting)
+        ending || self.target.as_ref().map_or(self.has_work(), |target| current && waiting(target))
     }
 
     /// The program that was sent completely, or whose record is being stored: what its host was
@@ -261,13 +255,15 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
         match self.job {
             Some(Job::Store(Change::Record, of)) => Some(of),
             Some(Job::Verify { .. }) => self.program(),
-            _ => self.program().filter(|_| self.target().is_some_and(|target| target.expected.is_some())),
+            _ => self
+                .program()
+                .filter(|_| self.target.as_ref().is_some_and(|target| target.expected.is_some())),
         }
     }
 
     /// Whether [`abort`](Self::abort) takes nothing back that a host was told is done.
     pub(crate) fn is_abortable(&self) -> bool {
-        let clearing = self.target().is_some_and(|target| target.clearing);
+        let clearing = self.target.as_ref().is_some_and(|target| target.clearing);
         !clearing && self.finishing().is_none() && !self.is_storing_node()
     }
 
@@ -278,6 +274,7 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
 
     /// Whether the queue takes a block of the largest size. (One that is not even as large takes
     /// one at a time.)
+    #[inline(never)]
     pub(crate) fn has_room(&self) -> bool {
         self.queue.is_empty() || self.queue.free() >= MAX_BLOCK_SIZE
     }
@@ -369,7 +366,7 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
                     Err(_) if change == Change::Confirm => None,
                     Err(error) => {
                         // A record that does not go protects its data: nothing of them is touched.
-                        if self.current == program {
+                        if self.program() == Some(program) {
                             self.abort();
                         }
                         Some(Event::Failed { program, error, erasing: false })
@@ -378,14 +375,8 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
             }
             (job, Err(error)) => self.fail(error, matches!(job, Job::Erase { .. })),
             (Job::Erase { until, .. }, Ok(())) => {
-                let program = self.current;
-                let target = self.target_mut()?;
-                target.erased = until;
-                if !target.clearing || until < target.ahead {
-                    return None;
-                }
-                target.clearing = false;
-                Some(Event::Erased(program))
+                self.target.as_mut()?.erased = until;
+                None
             }
             (Job::Write(_), Ok(())) => {
                 self.queue.pop();
@@ -397,6 +388,8 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
         }
     }
 
+    // A call is shorter: three ways lead here.
+    #[inline(never)]
     fn fail(&mut self, error: FlashError, erasing: bool) -> Option<Event> {
         let program = self.program()?;
         self.abort();
@@ -411,15 +404,25 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
     ) -> Result<Option<Job>, FlashError> {
         if self.voids != 0 {
             let program = self.voids.trailing_zeros() as u8 + 1;
-            parameters.store(Key::Program(program), ProgramRecord::NONE);
-            return Ok(Some(Job::Store(Change::Void, program)));
+            let mut half_erased = ProgramRecord::load_half_erased(parameters, flash, program);
+            if let Some(target) = self.target.as_mut().filter(|target| target.program == program) {
+                target.half_erased = core::mem::replace(&mut half_erased, true);
+            }
+            return Ok(Some(store(parameters, Change::Void, program, ProgramRecord::none(half_erased))));
         }
         let piece = self.queue.first();
-        let Some(target) = self.target_mut() else { return Ok(None) };
+        let Some(target) = &mut self.target else { return Ok(None) };
         let needed = piece.map_or(target.ahead, |piece| piece.address + piece.size);
         if target.erased < needed {
             let sector = flash.sector_at(target.erased).ok_or(FlashError::Address)?;
+            let piece = Region::new(target.erased, BLANK_STEP);
+            if target.clearing && !target.half_erased && flash.is_blank(piece) {
+                return Ok(Some(Job::Erase { sector: None, until: piece.end() }));
+            }
             return Ok(Some(Job::Erase { sector: Some(sector), until: sector.region.end() }));
+        }
+        if core::mem::take(&mut target.clearing) {
+            return Ok(Some(store(parameters, Change::Record, target.program, ProgramRecord::none(false))));
         }
         if let Some(piece) = piece {
             let write = WritePiece::new(flash, piece).ok_or(FlashError::NotCleared)?;
@@ -430,4 +433,10 @@ impl<'b, const PROGRAMS: usize> Programmer<'b, PROGRAMS> {
             Job::Verify { expected, crc }
         }))
     }
+}
+
+/// A value of a program is on its way into the store from now on.
+fn store(parameters: &mut impl Parameters, change: Change, program: u8, value: Value) -> Job {
+    parameters.store(Key::Program(program), value);
+    Job::Store(change, program)
 }

@@ -17,6 +17,9 @@ pub struct ProgramRecord {
     pub confirmed: bool,
     /// The version that its control block told, 0 for none.
     pub version: u32,
+    /// Since all of the program's flash was last erased, work on it was begun that did not come to its
+    /// end: a sector that reads as erased may be so badly.
+    pub half_erased: bool,
 }
 
 /// The words of the two flags: signed or not, confirmed or not. Magic numbers, so that few wrong
@@ -25,24 +28,37 @@ const SIGNED: u32 = u32::from_le_bytes(*b"APP1");
 const CONFIRMED: u32 = u32::from_le_bytes(*b"RUN0");
 const SIGNED_CONFIRMED: u32 = u32::from_le_bytes(*b"RUN1");
 
+/// In the first word of the stored form, above the size: [`half_erased`](ProgramRecord::half_erased).
+const HALF_ERASED: u32 = 1 << 31;
+
 impl ProgramRecord {
     /// The stored form of "no program".
-    pub const NONE: Value = [0; 4];
+    #[must_use]
+    pub const fn none(half_erased: bool) -> Value {
+        [if half_erased { HALF_ERASED } else { 0 }, 0, 0, 0]
+    }
+
+    /// [`half_erased`](Self::half_erased), whether or not there is a program.
+    pub fn load_half_erased<F: Flash>(parameters: &impl Parameters, flash: &F, number: u8) -> bool {
+        parameters.get(flash, Key::Program(number)).is_some_and(|[first, ..]| first & HALF_ERASED != 0)
+    }
 
     /// From the store; `None` where there is no program.
     pub fn load<F: Flash>(parameters: &impl Parameters, flash: &F, number: u8) -> Option<Self> {
         Self::from_value(parameters.get(flash, Key::Program(number))?)
     }
 
-    /// From its stored form; `None` for [`NONE`](Self::NONE).
+    /// From its stored form; `None` for [`none`](Self::none).
     #[must_use]
-    pub const fn from_value([size, crc, flags, version]: Value) -> Option<Self> {
+    pub const fn from_value([first, crc, flags, version]: Value) -> Option<Self> {
+        let half_erased = first & HALF_ERASED != 0;
+        let size = first & !HALF_ERASED;
         if size == 0 {
             return None;
         }
         let signed = flags == SIGNED || flags == SIGNED_CONFIRMED;
         let confirmed = flags == CONFIRMED || flags == SIGNED_CONFIRMED;
-        Some(Self { size, crc, signed, confirmed, version })
+        Some(Self { size, crc, signed, confirmed, version, half_erased })
     }
 
     /// The stored form.
@@ -54,6 +70,6 @@ impl ProgramRecord {
             (false, true) => CONFIRMED,
             (true, true) => SIGNED_CONFIRMED,
         };
-        [self.size, self.crc, flags, self.version]
+        [self.size | Self::none(self.half_erased)[0], self.crc, flags, self.version]
     }
 }

@@ -38,6 +38,7 @@ pub const CONFIG: Config = Config {
     layout: LAYOUT_REF,
     supports: |rate| rate != BitRate::K800,
     boot_up_emergency: false,
+    lss_store: true,
     download: Policy::DEFAULT,
     password: b"",
 };

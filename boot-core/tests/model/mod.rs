@@ -88,6 +88,8 @@ pub struct ModelFlash {
     pub weak: Option<(u32, u64)>,
     /// Every region that was written to or erased.
     pub touched: Vec<Region>,
+    /// Bytes that were read.
+    pub bytes_read: Cell<usize>,
 }
 
 impl ModelFlash {
@@ -104,6 +106,7 @@ impl ModelFlash {
             fail: None,
             weak: None,
             touched: Vec::new(),
+            bytes_read: Cell::new(0),
         }
     }
 
@@ -237,6 +240,7 @@ fn splitmix64(state: &mut u64) -> u64 {
 impl Flash for ModelFlash {
     fn read(&self, address: u32, buffer: &mut [u8]) {
         assert!(self.running.is_none(), "flash was read while it is busy: on the chip the core stalls");
+        self.bytes_read.set(self.bytes_read.get() + buffer.len());
         for (i, byte) in buffer.iter_mut().enumerate() {
             let address = address.wrapping_add(i as u32);
             let inside = self.chip.flash.contains(address, 1);

@@ -75,14 +75,17 @@ const fn config(profile: &Profile, layout: &'static Layout, entries: &'static [E
         layout,
         supports: |_| true,
         boot_up_emergency: false,
+        lss_store: true,
         download: Policy { identity: Some((VENDOR_ID, PRODUCT_CODE)), ..profile.download },
         password: profile.password,
     }
 }
 
 /// The standard profile whose CLEAR erases at once.
-const AT_ONCE: Profile =
-    Profile { download: Policy { erase: Erase::AtOnce, ..Profile::STANDARD.download }, ..Profile::STANDARD };
+const AT_ONCE: Profile = Profile {
+    download: Policy { erase: |_| Erase::AtOnce, ..Profile::STANDARD.download },
+    ..Profile::STANDARD
+};
 
 pub static STANDARD_1: Setup = setup!("STANDARD_1", 1, ONE, Profile::STANDARD);
 pub static STANDARD_2: Setup = setup!("STANDARD_2", 2, TWO, Profile::STANDARD);
