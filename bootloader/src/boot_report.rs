@@ -1,5 +1,7 @@
 //! What the boot stage tells the RAM part of the bootloader.
 
+use shared_abi::warm_start::Owed;
+
 /// Why the bootloader runs, and what is left for it to do.
 #[repr(C)]
 #[derive(Clone, Copy)]
@@ -10,8 +12,12 @@ pub struct BootReport {
     pub held_program: u8,
     /// How long the rescue window is, in ms.
     pub window_ms: u16,
-    /// The program whose CLEAR was asked of the application; 0 for none.
-    pub clear: u8,
+    /// The write of 1F51h that the application has left to be answered here; its node-ID is 0 for none.
+    pub owed: Owed,
     /// The program that has brought the device back to the bootloader; 0 for none.
     pub returned: u8,
+    /// Node-ID in force from this reset on; 255 for none.
+    pub node_id: u8,
+    /// Bit rate in force from this reset on, as the index of CiA 305 table 1.
+    pub bit_rate: u8,
 }

@@ -53,11 +53,11 @@ mod app {
     use boot_core::canopen::lss;
     use boot_core::canopen::node::{self, NmtPolicy};
     use boot_core::canopen::od::{concat, Entry};
-    use boot_core::canopen::program::ProgramControl;
     use boot_core::canopen::sdo::server::Config as SdoConfig;
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
-    use boot_core::canopen::{BitRate, CobId, Frame, Instant};
+    use boot_core::canopen::{BitRate, CobId, Frame, Instant, NodeId};
     use boot_core::control::Step;
+    use boot_core::store::NodeParameters;
     use bsp::can::{Errors, Mode};
     use bsp::clock::Source;
     use bsp::hal::rcc::RccExt;
@@ -65,7 +65,7 @@ mod app {
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
     use rtic::Mutex;
-    use shared_abi::warm_start::{BootRequest, WarmStart};
+    use shared_abi::warm_start::{BootRequest, Owed, WarmStart};
 
     use super::{product, start, Mono};
     use crate::debugger::{self, Debugger};
@@ -105,6 +105,7 @@ mod app {
         layout: LAYOUT,
         supports: product::supports,
         boot_up_emergency: PRODUCT.boot_up_emergency,
+        lss_store: PRODUCT.lss_store,
         download: PRODUCT.download(),
         password: PRODUCT.profile.password,
     };
@@ -122,6 +123,8 @@ mod app {
         slave: Slave,
         debugger: Debugger,
         pending_reset: PendingReset,
+        /// The write of 1F51h that the application has left to be answered here.
+        owed: Owed,
         /// The program that starts at the end of the rescue window, and its length in ms.
         held: Option<(u8, u16)>,
         watchdog: Watchdog,
@@ -148,18 +151,28 @@ mod app {
 
         let parameters = Store::open(cx.local.store);
         let report = start::boot_report();
-        let node = product::node_parameters(&parameters, &flash);
+        let node = NodeParameters {
+            id: NodeId::new(report.node_id),
+            // The boot stage tells one that the controller can be set to.
+            bit_rate: BitRate::from_index(report.bit_rate).unwrap_or(BitRate::Auto),
+        };
         let slave_config = slave::Config {
             node: node::Config {
+                boot_up: PRODUCT.boot_up_message,
                 heartbeat_ms: PRODUCT.heartbeat_ms,
                 nmt: NmtPolicy::StayPreOperational,
                 sdo: SdoConfig {
                     block_upload: PRODUCT.block_upload,
                     unknown_request: PRODUCT.profile.unknown_request,
+                    request_base: PRODUCT.sdo_request_base,
+                    response_base: PRODUCT.sdo_response_base,
                     ..SdoConfig::DEFAULT
                 },
             },
-            lss: if PRODUCT.lss { Some(lss::Config::default()) } else { None },
+            lss: PRODUCT.lss.then_some(lss::Config {
+                start_in_configuration: PRODUCT.lss_start_in_configuration,
+                announce: PRODUCT.lss_announce,
+            }),
         };
         let mut bootloader = Bootloader::new(
             &CONFIG,
@@ -170,10 +183,7 @@ mod app {
             flash,
             cx.local.blocks,
         );
-        if report.clear > 0 {
-            // Acknowledged by the application; what becomes of it is in 1F57h.
-            let _ = bootloader.command(report.clear, ProgramControl::Clear);
-        } else if report.returned > 0 {
+        if report.returned > 0 {
             bootloader.confirm(report.returned);
         }
         let slave = Slave::new(bootloader.lss_address(), bootloader.node_id(), node.bit_rate, slave_config);
@@ -191,6 +201,7 @@ mod app {
                 to_handle,
                 slave,
                 debugger: Debugger::new(),
+                owed: report.owed,
                 held: (report.held_program > 0).then_some((report.held_program, report.window_ms)),
                 pending_reset: PendingReset { wanted: false, request: BootRequest::PowerOn, at: None },
                 watchdog: Watchdog::new(cx.device.IWDG),
@@ -237,14 +248,14 @@ mod app {
     #[task(
         binds = CAN1_TX,
         shared = [can, bootloader],
-        local = [to_handle, slave, debugger, pending_reset, held],
+        local = [to_handle, slave, debugger, pending_reset, owed, held],
         priority = 2
     )]
     fn protocol(cx: protocol::Context) {
         watchdog::check_in(Task::Protocol);
         let now = Instant::from_millis(Mono::now().ticks());
         let protocol::SharedResources { mut can, mut bootloader, .. } = cx.shared;
-        let protocol::LocalResources { to_handle, slave, debugger, pending_reset, held, .. } = cx.local;
+        let protocol::LocalResources { to_handle, slave, debugger, pending_reset, owed, held, .. } = cx.local;
         if let Some(at) = pending_reset.at {
             // A frame that began now would be cut off by the reset.
             if now.has_reached(at) {
@@ -262,7 +273,13 @@ mod app {
             // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests
             // waiting behind it.
             carry_out(slave, &mut can, now, device);
-            while let Some(frame) = to_handle.dequeue() {
+            // What was asked of the application comes first, now that the boot-up is on its way.
+            let Owed { program, value, node_id } = core::mem::replace(owed, Owed::NOTHING);
+            let asked = NodeId::new(node_id).map(|node| {
+                Frame::full(CobId::sdo_request(node), [0x2F, 0x51, 0x1F, program, value, 0, 0, 0])
+            });
+            let mut next = asked.or_else(|| to_handle.dequeue());
+            while let Some(frame) = next {
                 log::received(&frame);
                 // The filters let nothing in but network management and what is for this device, or
                 // for layer setting services.
@@ -273,6 +290,7 @@ mod app {
                     *pending_reset = PendingReset { wanted: true, request: BootRequest::PowerOn, at: None };
                 }
                 carry_out(slave, &mut can, now, device);
+                next = to_handle.dequeue();
             }
             if let Some(request) = bootloader.take_boot_request() {
                 *pending_reset = PendingReset { wanted: true, request, at: None };

@@ -38,6 +38,17 @@ pub struct Product {
     pub rescue_window_confirmed_ms: u16,
     /// Node-IDs with which programs may be started (`BLCOP_MIN_NODEID`, `BLCOP_MAX_NODEID`).
     pub node_ids: RangeInclusive<u8>,
+    /// Bit rates that the device may be set to, as indices of CiA 305 table 1: 0 for 1 Mbit/s to 8
+    /// for 10 kbit/s (`BLCOP_MIN_BAUIDX`, `BLCOP_MAX_BAUIDX`).
+    pub bit_rates: RangeInclusive<u8>,
+    /// Where node-ID and bit rate come from (`TgtGetNodeId`).
+    pub node_source: NodeSource,
+    /// Whether a node says by a boot-up message that it is up (`BLCOP_SEND_BOOTUP`).
+    pub boot_up_message: bool,
+    /// SDO requests come on this COB-ID and the node-ID on top, at most 780h (`BLCOP_BASE_REQUEST`).
+    pub sdo_request_base: u16,
+    /// SDO answers go to this one and the node-ID on top, at most 780h (`BLCOP_BASE_RESPONSE`).
+    pub sdo_response_base: u16,
     /// Whether the device may find out the bit rate by listening, where none is stored or told.
     pub auto_bit_rate: bool,
     /// Whether an emergency follows each boot-up, which tells a master the bootloader from the
@@ -47,6 +58,12 @@ pub struct Product {
     pub heartbeat_ms: u16,
     /// Whether it speaks layer setting services (LSS, CiA 305).
     pub lss: bool,
+    /// Whether it starts in LSS configuration state, for a bus with one device to configure.
+    pub lss_start_in_configuration: bool,
+    /// Whether it says by "non-configured slave" that it has no node-ID.
+    pub lss_announce: bool,
+    /// Whether LSS may store node-ID and bit rate.
+    pub lss_store: bool,
     /// Whether objects can be read by SDO block upload.
     pub block_upload: bool,
     /// Whether vendor-ID and product code of a program have to be the device's
@@ -56,8 +73,12 @@ pub struct Product {
     pub check: fn(program: u8, control: &block_file::Control) -> Verdict,
     /// Whether programs may be changed now.
     pub programming_allowed: fn() -> bool,
-    /// When CLEAR erases.
-    pub erase: Erase,
+    /// When CLEAR of a program erases (`TgtCheckEraseApp`); `None` for what the profile does.
+    pub erase: Option<fn(program: u8) -> Erase>,
+    /// Whether a program that is signed may be started now: a function that looks at a port pin, for
+    /// instance (`TgtCheckAppSig`). It runs in the boot stage, before any peripheral is set up, and
+    /// must leave what it uses as after a reset ([`bsp::inputs`] does).
+    pub start_allowed: fn(program: u8) -> bool,
     /// Which CRC blocks and programs carry (`BLCOP_USE_CRC16`).
     pub crc: CrcKind,
     /// Bytes of flash that one step of a CRC covers, at least 64: the longest that work of the same
@@ -68,8 +89,8 @@ pub struct Product {
     /// some 55 KiB.
     pub block_buffer: usize,
     /// How long a task of the bootloader may be missing before the watchdog resets the chip, in ms,
-    /// 100 to 4000 (`BLCOP_USE_WATCHDOG`).
-    pub watchdog_ms: u16,
+    /// 100 to 4000; `None` for no watchdog (`BLCOP_USE_WATCHDOG`).
+    pub watchdog_ms: Option<u16>,
     /// A program has to feed the independent watchdog within this time, in ms, 1 to 4000, from its
     /// first instruction on; `None` for a program that is started without one.
     pub program_watchdog_ms: Option<u16>,
@@ -87,19 +108,28 @@ impl Product {
         rescue_window_ms: 300,
         rescue_window_confirmed_ms: 0,
         node_ids: 1..=127,
+        bit_rates: 0..=8,
+        node_source: NodeSource::Stored,
+        boot_up_message: true,
+        sdo_request_base: 0x600,
+        sdo_response_base: 0x580,
         auto_bit_rate: true,
         boot_up_emergency: true,
         heartbeat_ms: 1000,
         lss: true,
+        lss_start_in_configuration: false,
+        lss_announce: false,
+        lss_store: true,
         block_upload: true,
         identity_check: true,
         check: |_, _| Verdict::Standard,
         programming_allowed: || true,
-        erase: Erase::WithFirstBlock,
+        erase: None,
+        start_allowed: |_| true,
         crc: CrcKind::Crc32,
         crc_step: 1024,
         block_buffer: 80 * 1024,
-        watchdog_ms: 1000,
+        watchdog_ms: Some(1000),
         program_watchdog_ms: None,
         answer_to_reset_ms: 20,
     };
@@ -123,12 +153,34 @@ impl Product {
                 rescue_window_ms: 0,
                 auto_bit_rate: false,
                 boot_up_emergency: false,
+                watchdog_ms: None,
                 lss: false,
                 block_upload: false,
                 ..standard
             }
+        } else if equal(name, "switches") {
+            // Node-ID and bit rate by the pins of port E, whether a program is valid by PC0, and
+            // nearly everything else as it is not by default.
+            Self {
+                node_source: NodeSource::Function(|| {
+                    let switches = bsp::inputs('E');
+                    ((switches >> 8) as u8 & 0x7F, (switches >> 4) as u8 & 0xF)
+                }),
+                start_allowed: |_| bsp::inputs('C') & 1 != 0,
+                node_ids: 2..=100,
+                bit_rates: 2..=6,
+                boot_up_message: false,
+                boot_up_emergency: false,
+                sdo_request_base: 0x680,
+                sdo_response_base: 0x480,
+                lss_start_in_configuration: true,
+                lss_announce: true,
+                lss_store: false,
+                erase: Some(|_| Erase::AtOnce),
+                ..standard
+            }
         } else {
-            panic!("COBOOT_PRODUCT: it must be paulus, esacademy, lift, crc-16 or least")
+            panic!("COBOOT_PRODUCT: it must be paulus, esacademy, lift, crc-16, least or switches")
         }
     }
 
@@ -162,15 +214,31 @@ impl Product {
                 && *self.node_ids.start() <= *self.node_ids.end(),
             "product: node_ids must be a range within 1 to 127"
         );
+        assert!(
+            *self.bit_rates.end() <= 8 && *self.bit_rates.start() <= *self.bit_rates.end(),
+            "product: bit_rates must be a range within 0 to 8"
+        );
+        let (request, response) = (self.sdo_request_base, self.sdo_response_base);
+        assert!(
+            request >= 0x80 && request <= 0x780 && response >= 0x80 && response <= 0x780,
+            "product: sdo_request_base and sdo_response_base must be 80h to 780h"
+        );
+        assert!(
+            request.abs_diff(response) >= 0x80,
+            "product: sdo_request_base and sdo_response_base must be 80h or more apart"
+        );
+        assert!(
+            request.abs_diff(0x700) >= 0x80 && response.abs_diff(0x700) >= 0x80,
+            "product: the COB-IDs of SDO must not be those of boot-up and heartbeat (700h)"
+        );
         assert!(self.crc_step >= 64, "product: crc_step must be 64 bytes or more");
         assert!(
             self.block_buffer >= 1024 && self.block_buffer < LAYOUT.ram.size as usize,
             "product: block_buffer must be 1024 bytes or more, and fit the RAM"
         );
-        assert!(
-            self.watchdog_ms >= 100 && self.watchdog_ms <= 4000,
-            "product: watchdog_ms must be 100 to 4000"
-        );
+        if let Some(ms) = self.watchdog_ms {
+            assert!(ms >= 100 && ms <= 4000, "product: watchdog_ms must be 100 to 4000");
+        }
         if let Some(ms) = self.program_watchdog_ms {
             assert!(ms >= 1 && ms <= 4000, "product: program_watchdog_ms must be 1 to 4000");
         }
@@ -208,7 +276,10 @@ impl Product {
             },
             check: self.check,
             allowed: self.programming_allowed,
-            erase: self.erase,
+            erase: match self.erase {
+                Some(erase) => erase,
+                None => self.profile.download.erase,
+            },
             crc: self.crc,
             crc_step: self.crc_step,
             ..self.profile.download
@@ -223,8 +294,24 @@ impl Product {
             node_ids: *self.node_ids.start()..=*self.node_ids.end(),
             rescue_window_ms: self.rescue_window_ms,
             rescue_window_confirmed_ms: self.rescue_window_confirmed_ms,
+            start_allowed: self.start_allowed,
         }
     }
+}
+
+/// Where node-ID and bit rate come from.
+#[derive(Clone, Copy, Debug)]
+pub enum NodeSource {
+    /// From the parameters, where layer setting services stored them; the board's, or the profile's,
+    /// until then.
+    Stored,
+    /// The board's, or the profile's, whatever is stored.
+    Constant,
+    /// From a function that reads switches, for instance: the node-ID, and the bit rate as the index
+    /// of CiA 305 table 1. What is no node-ID stands for none (LSS may give one); what is no bit rate
+    /// of this device, for the board's. It runs in the boot stage, before any peripheral is set up,
+    /// and must leave what it uses as after a reset ([`bsp::inputs`] does).
+    Function(fn() -> (u8, u8)),
 }
 
 /// This product.
@@ -272,14 +359,28 @@ pub fn node_parameters<F: Flash>(
 ) -> NodeParameters {
     let default =
         PRODUCT.profile.default_node.map(|(id, bit_rate)| NodeParameters { id: Some(id), bit_rate });
-    NodeParameters::load(parameters, flash, default.unwrap_or(BOARD_NODE), supports)
+    let default = default.unwrap_or(BOARD_NODE);
+    match PRODUCT.node_source {
+        NodeSource::Stored => NodeParameters::load(parameters, flash, default, supports),
+        NodeSource::Constant => default,
+        NodeSource::Function(read) => {
+            let (id, index) = read();
+            let bit_rate = BitRate::from_index(index).filter(|rate| supports(*rate));
+            NodeParameters { id: NodeId::new(id), bit_rate: bit_rate.unwrap_or(default.bit_rate) }
+        }
+    }
 }
 
 /// Whether the board's CAN controller can run at this bit rate.
 pub const fn supports(rate: BitRate) -> bool {
     match rate {
         BitRate::Auto => PRODUCT.auto_bit_rate,
-        rate => TIMINGS[rate as usize].is_some(),
+        rate => {
+            let index = rate as u8;
+            index >= *PRODUCT.bit_rates.start()
+                && index <= *PRODUCT.bit_rates.end()
+                && TIMINGS[index as usize].is_some()
+        }
     }
 }
 

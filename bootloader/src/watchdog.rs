@@ -26,13 +26,15 @@ pub fn check_in(task: Task) {
     CHECKED_IN[task as usize].store(true, Ordering::Relaxed);
 }
 
-/// The watchdog, running.
+/// The watchdog, running if the product has one.
 pub struct Watchdog(pac::IWDG);
 
 impl Watchdog {
     /// Takes it and starts it.
     pub fn new(registers: pac::IWDG) -> Self {
-        watchdog::start(&registers, PRODUCT.watchdog_ms);
+        if let Some(ms) = PRODUCT.watchdog_ms {
+            watchdog::start(&registers, ms);
+        }
         Self(registers)
     }
 

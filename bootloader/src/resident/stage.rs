@@ -4,7 +4,7 @@
 //! the CRC unit and the entry strap was touched, and leaves those to a program as after a reset. The
 //! rest of the bootloader gets the CRC unit switched on, for the services.
 
-use boot_core::canopen::NodeId;
+use boot_core::canopen::{BitRate, NodeId};
 use boot_core::decision::{decide, BootDecision, Circumstances, StayReason};
 use boot_core::program::verify;
 use boot_core::store::Key;
@@ -13,7 +13,7 @@ use bsp::{pac, CLOCK_TREE, LAYOUT};
 use cortex_m::peripheral::SCB;
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
 use shared_abi::ram_image::Header;
-use shared_abi::warm_start::BootRequest;
+use shared_abi::warm_start::{BootRequest, Owed};
 
 use crate::boot_report::BootReport;
 use crate::caches::Caches;
@@ -42,7 +42,7 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
 
     let mut cell = product::warm_start_cell();
     let request = cell.take();
-    let strap = bsp::entry_strap(&rcc);
+    let strap = bsp::entry_strap();
 
     // CRCs and unpacking want speed. Exact it need not be, and the crystal would take its time.
     CLOCK_TREE.speed_up(&rcc, Source::Internal);
@@ -58,8 +58,12 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
     let node_id = node.id.map_or(NO_NODE_ID, NodeId::get);
     // A bootloader that cannot run resumes what would start by itself, at once: a rescue window would
     // need the RAM image, and the strap asks for what is not there.
-    for (request, strap) in [(request, strap), (PRODUCT.autostart.map(BootRequest::Resume), false)] {
-        let circumstances = Circumstances { request, strap, crash_resets, node_id };
+    let mut circumstances = Circumstances { request, strap, crash_resets, node_id };
+    for is_damaged in [false, true] {
+        if is_damaged {
+            circumstances.request = PRODUCT.autostart.map(BootRequest::Resume);
+            circumstances.strap = false;
+        }
         let verified = |number| verify(&flash, &parameters, LAYOUT, PRODUCT.crc, number);
         let decision = decide(&circumstances, &DECISION, verified);
         if let BootDecision::Start { program, trial } = decision {
@@ -72,6 +76,7 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
                 program: program.number(),
                 reset_cause,
                 trial,
+                fresh: matches!(request, Some(BootRequest::Fresh(_))),
                 bootloader_version: product::VERSION,
                 serial_number: bsp::serial_number(),
             });
@@ -89,7 +94,7 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
         match unsafe { ram_image::load(image, &flash) } {
             Ok(()) => {
                 // SAFETY: the caller vouches for the address.
-                unsafe { report.write(boot_report(&decision, request)) };
+                unsafe { report.write(boot_report(&decision, request, node_id, node.bit_rate)) };
                 return;
             }
             Err(damage) => cell.put(BootRequest::Damaged(damage)),
@@ -102,7 +107,12 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
 }
 
 /// What the RAM part is told.
-fn boot_report(decision: &BootDecision, request: Option<BootRequest>) -> BootReport {
+fn boot_report(
+    decision: &BootDecision,
+    request: Option<BootRequest>,
+    node_id: u8,
+    bit_rate: BitRate,
+) -> BootReport {
     let (reason, held_program, window_ms) = match decision {
         BootDecision::Stay(reason) => (*reason, 0, 0),
         BootDecision::Hold { program, window_ms } => (StayReason::Rescue, *program, *window_ms),
@@ -112,13 +122,21 @@ fn boot_report(decision: &BootDecision, request: Option<BootRequest>) -> BootRep
     // it was stands in the handoff, which nobody has written since.
     let returned = match request {
         // SAFETY: the layout's handoff region, checked to be RAM of that size in no image.
-        Some(BootRequest::Stay | BootRequest::Clear(_)) => unsafe {
+        Some(BootRequest::Stay | BootRequest::Owed(_)) => unsafe {
             Handoff::read_program(LAYOUT.handoff.base as *const Handoff)
         },
         _ => 0,
     };
-    let clear = if let Some(BootRequest::Clear(program)) = request { program } else { 0 };
-    BootReport { reason: reason.code(), held_program, window_ms, clear, returned }
+    let owed = if let Some(BootRequest::Owed(owed)) = request { owed } else { Owed::NOTHING };
+    BootReport {
+        reason: reason.code(),
+        held_program,
+        window_ms,
+        owed,
+        returned,
+        node_id,
+        bit_rate: bit_rate as u8,
+    }
 }
 
 /// The product's policy.
