@@ -34,12 +34,13 @@ static inline uint32_t coboot_check_word(const void *record, size_t words)
 
 #define COBOOT_WARM_START_MAGIC UINT32_C(0x31574243)
 
-/* Requests. Those for a program take its number, 1 to 254; the others 0. */
+/* Requests. Those for a program take its number, 1 to 254, as argument, an owed answer what coboot_owed makes, and the
+ * others 0. */
 #define COBOOT_REQUEST_STAY UINT32_C(0x1)
 #define COBOOT_REQUEST_TRIAL UINT32_C(0x2)
 #define COBOOT_REQUEST_START UINT32_C(0x3)
 #define COBOOT_REQUEST_POWER_ON UINT32_C(0x5)
-#define COBOOT_REQUEST_CLEAR UINT32_C(0x7)
+#define COBOOT_REQUEST_OWED UINT32_C(0x7)
 
 struct coboot_warm_start {
     uint32_t magic;
@@ -53,10 +54,18 @@ _Static_assert(offsetof(struct coboot_warm_start, request) == 4, "coboot_warm_st
 _Static_assert(offsetof(struct coboot_warm_start, argument) == 8, "coboot_warm_start: argument");
 _Static_assert(offsetof(struct coboot_warm_start, check) == 12, "coboot_warm_start: check");
 
-/* The cell that carries a request. */
-static inline struct coboot_warm_start coboot_request(uint32_t request, uint32_t program)
+/* The argument of COBOOT_REQUEST_OWED: node `node_id` was written `value` (0 STOP or 3 CLEAR) to 1F51h, sub-index `program`,
+ * and has not answered. The bootloader serves the request behind its boot-up, if it comes up with this node-ID.
+ */
+static inline uint32_t coboot_owed(uint8_t program, uint8_t value, uint8_t node_id)
 {
-    struct coboot_warm_start cell = { COBOOT_WARM_START_MAGIC, request, program, 0 };
+    return program | (uint32_t)value << 8 | (uint32_t)node_id << 16;
+}
+
+/* The cell that carries a request. */
+static inline struct coboot_warm_start coboot_request(uint32_t request, uint32_t argument)
+{
+    struct coboot_warm_start cell = { COBOOT_WARM_START_MAGIC, request, argument, 0 };
     cell.check = coboot_check_word(&cell, offsetof(struct coboot_warm_start, check) / sizeof(uint32_t));
     return cell;
 }
@@ -64,7 +73,11 @@ static inline struct coboot_warm_start coboot_request(uint32_t request, uint32_t
 /* ---- The handoff: how the device came up ---- */
 
 #define COBOOT_HANDOFF_MAGIC UINT32_C(0x4F484243)
-#define COBOOT_HANDOFF_VERSION UINT32_C(0x1)
+#define COBOOT_HANDOFF_VERSION UINT32_C(0x2)
+#define COBOOT_HANDOFF_OLDEST UINT32_C(0x1)
+
+/* In `flags`, since version 2: the program was started right behind its download in one go. */
+#define COBOOT_HANDOFF_FRESH UINT32_C(0x1)
 
 /* Reset causes. */
 #define COBOOT_RESET_UNKNOWN UINT32_C(0x0)
@@ -87,7 +100,8 @@ struct coboot_handoff {
     uint32_t bit_rate;
     uint32_t bootloader_version;
     uint32_t serial_number;
-    uint32_t reserved[5];
+    uint32_t flags;
+    uint32_t reserved[4];
     uint32_t check;
 };
 _Static_assert(sizeof(struct coboot_handoff) == 48, "coboot_handoff");
@@ -101,16 +115,25 @@ _Static_assert(offsetof(struct coboot_handoff, trial) == 11, "coboot_handoff: tr
 _Static_assert(offsetof(struct coboot_handoff, bit_rate) == 12, "coboot_handoff: bit_rate");
 _Static_assert(offsetof(struct coboot_handoff, bootloader_version) == 16, "coboot_handoff: bootloader_version");
 _Static_assert(offsetof(struct coboot_handoff, serial_number) == 20, "coboot_handoff: serial_number");
-_Static_assert(offsetof(struct coboot_handoff, reserved) == 24, "coboot_handoff: reserved");
+_Static_assert(offsetof(struct coboot_handoff, flags) == 24, "coboot_handoff: flags");
+_Static_assert(offsetof(struct coboot_handoff, reserved) == 28, "coboot_handoff: reserved");
 _Static_assert(offsetof(struct coboot_handoff, check) == 44, "coboot_handoff: check");
 
 /* Whether a bootloader wrote it, and it is whole. Later versions only give names to reserved words. */
 static inline bool coboot_handoff_is_sound(const struct coboot_handoff *handoff)
 {
     const size_t guarded = offsetof(struct coboot_handoff, check) / sizeof(uint32_t);
-    return handoff->magic == COBOOT_HANDOFF_MAGIC && handoff->version >= COBOOT_HANDOFF_VERSION
+    return handoff->magic == COBOOT_HANDOFF_MAGIC && handoff->version >= COBOOT_HANDOFF_OLDEST
         && handoff->length == sizeof *handoff && handoff->node_id >= 1 && handoff->node_id <= 127
         && handoff->check == coboot_check_word(handoff, guarded);
+}
+
+/* Whether the program was started right behind its download as raw image, Intel HEX or sealed image: the first 1F51h = 80h
+ * confirms it then, and does not call the bootloader.
+ */
+static inline bool coboot_is_fresh(const struct coboot_handoff *handoff)
+{
+    return (handoff->flags & COBOOT_HANDOFF_FRESH) != 0;
 }
 
 /* ---- The callgate: services of the bootloader that an application calls like a function ----
@@ -289,12 +312,13 @@ static inline int32_t coboot_invalidate(const struct coboot_callgate *gate, uint
     return coboot_call(gate, COBOOT_SELECTOR_INVALIDATE, &args);
 }
 
-/* Leaves a request for the bootloader and resets the chip. What asked for it has to be answered before: wait until the
- * answer is on the bus, then 10 ms, and send nothing more.
+/* Leaves a request for the bootloader and resets the chip. What asked for it is answered before: wait until the answer is
+ * on the bus, then 10 ms in which requests are served. Who leaves with COBOOT_REQUEST_OWED does so
+ * at once, and has not answered.
  */
-static inline _Noreturn void coboot_reset(uint32_t request, uint32_t program)
+static inline _Noreturn void coboot_reset(uint32_t request, uint32_t argument)
 {
-    const struct coboot_warm_start cell = coboot_request(request, program);
+    const struct coboot_warm_start cell = coboot_request(request, argument);
     __asm volatile("cpsid i" ::: "memory");
     __warm_start.magic = cell.magic;
     __warm_start.request = cell.request;

@@ -10,11 +10,7 @@
 #include "coboot.h"
 #include "registers.h"
 #include "probe.h"
-
-/* How long the device stays after the answer to 80h is on the bus: at least 10 ms (SYS TEC manual L-1112d_10, 4.5), and one
- * that may be almost over.
- */
-#define ANSWER_TO_RESET_MS 11
+#include "reentry.h"
 
 /* Without a bootloader, or where it leaves the bit rate to be found out, which this program cannot do. */
 #define DEFAULT_NODE_ID 1
@@ -30,6 +26,7 @@ enum abort_code {
     ABORT_COMMAND = 0x05040001,
     ABORT_READ_ONLY = 0x06010002,
     ABORT_NO_OBJECT = 0x06020000,
+    ABORT_HARDWARE = 0x06060000,
     ABORT_LENGTH = 0x06070010,
     ABORT_NO_SUB_INDEX = 0x06090011,
     ABORT_VALUE = 0x06090030,
@@ -43,6 +40,10 @@ enum { NMT_START = 1, NMT_STOP = 2, NMT_ENTER_PRE_OPERATIONAL = 128, NMT_RESET_N
 /* Values of 1F51h (CiA 302-3 and the SYS TEC manual, 3.4.4). */
 enum { PROGRAM_STOP = 0, PROGRAM_START = 1, PROGRAM_RESET_STAT = 2, PROGRAM_CLEAR = 3 };
 enum { PROGRAM_START_BOOTLOADER = 0x80, PROGRAM_SET_SIGNATURE = 0x83, PROGRAM_CLR_SIGNATURE = 0x84 };
+/* What 1F51h reads of a program (CiA 302-3). */
+enum { STATE_STOPPED = 0, STATE_RUNNING = 1, STATE_ABSENT = 3 };
+/* Objects with an element for each program (SYS TEC manual, 3.4.1). */
+enum { PROGRAM_CONTROL = 0x1F51, PROGRAM_ID = 0x1F56, FLASH_STATUS = 0x1F57 };
 
 static volatile uint32_t now_ms;
 
@@ -50,10 +51,12 @@ static uint8_t node_id = DEFAULT_NODE_ID;
 static uint8_t program_number = 1;
 static uint8_t nmt_state = PRE_OPERATIONAL;
 
-/* The way out: first the answer, then a while in which nothing is said any more, then the reset. */
-static enum { REENTRY_IDLE, ANSWER_PENDING, RESET_PENDING } reentry;
-static uint32_t reentry_request, reentry_argument;
-static uint32_t reset_at_ms;
+/* The callgate, if there is one. */
+static const struct coboot_callgate *gate;
+/* The next 80h to this program confirms it. */
+static bool fresh;
+/* The bootloader comes up with the same node-ID and bit rate, so that it can answer in this program's place. */
+static bool bootloader_answers;
 
 /* Values of the object dictionary. */
 static uint32_t device_type = 0; /* No profile; the bootloader's is another. */
@@ -61,9 +64,7 @@ static uint32_t error_register = 0;
 static uint32_t heartbeat_ms = 1000;
 static uint32_t heartbeat_at_ms;
 static uint32_t identity[5] = { 4, VENDOR_ID, PRODUCT_CODE, REVISION, 0 };
-static uint32_t one = 1;
 static uint32_t program_crc;
-static uint32_t flash_status = 0;
 
 enum access { RO, RW };
 
@@ -85,13 +86,6 @@ static const struct object objects[] = {
     { 0x1018, 2, 4, RO, &identity[2] },
     { 0x1018, 3, 4, RO, &identity[3] },
     { 0x1018, 4, 4, RO, &identity[4] },
-    { 0x1F51, 0, 1, RO, &one },
-    /* 1: it runs. */
-    { 0x1F51, 1, 1, RW, &one },
-    { 0x1F56, 0, 1, RO, &one },
-    { 0x1F56, 1, 4, RO, &program_crc },
-    { 0x1F57, 0, 1, RO, &one },
-    { 0x1F57, 1, 4, RO, &flash_status },
     { 0x2100, 0, 1, RO, &probe_values[0] },
     { 0x2100, PROBE_SELECTOR, 4, RW, &probe_values[PROBE_SELECTOR] },
     { 0x2100, PROBE_POINTER, 4, RW, &probe_values[PROBE_POINTER] },
@@ -117,9 +111,48 @@ void tick(void)
 
 /* ---- Object dictionary ---- */
 
+/* How many programs the device has. */
+static uint32_t programs(void)
+{
+    extern const uint8_t __programs;
+    return (uint32_t)(uintptr_t)&__programs;
+}
+
+/* An element of 1F51h, 1F56h or 1F57h, whichever program it is of. Element 0 is the number of programs. */
+static enum abort_code find_element(uint16_t index, uint8_t sub, const struct object **found)
+{
+    static uint32_t value;
+    static struct object element;
+    struct coboot_program_args program;
+
+    if (sub > programs()) {
+        return ABORT_NO_SUB_INDEX;
+    }
+    const bool own = sub == program_number;
+    const bool installed = gate != NULL && sub != 0 && !own
+        && coboot_program_info(gate, sub, &program) == COBOOT_STATUS_OK
+        && (program.flags & COBOOT_PROGRAM_INSTALLED) != 0;
+    const uint8_t size = index == PROGRAM_CONTROL || sub == 0 ? 1 : 4;
+    element = (struct object){ index, sub, size, index == PROGRAM_CONTROL && sub != 0 ? RW : RO, &value };
+    if (sub == 0) {
+        value = programs();
+    } else if (index == PROGRAM_CONTROL) {
+        value = own ? STATE_RUNNING : installed ? STATE_STOPPED : STATE_ABSENT;
+    } else if (index == PROGRAM_ID) {
+        value = own ? program_crc : installed ? program.crc : 0;
+    } else {
+        value = 0;
+    }
+    *found = &element;
+    return GOOD;
+}
+
 static enum abort_code find(uint16_t index, uint8_t sub, const struct object **found)
 {
     enum abort_code why = ABORT_NO_OBJECT;
+    if (index == PROGRAM_CONTROL || index == PROGRAM_ID || index == FLASH_STATUS) {
+        return find_element(index, sub, found);
+    }
     for (unsigned i = 0; i < sizeof objects / sizeof *objects; i++) {
         if (objects[i].index == index) {
             why = ABORT_NO_SUB_INDEX;
@@ -132,27 +165,36 @@ static enum abort_code find(uint16_t index, uint8_t sub, const struct object **f
     return why;
 }
 
-/* The 1F51h callback. It runs before the answer is sent, so it only notes what is to be done. */
-static enum abort_code depart_with(uint32_t request, uint32_t argument)
+static enum abort_code depart(uint32_t request, uint32_t argument)
 {
-    reentry = ANSWER_PENDING;
-    reentry_request = request;
-    reentry_argument = argument;
+    reentry_begin(request, argument, now_ms);
     return GOOD;
 }
 
-static enum abort_code program_control(uint32_t command)
+/* The 1F51h callback. It runs before the answer is sent, so it only notes what is to be done. */
+static enum abort_code program_control(uint8_t program, uint32_t command)
 {
+    const bool own = program == program_number;
+
     switch (command) {
     case PROGRAM_START_BOOTLOADER:
-    case PROGRAM_STOP: /* The bootloader runs instead. */
-        return depart_with(COBOOT_REQUEST_STAY, 0);
-    case PROGRAM_START: /* It runs already. */
-        return GOOD;
-    case PROGRAM_RESET_STAT: /* CiA 302-3: reset program, which starts it anew. */
-        return depart_with(COBOOT_REQUEST_START, program_number);
+        /* The first 80h right behind a download in one go means "confirm", to masters that do that. */
+        if (own && fresh) {
+            fresh = false;
+            return gate != NULL && coboot_confirm(gate, program) == COBOOT_STATUS_OK ? GOOD : ABORT_HARDWARE;
+        }
+        return depart(COBOOT_REQUEST_STAY, 0);
+    case PROGRAM_STOP:  /* The bootloader runs instead. */
     case PROGRAM_CLEAR: /* The bootloader carries it out. */
-        return depart_with(COBOOT_REQUEST_CLEAR, program_number);
+        /* Masters send the next request as soon as they see the answer, so that is the bootloader's, too. */
+        if (bootloader_answers) {
+            return depart(COBOOT_REQUEST_OWED, coboot_owed(program, (uint8_t)command, node_id));
+        }
+        return command == PROGRAM_STOP ? depart(COBOOT_REQUEST_STAY, 0) : ABORT_DEVICE_STATE;
+    case PROGRAM_START: /* It runs already; another one is the bootloader's to start. */
+        return own ? GOOD : ABORT_DEVICE_STATE;
+    case PROGRAM_RESET_STAT: /* CiA 302-3: reset program, which starts it anew. */
+        return own ? depart(COBOOT_REQUEST_START, program) : ABORT_DEVICE_STATE;
     case PROGRAM_SET_SIGNATURE:
     case PROGRAM_CLR_SIGNATURE: /* The bootloader's to do. */
         return ABORT_DEVICE_STATE;
@@ -166,8 +208,8 @@ static enum abort_code write(const struct object *object, uint32_t value)
     if (object->access == RO) {
         return ABORT_READ_ONLY;
     }
-    if (object->index == 0x1F51) {
-        return program_control(value);
+    if (object->index == PROGRAM_CONTROL) {
+        return program_control(object->sub, value);
     }
     if (object->index == 0x2100 && object->sub == PROBE_CALL) {
         probe_call();
@@ -236,7 +278,8 @@ static bool sdo(const uint8_t *request, uint8_t *answer)
         answer[0] = 0x80;
         put_word(&answer[4], abort);
     }
-    return true;
+    /* Who has fallen silent owes the answer. */
+    return !reentry_is_silent();
 }
 
 /* ---- The node ---- */
@@ -265,7 +308,7 @@ static void nmt(const struct can_frame *frame)
     case NMT_RESET_NODE:
     case NMT_RESET_COMMUNICATION:
         /* There is little to reset: both go through a reset that nobody takes for a crash. */
-        (void)depart_with(COBOOT_REQUEST_POWER_ON, 0);
+        reentry_begin(COBOOT_REQUEST_POWER_ON, 0, now_ms);
         break;
     default:
         break;
@@ -282,19 +325,6 @@ static void handle(const struct can_frame *frame)
             can_send(CAN_SDO, &answer);
         }
     }
-}
-
-/* Goes on with the departure. Whether the device is silent from now on. */
-static bool start_reentry(void)
-{
-    if (reentry == ANSWER_PENDING && can_is_free(CAN_SDO) && can_is_free(CAN_HEARTBEAT)) {
-        reentry = RESET_PENDING;
-        reset_at_ms = now_ms + ANSWER_TO_RESET_MS;
-    }
-    if (reentry == RESET_PENDING && (int32_t)(now_ms - reset_at_ms) >= 0) {
-        coboot_reset(reentry_request, reentry_argument);
-    }
-    return reentry != REENTRY_IDLE;
 }
 
 /* ---- The chip ---- */
@@ -343,11 +373,13 @@ void main(void)
         node_id = handoff.node_id;
         program_number = (uint8_t)handoff.program;
         identity[4] = handoff.serial_number;
+        fresh = coboot_is_fresh(&handoff);
         if (handoff.bit_rate != 0) {
             bit_rate = handoff.bit_rate;
+            bootloader_answers = true;
         }
     }
-    const struct coboot_callgate *gate = coboot_callgate();
+    gate = coboot_callgate();
     /* What the bootloader has verified is larger than this image where more was downloaded with it. */
     const uint32_t start = (uint32_t)(uintptr_t)&__vector_table, end = (uint32_t)(uintptr_t)&__image_end;
     struct coboot_program_args program;
@@ -372,13 +404,13 @@ void main(void)
     heartbeat_at_ms = now_ms + heartbeat_ms;
     uint32_t blink_at_ms = now_ms;
     for (;;) {
-        if (!start_reentry()) {
+        if (!reentry_proceed(now_ms)) {
             struct can_frame frame;
             /* A request stays in the FIFO until its answer has room. */
-            while (reentry == REENTRY_IDLE && can_is_free(CAN_SDO) && can_receive(&frame)) {
+            while (!reentry_is_silent() && can_is_free(CAN_SDO) && can_receive(&frame)) {
                 handle(&frame);
             }
-            if (heartbeat_ms != 0 && (int32_t)(now_ms - heartbeat_at_ms) >= 0 && can_is_free(CAN_HEARTBEAT)) {
+            if (!reentry_is_silent() && heartbeat_ms != 0 && (int32_t)(now_ms - heartbeat_at_ms) >= 0 && can_is_free(CAN_HEARTBEAT)) {
                 heartbeat_at_ms = now_ms + heartbeat_ms;
                 send_state(nmt_state);
             }
@@ -387,6 +419,8 @@ void main(void)
             blink_at_ms = now_ms + 500;
             GPIO_ODR(LED_PORT) ^= UINT32_C(1) << LED_PIN;
         }
-        __asm volatile("wfi");
+        if (!reentry_is_silent()) {
+            __asm volatile("wfi");
+        }
     }
 }

@@ -5,18 +5,16 @@ use core::sync::atomic::{AtomicU32, Ordering};
 
 use bsp::can::BitTiming;
 use bsp::{BIT_RATE, CAN_CLOCK, LAYOUT, NODE_ID};
-use canopen::{BitRate, Instant, NodeId};
+use canopen::application::{self, Next};
+use canopen::slave::Slave;
+use canopen::{AbortCode, BitRate, Instant, NodeId};
 use shared_abi::callgate::{Callgate, CallgateError, NodeArgs, ProgramArgs};
 use shared_abi::handoff::Handoff;
 use shared_abi::layout::Layout;
 use shared_abi::reentry;
-use shared_abi::warm_start::{BootRequest, WarmStart};
+use shared_abi::warm_start::{BootRequest, Owed, WarmStart};
 
 use crate::debugger;
-
-/// How long the device stays after the answer to 80h is on the bus, in ms: at least 10 (SYS TEC
-/// manual L-1112d_10, 4.5), and one that may be almost over.
-const ANSWER_TO_RESET_MS: u32 = 11;
 
 /// The bit rate without a bootloader.
 const DEFAULT_BIT_RATE: BitRate = match BitRate::from_bits_per_second(BIT_RATE) {
@@ -43,6 +41,17 @@ pub struct Start {
     pub serial_number: u32,
     /// The program that this is, 1 to 254.
     pub program: u8,
+    /// It was started right behind its download in one go: the first 1F51h = 80h confirms it.
+    pub fresh: bool,
+}
+
+impl Start {
+    /// The node-ID with which the bootloader comes up at the same bit rate, so that it can answer in
+    /// this program's place. `None` where it has to find the bit rate out first, or is another node
+    /// (lifts).
+    pub fn bootloader_answers(&self) -> Option<NodeId> {
+        self.node_id.filter(|_| self.bit_rate != BitRate::Auto && !cfg!(feature = "lift"))
+    }
 }
 
 /// Reads the handoff; started by a debugger without a bootloader, the application has the board's
@@ -56,12 +65,14 @@ pub fn read_handoff(layout: &Layout) -> Start {
             bit_rate: BitRate::from_bits_per_second(info.bit_rate).unwrap_or(DEFAULT_BIT_RATE),
             serial_number: info.serial_number,
             program: info.program,
+            fresh: info.fresh,
         },
         None => Start {
             node_id: NodeId::new(NODE_ID),
             bit_rate: DEFAULT_BIT_RATE,
             serial_number: bsp::serial_number(),
             program: 1,
+            fresh: false,
         },
     }
 }
@@ -136,47 +147,62 @@ impl ReentryPath {
     }
 }
 
-/// The re-entry in order: the answer, then a time without any transmission, then the reset.
-#[derive(Clone, Copy, Debug)]
-pub enum ReentrySequence {
-    /// The device stays.
-    Idle,
-    /// What is to be said first is not on the bus yet.
-    AnswerPending(ReentryPath, BootRequest),
-    /// The device leaves at this time. A frame that began now would be cut off by the reset.
-    ResetPending(ReentryPath, BootRequest, Instant),
+/// How the device leaves for a command.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Leave {
+    /// This program answers, and the bootloader finds this request.
+    Answered(BootRequest),
+    /// The bootloader answers, behind its boot-up.
+    Owed(Owed),
 }
 
-impl ReentrySequence {
-    /// Goes on with it: `quiet` says that everything is on the bus. Whether the device is silent
-    /// from now on.
-    pub fn proceed(&mut self, quiet: bool, now: Instant) -> bool {
-        match *self {
-            Self::AnswerPending(path, request) if quiet => {
-                *self = Self::ResetPending(path, request, now + ANSWER_TO_RESET_MS)
-            }
-            Self::ResetPending(path, request, at) if now.has_reached(at) => request_reentry(path, request),
-            _ => {}
+/// The way out: when, where, and with which request.
+pub type Departure = application::Departure<(ReentryPath, BootRequest)>;
+
+/// Begins with it, right behind the frame that asked for it.
+pub fn begin(departure: &mut Departure, path: ReentryPath, leave: Leave, slave: &mut Slave, now: Instant) {
+    match leave {
+        Leave::Answered(request) => departure.begin((path, request), request == BootRequest::Stay, now),
+        Leave::Owed(owed) if slave.withdraw_answer(&[0x60, 0x51, 0x1F, owed.program, 0, 0, 0, 0]) => {
+            departure.begin_silent((path, BootRequest::Owed(owed)), now)
         }
-        matches!(self, Self::ResetPending(..))
+        // The client has written STOP in segments, whose end only this program can acknowledge.
+        Leave::Owed(Owed { value: 0, .. }) => departure.begin((path, BootRequest::Stay), true, now),
+        // CLEAR in segments: nobody could acknowledge it and carry it out.
+        Leave::Owed(_) => slave.refuse(AbortCode::DEVICE_STATE),
     }
 }
 
+/// Goes on with it: `quiet` says that everything is on the bus. Whether the device is silent from now
+/// on.
+pub fn proceed(departure: &mut Departure, quiet: bool, now: Instant) -> bool {
+    match departure.proceed(quiet, now) {
+        Next::Serve => return false,
+        Next::Wait => {}
+        Next::Leave((path, request)) => request_reentry(path, request),
+    }
+    true
+}
+
 /// Told to `idle`, where no exception is active: 0 to stay, else the path (1 to 3), and from bit 8
-/// on the request as the warm-start cell has it, from bit 16 on its argument.
+/// on the request as the warm-start cell has it.
 static REENTRY_REQUEST: AtomicU32 = AtomicU32::new(0);
+/// The argument of the request.
+static REENTRY_ARGUMENT: AtomicU32 = AtomicU32::new(0);
 
 fn request_reentry(path: ReentryPath, request: BootRequest) {
     let WarmStart { request, argument, .. } = WarmStart::new(request);
-    REENTRY_REQUEST.store((path as u32 + 1) | request << 8 | argument << 16, Ordering::Relaxed);
+    REENTRY_ARGUMENT.store(argument, Ordering::Relaxed);
+    REENTRY_REQUEST.store((path as u32 + 1) | request << 8, Ordering::Release);
     debugger::release_program();
 }
 
 /// To be called by `idle` whenever it wakes. Does not return if the device is to leave.
 pub fn reenter_if_requested() {
-    let told = REENTRY_REQUEST.load(Ordering::Relaxed);
+    let told = REENTRY_REQUEST.load(Ordering::Acquire);
     let Some(path) = (told as u8).checked_sub(1).and_then(ReentryPath::from_number) else { return };
-    let request = WarmStart::encode(told >> 8 & 0xFF, told >> 16).request().unwrap_or(BootRequest::Stay);
+    let argument = REENTRY_ARGUMENT.load(Ordering::Relaxed);
+    let request = WarmStart::encode(told >> 8, argument).request().unwrap_or(BootRequest::Stay);
     match path {
         ReentryPath::SystemReset => reentry::system_reset(LAYOUT, request),
         ReentryPath::Watchdog => reentry::watchdog_reset(LAYOUT, request),

@@ -9,7 +9,10 @@ pub use on::*;
 
 #[cfg(not(feature = "debugger"))]
 mod off {
-    pub use crate::entries::{ENTRIES, LIFT_ENTRIES};
+    use canopen::od::Entry;
+
+    /// No objects.
+    pub const ENTRIES: [Entry; 0] = [];
 
     /// Nothing.
     pub struct Debugger;
@@ -40,18 +43,10 @@ mod on {
     use bsp::debugger::Refused;
     use bsp::{monitor, pac, LAYOUT};
     use canopen::debugger::{self, Command, Debugged, Kind, Memory, Stop};
-    use canopen::od::{concat, Entry};
     use canopen::AbortCode;
     use shared_abi::memory_map::{may_read, may_write};
 
-    use crate::entries;
-
-    /// The object dictionary, with 1025h.
-    pub static ENTRIES: [Entry; entries::ENTRIES.len() + debugger::ENTRIES.len()] =
-        concat(entries::ENTRIES, debugger::ENTRIES);
-    /// The one of a lift device, with 1025h.
-    pub static LIFT_ENTRIES: [Entry; entries::LIFT_ENTRIES.len() + debugger::ENTRIES.len()] =
-        concat(entries::LIFT_ENTRIES, debugger::ENTRIES);
+    pub use canopen::debugger::ENTRIES;
 
     /// Tasks of this priority can be stopped no more, those of 1 and `idle` can. The tasks that
     /// serve the bus have higher ones.

@@ -46,7 +46,7 @@ mod app {
     use rtic_monotonics::Monotonic;
 
     use super::Mono;
-    use crate::coboot::{self, ReentryPath, ReentrySequence};
+    use crate::coboot::{self, Departure, Leave, ReentryPath};
     use crate::debugger::{self, Debugger};
     use crate::objects::{Application, HEARTBEAT_MS};
 
@@ -67,7 +67,7 @@ mod app {
         slave: Slave,
         application: Application,
         debugger: Debugger,
-        reentry: ReentrySequence,
+        departure: Departure,
         led: bsp::Led,
     }
 
@@ -103,7 +103,7 @@ mod app {
                 slave: Slave::new(application.lss_address(), start.node_id, start.bit_rate, config),
                 application,
                 debugger: Debugger::start(),
-                reentry: ReentrySequence::Idle,
+                departure: Departure::NONE,
                 led: board.led,
             },
         )
@@ -136,14 +136,14 @@ mod app {
     #[task(
         binds = CAN1_TX,
         shared = [can],
-        local = [to_handle, slave, application, debugger, reentry],
+        local = [to_handle, slave, application, debugger, departure],
         priority = 3
     )]
     fn protocol(cx: protocol::Context) {
         let now = Instant::from_millis(Mono::now().ticks());
         let protocol::SharedResources { mut can, .. } = cx.shared;
-        let protocol::LocalResources { to_handle, slave, application, debugger, reentry, .. } = cx.local;
-        if reentry.proceed(slave.is_idle() && can.lock(|can| can.is_idle()), now) {
+        let protocol::LocalResources { to_handle, slave, application, debugger, departure, .. } = cx.local;
+        if coboot::proceed(departure, slave.is_idle() && can.lock(|can| can.is_idle()), now) {
             return;
         }
         #[cfg(feature = "lift")]
@@ -153,19 +153,24 @@ mod app {
         #[cfg(feature = "debugger")]
         let device = &mut { device };
         slave.observe(status, now, device);
-        // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests waiting
-        // behind it.
-        carry_out(slave, &mut can, now, device);
-        let mut reset = false;
-        while let Some(frame) = to_handle.dequeue() {
-            reset |= slave.handle(&frame, now, device);
+        loop {
+            let device = debugger.attach(application);
+            #[cfg(feature = "debugger")]
+            let device = &mut { device };
+            // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests
+            // waiting behind it.
             carry_out(slave, &mut can, now, device);
-        }
-        if reset {
-            *reentry = ReentrySequence::AnswerPending(ReentryPath::SystemReset, application.reset_request());
-        }
-        if let Some((path, request)) = application.take_reentry() {
-            *reentry = ReentrySequence::AnswerPending(path, request);
+            let Some(frame) = to_handle.dequeue() else { return };
+            if slave.handle(&frame, now, device) {
+                let leave = Leave::Answered(application.reset_request());
+                coboot::begin(departure, ReentryPath::SystemReset, leave, slave, now);
+            }
+            if let Some((path, leave)) = application.take_leave() {
+                coboot::begin(departure, path, leave, slave, now);
+                if coboot::proceed(departure, slave.is_idle() && can.lock(|can| can.is_idle()), now) {
+                    return;
+                }
+            }
         }
     }
 

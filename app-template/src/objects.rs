@@ -3,12 +3,13 @@
 
 use core::task::Poll;
 
-use bsp::IDENTITY;
+use bsp::{IDENTITY, LAYOUT};
+use canopen::application::{react, Reaction, Standing};
 use canopen::device::Device;
 use canopen::emcy::Emcy;
 use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
-use canopen::od::{put, Address, Entry, Objects};
+use canopen::od::{concat, put, Address, Entry, Objects};
 #[cfg(feature = "lift")]
 use canopen::program::UNLOCK;
 use canopen::program::{
@@ -18,13 +19,13 @@ use canopen::slave::SlaveDevice;
 #[cfg(feature = "lift")]
 use canopen::{password::Lock, Instant};
 use canopen::{AbortCode, BitRate, NodeId};
-use shared_abi::callgate::PROGRAM_SIGNED;
+use shared_abi::callgate::{PROGRAM_INSTALLED, PROGRAM_SIGNED};
 use shared_abi::label::Label;
-use shared_abi::warm_start::BootRequest;
+use shared_abi::warm_start::{BootRequest, Owed};
 
-use crate::coboot::{self, ReentryPath, Start};
-use crate::debugger::{ENTRIES, LIFT_ENTRIES};
-use crate::entries::{CONFIRMATION, REENTRY_PATH};
+use crate::coboot::{self, Leave, ReentryPath, Start};
+use crate::debugger;
+use crate::entries::{entries, entry_count, CONFIRMATION, LIFT_ENTRIES, REENTRY_PATH};
 
 /// 1000h: no standardised profile. Anything but the bootloader's 10000000h tells a host that the
 /// application runs.
@@ -46,6 +47,16 @@ macro_rules! version {
 }
 const SOFTWARE_VERSION: &str = version!();
 
+/// Programs of the device, each a sub-index of 1F51h, 1F56h and 1F57h.
+const PROGRAMS: u8 = LAYOUT.programs.len() as u8;
+const ENTRY_COUNT: usize = entry_count(PROGRAMS);
+const DEBUGGER_COUNT: usize = ENTRY_COUNT + debugger::ENTRIES.len();
+/// The object dictionary, with 1025h where there is a debugger interface.
+static ENTRIES: [Entry; DEBUGGER_COUNT] =
+    concat::<ENTRY_COUNT, { debugger::ENTRIES.len() }, DEBUGGER_COUNT>(entries(PROGRAMS), debugger::ENTRIES);
+/// The one of a lift device.
+static WITH_PASSWORD: [Entry; DEBUGGER_COUNT + LIFT_ENTRIES.len()] = concat(ENTRIES, LIFT_ENTRIES);
+
 /// Whom this image is for, at the place where the bootloader looks before it takes a raw image or
 /// HEX file.
 #[used]
@@ -65,7 +76,11 @@ pub struct Application {
     program: u8,
     /// The re-entry path (2000h).
     path: ReentryPath,
-    leave_for: Option<BootRequest>,
+    leave: Option<Leave>,
+    /// The next 80h to this program confirms it.
+    fresh: bool,
+    /// The node-ID as which the bootloader can answer in this program's place.
+    bootloader_answers: Option<NodeId>,
     #[cfg(feature = "lift")]
     lock: Lock,
     /// The time that was told last.
@@ -99,7 +114,9 @@ impl Application {
             program_crc: coboot::program_crc(start.program),
             program: start.program,
             path: ReentryPath::default(),
-            leave_for: None,
+            leave: None,
+            fresh: start.fresh,
+            bootloader_answers: start.bootloader_answers(),
             #[cfg(feature = "lift")]
             lock: Lock::new(shared_abi::LIFT_PASSWORD),
             #[cfg(feature = "lift")]
@@ -116,9 +133,9 @@ impl Application {
         self.device.lss_address()
     }
 
-    /// Whether, how and with which request the device shall go back to the bootloader, once.
-    pub fn take_reentry(&mut self) -> Option<(ReentryPath, BootRequest)> {
-        self.leave_for.take().map(|request| (self.path, request))
+    /// Whether and how the device shall go back to the bootloader, once.
+    pub fn take_leave(&mut self) -> Option<(ReentryPath, Leave)> {
+        self.leave.take().map(|leave| (self.path, leave))
     }
 
     /// With which request the device restarts when the NMT master says so.
@@ -138,33 +155,44 @@ impl Application {
         let _ = self.lock.is_waiting(now);
     }
 
-    /// The 1F51h callback. It runs before the SDO answer is sent, so it only notes what is to be
-    /// done: `main` waits until the answer is on the bus, then leaves.
-    fn program_control(&mut self, command: ProgramControl) -> Result<(), AbortCode> {
-        self.leave_for = Some(match command {
-            // While a program is stopped the bootloader runs.
-            ProgramControl::StartBootloader | ProgramControl::Stop => BootRequest::Stay,
-            // CiA 814-1 clause 6.3: the tool has written the password and wants the bootloader.
-            ProgramControl::ResetStat if self.armed => BootRequest::Stay,
-            // CiA 302-3 calls it "reset program", which starts it anew.
-            ProgramControl::ResetStat => BootRequest::Start(self.program),
-            // The bootloader carries it out.
-            ProgramControl::Clear => BootRequest::Clear(self.program),
-            // It runs already.
-            ProgramControl::Start => return Ok(()),
-            // The bootloader's to do; this program cannot do it to itself.
-            ProgramControl::SetSignature | ProgramControl::ClrSignature => {
-                return Err(AbortCode::DEVICE_STATE)
+    /// The 1F51h callback. It runs before the SDO answer is sent, so it only notes what is to be done:
+    /// `main` sends the answer and leaves, or leaves the answer to the bootloader.
+    fn program_control(&mut self, program: u8, command: ProgramControl) -> Result<(), AbortCode> {
+        let node_id = self.bootloader_answers.filter(|id| self.id == Some(*id));
+        let Self { fresh, armed, .. } = *self;
+        let standing = Standing { fresh, armed, can_hand_over: node_id.is_some() };
+        self.leave = Some(match react(command, program == self.program, standing)? {
+            Reaction::Nothing => return Ok(()),
+            Reaction::Confirm => {
+                self.fresh = false;
+                return coboot::confirm(program, true).map_err(|_| AbortCode::HARDWARE);
+            }
+            Reaction::CallBack => Leave::Answered(BootRequest::Stay),
+            Reaction::Restart => Leave::Answered(BootRequest::Start(program)),
+            Reaction::HandOver => {
+                let node_id = node_id.map_or(0, NodeId::get);
+                Leave::Owed(Owed { program, value: command as u8, node_id })
             }
         });
         Ok(())
+    }
+
+    /// What 1F51h reads.
+    fn program_state(&self, program: u8) -> ProgramState {
+        if program == self.program {
+            return ProgramState::Running;
+        }
+        match coboot::program_info(program) {
+            Ok(info) if info.flags & PROGRAM_INSTALLED != 0 => ProgramState::Stopped,
+            _ => ProgramState::Absent,
+        }
     }
 }
 
 impl Objects for Application {
     fn entries(&self) -> &'static [Entry] {
         if cfg!(feature = "lift") {
-            &LIFT_ENTRIES
+            &WITH_PASSWORD
         } else {
             &ENTRIES
         }
@@ -178,8 +206,9 @@ impl Objects for Application {
             return read;
         }
         match at.index {
-            PROGRAM_CONTROL => put(buf, &[ProgramState::Running as u8]),
-            PROGRAM_ID => put(buf, &self.program_crc.to_le_bytes()),
+            PROGRAM_CONTROL => put(buf, &[self.program_state(at.sub) as u8]),
+            PROGRAM_ID if at.sub == self.program => put(buf, &self.program_crc.to_le_bytes()),
+            PROGRAM_ID => put(buf, &coboot::program_info(at.sub).map_or(0, |info| info.crc).to_le_bytes()),
             FLASH_STATUS => put(buf, &FlashStatus::OK.to_word().to_le_bytes()),
             REENTRY_PATH => put(buf, &[self.path as u8]),
             CONFIRMATION => {
@@ -195,7 +224,7 @@ impl Objects for Application {
             return written;
         }
         match (at.index, data) {
-            (PROGRAM_CONTROL, &[value]) => self.program_control(ProgramControl::try_from(value)?),
+            (PROGRAM_CONTROL, &[value]) => self.program_control(at.sub, ProgramControl::try_from(value)?),
             #[cfg(feature = "lift")]
             (UNLOCK, password) => {
                 self.lock.open(password, self.now)?;
@@ -228,7 +257,12 @@ impl LssDevice for Application {
     /// Storing is the bootloader's: its journal lies in flash that this program does not own.
     fn store(&mut self, id: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {
         let rate = rate.unwrap_or(self.bit_rate);
-        Poll::Ready(coboot::store_node(id, rate).map_err(|_| StoreError::Failed))
+        let stored = coboot::store_node(id, rate).map_err(|_| StoreError::Failed);
+        if stored.is_ok() && self.bootloader_answers.is_some() {
+            // It comes up with these from now on.
+            self.bootloader_answers = id.filter(|_| rate == self.bit_rate);
+        }
+        Poll::Ready(stored)
     }
 }
 
