@@ -8,20 +8,20 @@ use std::io;
 use std::time::Duration;
 
 use boot_core::bootloader::{self, Bootloader};
-use boot_core::canopen::node::{self, NmtPolicy};
+use boot_core::canopen::application::{Departure, Next};
+use boot_core::canopen::node::{self, NmtPolicy, Node};
 use boot_core::canopen::od::Entry;
-use boot_core::canopen::program::ProgramControl;
 use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
-use boot_core::canopen::{Frame, Instant, NodeId};
+use boot_core::canopen::{AbortCode, CobId, Frame, Instant, NodeId};
 use boot_core::control::Step;
 use boot_core::decision::{decide, BootDecision, Circumstances, Policy, StayReason};
 use boot_core::program::verify;
+use boot_core::store::Journal;
 use boot_core::store::NodeParameters;
-use boot_core::store::{Journal, ProgramRecord};
-use shared_abi::warm_start::BootRequest;
+use shared_abi::warm_start::{BootRequest, Owed};
 
 use crate::file_flash::FileFlash;
-use crate::stand_in::StandIn;
+use crate::stand_in::{Leave, StandIn, Started};
 use crate::supports;
 
 /// Bytes of blocks that may wait for the flash, as in the firmware for the STM32F407.
@@ -38,6 +38,7 @@ const POLICY: Policy = Policy {
     node_ids: 1..=127,
     rescue_window_ms: 0,
     rescue_window_confirmed_ms: 0,
+    start_allowed: |_| true,
 };
 /// Stands for no node-ID (CiA 305).
 const NO_NODE_ID: u8 = 255;
@@ -57,7 +58,7 @@ pub struct Setup {
     pub strap: bool,
 }
 
-/// What came of a reset.
+/// What came of a reset, or of the bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Event {
     /// The bootloader runs.
@@ -76,6 +77,8 @@ pub enum Event {
         /// The node-ID that it would have.
         node: Option<NodeId>,
     },
+    /// What runs has taken over another node-ID, which layer setting services gave it.
+    NodeId(NodeId),
 }
 
 /// A device with `PROGRAMS` programs.
@@ -87,7 +90,7 @@ pub struct Device<'b, const PROGRAMS: usize> {
 /// What runs between two resets.
 enum Phase<'b, const PROGRAMS: usize> {
     Bootloader(Box<Running<Bootloader<'b, FileFlash, Journal, PROGRAMS>>>),
-    StandIn(Box<Running<StandIn>>, Idle<'b>),
+    StandIn(Box<Running<StandIn>>, &'b mut [u8]),
     Silent(Idle<'b>),
     /// Only while one takes the place of the other.
     None,
@@ -103,7 +106,14 @@ struct Idle<'b> {
 struct Running<D> {
     device: D,
     slave: Slave,
+    /// The node-ID that was told last.
+    told: Option<NodeId>,
+    /// The way out of the bootloader.
     pending_reset: Option<PendingReset>,
+    /// The way out of a program.
+    departure: Departure<BootRequest>,
+    /// What was asked of the program, and left to be answered by the bootloader.
+    owed: Option<Frame>,
 }
 
 /// The device is about to reset.
@@ -127,7 +137,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
     pub fn handle(&mut self, frame: &Frame, now: Instant) {
         match &mut self.phase {
             Phase::Bootloader(running) => running.handle(frame, now),
-            Phase::StandIn(running, _) => running.handle(frame, now),
+            Phase::StandIn(running, _) => running.handle_in_program(frame, now),
             Phase::Silent(_) | Phase::None => {}
         }
     }
@@ -160,12 +170,15 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                 }
                 let finishing = running.device.is_finishing();
                 reset = running.exchange(now, !finishing, send);
+                running.tell_node_id(tell);
             }
             Phase::StandIn(running, _) => {
-                if running.device.is_called_back() && running.pending_reset.is_none() {
-                    running.pending_reset = Some(PendingReset { request: Some(BootRequest::Stay), at: None });
+                let flash = running.device.flash();
+                if flash.is_urgent() {
+                    flash.save()?;
                 }
-                reset = running.exchange(now, true, send);
+                reset = running.leave_or_exchange(now, send).map(Some);
+                running.tell_node_id(tell);
             }
             Phase::Silent(_) | Phase::None => return Ok(false),
         }
@@ -175,7 +188,8 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                     let (flash, buffer) = running.device.into_parts();
                     Idle { flash, buffer }
                 }
-                Phase::StandIn(_, idle) | Phase::Silent(idle) => idle,
+                Phase::StandIn(running, buffer) => Idle { flash: running.device.into_flash(), buffer },
+                Phase::Silent(idle) => idle,
                 Phase::None => return Ok(false),
             };
             tell(self.reset(idle, request));
@@ -203,38 +217,47 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
             BootDecision::Stay(_) | BootDecision::Hold { .. } => {
                 let reason =
                     if let BootDecision::Stay(reason) = decision { reason } else { StayReason::Rescue };
-                let mut device =
+                let device =
                     Bootloader::new(config, serial_number, node, reason.code(), journal, flash, buffer);
-                if let Some(BootRequest::Clear(program)) = request {
-                    // Acknowledged already; what becomes of it is in 1F57h.
-                    let _ = device.command(program, ProgramControl::Clear);
-                }
                 let address = device.lss_address();
                 let node = NodeParameters { id: device.node_id(), ..node };
                 let slave = slave(address, node, config.device.heartbeat_ms, NmtPolicy::StayPreOperational);
-                self.phase = Phase::Bootloader(Box::new(Running { device, slave, pending_reset: None }));
+                let mut running = Running::new(device, slave, node.id);
+                running.owed = match request {
+                    Some(BootRequest::Owed(owed)) => asked(owed),
+                    _ => None,
+                };
+                self.phase = Phase::Bootloader(Box::new(running));
                 Event::Bootloader { node: node.id, reason }
             }
             BootDecision::Start { program, trial } => {
                 let number = program.number();
-                let record = |number| ProgramRecord::load(&journal, &flash, number);
-                let crcs = (1..=PROGRAMS as u8).map(|number| record(number).map_or(0, |record| record.crc));
-                let crcs = crcs.collect();
-                let idle = Idle { flash, buffer };
                 self.phase = match stand_in {
-                    None => Phase::Silent(idle),
+                    None => Phase::Silent(Idle { flash, buffer }),
                     Some(entries) => {
                         let says = boot_core::canopen::device::Device { serial_number, ..config.device };
-                        let device = StandIn::new(entries, says, number, crcs);
+                        let started = Started {
+                            program: number,
+                            fresh: matches!(request, Some(BootRequest::Fresh(_))),
+                            bootloader_answers: node.id.filter(|_| config.node_id.is_none()),
+                        };
+                        let device = StandIn::new(entries, says, started, flash, config.layout.parameters);
                         let address = device.lss_address();
                         let slave = slave(address, node, config.device.heartbeat_ms, NmtPolicy::Follow);
-                        Phase::StandIn(Box::new(Running { device, slave, pending_reset: None }), idle)
+                        Phase::StandIn(Box::new(Running::new(device, slave, node.id)), buffer)
                     }
                 };
                 Event::Program { number, trial, node: node.id }
             }
         }
     }
+}
+
+/// What was asked of the program, as the bootloader serves it behind its boot-up.
+fn asked(owed: Owed) -> Option<Frame> {
+    let Owed { program, value, node_id } = owed;
+    let request = [0x2F, 0x51, 0x1F, program, value, 0, 0, 0];
+    Some(Frame::full(CobId::sdo_request(NodeId::new(node_id)?), request))
 }
 
 fn slave(
@@ -251,6 +274,10 @@ fn slave(
 }
 
 impl<D: SlaveDevice> Running<D> {
+    fn new(device: D, slave: Slave, told: Option<NodeId>) -> Self {
+        Self { device, slave, told, pending_reset: None, departure: Departure::NONE, owed: None }
+    }
+
     fn handle(&mut self, frame: &Frame, now: Instant) {
         // Who is about to reset takes nothing on.
         if self.pending_reset.is_some_and(|pending_reset| pending_reset.at.is_some()) {
@@ -258,6 +285,15 @@ impl<D: SlaveDevice> Running<D> {
         }
         if self.slave.handle(frame, now, &mut self.device) {
             self.pending_reset = Some(PendingReset { request: None, at: None });
+        }
+    }
+
+    /// Tells a node-ID that came over the bus.
+    fn tell_node_id(&mut self, tell: &mut impl FnMut(Event)) {
+        let id = self.slave.node().map(Node::id);
+        if let Some(id) = id.filter(|_| id != self.told) {
+            self.told = Some(id);
+            tell(Event::NodeId(id));
         }
     }
 
@@ -271,6 +307,20 @@ impl<D: SlaveDevice> Running<D> {
         if let Some(PendingReset { request, at: Some(at) }) = self.pending_reset {
             return now.has_reached(at).then_some(request);
         }
+        self.send(now, send);
+        if let Some(asked) = self.owed.take() {
+            // Behind the boot-up.
+            self.handle(&asked, now);
+            self.send(now, send);
+        }
+        if let Some(pending_reset) = self.pending_reset.as_mut().filter(|_| may_reset && self.slave.is_idle())
+        {
+            pending_reset.at = Some(now + ANSWER_TO_RESET_MS);
+        }
+        None
+    }
+
+    fn send(&mut self, now: Instant, send: &mut impl FnMut(Frame)) {
         while let Some(output) = self.slave.poll(now, true, &mut self.device) {
             match output {
                 Output::Send(frame) => send(frame),
@@ -278,9 +328,43 @@ impl<D: SlaveDevice> Running<D> {
                 Output::Join(_) | Output::Listen(_) | Output::RecoverFromBusOff | Output::Accept(_) => {}
             }
         }
-        if let Some(pending_reset) = self.pending_reset.as_mut().filter(|_| may_reset && self.slave.is_idle())
-        {
-            pending_reset.at = Some(now + ANSWER_TO_RESET_MS);
+    }
+}
+
+/// A program, which leaves as the application template does.
+impl Running<StandIn> {
+    fn handle_in_program(&mut self, frame: &Frame, now: Instant) {
+        if self.departure.proceed(false, now) != Next::Serve {
+            return;
+        }
+        if self.slave.handle(frame, now, &mut self.device) {
+            self.departure.begin(BootRequest::PowerOn, false, now);
+        }
+        match self.device.take_leave() {
+            None => {}
+            Some(Leave::Answered(request)) => {
+                self.departure.begin(request, request == BootRequest::Stay, now);
+            }
+            Some(Leave::Owed(owed)) => {
+                if self.slave.withdraw_answer(&[0x60, 0x51, 0x1F, owed.program, 0, 0, 0, 0]) {
+                    self.departure.begin_silent(BootRequest::Owed(owed), now);
+                } else if owed.value == 0 {
+                    // Written in segments, whose end only the program can acknowledge.
+                    self.departure.begin(BootRequest::Stay, true, now);
+                } else {
+                    self.slave.refuse(AbortCode::DEVICE_STATE);
+                }
+            }
+        }
+    }
+
+    /// Leaves if it is time, with this request, or sends what there is to send.
+    fn leave_or_exchange(&mut self, now: Instant, send: &mut impl FnMut(Frame)) -> Option<BootRequest> {
+        let quiet = self.slave.is_idle();
+        match self.departure.proceed(quiet, now) {
+            Next::Leave(request) => return Some(request),
+            Next::Wait => {}
+            Next::Serve => self.send(now, send),
         }
         None
     }

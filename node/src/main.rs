@@ -12,6 +12,7 @@ use boot_core::canopen::device;
 use boot_core::canopen::od::Entry;
 use boot_core::canopen::{BitRate, Instant, NodeId};
 use boot_core::control::Policy;
+use boot_core::crc::CrcKind;
 use boot_core::profile::Profile;
 use boot_core::store::NodeParameters;
 use clap::{Parser, ValueEnum};
@@ -90,6 +91,11 @@ struct Args {
     /// What the nodes speak where dialects contradict each other
     #[arg(long, value_enum, default_value = "standard")]
     profile: Dialect,
+
+    /// Blocks and programs carry a CRC-16, as of a product with `CrcKind::Crc16`; `coflash convert
+    /// --crc16` makes their files
+    #[arg(long)]
+    crc16: bool,
 
     /// The nodes stay in the bootloader whatever program they have, as with the entry strap set
     #[arg(long)]
@@ -265,8 +271,10 @@ fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
         layout: args.board,
         supports,
         boot_up_emergency: true,
+        lss_store: true,
         download: Policy {
             identity: Some((args.vendor_id, args.product_code)).filter(|identity| *identity != (0, 0)),
+            crc: if args.crc16 { CrcKind::Crc16 } else { CrcKind::Crc32 },
             ..profile.download
         },
         password: profile.password,
@@ -293,6 +301,7 @@ fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
 /// Says what came of a reset.
 fn log_event(serial: u32, event: Event) {
     let (node, what) = match event {
+        Event::NodeId(node) => (Some(node), "this node-ID came by LSS".to_owned()),
         Event::Bootloader { node, reason } => (node, format!("bootloader ({reason:?})")),
         Event::Program { number, trial, node } => {
             let trial = if trial { ", on trial" } else { "" };
@@ -306,4 +315,28 @@ fn log_event(serial: u32, event: Event) {
 fn print_line(line: &str) {
     // Nobody has to read it.
     let _ = writeln!(io::stdout(), "{line}");
+}
+
+#[cfg(test)]
+#[path = "../../xtask/src/pages.rs"]
+mod pages;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Every call of this program on every page, for the command line's own reader.
+    #[test]
+    fn what_the_pages_show_is_understood() {
+        let mut count = 0;
+        for shown in pages::commands() {
+            let Some(words) = pages::call_of(&shown.words, "coboot-node") else { continue };
+            count += 1;
+            let words = std::iter::once("coboot-node").chain(words.iter().map(String::as_str));
+            if let Err(error) = Args::try_parse_from(words) {
+                panic!("{}: {:?}: {error}", shown.place, shown.words);
+            }
+        }
+        assert!(count > 0);
+    }
 }

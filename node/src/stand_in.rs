@@ -1,9 +1,10 @@
 //! A program that is none: there is no CPU here that could run the one in the file. It answers what
 //! a host asks a running application for, as CiA 302-3 has it: which program runs (1F51h) and which
-//! one it is (1F56h); and it lets itself be called back to the bootloader (1F51h = 80h).
+//! one it is (1F56h); and it takes the commands of 1F51h as the application template does.
 
 use std::task::Poll;
 
+use boot_core::canopen::application::{react, Reaction, Standing};
 use boot_core::canopen::device::{self, Device};
 use boot_core::canopen::lss::{LssAddress, LssDevice, StoreError};
 use boot_core::canopen::od::{put, Access, Address, DataType, Entry, Objects};
@@ -12,29 +13,63 @@ use boot_core::canopen::program::{
 };
 use boot_core::canopen::slave::SlaveDevice;
 use boot_core::canopen::{AbortCode, BitRate, NodeId};
+use boot_core::flash::run;
+use boot_core::store::{Journal, Key, Parameters as _, ProgramRecord};
+use shared_abi::geometry::Region;
+use shared_abi::warm_start::{BootRequest, Owed};
+
+use crate::file_flash::FileFlash;
 
 /// 1000h: no standardised profile, and not the bootloader's value.
 const DEVICE_TYPE: u32 = 0;
 /// 100Ah. Nobody shall take it for the program itself.
 const SOFTWARE_VERSION: &str = "coboot-node stand-in";
 
+/// How the device leaves for a command.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Leave {
+    /// The program answers, and the bootloader finds this request.
+    Answered(BootRequest),
+    /// The bootloader answers.
+    Owed(Owed),
+}
+
+/// Which program it stands for, and how that came up.
+#[derive(Clone, Copy, Debug)]
+pub struct Started {
+    /// Its number.
+    pub program: u8,
+    /// It was started right behind its download in one go: the first 80h confirms it.
+    pub fresh: bool,
+    /// The node-ID in force, if the bootloader has the same one and can answer in its place.
+    pub bootloader_answers: Option<NodeId>,
+}
+
 /// The stand-in of a program.
 #[derive(Debug)]
 pub struct StandIn {
     entries: &'static [Entry],
     device: Device,
-    program: u8,
-    crcs: Vec<u32>,
-    called_back: bool,
+    started: Started,
+    flash: FileFlash,
+    /// Where the journal is.
+    parameters: [Region; 2],
+    leave: Option<Leave>,
 }
 
 impl StandIn {
-    /// Of this program, of those with these CRCs (0 for one that is not there), on a device that
-    /// says this of itself as a bootloader.
+    /// Of this program, on a device with this flash and journal that says this of itself as a
+    /// bootloader.
     #[must_use]
-    pub fn new(entries: &'static [Entry], bootloader: Device, program: u8, crcs: Vec<u32>) -> Self {
+    pub fn new(
+        entries: &'static [Entry],
+        bootloader: Device,
+        started: Started,
+        flash: FileFlash,
+        parameters: [Region; 2],
+    ) -> Self {
         let device = Device { device_type: DEVICE_TYPE, software_version: SOFTWARE_VERSION, ..bootloader };
-        Self { entries, device, program, crcs, called_back: false }
+        Self { entries, device, started, flash, parameters, leave: None }
     }
 
     /// Its object dictionary on a device with so many programs.
@@ -58,10 +93,54 @@ impl StandIn {
         self.device.lss_address()
     }
 
-    /// Whether the bootloader was asked for.
+    /// Whether and how the device shall leave, once.
+    pub fn take_leave(&mut self) -> Option<Leave> {
+        self.leave.take()
+    }
+
+    /// The flash behind it.
+    pub fn flash(&mut self) -> &mut FileFlash {
+        &mut self.flash
+    }
+
+    /// Ends; gives the flash back.
     #[must_use]
-    pub fn is_called_back(&self) -> bool {
-        self.called_back
+    pub fn into_flash(self) -> FileFlash {
+        self.flash
+    }
+
+    /// What is known of a program.
+    fn record(&self, program: u8) -> Option<ProgramRecord> {
+        ProgramRecord::load(&Journal::open(&self.flash, self.parameters), &self.flash, program)
+    }
+
+    /// What a program does through the callgate: it is signed, and needs no rescue window.
+    fn confirm(&mut self, program: u8) -> Result<(), AbortCode> {
+        let record = self.record(program).ok_or(AbortCode::HARDWARE)?;
+        let mut journal = Journal::open(&self.flash, self.parameters);
+        let confirmed = ProgramRecord { signed: true, confirmed: true, ..record };
+        journal.store(Key::Program(program), confirmed.value());
+        run(&mut self.flash, |flash, outcome| journal.next(flash, outcome)).map_err(|_| AbortCode::HARDWARE)
+    }
+
+    /// 1F51h: a command.
+    fn program_control(&mut self, program: u8, command: ProgramControl) -> Result<(), AbortCode> {
+        let Started { program: own, fresh, bootloader_answers } = self.started;
+        let standing = Standing { fresh, armed: false, can_hand_over: bootloader_answers.is_some() };
+        self.leave = Some(match react(command, program == own, standing)? {
+            Reaction::Nothing => return Ok(()),
+            Reaction::Confirm => {
+                self.started.fresh = false;
+                return self.confirm(program);
+            }
+            Reaction::CallBack => Leave::Answered(BootRequest::Stay),
+            Reaction::Restart => Leave::Answered(BootRequest::Start(program)),
+            Reaction::HandOver => {
+                let node_id = bootloader_answers.map_or(0, NodeId::get);
+                Leave::Owed(Owed { program, value: command as u8, node_id })
+            }
+        });
+        Ok(())
     }
 }
 
@@ -75,11 +154,17 @@ impl Objects for StandIn {
             return read;
         }
         match at.index {
-            PROGRAM_CONTROL if at.sub == self.program => put(buf, &[ProgramState::Running as u8]),
-            PROGRAM_CONTROL => put(buf, &[ProgramState::Stopped as u8]),
+            PROGRAM_CONTROL => {
+                let state = match self.record(at.sub) {
+                    _ if at.sub == self.started.program => ProgramState::Running,
+                    Some(_) => ProgramState::Stopped,
+                    None => ProgramState::Absent,
+                };
+                put(buf, &[state as u8])
+            }
             PROGRAM_ID => {
-                let crc = self.crcs.get(usize::from(at.sub).wrapping_sub(1)).copied();
-                put(buf, &crc.unwrap_or(0).to_le_bytes())
+                let crc = self.record(at.sub).map_or(0, |record| record.crc);
+                put(buf, &crc.to_le_bytes())
             }
             FLASH_STATUS => put(buf, &FlashStatus::OK.to_word().to_le_bytes()),
             _ => Err(AbortCode::NO_DATA),
@@ -88,16 +173,7 @@ impl Objects for StandIn {
 
     fn write(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
         let (PROGRAM_CONTROL, &[value]) = (at.index, data) else { return Err(AbortCode::UNSUPPORTED_ACCESS) };
-        match ProgramControl::try_from(value)? {
-            ProgramControl::StartBootloader => {
-                self.called_back = true;
-                Ok(())
-            }
-            // It runs already.
-            ProgramControl::Start if at.sub == self.program => Ok(()),
-            // The bootloader's to do.
-            _ => Err(AbortCode::DEVICE_STATE),
-        }
+        self.program_control(at.sub, ProgramControl::try_from(value)?)
     }
 }
 
@@ -112,4 +188,9 @@ impl LssDevice for StandIn {
     }
 }
 
-impl SlaveDevice for StandIn {}
+impl SlaveDevice for StandIn {
+    fn node_id_changed(&mut self, id: Option<NodeId>) {
+        // It is not stored: the bootloader comes up with the one that was in force before.
+        self.started.bootloader_answers = self.started.bootloader_answers.filter(|own| id == Some(*own));
+    }
+}

@@ -93,6 +93,29 @@ fn a_stand_in_answers_for_the_program_and_lets_itself_be_called_back() {
     nodes.await_line("serial 1, node 7: bootloader (Unsigned)");
 }
 
+/// A node of a product with CRC-16: files with the other CRC are refused, its own are taken, signed,
+/// and started, also behind a power-off.
+#[test]
+fn a_node_with_crc_16_starts_its_programs() {
+    // Polynomial 1021h, start 0 (CiA 301 clause 7.2.4.3.16).
+    let crc = program().iter().fold(0_u32, |crc, byte| {
+        (0..8).fold(crc ^ u32::from(*byte) << 8, |crc, _| {
+            (if crc & 0x8000 != 0 { crc << 1 ^ 0x1021 } else { crc << 1 }) & 0xFFFF
+        })
+    });
+    let folder = folder("crc16");
+    let options = ["--node", "7", "--flash", "instant", "--stand-in", "--crc16"];
+    let nodes = Nodes::start(&folder, &options);
+    let coflash = Coflash::new(&folder, &nodes);
+    assert_ne!(coflash.run(&[FLASH, &["-N", "7"]].concat()).exit, 0);
+    coflash.done(&[FLASH, &["-N", "7", "--crc16", "--verify"]].concat());
+    nodes.await_line("serial 1, node 7: would start program 1");
+    assert_eq!(coflash.json(&["read", "1F56/1", "-N", "7"])["number"], crc);
+    drop(nodes);
+    let nodes = Nodes::start(&folder, &options);
+    nodes.await_line("serial 1, node 7: would start program 1");
+}
+
 #[test]
 fn many_nodes_take_their_programs_at_the_same_time() {
     let folder = folder("many");
@@ -142,6 +165,9 @@ fn nodes_are_commissioned_by_layer_setting_services() {
     let coflash = Coflash::new(&folder, &nodes);
     let said = coflash.done(&["lss", "fastscan", "--assign", "40", "--store", "--lss-timeout", "60"]);
     assert!(said.contains("40") && said.contains("41"), "{said}");
+    // Those who look at the nodes' own words see who became what.
+    nodes.await_line("serial 77, node 40: this node-ID came by LSS");
+    nodes.await_line("serial 78, node 41: this node-ID came by LSS");
     assert_eq!(coflash.json(&["read", "1018/2", "-N", "41"])["number"], 0x1234);
     drop(nodes);
     let nodes = start(&folder);
@@ -153,6 +179,7 @@ fn nodes_are_commissioned_by_layer_setting_services() {
     assert!(said.contains("500"), "{said}");
     let said = coflash.done(&[&["lss", "assign", "-N", "9", "--reset", "--store"][..], &device].concat());
     assert!(said.contains('9'), "{said}");
+    nodes.await_line("serial 78, node 9: this node-ID came by LSS");
     assert_eq!(coflash.json(&["read", "1018/4", "-N", "9"])["number"], 78);
     let said = coflash.done(&[&["lss", "inquire"][..], &device].concat());
     assert!(said.contains("serial 0000004Eh: node 9"), "{said}");
@@ -215,9 +242,37 @@ fn two_programs_have_their_places() {
     assert!(said.contains("an application"), "{said}");
     nodes.await_line("serial 1, node 1: would start program 2");
     assert_eq!(coflash.json(&["read", "1F51/2", "-N", "1"])["number"], 1);
-    assert_eq!(coflash.json(&["read", "1F51/1", "-N", "1"])["number"], 0);
+    assert_eq!(coflash.json(&["read", "1F51/1", "-N", "1"])["number"], 3, "there is none");
     // zlib's crc32 over the 1000 bytes.
     assert_eq!(coflash.json(&["read", "1F56/2", "-N", "1"])["hex"], "1BD5F407");
+    // The first program, from the second one that runs; and the second, from the first.
+    folder.write("program.bin", &program());
+    coflash.done(&[&["flash", "program.bin", "-N", "1"][..], &flash].concat());
+    nodes.await_line("serial 1, node 1: would start program 1");
+    assert_eq!(coflash.json(&["read", "1F51/2", "-N", "1"])["number"], 0, "stopped");
+    coflash.done(&[&["flash", "second.bin", "-N", "1", "-P", "2", "--verify"][..], &flash].concat());
+    nodes.await_line("serial 1, node 1: would start program 2");
+    // Another one than the one that runs is started by way of the bootloader.
+    coflash.done(&["start", "-N", "1", "-P", "1"]);
+    nodes.await_line("serial 1, node 1: would start program 1");
+}
+
+/// A download in one go, started: the first 80h confirms it, and coflash asks again; STOP is answered by
+/// the bootloader.
+#[test]
+fn a_fresh_program_is_called_back_all_the_same() {
+    let folder = folder("fresh");
+    let nodes = Nodes::start(&folder, &["--node", "7", "--flash", "instant", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    coflash.done(&[FLASH, &["-N", "7", "--dialect", "raw"]].concat());
+    nodes.await_line("serial 1, node 7: would start program 1");
+    assert!(coflash.done(&["enter", "-N", "7"]).contains("the bootloader is running"));
+    nodes.await_line("serial 1, node 7: bootloader (Requested)");
+    coflash.done(&[FLASH, &["-N", "7", "--dialect", "raw"]].concat());
+    nodes.await_line("serial 1, node 7: would start program 1");
+    // From the running program, by STOP.
+    coflash.done(&[FLASH, &["-N", "7", "--dialect", "raw", "--no-start"]].concat());
+    nodes.await_line("serial 1, node 7: bootloader (Requested)");
 }
 
 /// A node on somebody else's bus: here that of other nodes.
@@ -277,6 +332,62 @@ fn clients_that_misbehave_harm_nobody() {
     coflash.done(&[FLASH, &["-N", "5", "--no-start"]].concat());
     assert!(folder.read("1.flash")[0x1_0000..] == flashed());
     drop(silent);
+}
+
+/// A block download that nobody goes on with: who asks is answered, and NMT reset node is carried out
+/// while somebody asks.
+#[test]
+fn an_abandoned_download_locks_nobody_out() {
+    let folder = folder("abandoned");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--heartbeat", "0"]);
+    let mut stream = TcpStream::connect(nodes.address()).unwrap();
+    stream.set_nodelay(true).unwrap();
+    let say =
+        |stream: &mut TcpStream, text: &str| stream.write_all(format!("< {text} >").as_bytes()).unwrap();
+    assert_eq!(bus::message(&mut stream), "< hi >");
+    for mode in ["open can0", "rawmode"] {
+        say(&mut stream, mode);
+        assert_eq!(bus::message(&mut stream), "< ok >");
+    }
+    // The next frame of the device, as identifier and data.
+    let heard = |stream: &mut TcpStream| {
+        let message = bus::message(stream);
+        let words: Vec<&str> = message.split_whitespace().collect();
+        format!("{}#{}", words[2], words[4])
+    };
+    let abandon = |stream: &mut TcpStream| {
+        say(stream, "send 605 8 C2 50 1F 01 00 10 00 00");
+        while heard(stream) != "585#A4501F017F000000" {}
+        for seqno in 1..4 {
+            say(stream, &format!("send 605 8 {seqno} 0 0 0 0 0 0 0"));
+        }
+    };
+    const ASK: &str = "send 605 8 40 00 10 00 00 00 00 00";
+    abandon(&mut stream);
+    say(&mut stream, ASK);
+    let first = heard(&mut stream);
+    // On a machine that is busy the question may come when the pause of the sub-block is over already.
+    let answer = if first == "585#A2037F0000000000" { heard(&mut stream) } else { first };
+    assert_eq!(answer, "585#4300100000000010");
+    abandon(&mut stream);
+    say(&mut stream, "send 0 2 81 05");
+    let mut asker = stream.try_clone().unwrap();
+    let asking = std::thread::spawn(move || {
+        for _ in 0..20 {
+            if asker.write_all(format!("< {ASK} >").as_bytes()).is_err() {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(100));
+        }
+    });
+    let mut answers = 0;
+    while heard(&mut stream) != "705#00" {
+        answers += 1;
+    }
+    // The reset takes 20 ms, so none is answered before it, or on a busy machine a few are; twenty were
+    // asked if the device had waited for the end of the transfer.
+    assert!(answers < 15, "{answers}");
+    asking.join().unwrap();
 }
 
 #[test]
