@@ -3,7 +3,9 @@
 use std::fmt;
 
 use crc::{Crc, Table, CRC_16_XMODEM, CRC_32_ISO_HDLC};
-use shared_abi::block_file::{Control, Header, Last, CRC_SIZE, HEADER_SIZE, NUMBER_CONTROL, NUMBER_LAST};
+use shared_abi::block_file::{
+    Control, Header, Last, CRC_SIZE, HEADER_SIZE, LAST_SIZE, LAST_SIZE_2008, NUMBER_CONTROL, NUMBER_LAST,
+};
 pub use shared_abi::block_file::{Identity, FRAMING, MAX_BLOCK_SIZE};
 
 use crate::image::{AddressRange, Image, Pieces};
@@ -61,6 +63,16 @@ pub const MAX_DATA: usize = MAX_BLOCK_SIZE - FRAMING;
 /// what exceeds it holds data for two memories.
 pub const MAX_PROGRAM_SIZE: u32 = 64 * 1024 * 1024;
 
+/// The form of the last block.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum LastBlock {
+    /// Size and CRC of the program: the manual of 2015.
+    #[default]
+    Of2015,
+    /// 32 reserved bytes in front of them: the manual of 2008.
+    Of2008,
+}
+
 /// One block, as one SDO download takes it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Block {
@@ -68,7 +80,7 @@ pub struct Block {
     pub number: u32,
     /// Where the data goes.
     pub flash_address: u32,
-    /// The data: control, program or the last block's eight bytes.
+    /// The data: control, program, or size and CRC of it.
     pub data: Vec<u8>,
 }
 
@@ -85,8 +97,12 @@ impl Block {
         let header = Header {
             number: self.number,
             flash_address: self.flash_address,
-            // A block is never larger than `MAX_DATA`.
-            size: self.data.len() as u32,
+            size: match (self.number, self.data.len()) {
+                // The manual of 2008 does not count the reserved bytes.
+                (NUMBER_LAST, LAST_SIZE_2008) => LAST_SIZE as u32,
+                // A block is never larger than `MAX_DATA`.
+                (_, size) => size as u32,
+            },
         };
         let mut bytes = Vec::with_capacity(FRAMING + self.data.len());
         bytes.extend_from_slice(&header.emit());
@@ -116,6 +132,7 @@ impl BlockFile {
         blocks: Vec<(u32, Vec<u8>)>,
         control: impl FnOnce(u32) -> Control,
         checksum: Checksum,
+        last_block: LastBlock,
     ) -> Self {
         let program_size = blocks.last().map_or(0, |(address, data)| address - start + data.len() as u32);
         let program_crc =
@@ -127,7 +144,11 @@ impl BlockFile {
         let block = |number, flash_address, data| Block { number, flash_address, data };
         let mut all = vec![block(NUMBER_CONTROL, 0, bytes[..len].to_vec())];
         all.extend((1..).zip(blocks).map(|(number, (address, data))| block(number, address, data)));
-        all.push(block(NUMBER_LAST, 0, last.emit().to_vec()));
+        let reserved = match last_block {
+            LastBlock::Of2015 => 0,
+            LastBlock::Of2008 => LAST_SIZE_2008 - LAST_SIZE,
+        };
+        all.push(block(NUMBER_LAST, 0, [&vec![0; reserved][..], &last.emit()].concat()));
         Self { blocks: all, control, last, checksum }
     }
 
@@ -338,7 +359,12 @@ fn parse_block(bytes: &[u8], checksum: Checksum, place: Place) -> Result<(Block,
     if size as usize > MAX_DATA {
         return Err(place.fault(Cause::BlockSize { number, size }));
     }
-    let crc_at = HEADER_SIZE + size as usize;
+    let mut crc_at = HEADER_SIZE + size as usize;
+    let of_2008 = HEADER_SIZE + LAST_SIZE_2008;
+    // The manual of 2008 does not count the reserved bytes. The last block ends with the file.
+    if number == NUMBER_LAST && size as usize == LAST_SIZE && bytes.len() == of_2008 + CRC_SIZE {
+        crc_at = of_2008;
+    }
     let crc = bytes.get(crc_at..).and_then(|rest| rest.first_chunk::<CRC_SIZE>());
     let crc = crc.ok_or_else(|| cut_off("a block", crc_at + CRC_SIZE))?;
     let (found, needed) = (u32::from_le_bytes(*crc), checksum.of([&bytes[..crc_at]].into_iter()));

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 
 use shared_abi::block_file::{Control, Identity};
 
-use crate::block_file::{BlockFile, Checksum, FRAMING, MAX_BLOCK_SIZE, MAX_PROGRAM_SIZE};
+use crate::block_file::{BlockFile, Checksum, LastBlock, FRAMING, MAX_BLOCK_SIZE, MAX_PROGRAM_SIZE};
 use crate::image::{AddressRange, Image};
 use crate::read::{Cause, Firmware, Place, ReadError};
 
@@ -120,6 +120,12 @@ pub struct Options {
     pub adjust_start: u32,
     /// With what the blocks and the program are checked: what the bootloader was built for.
     pub checksum: Checksum,
+    /// The most bytes in a row that a block may have without data of the program between two that
+    /// have (manual L-1112e_5, `FT_BLOCK_MAX_GAP`): a longer gap starts a new block. `None`: as many
+    /// as the block has room for.
+    pub max_gap: Option<u32>,
+    /// The form of the last block.
+    pub last_block: LastBlock,
 }
 
 impl Default for Options {
@@ -131,6 +137,8 @@ impl Default for Options {
             label: Label::default(),
             adjust_start: 0,
             checksum: Checksum::default(),
+            max_gap: None,
+            last_block: LastBlock::default(),
         }
     }
 }
@@ -194,9 +202,9 @@ pub fn convert(image: &Image, options: &Options) -> Result<Converted, ConvertErr
     if last - start >= MAX_PROGRAM_SIZE {
         return Err(Place::File.fault(Cause::TooSparse { first: start, last }).into());
     }
-    let blocks = blocks(&image, payload, options.gap_fill);
+    let blocks = blocks(&image, payload, options);
     let label = |app_size| options.label.control(app_size);
-    let file = BlockFile::new(start, blocks, label, options.checksum);
+    let file = BlockFile::new(start, blocks, label, options.checksum, options.last_block);
     Ok(Converted { file, left_out })
 }
 
@@ -288,20 +296,26 @@ fn check_range(range: AddressRange) -> Result<(), ConvertError> {
 }
 
 /// Address and data of each block.
-fn blocks(image: &Image, payload: usize, gap_fill: GapFill) -> Vec<(u32, Vec<u8>)> {
+fn blocks(image: &Image, payload: usize, options: &Options) -> Vec<(u32, Vec<u8>)> {
     let mut blocks: Vec<(u32, Vec<u8>)> = Vec::new();
     for piece in image.pieces() {
         let (mut address, mut data) = (u64::from(piece.address), piece.data.as_slice());
         while !data.is_empty() {
             // The block under way, if its window reaches this far, or else a new one.
-            let reaches = |(start, _): &(u32, Vec<u8>)| address < u64::from(*start) + payload as u64;
+            let reaches = |(start, data): &(u32, Vec<u8>)| {
+                let end = u64::from(*start) + data.len() as u64;
+                // A word that the block has begun is the block's: no word lies in two.
+                let same_word = address < end.next_multiple_of(WORD.into());
+                let near = options.max_gap.is_none_or(|most| address - end <= most.into());
+                address < u64::from(*start) + payload as u64 && (near || same_word)
+            };
             if !blocks.last().is_some_and(reaches) {
                 // `address` is that of a byte, so it fits.
                 blocks.push((address as u32 & !(WORD - 1), Vec::with_capacity(payload)));
             }
             let Some((start, block)) = blocks.last_mut() else { break };
             let gap = *start + block.len() as u32..address as u32;
-            block.extend(gap.map(|address| gap_fill.at(address)));
+            block.extend(gap.map(|address| options.gap_fill.at(address)));
             let (fitting, rest) = data.split_at(data.len().min(payload - block.len()));
             block.extend_from_slice(fitting);
             address += fitting.len() as u64;

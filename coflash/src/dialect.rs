@@ -13,6 +13,7 @@
 use std::fmt;
 use std::time::Duration;
 
+use canopen::nmt::parse_state_message;
 use canopen::program::{
     self, FlashError, ProgramControl, ProgramState, ESACADEMY_DEVICE_TYPE, LIFT_DEVICE_TYPE, LIFT_NODE_ID,
 };
@@ -22,7 +23,7 @@ use crate::block_file::BlockFile;
 use crate::error::Error;
 use crate::flash::{
     await_application, call_back, clear_and_wait, find, judge, DeviceState, Event, FlashOptions, Judgement,
-    RepeatReason,
+    RepeatReason, CALL_BACK,
 };
 use crate::info::{absent, optional};
 use crate::session::{DeviceType, Doing, Session, Timing, Transfers};
@@ -43,6 +44,8 @@ const LIFT_WAIT: Duration = Duration::from_secs(10);
 /// How often it is asked for meanwhile: a device that listens for the bit rate needs somebody who
 /// talks.
 const LIFT_PAUSE: Duration = Duration::from_millis(125);
+/// How long it takes to hear a heartbeat: they come once a second in most networks.
+const HEARTBEAT: Duration = Duration::from_millis(1200);
 /// A device that takes the whole program at once may erase behind any of its segments: 2 s at
 /// worst, and some more.
 const SLOW_SEGMENT: Duration = Duration::from_secs(5);
@@ -238,16 +241,25 @@ pub(crate) fn stop_program(
     tell: &mut dyn FnMut(Event),
 ) -> Result<(), Error> {
     const RUNNING: u32 = ProgramState::Running as u32;
-    let at = Address::new(program::PROGRAM_CONTROL, number);
-    if optional(session.read_number(at))? != Some(RUNNING) {
+    let control = |number| Address::new(program::PROGRAM_CONTROL, number);
+    // The one that runs may be another one than the one that is to be written.
+    let mut running = None;
+    for number in [number, CALL_BACK] {
+        if optional(session.read_number(control(number)))? == Some(RUNNING) {
+            running = Some(number);
+            break;
+        }
+    }
+    let Some(running) = running else {
         // Its bootloader runs already, or nobody can tell.
         return Ok(());
-    }
+    };
+    let at = control(running);
     tell(Event::CallingBack);
-    match session.command(number, ProgramControl::Stop) {
+    match session.command(running, ProgramControl::Stop) {
         Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
         Err(Error::Refused { .. }) => {
-            call_back(session, number)?;
+            call_back(session)?;
             tell(Event::InBootloader);
             return Ok(());
         }
@@ -255,8 +267,6 @@ pub(crate) fn stop_program(
     }
     let deadline = session.now() + session.timing().boot;
     loop {
-        let pause = session.timing().sdo;
-        session.await_boot_up(pause)?;
         match session.read_number(at) {
             Ok(RUNNING) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
             Ok(_) => break,
@@ -267,20 +277,20 @@ pub(crate) fn stop_program(
             let (node, running) = (session.node(), session.device_type()?);
             return Err(Error::NoBootloader { node, running, code: None });
         }
+        let pause = session.timing().sdo;
+        session.await_boot_up(pause)?;
     }
     tell(Event::InBootloader);
     Ok(())
 }
 
 /// Brings a lift device into its bootloader and unlocks it there (CiA 814-1 clause 6.3). From then
-/// on the session is with node 126.
+/// on the session is with node 126. [`check_lift`] comes before.
 ///
 /// # Errors
-/// [`Error::NoPassword`], [`Error::Occupied`], [`Error::NoBootloader`], and [`Error::Refused`] for
-/// a wrong password.
+/// [`Error::NoPassword`], [`Error::NoBootloader`], and [`Error::Refused`] for a wrong password.
 pub fn enter_lift(
     session: &mut Session<'_>,
-    running: DeviceType,
     password: Option<Password>,
     tell: &mut dyn FnMut(Event),
 ) -> Result<(), Error> {
@@ -288,10 +298,6 @@ pub fn enter_lift(
     let password = password.ok_or(Error::NoPassword { node })?;
     let lift = lift_node();
     if node != lift {
-        let mut look = session.with(lift, brief(session.timing()));
-        if look.device_type()?.is_some() {
-            return Err(Error::Occupied { node: lift });
-        }
         unlock(session, password)?;
         tell(Event::Unlocked);
         tell(Event::CallingBack);
@@ -300,11 +306,42 @@ pub fn enter_lift(
         await_lift(session)?;
         tell(Event::Moved(lift));
         tell(Event::InBootloader);
-    } else if !running.is_bootloader() {
-        return Err(Error::NoBootloader { node, running: Some(running), code: None });
     }
     unlock(session, password)?;
     tell(Event::Unlocked);
+    Ok(())
+}
+
+/// Looks whether a lift device can be updated, before anything is done to it: a password is there,
+/// and no other device has node-ID 126, be it one that only sends heartbeats (CiA 814-1 clause 6.3).
+///
+/// # Errors
+/// [`Error::NoPassword`], [`Error::Occupied`], [`Error::NoBootloader`].
+pub fn check_lift(
+    session: &mut Session<'_>,
+    running: DeviceType,
+    password: Option<Password>,
+) -> Result<(), Error> {
+    let (node, lift) = (session.node(), lift_node());
+    if password.is_none() {
+        return Err(Error::NoPassword { node });
+    }
+    if node == lift {
+        return if running.is_bootloader() {
+            Ok(())
+        } else {
+            Err(Error::NoBootloader { node, running: Some(running), code: None })
+        };
+    }
+    let mut look = session.with(lift, brief(session.timing()));
+    let there = look.device_type()?.is_some()
+        || look.hears_the_bus()
+            && look.observe_until(HEARTBEAT, &mut |frame| {
+                parse_state_message(frame).is_some_and(|(node, _)| node == lift)
+            })?;
+    if there {
+        return Err(Error::Occupied { node: lift });
+    }
     Ok(())
 }
 
@@ -565,7 +602,8 @@ pub fn read_locked(
         return Err(Error::NotInDialect { dialect, what });
     }
     let original = session.node();
-    enter_lift(session, running, password, tell)?;
+    check_lift(session, running, password)?;
+    enter_lift(session, password, tell)?;
     let bytes = session.upload(at, &mut |_| {});
     if original != session.node() && !matches!(bytes, Err(Error::Adapter(_))) {
         let restarted = reset_program(session, LIFT_PROGRAM);

@@ -75,6 +75,17 @@ pub enum Error {
         /// What the file says.
         file: u32,
     },
+    /// The program on trial is another device than its bootloader.
+    OtherIdentity {
+        /// Which device was looked at.
+        node: NodeId,
+        /// What differs.
+        what: IdentityPart,
+        /// What the bootloader told.
+        bootloader: Option<u32>,
+        /// What the program on trial tells, `None` for nothing.
+        application: Option<u32>,
+    },
     /// The application does not go back to the bootloader.
     NoBootloader {
         /// Which device.
@@ -142,6 +153,36 @@ pub enum LssFailure {
     },
 }
 
+/// A part of 1018h.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum IdentityPart {
+    /// 1018h/1.
+    VendorId,
+    /// 1018h/2.
+    ProductCode,
+    /// 1018h/4.
+    SerialNumber,
+}
+
+impl IdentityPart {
+    /// That of a sub-index of 1018h, among those which are compared.
+    pub(crate) const fn of(sub: usize) -> Self {
+        match sub {
+            1 => Self::VendorId,
+            2 => Self::ProductCode,
+            _ => Self::SerialNumber,
+        }
+    }
+
+    const fn words(self) -> &'static str {
+        match self {
+            Self::VendorId => "vendor-ID",
+            Self::ProductCode => "product code",
+            Self::SerialNumber => "serial number",
+        }
+    }
+}
+
 /// In what a device is another one than the file's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mismatch {
@@ -196,7 +237,7 @@ impl Error {
             Self::NotInDialect { .. } | Self::NoPassword { .. } => 0x6000_0018,
             Self::Occupied { .. } => 0x6000_0010,
             Self::Lss { failure: LssFailure::Refused { code, .. }, .. } => 0x6000_0200 + *code as u32,
-            Self::StartFailed { .. } => 0x6000_0014,
+            Self::StartFailed { .. } | Self::OtherIdentity { .. } => 0x6000_0014,
             Self::Busy { .. } => 0x6000_0016,
             Self::Refused { .. } | Self::Protocol { .. } => 0x6000_0025,
         }
@@ -229,6 +270,9 @@ impl Error {
                 .to_string(),
             Self::Failed { error, .. } => failure_advice(*error).to_string(),
             Self::WrongTarget { what, .. } => failure_advice(what.error()).to_string(),
+            Self::OtherIdentity { .. } => "check that the program was made for this device: it is not signed; one that has an \
+                                           identity of its own is flashed without --trial-run"
+                .to_string(),
             Self::Busy { .. } => "give it more time with --command-timeout, or switch the device off and on".to_string(),
             Self::NoBootloader { code: Some(_), .. } => {
                 "this application cannot be called back: bring the device into the bootloader by its entry strap, or \
@@ -395,6 +439,14 @@ impl fmt::Display for Error {
                     Mismatch::ProductCode => "product code",
                 };
                 write!(f, "the program is for {what} {file:08X}h, and node {node} has {device:08X}h")
+            }
+            Self::OtherIdentity { node, what, bootloader, application } => {
+                let number = |number: &Option<u32>| {
+                    number.map_or("none".to_string(), |number| format!("{number:08X}h"))
+                };
+                let (was, is) = (number(bootloader), number(application));
+                let what = what.words();
+                write!(f, "the program on trial tells {what} {is}, and the bootloader of node {node} {was}")
             }
             Self::NoBootloader { node, running, code } => {
                 match running {

@@ -14,8 +14,12 @@ use shared_abi::block_file::Control;
 use crate::block_file::{Block, BlockFile};
 use crate::dialect::{self, Dialect, Password};
 use crate::error::{Error, Mismatch};
-use crate::info::absent;
+use crate::flying_master::{self, Asked, Mastership};
+use crate::info::{absent, nameplate, Nameplate};
 use crate::session::{DeviceType, Doing, Session, Timing, Transfers};
+
+mod search;
+mod trial;
 
 /// What to do beyond the download itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,6 +45,11 @@ pub struct FlashOptions {
     /// Whether the session can follow a device to another node-ID, which lifts need. One of several
     /// at once cannot.
     pub follow: bool,
+    /// Search until the bootloader is there or the user gives up (manual, chapter 5.2, step 1):
+    /// neither silence nor an application that stays ends the procedure.
+    pub wait: bool,
+    /// Ask for the NMT mastership around a lift's update, and give it back (CiA 814-1 clause 6.3).
+    pub mastership: bool,
 }
 
 /// The device that a program is for: what 1018h/1 and 1018h/2 have to read.
@@ -77,15 +86,27 @@ impl Default for FlashOptions {
             dialect: None,
             unlock: None,
             follow: true,
+            wait: false,
+            mastership: true,
         }
     }
 }
 
 /// What happens during an update. `Display` has words for people.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Event {
+    /// Step 1: nothing of a bootloader yet, for this reason; it is looked for until it is there.
+    Searching(String),
     /// Step 2: this is running on the device.
     Found(DeviceType),
+    /// What the device tells of itself.
+    Nameplate(Box<Nameplate>),
+    /// The NMT mastership was taken over from this node.
+    MasterTaken(NodeId),
+    /// This node keeps the NMT mastership.
+    MasterKept(NodeId),
+    /// The NMT mastership was given back; this node has it now, if one says so.
+    MasterBack(Option<NodeId>),
     /// It is the device that the file is for.
     TargetRight(Target),
     /// Step 3: the application is asked to go back to the bootloader.
@@ -195,7 +216,19 @@ impl fmt::Display for DeviceState {
 impl fmt::Display for Event {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
+            Self::Searching(why) => write!(f, "searching for the bootloader, Ctrl-C ends it ({why})"),
             Self::Found(running) => write!(f, "found {running}"),
+            Self::Nameplate(plate) => write!(f, "device: {plate}"),
+            Self::MasterTaken(node) => write!(f, "NMT mastership taken over from node {node}"),
+            Self::MasterKept(node) => {
+                write!(f, "node {node} keeps the NMT mastership: it may disturb the update")
+            }
+            Self::MasterBack(Some(node)) => {
+                write!(f, "NMT mastership given back: node {node} is the master")
+            }
+            Self::MasterBack(None) => {
+                f.write_str("NMT mastership given back, and nobody has said that it is the master")
+            }
             Self::TargetRight(Target { vendor_id, product_code }) => {
                 write!(
                     f,
@@ -276,8 +309,14 @@ pub struct Report {
     pub dialect: Dialect,
 }
 
-/// How often an application is asked to go back to the bootloader.
-const CALLS: u32 = 2;
+/// How often an application is asked to go back to the bootloader. A program that was started right
+/// behind its download may take the first time for a confirmation.
+const CALLS: u32 = 3;
+/// How long an application that was called may go on before it leaves, and is not asked again.
+const LEAVES_WITHIN: Duration = Duration::from_secs(2);
+/// The sub-index of 1F51h that takes the call, whichever program runs (manual, step 3). An application
+/// of another maker has no other.
+pub(crate) const CALL_BACK: u8 = 1;
 
 /// Puts a program into a device: finds out what runs there, calls the bootloader, erases, sends the
 /// blocks, compares the CRC, and as the options say tries, signs and starts it.
@@ -294,7 +333,14 @@ pub fn flash(
     tell: &mut dyn FnMut(Event),
 ) -> Result<Report, Error> {
     let mut state = DeviceState::Untouched;
-    let result = procedure(session, file, options, &mut state, tell);
+    let mut mastership = None;
+    let result = procedure(session, file, options, &mut state, &mut mastership, tell);
+    if let Some(taken) = mastership {
+        // What became of the update stands, whatever becomes of this.
+        if let Ok(master) = flying_master::give_back(session, taken) {
+            tell(Event::MasterBack(master.map(|master| master.node)));
+        }
+    }
     if result.is_err() {
         tell(Event::Left(state));
     }
@@ -307,18 +353,13 @@ fn procedure(
     file: &BlockFile,
     options: &FlashOptions,
     state: &mut DeviceState,
+    mastership: &mut Option<Mastership>,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Report, Error> {
     let began = session.now();
     let number = options.program;
-    let running = find(session)?;
-    tell(Event::Found(running));
-    if let Some(target) = options.check_target {
-        check_target(session, target)?;
-        tell(Event::TargetRight(target));
-    }
     let original = session.node();
-    let dialect = enter(session, running, options, state, tell)?;
+    let dialect = search::reach(session, options, state, mastership, tell)?;
     let (repeats, transfer) = match dialect.content(file) {
         Some(content) if !options.trial_run => {
             let transfer_began = session.now();
@@ -382,13 +423,7 @@ fn by_blocks(
     verify(session, number, file.program_crc(), tell)?;
     *state = DeviceState::Unsigned;
     if options.trial_run {
-        tell(Event::TrialStarting);
-        let running = start(session, number)?;
-        if let Some(target) = options.check_target {
-            check_target(session, target)?;
-        }
-        call_back(session, number)?;
-        tell(Event::TrialPassed(running));
+        trial::run(session, options, tell)?;
     }
     sign(session, number, tell)?;
     *state = DeviceState::Signed;
@@ -401,12 +436,13 @@ fn enter(
     running: DeviceType,
     options: &FlashOptions,
     state: &mut DeviceState,
+    mastership: &mut Option<Mastership>,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Dialect, Error> {
     let number = options.program;
     let found = match options.dialect {
         Some(dialect) => dialect,
-        None => dialect::recognise(session, running, number)?,
+        None => dialect::recognise(session, running, CALL_BACK)?,
     };
     let mut dialect = found;
     match found {
@@ -416,7 +452,19 @@ fn enter(
         }
         Dialect::Lift => {
             tell(Event::Speaks(dialect));
-            dialect::enter_lift(session, running, options.unlock, &mut |event| {
+            tell(Event::Nameplate(Box::new(nameplate(session)?)));
+            dialect::check_lift(session, running, options.unlock)?;
+            if options.mastership {
+                match flying_master::ask(session)? {
+                    Asked::Nobody => {}
+                    Asked::Kept(master) => tell(Event::MasterKept(master.node)),
+                    Asked::Taken(taken) => {
+                        tell(Event::MasterTaken(taken.from.node));
+                        *mastership = Some(taken);
+                    }
+                }
+            }
+            dialect::enter_lift(session, options.unlock, &mut |event| {
                 if event == Event::CallingBack {
                     *state = DeviceState::Called;
                 }
@@ -432,7 +480,7 @@ fn enter(
         Dialect::Block | Dialect::EsAcademy => {
             *state = DeviceState::Called;
             tell(Event::CallingBack);
-            let running = call_back(session, number)?;
+            let running = call_back(session)?;
             tell(Event::InBootloader);
             if options.dialect.is_none() {
                 dialect = Dialect::of_bootloader(running, session.node()).unwrap_or(found);
@@ -465,18 +513,14 @@ pub fn check_target(session: &mut Session<'_>, target: Target) -> Result<(), Err
 /// # Errors
 /// [`Error::NoAnswer`] where nothing answers, [`Error::NoBootloader`] where the application does
 /// not go back.
-pub fn enter_bootloader(
-    session: &mut Session<'_>,
-    number: u8,
-    tell: &mut dyn FnMut(Event),
-) -> Result<(), Error> {
+pub fn enter_bootloader(session: &mut Session<'_>, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
     let running = find(session)?;
     tell(Event::Found(running));
     if running.is_bootloader() {
         return Ok(());
     }
     tell(Event::CallingBack);
-    call_back(session, number)?;
+    call_back(session)?;
     tell(Event::InBootloader);
     Ok(())
 }
@@ -507,11 +551,11 @@ pub fn find(session: &mut Session<'_>) -> Result<DeviceType, Error> {
 ///
 /// # Errors
 /// [`Error::NoBootloader`].
-pub fn call_back(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Error> {
+pub fn call_back(session: &mut Session<'_>) -> Result<DeviceType, Error> {
     let node = session.node();
     let mut seen = None;
-    for _ in 0..CALLS {
-        match session.command(number, ProgramControl::StartBootloader) {
+    for call in 1..=CALLS {
+        match session.command(CALL_BACK, ProgramControl::StartBootloader) {
             // A device that resets at once may not get its answer out.
             Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
             Err(Error::Refused { code, .. }) => {
@@ -520,7 +564,17 @@ pub fn call_back(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Er
             }
             Err(error) => return Err(error),
         }
-        seen = settle(session, |running| running.is_bootloader())?;
+        let timing = *session.timing();
+        // An application that goes on as before has taken the first call for a confirmation.
+        let first = Timing { boot: timing.boot.min(LEAVES_WITHIN), ..timing };
+        seen = settle(
+            &mut session.with(node, if call == 1 { first } else { timing }),
+            DeviceType::is_bootloader,
+        )?;
+        if call == 1 && seen.is_none() {
+            // It restarts.
+            seen = settle(session, DeviceType::is_bootloader)?;
+        }
         if let Some(running) = seen.filter(|running| running.is_bootloader()) {
             return Ok(running);
         }

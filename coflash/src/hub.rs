@@ -225,5 +225,8 @@ fn copy(error: &AdapterError) -> AdapterError {
         AdapterError::Lost { adapter, source } => {
             AdapterError::Lost { adapter: adapter.clone(), source: again(source) }
         }
+        AdapterError::Gateway { adapter, what } => {
+            AdapterError::Gateway { adapter: adapter.clone(), what: what.clone() }
+        }
     }
 }

@@ -26,13 +26,30 @@ pub struct DeviceInfo {
     /// 100Ah, software version.
     pub software_version: Option<String>,
     /// 1018h/1 to 4: vendor-ID, product code, revision, serial number.
-    pub identity: [Option<u32>; 4],
+    pub identity: Identity,
     /// What its bootloader speaks, as far as that can be seen; `None` for a device without
     /// programs.
     pub dialect: Option<Dialect>,
     /// Its programs, from number 1 on.
     pub programs: Vec<ProgramInfo>,
 }
+
+/// What a device tells people of itself before an update (CiA 814-1 clause 6.3): 1008h, 1009h, 100Ah
+/// and 1018h. `Display` has it in one line.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Nameplate {
+    /// 1008h, device name.
+    pub name: Option<String>,
+    /// 1009h, hardware version.
+    pub hardware_version: Option<String>,
+    /// 100Ah, software version.
+    pub software_version: Option<String>,
+    /// 1018h/1 to 4.
+    pub identity: Identity,
+}
+
+/// 1018h/1 to 4: vendor-ID, product code, revision, serial number; `None` for what is not told.
+pub type Identity = [Option<u32>; 4];
 
 /// What a device says about one of its programs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -53,16 +70,9 @@ pub struct ProgramInfo {
 /// [`Error::NoAnswer`] and the like; an object that the device does not have is no error.
 pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
     let device_type = find(session)?;
-    let mut text = |index| optional(session.read_text(Address::new(index, 0)));
-    let name = text(program::DEVICE_NAME)?;
-    let hardware_version = text(program::HARDWARE_VERSION)?;
-    let software_version = text(program::SOFTWARE_VERSION)?;
+    let Nameplate { name, hardware_version, software_version, identity } = nameplate(session)?;
     let mut number = |index, sub| optional(session.read_number(Address::new(index, sub)));
     let error_register = number(program::ERROR_REGISTER, 0)?;
-    let mut identity = [None; 4];
-    for (sub, value) in (1..).zip(&mut identity) {
-        *value = number(program::IDENTITY, sub)?;
-    }
     // The highest sub-index is the number of programs; a device without the object has none.
     let count = number(program::PROGRAM_CONTROL, 0)?.map_or(0, |count| count.min(254) as u8);
     let mut programs = Vec::new();
@@ -84,6 +94,30 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
         dialect,
         programs,
     })
+}
+
+/// Asks a device for its name, its versions and its identity.
+///
+/// # Errors
+/// As [`info`].
+pub fn nameplate(session: &mut Session<'_>) -> Result<Nameplate, Error> {
+    let mut text = |index| optional(session.read_text(Address::new(index, 0)));
+    let name = text(program::DEVICE_NAME)?;
+    let hardware_version = text(program::HARDWARE_VERSION)?;
+    let software_version = text(program::SOFTWARE_VERSION)?;
+    Ok(Nameplate { name, hardware_version, software_version, identity: identity(session)? })
+}
+
+/// Asks a device for its identity.
+///
+/// # Errors
+/// As [`info`].
+pub fn identity(session: &mut Session<'_>) -> Result<Identity, Error> {
+    let mut identity = [None; 4];
+    for (sub, value) in (1..).zip(&mut identity) {
+        *value = optional(session.read_number(Address::new(program::IDENTITY, sub)))?;
+    }
+    Ok(identity)
 }
 
 /// Asks a device about one of its programs.
@@ -146,6 +180,22 @@ impl fmt::Display for DeviceInfo {
             writeln!(f, "  {name:<17} {value}")?;
         }
         self.programs.iter().try_for_each(|program| write!(f, "{program}"))
+    }
+}
+
+impl fmt::Display for Nameplate {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let text = |value: &Option<String>| value.clone().unwrap_or_else(|| "not told".to_string());
+        let hex = |value: Option<u32>| value.map_or("not told".to_string(), |value| format!("{value:08X}h"));
+        let [vendor, product, revision, serial] = self.identity.map(hex);
+        write!(
+            f,
+            "{}, hardware {}, software {}, vendor-ID {vendor}, product code {product}, revision {revision}, \
+             serial number {serial}",
+            text(&self.name),
+            text(&self.hardware_version),
+            text(&self.software_version)
+        )
     }
 }
 

@@ -8,9 +8,12 @@
 //! | [`inspect`] | what a firmware file holds, in words |
 //! | [`block_file`] | the container that 1F50h takes: read, verified, written |
 //! | [`adapter`] | ways to a CAN bus, chosen by URL |
+//! | [`gateway`] | ways to devices on a bus somewhere else, by SDO alone |
+//! | [`link`] | what a URL leads to: a bus or a gateway |
 //! | [`session`] | SDO with one node: values, commands, status |
 //! | [`flash`] | the update procedure, with its steps as events |
 //! | [`dialect`] | what different bootloaders make of the same objects |
+//! | [`flying_master`] | NMT mastership, asked for and given back |
 //! | [`job`] | a file that says which devices get what |
 //! | [`many`] | the same for many devices at once |
 //! | [`hub`] | several conversations over one adapter |
@@ -21,6 +24,7 @@
 //! | [`candump`] | logs of frames |
 //! | [`diagnose`] | why a device may be silent |
 //! | [`config`] | a file with defaults for options |
+//! | [`legacy`] | the numbers that the manual's tools end with |
 //! | [`error`] | what can go wrong with a device, with numbers and advice |
 //!
 //! Flashing a file takes these lines:
@@ -56,11 +60,15 @@ pub mod diagnose;
 pub mod dialect;
 pub mod error;
 pub mod flash;
+pub mod flying_master;
+pub mod gateway;
 pub mod hub;
 pub mod image;
 pub mod info;
 pub mod inspect;
 pub mod job;
+pub mod legacy;
+pub mod link;
 pub mod lss;
 pub mod many;
 pub mod read;

@@ -9,6 +9,7 @@ use crate::adapter::Adapter;
 use crate::block_file::BlockFile;
 use crate::error::Error;
 use crate::flash::{flash, DeviceState, Event, FlashOptions, Report};
+use crate::gateway::Gateway;
 use crate::hub;
 use crate::session::{Session, Timing, Transfers};
 
@@ -58,23 +59,48 @@ pub fn flash_many(
     let sdo = options.timing.sdo.saturating_mul(at_once as u32);
     let timing = Timing { sdo, ..options.timing };
     let conversation = |(number, job): (usize, &Job)| -> (NodeId, hub::Conversation<'_, _>) {
-        let (job, cancelled, transfers) = (job.clone(), options.cancelled.clone(), options.transfers);
+        let (node, job, all) = (job.node, job.clone(), options.clone());
         let act = move |port: &mut hub::Port| {
             let mut session = Session::new(port, job.node, timing);
-            session.cancel_by(cancelled);
-            session.transfer_by(transfers);
-            let mut left = DeviceState::Untouched;
-            let options = FlashOptions { follow: false, ..job.options };
-            let result = flash(&mut session, &job.file, &options, &mut |event| {
-                if let Event::Left(state) = event {
-                    left = state;
-                }
-                tell(number, event);
-            });
-            result.map_err(|error| Failed { error, left })
+            let one = FlashOptions { follow: false, ..job.options };
+            update(&mut session, &job, &one, &all, &mut |event| tell(number, event))
         };
-        (jobs[number].node, Box::new(act))
+        (node, Box::new(act))
     };
     let conversations = jobs.iter().enumerate().map(conversation).collect();
     hub::run(adapter, conversations, at_once)
+}
+
+/// The same behind a gateway, which does one thing at a time: one device after the other.
+pub fn flash_in_turn(
+    gateway: &mut dyn Gateway,
+    jobs: &[Job],
+    options: &ManyOptions,
+    tell: &dyn Fn(usize, Event),
+) -> Vec<Result<Report, Failed>> {
+    let one = |(number, job): (usize, &Job)| {
+        let mut session = Session::through(&mut *gateway, job.node, options.timing);
+        update(&mut session, job, &job.options, options, &mut |event| tell(number, event))
+    };
+    jobs.iter().enumerate().map(one).collect()
+}
+
+/// Updates one of them.
+fn update(
+    session: &mut Session<'_>,
+    job: &Job,
+    one: &FlashOptions,
+    all: &ManyOptions,
+    tell: &mut dyn FnMut(Event),
+) -> Result<Report, Failed> {
+    session.cancel_by(all.cancelled.clone());
+    session.transfer_by(all.transfers);
+    let mut left = DeviceState::Untouched;
+    let result = flash(session, &job.file, one, &mut |event| {
+        if let Event::Left(state) = event {
+            left = state;
+        }
+        tell(event);
+    });
+    result.map_err(|error| Failed { error, left })
 }

@@ -8,7 +8,7 @@ use std::time::Duration;
 use canopen::nmt::{parse_state_message, NmtState};
 use canopen::program::DEVICE_TYPE;
 use canopen::sdo::wire::Request;
-use canopen::{Address, CobId, Frame, NodeId};
+use canopen::{AbortCode, Address, CobId, Frame, NodeId};
 use embedded_can::Frame as _;
 
 use crate::adapter::Adapter;
@@ -56,6 +56,9 @@ const AT_ONCE: usize = 16;
 
 /// Asks all nodes what they are, and listens to what the bus says by itself.
 ///
+/// A transfer that is under way with a node is aborted first: within a block download a question could
+/// be taken for a segment, and go unanswered.
+///
 /// # Errors
 /// [`Error::Adapter`] or [`Error::Cancelled`]; nobody there is no error.
 pub fn scan(
@@ -66,10 +69,14 @@ pub fn scan(
     let mut found: BTreeMap<NodeId, Found> = BTreeMap::new();
     let mut answered: Vec<NodeId> = Vec::new();
     if options.ask {
-        let question = Request::InitiateUpload(Address::new(DEVICE_TYPE, 0)).emit();
+        let device_type = Address::new(DEVICE_TYPE, 0);
+        let requests =
+            [Request::Abort(device_type, AbortCode::GENERAL), Request::InitiateUpload(device_type)];
         for nodes in options.nodes.chunks(AT_ONCE) {
             for node in nodes {
-                adapter.send(&Frame::of(CobId::sdo_request(*node), &question))?;
+                for request in &requests {
+                    adapter.send(&Frame::of(CobId::sdo_request(*node), &request.emit()))?;
+                }
             }
             let mut silent: Vec<NodeId> = nodes.to_vec();
             listen(adapter, options.timing.sdo.min(AT_ONCE_LIMIT), cancelled, &mut |frame| {

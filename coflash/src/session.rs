@@ -1,5 +1,5 @@
 //! A conversation with one node: SDO reads and writes, commands and their outcome, over any
-//! [`Adapter`].
+//! [`Adapter`] or [`Gateway`].
 
 use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -16,6 +16,11 @@ use canopen::{AbortCode, Address, CobId, Frame, Instant, NodeId};
 
 use crate::adapter::Adapter;
 use crate::error::Error;
+use crate::gateway::Gateway;
+
+mod remote;
+
+use self::remote::of_gateway;
 
 /// How long to wait for what.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -141,13 +146,22 @@ enum Patience {
     ForEachStep,
 }
 
+/// The way to the node.
+enum Way<'a> {
+    /// Frames: the SDO client is ours.
+    Bus(&'a mut dyn Adapter),
+    /// Objects: the SDO client is the gateway's.
+    Gateway(&'a mut dyn Gateway),
+}
+
 /// A conversation with one node.
 pub struct Session<'a> {
-    adapter: &'a mut dyn Adapter,
+    way: Way<'a>,
     node: NodeId,
     timing: Timing,
     transfers: Transfers,
     cancelled: Option<Arc<AtomicBool>>,
+    answer: Option<fn(&Frame) -> Option<Frame>>,
 }
 
 impl fmt::Debug for Session<'_> {
@@ -162,14 +176,27 @@ impl fmt::Debug for Session<'_> {
 impl<'a> Session<'a> {
     /// A conversation with `node`. Nothing is sent yet.
     pub fn new(adapter: &'a mut dyn Adapter, node: NodeId, timing: Timing) -> Self {
-        Self { adapter, node, timing, transfers: Transfers::default(), cancelled: None }
+        Self::over(Way::Bus(adapter), node, timing)
+    }
+
+    /// The same with a node behind a gateway.
+    pub fn through(gateway: &'a mut dyn Gateway, node: NodeId, timing: Timing) -> Self {
+        Self::over(Way::Gateway(gateway), node, timing)
+    }
+
+    fn over(way: Way<'a>, node: NodeId, timing: Timing) -> Self {
+        Self { way, node, timing, transfers: Transfers::default(), cancelled: None, answer: None }
     }
 
     /// The same conversation with another node, or with other patience, for a while.
     #[must_use]
     pub fn with(&mut self, node: NodeId, timing: Timing) -> Session<'_> {
-        let (transfers, cancelled) = (self.transfers, self.cancelled.clone());
-        Session { adapter: &mut *self.adapter, node, timing, transfers, cancelled }
+        let (transfers, cancelled, answer) = (self.transfers, self.cancelled.clone(), self.answer);
+        let way = match &mut self.way {
+            Way::Bus(adapter) => Way::Bus(&mut **adapter),
+            Way::Gateway(gateway) => Way::Gateway(&mut **gateway),
+        };
+        Session { way, node, timing, transfers, cancelled, answer }
     }
 
     /// Goes on with another node.
@@ -180,6 +207,12 @@ impl<'a> Session<'a> {
     /// Ends with [`Error::Cancelled`] as soon as `flag` is set: a transfer under way is aborted.
     pub fn cancel_by(&mut self, flag: Arc<AtomicBool>) {
         self.cancelled = Some(flag);
+    }
+
+    /// Answers by this to frames that come meanwhile, whatever else is under way: what it gives is
+    /// sent.
+    pub fn answer_by(&mut self, answer: Option<fn(&Frame) -> Option<Frame>>) {
+        self.answer = answer;
     }
 
     /// Writes this way from now on.
@@ -208,7 +241,16 @@ impl<'a> Session<'a> {
     /// The time on the bus.
     #[must_use]
     pub fn now(&self) -> Duration {
-        self.adapter.now()
+        match &self.way {
+            Way::Bus(adapter) => adapter.now(),
+            Way::Gateway(gateway) => gateway.now(),
+        }
+    }
+
+    /// Whether it hears what others say on the bus. Behind a gateway it does not.
+    #[must_use]
+    pub fn hears_the_bus(&self) -> bool {
+        matches!(self.way, Way::Bus(_))
     }
 
     /// Reads a value of up to 4096 bytes. A read that gets no answer is repeated.
@@ -233,6 +275,9 @@ impl<'a> Session<'a> {
     /// # Errors
     /// As [`read`](Self::read).
     pub fn read_once(&mut self, at: Address) -> Result<Vec<u8>, Error> {
+        if !self.hears_the_bus() {
+            return self.read_there(at);
+        }
         let mut bytes = [0; VALUE_MAX];
         let mut upload = Upload::new(self.node, at, Buffer::new(&mut bytes), self.config());
         // A value is short: all of it has to be here in time.
@@ -246,6 +291,9 @@ impl<'a> Session<'a> {
     /// # Errors
     /// As [`read`](Self::read); [`Error::Protocol`] for more than [`UPLOAD_MAX`] bytes.
     pub fn upload(&mut self, at: Address, progress: &mut dyn FnMut(u32)) -> Result<Vec<u8>, Error> {
+        if !self.hears_the_bus() {
+            return self.upload_there(at, self.timing.command, progress);
+        }
         let (sink, config) = (Grown(Vec::new()), self.config());
         let mut upload = match self.transfers {
             Transfers::Blocks => Upload::as_blocks(self.node, at, sink, config, Block::default()),
@@ -286,6 +334,9 @@ impl<'a> Session<'a> {
         doing: Doing,
         progress: &mut dyn FnMut(u32),
     ) -> Result<(), Error> {
+        if !self.hears_the_bus() {
+            return self.write_there(at, data, doing, progress);
+        }
         if self.transfers == Transfers::Blocks && data.len() > WORTH_BLOCKS {
             let block = Block { fallback: false, ..Block::default() };
             let mut download = Download::as_blocks(self.node, at, data, self.config(), block);
@@ -444,8 +495,46 @@ impl<'a> Session<'a> {
     /// # Errors
     /// [`Error::Adapter`].
     pub fn reset_node(&mut self) -> Result<(), Error> {
-        let command = [NmtCommand::ResetNode as u8, self.node.get()];
-        Ok(self.adapter.send(&Frame::of(CobId::NMT, &command))?)
+        let node = self.node;
+        match &mut self.way {
+            Way::Bus(adapter) => {
+                Ok(adapter.send(&Frame::of(CobId::NMT, &[NmtCommand::ResetNode as u8, node.get()]))?)
+            }
+            Way::Gateway(gateway) => {
+                gateway.reset_node(node).map_err(|error| of_gateway(error, node, Doing::Restart))
+            }
+        }
+    }
+
+    /// Sends a frame that is no SDO. A gateway carries none, and none is sent there.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`].
+    pub fn send(&mut self, frame: &Frame) -> Result<(), Error> {
+        match &mut self.way {
+            Way::Bus(adapter) => Ok(adapter.send(frame)?),
+            Way::Gateway(_) => Ok(()),
+        }
+    }
+
+    /// The next frame from the bus. Those that somebody else waits for are answered on the way. Of a
+    /// gateway, boot-up messages are all there is to hear.
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, Error> {
+        let adapter = match &mut self.way {
+            Way::Bus(adapter) => adapter,
+            Way::Gateway(gateway) => {
+                let booted = gateway.wait(timeout);
+                let booted = booted.map_err(|error| of_gateway(error, self.node, Doing::Restart))?;
+                return Ok(booted.map(|node| Frame::of(CobId::heartbeat(node), &[0])));
+            }
+        };
+        let frame = adapter.receive(timeout)?;
+        if let (Some(answer), Some(frame)) = (self.answer, &frame) {
+            if let Some(answer) = answer(frame) {
+                adapter.send(&answer)?;
+            }
+        }
+        Ok(frame)
     }
 
     /// Receives until `enough` says so, `time` at most; tells whether it did.
@@ -454,7 +543,7 @@ impl<'a> Session<'a> {
         loop {
             self.check_cancelled()?;
             let left = deadline.saturating_sub(self.now());
-            if let Some(frame) = self.adapter.receive(left.min(SLICE))? {
+            if let Some(frame) = self.receive(left.min(SLICE))? {
                 if enough(&frame) {
                     return Ok(true);
                 }
@@ -487,7 +576,7 @@ impl<'a> Session<'a> {
         self.check_cancelled()?;
         // Answers to requests that were given up are no answers to this one.
         let mut stale = 0;
-        while stale < 1000 && self.adapter.receive(Duration::ZERO)?.is_some() {
+        while stale < 1000 && self.receive(Duration::ZERO)?.is_some() {
             stale += 1;
         }
         let mut deadline = self.now() + self.timing.command;
@@ -504,10 +593,10 @@ impl<'a> Session<'a> {
             }
             match transfer.poll(self.instant()) {
                 Step::Send(frame) => {
-                    self.adapter.send(&frame)?;
+                    self.send(&frame)?;
                     burst += 1;
                     if burst % BURST == 0 {
-                        if let Some(frame) = self.adapter.receive(Duration::ZERO)? {
+                        if let Some(frame) = self.receive(Duration::ZERO)? {
                             let now = self.instant();
                             transfer.handle(&frame, now);
                         }
@@ -518,7 +607,7 @@ impl<'a> Session<'a> {
                     let now = self.instant();
                     let left = if now.has_reached(until) { 0 } else { until.since(now) };
                     let left = Duration::from_millis(left.into());
-                    if let Some(frame) = self.adapter.receive(left.min(SLICE))? {
+                    if let Some(frame) = self.receive(left.min(SLICE))? {
                         let now = self.instant();
                         transfer.handle(&frame, now);
                         if transfer.progress() != told {

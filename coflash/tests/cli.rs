@@ -87,6 +87,29 @@ fn a_build_script_for_the_manuals_converter_works() {
     }
 }
 
+/// Blocks are taken as they are: it is said which CRC they keep, and that options for another one do
+/// nothing.
+#[test]
+fn convert_of_a_block_file_says_which_crc_it_keeps() {
+    let folder = Folder::new("convert-block");
+    let out = folder.path("out.blk");
+    for (name, options, kept, warns) in [
+        ("plain-400.blk", &[][..], "CRC-32", false),
+        ("plain-400.blk", &["--crc16"], "CRC-32", true),
+        ("crc16-400.blk", &[], "CRC-16", false),
+        ("crc16-400.blk", &["--crc16"], "CRC-16", false),
+        ("crc16-400.blk", &["--vid", "1", "--pid", "2"], "CRC-16", true),
+    ] {
+        let input = data(name);
+        let done = coflash(&[&["convert", "-I", "block", &input, &out][..], options].concat());
+        assert_eq!(done.exit, 0, "{}", done.err);
+        let words = format!("{input}: a block file already, which keeps its {kept}\n");
+        assert!(done.out.starts_with(&words), "{}", done.out);
+        assert_eq!(done.err.contains("change nothing in blocks"), warns, "{options:?}: {}", done.err);
+        assert!(fs::read(&out).unwrap() == fs::read(&input).unwrap());
+    }
+}
+
 #[test]
 fn inspect_tells_what_a_file_holds() {
     let shown = |file: &str, options: &[&str]| {

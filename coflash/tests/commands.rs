@@ -106,6 +106,26 @@ fn status_shows_and_clears() {
     assert_eq!((&json["status"]["error"], fake.writes()), (&Value::Null, vec!["command 02"]));
 }
 
+/// The device may be named before and behind what `debug` is to do.
+#[test]
+fn debug_knows_its_device_wherever_it_is_named() {
+    let words = ["debug", "read", "0x20000000", "64", "--node", "5"];
+    for place in [1, 4] {
+        let mut words = words.to_vec();
+        let option: Vec<&str> = words.drain(4..).collect();
+        words.splice(place..place, option);
+        let (bus, server) = serve(quick(APPLICATION));
+        let done = coflash(&[&["--bus", &bus], &words[..]].concat());
+        assert_eq!(done.exit, 6, "{words:?}: {}", done.err);
+        assert!(
+            done.err.contains("node 5 refuses") && done.err.contains("no debugger interface"),
+            "{}",
+            done.err
+        );
+        server.join().unwrap();
+    }
+}
+
 #[test]
 fn info_shows_the_device() {
     let (said, json, _) = on(|| quick(APPLICATION), &["info"]);
@@ -210,6 +230,15 @@ fn scan_finds_who_answers_and_who_is_heard() {
     assert!(out.contains("no answer") && bus.0.iter().all(|fake| fake.sent.is_empty()), "{out}");
     let (out, _) = scan(&["-N", "9,11-12"]);
     assert!(out.contains("\n9     bootloader"), "{out}");
+    // What a tool that was closed has left unfinished is ended first: within a block download a question
+    // can be taken for a segment.
+    let folder = Folder::new("scan");
+    let trace = folder.path("scan.log");
+    scan(&["-N", "9", "--trace", &trace]);
+    let text = fs::read_to_string(&trace).unwrap();
+    let frames: Vec<String> =
+        text.lines().map(|line| Line::parse(line).unwrap().unwrap().frame.to_string()).collect();
+    assert_eq!(frames[..2], ["609#8000100000000008", "609#4000100000000000"]);
     let (bus, server) = serve(Bus(vec![]));
     let done = coflash(&["scan", "--bus", &bus, "--listen", "10", "--sdo-timeout", "10"]);
     assert!(done.exit == 0 && done.out.starts_with("nobody answers, and nobody is heard"), "{}", done.out);

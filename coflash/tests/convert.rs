@@ -1,7 +1,7 @@
 //! Conversion against block files made by other tools (`data/make.sh`) and against literals from
 //! the manual's tables.
 
-use coflash::block_file::{BlockFile, Checksum};
+use coflash::block_file::{BlockFile, Checksum, LastBlock};
 use coflash::convert::{blocks_of, convert, ConvertError, Converted, GapFill, Label, Options, Region};
 use coflash::image::{AddressRange, Image};
 use coflash::read::{self, Firmware, Format};
@@ -49,6 +49,28 @@ fn every_format_of_one_program_gives_the_same_block_file() {
             assert_eq!(left_out, 0);
         }
     }
+}
+
+/// The last block of the manual of 2008 (L-1112e_5, 5.1): data size 8, 32 reserved bytes that it does
+/// not count, size and CRC. Everything before it is as it is today.
+#[test]
+fn the_last_block_of_2008_is_written_and_read() {
+    let elf = image(data!("program.elf"));
+    let options = Options { region: board(), last_block: LastBlock::Of2008, ..Options::default() };
+    let file = convert(&elf, &options).unwrap().file;
+    let (old, new) = (file.emit(), data!("plain-400.blk"));
+    let (before, last) = old.split_at(old.len() - 56);
+    assert!(before == &new[..new.len() - 24]);
+    let today = &new[new.len() - 24..];
+    assert_eq!(last[..12], today[..12], "number, address, data size 8");
+    assert_eq!((last[8..12].to_vec(), &last[12..44]), (vec![8, 0, 0, 0], &[0; 32][..]));
+    assert_eq!(last[44..52], today[12..20], "size and CRC of the program");
+    assert_eq!(BlockFile::parse(&old).unwrap(), file);
+    // One byte less is no last block of either manual.
+    assert!(BlockFile::parse(&old[..old.len() - 1]).is_err());
+    let mut damaged = old.clone();
+    damaged[before.len() + 20] ^= 1;
+    assert!(BlockFile::parse(&damaged).is_err(), "its CRC runs over the reserved bytes");
 }
 
 /// Polynomial 1021h in blocks and program, stored in 32 bits (manual, table 8); made with Python's
@@ -174,6 +196,29 @@ fn gaps_inside_a_block_take_the_fill_and_count_in_the_crc() {
     assert_eq!(data(0xFFFF_FFFF), (vec![1, 255, 255, 255, 255, 255, 255, 2], 0x08A9_57C5));
     assert_eq!(data(0x0000_00A5), (vec![1, 0xA5, 0xA5, 0xA5, 0xA5, 0xA5, 0xA5, 2], 0xD575_ECB9));
     assert_eq!(data(0x4433_2211), (vec![1, 0x22, 0x33, 0x44, 0x11, 0x22, 0x33, 2], 0x173E_DAA0));
+}
+
+/// The 2008 manual's `FT_BLOCK_MAX_GAP`: so many bytes in a row may a block have that are not the
+/// program's; with one more the program goes on in a new block.
+#[test]
+fn a_gap_that_is_too_long_starts_a_new_block() {
+    // 01 at 08010000h, 02 at 08010010h (a gap of 15), 03 at 08010013h (of 2, within a word).
+    let text = b":020000040801F1\n:0100000001FE\n:0100100002ED\n:0100130003E9\n:00000001FF\n";
+    let image = image(text);
+    let blocks = |max_gap| {
+        let file = convert(&image, &Options { max_gap, ..Options::default() }).unwrap().file;
+        let blocks: Vec<(u32, usize)> =
+            file.program_blocks().iter().map(|block| (block.flash_address, block.data.len())).collect();
+        (blocks, file.program_size())
+    };
+    let (start, next) = (0x0801_0000, 0x0801_0010);
+    for whole in [None, Some(15), Some(u32::MAX)] {
+        assert_eq!(blocks(whole), (vec![(start, 20)], 20), "{whole:?}");
+    }
+    // Flash is programmed by words: a gap within one never ends a block.
+    for split in [14, 2, 1, 0] {
+        assert_eq!(blocks(Some(split)), (vec![(start, 1), (next, 4)], 20), "{split}");
+    }
 }
 
 #[test]

@@ -223,8 +223,8 @@ fn a_file_for_another_device_erases_nothing() {
         let mut fake = Fake::new(running);
         let right = check(Target { vendor_id: 0x3F, product_code: 1234 });
         run(&mut fake, FlashOptions { trial_run: true, ..right }).0.unwrap();
-        // At first, and the program on trial.
-        assert_eq!((fake.count("read 1018/1"), fake.count("read 1018/2")), (2, 2));
+        // At first; bootloader and program on trial, which are compared; and the program with the file.
+        assert_eq!((fake.count("read 1018/1"), fake.count("read 1018/2")), (4, 4));
     }
 }
 
@@ -252,7 +252,7 @@ fn a_failure_tells_how_it_leaves_the_device() {
         change(&mut fake);
         let (result, events) = run(&mut fake, options);
         assert!(result.is_err());
-        *events.last().unwrap()
+        events.last().unwrap().clone()
     };
     let (plain, trial) =
         (FlashOptions::default(), FlashOptions { trial_run: true, ..FlashOptions::default() });
@@ -480,14 +480,48 @@ fn busy_for_ever_is_given_up() {
     assert_eq!(fails(&mut fake).number(), 0x6000_0013);
 }
 
+/// A program that was started right behind its download takes the first 80h for "confirm": it answers,
+/// and goes on. It is asked again, and soon.
+#[test]
+fn an_application_that_takes_the_first_call_for_a_confirmation_is_called_again() {
+    let mut fake = Fake::new(APPLICATION);
+    let mut calls = 0;
+    fake.on_command = Box::new(move |command| {
+        calls += u32::from(command == 0x80);
+        if command == 0x80 && calls == 1 {
+            Outcome::Ignore
+        } else {
+            Outcome::Accept
+        }
+    });
+    let began = fake.now;
+    let report = run(&mut fake, FlashOptions::default()).0.unwrap();
+    assert_eq!((fake.count("command 80"), fake.count("command 03")), (2, 1));
+    assert_eq!(report.running.map(|running| running.0), Some(APPLICATION));
+    let took = fake.now - began;
+    assert!(took < Timing::default().boot, "not after the time that a restart may take: {took:?}");
+}
+
+/// The call goes through 1F51h/1, whichever program runs and whichever is to be written (manual, steps 3
+/// and 12): an application has no other sub-index as a rule.
+#[test]
+fn a_second_program_is_written_to_a_device_whose_first_one_runs() {
+    let mut fake = Fake::new(APPLICATION);
+    let options = FlashOptions { program: 2, ..FlashOptions::default() };
+    // The fake's bootloader has one program, so the procedure ends there; it was called back before.
+    let error = run(&mut fake, options).0.unwrap_err();
+    assert_eq!(fake.writes(), ["command 80"], "{error}");
+    assert_eq!(fake.running, Some(BOOTLOADER));
+}
+
 #[test]
 fn an_application_that_does_not_go_back() {
     let mut fake = Fake::new(APPLICATION);
     fake.on_command = script(0x80, usize::MAX, Outcome::Ignore);
     let error = fails(&mut fake);
-    assert_eq!((error.number(), fake.count("command 80")), (0x6000_0010, 2));
+    assert_eq!((error.number(), fake.count("command 80")), (0x6000_0010, 3));
     assert_eq!(error.to_string(), "node 5 stays in an application (device type 00020192h)");
-    assert_eq!(fake.writes(), ["command 80"; 2], "nothing was erased");
+    assert_eq!(fake.writes(), ["command 80"; 3], "nothing was erased");
 
     let mut fake = Fake::new(APPLICATION);
     fake.on_command = script(0x80, usize::MAX, Outcome::Abort(0x0602_0000));

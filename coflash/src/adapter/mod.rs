@@ -7,12 +7,14 @@ use std::time::Duration;
 
 use canopen::Frame;
 
+mod sdo_ids;
 pub mod slcan;
 #[cfg(target_os = "linux")]
 mod socketcan;
 pub mod socketcand;
 mod trace;
 
+pub use self::sdo_ids::SdoIds;
 pub use self::slcan::{Line, Slcan};
 pub use self::socketcand::Socketcand;
 pub use self::trace::{OnFailure, Trace};
@@ -71,7 +73,7 @@ impl<A: Adapter + ?Sized> Adapter for Box<A> {
 
 /// What [`open`] understands, for messages and help texts.
 pub const URLS: &str = "socketcand://HOST:PORT/BUS, slcan:PORT@BITRATE, slcan:tcp://HOST:PORT@BITRATE, \
-                        socketcan:INTERFACE (Linux)";
+                        socketcan:INTERFACE (Linux), cia309://HOST:PORT/NET (gateway, SDO alone)";
 
 /// How long a server may take to let us in, and to take what we send.
 const PATIENCE: Duration = Duration::from_secs(3);
@@ -125,6 +127,7 @@ pub fn open_at(url: &str, bit_rate: Option<u32>) -> Result<Box<dyn Adapter>, Ada
         "socketcan" => Err(bad("it names no interface: socketcan:can0")),
         #[cfg(not(target_os = "linux"))]
         "socketcan" => Err(bad("only Linux has SocketCAN")),
+        "cia309" => Err(bad("a gateway carries SDO alone, and this needs the CAN bus itself")),
         _ => Err(bad("there is no such adapter")),
     }
 }
@@ -157,7 +160,7 @@ fn parse_bit_rate(text: &str) -> Option<u32> {
 }
 
 /// Connects to the first of the server's addresses that answers.
-fn connect(server: &str, default_port: Option<u16>) -> io::Result<TcpStream> {
+pub(crate) fn connect(server: &str, default_port: Option<u16>) -> io::Result<TcpStream> {
     let has_port = server.rsplit_once(':').is_some_and(|(host, port)| {
         !port.is_empty()
             && port.bytes().all(|b| b.is_ascii_digit())
@@ -208,6 +211,13 @@ pub enum AdapterError {
         /// How that showed.
         source: io::Error,
     },
+    /// A gateway does not answer, or does not do what it is asked, for a reason of its own.
+    Gateway {
+        /// Which one.
+        adapter: String,
+        /// What is the matter, as a sentence about it.
+        what: String,
+    },
 }
 
 impl AdapterError {
@@ -219,6 +229,7 @@ impl AdapterError {
             Self::Open { .. } => 0x6000_0301,
             Self::Protocol { .. } => 0x6000_0302,
             Self::Lost { .. } => 0x6000_0303,
+            Self::Gateway { .. } => 0x6000_0304,
         }
     }
 
@@ -235,6 +246,10 @@ impl AdapterError {
             Self::Protocol { .. } => {
                 "check that the address is that of the adapter, and that it knows this bus"
             }
+            Self::Gateway { .. } => {
+                "check the network's number behind the gateway's address, and that the gateway is on the bus; then run \
+                 the command again"
+            }
             Self::Lost { .. } => {
                 "check cable, adapter and the program behind it; the device can be flashed again at once"
             }
@@ -249,6 +264,7 @@ impl fmt::Display for AdapterError {
             Self::Open { adapter, source } => write!(f, "{adapter} cannot be opened: {source}"),
             Self::Protocol { adapter, said } => write!(f, "{adapter} answered unexpectedly: {said}"),
             Self::Lost { adapter, source } => write!(f, "{adapter} is gone: {source}"),
+            Self::Gateway { adapter, what } => write!(f, "{adapter}: {what}"),
         }
     }
 }
@@ -257,7 +273,7 @@ impl std::error::Error for AdapterError {
     fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
         match self {
             Self::Open { source, .. } | Self::Lost { source, .. } => Some(source),
-            Self::Url { .. } | Self::Protocol { .. } => None,
+            Self::Url { .. } | Self::Protocol { .. } | Self::Gateway { .. } => None,
         }
     }
 }

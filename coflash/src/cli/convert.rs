@@ -6,6 +6,7 @@ use std::time::SystemTime;
 use clap::Args;
 use coflash::block_file::FRAMING;
 use coflash::convert::{Converted, Label};
+use coflash::read::Firmware;
 use serde_json::json;
 
 use super::file::{warn_left_out, Input, Source};
@@ -97,7 +98,19 @@ impl Convert {
             let what = format!("{} would be overwritten by its own conversion", input.display());
             return Err(Failure::usage(what, "name another file for the result"));
         }
-        let done = self.source.blocks(input, self.program, self.labels.label()?)?;
+        let (firmware, _) = self.source.load(input, self.program)?;
+        if let Firmware::Blocks(blocks) = &firmware {
+            // Blocks are taken as they are, their CRC among it.
+            let (file, kept) = (input.display(), blocks.checksum());
+            context.out.say(format_args!("{file}: a block file already, which keeps its {kept}"));
+            if self.source.wants(kept) || self.labels.vid.is_some() {
+                let advice = "convert the firmware that it was made of";
+                context.out.warn(format_args!(
+                    "{file}: --crc16, --vid and --pid change nothing in blocks: {advice}"
+                ));
+            }
+        }
+        let done = self.source.convert(firmware, input, self.program, self.labels.label()?)?;
         warn_left_out(context, input, &done);
         write(&output, &done.file.emit())?;
         if self.temp {

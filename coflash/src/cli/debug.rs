@@ -18,7 +18,9 @@ use super::Context;
 ///
 /// For firmware that was built with the feature `debugger` (docs/debugger.md); no product has it.
 /// Addresses are in C notation, like 0x20000000.
+// The device may be named behind what is done with it, too.
 #[derive(Debug, Args)]
+#[command(mut_args(|argument| argument.global(true)))]
 pub(super) struct Debug {
     #[command(subcommand)]
     what: What,
@@ -121,8 +123,8 @@ struct Done {
 
 impl Debug {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        let mut adapter = context.open()?;
-        let mut session = self.device.session(&mut *adapter)?;
+        let mut link = context.link()?;
+        let mut session = self.device.session(&mut link)?;
         let node = session.node();
         let outcome = self.what.run(&mut Debugger::new(&mut session));
         let Done { words, value } = match outcome {

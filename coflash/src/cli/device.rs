@@ -6,11 +6,11 @@ use std::time::Duration;
 
 use canopen::NodeId;
 use clap::Args;
-use coflash::adapter::Adapter;
+use coflash::link::Link;
 use coflash::session::{Session, Timing, Transfers};
 
 use super::output::{Exit, Failure};
-use super::values::{milliseconds, node_id, number, program_number};
+use super::values::{attempts, milliseconds, node_id, number, program_number};
 
 /// One device.
 #[derive(Debug, Args)]
@@ -36,8 +36,8 @@ pub(super) struct Program {
 
 impl Device {
     /// A session which Ctrl-C ends.
-    pub(super) fn session<'a>(&self, adapter: &'a mut dyn Adapter) -> Result<Session<'a>, Failure> {
-        self.patience.session(adapter, self.node)
+    pub(super) fn session<'a>(&self, link: &'a mut Link) -> Result<Session<'a>, Failure> {
+        self.patience.session(link, self.node)
     }
 }
 
@@ -47,6 +47,10 @@ pub(super) struct Patience {
     /// How long the answer to one request may take, in milliseconds.
     #[arg(long, aliases = ["sdo_timeout", "timeout"], default_value = "500", value_parser = milliseconds, value_name = "MS")]
     sdo_timeout: Duration,
+
+    /// How often a request that may be repeated is sent when no answer comes.
+    #[arg(long, default_value = "3", value_parser = attempts, value_name = "TIMES")]
+    sdo_attempts: u32,
 
     /// How long a command (erasing, checking) may take, in milliseconds.
     #[arg(long, default_value = "60000", value_parser = milliseconds, value_name = "MS")]
@@ -77,12 +81,8 @@ const REPEATS: u32 = 0x400;
 
 impl Patience {
     /// A session which Ctrl-C ends.
-    pub(super) fn session<'a>(
-        &self,
-        adapter: &'a mut dyn Adapter,
-        node: NodeId,
-    ) -> Result<Session<'a>, Failure> {
-        let mut session = Session::new(adapter, node, self.timing());
+    pub(super) fn session<'a>(&self, link: &'a mut Link, node: NodeId) -> Result<Session<'a>, Failure> {
+        let mut session = link.session(node, self.timing());
         session.cancel_by(cancelled()?);
         session.transfer_by(self.transfers());
         Ok(session)
@@ -99,6 +99,7 @@ impl Patience {
     pub(super) fn timing(&self) -> Timing {
         let timing = Timing {
             sdo: self.sdo_timeout,
+            attempts: self.sdo_attempts,
             command: self.command_timeout,
             boot: self.boot_timeout,
             ..Timing::default()
@@ -162,6 +163,8 @@ mod tests {
         assert_eq!(legacy.sdo, ms(500));
         assert_eq!(timing(&["--delay", "20"]).command, ms(20 * 1024));
         assert_eq!(timing(&["--repeats", "3"]).command, ms(3000));
+        assert_eq!(timing(&["--sdo-attempts", "7"]).attempts, 7);
+        assert!(Line::try_parse_from(["coflash", "--sdo-attempts", "0"]).is_err());
         let own = timing(&["--sdo-timeout", "7", "--command-timeout", "8", "--boot-timeout", "9"]);
         assert_eq!((own.sdo, own.command, own.boot), (ms(7), ms(8), ms(9)));
         assert_eq!(own.poll_first, Timing::default().poll_first);

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
-use coflash::block_file::Checksum;
+use coflash::block_file::{Checksum, LastBlock};
 use coflash::convert::{blocks_of, Converted, GapFill, Label, Options, Region, DEFAULT_BLOCK_SIZE};
 use coflash::image::AddressRange;
 use coflash::read::{self, Firmware, Format};
@@ -36,6 +36,11 @@ pub(super) struct Source {
     #[arg(long, alias = "gap_fill", value_name = "VALUE", value_parser = number, default_value = "0xFFFFFFFF")]
     gap_fill: u32,
 
+    /// The most bytes in a row that a block may have without data of the program; a longer gap
+    /// starts a new block. Otherwise as many as the block has room for.
+    #[arg(long, alias = "block_max_gap", value_name = "BYTES", value_parser = number)]
+    block_max_gap: Option<u32>,
+
     /// What is added to every address of the file (0xF8000000 takes 0x08000000 away).
     #[arg(long, alias = "adjust_start", value_name = "OFFSET", value_parser = number, default_value = "0")]
     adjust_start: u32,
@@ -44,6 +49,16 @@ pub(super) struct Source {
     /// built for it.
     #[arg(long)]
     crc16: bool,
+
+    /// Put 32 reserved bytes into the last block, in front of size and CRC of the program: for a
+    /// bootloader of 2008 (manual L-1112e_5).
+    #[arg(long)]
+    last_block_2008: bool,
+
+    /// Where a raw binary goes that nothing is said about: for devices that take an image as it is,
+    /// and have no addresses in it.
+    #[arg(skip)]
+    image_at: Option<u32>,
 
     /// The file's format, if the first bytes do not tell it.
     #[arg(short = 'I', long = "input-format", value_name = "FORMAT", ignore_case = true)]
@@ -101,7 +116,7 @@ impl Source {
         // A raw file starts where the region does; conversion will adjust that like any other
         // address.
         let raw_address = match self.region(program)? {
-            Region::Unknown | Region::CutBehind(_) => None,
+            Region::Unknown | Region::CutBehind(_) => self.image_at,
             Region::Strict(range) => Some(range.first.wrapping_sub(self.adjust_start)),
             Region::Cut(range) => Some(range.first),
         };
@@ -123,6 +138,8 @@ impl Source {
             label,
             adjust_start: self.adjust_start,
             checksum: if self.crc16 { Checksum::Crc16 } else { Checksum::Crc32 },
+            max_gap: self.block_max_gap,
+            last_block: if self.last_block_2008 { LastBlock::Of2008 } else { LastBlock::Of2015 },
         };
         blocks_of(firmware, &options).map_err(|error| Failure::convert(error, file))
     }
@@ -132,6 +149,16 @@ impl Source {
         let layout =
             board(name).map_err(|known| Failure::usage(format!("there is no board '{name}'"), known))?;
         Ok(Self { board: Some(layout), ..self.clone() })
+    }
+
+    /// The same for a device that takes images without addresses.
+    pub(super) fn for_images(&self) -> Self {
+        Self { image_at: Some(0), ..self.clone() }
+    }
+
+    /// Whether another CRC was asked for than the one that a file has.
+    pub(super) fn wants(&self, kept: Checksum) -> bool {
+        self.crc16 && kept != Checksum::Crc16
     }
 
     /// Whether it was said where the program may lie.

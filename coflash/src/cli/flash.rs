@@ -6,13 +6,14 @@ use std::time::Duration;
 
 use canopen::NodeId;
 use clap::Args;
-use coflash::adapter::Adapter;
 use coflash::block_file::BlockFile;
 use coflash::convert::Label;
+use coflash::dialect::Dialect;
 use coflash::flash::{flash, DeviceState, Event, FlashOptions, Report, Target};
 use coflash::job::{self, Entry, Settings};
+use coflash::link::Link;
 use coflash::lss::{ensure_node_id, LssAddress};
-use coflash::many::{flash_many, Job, ManyOptions};
+use coflash::many::{flash_in_turn, flash_many, Job, ManyOptions};
 use coflash::session::Transfers;
 use serde_json::{json, Value};
 
@@ -43,7 +44,7 @@ use super::Context;
 #[derive(Debug, Args)]
 pub(super) struct Flash {
     /// The firmware: Intel HEX, Motorola S-record, ELF, raw binary or block file.
-    #[arg(value_name = "FILE", required_unless_present_any = ["legacy_file", "job"])]
+    #[arg(value_name = "FILE", required_unless_present_any = ["legacy_file", "job", "vxd_type", "index"])]
     file: Option<PathBuf>,
 
     /// The same in DotNetFlashtool's spelling.
@@ -83,9 +84,20 @@ pub(super) struct Flash {
     #[arg(long)]
     check_target: bool,
 
-    /// Start the program once, and call it back, before it is signed.
+    /// Start the program once, compare its identity (1018h) with the bootloader's, and call it back,
+    /// before it is signed.
     #[arg(long, alias = "chk_run")]
     trial_run: bool,
+
+    /// Search until the bootloader is there or Ctrl-C ends it: the device may still be switched on,
+    /// and an application that stays is asked again and again.
+    #[arg(long)]
+    wait: bool,
+
+    /// Leave a flying NMT master alone (CiA 302-2); otherwise it is asked for its place around the
+    /// update of a lift device.
+    #[arg(long)]
+    no_mastership: bool,
 
     /// Leave the device in the bootloader.
     #[arg(long)]
@@ -117,22 +129,36 @@ struct Assignment {
 
 impl Flash {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        if let Some(list) = self.legacy.list() {
+            context.out.result(&list, || json!({ "command": "flash", "list": list }));
+            return Ok(());
+        }
         self.legacy.check(context)?;
         let devices = match &self.job {
             Some(job) => self.devices_of_job(context, job)?,
             None => self.devices(context)?,
         };
-        let mut adapter = context.open_at(self.legacy.bit_rate())?;
+        let bus = context.bus.clone().or_else(|| self.legacy.bus());
+        let mut link = context.link_at(bus.as_deref(), self.legacy.bit_rate())?;
         match devices.as_slice() {
-            [device] if self.job.is_none() => self.one(context, &mut *adapter, device),
-            devices => self.many(context, &mut *adapter, devices),
+            [device] if self.job.is_none() => self.one(context, &mut link, device),
+            devices => self.many(context, &mut link, devices),
+        }
+    }
+
+    /// How to read a file for the dialect, as far as that is named.
+    fn source(&self) -> Source {
+        match self.access.dialect() {
+            Some(Dialect::Raw | Dialect::Lift) => self.source.for_images(),
+            _ => self.source.clone(),
         }
     }
 
     /// The devices of the command line, which all get the same.
     fn devices(&self, context: &Context) -> Result<Vec<Assignment>, Failure> {
-        let image = self.file.as_deref().or(self.legacy_file.as_deref()).unwrap_or(Path::new(""));
-        let done = self.source.blocks(image, self.program, self.labels.label()?)?;
+        let unnamed = || Failure::usage("no file is named", "name the firmware: coflash flash FILE");
+        let image = self.file.as_deref().or(self.legacy_file.as_deref()).ok_or_else(unnamed)?;
+        let done = self.source().blocks(image, self.program, self.labels.label()?)?;
         warn_left_out(context, image, &done);
         let options = self.options(&done.file, &Settings::default())?;
         let (size, crc) = (done.file.program_size(), done.file.program_crc());
@@ -177,8 +203,8 @@ impl Flash {
                 Some((.., file)) => file.clone(),
                 None => {
                     let source = match &settings.board {
-                        Some(board) => self.source.for_board(board)?,
-                        None => self.source.clone(),
+                        Some(board) => self.source().for_board(board)?,
+                        None => self.source(),
                     };
                     let done = source.blocks(&image, program, Label::None)?;
                     warn_left_out(context, &image, &done);
@@ -208,16 +234,22 @@ impl Flash {
             verify: settings.verify.unwrap_or(self.verify),
             dialect: self.access.dialect(),
             unlock: self.access.unlock(),
+            wait: self.wait,
+            mastership: !self.no_mastership,
             ..FlashOptions::default()
         })
     }
 
     /// The node-ID of a device, which is given it first if it is named by its LSS address.
-    fn node_of(&self, adapter: &mut dyn Adapter, device: &Assignment) -> Result<NodeId, Failure> {
+    fn node_of(&self, link: &mut Link, device: &Assignment) -> Result<NodeId, Failure> {
         match (device.address, device.node) {
             (Some(address), node) => {
+                let Link::Bus(adapter) = link else {
+                    let advice = "name the device by its node-ID, or reach its CAN bus by an adapter";
+                    return Err(Failure::usage("behind a gateway no device has an LSS address", advice));
+                };
                 let boot = self.patience.timing().boot;
-                Ok(ensure_node_id(adapter, &address, node, boot, &cancelled()?)?)
+                Ok(ensure_node_id(&mut **adapter, &address, node, boot, &cancelled()?)?)
             }
             (None, Some(node)) => Ok(node),
             // A job without either was refused.
@@ -225,9 +257,9 @@ impl Flash {
         }
     }
 
-    fn one(&self, context: &Context, adapter: &mut dyn Adapter, device: &Assignment) -> Result<(), Failure> {
-        let node = self.node_of(adapter, device)?;
-        let mut session = self.patience.session(adapter, node)?;
+    fn one(&self, context: &Context, link: &mut Link, device: &Assignment) -> Result<(), Failure> {
+        let node = self.node_of(link, device)?;
+        let mut session = self.patience.session(link, node)?;
         let mut progress = Progress::new(context.out);
         let mut left = None;
         let result = flash(&mut session, &device.file, &device.options, &mut |event| match event {
@@ -259,18 +291,13 @@ impl Flash {
         Ok(())
     }
 
-    fn many(
-        &self,
-        context: &Context,
-        adapter: &mut dyn Adapter,
-        devices: &[Assignment],
-    ) -> Result<(), Failure> {
+    fn many(&self, context: &Context, link: &mut Link, devices: &[Assignment]) -> Result<(), Failure> {
         let mut outcomes: Vec<Option<Outcome>> = Vec::new();
         let mut jobs: Vec<(usize, Job)> = Vec::new();
         for (number, device) in devices.iter().enumerate() {
             let image = device.image.display().to_string();
             let twice = |node| jobs.iter().any(|(_, job): &(usize, Job)| job.node == node);
-            let outcome = match self.node_of(adapter, device) {
+            let outcome = match self.node_of(link, device) {
                 Ok(node) if twice(node) => {
                     let advice = "name each device once, and give each its own node-ID";
                     let failure = Failure::usage(format!("node {node} is in the job twice"), advice);
@@ -295,7 +322,11 @@ impl Flash {
         let (numbers, jobs): (Vec<usize>, Vec<Job>) = jobs.into_iter().unzip();
         let nodes: Vec<NodeId> = jobs.iter().map(|job| job.node).collect();
         let board = Board::new(context.out, &nodes);
-        let results = flash_many(adapter, &jobs, &options, &|job, event| board.show(job, event));
+        let show = |job, event| board.show(job, event);
+        let results = match link {
+            Link::Bus(adapter) => flash_many(&mut **adapter, &jobs, &options, &show),
+            Link::Gateway(gateway) => flash_in_turn(&mut **gateway, &jobs, &options, &show),
+        };
         board.finish();
         for ((number, node), result) in numbers.into_iter().zip(nodes).zip(results) {
             let image = devices[number].image.display().to_string();

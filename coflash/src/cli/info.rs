@@ -19,8 +19,8 @@ pub(super) struct Info {
 
 impl Info {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        let mut adapter = context.open()?;
-        let mut session = self.device.session(&mut *adapter)?;
+        let mut link = context.link()?;
+        let mut session = self.device.session(&mut link)?;
         let info = info(&mut session).map_err(|error| Failure::diagnosed(error, &mut session))?;
         context.out.result(&info, || value(&info));
         Ok(())

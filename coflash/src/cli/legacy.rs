@@ -1,6 +1,8 @@
 //! What the manual's download tools have and this one does otherwise (tables 9 and 11): accepted,
 //! so that a script works by changing the program's name.
 
+use std::fmt::Write as _;
+
 use clap::Args;
 use coflash::lss::LssAddress;
 
@@ -13,12 +15,14 @@ use super::Context;
 #[command(next_help_heading = "Options of the manual's tools")]
 pub(super) struct Legacy {
     /// The bit rate as an index (0 is 1 Mbit/s, 2 is 500, 3 is 250, 4 is 125 kbit/s), for adapters
-    /// that set it.
-    #[arg(short = 'B', alias = "br_idx", long = "bit-rate-index", value_name = "0..8", value_parser = bit_rate_of_index)]
-    index: Option<u32>,
+    /// that set it; ? lists all of them.
+    #[arg(short = 'B', alias = "br_idx", long = "bit-rate-index", value_name = "0..8", value_parser = index,
+          overrides_with = "baudrate")]
+    index: Option<Index>,
 
-    /// The bit rate in kbit/s, for adapters that set it.
-    #[arg(long, alias = "baurate", value_name = "KBITS", value_parser = kilobits, overrides_with = "index")]
+    /// The bit rate in kbit/s, for adapters that set it; with --vxd_type 16 that of the serial line
+    /// in bit/s.
+    #[arg(long, alias = "baurate", value_name = "KBITS", value_parser = number, overrides_with = "index")]
     baudrate: Option<u32>,
 
     /// A value above 0 is --check-target.
@@ -41,11 +45,12 @@ pub(super) struct Legacy {
     #[arg(long = "vendor", value_name = "NUMBER", value_parser = number)]
     vendor: Option<u32>,
 
-    #[arg(long = "vxd_type", value_name = "VALUE", hide = true)]
-    vxd_type: Option<String>,
+    /// The PC's CAN interface, by the manual's number: ? lists them, with what --bus has for each.
+    #[arg(long = "vxd_type", value_name = "1..16", value_parser = interface)]
+    vxd_type: Option<Interface>,
 
-    #[arg(long = "device_no", value_name = "VALUE", hide = true)]
-    device_no: Option<String>,
+    #[arg(long = "device_no", value_name = "VALUE", value_parser = number, hide = true)]
+    device_no: Option<u32>,
 
     #[arg(long = "ip_addr", value_name = "VALUE", hide = true)]
     ip_addr: Option<String>,
@@ -60,24 +65,120 @@ pub(super) struct Legacy {
     network_id: Option<u32>,
 }
 
+/// `--br_idx`.
+#[derive(Clone, Copy, Debug)]
+enum Index {
+    /// `?`: tell which there are.
+    List,
+    /// In bit/s.
+    Rate(u32),
+}
+
+/// `--vxd_type`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Interface {
+    /// `?`: tell which there are.
+    List,
+    /// Its number in table 12.
+    Type(u32),
+}
+
+/// Table 13, by their index.
+const KILOBITS: [u32; 9] = [1000, 800, 500, 250, 125, 100, 50, 20, 10];
+
+/// CAN over a serial line (table 12).
+const VIRTUAL_CAN: u32 = 16;
+/// The bit rate of that line: the manual's, and this tool's.
+const SERIAL_BIT_RATE: u32 = 115_200;
+
+/// Table 12, in short: the interface, and the URL that reaches it here.
+const INTERFACES: [(&str, &str); 16] = [
+    ("pcNetCAN (ISA), PhyCAN driver", "none"),
+    ("pcNetCAN (ISA), PCAN 1.x driver", "none"),
+    ("PEAK PCAN-Dongle, PCAN 1.x driver", "socketcan:can0"),
+    ("SYS TEC USB-CANmodul, USBCAN 4.x driver", "socketcan:can0"),
+    ("PEAK PCAN-PCI, PCAN-PCI driver", "socketcan:can0"),
+    ("reserved", ""),
+    ("pcNetCAN (ISA), PCAN 2.x driver", "none"),
+    ("PEAK PCAN-Dongle, PCAN 2.x driver", "socketcan:can0"),
+    ("PEAK PCAN-PCI, PCAN 2.x driver", "socketcan:can0"),
+    ("PEAK PCAN-Dongle, PCAN-Dongle driver", "socketcan:can0"),
+    ("PEAK PCAN-USB, PCAN-USB driver", "socketcan:can0"),
+    ("reserved", ""),
+    ("reserved", ""),
+    ("SYS TEC CAN-Ethernet gateway", "none"),
+    ("PEAK PCAN-USB, PCAN 2.x driver", "socketcan:can0"),
+    ("CAN over a serial line (VCAN)", "slcan:PORT"),
+];
+
 impl Legacy {
+    /// What a question mark asks for; then nothing else is done.
+    pub(super) fn list(&self) -> Option<String> {
+        let mut text = String::new();
+        if self.vxd_type == Some(Interface::List) {
+            text.push_str("vxd_type  interface                                here, by --bus\n");
+            for (number, (name, url)) in (1..).zip(INTERFACES) {
+                let line = format!("{number:<8}  {name:<39}  {url}");
+                // Writing into memory does not fail.
+                let _ = writeln!(text, "{}", line.trim_end());
+            }
+            text.push_str("socketcan: is Linux, with the kernel's driver for the interface\n");
+        }
+        if matches!(self.index, Some(Index::List)) {
+            text.push_str("br_idx  bit rate\n");
+            for (index, kilobits) in KILOBITS.iter().enumerate() {
+                let _ = writeln!(text, "{index:<6}  {kilobits:>4} kbit/s");
+            }
+        }
+        (!text.is_empty()).then_some(text)
+    }
+
     /// Refuses what cannot be done, and tells what is passed over.
     pub(super) fn check(&self, context: &Context) -> Result<(), Failure> {
         if self.gateway_id.unwrap_or(0) != 0 || self.network_id.unwrap_or(0) != 0 {
-            let advice = "connect the adapter to the device's own network, and leave --gateway_id and --network_id out";
-            return Err(Failure::usage("devices behind an SDO gateway cannot be reached", advice));
+            let what = "an SDO gateway on the CAN bus (CiA 302-7) cannot be spoken to";
+            let advice = "connect the adapter to the device's own network and leave --gateway_id and --network_id out, \
+                          or reach it through a gateway with CiA 309-3: --bus cia309://HOST:PORT/NET";
+            return Err(Failure::usage(what, advice));
         }
-        for (name, value) in [
-            ("--vxd_type", &self.vxd_type),
-            ("--device_no", &self.device_no),
-            ("--ip_addr", &self.ip_addr),
-            ("--ip_port", &self.ip_port),
+        let serial = self.vxd_type == Some(Interface::Type(VIRTUAL_CAN));
+        match self.baudrate {
+            Some(rate) if serial && rate != SERIAL_BIT_RATE => {
+                let what = format!("a serial line with {rate} bit/s is not supported");
+                return Err(Failure::usage(what, format!("its bit rate is {SERIAL_BIT_RATE}")));
+            }
+            Some(rate) if !serial && !(1..=1000).contains(&rate) => {
+                let what = format!("{rate} kbit/s is no bit rate of a CAN bus");
+                let advice = "bit rates are 1 to 1000 kbit/s; a serial line (--vxd_type 16) has 115200 bit/s";
+                return Err(Failure::usage(what, advice));
+            }
+            _ => {}
+        }
+        if serial && self.bus().is_some() && context.bus.is_none() {
+            return Ok(());
+        }
+        for (name, given) in [
+            ("--vxd_type", self.vxd_type.is_some()),
+            ("--device_no", self.device_no.is_some()),
+            ("--ip_addr", self.ip_addr.is_some()),
+            ("--ip_port", self.ip_port.is_some()),
         ] {
-            if value.is_some() {
+            if given {
                 context.out.warn(format_args!("{name} is passed over: the adapter is what --bus says"));
             }
         }
         Ok(())
+    }
+
+    /// The bus that these options name by themselves: CAN over the serial port of this number.
+    pub(super) fn bus(&self) -> Option<String> {
+        let port = self.device_no.filter(|_| self.vxd_type == Some(Interface::Type(VIRTUAL_CAN)))?;
+        Some(if cfg!(windows) {
+            format!("slcan:COM{port}")
+        } else {
+            // COM1 is ttyS0.
+            format!("slcan:/dev/ttyS{}", port.checked_sub(1)?)
+        })
     }
 
     /// The LSS address, if any part of it was given; the other parts have the manual's defaults
@@ -97,23 +198,70 @@ impl Legacy {
         self.chk_tgt.is_some_and(|value| value > 0)
     }
 
-    /// In bit/s.
+    /// In bit/s. That of a serial line is no bit rate of a bus.
     pub(super) fn bit_rate(&self) -> Option<u32> {
-        self.baudrate.or(self.index)
+        let of_bus = self.vxd_type != Some(Interface::Type(VIRTUAL_CAN));
+        match (self.baudrate.filter(|_| of_bus), self.index) {
+            (Some(kilobits), _) => Some(kilobits * 1000),
+            (None, Some(Index::Rate(rate))) => Some(rate),
+            (None, Some(Index::List) | None) => None,
+        }
     }
 }
 
 /// Table 13.
-fn bit_rate_of_index(text: &str) -> Result<u32, String> {
-    const KILOBITS: [u32; 9] = [1000, 800, 500, 250, 125, 100, 50, 20, 10];
-    let index = number(text)? as usize;
-    let kilobits = KILOBITS.get(index).ok_or("bit rates are 0 (1 Mbit/s) to 8 (10 kbit/s)")?;
-    Ok(kilobits * 1000)
+fn index(text: &str) -> Result<Index, String> {
+    if text == "?" {
+        return Ok(Index::List);
+    }
+    let kilobits = KILOBITS.get(number(text)? as usize);
+    let kilobits = kilobits.ok_or("bit rates are 0 (1 Mbit/s) to 8 (10 kbit/s); ? lists them")?;
+    Ok(Index::Rate(kilobits * 1000))
 }
 
-fn kilobits(text: &str) -> Result<u32, String> {
+/// Table 12.
+fn interface(text: &str) -> Result<Interface, String> {
+    if text == "?" {
+        return Ok(Interface::List);
+    }
     match number(text)? {
-        kilobits @ 1..=1000 => Ok(kilobits * 1000),
-        _ => Err("bit rates are 1 to 1000 kbit/s".to_string()),
+        kind if (1..=INTERFACES.len() as u32).contains(&kind) => Ok(Interface::Type(kind)),
+        _ => Err("interfaces are 1 to 16; ? lists them".to_string()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        legacy: Legacy,
+    }
+
+    fn legacy(words: &[&str]) -> Legacy {
+        Line::try_parse_from([&["coflash"], words].concat()).unwrap_or_else(|error| panic!("{error}")).legacy
+    }
+
+    /// Chapter 5.3: "the bit rate whose position in the call is the last".
+    #[test]
+    fn of_two_bit_rates_the_last_one_counts() {
+        assert_eq!(legacy(&["--baudrate", "500", "--br_idx", "4"]).bit_rate(), Some(125_000));
+        assert_eq!(legacy(&["--br_idx", "4", "--baudrate", "500"]).bit_rate(), Some(500_000));
+        assert_eq!(legacy(&[]).bit_rate(), None);
+    }
+
+    /// The manual's example: COM7 with 115200 bit/s.
+    #[test]
+    fn a_serial_line_has_its_own_bit_rate_and_port() {
+        let line = legacy(&["--vxd_type", "16", "--baudrate", "115200", "--device_no", "7"]);
+        assert_eq!(line.bit_rate(), None);
+        let port = if cfg!(windows) { "slcan:COM7" } else { "slcan:/dev/ttyS6" };
+        assert_eq!(line.bus().as_deref(), Some(port));
+        assert_eq!(legacy(&["--vxd_type", "4", "--device_no", "7"]).bus(), None);
+        assert_eq!(legacy(&["--vxd_type", "16", "--device_no", "0"]).bus().is_some(), cfg!(windows));
     }
 }

@@ -118,10 +118,13 @@ pub(super) fn summary(out: Output, outcomes: &[Outcome], report: Option<&Path>) 
     }
     let cancelled =
         |outcome: &Outcome| matches!(&outcome.result, Err(failure) if failure.exit == Exit::Cancelled);
-    match failed {
-        0 => Ok(()),
-        _ if outcomes.iter().any(cancelled) => Err(Failure::told(Exit::Cancelled, failed, all)),
-        _ => Err(Failure::told(Exit::Some, failed, all)),
+    let first = outcomes.iter().find_map(|outcome| outcome.result.as_ref().err());
+    match first {
+        None => Ok(()),
+        Some(first) => {
+            let exit = if outcomes.iter().any(cancelled) { Exit::Cancelled } else { Exit::Some };
+            Err(Failure::told(exit, first.legacy, failed, all))
+        }
     }
 }
 

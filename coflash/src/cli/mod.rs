@@ -4,9 +4,11 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
-use coflash::adapter::{self, Adapter, Trace};
+use coflash::adapter::{self, Adapter, SdoIds, Trace};
+use coflash::link::Link;
 
 use self::output::{Failure, Output, EXIT_CODES};
+use self::values::base_id;
 
 mod config;
 mod convert;
@@ -39,7 +41,7 @@ const GLOBAL: &str = "For all commands";
 #[command(name = "coflash", version, max_term_width = 100, after_help = EXIT_CODES)]
 struct Cli {
     /// The CAN bus: socketcand://HOST:PORT/BUS, slcan:PORT@BITRATE, slcan:tcp://HOST:PORT@BITRATE
-    /// or (on Linux) socketcan:INTERFACE.
+    /// or (on Linux) socketcan:INTERFACE; or a gateway to it: cia309://HOST:PORT/NET.
     #[arg(long, global = true, help_heading = GLOBAL, env = "COFLASH_BUS", value_name = "URL")]
     bus: Option<String>,
 
@@ -51,6 +53,16 @@ struct Cli {
     /// Write all frames to this file, as candump -L does; monitor --replay shows it in words.
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "FILE")]
     trace: Option<PathBuf>,
+
+    /// SDO requests go to this COB-ID and the node-ID on top, for devices that do not listen on 0x600
+    /// (BLCOP_BASE_REQUEST of the manual).
+    #[arg(long, global = true, help_heading = GLOBAL, value_name = "COB-ID", value_parser = base_id)]
+    sdo_request: Option<u16>,
+
+    /// SDO answers come from this COB-ID and the node-ID on top, and not from 0x580
+    /// (BLCOP_BASE_RESPONSE).
+    #[arg(long, global = true, help_heading = GLOBAL, value_name = "COB-ID", value_parser = base_id)]
+    sdo_response: Option<u16>,
 
     #[command(flatten)]
     output: Output,
@@ -113,6 +125,8 @@ impl Cli {
         Context {
             bus: self.bus.clone(),
             trace: self.trace.clone(),
+            sdo_request: self.sdo_request,
+            sdo_response: self.sdo_response,
             config: self.config.clone(),
             out: self.output,
         }
@@ -124,17 +138,24 @@ pub fn main() -> ExitCode {
     let cli = match command_line() {
         Ok(cli) => cli,
         Err(failure) => {
-            Output::default().failure(&failure);
-            return failure.exit.into();
+            let output = early_output();
+            output.failure(&failure);
+            output.exit(&failure)
         }
     };
     match cli.command.run(&cli.context()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
             cli.output.failure(&failure);
-            failure.exit.into()
+            cli.output.exit(&failure)
         }
     }
+}
+
+/// What the command line says about output, as far as it can be read.
+fn early_output() -> Output {
+    let matches = Cli::command().ignore_errors(true).get_matches();
+    Output::from_arg_matches(&matches).unwrap_or_default().or(Output::of_words())
 }
 
 /// Reads the command line, with defaults from the configuration file. Help and wrong usage end the
@@ -143,7 +164,15 @@ fn command_line() -> Result<Cli, Failure> {
     // The file has to be known before the command line can be read in earnest.
     let first = Cli::command().ignore_errors(true).get_matches();
     let named = first.get_one::<PathBuf>("config").cloned();
-    let mut matches = configured(named)?.get_matches();
+    let matches = configured(named)?.try_get_matches();
+    let mut matches = matches.unwrap_or_else(|error| {
+        // Help goes to standard output and is no error; both have their colours.
+        let _ = error.print();
+        if error.use_stderr() {
+            early_output().exit(&Failure::unreadable_line(&error))
+        }
+        std::process::exit(0)
+    });
     Cli::from_arg_matches_mut(&mut matches).map_err(|error| Failure::bare_usage(error.to_string()))
 }
 
@@ -160,24 +189,48 @@ struct Context {
     /// What `--bus`, `COFLASH_BUS` or the configuration says.
     bus: Option<String>,
     trace: Option<PathBuf>,
+    /// COB-IDs of SDO requests and answers, without the node-ID, where they are not the usual ones.
+    sdo_request: Option<u16>,
+    sdo_response: Option<u16>,
     /// The configuration file that `--config` or `COFLASH_CONFIG` names.
     config: Option<PathBuf>,
     out: Output,
 }
 
 impl Context {
+    /// The CAN bus.
     fn open(&self) -> Result<Box<dyn Adapter>, Failure> {
-        self.open_at(None)
+        let adapter = adapter::open(self.url(self.bus.as_deref())?)?;
+        self.traced(adapter)
     }
 
-    /// At this bit rate, if the URL names none and the adapter sets it.
-    fn open_at(&self, bit_rate: Option<u32>) -> Result<Box<dyn Adapter>, Failure> {
-        let Some(url) = &self.bus else {
+    /// A way to devices: the CAN bus, or a gateway.
+    fn link(&self) -> Result<Link, Failure> {
+        self.link_at(self.bus.as_deref(), None)
+    }
+
+    /// The same to this bus, at this bit rate if the URL names none and the adapter sets it.
+    fn link_at(&self, bus: Option<&str>, bit_rate: Option<u32>) -> Result<Link, Failure> {
+        match Link::open(self.url(bus)?, bit_rate)? {
+            Link::Bus(adapter) => Ok(Link::Bus(self.traced(adapter)?)),
+            gateway => {
+                if self.trace.is_some() {
+                    self.out.warn("a gateway shows no frames: nothing is traced");
+                }
+                Ok(gateway)
+            }
+        }
+    }
+
+    fn url<'u>(&self, bus: Option<&'u str>) -> Result<&'u str, Failure> {
+        bus.ok_or_else(|| {
             let advice = format!("give --bus URL or set COFLASH_BUS; known are {}", adapter::URLS);
-            return Err(Failure::usage("it is not said on which CAN bus the device is", advice));
-        };
-        let adapter = adapter::open_at(url, bit_rate)?;
-        Ok(match &self.trace {
+            Failure::usage("it is not said on which CAN bus the device is", advice)
+        })
+    }
+
+    fn traced(&self, adapter: Box<dyn Adapter>) -> Result<Box<dyn Adapter>, Failure> {
+        let traced: Box<dyn Adapter> = match &self.trace {
             Some(path) => {
                 let (out, name) = (self.out, path.display().to_string());
                 let failed =
@@ -185,12 +238,23 @@ impl Context {
                 Box::new(Trace::new(adapter, path, Box::new(failed))?)
             }
             None => adapter,
+        };
+        Ok(match (self.sdo_request, self.sdo_response) {
+            (None, None) => traced,
+            (request, response) => {
+                Box::new(SdoIds::new(traced, request.unwrap_or(0x600), response.unwrap_or(0x580)))
+            }
         })
     }
 }
 
 #[cfg(test)]
+#[path = "../../../xtask/src/pages.rs"]
+mod pages;
+
+#[cfg(test)]
 mod tests {
+    use clap::error::ErrorKind;
     use clap::CommandFactory;
 
     use super::*;
@@ -200,20 +264,29 @@ mod tests {
         Cli::command().debug_assert();
     }
 
-    /// The commands that the manual page of this tool shows are commands of this tool.
+    /// Every call of this tool on every page, for the command line's own reader.
     #[test]
-    fn what_the_documentation_shows_is_understood() {
-        let page = include_str!("../../../docs/coflash.md");
-        let lines: Vec<&str> = page.lines().filter_map(|line| line.strip_prefix("$ ")).collect();
-        assert!(lines.len() > 5, "{lines:?}");
-        for line in lines {
-            // What stands behind it is for a shell: a variable in front, a pipe behind.
-            let words = line.split(" | ").next().unwrap_or_default().split(" > ").next().unwrap_or_default();
-            let words =
-                words.split_whitespace().skip_while(|word| word.contains('=') && !word.starts_with('-'));
-            if let Err(error) = Cli::try_parse_from(words) {
-                panic!("{line}: {error}");
-            }
+    fn what_the_pages_show_is_understood() {
+        let mut count = 0;
+        for shown in pages::commands() {
+            let Some(words) = pages::call_of(&shown.words, "coflash") else { continue };
+            // What stands for something is something.
+            let of = |word: &String| if word == "BOARD" { "stm32f407g-disc1" } else { word }.to_string();
+            let words = std::iter::once("coflash".to_string()).chain(words.iter().map(of));
+            let words: Vec<String> = words.filter(|word| word != "COMMAND").collect();
+            count += 1;
+            let Err(error) = Cli::try_parse_from(&words) else { continue };
+            let mention = shown.inline
+                && (matches!(
+                    error.kind(),
+                    ErrorKind::MissingRequiredArgument
+                        | ErrorKind::MissingSubcommand
+                        | ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand
+                ) || error.kind() == ErrorKind::InvalidValue
+                    && error.to_string().contains("a value is required"));
+            let help = matches!(error.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion);
+            assert!(mention || help, "{}: {words:?}: {error}", shown.place);
         }
+        assert!(count > 60, "{count}");
     }
 }

@@ -3,9 +3,9 @@
 use std::fmt;
 use std::io::{self, IsTerminal, Write as _};
 use std::path::Path;
-use std::process::ExitCode;
 
 use canopen::NodeId;
+use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::Args;
 use coflash::adapter::AdapterError;
 use coflash::convert::ConvertError;
@@ -13,6 +13,7 @@ use coflash::diagnose::diagnose;
 use coflash::error::LssFailure;
 use coflash::flash::DeviceState;
 use coflash::job::Fault;
+use coflash::legacy;
 use coflash::read::FileError;
 use coflash::session::Session;
 use coflash::Error;
@@ -35,13 +36,39 @@ pub(super) struct Output {
     /// Say more: what is waited for, and what was chosen where the command line did not say it.
     #[arg(long, short, global = true, help_heading = GLOBAL)]
     verbose: bool,
+
+    /// End with the error numbers of the manual's tools (0x60000013 and so on) in place of the exit
+    /// codes below; of these numbers Unix keeps the last two digits.
+    #[arg(long, global = true, help_heading = GLOBAL, env = "COFLASH_LEGACY_EXIT_CODES",
+          value_parser = clap::builder::FalseyValueParser::new())]
+    legacy_exit_codes: bool,
 }
 
 impl Output {
     /// What either of two says.
     pub(super) fn or(self, other: Self) -> Self {
-        let Self { json, quiet, verbose } = other;
-        Self { json: self.json || json, quiet: self.quiet || quiet, verbose: self.verbose || verbose }
+        let Self { json, quiet, verbose, legacy_exit_codes } = other;
+        Self {
+            json: self.json || json,
+            quiet: self.quiet || quiet,
+            verbose: self.verbose || verbose,
+            legacy_exit_codes: self.legacy_exit_codes || legacy_exit_codes,
+        }
+    }
+
+    /// What the plain words of the command line say, where it cannot be read as a whole.
+    pub(super) fn of_words() -> Self {
+        let set = std::env::var("COFLASH_LEGACY_EXIT_CODES").unwrap_or_default().to_lowercase();
+        let falsey = matches!(set.as_str(), "" | "0" | "n" | "no" | "f" | "false" | "off");
+        let word = std::env::args().any(|word| word == "--legacy-exit-codes");
+        Self { legacy_exit_codes: word || !falsey, ..Self::default() }
+    }
+
+    /// Ends the program for a failure.
+    pub(super) fn exit(self, failure: &Failure) -> ! {
+        let code = if self.legacy_exit_codes { failure.legacy } else { failure.exit as u32 };
+        // All numbers are below 2^31.
+        std::process::exit(code as i32)
     }
 
     /// Whether people read along.
@@ -153,9 +180,19 @@ pub(super) enum Exit {
     Cancelled = 130,
 }
 
-impl From<Exit> for ExitCode {
-    fn from(exit: Exit) -> Self {
-        Self::from(exit as u8)
+/// EIO: what the system refuses has its own number where it is known, and this one elsewhere.
+const INPUT_OUTPUT: u32 = 5;
+
+impl Exit {
+    /// The number that a tool of the manual ends with, where the failure itself has none.
+    const fn legacy(self) -> u32 {
+        match self {
+            Self::System => INPUT_OUTPUT,
+            Self::Usage | Self::File => legacy::INVALID_PARAMETER,
+            Self::Adapter | Self::NoAnswer | Self::Device | Self::NoStart | Self::Some | Self::Cancelled => {
+                legacy::UNKNOWN
+            }
+        }
     }
 }
 
@@ -165,6 +202,8 @@ pub(super) struct Failure {
     pub(super) exit: Exit,
     /// The stable number, where there is one.
     number: Option<u32>,
+    /// What a tool of the manual ends with.
+    pub(super) legacy: u32,
     what: String,
     /// In what state the device is left, where that is known.
     left: Option<DeviceState>,
@@ -177,7 +216,7 @@ impl Failure {
     /// A conversation that failed. Where the device is silent, the bus is listened to for the
     /// reason.
     pub(super) fn diagnosed(error: Error, session: &mut Session<'_>) -> Self {
-        let silent = matches!(error, Error::NoAnswer { .. });
+        let silent = matches!(error, Error::NoAnswer { .. }) && session.hears_the_bus();
         let failure = Self::from(error);
         match silent.then(|| diagnose(session)) {
             Some(Ok(diagnosis)) => Self { advice: Some(diagnosis.to_string()), ..failure },
@@ -186,14 +225,27 @@ impl Failure {
         }
     }
 
-    /// Devices of several have failed, and the summary has told why.
-    pub(super) fn told(exit: Exit, failed: usize, of: usize) -> Self {
+    /// Devices of several have failed, and the summary has told why; the manual's tools, which know
+    /// one device, would have ended with `legacy` for the first of them.
+    pub(super) fn told(exit: Exit, legacy: u32, failed: usize, of: usize) -> Self {
         let what = format!("{failed} of {of} devices failed");
-        Self { told: true, ..Self::new(exit, None, what, None) }
+        Self { told: true, legacy, ..Self::new(exit, None, what, None) }
     }
 
     fn new(exit: Exit, number: Option<u32>, what: String, advice: Option<String>) -> Self {
-        Self { exit, number, what, left: None, advice, told: false }
+        let legacy = number.unwrap_or(exit.legacy());
+        Self { exit, number, legacy, what, left: None, advice, told: false }
+    }
+
+    /// What the command line's reader objects to.
+    pub(super) fn unreadable_line(error: &clap::Error) -> Self {
+        let of_node = error.get(ContextKind::InvalidArg).is_some_and(|name| {
+            let ContextValue::String(name) = name else { return false };
+            name.split_whitespace().any(|word| matches!(word, "--node" | "--nodes"))
+        });
+        let wrong_value = matches!(error.kind(), ErrorKind::ValueValidation | ErrorKind::InvalidValue);
+        let legacy = if of_node && wrong_value { legacy::INVALID_NODE_ID } else { legacy::INVALID_PARAMETER };
+        Self { legacy, ..Self::new(Exit::Usage, None, error.to_string(), None) }
     }
 
     /// A fault in a job file.
@@ -295,9 +347,13 @@ impl From<Error> for Failure {
             | Error::WrongCrc { .. }
             | Error::WrongTarget { .. }
             | Error::Lss { .. } => Exit::Device,
-            Error::NoBootloader { .. } | Error::Occupied { .. } | Error::StartFailed { .. } => Exit::NoStart,
+            Error::NoBootloader { .. }
+            | Error::Occupied { .. }
+            | Error::StartFailed { .. }
+            | Error::OtherIdentity { .. } => Exit::NoStart,
         };
-        Self::new(exit, Some(error.number()), error.to_string(), Some(error.advice()))
+        let legacy = legacy::exit_code(&error);
+        Self { legacy, ..Self::new(exit, Some(error.number()), error.to_string(), Some(error.advice())) }
     }
 }
 

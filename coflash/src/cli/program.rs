@@ -1,5 +1,6 @@
 //! `coflash start`, `enter`, `erase`, `sign`, `unsign` and `status`: the single steps of an update.
 
+use canopen::program::ProgramState;
 use clap::Args;
 use coflash::flash::{
     call_back, enter_bootloader, erase_at_once, find, reset_status, sign, start, unsign, Event,
@@ -67,8 +68,8 @@ fn with(
     program: &Program,
     act: impl FnOnce(&mut Session<'_>, u8, &mut dyn FnMut(Event)) -> Result<(String, Value), Error>,
 ) -> Result<(), Failure> {
-    let mut adapter = context.open()?;
-    let mut session = program.device.session(&mut *adapter)?;
+    let mut link = context.link()?;
+    let mut session = program.device.session(&mut link)?;
     let (words, more) = act(&mut session, program.program, &mut |event| context.out.detail(event))
         .map_err(|error| Failure::diagnosed(error, &mut session))?;
     let node = session.node();
@@ -88,7 +89,12 @@ impl Start {
             let running = find(session)?;
             tell(Event::Found(running));
             if !running.is_bootloader() {
-                return Ok((format!("{running} is running already"), json!({ "running": running.0 })));
+                if runs(session, number)? {
+                    return Ok((format!("{running} is running already"), json!({ "running": running.0 })));
+                }
+                tell(Event::CallingBack);
+                call_back(session)?;
+                tell(Event::InBootloader);
             }
             let running = start(session, number)?;
             Ok((format!("{running} is running"), json!({ "running": running.0 })))
@@ -98,13 +104,13 @@ impl Start {
 
 impl Enter {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, "enter", &self.program, |session, number, tell| {
+        with(context, "enter", &self.program, |session, _, tell| {
             let running = find(session)?;
             tell(Event::Found(running));
             let words = if running.is_bootloader() {
                 "the bootloader is running already"
             } else {
-                call_back(session, number)?;
+                call_back(session)?;
                 "the bootloader is running"
             };
             Ok((words.to_string(), json!({})))
@@ -115,7 +121,7 @@ impl Enter {
 impl Erase {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         with(context, "erase", &self.program, |session, number, tell| {
-            enter_bootloader(session, number, tell)?;
+            enter_bootloader(session, tell)?;
             let began = session.now();
             erase_at_once(session, number)?;
             let seconds = session.now().saturating_sub(began).as_secs_f64();
@@ -166,6 +172,12 @@ impl Status {
             Ok((format!("{running}\n{}", info_words(&info)), value))
         })
     }
+}
+
+/// Whether this program runs in a device whose application runs. One that does not tell has no other.
+fn runs(session: &mut Session<'_>, number: u8) -> Result<bool, Error> {
+    let info = program_info(session, number)?;
+    Ok(info.control.is_none_or(|state| state == ProgramState::Running as u32))
 }
 
 fn info_words(info: &ProgramInfo) -> String {

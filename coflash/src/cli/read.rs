@@ -52,8 +52,8 @@ enum Kind {
 
 impl Read {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        let mut adapter = context.open()?;
-        let mut session = self.device.session(&mut *adapter)?;
+        let mut link = context.link()?;
+        let mut session = self.device.session(&mut link)?;
         let (node, object) = (session.node(), self.object);
         let (dialect, unlock) = (self.access.dialect(), self.access.unlock());
         let bytes = match (dialect, unlock) {

@@ -17,7 +17,7 @@ use super::{info, Context};
 
 /// Shows who is on the bus: asks all node-IDs by SDO, and listens for heartbeats.
 ///
-/// A question disturbs an SDO transfer that another tool has under way with the same node;
+/// It aborts an SDO transfer that another tool has under way with a node, or has left unfinished;
 /// --listen-only asks nothing.
 #[derive(Debug, Args)]
 pub(super) struct Scan {

@@ -85,6 +85,8 @@ fn command(context: &Context, words: Vec<String>) -> Result<(), Failure> {
     let line = Context {
         bus: line.bus.or_else(|| context.bus.clone()),
         trace: line.trace.or_else(|| context.trace.clone()),
+        sdo_request: line.sdo_request.or(context.sdo_request),
+        sdo_response: line.sdo_response.or(context.sdo_response),
         config: context.config.clone(),
         out: line.out.or(context.out),
     };

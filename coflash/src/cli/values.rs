@@ -56,6 +56,22 @@ pub(super) fn milliseconds(text: &str) -> Result<Duration, String> {
     }
 }
 
+/// A COB-ID that has room for a node-ID on top.
+pub(super) fn base_id(text: &str) -> Result<u16, String> {
+    match u16::try_from(number(text)?) {
+        Ok(id @ 0x80..=0x780) => Ok(id),
+        _ => Err("it must be 0x80 to 0x780, so that there is room for a node-ID on top".to_string()),
+    }
+}
+
+/// How often something is tried: once at least.
+pub(super) fn attempts(text: &str) -> Result<u32, String> {
+    match number(text)? {
+        0 => Err("it must be at least 1".to_string()),
+        times => Ok(times),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

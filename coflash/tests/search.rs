@@ -1,0 +1,218 @@
+//! The search for a bootloader "until the user gives up", and the identity of a program on trial
+//! (manual L-1112d_10, chapter 5.2, steps 1 and 6).
+
+mod fake;
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::Arc;
+use std::time::Duration;
+
+use canopen::{Frame, NodeId};
+use coflash::adapter::AdapterError;
+use coflash::block_file::BlockFile;
+use coflash::error::{Error, IdentityPart};
+use coflash::flash::{flash, Event, FlashOptions, Report};
+use coflash::session::{Session, Timing};
+use coflash::Adapter;
+
+use fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
+
+fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
+    let file = BlockFile::parse(include_bytes!("data/plain-400.blk")).unwrap();
+    let mut session = Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default());
+    let mut events = Vec::new();
+    let result = flash(&mut session, &file, options, &mut |event| events.push(event));
+    (result, events)
+}
+
+/// A device that is switched on at this time, with a program that starts 300 ms later unless
+/// somebody asks.
+struct Late {
+    fake: Fake,
+    on: Duration,
+    asked: bool,
+}
+
+impl Adapter for Late {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        assert!(self.fake.now < self.on + Duration::from_secs(60), "it was not caught");
+        let until = self.on + Duration::from_millis(300);
+        self.asked |= (self.on..until).contains(&self.fake.now) && frame.cob_id().unwrap().get() == 0x605;
+        self.fake.running = match () {
+            () if self.fake.now < self.on => None,
+            () if self.asked || self.fake.now < until => Some(BOOTLOADER),
+            () => Some(0xDEAD),
+        };
+        self.fake.send(frame)
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        self.fake.receive(timeout)
+    }
+
+    fn now(&self) -> Duration {
+        self.fake.now
+    }
+}
+
+#[test]
+fn a_device_that_is_switched_on_later_is_waited_for_and_caught_in_its_rescue_window() {
+    for millis in [0, 50, 999, 60_000, 60_037] {
+        let fake = Fake::new(BOOTLOADER);
+        let on = fake.now + Duration::from_millis(millis);
+        let mut late = Late { fake, on, asked: false };
+        let options = FlashOptions { wait: true, start: false, ..FlashOptions::default() };
+        let (result, events) = run(&mut late, &options);
+        assert!(result.is_ok(), "{millis}: {result:?}");
+        // However long it takes, it is said once.
+        let searching = events.iter().filter(|event| matches!(event, Event::Searching(_))).count();
+        assert_eq!(searching, usize::from(millis > 0), "{events:?}");
+    }
+    let fake = Fake::new(BOOTLOADER);
+    let on = fake.now + Duration::from_secs(60);
+    let mut late = Late { fake, on, asked: false };
+    assert!(matches!(run(&mut late, &FlashOptions::default()).0, Err(Error::NoAnswer { .. })));
+}
+
+#[test]
+fn an_application_that_stays_is_asked_until_it_goes() {
+    let stubborn = |refusal: Outcome| {
+        let mut fake = Fake::new(APPLICATION);
+        let mut calls = 0;
+        fake.on_command = Box::new(move |command| {
+            calls += u32::from(command == 0x80);
+            if command == 0x80 && calls < 6 {
+                refusal
+            } else {
+                Outcome::Accept
+            }
+        });
+        fake
+    };
+    for refusal in [Outcome::Abort(0x0800_0022), Outcome::Ignore] {
+        let mut fake = stubborn(refusal);
+        let options = FlashOptions { wait: true, ..FlashOptions::default() };
+        run(&mut fake, &options).0.unwrap();
+        assert_eq!(fake.count("command 80"), 6);
+        let error = run(&mut stubborn(refusal), &FlashOptions::default()).0.unwrap_err();
+        assert!(matches!(error, Error::NoBootloader { .. }), "{error}");
+    }
+}
+
+#[test]
+fn the_user_gives_up() {
+    struct GivesUp(Fake, Duration, Arc<AtomicBool>);
+    impl Adapter for GivesUp {
+        fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+            self.2.fetch_or(self.0.now >= self.1, Ordering::Relaxed);
+            self.0.send(frame)
+        }
+
+        fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+            self.0.receive(timeout)
+        }
+
+        fn now(&self) -> Duration {
+            self.0.now
+        }
+    }
+    for running in [None, Some(APPLICATION)] {
+        let mut fake = Fake::new(APPLICATION);
+        fake.running = running;
+        fake.on_command = Box::new(|_| Outcome::Ignore);
+        let (end, flag) = (fake.now + Duration::from_secs(120), Arc::new(AtomicBool::new(false)));
+        let mut bus = GivesUp(fake, end, flag.clone());
+        let file = BlockFile::parse(include_bytes!("data/plain-400.blk")).unwrap();
+        let mut session = Session::new(&mut bus, NodeId::new(NODE).unwrap(), Timing::default());
+        session.cancel_by(flag);
+        let options = FlashOptions { wait: true, ..FlashOptions::default() };
+        let result = flash(&mut session, &file, &options, &mut |_| {});
+        assert!(matches!(result, Err(Error::Cancelled)), "{result:?}");
+        assert!(bus.0.now < end + Duration::from_secs(1));
+    }
+}
+
+/// 1018h of the program on trial; the bootloader has vendor-ID 3Fh, product code 1234, no serial
+/// number.
+struct Told(fn(u8) -> Option<Result<u32, u32>>, Option<u32>);
+
+impl Maker for Told {
+    fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
+        let number = |number: u32| number.to_le_bytes().to_vec();
+        match at {
+            (0x1018, 4) if running == BOOTLOADER => Some(self.1.map(number).ok_or(0x0609_0011)),
+            (0x1018, sub) if running == APPLICATION => self.0(sub).map(|value| value.map(number)),
+            _ => None,
+        }
+    }
+
+    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
+        None
+    }
+
+    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
+        None
+    }
+}
+
+#[test]
+fn a_program_on_trial_that_is_another_device_is_called_back_and_never_signed() {
+    let trial = FlashOptions { trial_run: true, ..FlashOptions::default() };
+    let fake = |told: Told, options: &FlashOptions| {
+        let mut fake = Fake::new(BOOTLOADER);
+        fake.maker = Some(Box::new(told));
+        let result = run(&mut fake, options).0;
+        let commands: Vec<String> =
+            fake.log.iter().filter(|entry| entry.starts_with("command")).cloned().collect();
+        (result, commands, fake.running)
+    };
+    // What the test's device has anyway; no serial number on one side; a revision of its own; a
+    // product code that says nothing.
+    let same: fn(u8) -> Option<Result<u32, u32>> = |_| None;
+    for told in [
+        Told(same, None),
+        Told(same, Some(7)),
+        Told(|sub| (sub == 4).then_some(Ok(9)), None),
+        Told(|sub| (sub == 4).then_some(Ok(0)), Some(7)),
+        Told(|sub| (sub == 4).then_some(Ok(7)), Some(7)),
+        Told(|sub| (sub == 3).then_some(Ok(0x0002_0001)), None),
+        Told(|sub| (sub == 2).then_some(Ok(0)), None),
+    ] {
+        let (result, commands, _) = fake(told, &trial);
+        assert!(result.is_ok(), "{result:?}");
+        assert_eq!(commands[commands.len() - 2..], ["command 83", "command 01"]);
+    }
+    let cases: [(Told, IdentityPart, &str); 4] = [
+        (
+            Told(|sub| (sub == 1).then_some(Ok(0x40)), None),
+            IdentityPart::VendorId,
+            "the program on trial tells vendor-ID 00000040h, and the bootloader of node 5 0000003Fh",
+        ),
+        (
+            Told(|sub| (sub == 1).then_some(Err(0x0602_0000)), None),
+            IdentityPart::VendorId,
+            "the program on trial tells vendor-ID none, and the bootloader of node 5 0000003Fh",
+        ),
+        (
+            Told(|sub| (sub == 2).then_some(Ok(1235)), None),
+            IdentityPart::ProductCode,
+            "the program on trial tells product code 000004D3h, and the bootloader of node 5 000004D2h",
+        ),
+        (
+            Told(|sub| (sub == 4).then_some(Ok(8)), Some(7)),
+            IdentityPart::SerialNumber,
+            "the program on trial tells serial number 00000008h, and the bootloader of node 5 00000007h",
+        ),
+    ];
+    for (told, part, words) in cases {
+        let (result, commands, running) = fake(told, &trial);
+        let error = result.unwrap_err();
+        assert!(matches!(error, Error::OtherIdentity { what, .. } if what == part), "{error}");
+        assert_eq!((error.to_string().as_str(), error.number()), (words, 0x6000_0014));
+        assert_eq!(commands[commands.len() - 2..], ["command 01", "command 80"]);
+        assert_eq!(running, Some(BOOTLOADER));
+    }
+    // Without a trial nobody looks.
+    let other = Told(|sub| (sub == 1).then_some(Ok(0x40)), None);
+    assert!(fake(other, &FlashOptions::default()).0.is_ok());
+}
