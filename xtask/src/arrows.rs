@@ -44,7 +44,7 @@ const RULES: &[Rule] = &[
     Rule { name: "emulator", may_use: &["shared-abi"] },
     Rule {
         name: "coboot-tests",
-        may_use: &["boot-core", "bsp", "canopen", "coflash", "emulator", "shared-abi"],
+        may_use: &["boot-core", "bsp", "canopen", "coboot-node", "coflash", "emulator", "shared-abi"],
     },
     Rule { name: "xtask", may_use: &["shared-abi"] },
 ];

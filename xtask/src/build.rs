@@ -62,6 +62,8 @@ pub const VARIANTS: &[Variant] = table![
     product("bootloader-crc-16", "crc-16"),
     // Everything that a product may switch off is off.
     product("bootloader-least", "least"),
+    // The choices that stand for a board's own: switches, identifiers, ranges.
+    product("bootloader-switches", "switches"),
     // They tell what they do, each in a way of its own (`cargo xtask emulate --log=WAY`).
     bootloader("bootloader-log-rtt", "log-rtt"),
     bootloader("bootloader-log-defmt", "log-defmt"),
@@ -218,7 +220,7 @@ pub fn c_applications(board: &Layout) -> Outcome {
 }
 
 /// What the application in C is made of.
-const C_SOURCES: [&str; 4] = ["startup.c", "can.c", "probe.c", "main.c"];
+const C_SOURCES: [&str; 5] = ["startup.c", "can.c", "probe.c", "reentry.c", "main.c"];
 /// How it is compiled. It keeps the FPU off, so it is compiled for a chip without one; what it
 /// calls in the bootloader takes and gives no floating-point numbers.
 const C_FLAGS: &[&str] = &[

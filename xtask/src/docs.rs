@@ -2,7 +2,11 @@
 
 use std::fs;
 
-use crate::workspace;
+use shared_abi::layout::BOARDS;
+
+use crate::build::VARIANTS;
+use crate::pages::{self, Shown};
+use crate::{workspace, JOBS};
 
 /// A block of code in a document that names the file it was taken from.
 struct Quote {
@@ -89,4 +93,101 @@ fn links_between_the_documents_lead_somewhere() {
         }
     }
     assert!(links > 10, "{links}");
+}
+
+/// Commands that are nobody's of this house: of a shell, of the system, of other projects.
+const FOREIGN: [&str; 10] =
+    ["cd", "export", "ip", "base64", "candump", "canopend", "cocomm", "npm", "node", "west"];
+/// Cargo's own jobs that pages call; what is behind them names packages of the workspace.
+const CARGO: [&str; 3] = ["build", "run", "test"];
+
+/// Every command of every page: a job of this crate with options that it has, a program of the
+/// workspace (whose own tests read the rest: `coflash` and `coboot-node`), a file that is there, or
+/// one of the few that are foreign.
+#[test]
+fn every_command_of_the_pages_is_one() {
+    let commands = pages::commands();
+    let wrong: Vec<String> =
+        commands.iter().filter_map(|shown| Some(format!("{}: {}", shown.place, check(shown)?))).collect();
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    let jobs =
+        commands.iter().filter(|shown| shown.words.starts_with(&["cargo".into(), "xtask".into()])).count();
+    assert!(commands.len() > 120 && jobs > 50, "{} commands, {jobs} jobs", commands.len());
+}
+
+/// What is wrong with a command.
+fn check(shown: &Shown) -> Option<String> {
+    let words: Vec<&str> = shown.words.iter().map(String::as_str).collect();
+    match words.as_slice() {
+        ["coflash" | "coboot-node", ..] => None,
+        ["cargo", "xtask"] => None,
+        ["cargo", "xtask", job, rest @ ..] => match JOBS.iter().find(|known| known.name == *job) {
+            None => Some(format!("there is no job {job}")),
+            Some(known) => job_options(known.name, known.help, rest),
+        },
+        ["cargo", job, rest @ ..] if CARGO.contains(job) => {
+            let package = rest.iter().position(|word| matches!(*word, "-p" | "--package"));
+            let package = package.and_then(|at| rest.get(at + 1));
+            let folder = package.map(|name| workspace::root().join(name.trim_start_matches("coboot-")));
+            let there = folder.is_none_or(|folder| folder.join("Cargo.toml").exists());
+            (!there).then(|| format!("there is no package {}", package.unwrap_or(&"")))
+        }
+        [program, rest @ ..] if program.contains('/') || program.starts_with("python") => {
+            // An interpreter, or a script; and what it is given to run.
+            let ours = |word: &&&str| word.ends_with(".py") || word.ends_with("/run");
+            let all = [*program].into_iter().chain(rest.iter().copied()).collect::<Vec<_>>();
+            let missing = all.iter().filter(ours).find(|file| !workspace::root().join(file).exists());
+            missing.map(|file| format!("there is no {file}"))
+        }
+        [program, ..] if FOREIGN.contains(program) => None,
+        words => Some(format!("nobody knows {words:?}")),
+    }
+}
+
+/// What is wrong with what stands behind a job.
+fn job_options(job: &str, help: &str, words: &[&str]) -> Option<String> {
+    let mut words = words.iter().take_while(|word| **word != "--").copied();
+    while let Some(word) = words.next() {
+        let (name, value) = word.split_once('=').map_or((word, None), |(name, value)| (name, Some(value)));
+        let known = help.split([' ', '[', '\n']).any(|known| known == name);
+        match name {
+            _ if name.starts_with("--") && known => {
+                // An option with a value has it in capitals in the help, or an example.
+                let line = help.lines().find(|line| line.split([' ', '[']).any(|known| known == name))?;
+                let behind = line.split_once(name).map(|(_, behind)| behind.trim_start_matches(' '));
+                let takes = behind.is_some_and(|behind| {
+                    let value = behind.split(' ').next().unwrap_or_default();
+                    line.contains(&format!("{name} {value}")) && !value.is_empty() && !value.starts_with('[')
+                });
+                let value = value.or_else(|| if takes { words.next() } else { None });
+                let board = value.filter(|_| name == "--board").filter(|board| !pages::is_placeholder(board));
+                // A guide makes a board of this name.
+                let unknown = board.filter(|board| {
+                    *board != "my-board" && !BOARDS.iter().any(|layout| layout.board == *board)
+                });
+                if let Some(unknown) = unknown {
+                    return Some(format!("there is no board {unknown}"));
+                }
+            }
+            // The rest goes to cargo test.
+            "--test" if job == "test" => {
+                let name = words.next().unwrap_or_default();
+                let is_test =
+                    |krate: &&str| workspace::root().join(krate).join(format!("tests/{name}.rs")).exists();
+                if !["tests", "coflash", "node", "canopen", "boot-core"].iter().any(is_test) {
+                    return Some(format!("there is no test {name}"));
+                }
+            }
+            _ if job == "test" => {}
+            _ if name.starts_with('-') => return Some(format!("cargo xtask {job} has no {name}")),
+            _ if job == "build"
+                && !pages::is_placeholder(name)
+                && !VARIANTS.iter().any(|variant| variant.name == name) =>
+            {
+                return Some(format!("there is no image {name}"));
+            }
+            _ => {}
+        }
+    }
+    None
 }

@@ -32,10 +32,18 @@ static inline uint32_t coboot_check_word(const void *record, size_t words)
 
 @WARM_START@
 
-/* The cell that carries a request. */
-static inline struct coboot_warm_start coboot_request(uint32_t request, uint32_t program)
+/* The argument of COBOOT_REQUEST_OWED: node `node_id` was written `value` (0 STOP or 3 CLEAR) to 1F51h, sub-index `program`,
+ * and has not answered. The bootloader serves the request behind its boot-up, if it comes up with this node-ID.
+ */
+static inline uint32_t coboot_owed(uint8_t program, uint8_t value, uint8_t node_id)
 {
-    struct coboot_warm_start cell = { COBOOT_WARM_START_MAGIC, request, program, 0 };
+    return program | (uint32_t)value << 8 | (uint32_t)node_id << 16;
+}
+
+/* The cell that carries a request. */
+static inline struct coboot_warm_start coboot_request(uint32_t request, uint32_t argument)
+{
+    struct coboot_warm_start cell = { COBOOT_WARM_START_MAGIC, request, argument, 0 };
     cell.check = coboot_check_word(&cell, offsetof(struct coboot_warm_start, check) / sizeof(uint32_t));
     return cell;
 }
@@ -48,9 +56,17 @@ static inline struct coboot_warm_start coboot_request(uint32_t request, uint32_t
 static inline bool coboot_handoff_is_sound(const struct coboot_handoff *handoff)
 {
     const size_t guarded = offsetof(struct coboot_handoff, check) / sizeof(uint32_t);
-    return handoff->magic == COBOOT_HANDOFF_MAGIC && handoff->version >= COBOOT_HANDOFF_VERSION
+    return handoff->magic == COBOOT_HANDOFF_MAGIC && handoff->version >= COBOOT_HANDOFF_OLDEST
         && handoff->length == sizeof *handoff && handoff->node_id >= 1 && handoff->node_id <= 127
         && handoff->check == coboot_check_word(handoff, guarded);
+}
+
+/* Whether the program was started right behind its download as raw image, Intel HEX or sealed image: the first 1F51h = 80h
+ * confirms it then, and does not call the bootloader.
+ */
+static inline bool coboot_is_fresh(const struct coboot_handoff *handoff)
+{
+    return (handoff->flags & COBOOT_HANDOFF_FRESH) != 0;
 }
 
 /* ---- The callgate: services of the bootloader that an application calls like a function ----
@@ -160,12 +176,13 @@ static inline int32_t coboot_invalidate(const struct coboot_callgate *gate, uint
     return coboot_call(gate, COBOOT_SELECTOR_INVALIDATE, &args);
 }
 
-/* Leaves a request for the bootloader and resets the chip. What asked for it has to be answered before: wait until the
- * answer is on the bus, then 10 ms, and send nothing more.
+/* Leaves a request for the bootloader and resets the chip. What asked for it is answered before: wait until the answer is
+ * on the bus, then 10 ms in which requests are served. Who leaves with COBOOT_REQUEST_OWED does so
+ * at once, and has not answered.
  */
-static inline _Noreturn void coboot_reset(uint32_t request, uint32_t program)
+static inline _Noreturn void coboot_reset(uint32_t request, uint32_t argument)
 {
-    const struct coboot_warm_start cell = coboot_request(request, program);
+    const struct coboot_warm_start cell = coboot_request(request, argument);
     __asm volatile("cpsid i" ::: "memory");
     __warm_start.magic = cell.magic;
     __warm_start.request = cell.request;

@@ -8,7 +8,7 @@ use std::mem::{offset_of, size_of};
 
 use shared_abi::callgate::{self, Crc32Args, NodeArgs, ProgramArgs, Selector, Status, Table};
 use shared_abi::handoff::{self, Handoff, ResetCause};
-use shared_abi::warm_start::{self, BootRequest, WarmStart};
+use shared_abi::warm_start::{self, BootRequest, Owed, WarmStart};
 
 use crate::args::Args;
 use crate::Outcome;
@@ -113,23 +113,32 @@ fn check() -> String {
     ])
 }
 
+/// Any owed answer: all have the same request.
+const OWED: Owed = Owed { program: 1, value: 0, node_id: 1 };
+
 fn warm_start() -> String {
     let request = |request| WarmStart::new(request).request;
     defines([("WARM_START_MAGIC", warm_start::MAGIC)])
-        + "\n/* Requests. Those for a program take its number, 1 to 254; the others 0. */\n"
+        + "\n/* Requests. Those for a program take its number, 1 to 254, as argument, an owed answer what coboot_owed makes, and the\n \
+           * others 0. */\n"
         + &defines([
             ("REQUEST_STAY", request(BootRequest::Stay)),
             ("REQUEST_TRIAL", request(BootRequest::Trial(1))),
             ("REQUEST_START", request(BootRequest::Start(1))),
             ("REQUEST_POWER_ON", request(BootRequest::PowerOn)),
-            ("REQUEST_CLEAR", request(BootRequest::Clear(1))),
+            ("REQUEST_OWED", request(BootRequest::Owed(OWED))),
         ])
         + "\n"
         + &structure!("coboot_warm_start", WarmStart, magic, request, argument, check)
 }
 
 fn handoff() -> String {
-    defines([("HANDOFF_MAGIC", handoff::MAGIC), ("HANDOFF_VERSION", handoff::VERSION.into())])
+    defines([
+        ("HANDOFF_MAGIC", handoff::MAGIC),
+        ("HANDOFF_VERSION", handoff::VERSION.into()),
+        ("HANDOFF_OLDEST", handoff::OLDEST.into()),
+    ]) + "\n/* In `flags`, since version 2: the program was started right behind its download in one go. */\n"
+        + &defines([("HANDOFF_FRESH", handoff::FLAG_FRESH)])
         + "\n/* Reset causes. */\n"
         + &defines([
             ("RESET_UNKNOWN", ResetCause::Unknown as u8),
@@ -155,6 +164,7 @@ fn handoff() -> String {
             bit_rate,
             bootloader_version,
             serial_number,
+            flags,
             reserved,
             check
         )
@@ -250,7 +260,10 @@ mod tests {
             "#define COBOOT_REQUEST_POWER_ON UINT32_C(0x5)",
             "#define COBOOT_SELECTOR_INVALIDATE UINT32_C(0x6)",
             "#define COBOOT_STATUS_NO_PROGRAM INT32_C(-7) /* nothing is installed under this number */",
-            "    uint32_t reserved[5];",
+            "#define COBOOT_REQUEST_OWED UINT32_C(0x7)",
+            "#define COBOOT_HANDOFF_FRESH UINT32_C(0x1)",
+            "    uint32_t reserved[4];",
+            "_Static_assert(offsetof(struct coboot_handoff, flags) == 24, \"coboot_handoff: flags\");",
             "_Static_assert(sizeof(struct coboot_handoff) == 48, \"coboot_handoff\");",
             "_Static_assert(offsetof(struct coboot_handoff, reset_cause) == 10, \"coboot_handoff: reset_cause\");",
             "_Static_assert(offsetof(struct coboot_callgate, entry) == 12, \"coboot_callgate: entry\");",

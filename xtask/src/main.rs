@@ -25,6 +25,8 @@ mod layout;
 mod lint;
 mod new_board;
 mod pack;
+#[cfg(test)]
+mod pages;
 mod parts;
 mod portable;
 mod powercut;
@@ -34,6 +36,7 @@ mod setup;
 mod size;
 mod test;
 mod workspace;
+mod zx0;
 
 use args::Args;
 

@@ -127,7 +127,7 @@ fn changes(
     change("emulator/src/bin/emulate/main.rs", &|text| {
         let constant = constant(chip);
         let line = format!(
-            "    Board {{ name: \"{name}\", chip: &{constant}, hse_hz: 8_000_000, pulled_up: &[], usart: \"USART2\" }},\n"
+            "    Board {{ name: \"{name}\", chip: &{constant}, hse_hz: 8_000_000, pulled_up: &[], usart: \"USART2\", transceiver: 0 }},\n"
         );
         before(text, "const BOARDS", "];", &line)
     })?;
@@ -220,7 +220,7 @@ const STEPS: &[(&str, &str)] = &[
     ("pub const ENTRY_STRAP", "Step 9: the pin that keeps the device in the bootloader, and the level that does."),
     ("    pub type Led", "Step 10: the LED: its pin here and in `init`."),
     ("    uart! {", "Step 11: the UART for words while you port: which it is here, its pins in `init`, where each port is taken once."),
-    ("        let can = can1.can(", "Step 12: the CAN pins, transmit and receive. The build fails for pins that the chip cannot use for CAN1."),
+    ("        let can = can", "Step 12: the CAN pins, transmit and receive. The build fails for pins that the chip cannot use for its controller. CAN2 in the place of CAN1: docs/porting.md."),
 ];
 
 /// What stands in a board's header for C, and the step that it belongs to.

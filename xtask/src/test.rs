@@ -5,7 +5,7 @@ use std::io::{BufRead, BufReader, Write};
 use std::process::Stdio;
 use std::time::Instant;
 
-use shared_abi::layout::{Layout, BOARDS};
+use shared_abi::layout::{stm32f407g_disc1_can2, Layout, BOARDS};
 
 use crate::args::Args;
 use crate::setup::{self, Part, Setup};
@@ -39,6 +39,8 @@ pub fn run(mut args: Args) -> Outcome {
         build::all(two)?;
         build::c_applications(two)?;
     }
+    // And one that talks through CAN2.
+    build::images(&stm32f407g_disc1_can2::LAYOUT, &build::MAIN)?;
     process::run(process::cargo("build").current_dir(workspace::root()).args(["--package", "coflash"]))?;
     let coflash =
         workspace::target_dir().join("debug").join("coflash").with_extension(std::env::consts::EXE_EXTENSION);
@@ -79,9 +81,10 @@ pub fn run(mut args: Args) -> Outcome {
 
 /// The test programs that every board goes through each time: what a port can get wrong shows in
 /// them.
-const MAIN_TESTS: [&str; 10] = [
+const MAIN_TESTS: [&str; 11] = [
     "main_job",
     "device",
+    "masters",
     "watchdog",
     "boot_time",
     "abi",
