@@ -66,6 +66,12 @@ impl Bench {
         Self::of(bootloader, vec![Options::default()])
     }
 
+    /// The same with the transceiver at this CAN controller, 1 or 2, and not where the board has it.
+    #[must_use]
+    pub fn of_image_at(bootloader: &str, controller: u8) -> Self {
+        Self::at(controller, bootloader, vec![Options::default()])
+    }
+
     /// So many boards whose bootloaders have every option, each with a unique ID and noise of its
     /// own. They share bus and node-ID until they are told others.
     ///
@@ -85,6 +91,10 @@ impl Bench {
     }
 
     fn of(bootloader: &str, chips: Vec<Options>) -> Self {
+        Self::at(bsp::CAN_CONTROLLER, bootloader, chips)
+    }
+
+    fn at(controller: u8, bootloader: &str, chips: Vec<Options>) -> Self {
         let mut world = World::empty();
         let heard = Rc::new(RefCell::new(Vec::new()));
         let ears = Rc::clone(&heard);
@@ -93,6 +103,7 @@ impl Bench {
         let boards: Vec<MachineId> = chips
             .into_iter()
             .map(|options| {
+                let options = Options { transceiver: usize::from(controller) - 1, ..options };
                 let mut machine = Machine::new(firmware::board().chip, options).expect("the emulator starts");
                 machine.load(&bootloader).expect("the bootloader's ELF fits the flash");
                 // Nobody presses the button; the board's resistor pulls the pin the other way.
@@ -153,6 +164,22 @@ impl Bench {
     pub fn power_off(&mut self) {
         for board in self.boards() {
             self.world.power_off(board);
+        }
+    }
+
+    /// Writes zeros to the end of the flash of every program, and to the end of every sector in it, as a
+    /// debug probe could: each has to be erased before anything can be written.
+    ///
+    /// # Panics
+    /// Never: the layout's programs are in flash.
+    pub fn soil_programs(&mut self) {
+        let board = firmware::board();
+        for program in board.programs {
+            let mut at = program.base;
+            while let Some(sector) = board.chip.sector_at(at).filter(|_| at < program.end()) {
+                at = sector.region.end();
+                self.machine().load_bin(at - 4, &[0; 4]).expect("it is in flash");
+            }
         }
     }
 

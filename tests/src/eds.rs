@@ -6,11 +6,12 @@
 
 use std::fmt::Write;
 
-use boot_core::bootloader::{entries, entry_count};
+use boot_core::bootloader::{entries_with, entry_count_with, Extras};
+use boot_core::profile::Profile;
 use bsp::can::BitTiming;
 use canopen::device::Device;
 use canopen::od::{Access, Address, DataType, DefaultValue, Entry, Kind};
-use canopen::program::{BOOTLOADER_DEVICE_TYPE, IDENTITY};
+use canopen::program::IDENTITY;
 
 /// The table of the application template. It needs nothing of the chip.
 #[path = "../../app-template/src/entries.rs"]
@@ -24,9 +25,18 @@ const TIME: &str = "12:00AM";
 /// Serial number: no two devices have the same.
 const SERIAL_NUMBER: Address = Address::new(IDENTITY, 4);
 
-/// The table of the bootloader.
-static BOOTLOADER: [Entry; entry_count(PROGRAMS)] = entries(PROGRAMS);
+/// The tables of the bootloader: of the standard and of Paulus, of ESAcademy, of a lift.
+static STANDARD: [Entry; len(Extras::NONE)] = entries_with(PROGRAMS, Extras::NONE);
+static ESACADEMY: [Entry; len(Profile::ESACADEMY.extras)] = entries_with(PROGRAMS, Profile::ESACADEMY.extras);
+static LIFT: [Entry; len(Profile::LIFT.extras)] = entries_with(PROGRAMS, Profile::LIFT.extras);
+
+const fn len(extras: Extras) -> usize {
+    entry_count_with(PROGRAMS, extras)
+}
+
 const PROGRAMS: u8 = bsp::LAYOUT.programs.len() as u8;
+/// The table of the application.
+static APPLICATION: [Entry; application::entry_count(PROGRAMS)] = application::entries(PROGRAMS);
 
 /// One image, as its EDS file describes it.
 pub struct Image {
@@ -42,15 +52,52 @@ pub struct Image {
     pub lss: bool,
 }
 
-/// The bootloader. What stands here and in its `main.rs` is compared over the bus by the tests.
+/// All images: the bootloader in each profile, and the application template.
+#[must_use]
+pub fn images() -> [Image; 5] {
+    [
+        bootloader(),
+        bootloader_of(
+            "coboot-bootloader-paulus.eds",
+            "coboot, the CANopen bootloader, as port's Paulus",
+            Profile::PAULUS,
+            &STANDARD,
+        ),
+        bootloader_of(
+            "coboot-bootloader-esacademy.eds",
+            "coboot, the CANopen bootloader, as that of ESAcademy",
+            Profile::ESACADEMY,
+            &ESACADEMY,
+        ),
+        bootloader_of(
+            "coboot-bootloader-lift.eds",
+            "coboot, the CANopen bootloader of a lift (CiA 417)",
+            Profile::LIFT,
+            &LIFT,
+        ),
+        application(),
+    ]
+}
+
+/// The bootloader of the standard profile.
 #[must_use]
 pub fn bootloader() -> Image {
+    bootloader_of("coboot-bootloader.eds", "coboot, the CANopen bootloader", Profile::STANDARD, &STANDARD)
+}
+
+/// The bootloader. What stands here and in its `main.rs` is compared over the bus by the tests.
+fn bootloader_of(
+    file: &'static str,
+    description: &'static str,
+    profile: Profile,
+    entries: &'static [Entry],
+) -> Image {
     Image {
-        file: "coboot-bootloader.eds",
-        description: "coboot, the CANopen bootloader",
-        entries: &BOOTLOADER,
+        file,
+        description,
+        entries,
         device: Device {
-            device_type: BOOTLOADER_DEVICE_TYPE,
+            device_type: profile.device_type,
             software_version: concat!("coboot ", env!("CARGO_PKG_VERSION")),
             heartbeat_ms: 1000,
             ..BOARD
@@ -66,7 +113,7 @@ pub fn application() -> Image {
     Image {
         file: "coboot-application.eds",
         description: "The application template of coboot",
-        entries: &application::ENTRIES,
+        entries: &APPLICATION,
         device: Device { device_type: 0, software_version: "1.0.0", heartbeat_ms: 500, ..BOARD },
         lss: true,
     }

@@ -14,6 +14,8 @@ pub const BOOTLOADER: &str = "bootloader.elf";
 pub const BOOTLOADER_LEAST: &str = "bootloader-least.elf";
 /// The one whose blocks and programs carry CRC-16.
 pub const BOOTLOADER_CRC_16: &str = "bootloader-crc-16.elf";
+/// The one whose node-ID and bit rate are those of switches, with COB-IDs of its own.
+pub const BOOTLOADER_SWITCHES: &str = "bootloader-switches.elf";
 /// The one for masters that know Paulus, and the one for those that know the boot loader of
 /// ESAcademy.
 pub const BOOTLOADER_PAULUS: &str = "bootloader-paulus.elf";

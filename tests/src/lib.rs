@@ -7,6 +7,8 @@ pub mod endpoint;
 pub mod firmware;
 pub mod ihex;
 pub mod listener;
+pub mod masters;
+pub mod node;
 pub mod powercut;
 pub mod script;
 pub mod serial;

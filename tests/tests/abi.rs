@@ -11,7 +11,7 @@ use shared_abi::geometry::Region;
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
 use shared_abi::layout::Layout;
 use shared_abi::vectors::VectorTable;
-use shared_abi::warm_start::{BootRequest, WarmStart};
+use shared_abi::warm_start::{BootRequest, Owed, WarmStart};
 
 /// The bytes that a structure has in RAM. (The host is little-endian, as the chip is.)
 fn bytes<T: Copy>(value: &T) -> Vec<u8> {
@@ -30,10 +30,16 @@ fn warm_start_cell_byte_for_byte() {
     assert_eq!(offset_of!(WarmStart, argument), 8);
     assert_eq!(offset_of!(WarmStart, check), 12);
     #[rustfmt::skip]
-    let cells: [(BootRequest, [u8; 16]); 3] = [
+    let cells: [(BootRequest, [u8; 16]); 6] = [
         (BootRequest::Stay, [b'C', b'B', b'W', b'1', 1, 0, 0, 0, 0, 0, 0, 0, 0xF0, 0xB7, 0x28, 0xD9]),
         (BootRequest::Trial(1), [b'C', b'B', b'W', b'1', 2, 0, 0, 0, 1, 0, 0, 0, 0xCD, 0x59, 0x20, 0xE5]),
         (BootRequest::Start(1), [b'C', b'B', b'W', b'1', 3, 0, 0, 0, 1, 0, 0, 0, 0xF9, 0x81, 0xE0, 0x52]),
+        (BootRequest::Fresh(1), [b'C', b'B', b'W', b'1', 9, 0, 0, 0, 1, 0, 0, 0, 0x5F, 0xD5, 0xAC, 0xE8]),
+        // STOP of program 1, asked of node 5; CLEAR of program 2, asked of node 127.
+        (BootRequest::Owed(Owed { program: 1, value: 0, node_id: 5 }),
+         [b'C', b'B', b'W', b'1', 7, 0, 0, 0, 1, 0, 5, 0, 0x56, 0xAA, 0x9D, 0xE8]),
+        (BootRequest::Owed(Owed { program: 2, value: 3, node_id: 127 }),
+         [b'C', b'B', b'W', b'1', 7, 0, 0, 0, 2, 3, 127, 0, 0xA5, 0x7F, 0x86, 0xCC]),
     ];
     for (request, expected) in cells {
         assert_eq!(bytes(&WarmStart::new(request)), expected);
@@ -54,7 +60,8 @@ fn handoff_byte_for_byte() {
         (offset_of!(Handoff, bit_rate), 12),
         (offset_of!(Handoff, bootloader_version), 16),
         (offset_of!(Handoff, serial_number), 20),
-        (offset_of!(Handoff, reserved), 24),
+        (offset_of!(Handoff, flags), 24),
+        (offset_of!(Handoff, reserved), 28),
         (offset_of!(Handoff, check), 44),
     ];
     for (actual, expected) in offsets {
@@ -66,16 +73,17 @@ fn handoff_byte_for_byte() {
         program: 1,
         reset_cause: ResetCause::Software,
         trial: true,
+        fresh: true,
         bootloader_version: 0x0001_0002,
         serial_number: 0xDEAD_BEEF,
     });
     #[rustfmt::skip]
     let expected = [
-        b'C', b'B', b'H', b'O', 1, 0, 48, 0,
+        b'C', b'B', b'H', b'O', 2, 0, 48, 0,
         5, 1, 3, 1, 0x48, 0xE8, 0x01, 0x00,
         0x02, 0x00, 0x01, 0x00, 0xEF, 0xBE, 0xAD, 0xDE,
-        0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0,
-        0xDD, 0x3C, 0xA8, 0xD2,
+        1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0,
+        0x91, 0x69, 0x48, 0x4E,
     ];
     assert_eq!(bytes(&handoff), expected);
 }

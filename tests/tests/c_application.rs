@@ -634,7 +634,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
     let blocks = blocks_of(elf(firmware::APP_C_PROGRAM_2), &options).unwrap().file;
     let second = FlashOptions { program: 2, ..FlashOptions::default() };
     let report = flash(&mut bench.session(), &blocks, &second, &mut |_| {}).unwrap();
-    assert_eq!(number(&mut bench, CRC), report.program_crc, "its own");
+    assert_eq!(number(&mut bench, Address::new(0x1F56, 2)), report.program_crc, "its own");
     let info = call(&mut bench, PROGRAM_INFO, [2, 9, 9, 9, 9]).words;
     assert_eq!(info, [2, report.program_size, report.program_crc, 0, 0b11]);
 }

@@ -22,6 +22,11 @@ static void print(const void *record, size_t len)
 int main(void)
 {
     static const unsigned char handoff[48] = {
+        'C', 'B', 'H', 'O', 2, 0, 48, 0, 5, 1, 3, 1, 0x48, 0xE8, 0x01, 0x00,
+        0x02, 0x00, 0x01, 0x00, 0xEF, 0xBE, 0xAD, 0xDE, 1, [44] = 0x91, 0x69, 0x48, 0x4E,
+    };
+    /* Of a bootloader that knew no flags. */
+    static const unsigned char older[48] = {
         'C', 'B', 'H', 'O', 1, 0, 48, 0, 5, 1, 3, 1, 0x48, 0xE8, 0x01, 0x00,
         0x02, 0x00, 0x01, 0x00, 0xEF, 0xBE, 0xAD, 0xDE, [44] = 0xDD, 0x3C, 0xA8, 0xD2,
     };
@@ -32,8 +37,14 @@ int main(void)
     cell = coboot_request(COBOOT_REQUEST_START, 1);
     print(&cell, sizeof cell);
 
+    cell = coboot_request(COBOOT_REQUEST_OWED, coboot_owed(2, 3, 127));
+    print(&cell, sizeof cell);
+
     struct coboot_handoff record;
+    memcpy(&record, older, sizeof record);
+    printf("%d%d ", coboot_handoff_is_sound(&record), coboot_is_fresh(&record));
     memcpy(&record, handoff, sizeof record);
+    printf("%d ", coboot_is_fresh(&record));
     printf("%d %u %u %u %u\n", coboot_handoff_is_sound(&record), record.node_id, (unsigned)record.bit_rate,
            (unsigned)(record.reset_cause == COBOOT_RESET_SOFTWARE), record.trial);
     unsigned sound = 0;
@@ -103,7 +114,8 @@ fn c_makes_the_same_bytes_and_comes_to_the_same_verdicts() {
         434257310100000000000000F0B728D9\n\
         434257310200000001000000CD5920E5\n\
         434257310300000001000000F981E052\n\
-        1 5 125000 1 1\n\
+        434257310700000002037F00A57F86CC\n\
+        10 1 1 5 125000 1 1\n\
         0\n\
         00\n\
         011211\n";

@@ -84,6 +84,25 @@ fn python_canopen_updates_the_device_by_raw_images() {
     endpoint.bench.assert_nothing_unmodelled();
 }
 
+/// The asyncio port of the same client, by its own calls: in segments, with an SDO time-out of 2 s.
+#[test]
+fn canopen_asyncio_updates_the_device_by_raw_images() {
+    let mut endpoint = endpoint();
+    for (image, stopped, version) in [(firmware::APP_V1, false, "1.0.0"), (firmware::APP_V2, true, "2.0.0")] {
+        let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(image).with_extension("asyncio.bin");
+        fs::write(&path, firmware::raw(image)).unwrap();
+        let mut python = python();
+        python.arg(script("asyncio_client.py")).arg(endpoint.address()).arg(path).arg("1");
+        let output = endpoint.run(&mut python);
+        let said = text(&output);
+        assert!(output.status.success(), "{said}");
+        assert_eq!(said.contains("node 1: stopped"), stopped, "{said}");
+        assert!(said.contains("node 1: started; 1F56h is the same"), "{said}");
+        assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), version);
+    }
+    endpoint.bench.assert_nothing_unmodelled();
+}
+
 /// The command line that `cargo xtask test` has built.
 fn coflash() -> Command {
     let coflash = env::var_os("COBOOT_COFLASH")

@@ -224,7 +224,8 @@ fn what_must_not_be_touched_is_refused_and_faults_nothing() {
 fn memory_that_does_not_answer_now_is_refused_now() {
     let mut bench = bootloader();
     let board = firmware::board();
-    // Twice, it is carried out at once.
+    // Twice, it is carried out at once: what is not blank is erased.
+    bench.soil_programs();
     for _ in 0..2 {
         bench.session().command(1, canopen::program::ProgramControl::Clear).unwrap();
     }

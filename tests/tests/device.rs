@@ -275,6 +275,7 @@ fn slowest_answer(bench: &mut Bench) -> (Span, u32) {
 fn never_silent_during_an_erase() {
     let mut bench = running_board();
     call_back(&mut bench);
+    bench.soil_programs();
     let from = bench.time();
     // Twice in a row: erase everything at once.
     bench.session().command(1, ProgramControl::Clear).unwrap();

@@ -12,8 +12,8 @@ use coboot_tests::firmware;
 use coflash::flash::{flash, FlashOptions};
 use coflash::read::Firmware;
 
-fn images() -> [Image; 2] {
-    [eds::bootloader(), eds::application()]
+fn images() -> [Image; 5] {
+    eds::images()
 }
 
 /// The board whose files are committed in `docs/eds/`.

@@ -97,6 +97,7 @@ fn the_uart_speaks_while_the_flash_erases() {
         .unwrap();
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
+    bench.soil_programs();
     // Twice in a row: erase everything at once.
     bench.session().command(1, ProgramControl::Clear).unwrap();
     bench.session().command(1, ProgramControl::Clear).unwrap();

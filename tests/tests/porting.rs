@@ -328,7 +328,26 @@ const MISTAKES: &[Mistake] = &[
         "Product { block_buffer: 1023, ..Product::DEFAULT }",
         "product: block_buffer must be 1024 bytes or more, and fit the RAM",
     ),
-    product("Product { watchdog_ms: 4001, ..Product::DEFAULT }", "product: watchdog_ms must be 100 to 4000"),
+    product(
+        "Product { watchdog_ms: Some(4001), ..Product::DEFAULT }",
+        "product: watchdog_ms must be 100 to 4000",
+    ),
+    product(
+        "Product { bit_rates: 3..=9, ..Product::DEFAULT }",
+        "product: bit_rates must be a range within 0 to 8",
+    ),
+    product(
+        "Product { sdo_request_base: 0x781, ..Product::DEFAULT }",
+        "product: sdo_request_base and sdo_response_base must be 80h to 780h",
+    ),
+    product(
+        "Product { sdo_request_base: 0x5FF, ..Product::DEFAULT }",
+        "product: sdo_request_base and sdo_response_base must be 80h or more apart",
+    ),
+    product(
+        "Product { sdo_request_base: 0x680, sdo_response_base: 0x701, ..Product::DEFAULT }",
+        "product: the COB-IDs of SDO must not be those of boot-up and heartbeat (700h)",
+    ),
     product(
         "Product { program_watchdog_ms: Some(0), ..Product::DEFAULT }",
         "product: program_watchdog_ms must be 1 to 4000",

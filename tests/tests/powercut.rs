@@ -35,6 +35,9 @@ fn a_cut_shows_every_seeded_bug_where_it_should() {
             Bug::EraseBeforeCheck => ("update", "Bootloader, where [Runs(163)] may be"),
             Bug::JournalWithoutCrc | Bug::CompactionInPlace => ("compaction", ", where "),
             Bug::BlankAtFirstSight => ("update", "the recovery does not complete: status 00000008h"),
+            Bug::TouchedForgotten => {
+                ("erase-and-install", "the recovery does not complete: status 00000008h")
+            }
         };
         let shown = shows(scenario(name), bug);
         println!("{bug:?} in {name}: {shown:?}");

@@ -140,15 +140,12 @@ fn a_cia_302_master_updates_a_running_device() {
         bench.await_boot_up(2000);
 
         assert_ne!(bench.session().read_number(IDENTIFICATION).unwrap(), crc32(&new), "it needs an update");
+        // The bootloader answers whichever comes first, behind its boot-up.
         if stop {
             write(&mut bench, CONTROL, &[0], by);
-            bench.await_boot_up(1000);
             assert_eq!(bench.session().read_number(CONTROL).unwrap(), 0, "stopped");
         }
         write(&mut bench, CONTROL, &[CLEAR], by);
-        if !stop {
-            bench.await_boot_up(1000);
-        }
         assert!(bench.is_bootloader(NODE));
         write(&mut bench, DATA, &new, by);
         let status = bench.session().await_idle(1, Doing::Read(DATA)).unwrap();

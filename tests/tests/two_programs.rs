@@ -9,7 +9,8 @@ use coflash::block_file::BlockFile;
 use coflash::convert::{blocks_of, Options, Region};
 use coflash::flash::{flash, FlashOptions};
 use coflash::read::read;
-use coflash::session::Doing;
+use coflash::session::{Doing, Transfers};
+use emulator::time::Span;
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
 
 /// Whether the bench has the chip of the board with two programs: it is that of the board the tests
@@ -123,4 +124,91 @@ fn a_block_for_the_other_program_is_refused() {
     assert_eq!(status[4], 0x0C, "ADDRESS: {refused}");
     let (start, end) = (0x1_0000, LAYOUT.chip.flash.size as usize);
     assert!(bench.machine().flash()[start..end].iter().all(|byte| *byte == 0xFF));
+}
+
+/// Applications at the first program's place, and their likes at the second's.
+const PAIRS: [(&str, &str); 2] =
+    [(firmware::APP_V1, firmware::PROGRAM_2), (firmware::APP_C, firmware::APP_C_PROGRAM_2)];
+
+/// The second program of a device whose first one runs: the call goes through 1F51h/1, as the manual has
+/// it, and the application serves each program's sub-index.
+#[test]
+fn a_second_program_is_written_to_a_running_device() {
+    if !is_its_chip() {
+        return;
+    }
+    for (first, second) in PAIRS {
+        let mut bench = Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER));
+        bench.power_on();
+        bench.await_boot_up(100);
+        let (one, two) = (blocks(first, 1), blocks(second, 2));
+        flash(&mut bench.session(), &one, &FlashOptions::default(), &mut |_| {}).unwrap();
+        let read = |bench: &mut Bench, index: u8, sub: u8| {
+            bench.ask(0x601, &[0x40, index, 0x1F, sub, 0, 0, 0, 0], 0x581).expect("an answer")
+        };
+        // 1F51h: number of programs, running, absent; no third one (06090011h).
+        assert_eq!(read(&mut bench, 0x51, 0), [0x4F, 0x51, 0x1F, 0, 2, 0, 0, 0]);
+        assert_eq!(read(&mut bench, 0x51, 1), [0x4F, 0x51, 0x1F, 1, 1, 0, 0, 0]);
+        assert_eq!(read(&mut bench, 0x51, 2), [0x4F, 0x51, 0x1F, 2, 3, 0, 0, 0]);
+        assert_eq!(read(&mut bench, 0x51, 3), [0x80, 0x51, 0x1F, 3, 0x11, 0, 0x09, 0x06]);
+        for index in [0x56, 0x57] {
+            assert_eq!(read(&mut bench, index, 0), [0x4F, index, 0x1F, 0, 2, 0, 0, 0]);
+            assert_eq!(read(&mut bench, index, 3), [0x80, index, 0x1F, 3, 0x11, 0, 0x09, 0x06]);
+        }
+        assert_eq!(identification(&mut bench, 1), one.program_crc(), "{first}");
+        assert_eq!(identification(&mut bench, 2), 0, "{first}");
+        // Its own start is no news; that of another one, and what is done to another one, is the
+        // bootloader's (08000022h). What does not exist is told as such.
+        for (sub, value, code) in
+            [(2, 1, 0x0800_0022_u32), (2, 2, 0x0800_0022), (2, 0x83, 0x0800_0022), (3, 3, 0x0609_0011)]
+        {
+            let answer = bench.ask(0x601, &[0x2F, 0x51, 0x1F, sub, value, 0, 0, 0], 0x581).unwrap();
+            let expected = [&[0x80, 0x51, 0x1F, sub][..], &code.to_le_bytes()].concat();
+            assert_eq!(answer, expected, "{first}");
+        }
+
+        let options = FlashOptions { program: 2, verify: true, ..FlashOptions::default() };
+        let report = flash(&mut bench.session(), &two, &options, &mut |_| {}).unwrap();
+        assert!(report.running.is_some(), "{second}");
+        // The second runs now; the first is there, stopped.
+        assert_eq!(read(&mut bench, 0x51, 1), [0x4F, 0x51, 0x1F, 1, 0, 0, 0, 0]);
+        assert_eq!(read(&mut bench, 0x51, 2), [0x4F, 0x51, 0x1F, 2, 1, 0, 0, 0]);
+        assert_eq!(identification(&mut bench, 1), one.program_crc(), "{second}");
+        assert_eq!(identification(&mut bench, 2), two.program_crc(), "{second}");
+        // And back, from the second one.
+        let options = FlashOptions { verify: true, ..FlashOptions::default() };
+        flash(&mut bench.session(), &one, &options, &mut |_| {}).unwrap();
+        assert_eq!(read(&mut bench, 0x51, 1), [0x4F, 0x51, 0x1F, 1, 1, 0, 0, 0]);
+        bench.assert_nothing_unmodelled();
+    }
+}
+
+/// STOP and CLEAR of a program that does not run are the bootloader's as well, and answered by it; 80h of
+/// another program's sub-index is a call, also to a program that is fresh.
+#[test]
+fn commands_for_the_other_program_lead_into_the_bootloader() {
+    if !is_its_chip() {
+        return;
+    }
+    for (first, _) in PAIRS {
+        for value in [0x00, 0x03, 0x80] {
+            let mut bench = Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER));
+            bench.power_on();
+            bench.await_boot_up(100);
+            let mut session = bench.session();
+            session.transfer_by(Transfers::Segments);
+            let image = firmware::raw_from(LAYOUT.programs[0].base, &firmware::of_board(LAYOUT.board, first));
+            session.write(Address::new(0x1F50, 1), &image, Doing::Program, &mut |_| {}).unwrap();
+            session.await_idle(1, Doing::Program).unwrap();
+            session.command(1, ProgramControl::Start).unwrap();
+            bench.await_boot_up(1000);
+            bench.run_ms(50);
+            let from = bench.time();
+            let answer = bench.ask(0x601, &[0x2F, 0x51, 0x1F, 2, value, 0, 0, 0], 0x581).unwrap();
+            assert_eq!(answer, [0x60, 0x51, 0x1F, 2, 0, 0, 0, 0], "{first}, {value:02X}h");
+            assert!(bench.time() - from <= Span::from_millis(25), "{first}, {value:02X}h");
+            bench.run_ms(100);
+            assert!(bench.is_bootloader(NODE), "{first}, {value:02X}h");
+        }
+    }
 }

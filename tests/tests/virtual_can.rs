@@ -161,6 +161,7 @@ fn another_bit_rate_is_noticed() {
 #[test]
 fn never_silent_during_an_erase() {
     let mut bench = empty_board();
+    bench.soil_programs();
     let mut adapter = adapter(&mut bench);
     let blocks = firmware::blocks(firmware::APP_VIRTUAL_CAN);
     let mut session_ = session(&mut adapter);

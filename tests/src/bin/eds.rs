@@ -12,7 +12,7 @@ fn main() -> ExitCode {
         eprintln!("usage: eds FOLDER");
         return ExitCode::from(2);
     };
-    for image in [eds::bootloader(), eds::application()] {
+    for image in eds::images() {
         let path = Path::new(folder).join(image.file);
         if let Err(error) = fs::write(&path, image.eds()) {
             eprintln!("{}: {error}", path.display());

@@ -52,6 +52,7 @@ const CONFIG: Config = Config {
     node_id: None,
     password: b"",
     boot_up_emergency: false,
+    lss_store: true,
     download: Policy { identity: Some((VENDOR_ID, PRODUCT_CODE)), ..Policy::DEFAULT },
 };
 static SOUND: Config = CONFIG;
@@ -82,7 +83,7 @@ static ESACADEMY: Config = Config {
     password: Profile::ESACADEMY.password,
     ..CONFIG
 };
-static HASTY: Config = Config { download: Policy { erase: Erase::AtOnce, ..CONFIG.download }, ..CONFIG };
+static HASTY: Config = Config { download: Policy { erase: |_| Erase::AtOnce, ..CONFIG.download }, ..CONFIG };
 
 const DECISION: decision::Policy = decision::Policy {
     autostart: Some(1),
@@ -90,6 +91,7 @@ const DECISION: decision::Policy = decision::Policy {
     node_ids: 1..=127,
     rescue_window_ms: 0,
     rescue_window_confirmed_ms: 0,
+    start_allowed: |_| true,
 };
 
 /// Node-ID and bit rate of a device that was never told others.
@@ -110,17 +112,20 @@ pub enum Bug {
     CompactionInPlace,
     /// A sector that begins blank is taken for erased.
     BlankAtFirstSight,
+    /// Nobody keeps which sectors may be half erased.
+    TouchedForgotten,
 }
 
 impl Bug {
     /// All of them.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 7] = [
         Self::SignatureBeforeData,
         Self::EraseBeforeInvalidating,
         Self::EraseBeforeCheck,
         Self::JournalWithoutCrc,
         Self::CompactionInPlace,
         Self::BlankAtFirstSight,
+        Self::TouchedForgotten,
     ];
 }
 
@@ -425,6 +430,8 @@ enum Store {
     Journal(Journal),
     /// Stores this record where it should take one away, or none at all.
     Instead(Journal, Option<Value>),
+    /// Forgets which sectors may be half erased.
+    Forgetful(Journal),
     /// One region, record behind record; a word in front of each tells what it is about. `checked`:
     /// with a CRC behind it.
     Naive {
@@ -440,6 +447,7 @@ impl Store {
             Some(Bug::JournalWithoutCrc) => Self::Naive { checked: false, work: Vec::new() },
             Some(Bug::CompactionInPlace) => Self::Naive { checked: true, work: Vec::new() },
             Some(Bug::EraseBeforeInvalidating) => Self::Instead(journal, None),
+            Some(Bug::TouchedForgotten) => Self::Forgetful(journal),
             Some(Bug::SignatureBeforeData) => {
                 let new = image(1, super::scenario::NEW);
                 let record = ProgramRecord {
@@ -448,6 +456,7 @@ impl Store {
                     signed: true,
                     confirmed: false,
                     version: 0,
+                    half_erased: false,
                 };
                 Self::Instead(journal, Some(record.value()))
             }
@@ -491,6 +500,12 @@ impl Parameters for Store {
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value> {
         match self {
             Self::Journal(journal) | Self::Instead(journal, _) => journal.get(flash, key),
+            Self::Forgetful(journal) => {
+                let [first, rest @ ..] = journal.get(flash, key)?;
+                let [a, b, c] = rest;
+                // Above the size.
+                Some([if let Key::Program(_) = key { first & 0x00FF_FFFF } else { first }, a, b, c])
+            }
             Self::Naive { checked, .. } => {
                 let (records, _) = naive_records(flash, *checked);
                 let found = records.iter().rev().find(|record| record[0] == naive_key(key))?;
@@ -501,12 +516,16 @@ impl Parameters for Store {
 
     fn store(&mut self, key: Key, value: Value) {
         match self {
-            Self::Instead(journal, instead) if key == Key::Program(1) && value == ProgramRecord::NONE => {
+            Self::Instead(journal, instead)
+                if key == Key::Program(1) && ProgramRecord::from_value(value).is_none() =>
+            {
                 if let Some(instead) = instead {
                     journal.store(key, *instead);
                 }
             }
-            Self::Journal(journal) | Self::Instead(journal, _) => journal.store(key, value),
+            Self::Journal(journal) | Self::Instead(journal, _) | Self::Forgetful(journal) => {
+                journal.store(key, value);
+            }
             Self::Naive { work, .. } => {
                 let mut record = vec![naive_key(key), value[0], value[1], value[2], value[3]];
                 record.push(naive_crc(&record));
@@ -518,7 +537,9 @@ impl Parameters for Store {
 
     fn next<F: Flash>(&mut self, flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
         let Self::Naive { checked, work } = self else {
-            let (Self::Journal(journal) | Self::Instead(journal, _)) = self else { unreachable!() };
+            let (Self::Journal(journal) | Self::Instead(journal, _) | Self::Forgetful(journal)) = self else {
+                unreachable!()
+            };
             return journal.next(flash, outcome);
         };
         if let Err(fault) = outcome {

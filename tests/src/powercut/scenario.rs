@@ -162,6 +162,20 @@ fn update(device: &mut Device, tell: Tell<'_>) -> Result<(), String> {
     Ok(())
 }
 
+/// Two CLEARs, a reset, and the new program without CLEAR.
+fn erase_and_install(device: &mut Device, tell: Tell<'_>) -> Result<(), String> {
+    device.host(|host| {
+        host.command(1, CLEAR)?;
+        host.command(1, CLEAR)
+    })?;
+    tell(allowed(&[STAY]));
+    device.host(|host| good(1, NEW).iter().try_for_each(|block| host.block(1, block)))?;
+    tell(allowed(&[STAY, START_NEW]));
+    device.host(|host| host.command(1, SET_SIGNATURE))?;
+    tell(allowed(&[START_NEW]));
+    Ok(())
+}
+
 /// An update of program 1 in one go.
 fn update_at_once(device: &mut Device, data: Vec<u8>, tell: Tell<'_>) -> Result<(), String> {
     download(device, 1, &[data], || tell(allowed(&[START_OLD, STAY, START_NEW])))?;
@@ -298,6 +312,20 @@ pub const SCENARIOS: &[Scenario] = &[
             })
         },
         end: || allowed(&[STAY]),
+    },
+    Scenario {
+        name: "erase-and-install",
+        about: "a program taken away by two CLEARs, and behind a reset another one without CLEAR, which looks whether the flash is blank",
+        prepare: |device| install(device, 1, OLD, true),
+        act: |device, tell| {
+            tell(allowed(&[START_OLD, STAY]));
+            erase_and_install(device, tell)
+        },
+        recover: |device, from, tell| {
+            tell(from.clone());
+            erase_and_install(device, tell)
+        },
+        end: || allowed(&[START_NEW]),
     },
     Scenario {
         name: "sign",

@@ -1,0 +1,243 @@
+//! Masters that know CiA 302-3 and nothing of coboot, by their sequence of requests and its timing:
+//! Zephyr's `canopen_program.py` and the boot slave process of Lely's NMT master.
+//!
+//! Each request goes out once unless the original repeats it, and its answer is the next frame of
+//! the node's SDO server.
+
+use std::time::Duration;
+
+use canopen::{Address, Frame, NodeId};
+use coflash::adapter::Adapter;
+use coflash::session::{Doing, Session, Timing, Transfers};
+use embedded_can::{Frame as _, StandardId};
+
+/// What 1F51h takes (CiA 302-3; 80h is Zephyr's).
+const STOP: u8 = 0;
+const START: u8 = 1;
+const CLEAR: u8 = 3;
+const CONFIRM: u8 = 0x80;
+
+/// An SDO client with this patience, on any bus.
+pub struct Master<'a> {
+    /// The bus.
+    pub bus: &'a mut dyn Adapter,
+    node: u8,
+    timeout: Duration,
+}
+
+impl<'a> Master<'a> {
+    /// A client of a node, which waits so long for each answer.
+    pub fn new(bus: &'a mut dyn Adapter, node: u8, timeout: Duration) -> Self {
+        Self { bus, node, timeout }
+    }
+
+    /// Sends a frame.
+    ///
+    /// # Panics
+    /// If it is no frame.
+    pub fn post(&mut self, id: u16, data: &[u8]) {
+        let id = StandardId::new(id).expect("11 bits");
+        self.bus.send(&Frame::new(id, data).expect("8 bytes at most")).expect("the bus is there");
+    }
+
+    /// Lets time pass.
+    ///
+    /// # Panics
+    /// If the bus is gone.
+    pub fn pause(&mut self, time: Duration) {
+        let until = self.bus.now() + time;
+        while self.bus.now() < until {
+            let left = until.saturating_sub(self.bus.now());
+            let _ = self.bus.receive(left).expect("the bus is there");
+        }
+    }
+
+    /// The next frame with this identifier, within this time.
+    ///
+    /// # Panics
+    /// If the bus is gone.
+    pub fn await_frame(&mut self, id: u16, time: Duration) -> Option<Vec<u8>> {
+        let until = self.bus.now() + time;
+        loop {
+            let left = until.saturating_sub(self.bus.now());
+            let frame = self.bus.receive(left).expect("the bus is there")?;
+            if frame.cob_id().is_some_and(|of| of.get() == id) {
+                return Some(frame.data().to_vec());
+            }
+        }
+    }
+
+    /// One SDO request, once: its answer, and how long that took.
+    pub fn ask(&mut self, request: [u8; 8]) -> Option<(Vec<u8>, Duration)> {
+        let from = self.bus.now();
+        self.post(0x600 + u16::from(self.node), &request);
+        let answer = self.await_frame(0x580 + u16::from(self.node), self.timeout)?;
+        Some((answer, self.bus.now() - from))
+    }
+
+    /// Writes a command to 1F51h of a program: 60 51 1F nn is the answer.
+    ///
+    /// # Errors
+    /// What came in its place.
+    pub fn control(&mut self, program: u8, command: u8) -> Result<Duration, String> {
+        match self.ask([0x2F, 0x51, 0x1F, program, command, 0, 0, 0]) {
+            Some((answer, took)) if answer == [0x60, 0x51, 0x1F, program, 0, 0, 0, 0] => Ok(took),
+            other => Err(format!("1F51h/{program} = {command:02X}h: {other:02X?}")),
+        }
+    }
+
+    /// Reads a number of 8 or 32 bits.
+    ///
+    /// # Errors
+    /// What came in its place.
+    pub fn number(&mut self, index: u16, sub: u8) -> Result<u32, String> {
+        let [low, high] = index.to_le_bytes();
+        match self.ask([0x40, low, high, sub, 0, 0, 0, 0]) {
+            Some((answer, _)) if matches!(answer[0], 0x43 | 0x4F) && answer[1..4] == [low, high, sub] => {
+                Ok(u32::from_le_bytes([answer[4], answer[5], answer[6], answer[7]]))
+            }
+            other => Err(format!("{index:04X}h/{sub}: {other:02X?}")),
+        }
+    }
+
+    /// Writes a program to 1F50h.
+    ///
+    /// # Errors
+    /// What the transfer ended with.
+    pub fn download(&mut self, program: u8, image: &[u8], transfers: Transfers) -> Result<(), String> {
+        let timing = Timing { sdo: self.timeout, attempts: 1, ..Timing::default() };
+        let node = NodeId::new(self.node).ok_or("a node-ID")?;
+        let mut session = Session::new(&mut *self.bus, node, timing);
+        session.transfer_by(transfers);
+        let at = Address::new(0x1F50, program);
+        session.write(at, image, Doing::Program, &mut |_| {}).map_err(|error| error.to_string())
+    }
+}
+
+/// How Zephyr's runner goes (`scripts/west_commands/runners/canopen_program.py`), with the default
+/// options: an SDO time-out of 1 s, one attempt, 10 s for a status and for the boot-up, and the
+/// confirmation in the end.
+pub struct Zephyr {
+    /// How long STOP and CLEAR took to be answered.
+    pub answers: [Duration; 2],
+}
+
+/// Between an answer and the next request of the runner, as a trace of it shows.
+pub const ZEPHYR_PAUSE: Duration = Duration::from_micros(1400);
+
+/// Carries Zephyr's procedure through.
+///
+/// # Errors
+/// The first step that fails; the runner gives up there.
+pub fn zephyr(bus: &mut dyn Adapter, node: u8, image: &[u8]) -> Result<Zephyr, String> {
+    let limit = Duration::from_secs(10);
+    let mut master = Master::new(bus, node, Duration::from_secs(1));
+    let status_ok = |master: &mut Master<'_>| {
+        let until = master.bus.now() + limit;
+        loop {
+            let status = master.number(0x1F57, 1)?;
+            if status == 0 || master.bus.now() > until {
+                return Ok::<u32, String>(status);
+            }
+        }
+    };
+    if status_ok(&mut master)? == 0 {
+        master.number(0x1F56, 1)?;
+    }
+    master.post(0x000, &[0x80, node]);
+    master.pause(ZEPHYR_PAUSE);
+    let stop = master.control(1, STOP)?;
+    master.pause(ZEPHYR_PAUSE);
+    let clear = master.control(1, CLEAR)?;
+    master.pause(ZEPHYR_PAUSE);
+    status_ok(&mut master)?;
+    master.download(1, image, Transfers::Segments)?;
+    let status = status_ok(&mut master)?;
+    if status != 0 {
+        return Err(format!("1F57h reads {status:08X}h"));
+    }
+    master.number(0x1F56, 1)?;
+    master.control(1, START)?;
+    let boot_up = 0x700 + u16::from(node);
+    loop {
+        let state = master.await_frame(boot_up, limit).ok_or("no boot-up")?;
+        if state == [0] {
+            break;
+        }
+    }
+    master.number(0x1F56, 1)?;
+    master.post(0x000, &[0x80, node]);
+    master.pause(ZEPHYR_PAUSE);
+    master.control(1, CONFIRM)?;
+    Ok(Zephyr { answers: [stop, clear] })
+}
+
+/// How often Lely's master repeats what may meet a device that restarts.
+const LELY_RETRY: u32 = 3;
+/// Its pause before it looks at 1F57h and 1F51h.
+const LELY_CHECK: Duration = Duration::from_millis(100);
+
+/// How often Lely's master had to send what it may repeat, beyond the first time.
+pub struct Lely {
+    /// Repetitions in all.
+    pub repeated: u32,
+    /// Whether STOP was answered: the master goes on without, too.
+    pub stop_answered: bool,
+}
+
+/// Carries the step "check and update software version" of Lely's boot slave process through
+/// (`src/co/nmt_boot.c`), with its SDO time-out of 100 ms. `image` is what 1F58h has for the slave.
+///
+/// # Errors
+/// The first step that fails; the process ends there.
+pub fn lely(bus: &mut dyn Adapter, node: u8, image: &[u8], identification: u32) -> Result<Lely, String> {
+    let mut master = Master::new(bus, node, Duration::from_millis(100));
+    let mut repeated = 0;
+    let mut retry = |step: &mut dyn FnMut() -> Result<u32, String>| {
+        let mut attempt = 0;
+        loop {
+            match step() {
+                // A time-out is repeated, an abort is not.
+                Err(error) if error.ends_with("None") && attempt < LELY_RETRY => {
+                    attempt += 1;
+                    repeated += 1;
+                }
+                result => return result,
+            }
+        }
+    };
+    retry(&mut || master.number(0x1F56, 1))?;
+    let mut stop_answered = true;
+    if master.number(0x1F51, 1) != Ok(0) {
+        // "The download SDO request may be unconfirmed on some devices."
+        match master.control(1, STOP) {
+            Err(error) if error.ends_with("None") => stop_answered = false,
+            result => drop(result?),
+        }
+    }
+    retry(&mut || master.control(1, CLEAR).map(|_| 0))?;
+    master.download(1, image, Transfers::Blocks)?;
+    loop {
+        master.pause(LELY_CHECK);
+        let status = master.number(0x1F57, 1)?;
+        match status {
+            0 => break,
+            busy if busy & 1 != 0 => {}
+            error => return Err(format!("1F57h reads {error:08X}h")),
+        }
+    }
+    let found = master.number(0x1F56, 1)?;
+    if found != identification {
+        return Err(format!("1F56h reads {found:08X}h, not {identification:08X}h"));
+    }
+    match master.control(1, START) {
+        Err(error) if !error.ends_with("None") => return Err(error),
+        _ => {}
+    }
+    loop {
+        master.pause(LELY_CHECK);
+        if retry(&mut || master.number(0x1F51, 1))? == 1 {
+            return Ok(Lely { repeated, stop_answered });
+        }
+    }
+}

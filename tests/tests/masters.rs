@@ -1,0 +1,125 @@
+//! Masters that know CiA 302-3 and not coboot update a device whose program runs: the sequences of
+//! requests of Zephyr's runner and of Lely's NMT master, with their timing.
+
+use std::time::Duration;
+
+use canopen::BitRate;
+use coboot_node::device::Event;
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::firmware;
+use coboot_tests::masters::{lely, zephyr, Master};
+use coboot_tests::node::NodeBus;
+use coflash::flash::{flash, FlashOptions};
+
+/// Applications that a running device may have.
+const APPLICATIONS: [&str; 2] = [firmware::APP_V1, firmware::APP_C];
+
+/// Which bit rate the bench has.
+fn board_at(rate: BitRate, bits: u32, image: &str) -> Bench {
+    let mut bench = Bench::new();
+    if rate != BitRate::K125 {
+        let board = bench.device;
+        bench.commission(board, NODE, rate);
+        bench.set_host_bit_rate(bits);
+    }
+    bench.power_on();
+    bench.await_boot_up(1000);
+    flash(&mut bench.session(), &firmware::blocks(image), &FlashOptions::default(), &mut |_| {}).unwrap();
+    bench.run_ms(100);
+    bench.events();
+    bench
+}
+
+/// CRC-32/ISO-HDLC, bit by bit.
+fn crc32(bytes: &[u8]) -> u32 {
+    !bytes.iter().fold(u32::MAX, |crc, byte| {
+        (0..8).fold(crc ^ u32::from(*byte), |crc, _| crc >> 1 ^ (0xEDB8_8320 * (crc & 1)))
+    })
+}
+
+/// The whole procedure, from one application to the next, confirmed in the end: the device runs the
+/// new program, and starts it by itself.
+#[test]
+fn zephyrs_runner_updates_and_confirms_a_running_device() {
+    for image in APPLICATIONS {
+        let mut bench = board_at(BitRate::K125, 125_000, image);
+        let done = zephyr(&mut bench, NODE, &firmware::raw(firmware::APP_V2));
+        let [stop, clear] = done.unwrap_or_else(|error| panic!("{image}: {error}")).answers;
+        println!("{image}: STOP answered in {stop:?}, CLEAR in {clear:?}");
+        assert!(stop <= Duration::from_millis(25), "{image}: {stop:?}");
+        bench.run_ms(100);
+        assert!(!bench.is_bootloader(NODE), "{image}: it was confirmed, not called back");
+        bench.power_off();
+        bench.run_ms(100);
+        bench.power_on();
+        bench.await_boot_up(1000);
+        assert!(!bench.is_bootloader(NODE), "{image}: it starts by itself, without a rescue window");
+        bench.assert_nothing_unmodelled();
+    }
+}
+
+/// The step "check and update software version" at 500 kbit/s.
+#[test]
+fn lelys_master_updates_a_running_device() {
+    let raw = firmware::raw(firmware::APP_V2);
+    for image in APPLICATIONS {
+        let mut bench = board_at(BitRate::K500, 500_000, image);
+        let done =
+            lely(&mut bench, NODE, &raw, crc32(&raw)).unwrap_or_else(|error| panic!("{image}: {error}"));
+        assert_eq!((done.repeated, done.stop_answered), (0, true), "{image}");
+        assert!(!bench.is_bootloader(NODE), "{image}");
+        bench.assert_nothing_unmodelled();
+    }
+}
+
+/// A program as far as a bootloader looks at one: initial stack pointer in RAM, reset vector inside,
+/// Thumb bit set.
+fn program(first: u8) -> Vec<u8> {
+    let mut bytes = vec![first; 20 * 1024];
+    bytes[..8].copy_from_slice(&[0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x01, 0x08]);
+    bytes
+}
+
+/// Both against `coboot-node`, whose stand-in answers for the program.
+#[test]
+fn both_masters_update_a_node_without_a_chip() {
+    let mut node = NodeBus::new("masters");
+    // Twice: the second time from the running program.
+    for first in [1, 2] {
+        let done = zephyr(&mut node, NODE, &program(first)).unwrap();
+        assert!(done.answers[0] <= Duration::from_millis(25), "{:?}", done.answers);
+        node.run(Duration::from_millis(100));
+        let last = *node.events.last().unwrap();
+        assert!(matches!(last, Event::Program { trial: false, .. }), "confirmed, not called back: {last:?}");
+    }
+    let image = program(3);
+    let done = lely(&mut node, NODE, &image, crc32(&image)).unwrap();
+    assert_eq!((done.repeated, done.stop_answered), (0, true));
+}
+
+/// From the request to its answer, as a client sees it; the bootloader has sent its boot-up before.
+#[test]
+fn stop_and_clear_are_answered_by_the_bootloader_within_25_ms() {
+    for image in APPLICATIONS {
+        for command in [0, 3] {
+            let mut bench = board_at(BitRate::K125, 125_000, image);
+            let from = bench.time();
+            let took = Master::new(&mut bench, NODE, Duration::from_millis(100)).control(1, command);
+            let took = took.unwrap_or_else(|error| panic!("{image}: {error}"));
+            println!("{}, {image}: 1F51h = {command}: {took:?}", firmware::board().board);
+            assert!(took <= Duration::from_millis(25), "{image}, {command}: {took:?}");
+            bench.run_ms(2);
+            let frames = bench.frames_since(from);
+            // The emergency that tells of the bootloader may come in between: its identifier is lower.
+            let frames = frames.iter().filter(|(_, id, _)| *id != 0x80 + u32::from(NODE));
+            let of_node: Vec<_> = frames.map(|(_, id, data)| (*id, &data[..])).collect();
+            let expected: [(u32, &[u8]); 3] = [
+                (0x601, &[0x2F, 0x51, 0x1F, 1, command, 0, 0, 0]),
+                (0x701, &[0]),
+                (0x581, &[0x60, 0x51, 0x1F, 1, 0, 0, 0, 0]),
+            ];
+            assert_eq!(of_node[..3], expected, "{image}, {command}");
+            assert!(bench.is_bootloader(NODE));
+        }
+    }
+}

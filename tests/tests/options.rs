@@ -1,0 +1,147 @@
+//! The options of a product that are not its default: node-ID and bit rate by switches, COB-IDs of its
+//! own, no boot-up message, layer setting services that begin in configuration state and store nothing,
+//! an erasure at once, and a pin that says whether a program is valid.
+
+use canopen::program::ProgramControl;
+use canopen::BitRate;
+use coboot_tests::bench::Bench;
+use coboot_tests::firmware;
+use coflash::adapter::SdoIds;
+use coflash::flash::{flash, FlashOptions};
+use coflash::session::{Doing, Session, Timing};
+use emulator::time::Time;
+
+/// Pins of port E that the product `switches` reads: the node-ID on 8 to 14, the bit rate's index on
+/// 4 to 7.
+fn set_switches(bench: &mut Bench, node: u8, rate: BitRate) {
+    let pins = u16::from(node) << 8 | (rate as u16) << 4;
+    for pin in 4..15 {
+        bench.machine().set_pin('E', pin, Some(pins >> pin & 1 == 1));
+    }
+}
+
+/// A device with these switches, switched on and listened to at 500 kbit/s.
+fn switched_on(node: u8, rate: BitRate) -> Bench {
+    let mut bench = Bench::of_image(firmware::BOOTLOADER_SWITCHES);
+    bench.set_host_bit_rate(500_000);
+    set_switches(&mut bench, node, rate);
+    bench.power_on();
+    bench.run_ms(50);
+    bench
+}
+
+/// A request of 1000h on 680h and the node-ID is answered on 480h and the node-ID, and the predefined
+/// COB-IDs are nobody's.
+#[test]
+fn node_id_bit_rate_and_cob_ids_are_the_products() {
+    for (node, rate) in [(2, BitRate::K500), (42, BitRate::K500), (100, BitRate::K500)] {
+        let mut bench = switched_on(node, rate);
+        assert!(bench.records().is_empty(), "no boot-up message, no emergency");
+        let id = u32::from(node);
+        let request = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
+        let answer = bench.ask(0x680 + u16::from(node), &request, 0x480 + id);
+        assert_eq!(answer.unwrap(), [0x43, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x10]);
+        assert_eq!(bench.ask(0x600 + u16::from(node), &request, 0x580 + id), None);
+        bench.run_ms(1000);
+        // The heartbeat is there, and says PRE-OPERATIONAL.
+        assert!(bench
+            .frames_since(Time::default())
+            .iter()
+            .any(|(_, cob, data)| { *cob == 0x700 + id && data == &[0x7F] }));
+        bench.assert_nothing_unmodelled();
+    }
+}
+
+/// A bit rate out of the product's range (1 Mbit/s; 20 kbit/s) and switches that are none stand for the
+/// board's 125 kbit/s; a node-ID that is none waits for LSS, and says so.
+#[test]
+fn switches_out_of_range_stand_for_the_boards() {
+    for index in [0, 7, 15] {
+        let mut bench = Bench::of_image(firmware::BOOTLOADER_SWITCHES);
+        for pin in 4..15 {
+            let pins: u16 = 42 << 8 | index << 4;
+            bench.machine().set_pin('E', pin, Some(pins >> pin & 1 == 1));
+        }
+        bench.power_on();
+        bench.run_ms(50);
+        let answer = bench.ask(0x6AA, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0], 0x4AA);
+        assert!(answer.is_some(), "index {index}: at 125 kbit/s");
+    }
+    let bench = switched_on(0, BitRate::K500);
+    // 50h, "non-configured slave" (CiA 305): what the product announces in place of the boot-up.
+    let announced = bench.frames_since(Time::default());
+    assert_eq!(announced.len(), 1, "{announced:x?}");
+    assert_eq!((announced[0].1, announced[0].2[0]), (0x7E4, 0x50));
+}
+
+/// Layer setting services start in configuration state, give a node-ID, and store nothing.
+#[test]
+fn lss_starts_in_configuration_and_stores_nothing() {
+    let mut bench = switched_on(42, BitRate::K500);
+    // 5Eh: inquire node-ID, without having been selected.
+    let answer = bench.ask(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0], 0x7E4).unwrap();
+    assert_eq!(answer[..2], [0x5E, 42]);
+    // 17h: store configuration; 1: storing is not supported.
+    let answer = bench.ask(0x7E5, &[0x17, 0, 0, 0, 0, 0, 0, 0], 0x7E4).unwrap();
+    assert_eq!(answer[..2], [0x17, 1]);
+}
+
+/// A signed program starts while PC0 is high alone; CLEAR of this product erases at once.
+#[test]
+fn a_pin_says_whether_a_program_is_valid() {
+    let mut bench = switched_on(42, BitRate::K500);
+    bench.machine().set_pin('C', 0, Some(true));
+    let file = firmware::blocks(firmware::APP_V1);
+    let node = canopen::NodeId::new(42).unwrap();
+    let request = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
+    {
+        let mut ids = SdoIds::new(&mut bench, 0x680, 0x480);
+        let mut session = Session::new(&mut ids, node, Timing::default());
+        let options = FlashOptions { start: false, ..FlashOptions::default() };
+        flash(&mut session, &file, &options, &mut |_| {}).unwrap();
+    }
+    let restart = |bench: &mut Bench, valid: bool| {
+        bench.power_off();
+        bench.machine().set_pin('C', 0, Some(valid));
+        bench.power_on();
+        bench.run_ms(600);
+        bench.ask(0x6AA, &request, 0x4AA).is_some()
+    };
+    assert!(restart(&mut bench, false), "low: the bootloader stays, without a rescue window");
+    bench.run_ms(600);
+    assert!(bench.ask(0x6AA, &request, 0x4AA).is_some());
+    assert!(!restart(&mut bench, true), "high: behind the rescue window the program runs");
+    // The first CLEAR already leaves nothing of the program.
+    bench.power_off();
+    bench.machine().set_pin('C', 0, Some(false));
+    bench.power_on();
+    bench.run_ms(50);
+    let mut ids = SdoIds::new(&mut bench, 0x680, 0x480);
+    let mut session = Session::new(&mut ids, node, Timing::default());
+    session.command(1, ProgramControl::Clear).unwrap();
+    session.await_idle(1, Doing::Block(0)).unwrap();
+    drop(session);
+    let program = firmware::board().programs[0];
+    let at = (program.base - firmware::board().chip.flash.base) as usize;
+    assert!(bench.machine().flash()[at..at + 4096].iter().all(|byte| *byte == 0xFF));
+}
+
+/// The page of the choices has every field of the struct, and no other.
+#[test]
+fn the_page_has_every_choice() {
+    let source = include_str!("../../bootloader/src/product.rs");
+    let page = include_str!("../../docs/product.md");
+    let (_, fields) = source.split_once("pub struct Product {").unwrap();
+    let (fields, _) = fields.split_once("\n}").unwrap();
+    let mut fields: Vec<&str> = fields
+        .lines()
+        .filter_map(|line| line.trim().strip_prefix("pub ")?.split_once(':').map(|(name, _)| name))
+        .collect();
+    let mut rows: Vec<&str> = page
+        .lines()
+        .filter_map(|line| line.strip_prefix("| `")?.split_once('`').map(|(name, _)| name))
+        .collect();
+    fields.sort_unstable();
+    rows.sort_unstable();
+    assert_eq!(rows, fields);
+}

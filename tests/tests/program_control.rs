@@ -1,0 +1,456 @@
+//! 1F51h of a running device: what is answered by whom, what happens between an answer and the reset,
+//! and what 80h means to a program that has just been downloaded. For the application in Rust and the
+//! one in C alike.
+
+use canopen::program::ProgramControl;
+use coboot_tests::bench::{Bench, NODE, RESCUE_WINDOW_MS};
+use coboot_tests::firmware;
+use coflash::flash::{call_back, flash, FlashOptions};
+use emulator::machine::Stop;
+use emulator::time::{Span, Time};
+
+const APPLICATIONS: [&str; 2] = [firmware::APP_V1, firmware::APP_C];
+
+const REQUEST: u16 = 0x600 + NODE as u16;
+const ANSWER: u32 = 0x580 + NODE as u32;
+const HEARTBEAT: u32 = 0x700 + NODE as u32;
+
+/// 1F51h/1 := value, and its acknowledgement (CiA 301, 7.2.4.3.3).
+const fn command(value: u8) -> [u8; 8] {
+    [0x2F, 0x51, 0x1F, 1, value, 0, 0, 0]
+}
+const ACKNOWLEDGED: [u8; 8] = [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0];
+
+fn running_board(image: &str) -> Bench {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    flash(&mut bench.session(), &firmware::blocks(image), &FlashOptions::default(), &mut |_| {}).unwrap();
+    bench.run_ms(100);
+    bench.events();
+    bench
+}
+
+/// When the chip was reset, once.
+fn reset(bench: &mut Bench) -> Time {
+    let events = bench.events();
+    let [(at, Stop::Reset(_))] = events[..] else { panic!("{events:?}") };
+    at
+}
+
+/// The answers since then, with the times of their ends.
+fn answers(bench: &Bench, from: Time) -> Vec<(Time, [u8; 8])> {
+    let frames = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == ANSWER);
+    frames.map(|(at, _, data)| (at, data.try_into().expect("8 bytes"))).collect()
+}
+
+fn power_cycle(bench: &mut Bench) {
+    bench.power_off();
+    bench.run_ms(100);
+    bench.power_on();
+}
+
+/// Requests of every kind that come in the 10 ms between the answer and the reset are served; what
+/// none is gets none. Each acknowledged command has its 10 ms.
+#[test]
+fn requests_between_the_answer_and_the_reset_are_served() {
+    for image in APPLICATIONS {
+        for leaving in [0x80, 0x02] {
+            let mut bench = running_board(image);
+            let from = bench.time();
+            assert_eq!(bench.ask(REQUEST, &command(leaving), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+            // What is no request, and what is for somebody else.
+            bench.post(REQUEST, &[0x40, 0, 0x10]);
+            bench.post(REQUEST, &[0x80, 0, 0x10, 0, 0, 0, 0, 0]);
+            bench.post(REQUEST + 1, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]);
+            bench.post(0x000, &[0x81, NODE + 1]);
+            // Start remote node: the state changes, and the heartbeat would tell.
+            bench.post(0x000, &[0x01, NODE]);
+            let read = bench.ask(REQUEST, &[0x40, 0, 0x10, 0, 0, 0, 0, 0], ANSWER);
+            assert_eq!(read.as_deref(), Some(&[0x43, 0, 0x10, 0, 0, 0, 0, 0][..]), "{image}");
+            let absent = bench.ask(REQUEST, &[0x40, 0xFF, 0x5F, 0, 0, 0, 0, 0], ANSWER);
+            assert_eq!(absent.as_deref(), Some(&[0x80, 0xFF, 0x5F, 0, 0, 0, 2, 6][..]), "{image}");
+            let signature = bench.ask(REQUEST, &command(0x83), ANSWER);
+            assert_eq!(signature.as_deref(), Some(&[0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 8][..]), "{image}");
+            assert_eq!(bench.events(), [], "{image}: it is still there");
+            bench.await_boot_up(1000);
+            let reset = reset(&mut bench);
+            let (last, _) = answers(&bench, from)[0];
+            assert!(reset - last >= Span::from_millis(10), "{image}");
+            assert!(reset - last <= Span::from_millis(25), "{image}: {} us", (reset - last).0 / 1_000_000);
+            assert_eq!(bench.is_bootloader(NODE), leaving == 0x80, "{image}");
+            bench.assert_nothing_unmodelled();
+        }
+    }
+}
+
+/// 80h, again and again: each is acknowledged, the reset comes 10 ms behind the last one, and somebody
+/// who never stops does not keep the device.
+#[test]
+fn a_call_in_quick_succession_is_acknowledged_each_time() {
+    for image in APPLICATIONS {
+        let mut bench = running_board(image);
+        let from = bench.time();
+        for _ in 0..4 {
+            assert_eq!(bench.ask(REQUEST, &command(0x80), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+            bench.run_ms(3);
+        }
+        bench.await_boot_up(1000);
+        let last = answers(&bench, from).last().unwrap().0;
+        let pause = reset(&mut bench) - last;
+        assert!(pause >= Span::from_millis(10), "{image}: {} us", pause.0 / 1_000_000);
+        assert!(bench.is_bootloader(NODE), "{image}");
+
+        let mut bench = running_board(image);
+        let from = bench.time();
+        while bench.time() - from < Span::from_millis(600) {
+            bench.post(REQUEST, &command(0x80));
+            bench.run_ms(4);
+        }
+        let reset = reset(&mut bench);
+        assert!(reset - from <= Span::from_millis(520), "{image}: {} ms", (reset - from).0 / 1_000_000_000);
+        assert!(bench.is_bootloader(NODE), "{image}");
+    }
+}
+
+/// The second master's command comes while the first one's is being carried out.
+#[test]
+fn two_masters_are_both_answered() {
+    for image in APPLICATIONS {
+        // STOP or CLEAR behind the answer to 80h: the first has its 10 ms, the second its answer by the
+        // bootloader within 25 ms.
+        for second in [0x00, 0x03] {
+            let mut bench = running_board(image);
+            let from = bench.time();
+            assert_eq!(bench.ask(REQUEST, &command(0x80), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+            bench.run_ms(2);
+            let asked = bench.time();
+            assert_eq!(bench.ask(REQUEST, &command(second), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+            let took = bench.time() - asked;
+            assert!(took <= Span::from_millis(25), "{image}, {second}: {} us", took.0 / 1_000_000);
+            bench.run_ms(2);
+            let answers = answers(&bench, from);
+            assert_eq!(answers.len(), 2, "{image}, {second}");
+            assert!(reset(&mut bench) - answers[0].0 >= Span::from_millis(10), "{image}, {second}");
+            assert!(bench.is_bootloader(NODE), "{image}");
+        }
+        // Whoever was promised the bootloader gets it, although somebody restarts the device: by 2 of
+        // 1F51h, and by NMT reset node.
+        for nmt in [false, true] {
+            let mut bench = running_board(image);
+            assert_eq!(bench.ask(REQUEST, &command(0x80), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+            if nmt {
+                bench.post(0x000, &[0x81, NODE]);
+            } else {
+                assert_eq!(bench.ask(REQUEST, &command(0x02), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+            }
+            bench.await_boot_up(1000);
+            assert!(bench.is_bootloader(NODE), "{image}");
+        }
+    }
+}
+
+/// A heartbeat that is on its way is not cut off by a departure at once, and no half frame disturbs
+/// the bus.
+#[test]
+fn a_frame_on_its_way_is_not_cut_off() {
+    for image in APPLICATIONS {
+        // The request at many distances to the heartbeat, over more than a frame's time.
+        for offset in 0..8 {
+            let mut bench = running_board(image);
+            let next = loop {
+                let from = bench.time();
+                bench.run_ms(1);
+                if let Some((at, ..)) = bench.frames_since(from).iter().find(|(_, id, _)| *id == HEARTBEAT) {
+                    let period = if image == firmware::APP_C { 1000 } else { 500 };
+                    break *at + Span::from_millis(period);
+                }
+            };
+            let before = bench.records().len();
+            // The request takes 1 ms on the bus; the heartbeat begins about then.
+            let asked = Time(next.0 - Span::from_micros(2000 - 250 * offset).0);
+            bench.world.run_until(asked);
+            bench.post(REQUEST, &command(0x00));
+            bench.await_boot_up(1000);
+            bench.run_ms(10);
+            let bad: Vec<_> = bench.records()[before..]
+                .iter()
+                .filter(|record| record.outcome != emulator::bus::Outcome::Good)
+                .cloned()
+                .collect();
+            assert!(bad.is_empty(), "{image}, {offset}: {bad:?}");
+            assert_eq!(answers(&bench, asked).len(), 1, "{image}, {offset}");
+        }
+    }
+}
+
+/// The answer is an application's where the bootloader could not take its place: the sub-index does
+/// not exist, the value does not, or it is another's to do.
+#[test]
+fn what_the_application_can_refuse_it_refuses_itself() {
+    for image in APPLICATIONS {
+        let mut bench = running_board(image);
+        for (request, answer) in [
+            ([0x2F, 0x51, 0x1F, 2, 0, 0, 0, 0], [0x80, 0x51, 0x1F, 2, 0x11, 0, 0x09, 0x06]),
+            ([0x2F, 0x51, 0x1F, 2, 3, 0, 0, 0], [0x80, 0x51, 0x1F, 2, 0x11, 0, 0x09, 0x06]),
+            ([0x2F, 0x51, 0x1F, 2, 0x80, 0, 0, 0], [0x80, 0x51, 0x1F, 2, 0x11, 0, 0x09, 0x06]),
+            ([0x2F, 0x51, 0x1F, 0, 3, 0, 0, 0], [0x80, 0x51, 0x1F, 0, 0x02, 0, 0x01, 0x06]),
+            ([0x2F, 0x51, 0x1F, 1, 4, 0, 0, 0], [0x80, 0x51, 0x1F, 1, 0x30, 0, 0x09, 0x06]),
+            ([0x2F, 0x51, 0x1F, 1, 0x84, 0, 0, 0], [0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 0x08]),
+        ] {
+            assert_eq!(bench.ask(REQUEST, &request, ANSWER).as_deref(), Some(&answer[..]), "{image}");
+        }
+        bench.run_ms(600);
+        assert_eq!(bench.events(), [], "{image}: it stays");
+    }
+}
+
+/// CLEAR in the application is CLEAR in the bootloader: its refusal, too, is the bootloader's. Here
+/// 1F50h is locked by a password (ESAcademy).
+#[test]
+fn a_clear_that_the_bootloader_refuses_is_aborted_by_it() {
+    /// What a boot loader of ESAcademy has where nobody has told another one.
+    const ESACADEMY: u8 = 64;
+    let (request, answer) = (0x600 + u16::from(ESACADEMY), 0x580 + u32::from(ESACADEMY));
+    for image in APPLICATIONS {
+        let mut bench = Bench::of_image(firmware::BOOTLOADER_ESACADEMY);
+        bench.power_on();
+        bench.await_boot_up_of(ESACADEMY, 100);
+        // 7F50h/1: the password "INIT".
+        let password = [0x23, 0x50, 0x7F, 1, b'T', b'I', b'N', b'I'];
+        assert_eq!(bench.ask(request, &password, answer).unwrap()[0], 0x60);
+        raw_download(&mut bench, ESACADEMY, image);
+        // It starts what it has taken.
+        bench.run_ms(2000);
+        assert!(!bench.is_bootloader(ESACADEMY));
+        let clear = bench.ask(request, &command(0x03), answer);
+        assert_eq!(clear.as_deref(), Some(&[0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 0x08][..]), "{image}");
+        assert!(bench.is_bootloader(ESACADEMY));
+        // 84h: NO_ACCESS.
+        let status = bench.ask(request, &[0x40, 0x57, 0x1F, 1, 0, 0, 0, 0], answer);
+        assert_eq!(status.as_deref(), Some(&[0x43, 0x57, 0x1F, 1, 0x84, 0, 0, 0][..]), "{image}");
+    }
+}
+
+/// A client that writes a byte in segments has its answer in the segment's end, which only the
+/// application can acknowledge: STOP is a call back, CLEAR is refused.
+#[test]
+fn commands_in_segments_are_answered_by_the_application() {
+    let initiate = [0x21, 0x51, 0x1F, 1, 1, 0, 0, 0];
+    for (value, end) in [(0, [0x20, 0, 0, 0, 0, 0, 0, 0]), (3, [0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 0x08])] {
+        let mut bench = running_board(firmware::APP_V1);
+        assert_eq!(bench.ask(REQUEST, &initiate, ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+        let segment = [0x0D, value, 0, 0, 0, 0, 0, 0];
+        assert_eq!(bench.ask(REQUEST, &segment, ANSWER).as_deref(), Some(&end[..]), "{value}");
+        bench.run_ms(100);
+        assert_eq!(bench.is_bootloader(NODE), value == 0, "{value}");
+    }
+}
+
+/// A warm-start cell with an owed answer that is damaged asks for nothing, and nothing is sent. One
+/// that is whole and asks for what there is not gets the abort that 1F51h gives for it; one of another
+/// node is not answered in its place.
+#[test]
+fn an_owed_answer_in_a_damaged_cell_is_not_sent() {
+    let magic = u32::from_le_bytes(*b"CBW1");
+    // The fold of the ABI, written again.
+    let check = |words: [u32; 3]| {
+        let fold = |fold: u32, word: &u32| (fold.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B1);
+        !words.iter().fold(0xC0B0_07A5_u32, fold)
+    };
+    let sound = |argument: u32| [magic, 7, argument, check([magic, 7, argument])];
+    let [.., good] = sound(0x0001_0001);
+    let of_node_1 = |program: u32, value: u32| program | value << 8 | u32::from(NODE) << 16;
+    let abort = |program: u8, code: [u8; 4]| {
+        let [a, b, c, d] = code;
+        Some([0x80, 0x51, 0x1F, program, a, b, c, d])
+    };
+    for (what, cell, stays, answer) in [
+        ("STOP, for comparison", sound(of_node_1(1, 0)), true, Some(ACKNOWLEDGED)),
+        ("CLEAR, for comparison", sound(of_node_1(1, 3)), true, Some(ACKNOWLEDGED)),
+        ("a bit of the argument", [magic, 7, 0x0001_0003, good], false, None),
+        ("a bit of the check word", [magic, 7, 0x0001_0001, good ^ 0x8000_0000], false, None),
+        ("a bit of the request", [magic, 5, 0x0001_0001, good], false, None),
+        ("no program", sound(of_node_1(0, 3)), false, None),
+        ("bits that mean nothing", sound(of_node_1(1, 3) | 1 << 24), false, None),
+        ("a program that is not there", sound(of_node_1(2, 3)), true, abort(2, [0x11, 0, 0x09, 0x06])),
+        ("an unknown value", sound(of_node_1(1, 0x7F)), true, abort(1, [0x30, 0, 0x09, 0x06])),
+        ("another node", sound(1 | 3 << 8 | 9 << 16), true, None),
+        ("no node", sound(1 | 3 << 8), true, None),
+        ("an impossible node", sound(1 | 3 << 8 | 200 << 16), true, None),
+    ] {
+        let mut bench = running_board(firmware::APP_V1);
+        let bytes: Vec<u8> = cell.iter().flat_map(|word| word.to_le_bytes()).collect();
+        bench.machine().write_ram(firmware::board().warm_start.base, &bytes).unwrap();
+        let from = bench.time();
+        bench.machine().reset_pin();
+        bench.await_boot_up(1000);
+        bench.run_ms(RESCUE_WINDOW_MS + 100);
+        let sent: Vec<_> = answers(&bench, from).into_iter().map(|(_, data)| data).collect();
+        assert_eq!(sent, answer.into_iter().collect::<Vec<_>>(), "{what}");
+        assert_eq!(bench.is_bootloader(NODE), stays, "{what}");
+        // Used up: the next reset starts the program.
+        bench.machine().reset_pin();
+        bench.await_boot_up(1000);
+        bench.run_ms(RESCUE_WINDOW_MS + 100);
+        assert_eq!(answers(&bench, from).len(), sent.len() + 1, "{what}: only the question for 1000h");
+        assert!(!bench.is_bootloader(NODE), "{what}");
+    }
+}
+
+/// Downloads an application in one go, by the segments of any client.
+fn raw_download(bench: &mut Bench, node: u8, image: &str) {
+    let mut session = bench.session_with(node);
+    session.transfer_by(coflash::session::Transfers::Segments);
+    let doing = coflash::session::Doing::Program;
+    let at = canopen::Address::new(0x1F50, 1);
+    session.write(at, &firmware::raw(image), doing, &mut |_| {}).unwrap();
+    let _ = session.await_idle(1, doing);
+}
+
+/// A board whose program was downloaded in one go, and started.
+fn fresh_board(image: &str) -> Bench {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    bench.session().command(1, ProgramControl::Clear).unwrap();
+    raw_download(&mut bench, NODE, image);
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    bench.await_boot_up(1000);
+    bench.run_ms(50);
+    bench.events();
+    bench
+}
+
+/// The first 80h confirms it; the second one calls it back.
+#[test]
+fn the_first_80h_to_a_fresh_program_confirms_it() {
+    for image in APPLICATIONS {
+        let mut bench = fresh_board(image);
+        // Whatever else is asked before: it stays fresh.
+        bench.post(0x000, &[0x80, NODE]);
+        assert_eq!(bench.session().read_number(canopen::Address::new(0x1F51, 1)).unwrap(), 1);
+        assert_eq!(bench.ask(REQUEST, &command(0x01), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+        assert_eq!(bench.ask(REQUEST, &command(0x80), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+        bench.run_ms(600);
+        assert_eq!(bench.events(), [], "{image}: it stays");
+        assert_eq!(bench.ask(REQUEST, &command(0x80), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+        bench.await_boot_up(1000);
+        assert!(bench.is_bootloader(NODE), "{image}: the second is a call");
+    }
+}
+
+/// What was confirmed by 80h is so for good: it starts without a rescue window.
+#[test]
+fn a_program_that_80h_has_confirmed_has_no_rescue_window() {
+    for image in APPLICATIONS {
+        for confirm in [false, true] {
+            let mut bench = fresh_board(image);
+            if confirm {
+                assert!(bench.ask(REQUEST, &command(0x80), ANSWER).is_some());
+            }
+            bench.run_ms(50);
+            bench.power_off();
+            bench.run_ms(100);
+            let from = bench.time();
+            bench.power_on();
+            bench.run_ms(RESCUE_WINDOW_MS + 200);
+            let boot_ups = bench.frames_since(from);
+            let boot_ups = boot_ups.iter().filter(|(_, id, data)| *id == HEARTBEAT && data[..] == [0]);
+            assert_eq!(boot_ups.count(), if confirm { 1 } else { 2 }, "{image}");
+        }
+    }
+}
+
+/// Fresh is what was started right behind its download: not behind a power-off, an NMT reset or a
+/// restart by 2, not in a trial run of block files, not when it was signed by 83h before.
+#[test]
+fn every_other_80h_is_a_call() {
+    type Step = fn(&mut Bench);
+    let between: [(&str, Step); 3] = [
+        ("power-off", |bench| {
+            power_cycle(bench);
+            bench.await_program(1000);
+        }),
+        ("NMT reset node", |bench| {
+            bench.post(0x000, &[0x81, NODE]);
+            bench.await_program(1000);
+        }),
+        ("reset program", |bench| {
+            assert!(bench.ask(REQUEST, &command(0x02), ANSWER).is_some());
+            bench.await_boot_up(1000);
+        }),
+    ];
+    for image in APPLICATIONS {
+        for (what, between) in between {
+            let mut bench = fresh_board(image);
+            between(&mut bench);
+            bench.run_ms(50);
+            assert!(!bench.is_bootloader(NODE), "{image}, {what}");
+            assert!(bench.ask(REQUEST, &command(0x80), ANSWER).is_some());
+            bench.await_boot_up(1000);
+            assert!(bench.is_bootloader(NODE), "{image}, {what}");
+        }
+        // A trial run of our own dialect: blocks, START, 80h, signature.
+        let mut bench = Bench::new();
+        bench.power_on();
+        bench.await_boot_up(100);
+        let options = FlashOptions { trial_run: true, ..FlashOptions::default() };
+        let began = bench.time();
+        flash(&mut bench.session(), &firmware::blocks(image), &options, &mut |_| {}).unwrap();
+        assert!(bench.time() - began < Span::from_millis(3000), "{image}: nobody was asked twice");
+        // Signed by SYS TEC's command behind a download in one go.
+        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+        bench.await_boot_up(1000);
+        for value in [0x03, 0x83] {
+            if value == 0x83 {
+                raw_download(&mut bench, NODE, image);
+            }
+            assert_eq!(bench.ask(REQUEST, &command(value), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+        }
+        bench.run_ms(100);
+        assert!(bench.ask(REQUEST, &command(0x01), ANSWER).is_some());
+        bench.await_boot_up(1000);
+        bench.run_ms(50);
+        assert!(bench.ask(REQUEST, &command(0x80), ANSWER).is_some());
+        bench.await_boot_up(1000);
+        assert!(bench.is_bootloader(NODE), "{image}, signed by 83h");
+    }
+}
+
+/// A confirmation that cannot be stored is told by an abort (06060000h, hardware), and does not shut
+/// the way back: the next 80h is a call.
+#[test]
+fn a_confirmation_that_fails_is_told_and_leaves_the_way_back_open() {
+    for image in APPLICATIONS {
+        let mut bench = fresh_board(image);
+        let sectors: Vec<u8> = {
+            let chip = firmware::board().chip;
+            firmware::board().parameters.map(|region| chip.sector_at(region.base).unwrap().number).into()
+        };
+        for sector in &sectors {
+            bench.machine().protect_sector(*sector, true);
+        }
+        let refused = bench.ask(REQUEST, &command(0x80), ANSWER);
+        assert_eq!(refused.as_deref(), Some(&[0x80, 0x51, 0x1F, 1, 0, 0, 0x06, 0x06][..]), "{image}");
+        for sector in &sectors {
+            bench.machine().protect_sector(*sector, false);
+        }
+        assert_eq!(bench.ask(REQUEST, &command(0x80), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+        bench.await_boot_up(1000);
+        assert!(bench.is_bootloader(NODE), "{image}");
+    }
+}
+
+/// The host tool's call, when the first one confirmed.
+#[test]
+fn coflash_calls_a_fresh_program_back() {
+    for image in APPLICATIONS {
+        let mut bench = fresh_board(image);
+        let began = bench.time();
+        let running = call_back(&mut bench.session()).unwrap();
+        assert!(running.is_bootloader(), "{image}");
+        let took = bench.time() - began;
+        assert!(took < Span::from_millis(4000), "{image}: {} ms", took.0 / 1_000_000_000);
+    }
+}
