@@ -19,6 +19,9 @@ use bsp::{BIT_RATE, CAN_CLOCK, IDENTITY, LAYOUT, NODE_ID};
 use shared_abi::block_file;
 use shared_abi::warm_start::Cell;
 
+#[path = "test_products.rs"]
+mod test_products;
+
 /// What a product may choose.
 #[derive(Clone, Debug)]
 pub struct Product {
@@ -134,59 +137,9 @@ impl Product {
         answer_to_reset_ms: 20,
     };
 
-    /// The product of this name, for `COBOOT_PRODUCT` in the environment of a build: so the dialects
-    /// are built side by side, and tests build other choices.
-    const fn named(name: Option<&str>) -> Self {
-        let Some(name) = name else { return PRODUCT_OF_THIS_FILE };
-        let standard = PRODUCT_OF_THIS_FILE;
-        if equal(name, "paulus") {
-            Self { profile: Profile::PAULUS, ..standard }
-        } else if equal(name, "esacademy") {
-            Self { profile: Profile::ESACADEMY, ..standard }
-        } else if equal(name, "lift") {
-            Self { profile: Profile::LIFT, ..standard }
-        } else if equal(name, "crc-16") {
-            // With a step so large that the tests see what a long computation costs.
-            Self { crc: CrcKind::Crc16, crc_step: 64 * 1024, ..standard }
-        } else if equal(name, "least") {
-            Self {
-                rescue_window_ms: 0,
-                auto_bit_rate: false,
-                boot_up_emergency: false,
-                watchdog_ms: None,
-                lss: false,
-                block_upload: false,
-                ..standard
-            }
-        } else if equal(name, "switches") {
-            // Node-ID and bit rate by the pins of port E, whether a program is valid by PC0, and
-            // nearly everything else as it is not by default.
-            Self {
-                node_source: NodeSource::Function(|| {
-                    let switches = bsp::inputs('E');
-                    ((switches >> 8) as u8 & 0x7F, (switches >> 4) as u8 & 0xF)
-                }),
-                start_allowed: |_| bsp::inputs('C') & 1 != 0,
-                node_ids: 2..=100,
-                bit_rates: 2..=6,
-                boot_up_message: false,
-                boot_up_emergency: false,
-                sdo_request_base: 0x680,
-                sdo_response_base: 0x480,
-                lss_start_in_configuration: true,
-                lss_announce: true,
-                lss_store: false,
-                erase: Some(|_| Erase::AtOnce),
-                ..standard
-            }
-        } else {
-            panic!("COBOOT_PRODUCT: it must be paulus, esacademy, lift, crc-16, least or switches")
-        }
-    }
-
     /// Gives the product back if its choices go together; fails the build with the rule's name if
     /// not.
-    const fn checked(self) -> Self {
+    pub const fn checked(self) -> Self {
         let programs = LAYOUT.programs.len();
         if let Some(number) = self.autostart {
             assert!(
@@ -314,8 +267,8 @@ pub enum NodeSource {
     Function(fn() -> (u8, u8)),
 }
 
-/// This product.
-pub const PRODUCT: Product = Product::named(option_env!("COBOOT_PRODUCT")).checked();
+/// This product, or one that the repository builds beside it (`test_products.rs`).
+pub const PRODUCT: Product = test_products::or_this(PRODUCT_OF_THIS_FILE).checked();
 
 /// **What a product changes**: name the fields that differ from the default.
 const PRODUCT_OF_THIS_FILE: Product = Product { ..Product::DEFAULT };
@@ -392,19 +345,4 @@ pub fn warm_start_cell() -> Cell {
     // SAFETY: the layout's warm-start region, checked to be RAM of that size that the linker keeps
     // out of every image.
     unsafe { Cell::at(LAYOUT.warm_start.base as *mut _) }
-}
-
-const fn equal(a: &str, b: &str) -> bool {
-    let (a, b) = (a.as_bytes(), b.as_bytes());
-    if a.len() != b.len() {
-        return false;
-    }
-    let mut i = 0;
-    while i < a.len() {
-        if a[i] != b[i] {
-            return false;
-        }
-        i += 1;
-    }
-    true
 }

@@ -97,7 +97,7 @@ const fn bootloader(name: &'static str, features: &'static str) -> Variant {
     Variant { name, package: "bootloader", features, product: None, program: 0, least_programs: 1 }
 }
 
-/// The bootloader with the choices of a product of this name (`Product::named`).
+/// The bootloader with the choices of a product of this name (`bootloader/src/test_products.rs`).
 const fn product(name: &'static str, product: &'static str) -> Variant {
     Variant { product: Some(product), ..bootloader(name, "") }
 }

@@ -27,6 +27,7 @@ mod new_board;
 mod pack;
 #[cfg(test)]
 mod pages;
+mod pairs;
 mod parts;
 mod portable;
 mod powercut;
@@ -124,6 +125,12 @@ const JOBS: &[Job] = &[
         about: "the bootloader's flash against its budget",
         help: size::HELP,
         run: size::run,
+    },
+    Job {
+        name: "pairs",
+        about: "bootloaders with every pair of a product's choices: they build and fit",
+        help: pairs::HELP,
+        run: pairs::run,
     },
     Job {
         name: "arrows",
