@@ -15,6 +15,8 @@
 #[allow(dead_code, reason = "the tests need its records")]
 mod ihex;
 mod model;
+#[path = "../../tests/src/random.rs"]
+mod random;
 mod rig;
 
 use std::cell::Cell;
@@ -28,6 +30,7 @@ use boot_core::store::NodeParameters;
 use canopen::od::Address;
 use canopen::{AbortCode, BitRate, Instant, NodeId};
 use model::{Cut, PowerCut};
+use random::Random;
 use rig::{block, crc32, hex, program, words, Rig, Setup, Stored, PRODUCT_CODE, VENDOR_ID};
 use shared_abi::geometry::Region;
 use shared_abi::label;
@@ -295,31 +298,6 @@ enum Action {
         after: u32,
         seed: u64,
     },
-}
-
-/// A deterministic generator of numbers (splitmix64).
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let z = (self.0 ^ self.0 >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        let z = (z ^ z >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ z >> 31
-    }
-
-    fn below(&mut self, end: usize) -> usize {
-        (self.next() >> 33) as usize % end
-    }
-
-    /// With this probability, in percent.
-    fn chance(&mut self, percent: usize) -> bool {
-        self.below(100) < percent
-    }
-
-    fn pick<T: Copy>(&mut self, among: &[T]) -> T {
-        among[self.below(among.len())]
-    }
 }
 
 const COMMANDS: [u8; 9] = [0x00, 0x01, 0x01, 0x02, 0x03, 0x03, 0x80, 0x83, 0x84];

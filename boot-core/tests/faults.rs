@@ -260,6 +260,54 @@ fn a_record_never_outlives_its_program_whatever_is_stored_during_a_download() {
     assert!(wrong.is_empty(), "{} times; the first is {:?}", wrong.len(), wrong.first());
 }
 
+/// One download at a time: what begins ends what is open of another program, of which the next block
+/// is refused and writes nothing. What is refused ends nothing.
+#[test]
+fn a_download_that_begins_ends_one_of_another_program() {
+    let setup = &STANDARD_2;
+    let new = [1, 2].map(|number| image(setup, number, 700, 0x66));
+    let control = block(0, 0, &words(&[700, 0, 0]));
+    let data = |number: u8, n: usize| {
+        let at = setup.region(number).base + 100 * n as u32;
+        block(1 + n as u32, at, new[usize::from(number) - 1].chunks(100).nth(n).unwrap())
+    };
+    let last = |number: u8| block(u32::MAX, 0, &words(&[700, crc32(&new[usize::from(number) - 1])]));
+    for (one, other) in [(1, 2), (2, 1)] {
+        let mut device = Rig::new(setup, BUFFER);
+        device.command(one, CLEAR).unwrap();
+        device.send(one, &control).unwrap();
+        device.send(one, &data(one, 0)).unwrap();
+        device.settle();
+
+        // Of the other program, without its CLEAR: refused.
+        device.send(other, &data(other, 0)).unwrap_err();
+        device.settle();
+        device.send(one, &data(one, 1)).unwrap();
+        device.settle();
+        assert_eq!(device.status(one), 0, "{one}");
+
+        device.command(other, CLEAR).unwrap();
+        device.send(other, &control).unwrap();
+        device.settle();
+        let before = device.cells(one);
+        device.send(one, &data(one, 2)).unwrap_err();
+        device.settle();
+        assert_eq!((device.status(one), device.status(other)), (0x88, 0), "{one}: SEQUENCE");
+        assert!(device.cells(one) == before, "{one}: a block of what was ended was written");
+
+        // That refusal ended nothing, and the one that was ended can begin anew.
+        for n in 0..7 {
+            device.send(other, &data(other, n)).unwrap();
+            device.settle();
+        }
+        device.send(other, &last(other)).unwrap();
+        device.settle();
+        assert_eq!((device.status(other), device.state(other)), (0, 0), "{one}");
+        device.install(one, &new[usize::from(one) - 1]);
+        assert!(device.is_true(one) && device.is_true(other), "{one}");
+    }
+}
+
 /// A slot of the journal (docs/adr/0004): five words and their CRC.
 fn slot(five: [u32; 5]) -> Vec<u8> {
     let mut bytes = words(&five);

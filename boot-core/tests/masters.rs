@@ -9,6 +9,8 @@
 
 mod bench;
 mod model;
+#[path = "../../tests/src/random.rs"]
+mod random;
 
 use bench::{block_file, crc32, program, Bench as Device, CLEAR, CONTROL, DATA, DEVICE, PROGRAM};
 use boot_core::control::{Policy, Step as Work};
@@ -17,6 +19,7 @@ use canopen::sdo::client::{Block, Config as ClientConfig, Download, SdoError, St
 use canopen::slave::{self, Output, Slave};
 use canopen::{Address, BitRate, CobId, Frame, Instant, NodeId};
 use model::{ModelFlash, CHIP};
+use random::Random;
 
 const NODE: u8 = 5;
 const READ_1000: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
@@ -25,30 +28,6 @@ const IS_1000: [u8; 8] = [0x43, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x10];
 const ANSWER_MS: u32 = 54;
 /// A client's time-out in an abandoned transfer.
 const TIMEOUT_MS: u32 = 2000;
-
-/// A deterministic generator of numbers (splitmix64).
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let z = (self.0 ^ self.0 >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        let z = (z ^ z >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ z >> 31
-    }
-
-    fn below(&mut self, end: usize) -> usize {
-        (self.next() >> 33) as usize % end
-    }
-
-    fn chance(&mut self, percent: usize) -> bool {
-        self.below(100) < percent
-    }
-
-    fn pick<T: Copy>(&mut self, among: &[T]) -> T {
-        among[self.below(among.len())]
-    }
-}
 
 /// The device on its bus.
 struct World<'f> {

@@ -2,12 +2,16 @@
 //! has given up, silence, a reset. Frames written by hand from CiA 301 sections 7.2.4.3 and 7.2.8.3.
 
 mod common;
+#[path = "../../tests/src/random.rs"]
+#[allow(dead_code, reason = "the tests need some of it")]
+mod random;
 
 use canopen::od::Objects;
 use canopen::sdo::client::{Block, Config as ClientConfig, Download, Step, Transfer};
 use canopen::sdo::server::{Config, SdoServer};
 use canopen::{Address, Frame};
 use common::{at, node, request, response, Device, Event};
+use random::Random;
 
 struct Bench {
     server: SdoServer,
@@ -252,18 +256,6 @@ fn a_download_that_makes_no_progress_times_out() {
     assert_eq!(sent[..2], [(0, response(acked(1))), (2000, response(TIMED_OUT))]);
 }
 
-/// A generator of numbers (splitmix64).
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, end: u64) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let z = (self.0 ^ self.0 >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        let z = (z ^ z >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
-        (z ^ z >> 31) % end
-    }
-}
-
 /// Downloads whose segments are lost and doubled, of data of which many segments read as requests
 /// for objects that there are: none is disturbed. The client has its pauses, as one on a busy
 /// machine.
@@ -277,7 +269,7 @@ fn no_lost_or_doubled_segment_makes_a_request_of_data() {
         let tells_request = random.below(4);
         let mut data = Vec::new();
         for _ in 0..segments {
-            let at = objects[random.below(objects.len() as u64) as usize];
+            let at = random.pick(&objects);
             let [low, high] = at.index.to_le_bytes();
             let mut bytes = [low, high, at.sub, 0, 0, 0, 0];
             if random.below(4) < tells_request {
@@ -290,7 +282,7 @@ fn no_lost_or_doubled_segment_makes_a_request_of_data() {
         // The last segment of all reads as no request: see below.
         let len = data.len();
         data[len - 7..].fill(0xEE);
-        let per_mille = [0, 5, 50][random.below(3) as usize];
+        let per_mille = random.pick(&[0, 5, 50]);
         let block = Block { fallback: false, ..Block::default() };
         let mut client =
             Download::as_blocks(node(), Address::new(0x1F50, 1), &data, ClientConfig::default(), block);
