@@ -123,3 +123,27 @@ fn stop_and_clear_are_answered_by_the_bootloader_within_25_ms() {
         }
     }
 }
+
+/// At every bit rate: the device needs the same few milliseconds, and the rest is frames on the wire:
+/// request, boot-up, emergency and answer. From 50 kbit/s on that is within 25 ms.
+#[test]
+fn stop_is_answered_as_soon_as_the_wire_allows_at_every_bit_rate() {
+    /// The longest frames with 8, 1, 8 and 8 bytes, stuff bits and the space behind them included
+    /// (CiA 301 has 11-bit identifiers: 47 bits and the data, a stuff bit behind each 4 of 34 and the
+    /// data).
+    const BITS: u32 = 3 * (47 + 64 + (34 + 64 - 1) / 4) + 47 + 8 + (34 + 8 - 1) / 4;
+    const DEVICE: Duration = Duration::from_millis(15);
+    // Not 800 kbit/s, which the clocks of these boards cannot make.
+    let rates = [BitRate::K10, BitRate::K20, BitRate::K50, BitRate::K250, BitRate::K500, BitRate::K1000];
+    for rate in rates {
+        let bits = rate.bits_per_second().unwrap();
+        let mut bench = board_at(rate, bits, firmware::APP_V1);
+        let took = Master::new(&mut bench, NODE, Duration::from_millis(100)).control(1, 0).unwrap();
+        println!("{}: {bits} bit/s: {took:?}", firmware::board().board);
+        let limit = DEVICE + Duration::from_secs(1) * BITS / bits;
+        assert!(took <= limit, "{bits} bit/s: {took:?}, not {limit:?}");
+        assert!(bits < 50_000 || limit <= Duration::from_millis(25));
+        bench.run_ms(50);
+        assert!(bench.is_bootloader(NODE));
+    }
+}
