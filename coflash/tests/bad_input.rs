@@ -1,8 +1,8 @@
 //! No input may make a reader panic, and nothing damaged may pass for firmware.
 
-use coflash::block_file::{BlockFile, Checksum};
-use coflash::convert::{blocks_of, GapFill, Options};
-use coflash::read::{self, Firmware, Format};
+use coflash::file::block_file::{BlockFile, Checksum};
+use coflash::file::convert::{blocks_of, GapFill, Options};
+use coflash::file::read::{self, Firmware, Format};
 use proptest::prelude::*;
 
 macro_rules! data {
@@ -80,7 +80,7 @@ fn a_damaged_block_file_is_named_with_its_offset() {
         bytes[at] = value;
         meaning(&bytes, Some(Format::BlockFile)).unwrap_err()
     };
-    let crc_of = |block: &[u8]| coflash::block_file::CRC.checksum(block).to_le_bytes();
+    let crc_of = |block: &[u8]| coflash::file::block_file::CRC.checksum(block).to_le_bytes();
     // Data of block 1, which starts behind the 24 bytes of block 0.
     assert!(with(0x30, 0).starts_with("offset 0x18: CRC of block 1 is 0x39a6fa3b"), "{}", with(0x30, 0));
     assert!(
@@ -169,7 +169,7 @@ proptest! {
             .collect();
         let Firmware::Image(image) = read::read(hex.as_bytes(), None, None).unwrap() else { panic!() };
         let gap_fill = GapFill::new(gap_fill);
-        let options = Options { block_size, checksum, gap_fill, adjust_start, ..Options::default() };
+        let options = Options::default().block_size(block_size).checksum(checksum).gap_fill(gap_fill).adjust_start(adjust_start);
         let file = blocks_of(Firmware::Image(image), &options).unwrap().file;
         let mut memory = [0xFFu8; 4096];
         let mut covered = [false; 4096];

@@ -9,7 +9,7 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use canopen::{CobId, Frame};
-use coflash::candump::Line;
+use coflash::bus::candump::Line;
 use fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use serde_json::Value;
 use tool::{coflash, data, run, serve, snapshot, Folder};
@@ -340,11 +340,11 @@ fn monitor_ends_with_its_reader() {
 struct Heartbeats(Duration);
 
 impl coflash::Adapter for Heartbeats {
-    fn send(&mut self, _: &Frame) -> Result<(), coflash::adapter::AdapterError> {
+    fn send(&mut self, _: &Frame) -> Result<(), coflash::bus::AdapterError> {
         Ok(())
     }
 
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::adapter::AdapterError> {
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::bus::AdapterError> {
         let beat = Duration::from_millis(10);
         if timeout < beat {
             return Ok(None);
@@ -418,7 +418,7 @@ struct LssDevice {
 }
 
 impl coflash::Adapter for LssDevice {
-    fn send(&mut self, frame: &Frame) -> Result<(), coflash::adapter::AdapterError> {
+    fn send(&mut self, frame: &Frame) -> Result<(), coflash::bus::AdapterError> {
         let bytes: [u8; 8] = *frame.exactly().unwrap();
         let number = u32::from_le_bytes(bytes[1..5].try_into().unwrap());
         let address = [0x3Fu32, 2, 0x10000, 7];
@@ -449,7 +449,7 @@ impl coflash::Adapter for LssDevice {
         Ok(())
     }
 
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::adapter::AdapterError> {
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::bus::AdapterError> {
         self.now += timeout;
         Ok(self.answers.pop_front().map(|bytes| Frame::of(CobId::new(0x7E4).unwrap(), &bytes)))
     }

@@ -1,10 +1,10 @@
 //! Conversion against block files made by other tools (`data/make.sh`) and against literals from
 //! the manual's tables.
 
-use coflash::block_file::{BlockFile, Checksum, LastBlock};
-use coflash::convert::{blocks_of, convert, ConvertError, Converted, GapFill, Label, Options, Region};
-use coflash::image::{AddressRange, Image};
-use coflash::read::{self, Firmware, Format};
+use coflash::file::block_file::{BlockFile, Checksum, LastBlock};
+use coflash::file::convert::{blocks_of, convert, ConvertError, Converted, GapFill, Label, Options, Region};
+use coflash::file::read::{self, Firmware, Format};
+use coflash::file::{AddressRange, Image};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
 macro_rules! data {
@@ -30,7 +30,7 @@ const RELEASE: Label =
 
 #[test]
 fn every_format_of_one_program_gives_the_same_block_file() {
-    let plain = Options { region: board(), ..Options::default() };
+    let plain = Options::default().region(board());
     for (name, bytes) in [
         ("program.elf", data!("program.elf")),
         ("program.hex", data!("program.hex")),
@@ -41,8 +41,8 @@ fn every_format_of_one_program_gives_the_same_block_file() {
         for (expected, options) in [
             (data!("plain-400.blk"), plain),
             (data!("plain-400.blk"), Options::default()),
-            (data!("identity-110.blk"), Options { block_size: 0x110, label: IDENTITY, ..plain }),
-            (data!("release-110.blk"), Options { block_size: 0x110, label: RELEASE, ..plain }),
+            (data!("identity-110.blk"), plain.block_size(0x110).label(IDENTITY)),
+            (data!("release-110.blk"), plain.block_size(0x110).label(RELEASE)),
         ] {
             let Converted { file, left_out } = convert(&image, &options).unwrap();
             assert!(file.emit() == expected, "{name}, {options:?}");
@@ -56,7 +56,7 @@ fn every_format_of_one_program_gives_the_same_block_file() {
 #[test]
 fn the_last_block_of_2008_is_written_and_read() {
     let elf = image(data!("program.elf"));
-    let options = Options { region: board(), last_block: LastBlock::Of2008, ..Options::default() };
+    let options = Options::default().region(board()).last_block(LastBlock::Of2008);
     let file = convert(&elf, &options).unwrap().file;
     let (old, new) = (file.emit(), data!("plain-400.blk"));
     let (before, last) = old.split_at(old.len() - 56);
@@ -78,7 +78,7 @@ fn the_last_block_of_2008_is_written_and_read() {
 #[test]
 fn the_16_bit_crc_is_that_of_the_manual() {
     let elf = image(data!("program.elf"));
-    let options = Options { region: board(), checksum: Checksum::Crc16, ..Options::default() };
+    let options = Options::default().region(board()).checksum(Checksum::Crc16);
     let file = convert(&elf, &options).unwrap().file;
     assert!(file.emit() == data!("crc16-400.blk"));
     // Read back, it is known for what it is.
@@ -93,16 +93,17 @@ fn the_16_bit_crc_is_that_of_the_manual() {
 #[test]
 fn addresses_are_adjusted_behind_the_cut_and_before_the_board() {
     let elf = image(data!("program.elf"));
-    let with = |region, adjust_start| convert(&elf, &Options { region, adjust_start, ..Options::default() });
+    let with =
+        |region, adjust_start| convert(&elf, &Options::default().region(region).adjust_start(adjust_start));
     let range = |first, last| Region::Cut(AddressRange { first, last });
     for region in [Region::Unknown, range(0x0801_0000, 0x080F_FFFF)] {
         assert!(with(region, 0xF800_0000).unwrap().file.emit() == data!("adjusted-400.blk"), "{region:?}");
     }
     // Away from the board and back to it.
     let moved = Firmware::Image(elf.moved(0x1000_0000).unwrap());
-    let back = Options { region: board(), adjust_start: 0xF000_0000, ..Options::default() };
+    let back = Options::default().region(board()).adjust_start(0xF000_0000);
     assert!(blocks_of(moved.clone(), &back).unwrap().file.emit() == data!("plain-400.blk"));
-    assert!(blocks_of(moved, &Options { region: board(), ..Options::default() }).is_err());
+    assert!(blocks_of(moved, &Options::default().region(board())).is_err());
     // Over the end of the address space: the border within a piece, between two, and before the
     // first.
     for (region, offset) in [
@@ -115,7 +116,7 @@ fn addresses_are_adjusted_behind_the_cut_and_before_the_board() {
     }
     assert!(with(Region::Unknown, 2).is_ok(), "a start inside a word is rounded down");
     let blocks = read::read(data!("plain-400.blk"), None, None).unwrap();
-    let error = blocks_of(blocks, &Options { adjust_start: 4, ..Options::default() }).unwrap_err();
+    let error = blocks_of(blocks, &Options::default().adjust_start(4)).unwrap_err();
     assert!(matches!(error, ConvertError::Blocks(_)), "{error}");
 }
 
@@ -140,7 +141,7 @@ fn the_software_version_is_found_in_every_format() {
     let found = Some("1.2.0 (\u{e9})?".to_string());
     assert_eq!(raw(text).software_version(), found);
     // It may lie across two blocks.
-    let options = Options { block_size: 24, ..Options::default() };
+    let options = Options::default().block_size(24);
     let file = convert(&raw(text), &options).unwrap().file;
     assert_eq!(file.image().software_version(), found);
     assert_eq!(raw(&text[..4]).software_version(), None);
@@ -160,7 +161,7 @@ fn short_addresses_read_the_same_memory() {
 fn a_block_file_is_read_back_and_taken_as_it_is() {
     for bytes in [data!("plain-400.blk"), data!("identity-110.blk"), data!("release-110.blk")] {
         let firmware = read::read(bytes, None, None).unwrap();
-        let done = blocks_of(firmware, &Options { region: board(), ..Options::default() }).unwrap();
+        let done = blocks_of(firmware, &Options::default().region(board())).unwrap();
         assert!(done.file.emit() == bytes);
         assert_eq!(done.file.program_size(), 0xFA1);
     }
@@ -187,9 +188,7 @@ fn gaps_inside_a_block_take_the_fill_and_count_in_the_crc() {
     // 01 at 08010000h, a gap of six bytes, 02 at 08010007h.
     let image = image(b":020000040801F1\n:0100000001FE\n:0100070002F6\n:00000001FF\n");
     let data = |gap_fill| {
-        let file = convert(&image, &Options { gap_fill: GapFill::new(gap_fill), ..Options::default() })
-            .unwrap()
-            .file;
+        let file = convert(&image, &Options::default().gap_fill(GapFill::new(gap_fill))).unwrap().file;
         (file.program_blocks()[0].data.clone(), file.program_crc())
     };
     // CRCs: zlib.crc32 over the eight bytes.
@@ -206,7 +205,7 @@ fn a_gap_that_is_too_long_starts_a_new_block() {
     let text = b":020000040801F1\n:0100000001FE\n:0100100002ED\n:0100130003E9\n:00000001FF\n";
     let image = image(text);
     let blocks = |max_gap| {
-        let file = convert(&image, &Options { max_gap, ..Options::default() }).unwrap().file;
+        let file = convert(&image, &Options::default().max_gap(max_gap)).unwrap().file;
         let blocks: Vec<(u32, usize)> =
             file.program_blocks().iter().map(|block| (block.flash_address, block.data.len())).collect();
         (blocks, file.program_size())
@@ -224,7 +223,7 @@ fn a_gap_that_is_too_long_starts_a_new_block() {
 #[test]
 fn the_region_decides_about_data_outside() {
     let elf = image(data!("program.elf"));
-    let with = |region| convert(&elf, &Options { region, ..Options::default() });
+    let with = |region| convert(&elf, &Options::default().region(region));
     let range = |first, last| AddressRange { first, last };
 
     let error = with(Region::Strict(range(0x0801_0000, 0x0801_0F9F))).unwrap_err().to_string();
@@ -262,7 +261,7 @@ fn a_block_file_for_another_place_is_refused() {
 #[test]
 fn a_block_size_holds_every_block() {
     let elf = image(data!("program.elf"));
-    let with = |block_size, label| convert(&elf, &Options { block_size, label, ..Options::default() });
+    let with = |block_size, label| convert(&elf, &Options::default().block_size(block_size).label(label));
     for (least, label) in [(24, Label::None), (28, IDENTITY), (40, RELEASE)] {
         let file = with(least, label).unwrap().file;
         assert!(file.blocks().iter().all(|block| block.emit().len() <= least));
@@ -280,7 +279,7 @@ fn two_memories_in_one_file_are_not_one_program() {
     assert!(error.starts_with("the file: the data spans 0x00000000..=0xffffffff"), "{error}");
     // The end of the address space itself is no problem.
     let top = AddressRange { first: 0xFFFF_FF00, last: 0xFFFF_FFFF };
-    let file = convert(&image, &Options { region: Region::Cut(top), ..Options::default() }).unwrap().file;
+    let file = convert(&image, &Options::default().region(Region::Cut(top))).unwrap().file;
     assert_eq!((file.program_size(), file.span().last), (0x100, 0xFFFF_FFFF));
     assert!(BlockFile::parse(&file.emit()).is_ok());
 }
@@ -290,7 +289,7 @@ fn a_raw_file_goes_where_it_is_told() {
     let bytes = data!("program.bin");
     let read = |address| read::read(bytes, Some(Format::Raw), address);
     let Firmware::Image(raw) = read(Some(0x0801_0000)).unwrap() else { panic!() };
-    let file = convert(&raw, &Options { region: board(), ..Options::default() }).unwrap().file;
+    let file = convert(&raw, &Options::default().region(board())).unwrap().file;
     let gapless = BlockFile::parse(data!("plain-400.blk")).unwrap();
     assert_eq!((file.program_size(), file.program_crc()), (gapless.program_size(), gapless.program_crc()));
     assert!(read(None).unwrap_err().to_string().contains("give --start-address"));

@@ -1,8 +1,8 @@
 //! Frames in words. The frames are written by hand from CiA 301 and CiA 305.
 
 use canopen::Frame;
-use coflash::candump::Line;
-use coflash::decode::Decoder;
+use coflash::bus::candump::Line;
+use coflash::bus::decode::Decoder;
 use proptest::prelude::*;
 
 fn frame(text: &str) -> Frame {

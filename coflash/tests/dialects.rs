@@ -6,14 +6,15 @@ mod fake;
 use std::sync::{Arc, Mutex};
 
 use canopen::NodeId;
-use coflash::block_file::BlockFile;
-use coflash::convert::{blocks_of, Options};
-use coflash::dialect::{self, intel_hex, read_locked, recognise, Dialect, Password};
-use coflash::error::Error;
-use coflash::flash::{flash, DeviceState, Event, FlashOptions, Report, Target};
-use coflash::many::{flash_many, Job, ManyOptions};
-use coflash::session::{Doing, Session, Timing, Transfers};
+use coflash::device::{recognise, Dialect, Doing, Session, Timing, Transfers};
+use coflash::file::block_file::BlockFile;
+use coflash::file::convert::{blocks_of, Options};
+use coflash::file::ihex;
+use coflash::update::dialect::{self, read_locked};
+use coflash::update::many::{flash_many, Job, ManyOptions};
+use coflash::update::{flash, DeviceState, Event, FlashOptions, Password, Report, Target};
 use coflash::Adapter;
+use coflash::Error;
 use embedded_can::Frame as _;
 
 use fake::{Blocks, Bus, Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
@@ -58,7 +59,7 @@ fn run_at(
 }
 
 fn locked(phrase: &str) -> FlashOptions {
-    FlashOptions { unlock: Password::new(phrase), ..FlashOptions::default() }
+    FlashOptions::default().unlock(Password::new(phrase))
 }
 
 // --- CiA 417
@@ -229,7 +230,7 @@ fn a_lift_that_refuses_is_left_as_it_was_found() {
     // One that was told by 1018h is refused before anything.
     let (mut fake, _) = Lift::fake(APPLICATION, |_| {});
     let target = Some(Target { vendor_id: 1, product_code: 2 });
-    let options = FlashOptions { check_target: target, ..locked(PHRASE) };
+    let options = locked(PHRASE).check_target(target);
     assert!(matches!(run_at(&mut fake, NODE, &options).0, Err(Error::WrongTarget { .. })));
     assert!(fake.writes().is_empty());
 }
@@ -237,13 +238,8 @@ fn a_lift_that_refuses_is_left_as_it_was_found() {
 #[test]
 fn lifts_are_not_updated_together() {
     let (mut fake, _) = Lift::fake(APPLICATION, |_| {});
-    let jobs = [Job { node: node(NODE), file: Arc::new(file()), options: locked(PHRASE) }];
-    let options = ManyOptions {
-        timing: Timing::default(),
-        transfers: Transfers::Segments,
-        at_once: 1,
-        cancelled: Arc::default(),
-    };
+    let jobs = [Job::new(node(NODE), Arc::new(file()), locked(PHRASE))];
+    let options = ManyOptions::default().transfers(Transfers::Segments).at_once(1);
     let results = flash_many(&mut fake, &jobs, &options, &|_, _| {});
     let failed = results.into_iter().next().unwrap().unwrap_err();
     assert!(matches!(failed.error, Error::NotInDialect { dialect: Dialect::Lift, .. }), "{}", failed.error);
@@ -349,7 +345,7 @@ impl Maker for EsAcademy {
 fn esacademy_gets_the_password_and_then_intel_hex() {
     for (unlock, runs_by_itself) in [(None, true), (Some("INIT"), false), (Some("0x494E4954"), true)] {
         let (mut fake, kept) = EsAcademy::fake(|device| device.runs_by_itself = runs_by_itself);
-        let options = FlashOptions { unlock: unlock.and_then(Password::new), ..FlashOptions::default() };
+        let options = FlashOptions::default().unlock(unlock.and_then(Password::new));
         let (result, events, _) = run_at(&mut fake, 64, &options);
         let report = result.unwrap();
         assert_eq!((report.dialect, report.running.unwrap().0), (Dialect::EsAcademy, APPLICATION));
@@ -357,7 +353,7 @@ fn esacademy_gets_the_password_and_then_intel_hex() {
         let password = [0x23, 0x50, 0x7F, 1, 0x54, 0x49, 0x4E, 0x49];
         assert_eq!(fake.sent.iter().filter(|frame| frame.data() == password).count(), 1);
         let text = kept.lock().unwrap().clone();
-        assert_eq!(text, intel_hex(&file()).into_bytes());
+        assert_eq!(text, ihex::emit(&file().image()).into_bytes());
         // A program that runs already is not restarted.
         assert_eq!(fake.count("64: 1F51/1, 1 bytes"), usize::from(!runs_by_itself));
     }
@@ -452,10 +448,10 @@ fn a_standard_device_is_stopped_cleared_written_and_started() {
         for (dialect, content) in [
             (None, file().flash_image()),
             (Some(Dialect::Raw), file().flash_image()),
-            (Some(Dialect::Hex), intel_hex(&file()).into_bytes()),
+            (Some(Dialect::Hex), ihex::emit(&file().image()).into_bytes()),
         ] {
             let (mut fake, kept) = Standard::fake(state);
-            let options = FlashOptions { dialect, ..FlashOptions::default() };
+            let options = FlashOptions::default().dialect(dialect);
             let (result, ..) = run_at(&mut fake, NODE, &options);
             let report = result.unwrap();
             assert_eq!(report.dialect, dialect.unwrap_or(Dialect::Raw));
@@ -471,7 +467,7 @@ fn a_standard_device_is_stopped_cleared_written_and_started() {
         }
     }
     let (mut fake, _) = Standard::fake(0);
-    let options = FlashOptions { trial_run: true, ..FlashOptions::default() };
+    let options = FlashOptions::default().trial_run(true);
     let (result, ..) = run_at(&mut fake, NODE, &options);
     assert!(matches!(result, Err(Error::NotInDialect { dialect: Dialect::Raw, .. })), "{result:?}");
     assert!(fake.writes().is_empty());
@@ -521,8 +517,8 @@ fn intel_hex_is_written_as_its_description_has_it() {
 :100110002146017E17C20001FF5F16002148011928
 :00000001FF
 ";
-    let firmware = coflash::read::read(text.as_bytes(), None, None).unwrap();
-    let written = intel_hex(&blocks_of(firmware, &Options::default()).unwrap().file);
+    let firmware = coflash::file::read::read(text.as_bytes(), None, None).unwrap();
+    let written = ihex::emit(&blocks_of(firmware, &Options::default()).unwrap().file.image());
     let lines: Vec<&str> = written.lines().collect();
     assert_eq!(lines[0], ":020000040000FA");
     assert_eq!(lines[1..].join("\n") + "\n", text);
@@ -530,9 +526,10 @@ fn intel_hex_is_written_as_its_description_has_it() {
     let mut image = vec![0xA5; 70_003];
     image[0] = 1;
     for start in [0x0800_8001_u32, 0x0801_FFF0] {
-        let firmware = coflash::read::read(&image, Some(coflash::read::Format::Raw), Some(start)).unwrap();
+        let firmware =
+            coflash::file::read::read(&image, Some(coflash::file::read::Format::Raw), Some(start)).unwrap();
         let blocks = blocks_of(firmware, &Options::default()).unwrap().file;
-        let again = coflash::read::read(intel_hex(&blocks).as_bytes(), None, None).unwrap();
+        let again = coflash::file::read::read(ihex::emit(&blocks.image()).as_bytes(), None, None).unwrap();
         assert_eq!(blocks_of(again, &Options::default()).unwrap().file.emit(), blocks.emit());
     }
 }

@@ -12,8 +12,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use canopen::{Address, NodeId};
-use coflash::gateway::{Ask, Cia309, Gateway, GatewayError};
-use coflash::session::{Doing, Session, Timing};
+use coflash::bus::gateway::{Ask, Gateway, GatewayError};
+use coflash::bus::Cia309;
+use coflash::device::{Doing, Session, Timing};
 use coflash::Error;
 
 use fake::{Blocks, Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
@@ -134,7 +135,7 @@ impl Behind {
     }
 
     fn session(&mut self, node: &str) -> Session<'_> {
-        let timing = Timing { sdo: Duration::from_millis(self.timeout), attempts: 1, ..Timing::default() };
+        let timing = Timing::default().sdo(Duration::from_millis(self.timeout)).attempts(1);
         Session::new(&mut self.fake, NodeId::new(node.parse().unwrap()).unwrap(), timing)
     }
 }

@@ -7,9 +7,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
-use coflash::adapter::{Adapter, AdapterError};
-use coflash::error::{Error, LssFailure};
-use coflash::lss::{BitRate, LssAddress, LssDoing, Master, ANSWER};
+use coflash::bus::{Adapter, AdapterError};
+use coflash::device::error::{Error, LssFailure};
+use coflash::device::lss::{BitRate, LssAddress, LssDoing, Master, ANSWER};
 
 const ADDRESS: LssAddress = LssAddress {
     vendor_id: 0x0000_003F,

@@ -7,13 +7,13 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
-use coflash::block_file::BlockFile;
-use coflash::error::Error;
-use coflash::flash::{DeviceState, Event, FlashOptions, Report};
-use coflash::hub::{self, Conversation};
-use coflash::many::{flash_many, Failed, Job, ManyOptions};
-use coflash::session::{Timing, Transfers};
+use coflash::bus::hub::{self, Conversation};
+use coflash::device::Transfers;
+use coflash::file::block_file::BlockFile;
+use coflash::update::many::{flash_many, Failed, Job, ManyOptions};
+use coflash::update::{DeviceState, Event, FlashOptions, Report};
 use coflash::Adapter;
+use coflash::Error;
 use fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 
 const FILE: &[u8] = include_bytes!("data/identity-110.blk");
@@ -32,18 +32,12 @@ fn devices(nodes: impl IntoIterator<Item = u8>) -> Bus {
 
 fn jobs(nodes: impl IntoIterator<Item = u8>) -> Vec<Job> {
     let file = Arc::new(BlockFile::parse(FILE).unwrap());
-    let job =
-        |node| Job { node: NodeId::new(node).unwrap(), file: file.clone(), options: FlashOptions::default() };
+    let job = |node| Job::new(NodeId::new(node).unwrap(), file.clone(), FlashOptions::default());
     nodes.into_iter().map(job).collect()
 }
 
 fn options(at_once: usize) -> ManyOptions {
-    ManyOptions {
-        timing: Timing::default(),
-        transfers: Transfers::Blocks,
-        at_once,
-        cancelled: Arc::default(),
-    }
+    ManyOptions::default().transfers(Transfers::Blocks).at_once(at_once)
 }
 
 fn run(bus: &mut Bus, jobs: &[Job], at_once: usize) -> (Results, Vec<(usize, Event)>) {

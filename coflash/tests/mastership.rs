@@ -7,13 +7,12 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
-use coflash::adapter::AdapterError;
-use coflash::block_file::BlockFile;
-use coflash::dialect::{Dialect, Password};
-use coflash::error::Error;
-use coflash::flash::{flash, Event, FlashOptions, Report};
-use coflash::session::{Session, Timing};
+use coflash::bus::AdapterError;
+use coflash::device::{Dialect, Session, Timing};
+use coflash::file::block_file::BlockFile;
+use coflash::update::{flash, Event, FlashOptions, Password, Report};
 use coflash::Adapter;
+use coflash::Error;
 
 use fake::{Deed, Fake, Maker, APPLICATION, NODE};
 
@@ -77,7 +76,7 @@ fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Err
 }
 
 fn options() -> FlashOptions {
-    FlashOptions { unlock: Password::new("open"), ..FlashOptions::default() }
+    FlashOptions::default().unlock(Password::new("open"))
 }
 
 fn frame(id: u16, data: &[u8]) -> Frame {
@@ -283,12 +282,12 @@ fn the_mastership_is_asked_for_and_given_back_around_the_update() {
     }
     // It is given back when the update fails, too.
     let mut network = Network::new(2, 10, Forced::Negotiates);
-    let (result, events) = run(&mut network, &FlashOptions { unlock: Password::new("no"), ..options() });
+    let (result, events) = run(&mut network, &options().unlock(Password::new("no")));
     assert!(result.is_err() && network.active);
     assert!(events.contains(&Event::MasterBack(Some(node(10)))), "{events:?}");
     // And it is left alone where that is asked for.
     let mut network = Network::new(1, 3, Forced::Negotiates);
-    let (result, events) = run(&mut network, &FlashOptions { mastership: false, ..options() });
+    let (result, events) = run(&mut network, &options().mastership(false));
     assert!(result.is_ok() && network.log.iter().all(|entry| entry == "sdo"), "{events:?}");
 }
 

@@ -7,12 +7,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
-use coflash::block_file::BlockFile;
-use coflash::error::Error;
-use coflash::flash::{flash, DeviceState, Event, FlashOptions, RepeatReason, Report, Target};
-use coflash::info::info;
-use coflash::session::{Session, Timing, Transfers};
+use coflash::device::info::info;
+use coflash::device::{Session, Timing, Transfers};
+use coflash::file::block_file::BlockFile;
+use coflash::update::{flash, DeviceState, Event, FlashOptions, RepeatReason, Report, Target};
 use coflash::Adapter;
+use coflash::Error;
 use embedded_can::{Frame as _, StandardId};
 use fake::{Blocks, Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use proptest::prelude::*;
@@ -206,7 +206,7 @@ fn a_block_transfer_that_is_refused_in_the_middle_is_told_by_its_status() {
 fn a_file_for_another_device_erases_nothing() {
     let target = Target::of(&file()).unwrap();
     assert_eq!((target.vendor_id, target.product_code), (0, 1234));
-    let check = |check_target| FlashOptions { check_target: Some(check_target), ..FlashOptions::default() };
+    let check = |check_target| FlashOptions::default().check_target(Some(check_target));
     for running in [APPLICATION, BOOTLOADER] {
         // The fake has vendor-ID 3Fh and product code 1234.
         let mut fake = Fake::new(running);
@@ -222,7 +222,7 @@ fn a_file_for_another_device_erases_nothing() {
 
         let mut fake = Fake::new(running);
         let right = check(Target { vendor_id: 0x3F, product_code: 1234 });
-        run(&mut fake, FlashOptions { trial_run: true, ..right }).0.unwrap();
+        run(&mut fake, right.trial_run(true)).0.unwrap();
         // At first; bootloader and program on trial, which are compared; and the program with the file.
         assert_eq!((fake.count("read 1018/1"), fake.count("read 1018/2")), (4, 4));
     }
@@ -230,7 +230,7 @@ fn a_file_for_another_device_erases_nothing() {
 
 #[test]
 fn verify_looks_once_more_at_the_running_program() {
-    let options = FlashOptions { verify: true, ..FlashOptions::default() };
+    let options = FlashOptions::default().verify(true);
     let mut fake = Fake::new(BOOTLOADER);
     let (report, events) = run(&mut fake, options);
     report.unwrap();
@@ -254,8 +254,7 @@ fn a_failure_tells_how_it_leaves_the_device() {
         assert!(result.is_err());
         events.last().unwrap().clone()
     };
-    let (plain, trial) =
-        (FlashOptions::default(), FlashOptions { trial_run: true, ..FlashOptions::default() });
+    let (plain, trial) = (FlashOptions::default(), FlashOptions::default().trial_run(true));
     let at = |state| Event::Left(state);
     assert_eq!(left(BOOTLOADER, &|fake| fake.running = None, plain), at(DeviceState::Untouched));
     let stays = |fake: &mut Fake| fake.on_command = script(0x80, usize::MAX, Outcome::Ignore);
@@ -273,7 +272,7 @@ fn a_failure_tells_how_it_leaves_the_device() {
 #[test]
 fn in_the_bootloader_no_call_and_without_start_none() {
     let mut fake = Fake::new(BOOTLOADER);
-    let report = run(&mut fake, FlashOptions { start: false, ..FlashOptions::default() }).0.unwrap();
+    let report = run(&mut fake, FlashOptions::default().start(false)).0.unwrap();
     assert_eq!((fake.writes()[0], *fake.writes().last().unwrap()), ("command 03", "command 83"));
     assert_eq!((report.running, fake.running), (None, Some(BOOTLOADER)));
 }
@@ -281,12 +280,12 @@ fn in_the_bootloader_no_call_and_without_start_none() {
 #[test]
 fn a_trial_run_comes_before_the_signature() {
     let mut fake = Fake::new(BOOTLOADER);
-    run(&mut fake, FlashOptions { trial_run: true, ..FlashOptions::default() }).0.unwrap();
+    run(&mut fake, FlashOptions::default().trial_run(true)).0.unwrap();
     assert_eq!(fake.writes()[1 + BLOCKS..], ["command 01", "command 80", "command 83", "command 01"]);
     // A program that fails its trial is never signed.
     let mut fake = Fake::new(BOOTLOADER);
     fake.starts = None;
-    let error = run(&mut fake, FlashOptions { trial_run: true, ..FlashOptions::default() }).0.unwrap_err();
+    let error = run(&mut fake, FlashOptions::default().trial_run(true)).0.unwrap_err();
     assert_eq!((error.number(), fake.count("command 83")), (0x6000_0014, 0));
 }
 
@@ -397,7 +396,7 @@ fn an_unknown_status_and_its_detail_are_shown() {
 fn a_block_is_repeated_as_often_as_allowed() {
     let mut fake = Fake::new(BOOTLOADER);
     fake.on_block = script(2, 2, Outcome::Status(0x06));
-    let (report, events) = run(&mut fake, FlashOptions { repeats: 2, ..FlashOptions::default() });
+    let (report, events) = run(&mut fake, FlashOptions::default().repeats(2));
     assert_eq!(report.unwrap().repeats, 2);
     assert_eq!(fake.count("block 2"), 3);
     assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"));
@@ -406,7 +405,7 @@ fn a_block_is_repeated_as_often_as_allowed() {
 
     let mut fake = Fake::new(BOOTLOADER);
     fake.on_block = script(2, 3, Outcome::Status(0x06));
-    let error = run(&mut fake, FlashOptions { repeats: 2, ..FlashOptions::default() }).0.unwrap_err();
+    let error = run(&mut fake, FlashOptions::default().repeats(2)).0.unwrap_err();
     assert_eq!((error.number(), fake.count("block 2"), fake.count("block 3")), (0x6000_0003, 3, 0));
 }
 
@@ -507,7 +506,7 @@ fn an_application_that_takes_the_first_call_for_a_confirmation_is_called_again()
 #[test]
 fn a_second_program_is_written_to_a_device_whose_first_one_runs() {
     let mut fake = Fake::new(APPLICATION);
-    let options = FlashOptions { program: 2, ..FlashOptions::default() };
+    let options = FlashOptions::default().program(2);
     // The fake's bootloader has one program, so the procedure ends there; it was called back before.
     let error = run(&mut fake, options).0.unwrap_err();
     assert_eq!(fake.writes(), ["command 80"], "{error}");
@@ -590,7 +589,7 @@ fn answers_that_come_late_do_not_stand_for_others() {
     // With a longer time-out all is well.
     let mut fake = Fake::new(BOOTLOADER);
     fake.latency = Duration::from_millis(700);
-    let timing = Timing { sdo: Duration::from_secs(2), ..Timing::default() };
+    let timing = Timing::default().sdo(Duration::from_secs(2));
     let mut session = Session::new(&mut fake, node(), timing);
     flash(&mut session, &file(), &FlashOptions::default(), &mut |_| {}).unwrap();
 }
@@ -630,7 +629,7 @@ fn an_adapter_that_goes_away_ends_it_at_any_frame() {
 #[test]
 fn another_program_number_is_another_sub_index() {
     let mut fake = Fake::new(BOOTLOADER);
-    let error = run(&mut fake, FlashOptions { program: 2, ..FlashOptions::default() }).0.unwrap_err();
+    let error = run(&mut fake, FlashOptions::default().program(2)).0.unwrap_err();
     assert!(fake.sent[1].data()[..4] == [0x2F, 0x51, 0x1F, 2], "{:?}", fake.sent[1]);
     assert_eq!(error.number(), 0x6000_0025);
 }
@@ -669,11 +668,11 @@ struct Chaos {
 }
 
 impl Adapter for Chaos {
-    fn send(&mut self, _: &Frame) -> Result<(), coflash::adapter::AdapterError> {
+    fn send(&mut self, _: &Frame) -> Result<(), coflash::bus::AdapterError> {
         Ok(())
     }
 
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::adapter::AdapterError> {
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::bus::AdapterError> {
         if timeout.is_zero() {
             return Ok(None);
         }
@@ -736,7 +735,7 @@ proptest! {
         ),
     ) {
         let mut chaos = Chaos { now: Duration::ZERO, frames, next: 0 };
-        let timing = Timing { command: Duration::from_secs(2), ..Timing::default() };
+        let timing = Timing::default().command(Duration::from_secs(2));
         let mut session = Session::new(&mut chaos, node(), timing);
         let result = flash(&mut session, &file(), &FlashOptions::default(), &mut |_| {});
         prop_assert!(result.is_err());

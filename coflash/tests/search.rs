@@ -8,11 +8,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::{Frame, NodeId};
-use coflash::adapter::AdapterError;
-use coflash::block_file::BlockFile;
-use coflash::error::{Error, IdentityPart};
-use coflash::flash::{flash, Event, FlashOptions, Report};
-use coflash::session::{Session, Timing};
+use coflash::bus::AdapterError;
+use coflash::device::error::{Error, IdentityPart};
+use coflash::device::{Session, Timing};
+use coflash::file::block_file::BlockFile;
+use coflash::update::{flash, Event, FlashOptions, Report};
 use coflash::Adapter;
 
 use fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
@@ -61,7 +61,7 @@ fn a_device_that_is_switched_on_later_is_waited_for_and_caught_in_its_rescue_win
         let fake = Fake::new(BOOTLOADER);
         let on = fake.now + Duration::from_millis(millis);
         let mut late = Late { fake, on, asked: false };
-        let options = FlashOptions { wait: true, start: false, ..FlashOptions::default() };
+        let options = FlashOptions::default().wait(true).start(false);
         let (result, events) = run(&mut late, &options);
         assert!(result.is_ok(), "{millis}: {result:?}");
         // However long it takes, it is said once.
@@ -91,7 +91,7 @@ fn an_application_that_stays_is_asked_until_it_goes() {
     };
     for refusal in [Outcome::Abort(0x0800_0022), Outcome::Ignore] {
         let mut fake = stubborn(refusal);
-        let options = FlashOptions { wait: true, ..FlashOptions::default() };
+        let options = FlashOptions::default().wait(true);
         run(&mut fake, &options).0.unwrap();
         assert_eq!(fake.count("command 80"), 6);
         let error = run(&mut stubborn(refusal), &FlashOptions::default()).0.unwrap_err();
@@ -125,7 +125,7 @@ fn the_user_gives_up() {
         let file = BlockFile::parse(include_bytes!("data/plain-400.blk")).unwrap();
         let mut session = Session::new(&mut bus, NodeId::new(NODE).unwrap(), Timing::default());
         session.cancel_by(flag);
-        let options = FlashOptions { wait: true, ..FlashOptions::default() };
+        let options = FlashOptions::default().wait(true);
         let result = flash(&mut session, &file, &options, &mut |_| {});
         assert!(matches!(result, Err(Error::Cancelled)), "{result:?}");
         assert!(bus.0.now < end + Duration::from_secs(1));
@@ -157,7 +157,7 @@ impl Maker for Told {
 
 #[test]
 fn a_program_on_trial_that_is_another_device_is_called_back_and_never_signed() {
-    let trial = FlashOptions { trial_run: true, ..FlashOptions::default() };
+    let trial = FlashOptions::default().trial_run(true);
     let fake = |told: Told, options: &FlashOptions| {
         let mut fake = Fake::new(BOOTLOADER);
         fake.maker = Some(Box::new(told));

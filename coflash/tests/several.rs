@@ -105,7 +105,7 @@ struct Unconfigured {
 const ADDRESS: [u32; 4] = [0x3F, 2, 3, 4];
 
 impl coflash::Adapter for Unconfigured {
-    fn send(&mut self, frame: &Frame) -> Result<(), coflash::adapter::AdapterError> {
+    fn send(&mut self, frame: &Frame) -> Result<(), coflash::bus::AdapterError> {
         let bytes: Option<&[u8; 8]> = frame.exactly();
         let Some(bytes) = bytes.filter(|_| frame.cob_id() == CobId::new(0x7E5)) else {
             return self.fake.send(frame);
@@ -140,7 +140,7 @@ impl coflash::Adapter for Unconfigured {
         Ok(())
     }
 
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::adapter::AdapterError> {
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::bus::AdapterError> {
         if self.outbox.is_empty() {
             return self.fake.receive(timeout);
         }
@@ -235,11 +235,11 @@ struct Chatter {
 }
 
 impl coflash::Adapter for Chatter {
-    fn send(&mut self, frame: &Frame) -> Result<(), coflash::adapter::AdapterError> {
+    fn send(&mut self, frame: &Frame) -> Result<(), coflash::bus::AdapterError> {
         self.fake.send(frame)
     }
 
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::adapter::AdapterError> {
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::bus::AdapterError> {
         if self.fake.now >= self.next {
             self.next = self.fake.now + Duration::from_millis(50);
             self.frames.iter().for_each(|frame| self.fake.inject(*frame));

@@ -5,8 +5,8 @@
 //! words.
 #![no_main]
 
-use coflash::candump::Line;
-use coflash::decode::Decoder;
+use coflash::bus::candump::Line;
+use coflash::bus::decode::Decoder;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {

@@ -11,7 +11,7 @@ use boot_core::store::Journal;
 use canopen::program::{FlashError, FlashStatus, ProgramControl};
 use coboot_fuzz::model::{ModelFlash, CHIP, ONE_PROGRAM};
 use coboot_fuzz::Input;
-use coflash::block_file::{Block, CRC};
+use coflash::file::block_file::{Block, CRC};
 use libfuzzer_sys::fuzz_target;
 use shared_abi::layout::Layout;
 

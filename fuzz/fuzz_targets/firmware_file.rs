@@ -6,9 +6,9 @@
 //! is written as it was read.
 #![no_main]
 
-use coflash::block_file::BlockFile;
-use coflash::convert::{blocks_of, Options};
-use coflash::read::{read, Firmware, Format};
+use coflash::file::block_file::BlockFile;
+use coflash::file::convert::{blocks_of, Options};
+use coflash::file::read::{read, Firmware, Format};
 use libfuzzer_sys::fuzz_target;
 
 const FORMATS: [Option<Format>; 6] = [

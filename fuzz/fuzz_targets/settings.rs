@@ -6,7 +6,7 @@
 
 use std::path::Path;
 
-use coflash::{config, job};
+use coflash::update::{config, job};
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {

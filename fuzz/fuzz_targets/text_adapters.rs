@@ -10,8 +10,8 @@ use std::time::Duration;
 
 use canopen::Frame;
 use coboot_fuzz::Input;
-use coflash::adapter::socketcand::{frame_message, parse_frame, parse_send, send_message, Messages};
-use coflash::adapter::{Adapter, Line, Slcan};
+use coflash::bus::socketcand::{frame_message, parse_frame, parse_send, send_message, Messages};
+use coflash::bus::{Adapter, Line, Slcan};
 use embedded_can::Frame as _;
 use libfuzzer_sys::fuzz_target;
 

@@ -12,12 +12,12 @@ use std::time::{Duration, Instant};
 use std::{env, fs};
 
 use boot_core::canopen::{Frame, NodeId};
-use coflash::adapter::{self, Adapter, AdapterError};
-use coflash::block_file::BlockFile;
-use coflash::convert::{blocks_of, Options, Region};
-use coflash::flash::{flash, FlashOptions};
-use coflash::read::{read, Format};
-use coflash::session::{Session, Timing, Transfers};
+use coflash::bus::{self, Adapter, AdapterError};
+use coflash::device::{Session, Timing, Transfers};
+use coflash::file::block_file::BlockFile;
+use coflash::file::convert::{blocks_of, Options, Region};
+use coflash::file::read::{read, Format};
+use coflash::update::{flash, FlashOptions};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
 const SIZES: [u32; 2] = [256, 900];
@@ -102,10 +102,10 @@ fn main() -> Result<(), Box<dyn Error>> {
             let file = program(kib)?;
             // Each gets a new one: the first update of a node has nothing to erase.
             let node = Node::start()?;
-            let mut bus = Counted { bus: adapter::open(&node.url)?, frames: 0 };
+            let mut bus = Counted { bus: bus::open(&node.url)?, frames: 0 };
             let mut session = Session::new(&mut bus, NodeId::new(1).ok_or("no node-ID")?, Timing::default());
             session.transfer_by(transfers);
-            let options = FlashOptions { start: false, ..FlashOptions::default() };
+            let options = FlashOptions::default().start(false);
             let (began, before) = (Instant::now(), processor_time());
             flash(&mut session, &file, &options, &mut |_| {})?;
             let took = began.elapsed();
@@ -150,6 +150,6 @@ fn program(kib: u32) -> Result<BlockFile, Box<dyn Error>> {
     bytes[..4].copy_from_slice(&(LAYOUT.ram.base + 0x1000).to_le_bytes());
     bytes[4..8].copy_from_slice(&(region.base + 0x201).to_le_bytes());
     let image = read(&bytes, Some(Format::Raw), Some(region.base)).map_err(|error| format!("{error:?}"))?;
-    let options = Options { region: Region::Strict(region.into()), ..Options::default() };
+    let options = Options::default().region(Region::Strict(region.into()));
     Ok(blocks_of(image, &options)?.file)
 }

@@ -21,7 +21,7 @@ use coboot_node::file_flash::{FileFlash, Speed};
 use coboot_node::server::Server;
 use coboot_node::stand_in::StandIn;
 use coboot_node::supports;
-use coflash::adapter::{self, Adapter};
+use coflash::bus::{self, Adapter};
 use shared_abi::layout::{self, Layout};
 
 /// How often time passes for the nodes while nothing happens.
@@ -209,7 +209,7 @@ fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, B
         flashes.push(flash);
     }
     let mut bus: Box<dyn Adapter> = match (&args.bus, &args.listen) {
-        (Some(url), _) => adapter::open(url).map_err(|error| format!("{error}; {}", error.advice()))?,
+        (Some(url), _) => bus::open(url).map_err(|error| format!("{error}; {}", error.advice()))?,
         (None, Some(address)) => {
             let server =
                 Server::bind(address, "can0").map_err(|error| format!("listening at {address}: {error}"))?;

@@ -12,8 +12,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use boot_core::canopen::Frame;
-use coflash::adapter::socketcand::{frame_message, parse_send, Messages};
-use coflash::adapter::{Adapter, AdapterError};
+use coflash::bus::socketcand::{frame_message, parse_send, Messages};
+use coflash::bus::{Adapter, AdapterError};
 
 /// Clients at a time.
 const MAX_CLIENTS: usize = 64;

@@ -4,7 +4,7 @@
 use bsp::can::BitTiming;
 use canopen::program::ProgramControl;
 use canopen::BitRate;
-use coflash::flash::{flash, FlashOptions};
+use coflash::update::{flash, FlashOptions};
 use emulator::machine::{ResetCause, Stop};
 use emulator::time::Span;
 

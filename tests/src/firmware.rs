@@ -3,9 +3,9 @@
 use std::path::PathBuf;
 use std::{env, fs};
 
-use coflash::block_file::BlockFile;
-use coflash::convert::{blocks_of, Options, Region};
-use coflash::read::{read, Firmware};
+use coflash::file::block_file::BlockFile;
+use coflash::file::convert::{blocks_of, Options, Region};
+use coflash::file::read::{read, Firmware};
 use shared_abi::layout::{self, Layout};
 
 /// The images by the names that `cargo xtask build` gives them.
@@ -86,8 +86,8 @@ pub fn dir() -> PathBuf {
 #[must_use]
 pub fn blocks(name: &str) -> BlockFile {
     let _ = elf(name);
-    let image = coflash::read::load(&dir().join(name), None, None).expect("an ELF of ours");
-    let options = Options { region: Region::Strict(board().programs[0].into()), ..Options::default() };
+    let image = coflash::file::read::load(&dir().join(name), None, None).expect("an ELF of ours");
+    let options = Options::default().region(Region::Strict(board().programs[0].into()));
     blocks_of(image, &options).expect("it lies in the program's flash").file
 }
 

@@ -7,8 +7,8 @@
 use std::time::Duration;
 
 use canopen::{Address, Frame, NodeId};
-use coflash::adapter::Adapter;
-use coflash::session::{Doing, Session, Timing, Transfers};
+use coflash::bus::Adapter;
+use coflash::device::{Doing, Session, Timing, Transfers};
 use embedded_can::{Frame as _, StandardId};
 
 /// What 1F51h takes (CiA 302-3; 80h is Zephyr's).
@@ -105,7 +105,7 @@ impl<'a> Master<'a> {
     /// # Errors
     /// What the transfer ended with.
     pub fn download(&mut self, program: u8, image: &[u8], transfers: Transfers) -> Result<(), String> {
-        let timing = Timing { sdo: self.timeout, attempts: 1, ..Timing::default() };
+        let timing = Timing::default().sdo(self.timeout).attempts(1);
         let node = NodeId::new(self.node).ok_or("a node-ID")?;
         let mut session = Session::new(&mut *self.bus, node, timing);
         session.transfer_by(transfers);

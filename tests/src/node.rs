@@ -16,7 +16,7 @@ use canopen::{BitRate, Frame, Instant, NodeId};
 use coboot_node::device::{Device, Event, Setup, BUFFER};
 use coboot_node::file_flash::{FileFlash, Speed};
 use coboot_node::stand_in::StandIn;
-use coflash::adapter::{Adapter, AdapterError};
+use coflash::bus::{Adapter, AdapterError};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
 use crate::bench::NODE;

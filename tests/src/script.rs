@@ -28,8 +28,8 @@ use std::time::Duration;
 
 use canopen::sdo::wire::Request;
 use canopen::{AbortCode, Address};
-use coflash::adapter::Adapter;
-use coflash::session::{Doing, Session, Transfers};
+use coflash::bus::Adapter;
+use coflash::device::{Doing, Session, Transfers};
 use emulator::time::{Span, Time};
 use shared_abi::layout::Layout;
 

@@ -5,11 +5,11 @@ use std::time::Duration;
 use canopen::program::ProgramControl;
 use canopen::sdo::wire::{BlockAck, BlockEnd, Request, Response};
 use canopen::{Address, BitRate, NodeId};
-use coflash::block_file::BlockFile;
-use coflash::convert::{blocks_of, Label, Options, Region};
-use coflash::flash::{flash, Event, FlashOptions};
-use coflash::read::{read, Format};
-use coflash::session::{Doing, Session, Timing};
+use coflash::device::{Doing, Session, Timing};
+use coflash::file::block_file::BlockFile;
+use coflash::file::convert::{blocks_of, Label, Options, Region};
+use coflash::file::read::{read, Format};
+use coflash::update::{flash, Event, FlashOptions};
 use emulator::frame::Frame;
 
 use crate::bench::{Bench, NODE};
@@ -66,11 +66,7 @@ pub fn measure(rate: BitRate, kib: u32) -> Measurement {
     let bytes = program(kib);
     let file = blocks(&bytes, BLOCK_SIZE);
     let from = bench.time();
-    let poll = Timing {
-        poll_first: Duration::from_millis(2),
-        poll_most: Duration::from_millis(10),
-        ..Timing::default()
-    };
+    let poll = Timing::default().poll_first(Duration::from_millis(2)).poll_most(Duration::from_millis(10));
     let mut session = Session::new(&mut bench, NodeId::new(NODE).expect("1 to 127"), poll);
     session.command(1, ProgramControl::Clear).expect("CLEAR");
     for block in file.blocks() {
@@ -130,7 +126,7 @@ pub fn load(rate: BitRate, kib: u32, block_size: usize) -> Load {
     let (mut bench, bit_rate) = board_at(rate);
     let file = blocks(&program(kib), block_size);
     let (clock, mut from, mut to) = (bench.clock(), None, None);
-    let options = FlashOptions { start: false, ..FlashOptions::default() };
+    let options = FlashOptions::default().start(false);
     flash(&mut bench.session(), &file, &options, &mut |event| match event {
         Event::Erased { .. } => from = Some(clock.get()),
         Event::Verified { .. } => to = Some(clock.get()),
@@ -162,13 +158,14 @@ pub fn program(kib: u32) -> Vec<u8> {
 fn blocks(bytes: &[u8], block_size: usize) -> BlockFile {
     let region = firmware::board().programs[0];
     let image = read(bytes, Some(Format::Raw), Some(region.base)).expect("a raw image");
-    let options = Options {
-        region: Region::Strict(region.into()),
-        block_size,
+    let options = Options::default()
+        .region(Region::Strict(region.into()))
+        .block_size(block_size)
         // Tells the size, so that sectors are erased ahead of the data.
-        label: Label::Device { vendor_id: bsp::IDENTITY.vendor_id, product_code: bsp::IDENTITY.product_code },
-        ..Options::default()
-    };
+        .label(Label::Device {
+            vendor_id: bsp::IDENTITY.vendor_id,
+            product_code: bsp::IDENTITY.product_code,
+        });
     blocks_of(image, &options).expect("it fits").file
 }
 

@@ -9,7 +9,7 @@ use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
-use coflash::flash::{flash, FlashOptions};
+use coflash::update::{flash, FlashOptions};
 
 const REQUEST: u16 = 0x600 + NODE as u16;
 const RESPONSE: u32 = 0x580 + NODE as u32;

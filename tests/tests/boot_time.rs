@@ -3,10 +3,10 @@
 use canopen::program::ProgramControl;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
-use coflash::block_file::BlockFile;
-use coflash::convert::{blocks_of, Options, Region};
-use coflash::flash::{flash, FlashOptions};
-use coflash::read::{read, Firmware, Format};
+use coflash::file::block_file::BlockFile;
+use coflash::file::convert::{blocks_of, Options, Region};
+use coflash::file::read::{read, Firmware, Format};
+use coflash::update::{flash, FlashOptions};
 use emulator::time::{Span, Time};
 
 /// The application, followed by other data up to 400 KiB.
@@ -23,11 +23,8 @@ fn large_program() -> BlockFile {
         bytes[at..at + data.len()].copy_from_slice(&data);
     }
     let large = read(&bytes, Some(Format::Raw), Some(base)).expect("a raw image");
-    let options = Options {
-        region: Region::Strict(firmware::board().programs[0].into()),
-        block_size: 16_384,
-        ..Options::default()
-    };
+    let options =
+        Options::default().region(Region::Strict(firmware::board().programs[0].into())).block_size(16_384);
     blocks_of(large, &options).expect("it fits").file
 }
 

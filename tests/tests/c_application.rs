@@ -8,10 +8,10 @@ use canopen::program::ProgramControl;
 use canopen::{Address, BitRate, NodeId};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::{call_back, firmware};
-use coflash::convert::{self, blocks_of, Options};
-use coflash::flash::{flash, FlashOptions, Report};
-use coflash::read::read;
-use coflash::session::{Doing, Session, Timing};
+use coflash::device::{Doing, Session, Timing};
+use coflash::file::convert::{self, blocks_of, Options};
+use coflash::file::read::read;
+use coflash::update::{flash, FlashOptions, Report};
 use shared_abi::callgate;
 use shared_abi::geometry::Region;
 use shared_abi::layout::stm32f407g_disc1_two;
@@ -60,7 +60,7 @@ mod probe {
 const PAGE: u32 = 4096;
 
 fn install(bench: &mut Bench, image: &str) -> Report {
-    let options = FlashOptions { verify: true, ..FlashOptions::default() };
+    let options = FlashOptions::default().verify(true);
     flash(&mut bench.session(), &firmware::blocks(image), &options, &mut |_| {}).unwrap()
 }
 
@@ -81,7 +81,7 @@ fn number(bench: &mut Bench, at: Address) -> u32 {
 /// Writes a word. A call that erases a sector of the journal may take longer than a host usually
 /// waits.
 fn put(bench: &mut Bench, at: Address, value: u32) {
-    let timing = Timing { sdo: Duration::from_secs(3), ..Timing::default() };
+    let timing = Timing::default().sdo(Duration::from_secs(3));
     let mut session = Session::new(bench, NodeId::new(NODE).unwrap(), timing);
     session.write(at, &value.to_le_bytes(), Doing::Write(at), &mut |_| {}).unwrap();
 }
@@ -554,7 +554,7 @@ fn a_trial_confirms_itself_and_takes_it_back() {
     let mut bench = Bench::new();
     bench.power_on();
     bench.await_boot_up(100);
-    let options = FlashOptions { start: false, ..FlashOptions::default() };
+    let options = FlashOptions::default().start(false);
     flash(&mut bench.session(), &firmware::blocks(firmware::APP_C), &options, &mut |_| {}).unwrap();
     let start_unsigned = |bench: &mut Bench| {
         for command in [ProgramControl::ClrSignature, ProgramControl::Start] {
@@ -591,14 +591,14 @@ fn the_other_program_and_a_program_for_the_other_place() {
     let strict = |program: usize| convert::Region::Strict(layout.programs[program - 1].into());
 
     // coflash sees it before anything is sent.
-    let options = Options { region: strict(1), ..Options::default() };
+    let options = Options::default().region(strict(1));
     let refused = blocks_of(elf(firmware::APP_C_PROGRAM_2), &options).unwrap_err().to_string();
     assert!(refused.contains("0x08080000"), "{refused}");
 
     let mut bench = Bench::of_image(&image(firmware::BOOTLOADER));
     bench.power_on();
     bench.await_boot_up(100);
-    let once = FlashOptions { repeats: 0, ..FlashOptions::default() };
+    let once = FlashOptions::default().repeats(0);
     // A host that does not know the board: the bootloader sees it.
     let blocks = blocks_of(elf(firmware::APP_C_PROGRAM_2), &Options::default()).unwrap().file;
     let refused = flash(&mut bench.session(), &blocks, &once, &mut |_| {}).unwrap_err();
@@ -608,7 +608,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
     // A host that moves it to the first place makes blocks that fit, of a program that does not:
     // its vectors point to the second.
     let moved = layout.programs[0].base.wrapping_sub(layout.programs[1].base);
-    let options = Options { region: strict(1), adjust_start: moved, ..Options::default() };
+    let options = Options::default().region(strict(1)).adjust_start(moved);
     let blocks = blocks_of(elf(firmware::APP_C_PROGRAM_2), &options).unwrap().file;
     let refused = flash(&mut bench.session(), &blocks, &once, &mut |_| {}).unwrap_err();
     println!("{refused}");
@@ -621,8 +621,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
     assert!(bench.is_bootloader(NODE));
 
     // And the right ones.
-    let blocks =
-        blocks_of(elf(firmware::APP_C), &Options { region: strict(1), ..Options::default() }).unwrap().file;
+    let blocks = blocks_of(elf(firmware::APP_C), &Options::default().region(strict(1))).unwrap().file;
     flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).unwrap();
     assert_eq!(call(&mut bench, PROGRAM_INFO, [2, 9, 9, 9, 9]).words, [2, 0, 0, 0, 0]);
     for selector in [CONFIRM, INVALIDATE] {
@@ -630,9 +629,9 @@ fn the_other_program_and_a_program_for_the_other_place() {
     }
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
-    let options = Options { region: strict(2), ..Options::default() };
+    let options = Options::default().region(strict(2));
     let blocks = blocks_of(elf(firmware::APP_C_PROGRAM_2), &options).unwrap().file;
-    let second = FlashOptions { program: 2, ..FlashOptions::default() };
+    let second = FlashOptions::default().program(2);
     let report = flash(&mut bench.session(), &blocks, &second, &mut |_| {}).unwrap();
     assert_eq!(number(&mut bench, Address::new(0x1F56, 2)), report.program_crc, "its own");
     let info = call(&mut bench, PROGRAM_INFO, [2, 9, 9, 9, 9]).words;

@@ -4,10 +4,10 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
-use coflash::block_file::BlockFile;
-use coflash::convert::{blocks_of, Options, Region};
-use coflash::flash::{flash, FlashOptions};
-use coflash::read::read;
+use coflash::file::block_file::BlockFile;
+use coflash::file::convert::{blocks_of, Options, Region};
+use coflash::file::read::read;
+use coflash::update::{flash, FlashOptions};
 use emulator::peripheral::Peripheral;
 use shared_abi::layout::stm32f407g_disc1_can2::LAYOUT;
 
@@ -26,7 +26,7 @@ fn bench_at(controller: u8) -> Bench {
 
 fn blocks(image: &str) -> BlockFile {
     let elf = firmware::elf(&firmware::of_board(LAYOUT.board, image));
-    let options = Options { region: Region::Strict(LAYOUT.programs[0].into()), ..Options::default() };
+    let options = Options::default().region(Region::Strict(LAYOUT.programs[0].into()));
     blocks_of(read(&elf, None, None).expect("an ELF of ours"), &options).expect("it fits").file
 }
 

@@ -4,13 +4,13 @@
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::block_file::BlockFile;
-use coflash::convert::{blocks_of, Options, Region};
-use coflash::dialect::{read_locked, recognise, Dialect, Password};
-use coflash::error::Error;
-use coflash::flash::{flash, DeviceState, Event, FlashOptions, Report};
-use coflash::read::{read, Format};
-use coflash::session::Doing;
+use coflash::device::{recognise, Dialect, Doing};
+use coflash::file::block_file::BlockFile;
+use coflash::file::convert::{blocks_of, Options, Region};
+use coflash::file::read::{read, Format};
+use coflash::update::dialect::read_locked;
+use coflash::update::{flash, DeviceState, Event, FlashOptions, Password, Report};
+use coflash::Error;
 use shared_abi::layout::stm32f407g_disc1_two;
 
 const VERSION: Address = Address::new(0x100A, 0);
@@ -58,7 +58,7 @@ fn images_and_intel_hex_update_the_standard_firmware() {
         let mut bench = Bench::new();
         bench.power_on();
         bench.await_boot_up(100);
-        let options = FlashOptions { dialect: Some(dialect), verify: true, ..FlashOptions::default() };
+        let options = FlashOptions::default().dialect(Some(dialect)).verify(true);
         // Into an empty device, and into one whose application runs.
         for (image, expected) in [(firmware::APP_V1, "1.0.0"), (firmware::APP_V2, "2.0.0")] {
             let blocks = firmware::blocks(image);
@@ -84,7 +84,7 @@ fn the_profile_of_esacademy_is_recognised_and_updated() {
     bench.power_on();
     bench.await_boot_up_of(ESACADEMY_NODE, 100);
     // "Wrong" instead of "INIT".
-    let wrong = FlashOptions { unlock: Password::new("0x57726F6E"), ..FlashOptions::default() };
+    let wrong = FlashOptions::default().unlock(Password::new("0x57726F6E"));
     let (result, events) = update(&mut bench, ESACADEMY_NODE, &firmware::blocks(firmware::APP_V1), &wrong);
     assert!(matches!(result, Err(Error::Refused { doing: Doing::Unlock, .. })), "{result:?}");
     assert_eq!(events.last(), Some(&Event::Left(DeviceState::Untouched)));
@@ -114,13 +114,13 @@ fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
     }
     let blocks = |name: &str| {
         let elf = firmware::elf(&firmware::of_board(layout.board, name));
-        let options = Options { region: Region::Strict(layout.programs[0].into()), ..Options::default() };
+        let options = Options::default().region(Region::Strict(layout.programs[0].into()));
         blocks_of(read(&elf, None, None).unwrap(), &options).unwrap().file
     };
     let mut bench = Bench::of_image(&firmware::of_board(layout.board, LIFT));
     bench.power_on();
     bench.await_boot_up_of(LIFT_NODE, 1000);
-    let options = FlashOptions { unlock: Password::new(PASSWORD), ..FlashOptions::default() };
+    let options = FlashOptions::default().unlock(Password::new(PASSWORD));
     // A device without a program is in its bootloader, and nobody knows its own node-ID.
     for (from, image, expected) in [(LIFT_NODE, APP_LIFT, "1.0.0"), (NODE, APP_LIFT_V2, "2.0.0")] {
         let (result, events) = update(&mut bench, from, &blocks(image), &options);
@@ -143,7 +143,7 @@ fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
     let set: Vec<u8> = (0..3001_u32).map(|i| (i * i / 7) as u8).collect();
     let raw = read(&set, Some(Format::Raw), Some(layout.programs[1].base)).unwrap();
     let blocks_of_set = blocks_of(raw, &Options::default()).unwrap().file;
-    let second = FlashOptions { program: 2, ..options };
+    let second = options.program(2);
     update(&mut bench, NODE, &blocks_of_set, &second).0.unwrap();
     assert!(version(&mut bench, NODE).contains("2.0.0"), "the program goes on");
     let mut session = bench.session_with(NODE);
@@ -152,7 +152,7 @@ fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
     assert_eq!(stored, set);
     bench.await_boot_up(2000);
 
-    let wrong = FlashOptions { unlock: Password::new("Coboot"), ..FlashOptions::default() };
+    let wrong = FlashOptions::default().unlock(Password::new("Coboot"));
     let (result, events) = update(&mut bench, NODE, &blocks(APP_LIFT), &wrong);
     assert!(matches!(result, Err(Error::Refused { doing: Doing::Unlock, .. })), "{result:?}");
     assert_eq!(events.last(), Some(&Event::Left(DeviceState::Untouched)));

@@ -8,9 +8,9 @@ use canopen::program::ProgramControl;
 use canopen::{Address, BitRate};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::adapter::Adapter;
-use coflash::flash::{flash, FlashOptions};
-use coflash::session::{Doing, Transfers};
+use coflash::bus::Adapter;
+use coflash::device::{Doing, Transfers};
+use coflash::update::{flash, FlashOptions};
 use emulator::time::{Span, Time};
 
 const REQUEST: u16 = 0x600 + NODE as u16;

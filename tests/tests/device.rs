@@ -4,9 +4,9 @@ use canopen::program::{FlashError, ProgramControl};
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::error::Error;
-use coflash::flash::{flash, Event, FlashOptions};
-use coflash::session::Doing;
+use coflash::device::Doing;
+use coflash::update::{flash, Event, FlashOptions};
+use coflash::Error;
 use emulator::machine::{Options, ResetCause, Stop};
 use emulator::time::{Span, Time};
 
@@ -208,7 +208,7 @@ fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
 fn a_trial_run_comes_back_to_the_bootloader_and_an_unsigned_program_does_not_start_by_itself() {
     let mut bench = empty_board();
     let file = firmware::blocks(firmware::APP_V1);
-    let options = FlashOptions { trial_run: true, start: false, ..FlashOptions::default() };
+    let options = FlashOptions::default().trial_run(true).start(false);
     let mut trial_passed = false;
     flash(&mut bench.session(), &file, &options, &mut |event| {
         trial_passed |= matches!(event, Event::TrialPassed(_));

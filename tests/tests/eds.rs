@@ -9,8 +9,8 @@ use coboot_tests::bench::Bench;
 use coboot_tests::eds::{self, Image};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
-use coflash::flash::{flash, FlashOptions};
-use coflash::read::Firmware;
+use coflash::file::read::Firmware;
+use coflash::update::{flash, FlashOptions};
 
 fn images() -> [Image; 5] {
     eds::images()
@@ -182,7 +182,7 @@ fn the_protocol_page_names_every_object() {
 #[test]
 fn the_firmware_does_not_carry_the_names() {
     for elf in [firmware::BOOTLOADER, firmware::APP_V1] {
-        let Ok(Firmware::Image(image)) = coflash::read::read(&firmware::elf(elf), None, None) else {
+        let Ok(Firmware::Image(image)) = coflash::file::read::read(&firmware::elf(elf), None, None) else {
             panic!("{elf} is no ELF of ours")
         };
         let has = |text: &str| {

@@ -7,10 +7,10 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{Bench, RESCUE_WINDOW_MS};
 use coboot_tests::firmware;
-use coflash::convert::{blocks_of, Options};
-use coflash::flash::{flash, FlashOptions};
-use coflash::read::{read, Format};
-use coflash::session::Doing;
+use coflash::device::Doing;
+use coflash::file::convert::{blocks_of, Options};
+use coflash::file::read::{read, Format};
+use coflash::update::{flash, FlashOptions};
 
 /// The application template's way back (object 2000h), and that of the three which is a jump.
 const REENTRY_PATH: Address = Address::new(0x2000, 0);
@@ -122,7 +122,7 @@ fn the_application_finds_the_chip_as_after_a_reset() {
     let mut bench = Bench::new();
     bench.power_on();
     bench.await_boot_up(100);
-    let options = FlashOptions { start: false, ..FlashOptions::default() };
+    let options = FlashOptions::default().start(false);
     flash(&mut bench.session(), &blocks, &options, &mut |_| {}).unwrap();
     bench.machine().reset_pin();
     bench.run_ms(RESCUE_WINDOW_MS + 100);

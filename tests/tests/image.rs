@@ -10,7 +10,7 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::flash::{flash, FlashOptions};
+use coflash::update::{flash, FlashOptions};
 use crc::{Crc, CRC_32_ISO_HDLC};
 use emulator::machine::{ResetCause, Stop};
 use emulator::time::Span;

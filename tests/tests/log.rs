@@ -5,7 +5,7 @@ use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::listener::{decoder, heard, Listener};
-use coflash::flash::{flash, FlashOptions};
+use coflash::update::{flash, FlashOptions};
 use emulator::defmt::Decoder;
 use emulator::peripheral::Peripheral;
 use object::{Object, ObjectSection, ObjectSymbol};

@@ -4,7 +4,7 @@
 use canopen::Address;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
-use coflash::flash::{flash, Event, FlashOptions};
+use coflash::update::{flash, Event, FlashOptions};
 
 #[test]
 fn an_empty_board_says_boot_up_and_serves_its_objects() {

@@ -9,7 +9,7 @@ use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::masters::{lely, zephyr, Master};
 use coboot_tests::node::NodeBus;
-use coflash::flash::{flash, FlashOptions};
+use coflash::update::{flash, FlashOptions};
 
 /// Applications that a running device may have.
 const APPLICATIONS: [&str; 2] = [firmware::APP_V1, firmware::APP_C];

@@ -10,10 +10,10 @@ use coboot_tests::listener::Listener;
 use coboot_tests::script::{play_on, Wire};
 use coboot_tests::serial::TextBus;
 use coboot_tests::{firmware, script};
-use coflash::convert::{blocks_of, Options, Region};
-use coflash::flash::{flash, FlashOptions};
-use coflash::read::read;
-use coflash::session::{Doing, Session};
+use coflash::device::{Doing, Session};
+use coflash::file::convert::{blocks_of, Options, Region};
+use coflash::file::read::read;
+use coflash::update::{flash, FlashOptions};
 use emulator::time::{Span, Time};
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
 
@@ -216,15 +216,15 @@ fn a_bootloader_with_the_debugger_takes_hex() {
 /// good.
 #[test]
 fn a_product_with_crc_16_is_updated_by_block_file() {
-    use coflash::block_file::Checksum;
+    use coflash::file::block_file::Checksum;
 
     let Some(mut bench) = board("bootloader-crc-16") else { return };
     let file = |checksum| {
         let firmware = read(&firmware::elf(&image(firmware::APP_V1)), None, None).unwrap();
         let region = Region::Strict(LAYOUT.programs[0].into());
-        blocks_of(firmware, &Options { region, checksum, ..Options::default() }).unwrap().file
+        blocks_of(firmware, &Options::default().region(region).checksum(checksum)).unwrap().file
     };
-    let options = FlashOptions { start: false, repeats: 0, verify: true, ..FlashOptions::default() };
+    let options = FlashOptions::default().start(false).repeats(0).verify(true);
     let refused = flash(&mut bench.session(), &file(Checksum::Crc32), &options, &mut |_| {});
     assert!(refused.is_err());
     assert_eq!(bench.session().status(1).unwrap().to_word() & 0xFFFF, 0x06);

@@ -6,9 +6,9 @@ use canopen::program::ProgramControl;
 use canopen::BitRate;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
-use coflash::adapter::SdoIds;
-use coflash::flash::{flash, FlashOptions};
-use coflash::session::{Doing, Session, Timing};
+use coflash::bus::SdoIds;
+use coflash::device::{Doing, Session, Timing};
+use coflash::update::{flash, FlashOptions};
 use emulator::time::Time;
 
 /// Pins of port E that the product `switches` reads: the node-ID on 8 to 14, the bit rate's index on
@@ -97,7 +97,7 @@ fn a_pin_says_whether_a_program_is_valid() {
     {
         let mut ids = SdoIds::new(&mut bench, 0x680, 0x480);
         let mut session = Session::new(&mut ids, node, Timing::default());
-        let options = FlashOptions { start: false, ..FlashOptions::default() };
+        let options = FlashOptions::default().start(false);
         flash(&mut session, &file, &options, &mut |_| {}).unwrap();
     }
     let restart = |bench: &mut Bench, valid: bool| {

@@ -5,7 +5,8 @@
 use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE, RESCUE_WINDOW_MS};
 use coboot_tests::firmware;
-use coflash::flash::{call_back, flash, FlashOptions};
+use coflash::update::steps::call_back;
+use coflash::update::{flash, FlashOptions};
 use emulator::machine::Stop;
 use emulator::time::{Span, Time};
 
@@ -301,8 +302,8 @@ fn an_owed_answer_in_a_damaged_cell_is_not_sent() {
 /// Downloads an application in one go, by the segments of any client.
 fn raw_download(bench: &mut Bench, node: u8, image: &str) {
     let mut session = bench.session_with(node);
-    session.transfer_by(coflash::session::Transfers::Segments);
-    let doing = coflash::session::Doing::Program;
+    session.transfer_by(coflash::device::Transfers::Segments);
+    let doing = coflash::device::Doing::Program;
     let at = canopen::Address::new(0x1F50, 1);
     session.write(at, &firmware::raw(image), doing, &mut |_| {}).unwrap();
     let _ = session.await_idle(1, doing);
@@ -395,7 +396,7 @@ fn every_other_80h_is_a_call() {
         let mut bench = Bench::new();
         bench.power_on();
         bench.await_boot_up(100);
-        let options = FlashOptions { trial_run: true, ..FlashOptions::default() };
+        let options = FlashOptions::default().trial_run(true);
         let began = bench.time();
         flash(&mut bench.session(), &firmware::blocks(image), &options, &mut |_| {}).unwrap();
         assert!(bench.time() - began < Span::from_millis(3000), "{image}: nobody was asked twice");

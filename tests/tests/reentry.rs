@@ -4,9 +4,9 @@ use canopen::program::ProgramControl;
 use canopen::{AbortCode, Address, BitRate};
 use coboot_tests::bench::{Bench, NODE, RESCUE_WINDOW_MS};
 use coboot_tests::{call_back, firmware};
-use coflash::error::Error;
-use coflash::flash::{flash, FlashOptions};
-use coflash::session::Doing;
+use coflash::device::Doing;
+use coflash::update::{flash, FlashOptions};
+use coflash::Error;
 use emulator::machine::{ResetCause, Stop};
 use emulator::time::Span;
 
@@ -128,7 +128,7 @@ fn a_trial_confirms_itself_through_the_callgate() {
     let mut bench = Bench::new();
     bench.power_on();
     bench.await_boot_up(100);
-    let options = FlashOptions { trial_run: true, start: false, ..FlashOptions::default() };
+    let options = FlashOptions::default().trial_run(true).start(false);
     flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
     for command in [ProgramControl::ClrSignature, ProgramControl::Start] {
         bench.session().command(1, command).unwrap();

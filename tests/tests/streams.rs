@@ -5,7 +5,7 @@ use canopen::{Address, BitRate};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::ihex::intel_hex;
 use coboot_tests::{firmware, throughput};
-use coflash::session::{Doing, Transfers};
+use coflash::device::{Doing, Transfers};
 use emulator::machine::{FlashTimes, Options};
 use emulator::time::{Span, Time};
 

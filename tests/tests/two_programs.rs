@@ -5,11 +5,11 @@ use canopen::program::ProgramControl;
 use canopen::{Address, NodeId};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::block_file::BlockFile;
-use coflash::convert::{blocks_of, Options, Region};
-use coflash::flash::{flash, FlashOptions};
-use coflash::read::read;
-use coflash::session::{Doing, Transfers};
+use coflash::device::{Doing, Transfers};
+use coflash::file::block_file::BlockFile;
+use coflash::file::convert::{blocks_of, Options, Region};
+use coflash::file::read::read;
+use coflash::update::{flash, FlashOptions};
 use emulator::time::Span;
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
 
@@ -32,13 +32,12 @@ fn identification(bench: &mut Bench, program: u8) -> u32 {
 
 fn blocks(image: &str, program: usize) -> BlockFile {
     let elf = firmware::elf(&firmware::of_board(LAYOUT.board, image));
-    let options =
-        Options { region: Region::Strict(LAYOUT.programs[program - 1].into()), ..Options::default() };
+    let options = Options::default().region(Region::Strict(LAYOUT.programs[program - 1].into()));
     blocks_of(read(&elf, None, None).expect("an ELF of ours"), &options).expect("it fits").file
 }
 
 fn install(bench: &mut Bench, program: u8, file: &BlockFile) {
-    let options = FlashOptions { program, start: false, ..FlashOptions::default() };
+    let options = FlashOptions::default().program(program).start(false);
     flash(&mut bench.session(), file, &options, &mut |_| {}).unwrap();
 }
 
@@ -118,7 +117,7 @@ fn a_block_for_the_other_program_is_refused() {
     bench.power_on();
     bench.await_boot_up(100);
     let second = blocks(firmware::PROGRAM_2, 2);
-    let options = FlashOptions { program: 1, start: false, repeats: 0, ..FlashOptions::default() };
+    let options = FlashOptions::default().program(1).start(false).repeats(0);
     let refused = flash(&mut bench.session(), &second, &options, &mut |_| {}).unwrap_err();
     let status = bench.ask(0x601, &[0x40, 0x57, 0x1F, 1, 0, 0, 0, 0], 0x581).unwrap();
     assert_eq!(status[4], 0x0C, "ADDRESS: {refused}");
@@ -167,7 +166,7 @@ fn a_second_program_is_written_to_a_running_device() {
             assert_eq!(answer, expected, "{first}");
         }
 
-        let options = FlashOptions { program: 2, verify: true, ..FlashOptions::default() };
+        let options = FlashOptions::default().program(2).verify(true);
         let report = flash(&mut bench.session(), &two, &options, &mut |_| {}).unwrap();
         assert!(report.running.is_some(), "{second}");
         // The second runs now; the first is there, stopped.
@@ -176,7 +175,7 @@ fn a_second_program_is_written_to_a_running_device() {
         assert_eq!(identification(&mut bench, 1), one.program_crc(), "{second}");
         assert_eq!(identification(&mut bench, 2), two.program_crc(), "{second}");
         // And back, from the second one.
-        let options = FlashOptions { verify: true, ..FlashOptions::default() };
+        let options = FlashOptions::default().verify(true);
         flash(&mut bench.session(), &one, &options, &mut |_| {}).unwrap();
         assert_eq!(read(&mut bench, 0x51, 1), [0x4F, 0x51, 0x1F, 1, 1, 0, 0, 0]);
         bench.assert_nothing_unmodelled();

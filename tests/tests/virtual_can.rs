@@ -12,10 +12,10 @@ use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coboot_tests::serial::SerialLine;
-use coflash::adapter::slcan::Slcan;
-use coflash::adapter::Adapter;
-use coflash::flash::{flash, FlashOptions};
-use coflash::session::{Session, Timing};
+use coflash::bus::slcan::Slcan;
+use coflash::bus::Adapter;
+use coflash::device::{Session, Timing};
+use coflash::update::{flash, FlashOptions};
 
 /// A board in its bootloader, with nothing installed.
 fn empty_board() -> Bench {
@@ -74,7 +74,7 @@ fn the_text_on_the_line() {
 fn coflash_updates_the_device_through_its_serial_port() {
     let mut bench = empty_board();
     let blocks = firmware::blocks(firmware::APP_VIRTUAL_CAN);
-    let options = FlashOptions { verify: true, ..FlashOptions::default() };
+    let options = FlashOptions::default().verify(true);
     let mut adapter = adapter(&mut bench);
     for round in 0..2 {
         let mut session = session(&mut adapter);
@@ -165,8 +165,7 @@ fn never_silent_during_an_erase() {
     let mut adapter = adapter(&mut bench);
     let blocks = firmware::blocks(firmware::APP_VIRTUAL_CAN);
     let mut session_ = session(&mut adapter);
-    flash(&mut session_, &blocks, &FlashOptions { start: false, ..FlashOptions::default() }, &mut |_| {})
-        .unwrap();
+    flash(&mut session_, &blocks, &FlashOptions::default().start(false), &mut |_| {}).unwrap();
     session_.command(1, ProgramControl::Clear).unwrap();
     session_.command(1, ProgramControl::Clear).unwrap();
     drop(adapter);

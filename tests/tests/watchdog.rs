@@ -3,7 +3,7 @@
 use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::flash::{flash, FlashOptions};
+use coflash::update::{flash, FlashOptions};
 use emulator::machine::{ResetCause, Stop};
 use emulator::time::Time;
 use object::{Object, ObjectSymbol};

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::adapter::Adapter;
+use coflash::bus::Adapter;
 use embedded_can::{Frame, Id};
 use emulator::world::MachineId;
 use tokio::sync::mpsc::{unbounded_channel, UnboundedReceiver, UnboundedSender};

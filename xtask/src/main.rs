@@ -23,6 +23,7 @@ mod header;
 mod json;
 mod layout;
 mod lint;
+mod modules;
 mod new_board;
 mod pack;
 #[cfg(test)]

@@ -5,7 +5,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Command;
-use coflash::config::{parse, Fault, KEYS};
+use coflash::update::config::{parse, Fault, KEYS};
 
 use super::output::Failure;
 

@@ -4,15 +4,15 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use clap::Args;
-use coflash::block_file::FRAMING;
-use coflash::convert::{Converted, Label};
-use coflash::read::Firmware;
+use coflash::file::block_file::FRAMING;
+use coflash::file::convert::{Converted, Label};
+use coflash::file::read::Firmware;
 use serde_json::json;
 
+use super::context::Context;
 use super::file::{warn_left_out, Input, Source};
 use super::output::Failure;
 use super::values::{number, program_number};
-use super::Context;
 
 /// Converts a firmware file into a block file, ready for 1F50h.
 ///

@@ -5,14 +5,14 @@ use std::time::Duration;
 
 use canopen::debugger::Stop;
 use clap::{Args, Subcommand};
-use coflash::debugger::{Debugger, NoBreakpoint, Registers, Stopped, BREAKPOINTS, NAMES};
+use coflash::device::debugger::{Debugger, NoBreakpoint, Registers, Stopped, BREAKPOINTS, NAMES};
 use coflash::Error;
 use serde_json::{json, Value};
 
+use super::context::Context;
 use super::device::Device;
 use super::output::Failure;
 use super::values::{milliseconds, number};
-use super::Context;
 
 /// Looks into the memory of a device on the bench, and stops its program.
 ///

@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use canopen::NodeId;
 use clap::Args;
-use coflash::link::Link;
-use coflash::session::{Session, Timing, Transfers};
+use coflash::bus::Link;
+use coflash::device::{Session, Timing, Transfers};
 
 use super::output::{Exit, Failure};
 use super::values::{attempts, milliseconds, node_id, number, program_number};
@@ -82,7 +82,7 @@ const REPEATS: u32 = 0x400;
 impl Patience {
     /// A session which Ctrl-C ends.
     pub(super) fn session<'a>(&self, link: &'a mut Link, node: NodeId) -> Result<Session<'a>, Failure> {
-        let mut session = link.session(node, self.timing());
+        let mut session = Session::on(link, node, self.timing());
         session.cancel_by(cancelled()?);
         session.transfer_by(self.transfers());
         Ok(session)
@@ -97,19 +97,17 @@ impl Patience {
     }
 
     pub(super) fn timing(&self) -> Timing {
-        let timing = Timing {
-            sdo: self.sdo_timeout,
-            attempts: self.sdo_attempts,
-            command: self.command_timeout,
-            boot: self.boot_timeout,
-            ..Timing::default()
-        };
+        let timing = Timing::default()
+            .sdo(self.sdo_timeout)
+            .attempts(self.sdo_attempts)
+            .command(self.command_timeout)
+            .boot(self.boot_timeout);
         if self.delay.is_none() && self.repeats.is_none() {
             return timing;
         }
         let delay = self.delay.unwrap_or(DELAY);
         let command = delay.saturating_mul(self.repeats.unwrap_or(REPEATS).max(1));
-        Timing { command, poll_first: delay, poll_most: delay, ..timing }
+        timing.command(command).poll_first(delay).poll_most(delay)
     }
 }
 

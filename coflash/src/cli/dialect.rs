@@ -1,7 +1,8 @@
 //! `--dialect` and `--unlock`: what a device speaks, and what opens it.
 
 use clap::{Args, ValueEnum};
-use coflash::dialect::{Dialect, Password};
+use coflash::device::Dialect;
+use coflash::update::Password;
 
 /// How to deal with devices of other makers.
 #[derive(Debug, Args)]

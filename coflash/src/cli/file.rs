@@ -3,15 +3,15 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
-use coflash::block_file::{Checksum, LastBlock};
-use coflash::convert::{blocks_of, Converted, GapFill, Label, Options, Region, DEFAULT_BLOCK_SIZE};
-use coflash::image::AddressRange;
-use coflash::read::{self, Firmware, Format};
+use coflash::file::block_file::{Checksum, LastBlock};
+use coflash::file::convert::{blocks_of, Converted, GapFill, Label, Options, Region, DEFAULT_BLOCK_SIZE};
+use coflash::file::read::{self, Firmware, Format};
+use coflash::file::AddressRange;
 use shared_abi::layout;
 
+use super::context::Context;
 use super::output::Failure;
 use super::values::number;
-use super::Context;
 
 /// How to read a firmware file and cut it into blocks.
 #[derive(Clone, Debug, Args)]
@@ -131,16 +131,15 @@ impl Source {
         program: u8,
         label: Label,
     ) -> Result<Converted, Failure> {
-        let options = Options {
-            region: self.region(program)?,
-            block_size: self.block_size as usize,
-            gap_fill: GapFill::new(self.gap_fill),
-            label,
-            adjust_start: self.adjust_start,
-            checksum: if self.crc16 { Checksum::Crc16 } else { Checksum::Crc32 },
-            max_gap: self.block_max_gap,
-            last_block: if self.last_block_2008 { LastBlock::Of2008 } else { LastBlock::Of2015 },
-        };
+        let options = Options::default()
+            .region(self.region(program)?)
+            .block_size(self.block_size as usize)
+            .gap_fill(GapFill::new(self.gap_fill))
+            .label(label)
+            .adjust_start(self.adjust_start)
+            .checksum(if self.crc16 { Checksum::Crc16 } else { Checksum::Crc32 })
+            .max_gap(self.block_max_gap)
+            .last_block(if self.last_block_2008 { LastBlock::Of2008 } else { LastBlock::Of2015 });
         blocks_of(firmware, &options).map_err(|error| Failure::convert(error, file))
     }
 

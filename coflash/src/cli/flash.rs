@@ -2,31 +2,29 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
 
 use canopen::NodeId;
 use clap::Args;
-use coflash::block_file::BlockFile;
-use coflash::convert::Label;
-use coflash::dialect::Dialect;
-use coflash::flash::{flash, DeviceState, Event, FlashOptions, Report, Target};
-use coflash::job::{self, Entry, Settings};
-use coflash::link::Link;
-use coflash::lss::{ensure_node_id, LssAddress};
-use coflash::many::{flash_in_turn, flash_many, Job, ManyOptions};
-use coflash::session::Transfers;
-use serde_json::{json, Value};
+use coflash::bus::Link;
+use coflash::device::lss::{ensure_node_id, LssAddress};
+use coflash::device::Dialect;
+use coflash::file::block_file::BlockFile;
+use coflash::file::convert::Label;
+use coflash::update::job::{self, Entry, Settings};
+use coflash::update::many::{flash_in_turn, flash_many, Job, ManyOptions};
+use coflash::update::{flash, Event, FlashOptions, Report, Target};
+use serde_json::json;
 
+use super::context::Context;
 use super::convert::Labels;
 use super::device::{cancelled, Patience};
 use super::dialect::Access;
 use super::file::{warn_left_out, Source};
 use super::legacy::Legacy;
-use super::many::{document, summary, write_report, Board, Outcome};
+use super::many::{document, report_value, summary, write_report, Board, Outcome};
 use super::output::Failure;
 use super::progress::Progress;
 use super::values::{nodes, number, program_number};
-use super::Context;
 
 /// Puts a program into a device, or into many, and starts it.
 ///
@@ -193,7 +191,7 @@ impl Flash {
         let text = std::fs::read_to_string(job).map_err(|error| Failure::unreadable(job, &error))?;
         let entries = job::parse(&text, job.parent().unwrap_or(Path::new("")));
         for entry in entries.map_err(|fault| Failure::job(job, &fault))? {
-            let Entry { node, address, settings } = entry;
+            let Entry { node, address, settings, .. } = entry;
             let image = settings.image.clone().unwrap_or_default();
             let program = settings.program.unwrap_or(self.program);
             let same = known.iter().find(|(path, board, number, _)| {
@@ -213,7 +211,7 @@ impl Flash {
                     file
                 }
             };
-            let options = FlashOptions { program, ..self.options(&file, &settings)? };
+            let options = self.options(&file, &settings)?.program(program);
             devices.push(Assignment { node, address, image, file, options });
         }
         Ok(devices)
@@ -225,19 +223,17 @@ impl Flash {
         let advice = "convert it with --vid and --pid, or give them here";
         let unnamed = || Failure::usage("the file does not say for which device it is", advice);
         let check_target = if check { Some(Target::of(file).ok_or_else(unnamed)?) } else { None };
-        Ok(FlashOptions {
-            program: self.program,
-            repeats: self.block_repeats,
-            check_target,
-            trial_run: settings.trial_run.unwrap_or(self.trial_run),
-            start: settings.start.unwrap_or(!self.no_start),
-            verify: settings.verify.unwrap_or(self.verify),
-            dialect: self.access.dialect(),
-            unlock: self.access.unlock(),
-            wait: self.wait,
-            mastership: !self.no_mastership,
-            ..FlashOptions::default()
-        })
+        Ok(FlashOptions::default()
+            .program(self.program)
+            .repeats(self.block_repeats)
+            .check_target(check_target)
+            .trial_run(settings.trial_run.unwrap_or(self.trial_run))
+            .start(settings.start.unwrap_or(!self.no_start))
+            .verify(settings.verify.unwrap_or(self.verify))
+            .dialect(self.access.dialect())
+            .unlock(self.access.unlock())
+            .wait(self.wait)
+            .mastership(!self.no_mastership))
     }
 
     /// The node-ID of a device, which is given it first if it is named by its LSS address.
@@ -282,7 +278,7 @@ impl Flash {
             }
         };
         context.out.result(Done(&report), || {
-            let mut value = value(&report);
+            let mut value = report_value(&report);
             value["command"] = "flash".into();
             value["node"] = node.get().into();
             value["program"] = device.options.program.into();
@@ -304,7 +300,7 @@ impl Flash {
                     Some(Outcome { node: Some(node), name: device.name(), image, result: Err(failure) })
                 }
                 Ok(node) => {
-                    jobs.push((number, Job { node, file: device.file.clone(), options: device.options }));
+                    jobs.push((number, Job::new(node, device.file.clone(), device.options)));
                     None
                 }
                 Err(failure) => {
@@ -313,12 +309,11 @@ impl Flash {
             };
             outcomes.push(outcome);
         }
-        let options = ManyOptions {
-            timing: self.patience.timing(),
-            transfers: self.patience.transfers(),
-            at_once: self.at_once as usize,
-            cancelled: cancelled()?,
-        };
+        let options = ManyOptions::default()
+            .timing(self.patience.timing())
+            .transfers(self.patience.transfers())
+            .at_once(self.at_once as usize)
+            .cancelled(cancelled()?);
         let (numbers, jobs): (Vec<usize>, Vec<Job>) = jobs.into_iter().unzip();
         let nodes: Vec<NodeId> = jobs.iter().map(|job| job.node).collect();
         let board = Board::new(context.out, &nodes);
@@ -359,35 +354,5 @@ impl std::fmt::Display for Done<'_> {
             1 => f.write_str(", 1 block sent again"),
             blocks => write!(f, ", {blocks} blocks sent again"),
         }
-    }
-}
-
-/// For programs.
-pub(super) fn value(report: &Report) -> Value {
-    let seconds = |time: Duration| (time.as_secs_f64() * 1000.0).round() / 1000.0;
-    json!({
-        "size": report.program_size,
-        "crc": report.program_crc,
-        "blocks_repeated": report.repeats,
-        "seconds": seconds(report.took),
-        "transfer_seconds": seconds(report.transfer),
-        "transfer": match report.transfers {
-            Transfers::Blocks => "blocks",
-            Transfers::Segments => "segments",
-        },
-        "running": report.running.map(|running| running.0),
-        "dialect": report.dialect.name(),
-    })
-}
-
-/// For programs.
-pub(super) fn state_word(state: DeviceState) -> &'static str {
-    match state {
-        DeviceState::Untouched => "untouched",
-        DeviceState::Called => "called",
-        DeviceState::Erased => "erased",
-        DeviceState::Written => "written",
-        DeviceState::Unsigned => "unsigned",
-        DeviceState::Signed => "signed",
     }
 }

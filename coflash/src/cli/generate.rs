@@ -3,12 +3,12 @@
 use std::io::Write as _;
 use std::path::PathBuf;
 
-use clap::{Args, CommandFactory};
+use clap::{Args, Command};
 use clap_complete::Shell;
 use clap_mangen::Man;
 
+use super::context::Context;
 use super::output::Failure;
-use super::{Cli, Context};
 
 /// Writes the completions for a shell to standard output.
 #[derive(Debug, Args)]
@@ -26,20 +26,20 @@ pub(super) struct Manual {
 }
 
 impl Completions {
-    pub(super) fn run(&self) -> Result<(), Failure> {
+    pub(super) fn run(&self, mut commands: Command) -> Result<(), Failure> {
         // Made in memory: clap's own writer panics where nobody reads.
         let mut script = Vec::new();
-        clap_complete::generate(self.shell, &mut Cli::command(), "coflash", &mut script);
+        clap_complete::generate(self.shell, &mut commands, "coflash", &mut script);
         let _ = std::io::stdout().write_all(&script);
         Ok(())
     }
 }
 
 impl Manual {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+    pub(super) fn run(&self, context: &Context, commands: Command) -> Result<(), Failure> {
         let Some(folder) = &self.out else {
             let mut page = Vec::new();
-            Man::new(Cli::command())
+            Man::new(commands)
                 .render(&mut page)
                 .map_err(|error| Failure::system(format!("the page cannot be made: {error}")))?;
             let _ = std::io::stdout().write_all(&page);
@@ -47,7 +47,7 @@ impl Manual {
         };
         let write = || {
             std::fs::create_dir_all(folder)?;
-            clap_mangen::generate_to(Cli::command(), folder)
+            clap_mangen::generate_to(commands, folder)
         };
         write()
             .map_err(|error| Failure::system(format!("{}: cannot be written: {error}", folder.display())))?;

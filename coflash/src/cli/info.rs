@@ -2,13 +2,13 @@
 
 use canopen::program::FlashStatus;
 use clap::Args;
-use coflash::dialect::Dialect;
-use coflash::info::{info, DeviceInfo};
+use coflash::device::info::{info, DeviceInfo};
+use coflash::device::Dialect;
 use serde_json::{json, Value};
 
+use super::context::Context;
 use super::device::Device;
 use super::output::Failure;
-use super::Context;
 
 /// Shows what runs on a device, its identity, and the state of its programs.
 #[derive(Debug, Args)]

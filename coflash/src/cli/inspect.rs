@@ -1,14 +1,14 @@
 //! `coflash inspect`: what a firmware file holds, in words.
 
 use clap::Args;
-use coflash::inspect::Inspection;
-use coflash::read::Firmware;
+use coflash::file::inspect::Inspection;
+use coflash::file::read::Firmware;
 use serde_json::{json, Value};
 
+use super::context::Context;
 use super::file::{Input, Source};
 use super::output::Failure;
 use super::values::program_number;
-use super::Context;
 
 /// Shows what a firmware file or block file holds, and checks every record, size and CRC in it.
 ///
@@ -43,7 +43,7 @@ impl Inspect {
 }
 
 fn value(inspection: &Inspection) -> Value {
-    let segment = |range: &coflash::image::AddressRange| json!({ "first": range.first, "last": range.last });
+    let segment = |range: &coflash::file::AddressRange| json!({ "first": range.first, "last": range.last });
     let gaps: Vec<_> = inspection.gaps().collect();
     let blocks = inspection.blocks.as_ref().map(|blocks| {
         let all: Vec<Value> = blocks

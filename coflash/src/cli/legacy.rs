@@ -4,11 +4,11 @@
 use std::fmt::Write as _;
 
 use clap::Args;
-use coflash::lss::LssAddress;
+use coflash::device::lss::LssAddress;
 
+use super::context::Context;
 use super::output::Failure;
 use super::values::number;
-use super::Context;
 
 /// The options that mean nothing here, or something that is said otherwise.
 #[derive(Debug, Args)]

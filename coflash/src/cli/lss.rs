@@ -5,15 +5,15 @@ use std::time::Duration;
 use canopen::nmt::NmtCommand;
 use canopen::NodeId;
 use clap::{Args, Subcommand};
-use coflash::adapter::Adapter;
-use coflash::lss::{BitRate, LssAddress, Master};
+use coflash::bus::Adapter;
+use coflash::device::lss::{BitRate, LssAddress, Master};
 use coflash::Error;
 use serde_json::{json, Value};
 
+use super::context::Context;
 use super::device::cancelled;
 use super::output::Failure;
 use super::values::{milliseconds, node_id, number};
-use super::Context;
 
 /// Layer setting services: node-ID and bit rate over the bus.
 ///

@@ -2,14 +2,15 @@
 
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
 
 use canopen::NodeId;
-use coflash::flash::{Event, Report};
-use coflash::many::Failed;
+use coflash::device::Transfers;
+use coflash::update::many::Failed;
+use coflash::update::{Event, Report};
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{json, Value};
 
-use super::flash::value;
 use super::output::{Exit, Failure, Output};
 
 const STYLE: &str = "{prefix:<9} {bar:30} {percent:>3} %  {bytes_per_sec:>12}  {msg}";
@@ -149,10 +150,28 @@ fn outcome_value(outcome: &Outcome) -> Value {
         "ok": outcome.result.is_ok(),
     });
     match &outcome.result {
-        Ok(report) => all["report"] = value(report),
+        Ok(report) => all["report"] = report_value(report),
         Err(failure) => all["error"] = failure.value()["error"].clone(),
     }
     all
+}
+
+/// For programs.
+pub(super) fn report_value(report: &Report) -> Value {
+    let seconds = |time: Duration| (time.as_secs_f64() * 1000.0).round() / 1000.0;
+    json!({
+        "size": report.program_size,
+        "crc": report.program_crc,
+        "blocks_repeated": report.repeats,
+        "seconds": seconds(report.took),
+        "transfer_seconds": seconds(report.transfer),
+        "transfer": match report.transfers {
+            Transfers::Blocks => "blocks",
+            Transfers::Segments => "segments",
+        },
+        "running": report.running.map(|running| running.0),
+        "dialect": report.dialect.name(),
+    })
 }
 
 #[cfg(test)]

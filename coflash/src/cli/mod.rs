@@ -4,13 +4,13 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
-use coflash::adapter::{self, Adapter, SdoIds, Trace};
-use coflash::link::Link;
 
-use self::output::{Failure, Output, EXIT_CODES};
+use self::context::Context;
+use self::output::{Failure, Output, EXIT_CODES, GLOBAL};
 use self::values::base_id;
 
 mod config;
+mod context;
 mod convert;
 mod debug;
 mod device;
@@ -32,9 +32,6 @@ mod reset;
 mod scan;
 mod shell;
 mod values;
-
-/// Under this the options that all commands have are listed.
-const GLOBAL: &str = "For all commands";
 
 /// Converts firmware and flashes it over CANopen.
 #[derive(Debug, Parser)]
@@ -113,9 +110,9 @@ impl Command {
             Self::Lss(lss) => lss.run(context),
             Self::Debug(debug) => debug.run(context),
             Self::Monitor(monitor) => monitor.run(context),
-            Self::Shell(shell) => shell.run(context),
-            Self::Completions(completions) => completions.run(),
-            Self::Man(manual) => manual.run(context),
+            Self::Shell(shell) => shell.run(context, shell_line),
+            Self::Completions(completions) => completions.run(Cli::command()),
+            Self::Man(manual) => manual.run(context, Cli::command()),
         }
     }
 }
@@ -176,75 +173,42 @@ fn command_line() -> Result<Cli, Failure> {
     Cli::from_arg_matches_mut(&mut matches).map_err(|error| Failure::bare_usage(error.to_string()))
 }
 
+/// Runs one line of the shell.
+fn shell_line(context: &Context, words: Vec<String>) -> Result<(), Failure> {
+    let words = std::iter::once("coflash".to_string()).chain(words);
+    let read = configured(context.config.clone())?
+        .try_get_matches_from(words)
+        .and_then(|mut matches| Cli::from_arg_matches_mut(&mut matches));
+    let cli = match read {
+        Ok(cli) => cli,
+        Err(error) if !error.use_stderr() => {
+            // Help that was asked for.
+            context.out.say(error.to_string().trim_end());
+            return Ok(());
+        }
+        Err(error) => return Err(Failure::bare_usage(error.to_string())),
+    };
+    if matches!(cli.command, Command::Shell(_)) {
+        return Err(Failure::usage("this is the shell already", "leave the word shell out"));
+    }
+    let line = cli.context();
+    // What the line does not say, the shell's own command line does.
+    let line = Context {
+        bus: line.bus.or_else(|| context.bus.clone()),
+        trace: line.trace.or_else(|| context.trace.clone()),
+        sdo_request: line.sdo_request.or(context.sdo_request),
+        sdo_response: line.sdo_response.or(context.sdo_response),
+        config: context.config.clone(),
+        out: line.out.or(context.out),
+    };
+    cli.command.run(&line)
+}
+
 /// The commands and their options, with defaults from the configuration file.
 fn configured(named: Option<PathBuf>) -> Result<clap::Command, Failure> {
     match config::find(named) {
         Some(path) => config::apply(Cli::command(), &path),
         None => Ok(Cli::command()),
-    }
-}
-
-/// What every command is given.
-struct Context {
-    /// What `--bus`, `COFLASH_BUS` or the configuration says.
-    bus: Option<String>,
-    trace: Option<PathBuf>,
-    /// COB-IDs of SDO requests and answers, without the node-ID, where they are not the usual ones.
-    sdo_request: Option<u16>,
-    sdo_response: Option<u16>,
-    /// The configuration file that `--config` or `COFLASH_CONFIG` names.
-    config: Option<PathBuf>,
-    out: Output,
-}
-
-impl Context {
-    /// The CAN bus.
-    fn open(&self) -> Result<Box<dyn Adapter>, Failure> {
-        let adapter = adapter::open(self.url(self.bus.as_deref())?)?;
-        self.traced(adapter)
-    }
-
-    /// A way to devices: the CAN bus, or a gateway.
-    fn link(&self) -> Result<Link, Failure> {
-        self.link_at(self.bus.as_deref(), None)
-    }
-
-    /// The same to this bus, at this bit rate if the URL names none and the adapter sets it.
-    fn link_at(&self, bus: Option<&str>, bit_rate: Option<u32>) -> Result<Link, Failure> {
-        match Link::open(self.url(bus)?, bit_rate)? {
-            Link::Bus(adapter) => Ok(Link::Bus(self.traced(adapter)?)),
-            gateway => {
-                if self.trace.is_some() {
-                    self.out.warn("a gateway shows no frames: nothing is traced");
-                }
-                Ok(gateway)
-            }
-        }
-    }
-
-    fn url<'u>(&self, bus: Option<&'u str>) -> Result<&'u str, Failure> {
-        bus.ok_or_else(|| {
-            let advice = format!("give --bus URL or set COFLASH_BUS; known are {}", adapter::URLS);
-            Failure::usage("it is not said on which CAN bus the device is", advice)
-        })
-    }
-
-    fn traced(&self, adapter: Box<dyn Adapter>) -> Result<Box<dyn Adapter>, Failure> {
-        let traced: Box<dyn Adapter> = match &self.trace {
-            Some(path) => {
-                let (out, name) = (self.out, path.display().to_string());
-                let failed =
-                    move |error| out.warn(format_args!("{name}: cannot be written any more: {error}"));
-                Box::new(Trace::new(adapter, path, Box::new(failed))?)
-            }
-            None => adapter,
-        };
-        Ok(match (self.sdo_request, self.sdo_response) {
-            (None, None) => traced,
-            (request, response) => {
-                Box::new(SdoIds::new(traced, request.unwrap_or(0x600), response.unwrap_or(0x580)))
-            }
-        })
     }
 }
 

@@ -8,14 +8,14 @@ use std::time::Duration;
 
 use canopen::{Frame, NodeId};
 use clap::Args;
-use coflash::candump::Line;
-use coflash::decode::Decoder;
+use coflash::bus::candump::Line;
+use coflash::bus::decode::Decoder;
 use serde_json::json;
 
+use super::context::Context;
 use super::device::cancelled;
 use super::output::Failure;
 use super::values::{milliseconds, nodes};
-use super::Context;
 
 /// Shows what goes over the bus, in words: SDO, NMT, EMCY, heartbeat, LSS. Ctrl-C ends it.
 #[derive(Debug, Args)]

@@ -7,20 +7,19 @@ use std::path::Path;
 use canopen::NodeId;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::Args;
-use coflash::adapter::AdapterError;
-use coflash::convert::ConvertError;
-use coflash::diagnose::diagnose;
-use coflash::error::LssFailure;
-use coflash::flash::DeviceState;
-use coflash::job::Fault;
-use coflash::legacy;
-use coflash::read::FileError;
-use coflash::session::Session;
+use coflash::bus::AdapterError;
+use coflash::device::diagnose::diagnose;
+use coflash::device::error::LssFailure;
+use coflash::device::{legacy, Session};
+use coflash::file::convert::ConvertError;
+use coflash::file::FileError;
+use coflash::update::job::Fault;
+use coflash::update::DeviceState;
 use coflash::Error;
 use serde_json::{json, Value};
 
-use super::flash::state_word;
-use super::GLOBAL;
+/// Under this the options that all commands have are listed.
+pub(super) const GLOBAL: &str = "For all commands";
 
 /// How much is said, and in which form. For all commands.
 #[derive(Clone, Copy, Debug, Default, Args)]
@@ -312,7 +311,7 @@ impl Failure {
                 "number": self.number.map(|number| format!("{number:#010x}")),
                 "exit": self.exit as u8,
                 "what": self.what,
-                "device": self.left.map(state_word),
+                "device": self.left.map(DeviceState::name),
                 "advice": self.advice,
             }
         })

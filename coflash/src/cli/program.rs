@@ -2,18 +2,17 @@
 
 use canopen::program::ProgramState;
 use clap::Args;
-use coflash::flash::{
-    call_back, enter_bootloader, erase_at_once, find, reset_status, sign, start, unsign, Event,
-};
-use coflash::info::{program_info, ProgramInfo};
-use coflash::session::Session;
+use coflash::device::info::{program_info, ProgramInfo};
+use coflash::device::Session;
+use coflash::update::steps::{call_back, enter_bootloader, erase_at_once, reset_status, sign, start, unsign};
+use coflash::update::Event;
 use coflash::Error;
 use serde_json::{json, Value};
 
+use super::context::Context;
 use super::device::Program;
 use super::info::status;
 use super::output::Failure;
-use super::Context;
 
 /// Starts the program, and waits until it answers.
 #[derive(Debug, Args)]
@@ -86,7 +85,7 @@ fn with(
 impl Start {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         with(context, "start", &self.program, |session, number, tell| {
-            let running = find(session)?;
+            let running = session.find()?;
             tell(Event::Found(running));
             if !running.is_bootloader() {
                 if runs(session, number)? {
@@ -105,7 +104,7 @@ impl Start {
 impl Enter {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         with(context, "enter", &self.program, |session, _, tell| {
-            let running = find(session)?;
+            let running = session.find()?;
             tell(Event::Found(running));
             let words = if running.is_bootloader() {
                 "the bootloader is running already"
@@ -134,7 +133,7 @@ impl Sign {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         with(context, "sign", &self.program, |session, number, tell| {
             // Nobody there is told at once; a command that goes unanswered is waited for.
-            tell(Event::Found(find(session)?));
+            tell(Event::Found(session.find()?));
             sign(session, number, tell)?;
             Ok((format!("program {number} is signed: it starts by itself from now on"), json!({})))
         })
@@ -144,7 +143,7 @@ impl Sign {
 impl Unsign {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         with(context, "unsign", &self.program, |session, number, tell| {
-            tell(Event::Found(find(session)?));
+            tell(Event::Found(session.find()?));
             unsign(session, number)?;
             let words =
                 format!("program {number} is not signed any more: the device stays in the bootloader");
@@ -156,7 +155,7 @@ impl Unsign {
 impl Status {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         with(context, "status", &self.program, |session, number, tell| {
-            let running = find(session)?;
+            let running = session.find()?;
             tell(Event::Found(running));
             if self.clear {
                 reset_status(session, number)?;

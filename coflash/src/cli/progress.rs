@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use coflash::flash::Event;
+use coflash::update::Event;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 const STYLE: &str = "{bar:40} {percent:>3} %  {bytes} of {total_bytes}, {bytes_per_sec}, {eta} left";

@@ -4,13 +4,14 @@ use std::path::PathBuf;
 
 use canopen::Address;
 use clap::{Args, ValueEnum};
-use coflash::dialect::{read_locked, Dialect};
+use coflash::device::Dialect;
+use coflash::update::dialect::read_locked;
 use serde_json::json;
 
+use super::context::Context;
 use super::device::Device;
 use super::dialect::Access;
 use super::output::Failure;
-use super::Context;
 
 /// Reads an object, or a program where the device allows it (1F50/1).
 ///

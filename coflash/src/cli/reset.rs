@@ -5,13 +5,13 @@ use std::time::Duration;
 use canopen::nmt::{parse_state_message, NmtCommand, NmtState};
 use canopen::NodeId;
 use clap::Args;
-use coflash::scan::listen;
+use coflash::device::listen;
 use serde_json::json;
 
+use super::context::Context;
 use super::device::cancelled;
 use super::output::Failure;
 use super::values::{milliseconds, node_id};
-use super::Context;
 
 /// Resets a device, or all of them, and shows who comes back.
 ///

@@ -5,15 +5,16 @@ use std::time::Duration;
 
 use canopen::NodeId;
 use clap::Args;
-use coflash::decode::state_words;
-use coflash::scan::{scan, Found, ScanOptions};
-use coflash::session::Timing;
+use coflash::bus::decode::state_words;
+use coflash::device::scan::{scan, Found, ScanOptions};
+use coflash::device::Timing;
 use serde_json::{json, Value};
 
+use super::context::Context;
 use super::device::cancelled;
+use super::info;
 use super::output::Failure;
 use super::values::{milliseconds, nodes};
-use super::{info, Context};
 
 /// Shows who is on the bus: asks all node-IDs by SDO, and listens for heartbeats.
 ///
@@ -40,12 +41,11 @@ pub(super) struct Scan {
 
 impl Scan {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        let options = ScanOptions {
-            nodes: self.nodes.concat(),
-            listen: self.listen,
-            timing: Timing { sdo: self.sdo_timeout, ..Timing::default() },
-            ask: !self.listen_only,
-        };
+        let options = ScanOptions::default()
+            .nodes(self.nodes.concat())
+            .listen(self.listen)
+            .timing(Timing::default().sdo(self.sdo_timeout))
+            .ask(!self.listen_only);
         let mut adapter = context.open()?;
         context.out.detail("asking and listening");
         let found = scan(&mut *adapter, &options, &cancelled()?)?;

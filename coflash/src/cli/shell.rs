@@ -4,13 +4,13 @@ use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
-use clap::{Args, FromArgMatches};
+use clap::Args;
 use rustyline::error::ReadlineError;
 use rustyline::DefaultEditor;
 
+use super::context::Context;
 use super::device::cancelled;
 use super::output::Failure;
-use super::{Cli, Command, Context};
 
 /// Reads commands from the keyboard, with history; or from standard input, one a line.
 ///
@@ -19,8 +19,12 @@ use super::{Cli, Command, Context};
 #[derive(Debug, Args)]
 pub(super) struct Shell {}
 
+/// What runs one line, given in words.
+pub(super) type Runner = fn(&Context, Vec<String>) -> Result<(), Failure>;
+
 impl Shell {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+    /// Reads commands and has each of them run by `command`.
+    pub(super) fn run(&self, context: &Context, command: Runner) -> Result<(), Failure> {
         let interactive = std::io::stdin().is_terminal();
         let history = interactive.then(history_file).flatten();
         let mut editor =
@@ -60,37 +64,6 @@ impl Shell {
         }
         Ok(())
     }
-}
-
-/// Runs one line.
-fn command(context: &Context, words: Vec<String>) -> Result<(), Failure> {
-    let words = std::iter::once("coflash".to_string()).chain(words);
-    let read = super::configured(context.config.clone())?
-        .try_get_matches_from(words)
-        .and_then(|mut matches| Cli::from_arg_matches_mut(&mut matches));
-    let cli = match read {
-        Ok(cli) => cli,
-        Err(error) if !error.use_stderr() => {
-            // Help that was asked for.
-            context.out.say(error.to_string().trim_end());
-            return Ok(());
-        }
-        Err(error) => return Err(Failure::bare_usage(error.to_string())),
-    };
-    if matches!(cli.command, Command::Shell(_)) {
-        return Err(Failure::usage("this is the shell already", "leave the word shell out"));
-    }
-    let line = cli.context();
-    // What the line does not say, the shell's own command line does.
-    let line = Context {
-        bus: line.bus.or_else(|| context.bus.clone()),
-        trace: line.trace.or_else(|| context.trace.clone()),
-        sdo_request: line.sdo_request.or(context.sdo_request),
-        sdo_response: line.sdo_response.or(context.sdo_response),
-        config: context.config.clone(),
-        out: line.out.or(context.out),
-    };
-    cli.command.run(&line)
 }
 
 /// Words between blanks; quotes hold blanks together.

@@ -10,7 +10,7 @@ use std::io;
 use std::time::Duration;
 
 use canopen::{CobId, Frame};
-use coflash::adapter::{Adapter, AdapterError};
+use coflash::bus::{Adapter, AdapterError};
 
 pub const NODE: u8 = 5;
 pub const APPLICATION: u32 = 0x0002_0192;

@@ -11,8 +11,8 @@ use canopen::program::{ProgramControl, DEVICE_NAME, PROGRAM_ID, SOFTWARE_VERSION
 use canopen::Address;
 use coboot_tests::bench::{Bench, BIT_RATE, NODE};
 use coboot_tests::firmware;
-use coflash::block_file::BlockFile;
-use coflash::flash::{flash, Event, FlashOptions};
+use coflash::file::block_file::BlockFile;
+use coflash::update::{flash, Event, FlashOptions};
 use emulator::candump;
 use emulator::time::Time;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};

@@ -12,8 +12,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::Mutex;
 
 use canopen::{Address, BitRate};
-use coflash::block_file::BlockFile;
-use coflash::flash::{flash, FlashOptions};
+use coflash::file::block_file::BlockFile;
+use coflash::update::{flash, FlashOptions};
 use emulator::machine::{Cut, FlashCut, Machine, Options, ResetCause, Stop};
 
 use super::points::{Report, TOLD};

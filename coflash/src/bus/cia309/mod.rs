@@ -1,0 +1,402 @@
+//! Gateways of CiA 309-3: commands and answers as lines of text over TCP.
+//!
+//! | command | answer |
+//! |---|---|
+//! | `[7] 1 5 r 0x1018 4 d` | `[7] VNLxKQ==` |
+//! | `[8] 1 5 w 0x1F51 1 u8 0x80` | `[8] OK` |
+//! | `[9] 1 5 reset node` | `[9] OK` |
+//! | `[10] 1 set sdo_timeout 500` | `[10] OK` |
+//! | any | `[7] ERROR:0x06020000`, an SDO abort; `[7] ERROR:106`, an error of the gateway |
+//!
+//! A number in front goes with each command and comes back with its answer; then come network and
+//! node. Values are read as domains (`d`), which are base64, whatever they are: so the bytes are those
+//! of the SDO transfer. Lines without a number are events of the network, such as `1 5 ERROR 205`, a
+//! boot-up. Lines end with CR LF.
+//!
+//! Spoken so by CANopenNode's `canopend` and by Lely's `coctl` tools.
+
+use std::collections::BTreeSet;
+use std::io::{self, ErrorKind, Read, Write};
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+use canopen::{AbortCode, NodeId};
+
+use self::line::{Line, ERROR};
+use super::adapter::AdapterError;
+use super::gateway::{Ask, Gateway, GatewayError};
+use super::tcp;
+
+mod base64;
+mod line;
+
+/// Of canopend; the standard names none.
+const DEFAULT_PORT: u16 = 60_000;
+/// How long a read or write of the socket waits in one piece.
+const SLICE: Duration = Duration::from_millis(50);
+/// So much of a long command is handed over in one piece.
+const PIECE: usize = 4096;
+/// A gateway that answers a command about itself does so at once.
+const AT_ONCE: Duration = Duration::from_secs(5);
+/// More than any value that is read as a whole has as text.
+const LONGEST_LINE: usize = 100 * 1024 * 1024;
+/// No time-out of SDO is longer: 16 bits of milliseconds.
+const LONGEST_TIMEOUT: u128 = 0xFFFF;
+/// From here on a code is that of an SDO abort.
+const ABORTS: u32 = 0x0503_0000;
+
+/// A connection to a gateway, and one network behind it.
+#[derive(Debug)]
+pub struct Cia309 {
+    stream: TcpStream,
+    name: String,
+    network: u16,
+    opened: Instant,
+    /// The number of the last command.
+    sequence: u32,
+    /// Commands that were given up: their answers may still come.
+    given_up: BTreeSet<u32>,
+    /// What has come and was not looked at yet.
+    inbox: Vec<u8>,
+    /// How much of it is known to have no end of a line.
+    searched: usize,
+    /// The SDO time-out that the gateway was told last.
+    timeout: Option<Duration>,
+}
+
+/// `//HOST:PORT/NET`, where NET is 1 unless told otherwise.
+pub(super) fn open(url: &str, rest: &str) -> Result<Cia309, AdapterError> {
+    let bad = |why| AdapterError::Url { url: url.to_string(), why };
+    let rest = rest.strip_prefix("//").ok_or_else(|| bad("it must be cia309://HOST:PORT/NET"))?;
+    let (server, network) = rest.split_once('/').unwrap_or((rest, "1"));
+    let graphic = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_ascii_graphic());
+    if !graphic(server) {
+        return Err(bad("it must be cia309://HOST:PORT/NET"));
+    }
+    let digits = network.bytes().all(|digit| digit.is_ascii_digit());
+    let network = network.parse().ok().filter(|_| digits);
+    Cia309::connect(server, network.ok_or_else(|| bad("its network must be a number from 0 to 65535"))?)
+}
+
+impl Cia309 {
+    /// Connects to a gateway at `host:port`.
+    ///
+    /// # Errors
+    /// [`AdapterError::Open`].
+    pub fn connect(server: &str, network: u16) -> Result<Self, AdapterError> {
+        let name = format!("CiA 309-3 gateway {server}");
+        let open = |source| AdapterError::Open { adapter: name.clone(), source };
+        let stream = tcp::connect(server, Some(DEFAULT_PORT)).map_err(open)?;
+        stream.set_nodelay(true).map_err(open)?;
+        stream.set_read_timeout(Some(SLICE)).map_err(open)?;
+        stream.set_write_timeout(Some(SLICE)).map_err(open)?;
+        Ok(Self {
+            stream,
+            name,
+            network,
+            opened: Instant::now(),
+            sequence: 0,
+            given_up: BTreeSet::new(),
+            inbox: Vec::new(),
+            searched: 0,
+            timeout: None,
+        })
+    }
+
+    fn lost(&self, source: io::Error) -> AdapterError {
+        AdapterError::Lost { adapter: self.name.clone(), source }
+    }
+
+    fn protocol(&self, said: &str) -> AdapterError {
+        let shown: String = said.chars().filter(|c| !c.is_control()).take(80).collect();
+        AdapterError::Protocol { adapter: self.name.clone(), said: shown }
+    }
+
+    fn failed(&self, what: String) -> AdapterError {
+        AdapterError::Gateway { adapter: self.name.clone(), what }
+    }
+
+    /// Sends a command; its number is in front.
+    fn command(
+        &mut self,
+        words: &str,
+        ask: &Wait<'_>,
+        mut taken: impl FnMut(usize),
+    ) -> Result<u32, GatewayError> {
+        self.sequence = self.sequence.wrapping_add(1);
+        let sequence = self.sequence;
+        self.given_up.insert(sequence);
+        let text = format!("[{sequence}] {} {words}\r\n", self.network);
+        let mut rest = text.as_bytes();
+        let mut deadline = Instant::now() + ask.patience;
+        while !rest.is_empty() {
+            match self.stream.write(&rest[..rest.len().min(PIECE)]) {
+                Ok(0) => return Err(self.lost(ErrorKind::WriteZero.into()).into()),
+                Ok(len) => {
+                    rest = &rest[len..];
+                    deadline = Instant::now() + ask.patience;
+                    taken(text.len() - rest.len());
+                }
+                Err(error) if waits(&error) => {}
+                Err(error) => return Err(self.lost(error).into()),
+            }
+            if rest.is_empty() {
+                break;
+            }
+            if (ask.cancelled)() {
+                return Err(self.hang_up());
+            }
+            if Instant::now() >= deadline {
+                let seconds = ask.patience.as_secs_f64();
+                return Err(self.failed(format!("it has taken nothing for {seconds:.1} s")).into());
+            }
+        }
+        Ok(sequence)
+    }
+
+    /// Ends the connection in the middle of a command: nothing else ends a transfer of the gateway.
+    fn hang_up(&self) -> GatewayError {
+        // Whether it is gone already is all the same.
+        let _ = self.stream.shutdown(std::net::Shutdown::Both);
+        GatewayError::Cancelled
+    }
+
+    /// Waits for the answer to a command. `arrived` is told how much of it is here.
+    fn answer(
+        &mut self,
+        sequence: u32,
+        wait: &Wait<'_>,
+        whole: bool,
+        mut arrived: impl FnMut(usize),
+    ) -> Result<String, GatewayError> {
+        let mut deadline = Instant::now() + wait.patience;
+        let mut known = self.inbox.len();
+        let mut begun: Option<String> = None;
+        loop {
+            if let Some((text, ended)) = self.line()? {
+                match self.parse(&text)? {
+                    Line::Answer(number, answer)
+                        if number == sequence && (ended || !whole || answer.starts_with(ERROR)) =>
+                    {
+                        self.given_up.remove(&sequence);
+                        return Ok(answer);
+                    }
+                    // Half a line: what broke it off follows.
+                    Line::Answer(number, answer) if number == sequence => begun = Some(answer),
+                    Line::Broken(error) if begun.is_some() => {
+                        self.given_up.remove(&sequence);
+                        return Ok(error);
+                    }
+                    Line::Answer(number, _) if number != sequence && self.given_up.remove(&number) => {}
+                    Line::Answer(..) | Line::Broken(_) => {
+                        let said = format!("'{text}', while command [{sequence}] waits for its answer");
+                        return Err(self.protocol(&said).into());
+                    }
+                    Line::BootUp(..) | Line::Event => {}
+                }
+                continue;
+            }
+            if self.inbox.len() > known {
+                deadline = Instant::now() + wait.patience;
+                arrived(self.inbox.len());
+            }
+            known = self.inbox.len();
+            if (wait.cancelled)() {
+                return Err(GatewayError::Cancelled);
+            }
+            if Instant::now() >= deadline {
+                let seconds = wait.patience.as_secs_f64();
+                return Err(self.failed(format!("it has not answered for {seconds:.1} s")).into());
+            }
+            self.receive()?;
+        }
+    }
+
+    /// Takes what the socket has, and waits a little for it.
+    fn receive(&mut self) -> Result<(), AdapterError> {
+        let mut bytes = [0; 16 * 1024];
+        match self.stream.read(&mut bytes) {
+            Ok(0) => Err(self.lost(ErrorKind::UnexpectedEof.into())),
+            Ok(len) if self.inbox.len() + len > LONGEST_LINE => Err(self.protocol("a line without end")),
+            Ok(len) => {
+                self.inbox.extend_from_slice(&bytes[..len]);
+                Ok(())
+            }
+            Err(error) if waits(&error) => Ok(()),
+            Err(error) => Err(self.lost(error)),
+        }
+    }
+
+    /// The next line that is complete, and whether CR stood before its LF.
+    fn line(&mut self) -> Result<Option<(String, bool)>, AdapterError> {
+        loop {
+            let end = self.inbox[self.searched..].iter().position(|byte| *byte == b'\n');
+            let Some(end) = end.map(|end| end + self.searched) else {
+                self.searched = self.inbox.len();
+                return Ok(None);
+            };
+            self.searched = 0;
+            let mut line: Vec<u8> = self.inbox.drain(..=end).collect();
+            line.pop();
+            let ended = line.pop_if(|byte| *byte == b'\r').is_some();
+            let Ok(text) = String::from_utf8(line) else {
+                return Err(self.protocol("bytes that are no text"));
+            };
+            if !text.trim().is_empty() {
+                return Ok(Some((text, ended)));
+            }
+        }
+    }
+
+    fn parse(&self, text: &str) -> Result<Line, AdapterError> {
+        line::parse(text).ok_or_else(|| self.protocol(text))
+    }
+
+    /// What an answer says that is an error.
+    fn error(&self, answer: &str) -> Option<GatewayError> {
+        Some(match line::error(answer)? {
+            Some(103) => GatewayError::NoAnswer,
+            Some(code) if AbortCode(code) == AbortCode::TIMEOUT => GatewayError::NoAnswer,
+            Some(code) if code >= ABORTS => GatewayError::Abort(AbortCode(code)),
+            Some(code) => self.failed(self.refusal(code)).into(),
+            None => self.protocol(answer).into(),
+        })
+    }
+
+    /// The error codes of CiA 309-3 that a command of this tool can draw.
+    fn refusal(&self, code: u32) -> String {
+        let what = match code {
+            100 => "it does not support the request".to_string(),
+            101 => "it does not understand the request".to_string(),
+            102 => "its state does not allow the request".to_string(),
+            104 => "it wants a default network".to_string(),
+            105 => "it wants a default node".to_string(),
+            106 => format!("it has no network {}", self.network),
+            107 => "it does not reach this node-ID".to_string(),
+            301 => "it is off the bus".to_string(),
+            303 => "its buffer for CAN frames has overflowed".to_string(),
+            600 => "it has no memory left".to_string(),
+            _ => "it refuses".to_string(),
+        };
+        format!("{what} (error {code} of CiA 309-3)")
+    }
+
+    /// Tells the gateway how long a node may take. One that cannot be told keeps its own time.
+    fn set_timeout(&mut self, ask: &Ask<'_>) -> Result<(), GatewayError> {
+        if self.timeout == Some(ask.sdo) {
+            return Ok(());
+        }
+        let wait = Wait { patience: AT_ONCE, cancelled: ask.cancelled };
+        let words = format!("set sdo_timeout {}", ask.sdo.as_millis().clamp(1, LONGEST_TIMEOUT));
+        let sequence = self.command(&words, &wait, |_| {})?;
+        let answer = self.answer(sequence, &wait, false, |_| {})?;
+        match self.error(&answer) {
+            Some(GatewayError::Adapter(AdapterError::Gateway { .. })) | None => {}
+            Some(error) => return Err(error),
+        }
+        self.timeout = Some(ask.sdo);
+        Ok(())
+    }
+
+    /// What came of a command that gives no value.
+    fn done(&self, answer: &str) -> Result<(), GatewayError> {
+        match self.error(answer) {
+            Some(error) => Err(error),
+            None if answer.starts_with("OK") => Ok(()),
+            None => Err(self.protocol(answer).into()),
+        }
+    }
+}
+
+/// How long to wait for the gateway, and until when.
+struct Wait<'c> {
+    patience: Duration,
+    cancelled: &'c dyn Fn() -> bool,
+}
+
+impl<'c> From<&Ask<'c>> for Wait<'c> {
+    fn from(ask: &Ask<'c>) -> Self {
+        Self { patience: ask.patience, cancelled: ask.cancelled }
+    }
+}
+
+/// Whether the socket has nothing to say at present.
+fn waits(error: &io::Error) -> bool {
+    matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
+}
+
+impl Gateway for Cia309 {
+    fn upload(&mut self, ask: &Ask<'_>, progress: &mut dyn FnMut(u32)) -> Result<Vec<u8>, GatewayError> {
+        self.set_timeout(ask)?;
+        let words = format!("{} r {:#06X} {} d", ask.node, ask.at.index, ask.at.sub);
+        let wait = Wait::from(ask);
+        let sequence = self.command(&words, &wait, |_| {})?;
+        let answer = self.answer(sequence, &wait, true, |text| progress((text / 4 * 3) as u32))?;
+        if let Some(error) = self.error(&answer) {
+            return Err(error);
+        }
+        base64::decode(answer.as_bytes()).ok_or_else(|| {
+            let said = format!("'{answer}', which is no domain in base64");
+            self.protocol(&said).into()
+        })
+    }
+
+    fn download(
+        &mut self,
+        ask: &Ask<'_>,
+        data: &[u8],
+        progress: &mut dyn FnMut(u32),
+    ) -> Result<(), GatewayError> {
+        self.set_timeout(ask)?;
+        let number = || data.iter().rev().fold(0_u64, |number, byte| number << 8 | u64::from(*byte));
+        let value = match data.len() {
+            length @ (1 | 2 | 4) => format!("u{} {:#X}", length * 8, number()),
+            _ => format!("d {}", base64::encode(data)),
+        };
+        let words = format!("{} w {:#06X} {} {value}", ask.node, ask.at.index, ask.at.sub);
+        let wait = Wait::from(ask);
+        let sequence = self.command(&words, &wait, |taken| {
+            progress((taken / 4 * 3).min(data.len()) as u32);
+        })?;
+        let answer = self.answer(sequence, &wait, false, |_| {})?;
+        self.done(&answer)
+    }
+
+    fn reset_node(&mut self, node: NodeId) -> Result<(), GatewayError> {
+        let wait = Wait { patience: AT_ONCE, cancelled: &|| false };
+        let sequence = self.command(&format!("{node} reset node"), &wait, |_| {})?;
+        let answer = self.answer(sequence, &wait, false, |_| {})?;
+        self.done(&answer)
+    }
+
+    fn wait(&mut self, time: Duration) -> Result<Option<NodeId>, GatewayError> {
+        let deadline = Instant::now() + time;
+        loop {
+            while let Some((text, _)) = self.line()? {
+                match self.parse(&text)? {
+                    Line::BootUp(network, node) if network == u32::from(self.network) => {
+                        return Ok(Some(node))
+                    }
+                    Line::Answer(number, _) if !self.given_up.remove(&number) => {
+                        return Err(self.protocol(&format!("'{text}', which nobody asked")).into())
+                    }
+                    Line::Answer(..) | Line::Broken(_) | Line::BootUp(..) | Line::Event => {}
+                }
+            }
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Ok(None);
+            }
+            let slice = left.min(SLICE).max(Duration::from_millis(1));
+            let set = |stream: &TcpStream, time| stream.set_read_timeout(Some(time));
+            set(&self.stream, slice).map_err(|error| self.lost(error))?;
+            let received = self.receive();
+            set(&self.stream, SLICE).map_err(|error| self.lost(error))?;
+            received?;
+        }
+    }
+
+    fn now(&self) -> Duration {
+        self.opened.elapsed()
+    }
+}

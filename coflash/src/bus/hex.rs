@@ -1,0 +1,15 @@
+//! Hexadecimal digits, as the text protocols of adapters and logs have them.
+
+/// A number in hexadecimal digits and nothing else: no sign, no blank.
+pub(crate) fn hex_number(text: &str) -> Option<u32> {
+    let digits = !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_hexdigit());
+    digits.then(|| u32::from_str_radix(text, 16).ok()).flatten()
+}
+
+/// Bytes in pairs of hexadecimal digits and nothing else.
+pub(crate) fn hex_bytes(text: &str) -> Option<Vec<u8>> {
+    if !text.is_ascii() || !text.len().is_multiple_of(2) {
+        return None;
+    }
+    (0..text.len()).step_by(2).map(|at| hex_number(&text[at..at + 2]).map(|byte| byte as u8)).collect()
+}

@@ -1,0 +1,232 @@
+//! Several conversations over one adapter at once.
+//!
+//! Each conversation runs in a thread of its own with a [`Port`] as its adapter, and needs to know
+//! nothing of the others. The adapter stays where it is: while all conversations wait, the hub
+//! waits for them, and whoever got a frame, or whose time is over, goes on. Nothing runs beside the
+//! hub, so that the same answers give the same course of events.
+
+use std::collections::VecDeque;
+use std::io;
+use std::sync::mpsc::{channel, Receiver, Sender};
+use std::thread;
+use std::time::Duration;
+
+use canopen::{Frame, NodeId};
+
+use super::adapter::{Adapter, AdapterError};
+
+/// What a conversation does with its port; what it gives is gathered by [`run`].
+pub type Conversation<'c, R> = Box<dyn FnOnce(&mut Port) -> R + Send + 'c>;
+
+/// Frames that wait in the adapter may be the ones that are waited for: a conversation's time is
+/// over when there are none, or so much later.
+const GRACE: Duration = Duration::from_secs(1);
+
+/// What ports tell the hub.
+enum Ask {
+    Send(usize, Frame),
+    Receive { port: usize, until: Duration },
+    Gone(usize),
+}
+
+/// What the hub tells a port.
+struct Answer {
+    frame: Result<Option<Frame>, AdapterError>,
+    now: Duration,
+}
+
+/// A conversation's way to the bus: hears what concerns its node alone.
+#[derive(Debug)]
+pub struct Port {
+    number: usize,
+    now: Duration,
+    asks: Sender<Ask>,
+    answers: Receiver<Answer>,
+}
+
+impl Port {
+    /// The hub does not go before its ports; should it, that is a lost adapter.
+    fn hub_is_gone() -> AdapterError {
+        let source = io::Error::from(io::ErrorKind::BrokenPipe);
+        AdapterError::Lost { adapter: "the hub".to_string(), source }
+    }
+}
+
+impl Adapter for Port {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        // Should the adapter refuse it, the next wait tells.
+        self.asks.send(Ask::Send(self.number, *frame)).map_err(|_| Self::hub_is_gone())
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        let until = self.now + timeout;
+        self.asks.send(Ask::Receive { port: self.number, until }).map_err(|_| Self::hub_is_gone())?;
+        let Answer { frame, now } = self.answers.recv().map_err(|_| Self::hub_is_gone())?;
+        self.now = now;
+        frame
+    }
+
+    fn now(&self) -> Duration {
+        self.now
+    }
+}
+
+impl Drop for Port {
+    fn drop(&mut self) {
+        // If the hub is gone there is nobody to tell.
+        let _ = self.asks.send(Ask::Gone(self.number));
+    }
+}
+
+/// A port as the hub sees it.
+struct Line {
+    node: NodeId,
+    answers: Sender<Answer>,
+    state: State,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum State {
+    /// The conversation is at work, and will ask for something.
+    Running,
+    /// It waits for a frame.
+    Waiting {
+        until: Duration,
+    },
+    Gone,
+}
+
+/// Holds the conversations, each with one node and `at_once` of them at a time, and gives what they
+/// gave, in their order.
+///
+/// # Panics
+/// If a conversation does.
+pub fn run<'c, R: Send + 'c>(
+    adapter: &mut dyn Adapter,
+    conversations: Vec<(NodeId, Conversation<'c, R>)>,
+    at_once: usize,
+) -> Vec<R> {
+    let count = conversations.len();
+    let mut waiting: VecDeque<_> = conversations.into_iter().enumerate().collect();
+    let (asks, asked) = channel();
+    let (done, results) = channel();
+    let mut lines: Vec<Option<Line>> = (0..count).map(|_| None).collect();
+    thread::scope(|scope| {
+        let mut lost = None;
+        loop {
+            let busy = |line: &Option<Line>| line.as_ref().is_some_and(|line| line.state != State::Gone);
+            while lines.iter().filter(|line| busy(line)).count() < at_once.max(1) {
+                let Some((number, (node, conversation))) = waiting.pop_front() else { break };
+                let (answers, answered) = channel();
+                let mut port = Port { number, now: adapter.now(), asks: asks.clone(), answers: answered };
+                let done = done.clone();
+                lines[number] = Some(Line { node, answers, state: State::Running });
+                scope.spawn(move || {
+                    let result = conversation(&mut port);
+                    let _ = done.send((number, result));
+                });
+            }
+            if !lines.iter().any(busy) {
+                break;
+            }
+            settle(adapter, &asked, &mut lines, &mut lost);
+            serve(adapter, &mut lines, &mut lost);
+        }
+    });
+    drop(done);
+    let mut results: Vec<(usize, R)> = results.iter().collect();
+    results.sort_by_key(|(number, _)| *number);
+    results.into_iter().map(|(_, result)| result).collect()
+}
+
+/// Takes what the ports ask until all of them wait, and sends what they want to send: in the order
+/// of the ports, whoever was faster.
+fn settle(
+    adapter: &mut dyn Adapter,
+    asked: &Receiver<Ask>,
+    lines: &mut [Option<Line>],
+    lost: &mut Option<AdapterError>,
+) {
+    let running = |line: &Option<Line>| line.as_ref().is_some_and(|line| line.state == State::Running);
+    let mut frames: Vec<(usize, Frame)> = Vec::new();
+    while lines.iter().any(running) {
+        // The caller holds a sender, and each port tells when it goes: this comes to its end.
+        let Ok(ask) = asked.recv() else { return };
+        let (port, state) = match ask {
+            Ask::Send(port, frame) => {
+                frames.push((port, frame));
+                continue;
+            }
+            Ask::Receive { port, until } => (port, State::Waiting { until }),
+            Ask::Gone(port) => (port, State::Gone),
+        };
+        if let Some(line) = &mut lines[port] {
+            line.state = state;
+        }
+    }
+    frames.sort_by_key(|(port, _)| *port);
+    for (_, frame) in frames {
+        if lost.is_none() {
+            *lost = adapter.send(&frame).err();
+        }
+    }
+}
+
+/// Waits until somebody can go on, and lets them.
+fn serve(adapter: &mut dyn Adapter, lines: &mut [Option<Line>], lost: &mut Option<AdapterError>) {
+    let waiting = |line: &Line| match line.state {
+        State::Waiting { until } => Some(until),
+        State::Running | State::Gone => None,
+    };
+    let Some(earliest) = lines.iter().flatten().filter_map(waiting).min() else { return };
+    let received = match lost {
+        Some(error) => Err(copy(error)),
+        None => adapter.receive(earliest.saturating_sub(adapter.now())),
+    };
+    let now = adapter.now();
+    for line in lines.iter_mut().flatten() {
+        let Some(until) = waiting(line) else { continue };
+        let frame = match &received {
+            Ok(Some(frame)) if concerns(frame, line.node) => Ok(Some(*frame)),
+            Ok(Some(_)) if until + GRACE > now => continue,
+            Ok(None) if until > now => continue,
+            Ok(_) => Ok(None),
+            Err(error) => Err(copy(error)),
+        };
+        line.state = State::Running;
+        // A conversation that has ended meanwhile will say that it is gone.
+        let _ = line.answers.send(Answer { frame, now });
+    }
+    if let Err(error) = received {
+        lost.get_or_insert(error);
+    }
+}
+
+/// Whether a frame comes from this node: answer, heartbeat or emergency.
+fn concerns(frame: &Frame, node: NodeId) -> bool {
+    let from = |id: u16| id & 0x7F == u16::from(node.get()) && matches!(id & 0x780, 0x080 | 0x580 | 0x700);
+    frame.cob_id().is_some_and(|id| from(id.get()))
+}
+
+/// One loss is told to each conversation.
+fn copy(error: &AdapterError) -> AdapterError {
+    let again = |source: &io::Error| match source.raw_os_error() {
+        Some(code) => io::Error::from_raw_os_error(code),
+        None => io::Error::new(source.kind(), source.to_string()),
+    };
+    match error {
+        AdapterError::Url { url, why } => AdapterError::Url { url: url.clone(), why },
+        AdapterError::Open { adapter, source } => {
+            AdapterError::Open { adapter: adapter.clone(), source: again(source) }
+        }
+        AdapterError::Protocol { adapter, said } => {
+            AdapterError::Protocol { adapter: adapter.clone(), said: said.clone() }
+        }
+        AdapterError::Lost { adapter, source } => {
+            AdapterError::Lost { adapter: adapter.clone(), source: again(source) }
+        }
+        AdapterError::Gateway { adapter, what } => {
+            AdapterError::Gateway { adapter: adapter.clone(), what: what.clone() }
+        }
+    }
+}

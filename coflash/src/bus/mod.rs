@@ -1,0 +1,55 @@
+//! Ways to a CAN bus, and what goes over it.
+//!
+//! Here are frames, and nothing of what a device makes of them: that is [`device`](crate::device).
+
+pub mod adapter;
+pub mod candump;
+pub mod cia309;
+pub mod decode;
+pub mod gateway;
+mod hex;
+pub mod hub;
+mod link;
+mod open;
+mod sdo_ids;
+pub mod slcan;
+#[cfg(target_os = "linux")]
+mod socketcan;
+pub mod socketcand;
+mod tcp;
+mod trace;
+
+pub use self::adapter::{Adapter, AdapterError, URLS};
+pub use self::cia309::Cia309;
+pub use self::gateway::{Gateway, GatewayError};
+pub use self::link::Link;
+pub use self::open::{open, open_at};
+pub use self::sdo_ids::SdoIds;
+pub use self::slcan::{Line, Slcan};
+#[cfg(target_os = "linux")]
+pub use self::socketcan::SocketCan;
+pub use self::socketcand::Socketcand;
+pub use self::trace::{OnFailure, Trace};
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A bus can be opened here and used in another thread. Compiling this is the test.
+    #[test]
+    fn whatever_leads_to_a_bus_can_move_to_a_thread() {
+        fn moves<T: Send + 'static>() {}
+        moves::<Link>();
+        moves::<Box<dyn Adapter + Send>>();
+        moves::<Box<dyn Gateway + Send>>();
+        moves::<Slcan<std::net::TcpStream>>();
+        moves::<Slcan<Box<dyn serialport::SerialPort>>>();
+        moves::<Socketcand>();
+        #[cfg(target_os = "linux")]
+        moves::<SocketCan>();
+        moves::<Cia309>();
+        moves::<SdoIds<Box<dyn Adapter + Send>>>();
+        moves::<Trace<Box<dyn Adapter + Send>>>();
+        moves::<hub::Port>();
+    }
+}

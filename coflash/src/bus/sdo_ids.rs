@@ -1,0 +1,114 @@
+//! SDO on other identifiers than those of the predefined connection set.
+
+use std::time::Duration;
+
+use canopen::{CobId, Frame, NodeId};
+use embedded_can::Frame as _;
+
+use super::adapter::{Adapter, AdapterError};
+
+/// An adapter behind which devices listen to SDO requests, and answer them, on identifiers of their
+/// own (`BLCOP_BASE_REQUEST` and `BLCOP_BASE_RESPONSE` of the manual). To its user they are those of
+/// the predefined connection set, 600h and 580h with the node-ID on top.
+///
+/// What comes on 580h itself and its node-IDs is of devices that the user does not speak to, and is
+/// left out.
+#[derive(Debug)]
+pub struct SdoIds<A> {
+    adapter: A,
+    request: u16,
+    response: u16,
+}
+
+const REQUEST: u16 = 0x600;
+const RESPONSE: u16 = 0x580;
+
+impl<A: Adapter> SdoIds<A> {
+    /// Requests go to `request` and the node-ID on top, answers come from `response` and the node-ID
+    /// on top; both 80h to 780h.
+    pub fn new(adapter: A, request: u16, response: u16) -> Self {
+        Self { adapter, request, response }
+    }
+}
+
+/// The same frame with another base of its identifier; `None` if it has no node-ID above `from`.
+fn moved(frame: &Frame, from: u16, to: u16) -> Option<Frame> {
+    let node = frame.cob_id()?.get().checked_sub(from)?;
+    let node = NodeId::new(u8::try_from(node).ok()?)?;
+    Some(Frame::of(CobId::from_base(to, node)?, frame.data()))
+}
+
+impl<A: Adapter> Adapter for SdoIds<A> {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        match moved(frame, REQUEST, self.request) {
+            Some(request) => self.adapter.send(&request),
+            None => self.adapter.send(frame),
+        }
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        let until = self.now() + timeout;
+        loop {
+            let Some(frame) = self.adapter.receive(until.saturating_sub(self.now()))? else {
+                return Ok(None);
+            };
+            if let Some(answer) = moved(&frame, self.response, RESPONSE) {
+                return Ok(Some(answer));
+            }
+            if moved(&frame, RESPONSE, RESPONSE).is_none() {
+                return Ok(Some(frame));
+            }
+        }
+    }
+
+    fn now(&self) -> Duration {
+        self.adapter.now()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What was sent, and what comes.
+    #[derive(Default)]
+    struct Script {
+        sent: Vec<Option<CobId>>,
+        coming: Vec<Frame>,
+    }
+
+    impl Adapter for Script {
+        fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+            self.sent.push(frame.cob_id());
+            Ok(())
+        }
+
+        fn receive(&mut self, _timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+            Ok((!self.coming.is_empty()).then(|| self.coming.remove(0)))
+        }
+
+        fn now(&self) -> Duration {
+            Duration::ZERO
+        }
+    }
+
+    fn frame(id: u16, data: &[u8]) -> Frame {
+        Frame::of(CobId::new(id).unwrap(), data)
+    }
+
+    #[test]
+    fn sdo_goes_by_other_identifiers_and_all_else_as_it_is() {
+        let coming = vec![
+            frame(0x4AA, &[0x60, 0, 0, 0, 0, 0, 0, 0]),
+            // Another device, of the predefined connection set.
+            frame(0x5AA, &[0x60, 1, 1, 1, 1, 1, 1, 1]),
+            frame(0x72A, &[0x7F]),
+        ];
+        let mut adapter = SdoIds::new(Script { coming, ..Script::default() }, 0x680, 0x480);
+        adapter.send(&frame(0x62A, &[0x40, 0, 0x10, 0, 0, 0, 0, 0])).unwrap();
+        adapter.send(&frame(0x000, &[0x81, 0x2A])).unwrap();
+        assert_eq!(adapter.adapter.sent, [CobId::new(0x6AA), CobId::new(0x000)]);
+        let mut received = || adapter.receive(Duration::ZERO).unwrap().and_then(|frame| frame.cob_id());
+        assert_eq!([received(), received(), received()], [CobId::new(0x5AA), CobId::new(0x72A), None]);
+    }
+}

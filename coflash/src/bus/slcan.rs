@@ -1,0 +1,445 @@
+//! SLCAN: CAN frames as text over a serial line (Lawicel CAN232 manual, version 3), or over TCP.
+
+use std::io::{self, ErrorKind, Read, Write};
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+use canopen::Frame;
+use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
+
+use super::adapter::{Adapter, AdapterError};
+use super::hex::{hex_bytes, hex_number};
+use super::tcp::{connect, PATIENCE};
+
+/// How long an adapter may take to answer a command. Some never do, and work nevertheless.
+const ANSWER: Duration = Duration::from_millis(300);
+/// No message of the protocol comes near this length.
+const LONGEST_MESSAGE: usize = 64;
+/// The speed of a serial line; adapters on USB do not look at it.
+const BAUD: u32 = 115_200;
+
+/// The bit rates with their numbers (`S0` to `S8`).
+const BIT_RATES: [u32; 9] = [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000];
+
+/// What the text goes over.
+pub trait Line: Read + Write {
+    /// How long a read waits at most.
+    ///
+    /// # Errors
+    /// The line is gone.
+    fn set_timeout(&mut self, timeout: Duration) -> io::Result<()>;
+
+    /// The time, by the clock that the line's other end lives by.
+    fn now(&self) -> Instant {
+        Instant::now()
+    }
+}
+
+impl Line for TcpStream {
+    fn set_timeout(&mut self, timeout: Duration) -> io::Result<()> {
+        // Zero would mean for ever.
+        self.set_read_timeout(Some(timeout.max(Duration::from_micros(1))))
+    }
+}
+
+impl Line for Box<dyn serialport::SerialPort> {
+    fn set_timeout(&mut self, timeout: Duration) -> io::Result<()> {
+        (**self).set_timeout(timeout).map_err(io::Error::from)
+    }
+}
+
+/// An adapter that speaks SLCAN.
+#[derive(Debug)]
+pub struct Slcan<L: Line> {
+    line: L,
+    name: String,
+    opened: Instant,
+    /// What has arrived of a message that is not complete.
+    partial: Vec<u8>,
+    /// What has arrived and was not looked at yet.
+    rest: Vec<u8>,
+}
+
+/// A message of the adapter.
+#[derive(Debug, PartialEq, Eq)]
+enum Message {
+    /// A line, without its end.
+    Text(Vec<u8>),
+    /// It refuses (BEL).
+    Refused,
+}
+
+impl Slcan<TcpStream> {
+    /// Connects to an adapter, or a server that plays one, at `host:port`, and opens its bus.
+    ///
+    /// # Errors
+    /// [`AdapterError::Open`] or [`AdapterError::Protocol`].
+    pub fn connect(server: &str, bit_rate: Option<u32>) -> Result<Self, AdapterError> {
+        let name = format!("SLCAN adapter {server}");
+        let open = |source| AdapterError::Open { adapter: name.clone(), source };
+        let stream = connect(server, None).map_err(open)?;
+        stream.set_nodelay(true).map_err(open)?;
+        stream.set_write_timeout(Some(PATIENCE)).map_err(open)?;
+        Self::open(stream, name, bit_rate)
+    }
+}
+
+impl Slcan<Box<dyn serialport::SerialPort>> {
+    /// Opens the serial port `port` and the bus behind it.
+    ///
+    /// # Errors
+    /// [`AdapterError::Open`] or [`AdapterError::Protocol`].
+    pub fn serial(port: &str, bit_rate: Option<u32>) -> Result<Self, AdapterError> {
+        let name = format!("SLCAN adapter {port}");
+        let line = serialport::new(port, BAUD)
+            .timeout(PATIENCE)
+            .open()
+            .map_err(|error| AdapterError::Open { adapter: name.clone(), source: io::Error::from(error) })?;
+        Self::open(line, name, bit_rate)
+    }
+}
+
+impl<L: Line> Slcan<L> {
+    /// Opens the bus of the adapter at the other end of `line`, at `bit_rate` (bit/s) or at the one
+    /// that it has.
+    ///
+    /// # Errors
+    /// [`AdapterError::Protocol`] where the adapter refuses, [`AdapterError::Lost`] where it goes.
+    pub fn open(line: L, name: String, bit_rate: Option<u32>) -> Result<Self, AdapterError> {
+        let mut adapter = Self::opened(line, name);
+        // Whatever was under way before: end it, and close the bus. A bus that is closed already is
+        // refused, which is well.
+        adapter.send_text("\r\rC\r")?;
+        adapter.settle()?;
+        if let Some(rate) = bit_rate {
+            let Some(number) = BIT_RATES.iter().position(|known| *known == rate) else {
+                return Err(adapter.unexpected(format!("{rate} bit/s is none of its bit rates")));
+            };
+            adapter.command(&format!("S{number}\r"), "the bit rate")?;
+        }
+        adapter.command("O\r", "opening the bus")?;
+        Ok(adapter)
+    }
+
+    /// The adapter at the other end of `line`, whose bus is open already.
+    pub fn opened(line: L, name: String) -> Self {
+        Self { opened: line.now(), line, name, partial: Vec::new(), rest: Vec::new() }
+    }
+
+    /// Gives a command and waits for the answer, if one comes.
+    fn command(&mut self, text: &str, what: &str) -> Result<(), AdapterError> {
+        self.send_text(text)?;
+        let deadline = self.line.now() + ANSWER;
+        loop {
+            match self.message(deadline)? {
+                Some(Message::Refused) => return Err(self.unexpected(format!("it refuses {what}"))),
+                Some(Message::Text(text)) if text.is_empty() => return Ok(()),
+                // Frames may come as soon as the bus is open.
+                Some(Message::Text(_)) => {}
+                None => return Ok(()),
+            }
+        }
+    }
+
+    /// Reads what comes until nothing does.
+    fn settle(&mut self) -> Result<(), AdapterError> {
+        let end = self.line.now() + ANSWER;
+        while self.line.now() < end {
+            let quiet = self.line.now() + Duration::from_millis(50);
+            if self.message(quiet.min(end))?.is_none() {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    fn send_text(&mut self, text: &str) -> Result<(), AdapterError> {
+        let done = self.line.write_all(text.as_bytes()).and_then(|()| self.line.flush());
+        done.map_err(|error| self.lost(error))
+    }
+
+    /// The next message; `None` when the deadline has passed.
+    fn message(&mut self, deadline: Instant) -> Result<Option<Message>, AdapterError> {
+        loop {
+            if let Some(message) = self.take()? {
+                return Ok(Some(message));
+            }
+            let left = deadline.saturating_duration_since(self.line.now());
+            let mut bytes = [0; 4096];
+            // What is there already is taken even when the time is over.
+            let read = self.line.set_timeout(left).and_then(|()| self.line.read(&mut bytes));
+            match read {
+                Ok(0) => {
+                    let closed = io::Error::new(ErrorKind::ConnectionAborted, "the line was closed");
+                    return Err(self.lost(closed));
+                }
+                Ok(len) => self.rest.extend_from_slice(&bytes[..len]),
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {
+                    if deadline <= self.line.now() {
+                        return Ok(None);
+                    }
+                }
+                Err(error) => return Err(self.lost(error)),
+            }
+        }
+    }
+
+    /// A complete message from what has arrived.
+    fn take(&mut self) -> Result<Option<Message>, AdapterError> {
+        let mut taken = None;
+        let mut used = 0;
+        for byte in &self.rest {
+            used += 1;
+            match byte {
+                b'\r' => taken = Some(Message::Text(std::mem::take(&mut self.partial))),
+                0x07 => {
+                    self.partial.clear();
+                    taken = Some(Message::Refused);
+                }
+                b'\n' => {}
+                byte => self.partial.push(*byte),
+            }
+            if taken.is_some() || self.partial.len() > LONGEST_MESSAGE {
+                break;
+            }
+        }
+        self.rest.drain(..used);
+        if self.partial.len() > LONGEST_MESSAGE {
+            let said = String::from_utf8_lossy(&self.partial).escape_debug().to_string();
+            return Err(self.unexpected(format!("a message without end: '{said}'")));
+        }
+        Ok(taken)
+    }
+
+    fn lost(&self, source: io::Error) -> AdapterError {
+        AdapterError::Lost { adapter: self.name.clone(), source }
+    }
+
+    fn unexpected(&self, said: String) -> AdapterError {
+        AdapterError::Protocol { adapter: self.name.clone(), said }
+    }
+}
+
+impl<L: Line> Drop for Slcan<L> {
+    /// Closes the bus, so that the adapter does not fill up while nobody listens. If it is gone, so
+    /// be it.
+    fn drop(&mut self) {
+        let _ = self.send_text("C\r");
+    }
+}
+
+impl<L: Line> Adapter for Slcan<L> {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        self.send_text(&text_of(frame))
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        let deadline = self.line.now() + timeout;
+        while let Some(message) = self.message(deadline)? {
+            // Acknowledgements of what was sent (z, Z, empty) are not for us. A frame that the
+            // adapter refused is lost as one may be lost on the bus: it will be missed and
+            // repeated.
+            if let Message::Text(text) = message {
+                if let Some(frame) = parse_frame(&text) {
+                    return Ok(Some(frame));
+                }
+            }
+            if self.line.now() >= deadline {
+                break;
+            }
+        }
+        Ok(None)
+    }
+
+    fn now(&self) -> Duration {
+        self.line.now().saturating_duration_since(self.opened)
+    }
+}
+
+/// `t6018400010…`, `T1234567880…`, `r6018`, `R123456788`, with the line's end.
+fn text_of(frame: &Frame) -> String {
+    let (kind, id) = match (frame.id(), frame.is_remote_frame()) {
+        (Id::Standard(id), false) => ('t', format!("{:03X}", id.as_raw())),
+        (Id::Standard(id), true) => ('r', format!("{:03X}", id.as_raw())),
+        (Id::Extended(id), false) => ('T', format!("{:08X}", id.as_raw())),
+        (Id::Extended(id), true) => ('R', format!("{:08X}", id.as_raw())),
+    };
+    let data: String = frame.data().iter().map(|byte| format!("{byte:02X}")).collect();
+    format!("{kind}{id}{}{data}\r", frame.dlc())
+}
+
+/// The frame in a message. Four digits of time may follow it (the adapter's command `Z1`).
+fn parse_frame(text: &[u8]) -> Option<Frame> {
+    let text = std::str::from_utf8(text).ok().filter(|text| text.is_ascii())?;
+    let kind = text.chars().next()?;
+    let digits = match kind {
+        't' | 'r' => 3,
+        'T' | 'R' => 8,
+        _ => return None,
+    };
+    let number = hex_number(text.get(1..=digits)?)?;
+    let id: Id = if digits == 3 {
+        StandardId::new(u16::try_from(number).ok()?)?.into()
+    } else {
+        ExtendedId::new(number)?.into()
+    };
+    let dlc: usize = text.get(digits + 1..digits + 2)?.parse().ok().filter(|dlc| *dlc <= 8)?;
+    let rest = text.get(digits + 2..)?;
+    if kind.eq_ignore_ascii_case(&'r') {
+        return Frame::new_remote(id, dlc);
+    }
+    let data = rest.get(..2 * dlc)?;
+    if !matches!(rest.len() - data.len(), 0 | 4) {
+        return None;
+    }
+    Frame::new(id, &hex_bytes(data)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::VecDeque;
+
+    use canopen::CobId;
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn frame(id: u16, data: &[u8]) -> Frame {
+        Frame::of(CobId::new(id).unwrap(), data)
+    }
+
+    /// Examples of the CAN232 manual.
+    #[test]
+    fn messages_are_those_of_the_protocol() {
+        assert_eq!(text_of(&frame(0x100, &[0x11, 0x22, 0x33])), "t1003112233\r");
+        assert_eq!(text_of(&frame(0x7FF, &[])), "t7FF0\r");
+        assert_eq!(parse_frame(b"t10021133"), Some(frame(0x100, &[0x11, 0x33])));
+        assert_eq!(parse_frame(b"t100211330A1B"), Some(frame(0x100, &[0x11, 0x33])), "with time");
+        let extended = Frame::new(ExtendedId::new(0x100).unwrap(), &[0x11, 0x33]).unwrap();
+        assert_eq!(parse_frame(b"T0000010021133"), Some(extended));
+        assert_eq!(text_of(&extended), "T0000010021133\r");
+        let remote = Frame::new_remote(StandardId::new(0x100).unwrap(), 2).unwrap();
+        assert_eq!((parse_frame(b"r1002"), text_of(&remote)), (Some(remote), "r1002\r".to_string()));
+        for bad in [
+            &b""[..],
+            b"z",
+            b"Z",
+            b"V1013",
+            b"t",
+            b"t10",
+            b"t100",
+            b"t1009",
+            b"t10011",
+            b"t100111223",
+            b"t8000",
+            b"txyz0",
+            b"T200000000",
+            b"t100\xC3\xA91",
+            b"t1001+1",
+            b"t+121AA",
+        ] {
+            assert_eq!(parse_frame(bad), None, "{bad:?}");
+        }
+    }
+
+    /// An adapter that plays a script: each text that was written brings an answer.
+    #[derive(Debug, Default)]
+    struct Played {
+        answers: VecDeque<(&'static str, &'static [u8])>,
+        written: String,
+        incoming: VecDeque<u8>,
+        gone: bool,
+    }
+
+    impl Read for Played {
+        fn read(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
+            // One byte at a time: nobody may rely on more.
+            match self.incoming.pop_front() {
+                Some(byte) => bytes[0] = byte,
+                None if self.gone => return Ok(0),
+                None => return Err(ErrorKind::TimedOut.into()),
+            }
+            Ok(1)
+        }
+    }
+
+    impl Write for Played {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            self.written.push_str(std::str::from_utf8(bytes).unwrap());
+            while let Some((text, answer)) = self.answers.front() {
+                if !self.written.ends_with(text) {
+                    break;
+                }
+                self.incoming.extend(*answer);
+                self.answers.pop_front();
+            }
+            Ok(bytes.len())
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    impl Line for &mut Played {
+        fn set_timeout(&mut self, _: Duration) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    fn open(played: &mut Played, rate: Option<u32>) -> Result<Slcan<&mut Played>, AdapterError> {
+        Slcan::open(played, "SLCAN adapter test".to_string(), rate)
+    }
+
+    #[test]
+    fn a_session_sets_the_bit_rate_opens_and_closes() {
+        // The bus was closed already; the frame comes right behind the acknowledge.
+        let answers =
+            [("C\r", &b"\r\x07"[..]), ("S6\r", b"\r"), ("O\r", b"\rt70517F\r"), ("t6050\r", b"z\rt5850\r")];
+        let mut played = Played { answers: answers.into(), ..Played::default() };
+        let mut bus = open(&mut played, Some(500_000)).unwrap();
+        let soon = Duration::from_millis(20);
+        assert_eq!(bus.receive(soon).unwrap(), Some(frame(0x705, &[0x7F])));
+        bus.send(&frame(0x605, &[])).unwrap();
+        assert_eq!(bus.receive(soon).unwrap(), Some(frame(0x585, &[])));
+        assert_eq!(bus.receive(soon).unwrap(), None);
+        drop(bus);
+        assert_eq!(played.written, "\r\rC\rS6\rO\rt6050\rC\r");
+    }
+
+    #[test]
+    fn an_adapter_that_answers_to_nothing_works_and_one_that_refuses_is_named() {
+        assert!(open(&mut Played::default(), None).is_ok());
+        for (answers, rate, words) in [
+            (vec![("S4\r", &b"\x07"[..])], 125_000, "it refuses the bit rate"),
+            (vec![("O\r", &b"\x07"[..])], 125_000, "it refuses opening the bus"),
+            (vec![], 123_456, "123456 bit/s is none of its bit rates"),
+        ] {
+            let mut played = Played { answers: answers.into(), ..Played::default() };
+            let error = open(&mut played, Some(rate)).map(|_| ()).unwrap_err();
+            assert!(error.to_string().contains(words), "{error}");
+        }
+        let mut gone = Played { gone: true, ..Played::default() };
+        let error = open(&mut gone, None).map(|_| ()).unwrap_err();
+        assert!(matches!(error, AdapterError::Lost { .. }), "{error}");
+    }
+
+    #[test]
+    fn a_line_that_speaks_something_else_is_quoted() {
+        let mut played = Played::default();
+        played.incoming.extend([b'x'; LONGEST_MESSAGE + 1]);
+        let error = open(&mut played, None).map(|_| ()).unwrap_err();
+        assert!(error.to_string().contains("a message without end: 'xxx"), "{error}");
+    }
+
+    proptest! {
+        #[test]
+        fn any_text_is_a_frame_or_not(text in "[tTrRzZ][0-9A-Fa-f]{0,30}") {
+            if let Some(frame) = parse_frame(text.as_bytes()) {
+                let again = text_of(&frame);
+                prop_assert_eq!(parse_frame(again.trim_end().as_bytes()), Some(frame));
+            }
+        }
+    }
+}

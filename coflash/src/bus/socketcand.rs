@@ -1,0 +1,442 @@
+//! The socketcand protocol: CAN frames as text over TCP (socketcand, `doc/protocol.md`, raw mode).
+//! The client, and what a server needs of its texts.
+
+use std::collections::VecDeque;
+use std::io::{self, ErrorKind, Read, Write};
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+use canopen::Frame;
+use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
+
+use super::adapter::{Adapter, AdapterError};
+use super::hex::{hex_bytes, hex_number};
+use super::tcp::{connect, PATIENCE};
+
+/// No message of the protocol comes near this length.
+const LONGEST_MESSAGE: usize = 4096;
+/// The port that socketcand listens on unless told otherwise.
+const DEFAULT_PORT: u16 = 29536;
+
+/// A bus of a socketcand server.
+#[derive(Debug)]
+pub struct Socketcand {
+    stream: TcpStream,
+    name: String,
+    opened: Instant,
+    messages: Messages,
+}
+
+impl Socketcand {
+    /// Connects to `server` (`host:port` or `host`) and opens `bus` there in raw mode.
+    ///
+    /// # Errors
+    /// [`AdapterError::Open`] or [`AdapterError::Protocol`].
+    pub fn connect(server: &str, bus: &str) -> Result<Self, AdapterError> {
+        let name = format!("socketcand {server}, bus {bus}");
+        let open = |source| AdapterError::Open { adapter: name.clone(), source };
+        let stream = connect(server, Some(DEFAULT_PORT)).map_err(open)?;
+        // Frames are small and each waits for its answer: Nagle's algorithm would hold them back.
+        stream.set_nodelay(true).map_err(open)?;
+        stream.set_write_timeout(Some(PATIENCE)).map_err(open)?;
+        let mut adapter = Self { stream, name, opened: Instant::now(), messages: Messages::default() };
+        adapter.expect("hi")?;
+        adapter.send_text(&format!("< open {bus} >"))?;
+        adapter.expect("ok")?;
+        adapter.send_text("< rawmode >")?;
+        adapter.expect("ok")?;
+        Ok(adapter)
+    }
+
+    /// Waits for a message of one word during the log-in.
+    fn expect(&mut self, word: &str) -> Result<(), AdapterError> {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            match self.message(deadline)? {
+                Some(message) if message == word => return Ok(()),
+                // Frames may come as soon as the bus is open.
+                Some(message) if message.starts_with("frame ") => {}
+                Some(message) => {
+                    return Err(self.unexpected(format!("'< {message} >' instead of '< {word} >'")))
+                }
+                None => return Err(self.unexpected(format!("nothing instead of '< {word} >'"))),
+            }
+        }
+    }
+
+    fn send_text(&mut self, message: &str) -> Result<(), AdapterError> {
+        self.stream.write_all(message.as_bytes()).map_err(|error| self.lost(error))
+    }
+
+    /// The next message without its brackets; `None` when the deadline has passed.
+    fn message(&mut self, deadline: Instant) -> Result<Option<String>, AdapterError> {
+        loop {
+            match self.messages.next() {
+                Ok(None) => {}
+                Ok(message) => return Ok(message),
+                Err(said) => return Err(self.unexpected(said)),
+            }
+            let left = deadline.saturating_duration_since(Instant::now());
+            let mut bytes = [0; 4096];
+            let read = if left.is_zero() {
+                self.read_now(&mut bytes)
+            } else {
+                self.stream.set_read_timeout(Some(left)).and_then(|()| self.stream.read(&mut bytes))
+            };
+            match read {
+                Ok(0) => {
+                    let closed =
+                        io::Error::new(ErrorKind::ConnectionAborted, "the server closed the connection");
+                    return Err(self.lost(closed));
+                }
+                Ok(len) => self.messages.add(&bytes[..len]),
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {
+                    if left.is_zero() {
+                        return Ok(None);
+                    }
+                }
+                Err(error) => return Err(self.lost(error)),
+            }
+        }
+    }
+
+    /// Reads what is there already. (A time-out would be rounded up to the system's tick.)
+    fn read_now(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
+        self.stream.set_nonblocking(true)?;
+        let read = self.stream.read(bytes);
+        self.stream.set_nonblocking(false)?;
+        read
+    }
+
+    fn lost(&self, source: io::Error) -> AdapterError {
+        AdapterError::Lost { adapter: self.name.clone(), source }
+    }
+
+    fn unexpected(&self, said: String) -> AdapterError {
+        AdapterError::Protocol { adapter: self.name.clone(), said }
+    }
+}
+
+impl Adapter for Socketcand {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        self.send_text(&send_message(frame))
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        let deadline = Instant::now() + timeout;
+        while let Some(message) = self.message(deadline)? {
+            if let Some(frame) = parse_frame(&message) {
+                return Ok(Some(frame));
+            }
+            if let Some(error) = message.strip_prefix("error") {
+                return Err(self.unexpected(format!("error{error}")));
+            }
+            // Anything else (echo, statistics, frames of CAN FD) is not for us; a server that sends
+            // nothing else does not keep us here for ever.
+            if Instant::now() >= deadline {
+                break;
+            }
+        }
+        Ok(None)
+    }
+
+    fn now(&self) -> Duration {
+        self.opened.elapsed()
+    }
+}
+
+/// What a client says to send a frame: `< send 605 8 40 0 10 0 0 0 0 0 >`; a 29-bit identifier has
+/// eight digits.
+#[must_use]
+pub fn send_message(frame: &Frame) -> String {
+    let data: String = frame.data().iter().map(|byte| format!("{byte:02X} ")).collect();
+    format!("< send {} {} {data}>", identifier(frame), frame.dlc())
+}
+
+/// The frame that a server tells of: `frame 585 12.345678 4000100000000000`, without the brackets;
+/// servers write the data with or without blanks between the bytes. `None` for anything else.
+#[must_use]
+pub fn parse_frame(message: &str) -> Option<Frame> {
+    let mut words = message.split_ascii_whitespace();
+    let ("frame", Some(id), Some(_time)) = (words.next()?, words.next(), words.next()) else { return None };
+    let id = parse_identifier(id)?;
+    let digits: String = words.collect();
+    Frame::new(id, &hex_bytes(&digits)?)
+}
+
+/// What a server says of a frame on the bus, so long after its start: `< frame 585 12.345678
+/// 4000100000000000 >`. Without data there are two blanks before the bracket; python-can wants
+/// them.
+#[must_use]
+pub fn frame_message(frame: &Frame, time: Duration) -> String {
+    let data: String = frame.data().iter().map(|byte| format!("{byte:02X}")).collect();
+    format!("< frame {} {}.{:06} {data} >", identifier(frame), time.as_secs(), time.subsec_micros())
+}
+
+/// The frame that a client sends: `send 605 8 40 0 10 0 0 0 0 0`, without the brackets. `None` for
+/// anything else.
+#[must_use]
+pub fn parse_send(message: &str) -> Option<Frame> {
+    let mut words = message.split_ascii_whitespace();
+    let ("send", id, dlc) = (words.next()?, parse_identifier(words.next()?)?, words.next()?) else {
+        return None;
+    };
+    let data = words.map(|word| u8::try_from(hex_number(word)?).ok()).collect::<Option<Vec<u8>>>()?;
+    (dlc == data.len().to_string()).then(|| Frame::new(id, &data)).flatten()
+}
+
+/// Three digits for 11 bits, eight for 29.
+fn identifier(frame: &Frame) -> String {
+    match frame.id() {
+        Id::Standard(id) => format!("{:03X}", id.as_raw()),
+        Id::Extended(id) => format!("{:08X}", id.as_raw()),
+    }
+}
+
+fn parse_identifier(word: &str) -> Option<Id> {
+    let number = hex_number(word)?;
+    Some(if word.len() > 3 {
+        ExtendedId::new(number)?.into()
+    } else {
+        StandardId::new(u16::try_from(number).ok()?)?.into()
+    })
+}
+
+/// Cuts the byte stream into messages, however TCP has split and joined them.
+#[derive(Debug, Default)]
+pub struct Messages {
+    /// What has arrived of a message that is not complete.
+    partial: Option<Vec<u8>>,
+    complete: VecDeque<String>,
+    overlong: bool,
+}
+
+impl Messages {
+    /// Takes what has arrived.
+    pub fn add(&mut self, bytes: &[u8]) {
+        for &byte in bytes {
+            match (byte, &mut self.partial) {
+                (b'<', partial) => *partial = Some(Vec::new()),
+                (b'>', Some(text)) => {
+                    self.complete.push_back(String::from_utf8_lossy(text).trim().to_string());
+                    self.partial = None;
+                }
+                (_, Some(text)) if text.len() < LONGEST_MESSAGE => text.push(byte),
+                (_, Some(_)) => self.overlong = true,
+                // Between two messages.
+                (_, None) => {}
+            }
+        }
+    }
+
+    /// The oldest complete message, without its brackets.
+    ///
+    /// # Errors
+    /// What a peer said that speaks another language.
+    #[allow(clippy::should_implement_trait)]
+    pub fn next(&mut self) -> Result<Option<String>, String> {
+        if self.overlong {
+            return Err("a message without end".to_string());
+        }
+        Ok(self.complete.pop_front())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Read;
+    use std::net::TcpListener;
+    use std::thread;
+
+    use canopen::{CobId, NodeId};
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn frame(id: u16, data: &[u8]) -> Frame {
+        Frame::of(CobId::new(id).unwrap(), data)
+    }
+
+    /// Both directions as socketcand's protocol description writes them.
+    #[test]
+    fn messages_are_those_of_the_protocol() {
+        assert_eq!(send_message(&frame(0x123, &[0x11, 0x22, 0xA3])), "< send 123 3 11 22 A3 >");
+        assert_eq!(send_message(&frame(0x7E5, &[])), "< send 7E5 0 >");
+        assert_eq!(parse_frame("frame 123 23.424242 11 22 A3"), Some(frame(0x123, &[0x11, 0x22, 0xA3])));
+        assert_eq!(parse_frame("frame 123 23.424242 1122a3"), Some(frame(0x123, &[0x11, 0x22, 0xA3])));
+        assert_eq!(parse_frame("frame 7E5 23.4"), Some(frame(0x7E5, &[])));
+        let extended = Frame::new(ExtendedId::new(0x123).unwrap(), &[1]).unwrap();
+        assert_eq!(parse_frame("frame 00000123 1.0 01"), Some(extended));
+        assert_eq!(send_message(&extended), "< send 00000123 1 01 >");
+        for bad in [
+            "",
+            "ok",
+            "frame",
+            "frame 123",
+            "frame 800 1.0",
+            "frame xyz 1.0 00",
+            "frame 20000000 1.0 00",
+            "frame 123 1.0 1",
+            "frame 123 1.0 001122334455667788",
+            "frame 123 1.0 0\u{e9}1",
+            "frame 123 1.0 +1",
+            "frame +12 1.0 01",
+        ] {
+            assert_eq!(parse_frame(bad), None, "{bad}");
+        }
+    }
+
+    /// Both directions as socketcand's protocol description writes them, and what python-can needs.
+    #[test]
+    fn a_server_reads_and_writes_messages_of_the_protocol() {
+        assert_eq!(parse_send("send 123 0"), Some(frame(0x123, &[])));
+        assert_eq!(parse_send("send 123 4 11 22 33 44"), Some(frame(0x123, &[0x11, 0x22, 0x33, 0x44])));
+        assert_eq!(parse_send("send 1 1 5"), Some(frame(1, &[5])));
+        let extended = Frame::new(ExtendedId::new(0x1AAA_AAAA).unwrap(), &[0x11, 0xF1]).unwrap();
+        assert_eq!(parse_send("send 1AAAAAAA 2 11 F1"), Some(extended));
+        for bad in [
+            "",
+            "send",
+            "send 123",
+            "send 123 1",
+            "send 123 1 11 22",
+            "send 123 9 1 2 3 4 5 6 7 8 9",
+            "send 123 01 11",
+            "send 123 1 111",
+            "send 123 1 +1",
+            "send 800 0",
+            "send 20000000 0",
+            "sendrtr 123 0",
+            "frame 123 1.0 11",
+        ] {
+            assert_eq!(parse_send(bad), None, "{bad}");
+        }
+        let time = Duration::from_micros(23_024_242);
+        assert_eq!(frame_message(&frame(0x23, &[0x11, 0xA2]), time), "< frame 023 23.024242 11A2 >");
+        assert_eq!(frame_message(&frame(0x7E5, &[]), time), "< frame 7E5 23.024242  >");
+        assert_eq!(frame_message(&extended, time), "< frame 1AAAAAAA 23.024242 11F1 >");
+    }
+
+    /// A server that plays `script`: what to wait for, and what to answer then.
+    fn server(script: &'static [(&'static str, &'static str)]) -> String {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap().to_string();
+        thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            stream.set_nodelay(true).unwrap();
+            for (awaited, answer) in script {
+                let mut got = vec![0; awaited.len()];
+                stream.read_exact(&mut got).unwrap();
+                assert_eq!(std::str::from_utf8(&got).unwrap(), *awaited);
+                // Byte by byte: the client may rely on no border of a packet.
+                for byte in answer.as_bytes() {
+                    stream.write_all(&[*byte]).unwrap();
+                }
+            }
+        });
+        address
+    }
+
+    const LOG_IN: [(&str, &str); 2] = [("", "< hi >"), ("< open can0 >", "< ok >")];
+
+    #[test]
+    fn a_session_from_log_in_to_the_end_of_the_server() {
+        let address = server(&[
+            LOG_IN[0],
+            LOG_IN[1],
+            ("< rawmode >", "< ok >< frame 701 1.000000 00 >< frame 701 1.1 7F >< stat 1 >"),
+            ("< send 601 8 40 00 10 00 00 00 00 00 >", "\n< frame 581 2.000000 4300100000000010 > "),
+        ]);
+        let mut bus = crate::bus::open(&format!("socketcand://{address}/can0")).unwrap();
+        let long = Duration::from_secs(20);
+        assert_eq!(bus.receive(long).unwrap(), Some(frame(0x701, &[0])));
+        assert_eq!(bus.receive(long).unwrap(), Some(frame(0x701, &[0x7F])));
+        bus.send(&Frame::of(CobId::sdo_request(NodeId::MIN), &[0x40, 0, 0x10, 0, 0, 0, 0, 0])).unwrap();
+        let answer = frame(0x581, &[0x43, 0, 0x10, 0, 0, 0, 0, 0x10]);
+        assert_eq!(bus.receive(long).unwrap(), Some(answer));
+        assert!(matches!(bus.receive(long), Err(AdapterError::Lost { .. })));
+    }
+
+    #[test]
+    fn waiting_ends_when_nothing_comes() {
+        let address = server(&[LOG_IN[0], LOG_IN[1], ("< rawmode >", "< ok >"), ("never", "")]);
+        let mut bus = Socketcand::connect(&address, "can0").unwrap();
+        assert_eq!(bus.receive(Duration::ZERO).unwrap(), None);
+        let before = bus.now();
+        assert_eq!(bus.receive(Duration::from_millis(30)).unwrap(), None);
+        assert!(bus.now() - before >= Duration::from_millis(30), "the adapter's own clock has moved on");
+    }
+
+    #[test]
+    fn a_server_that_refuses_or_speaks_otherwise_is_quoted() {
+        for (script, words) in [
+            (
+                &[("", "< hi >"), ("< open can0 >", "< error could not open bus >")][..],
+                "'< error could not open bus >' instead of '< ok >'",
+            ),
+            (&[("", "<html>")][..], "'< html >' instead of '< hi >'"),
+        ] {
+            let error = Socketcand::connect(&server(script), "can0").unwrap_err();
+            assert!(error.to_string().contains(words), "{error}");
+            assert_eq!(error.number(), 0x6000_0302);
+        }
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap().to_string();
+        drop(listener);
+        let error = Socketcand::connect(&address, "can0").unwrap_err();
+        assert!(matches!(error, AdapterError::Open { .. }), "{error}");
+    }
+
+    #[test]
+    fn a_url_that_names_no_adapter_is_explained() {
+        for (url, words) in [
+            ("", "has no ':'"),
+            ("can0", "has no ':'"),
+            ("pcan:1", "there is no such adapter"),
+            ("socketcand:localhost/can0", "must be socketcand://HOST:PORT/BUS"),
+            ("socketcand://localhost", "names no bus"),
+            ("socketcand:///can0", "must be socketcand://HOST:PORT/BUS"),
+            ("socketcand://localhost/can0 >", "must be socketcand://HOST:PORT/BUS"),
+        ] {
+            let error = crate::bus::open(url).map(|_| ()).unwrap_err();
+            assert!(error.to_string().contains(words), "{error}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn any_stream_is_cut_the_same_however_it_arrives(
+            bytes in prop::collection::vec(prop::sample::select(b"<> frame123456.ABC\xFF".to_vec()), 0..200),
+            cut in any::<prop::sample::Index>(),
+        ) {
+            let cut = cut.index(bytes.len() + 1);
+            let (mut whole, mut parts) = (Messages::default(), Messages::default());
+            whole.add(&bytes);
+            parts.add(&bytes[..cut]);
+            parts.add(&bytes[cut..]);
+            prop_assert_eq!(&whole.complete, &parts.complete);
+            for message in &whole.complete {
+                let _ = parse_frame(message);
+            }
+        }
+    }
+
+    #[test]
+    fn a_message_that_was_cut_off_does_not_spoil_the_next() {
+        let mut messages = Messages::default();
+        messages.add(b"noise > < frame 123 < ok >");
+        assert_eq!(messages.next(), Ok(Some("ok".to_string())));
+        assert_eq!(messages.next(), Ok(None));
+    }
+
+    #[test]
+    fn a_message_without_end_is_no_leak() {
+        let mut messages = Messages::default();
+        messages.add(b"<");
+        messages.add(&[b'x'; LONGEST_MESSAGE]);
+        assert_eq!(messages.next(), Ok(None));
+        messages.add(b"x");
+        assert!(messages.next().is_err());
+    }
+}

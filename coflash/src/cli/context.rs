@@ -1,0 +1,71 @@
+//! What every command is given, and its way to the bus.
+
+use std::path::PathBuf;
+
+use coflash::bus::{self, Adapter, Link, SdoIds, Trace};
+
+use super::output::{Failure, Output};
+
+/// What every command is given.
+pub(super) struct Context {
+    /// What `--bus`, `COFLASH_BUS` or the configuration says.
+    pub(super) bus: Option<String>,
+    pub(super) trace: Option<PathBuf>,
+    /// COB-IDs of SDO requests and answers, without the node-ID, where they are not the usual ones.
+    pub(super) sdo_request: Option<u16>,
+    pub(super) sdo_response: Option<u16>,
+    /// The configuration file that `--config` or `COFLASH_CONFIG` names.
+    pub(super) config: Option<PathBuf>,
+    pub(super) out: Output,
+}
+
+impl Context {
+    /// The CAN bus.
+    pub(super) fn open(&self) -> Result<Box<dyn Adapter + Send>, Failure> {
+        let adapter = bus::open(self.url(self.bus.as_deref())?)?;
+        self.traced(adapter)
+    }
+
+    /// A way to devices: the CAN bus, or a gateway.
+    pub(super) fn link(&self) -> Result<Link, Failure> {
+        self.link_at(self.bus.as_deref(), None)
+    }
+
+    /// The same to this bus, at this bit rate if the URL names none and the adapter sets it.
+    pub(super) fn link_at(&self, bus: Option<&str>, bit_rate: Option<u32>) -> Result<Link, Failure> {
+        match Link::open(self.url(bus)?, bit_rate)? {
+            Link::Bus(adapter) => Ok(Link::Bus(self.traced(adapter)?)),
+            gateway => {
+                if self.trace.is_some() {
+                    self.out.warn("a gateway shows no frames: nothing is traced");
+                }
+                Ok(gateway)
+            }
+        }
+    }
+
+    fn url<'u>(&self, bus: Option<&'u str>) -> Result<&'u str, Failure> {
+        bus.ok_or_else(|| {
+            let advice = format!("give --bus URL or set COFLASH_BUS; known are {}", bus::URLS);
+            Failure::usage("it is not said on which CAN bus the device is", advice)
+        })
+    }
+
+    fn traced(&self, adapter: Box<dyn Adapter + Send>) -> Result<Box<dyn Adapter + Send>, Failure> {
+        let traced: Box<dyn Adapter + Send> = match &self.trace {
+            Some(path) => {
+                let (out, name) = (self.out, path.display().to_string());
+                let failed =
+                    move |error| out.warn(format_args!("{name}: cannot be written any more: {error}"));
+                Box::new(Trace::new(adapter, path, Box::new(failed))?)
+            }
+            None => adapter,
+        };
+        Ok(match (self.sdo_request, self.sdo_response) {
+            (None, None) => traced,
+            (request, response) => {
+                Box::new(SdoIds::new(traced, request.unwrap_or(0x600), response.unwrap_or(0x580)))
+            }
+        })
+    }
+}

@@ -1,0 +1,92 @@
+//! Why a device may not answer, judged by what the bus says meanwhile.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::time::Duration;
+
+use canopen::nmt::{parse_state_message, NmtState};
+use canopen::NodeId;
+
+use super::error::Error;
+use super::session::Session;
+use crate::bus::decode::state_words;
+
+/// How long to listen: heartbeats come once a second in most networks.
+pub const LISTEN: Duration = Duration::from_millis(1200);
+
+/// What the bus says while a device is silent. `Display` has the conclusion, with what to do.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Diagnosis {
+    /// The silent device.
+    pub node: NodeId,
+    /// Frames heard, of any kind.
+    pub frames: usize,
+    /// Nodes heard, with the state that they told last.
+    pub heard: BTreeMap<NodeId, Option<NmtState>>,
+}
+
+/// Listens to the bus for [`LISTEN`].
+///
+/// # Errors
+/// [`Error::Adapter`] or [`Error::Cancelled`].
+pub fn diagnose(session: &mut Session<'_>) -> Result<Diagnosis, Error> {
+    let mut diagnosis = Diagnosis { node: session.node(), frames: 0, heard: BTreeMap::new() };
+    session.observe(LISTEN, &mut |frame| {
+        diagnosis.frames += 1;
+        if let Some((node, state)) = parse_state_message(frame) {
+            diagnosis.heard.insert(node, Some(state));
+        } else if let Some(id) = frame.cob_id().map(|id| id.get()) {
+            // What a node sends by itself: EMCY, PDO, SDO answers.
+            let sent_by = matches!(id & 0x780, 0x080 | 0x180 | 0x280 | 0x380 | 0x480 | 0x580);
+            if let Some(node) = NodeId::new((id & 0x7F) as u8).filter(|_| sent_by) {
+                diagnosis.heard.entry(node).or_insert(None);
+            }
+        }
+    })?;
+    Ok(diagnosis)
+}
+
+impl fmt::Display for Diagnosis {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { node, frames, heard } = self;
+        if *frames == 0 {
+            return write!(
+                f,
+                "nothing at all is heard on the bus: check that the device has power, that both sides use the same bit \
+                 rate, and that cable and terminators are right; a device may also be silent because it has no node-ID \
+                 (coflash lss fastscan) or is off the bus (switch it off and on)"
+            );
+        }
+        match heard.get(node) {
+            Some(Some(NmtState::Stopped)) => write!(
+                f,
+                "node {node} is heard and has been stopped, so that it serves no SDO: coflash reset --node {node}"
+            ),
+            Some(Some(state)) => write!(
+                f,
+                "node {node} is heard (heartbeat, {}) but does not answer: another tool may be at work on it, or it \
+                 needs a longer --sdo-timeout",
+                state_words(*state)
+            ),
+            Some(None) => write!(
+                f,
+                "node {node} is heard but does not answer: another tool may be at work on it, or it needs a longer \
+                 --sdo-timeout"
+            ),
+            None if heard.is_empty() => write!(
+                f,
+                "the bus works, but no CANopen node is heard: check that node {node} is the right one and that it has \
+                 power; coflash scan asks all of them"
+            ),
+            None => {
+                let nodes: Vec<String> = heard.keys().map(NodeId::to_string).collect();
+                write!(
+                    f,
+                    "the bus works, and node {} is heard: check that node {node} is the right one and that it has \
+                     power; coflash scan asks all of them, coflash lss fastscan finds devices without node-ID",
+                    nodes.join(", ")
+                )
+            }
+        }
+    }
+}

@@ -1,0 +1,80 @@
+//! What the host was about, for the words of an error.
+
+use std::fmt;
+
+use canopen::program::ProgramControl;
+use canopen::Address;
+
+/// What the host was about when something went wrong.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Doing {
+    /// Reading an object.
+    Read(Address),
+    /// Writing an object.
+    Write(Address),
+    /// Carrying out a command of 1F51h.
+    Command(ProgramControl),
+    /// Writing a block of the program.
+    Block(u32),
+    /// Writing the whole program at once.
+    Program,
+    /// Writing the password of a device that is locked.
+    Unlock,
+    /// Telling the bootloader to restart into the program.
+    Restart,
+}
+
+impl fmt::Display for Doing {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Read(at) => write!(f, "reading {at}"),
+            Self::Write(at) => write!(f, "writing {at}"),
+            Self::Block(u32::MAX) => f.write_str("writing the last block"),
+            Self::Block(number) => write!(f, "writing block {number}"),
+            Self::Program => f.write_str("writing the program"),
+            Self::Unlock => f.write_str("unlocking the device"),
+            Self::Restart => f.write_str("restarting the program"),
+            Self::Command(command) => f.write_str(match command {
+                ProgramControl::Stop => "stopping the program",
+                ProgramControl::Start => "starting the program",
+                ProgramControl::ResetStat => "clearing the status",
+                ProgramControl::Clear => "erasing the program",
+                ProgramControl::StartBootloader => "calling the bootloader",
+                ProgramControl::SetSignature => "setting the signature",
+                ProgramControl::ClrSignature => "clearing the signature",
+            }),
+        }
+    }
+}
+
+/// What the LSS master was about when something went wrong.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LssDoing {
+    /// Addressing a device by its LSS address.
+    Select,
+    /// Asking for the address or the node-ID.
+    Inquire,
+    /// Giving a node-ID.
+    NodeId,
+    /// Giving a bit rate.
+    BitRate,
+    /// Having it stored.
+    Store,
+    /// Searching.
+    Fastscan,
+}
+
+impl LssDoing {
+    /// For people.
+    #[must_use]
+    pub const fn words(self) -> &'static str {
+        match self {
+            Self::Select => "selecting the device by its LSS address",
+            Self::Inquire => "asking for LSS address or node-ID",
+            Self::NodeId => "giving the node-ID",
+            Self::BitRate => "giving the bit rate",
+            Self::Store => "storing node-ID and bit rate",
+            Self::Fastscan => "fastscan",
+        }
+    }
+}

@@ -1,0 +1,388 @@
+//! What can go wrong with a device: what happened, a stable number, and what to do next.
+
+use std::fmt;
+use std::time::Duration;
+
+use canopen::program::{FlashError, FlashStatus};
+use canopen::AbortCode;
+use canopen::NodeId;
+
+use super::device_type::DeviceType;
+use super::dialect::Dialect;
+use super::doing::{Doing, LssDoing};
+use crate::bus::gateway::GatewayError;
+use crate::bus::AdapterError;
+
+mod advice;
+
+/// Why a conversation with a device ended early.
+///
+/// `Display` says what happened, [`advice`](Self::advice) what to do next.
+#[derive(Debug)]
+pub enum Error {
+    /// The CAN adapter failed.
+    Adapter(AdapterError),
+    /// The user gave up.
+    Cancelled,
+    /// The device does not answer.
+    NoAnswer {
+        /// Which one.
+        node: NodeId,
+        /// What it was asked.
+        doing: Doing,
+    },
+    /// The device answered with an SDO abort, and 1F57h does not say more.
+    Refused {
+        /// Which one.
+        node: NodeId,
+        /// What it was asked.
+        doing: Doing,
+        /// The abort code.
+        code: AbortCode,
+    },
+    /// The device's answer was none: wrong toggle, wrong command, wrong length.
+    Protocol {
+        /// What it was asked.
+        doing: Doing,
+        /// The code that the device was sent.
+        code: AbortCode,
+    },
+    /// 1F57h says that the bootloader could not do what it was told.
+    Failed {
+        /// What it was told.
+        doing: Doing,
+        /// Why it could not.
+        error: FlashError,
+        /// More about it, from the device's maker.
+        detail: u16,
+        /// The abort code, where the SDO was refused.
+        code: Option<AbortCode>,
+    },
+    /// 1F57h stays busy.
+    Busy {
+        /// Which device.
+        node: NodeId,
+        /// What it was told.
+        doing: Doing,
+        /// How long it was waited for.
+        waited: Duration,
+    },
+    /// The file is for another device.
+    WrongTarget {
+        /// Which device was looked at.
+        node: NodeId,
+        /// What differs.
+        what: Mismatch,
+        /// What the device says.
+        device: u32,
+        /// What the file says.
+        file: u32,
+    },
+    /// The program on trial is another device than its bootloader.
+    OtherIdentity {
+        /// Which device was looked at.
+        node: NodeId,
+        /// What differs.
+        what: IdentityPart,
+        /// What the bootloader told.
+        bootloader: Option<u32>,
+        /// What the program on trial tells, `None` for nothing.
+        application: Option<u32>,
+    },
+    /// The application does not go back to the bootloader.
+    NoBootloader {
+        /// Which device.
+        node: NodeId,
+        /// What runs instead, `None` where nothing answers.
+        running: Option<DeviceType>,
+        /// The abort code, where the application refused.
+        code: Option<AbortCode>,
+    },
+    /// The program in the device is not that of the file.
+    WrongCrc {
+        /// What 1F56h reads.
+        device: u32,
+        /// What the file says.
+        file: u32,
+    },
+    /// The device's dialect has no such thing.
+    NotInDialect {
+        /// The dialect.
+        dialect: Dialect,
+        /// What is missing, as a sentence.
+        what: &'static str,
+    },
+    /// The device is locked, and no password was given.
+    NoPassword {
+        /// Which device.
+        node: NodeId,
+    },
+    /// Another device has the node-ID that this one's bootloader takes.
+    Occupied {
+        /// The node-ID.
+        node: NodeId,
+    },
+    /// A layer setting service failed.
+    Lss {
+        /// What the master was about.
+        doing: LssDoing,
+        /// How it failed.
+        failure: LssFailure,
+    },
+    /// The program does not come up.
+    StartFailed {
+        /// Which device.
+        node: NodeId,
+        /// What answers instead, `None` where nothing does.
+        running: Option<DeviceType>,
+        /// What 1F57h says, if something.
+        status: Option<FlashStatus>,
+    },
+}
+
+/// How a layer setting service failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LssFailure {
+    /// Nobody answers.
+    NoAnswer,
+    /// The device has no node-ID, and it is not said which one to give.
+    None,
+    /// The device refuses.
+    Refused {
+        /// The standard's error code; FFh for one of the maker's own.
+        code: u8,
+        /// The maker's own error code.
+        detail: u8,
+    },
+}
+
+/// A part of 1018h.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum IdentityPart {
+    /// 1018h/1.
+    VendorId,
+    /// 1018h/2.
+    ProductCode,
+    /// 1018h/4.
+    SerialNumber,
+}
+
+impl IdentityPart {
+    /// That of a sub-index of 1018h, among those which are compared.
+    pub(crate) const fn of(sub: usize) -> Self {
+        match sub {
+            1 => Self::VendorId,
+            2 => Self::ProductCode,
+            _ => Self::SerialNumber,
+        }
+    }
+
+    const fn words(self) -> &'static str {
+        match self {
+            Self::VendorId => "vendor-ID",
+            Self::ProductCode => "product code",
+            Self::SerialNumber => "serial number",
+        }
+    }
+}
+
+/// In what a device is another one than the file's.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mismatch {
+    /// 1018h/1.
+    VendorId,
+    /// 1018h/2.
+    ProductCode,
+}
+
+impl Mismatch {
+    /// The error that the bootloader would have for it.
+    const fn error(self) -> FlashError {
+        match self {
+            Self::VendorId => FlashError::WrongVendorId,
+            Self::ProductCode => FlashError::WrongProductId,
+        }
+    }
+}
+
+impl From<AdapterError> for Error {
+    fn from(error: AdapterError) -> Self {
+        Self::Adapter(error)
+    }
+}
+
+impl Error {
+    /// Whether the device has refused the very first block: one that erases with the first good
+    /// block has lost nothing then.
+    #[must_use]
+    pub fn refuses_control_block(&self) -> bool {
+        matches!(
+            self,
+            Self::Refused { doing: Doing::Block(0), .. } | Self::Failed { doing: Doing::Block(0), .. }
+        )
+    }
+
+    /// The stable number: the manual's (L-1112e_5, table 5, which holds all of the newer manual's)
+    /// where it has one, otherwise 60000100h plus the word of 1F57h, 60000200h plus the error code
+    /// of LSS, and 6000030xh for adapters.
+    #[must_use]
+    pub const fn number(&self) -> u32 {
+        match self {
+            Self::Adapter(error) => error.number(),
+            Self::WrongCrc { .. } => 0x6000_0001,
+            Self::Failed { error, .. } => flash_error_number(*error),
+            Self::WrongTarget { what, .. } => flash_error_number(what.error()),
+            Self::NoBootloader { .. } => 0x6000_0010,
+            Self::Cancelled => 0x6000_0011,
+            Self::NoAnswer { .. } => 0x6000_0013,
+            Self::Lss { failure: LssFailure::NoAnswer, .. } => 0x6000_0013,
+            Self::Lss { failure: LssFailure::None, .. } => 0x6000_0017,
+            Self::NotInDialect { .. } | Self::NoPassword { .. } => 0x6000_0018,
+            Self::Occupied { .. } => 0x6000_0010,
+            Self::Lss { failure: LssFailure::Refused { code, .. }, .. } => 0x6000_0200 + *code as u32,
+            Self::StartFailed { .. } | Self::OtherIdentity { .. } => 0x6000_0014,
+            Self::Busy { .. } => 0x6000_0016,
+            Self::Refused { .. } | Self::Protocol { .. } => 0x6000_0025,
+        }
+    }
+}
+
+/// The manual's number for an error of 1F57h.
+const fn flash_error_number(error: FlashError) -> u32 {
+    match error {
+        FlashError::NoValidProgram => 0x6000_0001,
+        FlashError::Format => 0x6000_0002,
+        FlashError::Crc => 0x6000_0003,
+        FlashError::NotCleared => 0x6000_0004,
+        FlashError::Write => 0x6000_0005,
+        FlashError::Address => 0x6000_0006,
+        FlashError::Secured => 0x6000_0007,
+        // Newer than the manual's list.
+        FlashError::NvData
+        | FlashError::WrongVendorId
+        | FlashError::WrongProductId
+        | FlashError::NoAccess
+        | FlashError::Busy
+        | FlashError::Sequence => 0x6000_0100 + error.code() as u32,
+        // "An error that is unknown to the tool", or unspecified.
+        _ => 0x6000_0008,
+    }
+}
+
+impl fmt::Display for Error {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Adapter(error) => error.fmt(f),
+            Self::Cancelled => f.write_str("cancelled"),
+            Self::NoAnswer { node, doing } => write!(f, "node {node} does not answer ({doing})"),
+            Self::Refused { node, doing, code } => write!(f, "node {node} refuses {doing}: abort {code}"),
+            Self::Protocol { doing, code } => write!(f, "the answer to {doing} is invalid: {code}"),
+            Self::Failed { doing, error, detail, code } => {
+                write!(f, "{doing} failed: {error} (1F57h reads {:02X}h", error.code())?;
+                if *detail != 0 {
+                    write!(f, ", detail {detail:04X}h")?;
+                }
+                match code {
+                    Some(code) => write!(f, ", abort {code})"),
+                    None => f.write_str(")"),
+                }
+            }
+            Self::Busy { node, doing, waited } => {
+                write!(f, "node {node} is still busy {doing} after {:.1} s", waited.as_secs_f64())
+            }
+            Self::WrongTarget { node, what, device, file } => {
+                let what = match what {
+                    Mismatch::VendorId => "vendor-ID",
+                    Mismatch::ProductCode => "product code",
+                };
+                write!(f, "the program is for {what} {file:08X}h, and node {node} has {device:08X}h")
+            }
+            Self::OtherIdentity { node, what, bootloader, application } => {
+                let number = |number: &Option<u32>| {
+                    number.map_or("none".to_string(), |number| format!("{number:08X}h"))
+                };
+                let (was, is) = (number(bootloader), number(application));
+                let what = what.words();
+                write!(f, "the program on trial tells {what} {is}, and the bootloader of node {node} {was}")
+            }
+            Self::NoBootloader { node, running, code } => {
+                match running {
+                    Some(running) => write!(f, "node {node} stays in {running}")?,
+                    None => write!(f, "node {node} does not come back in the bootloader")?,
+                }
+                match code {
+                    Some(code) => write!(f, ": it refuses the call with abort {code}"),
+                    None => Ok(()),
+                }
+            }
+            Self::WrongCrc { device, file } => {
+                write!(f, "the program in the device has CRC {device:08X}h, that of the file {file:08X}h")
+            }
+            Self::NotInDialect { dialect, what } => write!(f, "in the dialect {}: {what}", dialect.name()),
+            Self::NoPassword { node } => write!(f, "node {node} is locked, and no password was given"),
+            Self::Occupied { node } => {
+                write!(f, "node {node} answers already: another device is in its bootloader")
+            }
+            Self::Lss { doing, failure: LssFailure::NoAnswer } => {
+                write!(f, "no device answers ({})", doing.words())
+            }
+            Self::Lss { failure: LssFailure::None, .. } => f.write_str("the device has no node-ID"),
+            Self::Lss { doing, failure: LssFailure::Refused { code, detail } } => {
+                write!(f, "the device refuses {}: error {code}", doing.words())?;
+                match detail {
+                    0 => Ok(()),
+                    detail => write!(f, ", {detail} of its maker"),
+                }
+            }
+            Self::StartFailed { node, running, status } => {
+                match running {
+                    Some(running) => write!(f, "the program does not start: node {node} stays in {running}")?,
+                    None => write!(f, "the program does not start: node {node} does not answer")?,
+                }
+                match status.and_then(|status| status.error) {
+                    Some(error) => write!(f, "; {error} (1F57h reads {:02X}h)", error.code()),
+                    None => Ok(()),
+                }
+            }
+        }
+    }
+}
+
+impl std::error::Error for Error {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        match self {
+            Self::Adapter(error) => Some(error),
+            _ => None,
+        }
+    }
+}
+
+/// What became of an object behind a gateway, as a transfer of our own has it.
+pub(crate) fn of_gateway(error: GatewayError, node: NodeId, doing: Doing) -> Error {
+    match error {
+        GatewayError::Adapter(error) => Error::Adapter(error),
+        GatewayError::NoAnswer => Error::NoAnswer { node, doing },
+        GatewayError::Abort(code) => Error::Refused { node, doing, code },
+        GatewayError::Cancelled => Error::Cancelled,
+    }
+}
+
+/// Makes the absence of an object a value.
+pub(crate) fn optional<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
+    match read {
+        Ok(value) => Ok(Some(value)),
+        Err(Error::Refused { code, .. }) if absent(code) => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
+pub(crate) fn absent(code: AbortCode) -> bool {
+    matches!(
+        code,
+        AbortCode::NO_OBJECT
+            | AbortCode::NO_SUB_INDEX
+            | AbortCode::UNSUPPORTED_ACCESS
+            | AbortCode::WRITE_ONLY
+            | AbortCode::NO_DATA
+    )
+}

@@ -1,0 +1,155 @@
+//! What to do about an error.
+
+use canopen::program::FlashError;
+use canopen::AbortCode;
+
+use super::{Error, LssFailure};
+use crate::device::doing::{Doing, LssDoing};
+
+impl Error {
+    /// What to do next.
+    #[must_use]
+    pub fn advice(&self) -> String {
+        match self {
+            Self::Adapter(error) => error.advice().to_string(),
+            Self::Cancelled => "run the same command again when you like".to_string(),
+            Self::NoAnswer { node, .. } => format!(
+                "check that node {node} is the right one, that the device has power, that both sides use the same bit \
+                 rate and that the bus is terminated; a slow device may need a longer --sdo-timeout"
+            ),
+            Self::Refused { doing: Doing::Unlock, code, .. } => unlock_advice(*code).to_string(),
+            Self::Refused { doing: Doing::Read(at) | Doing::Write(at), code, .. }
+                if at.index == canopen::debugger::DEBUGGER =>
+            {
+                debugger_advice(*code).to_string()
+            }
+            Self::Refused { code, .. } => refusal_advice(*code).to_string(),
+            Self::NotInDialect { .. } => "leave that out, or name another dialect by --dialect".to_string(),
+            Self::NoPassword { .. } => "give the device's password by --unlock; its maker knows it".to_string(),
+            Self::Occupied { node } => format!(
+                "finish the update of the device that is node {node} now, or switch that off, and run the command again"
+            ),
+            Self::Protocol { .. } => "look for a second tool or a second device with this node-ID on the bus; a longer \
+                                      --sdo-timeout helps against answers that come late"
+                .to_string(),
+            Self::Failed { error, .. } => failure_advice(*error).to_string(),
+            Self::WrongTarget { what, .. } => failure_advice(what.error()).to_string(),
+            Self::OtherIdentity { .. } => "check that the program was made for this device: it is not signed; one that has an \
+                                           identity of its own is flashed without --trial-run"
+                .to_string(),
+            Self::Busy { .. } => "give it more time with --command-timeout, or switch the device off and on".to_string(),
+            Self::NoBootloader { code: Some(_), .. } => {
+                "this application cannot be called back: bring the device into the bootloader by its entry strap, or \
+                 within its rescue window after power-on"
+                    .to_string()
+            }
+            Self::NoBootloader { .. } => "switch the device off and on and run the command again; if its application \
+                                          ignores the call, use the entry strap"
+                .to_string(),
+            Self::Lss { doing, failure: LssFailure::NoAnswer } => match doing {
+                LssDoing::Fastscan => "run it again; if it happens again, two devices may have one LSS address",
+                LssDoing::Select => {
+                    "check the four numbers of the address (coflash info shows them as identity), and that the device \
+                     has power"
+                }
+                _ => "check that the device supports LSS, that it has power, and that both sides use the same bit rate",
+            }
+            .to_string(),
+            Self::Lss { failure: LssFailure::None, .. } => {
+                "say which node-ID it is to get, or give it one by coflash lss assign".to_string()
+            }
+            Self::Lss { doing, failure: LssFailure::Refused { code, .. } } => match (doing, code) {
+                (LssDoing::Store, 1) => "this device cannot store: switches or its application set node-ID and bit rate",
+                (LssDoing::Store, _) => "run it again; if it happens again, the device's memory is broken",
+                (LssDoing::BitRate, _) => "choose a bit rate that the device supports",
+                _ => "choose a node-ID from 1 to 127",
+            }
+            .to_string(),
+            Self::WrongCrc { .. } => {
+                "check that the file was made for this board and this program number, and run the command again"
+                    .to_string()
+            }
+            Self::StartFailed { running: Some(running), .. } if running.is_bootloader() => {
+                "check that the program was linked for this board and program number; the device waits in the \
+                 bootloader for another one"
+                    .to_string()
+            }
+            Self::StartFailed { .. } => "the program may not speak CANopen, use another node-ID or bit rate, or crash; \
+                                         flash another one after calling the bootloader by power-on or entry strap"
+                .to_string(),
+        }
+    }
+}
+
+fn failure_advice(error: FlashError) -> &'static str {
+    match error {
+        FlashError::NoValidProgram => "flash a program, and let it be signed",
+        FlashError::Format => "check that the file is a block file for this bootloader, or convert it again",
+        FlashError::Crc => "run the command again; if it happens again, check bus and terminators",
+        FlashError::NotCleared => {
+            "run the flash command, which erases first; another tool may be at work on the device"
+        }
+        FlashError::Write => {
+            "run the command again; if it happens again, the flash may be worn out or write-protected"
+        }
+        FlashError::Address => "check --board and --program: the file is for another memory map",
+        FlashError::Secured => "the file wants to write into the bootloader: check how the program is linked",
+        FlashError::NvData => {
+            "run the command again; if it happens again, the device cannot store its parameters"
+        }
+        FlashError::WrongVendorId | FlashError::WrongProductId => {
+            "check that file and device belong together (coflash info shows the device's identity)"
+        }
+        FlashError::NoAccess => "the device forbids updates at present: ask its maker how to unlock it",
+        FlashError::Busy => {
+            "wait a moment and run the command again; another tool may be at work on the device"
+        }
+        FlashError::Sequence => "run the command again; another tool may be at work on the device",
+        _ => "run the command again, or switch the device off and on first",
+    }
+}
+
+fn unlock_advice(code: AbortCode) -> &'static str {
+    match code {
+        AbortCode::NO_OBJECT | AbortCode::NO_SUB_INDEX => {
+            "the device knows no password: check --dialect, or leave that out"
+        }
+        AbortCode::DEVICE_STATE => {
+            "after a wrong password a device takes none for a while: try the right one again in half a minute"
+        }
+        _ => "check the password: the device's maker knows it; after some wrong ones it may take none for a while",
+    }
+}
+
+fn refusal_advice(code: AbortCode) -> &'static str {
+    match code {
+        AbortCode::NO_OBJECT => "the device has no such object: is it a device with this bootloader?",
+        AbortCode::NO_SUB_INDEX => "the device has no such program: check --program",
+        AbortCode::LENGTH | AbortCode::LENGTH_TOO_HIGH | AbortCode::OUT_OF_MEMORY => {
+            "the block may be larger than the bootloader's buffer: convert with a smaller --block-size"
+        }
+        AbortCode::TIMEOUT | AbortCode::TOGGLE | AbortCode::COMMAND => {
+            "frames were lost, or a second tool is at work on the device: check the bus and run the command again"
+        }
+        _ => "run the command again; if it happens again, the abort code tells what the device objects to",
+    }
+}
+
+/// What to do about a refusal of the debugger interface, 1025h.
+fn debugger_advice(code: AbortCode) -> &'static str {
+    match code {
+        AbortCode::NO_OBJECT => {
+            "the device has no debugger interface, as no product has; on the bench, build its firmware with the feature \
+             `debugger` (docs/debugger.md)"
+        }
+        AbortCode::INVALID_VALUE => {
+            "these bytes must not be touched: nothing is there, or it is flash that is to be written, or part of a register \
+             (docs/debugger.md)"
+        }
+        AbortCode::DEVICE_STATE => {
+            "the device is secured: its read-out protection (RDP) has to be taken away first, which erases it"
+        }
+        AbortCode::LOCAL_CONTROL => "the flash is busy: try again when the erasing is over",
+        code => refusal_advice(code),
+    }
+}

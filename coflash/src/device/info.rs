@@ -1,0 +1,215 @@
+//! What a device says about itself.
+
+use std::fmt;
+
+use canopen::program::{self, FlashStatus, ProgramState};
+use canopen::Address;
+
+use super::device_type::DeviceType;
+use super::dialect::Dialect;
+use super::error::{optional, Error};
+use super::recognise::recognise;
+use super::session::Session;
+
+/// What a device says about itself. What it does not have is `None`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct DeviceInfo {
+    /// Its node-ID.
+    pub node: canopen::NodeId,
+    /// 1000h: bootloader or application.
+    pub device_type: DeviceType,
+    /// 1001h, error register.
+    pub error_register: Option<u32>,
+    /// 1008h, device name.
+    pub name: Option<String>,
+    /// 1009h, hardware version.
+    pub hardware_version: Option<String>,
+    /// 100Ah, software version.
+    pub software_version: Option<String>,
+    /// 1018h/1 to 4: vendor-ID, product code, revision, serial number.
+    pub identity: Identity,
+    /// What its bootloader speaks, as far as that can be seen; `None` for a device without
+    /// programs.
+    pub dialect: Option<Dialect>,
+    /// Its programs, from number 1 on.
+    pub programs: Vec<ProgramInfo>,
+}
+
+/// What a device tells people of itself before an update (CiA 814-1 clause 6.3): 1008h, 1009h, 100Ah
+/// and 1018h. `Display` has it in one line.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Nameplate {
+    /// 1008h, device name.
+    pub name: Option<String>,
+    /// 1009h, hardware version.
+    pub hardware_version: Option<String>,
+    /// 100Ah, software version.
+    pub software_version: Option<String>,
+    /// 1018h/1 to 4.
+    pub identity: Identity,
+}
+
+/// 1018h/1 to 4: vendor-ID, product code, revision, serial number; `None` for what is not told.
+pub type Identity = [Option<u32>; 4];
+
+/// What a device says about one of its programs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct ProgramInfo {
+    /// Sub-index of 1F51h, 1F56h and 1F57h.
+    pub number: u8,
+    /// 1F51h: 0 stopped, 1 running.
+    pub control: Option<u32>,
+    /// 1F56h: CRC of the program.
+    pub crc: Option<u32>,
+    /// 1F57h.
+    pub status: Option<FlashStatus>,
+}
+
+/// Asks a device for all of it.
+///
+/// # Errors
+/// [`Error::NoAnswer`] and the like; an object that the device does not have is no error.
+pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
+    let device_type = session.find()?;
+    let Nameplate { name, hardware_version, software_version, identity } = nameplate(session)?;
+    let mut number = |index, sub| optional(session.read_number(Address::new(index, sub)));
+    let error_register = number(program::ERROR_REGISTER, 0)?;
+    // The highest sub-index is the number of programs; a device without the object has none.
+    let count = number(program::PROGRAM_CONTROL, 0)?.map_or(0, |count| count.min(254) as u8);
+    let mut programs = Vec::new();
+    for number in 1..=count {
+        programs.push(program_info(session, number)?);
+    }
+    let dialect = match count {
+        0 => Dialect::of_bootloader(device_type, session.node()),
+        _ => Some(recognise(session, device_type, 1)?),
+    };
+    Ok(DeviceInfo {
+        node: session.node(),
+        device_type,
+        error_register,
+        name,
+        hardware_version,
+        software_version,
+        identity,
+        dialect,
+        programs,
+    })
+}
+
+/// Asks a device for its name, its versions and its identity.
+///
+/// # Errors
+/// As [`info`].
+pub fn nameplate(session: &mut Session<'_>) -> Result<Nameplate, Error> {
+    let mut text = |index| optional(session.read_text(Address::new(index, 0)));
+    let name = text(program::DEVICE_NAME)?;
+    let hardware_version = text(program::HARDWARE_VERSION)?;
+    let software_version = text(program::SOFTWARE_VERSION)?;
+    Ok(Nameplate { name, hardware_version, software_version, identity: identity(session)? })
+}
+
+/// Asks a device for its identity.
+///
+/// # Errors
+/// As [`info`].
+pub fn identity(session: &mut Session<'_>) -> Result<Identity, Error> {
+    let mut identity = [None; 4];
+    for (sub, value) in (1..).zip(&mut identity) {
+        *value = optional(session.read_number(Address::new(program::IDENTITY, sub)))?;
+    }
+    Ok(identity)
+}
+
+/// Asks a device about one of its programs.
+///
+/// # Errors
+/// As [`info`].
+pub fn program_info(session: &mut Session<'_>, program: u8) -> Result<ProgramInfo, Error> {
+    let mut number = |index| optional(session.read_number(Address::new(index, program)));
+    let control = number(program::PROGRAM_CONTROL)?;
+    let crc = number(program::PROGRAM_ID)?;
+    let status = number(program::FLASH_STATUS)?.map(FlashStatus::from_word);
+    Ok(ProgramInfo { number: program, control, crc, status })
+}
+
+impl fmt::Display for DeviceInfo {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        const ABSENT: &str = "not told";
+        let text = |value: &Option<String>| value.clone().unwrap_or_else(|| ABSENT.to_string());
+        let hex = |value: Option<u32>| value.map_or(ABSENT.to_string(), |value| format!("{value:08X}h"));
+        let [vendor, product, revision, serial] = self.identity.map(hex);
+        writeln!(f, "node {}: {}", self.node, self.device_type)?;
+        for (name, value) in [
+            ("device name", text(&self.name)),
+            ("hardware version", text(&self.hardware_version)),
+            ("software version", text(&self.software_version)),
+            ("vendor-ID", vendor),
+            ("product code", product),
+            ("revision", revision),
+            ("serial number", serial),
+            (
+                "error register",
+                match self.error_register {
+                    None => ABSENT.to_string(),
+                    Some(0) => "00h (no error)".to_string(),
+                    Some(bits) => format!("{bits:02X}h"),
+                },
+            ),
+            ("dialect", self.dialect.map_or(ABSENT.to_string(), |dialect| dialect.to_string())),
+        ] {
+            writeln!(f, "  {name:<17} {value}")?;
+        }
+        self.programs.iter().try_for_each(|program| write!(f, "{program}"))
+    }
+}
+
+impl fmt::Display for Nameplate {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let text = |value: &Option<String>| value.clone().unwrap_or_else(|| "not told".to_string());
+        let hex = |value: Option<u32>| value.map_or("not told".to_string(), |value| format!("{value:08X}h"));
+        let [vendor, product, revision, serial] = self.identity.map(hex);
+        write!(
+            f,
+            "{}, hardware {}, software {}, vendor-ID {vendor}, product code {product}, revision {revision}, \
+             serial number {serial}",
+            text(&self.name),
+            text(&self.hardware_version),
+            text(&self.software_version)
+        )
+    }
+}
+
+impl fmt::Display for ProgramInfo {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        const STOPPED: u32 = ProgramState::Stopped as u32;
+        const RUNNING: u32 = ProgramState::Running as u32;
+        const ABSENT: u32 = ProgramState::Absent as u32;
+        writeln!(f, "  program {}", self.number)?;
+        match self.control {
+            None => {}
+            Some(STOPPED) => writeln!(f, "    state           stopped")?,
+            Some(RUNNING) => writeln!(f, "    state           running")?,
+            Some(ABSENT) => writeln!(f, "    state           there is none")?,
+            Some(other) => writeln!(f, "    state           {other:02X}h")?,
+        }
+        if let Some(crc) = self.crc {
+            writeln!(f, "    CRC             {crc:08X}h")?;
+        }
+        if let Some(status) = self.status {
+            write!(f, "    status          ")?;
+            match status.error {
+                None => f.write_str("ok")?,
+                Some(error) => write!(f, "{error} ({:02X}h)", error.code())?,
+            }
+            if status.detail != 0 {
+                write!(f, ", detail {:04X}h", status.detail)?;
+            }
+            writeln!(f, "{}", if status.busy { ", busy" } else { "" })?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,29 @@
+//! One device on the bus, or whoever is there: conversations by SDO, what devices say about
+//! themselves, node-ID and bit rate by LSS, and what can go wrong.
+
+pub mod debugger;
+mod device_type;
+pub mod diagnose;
+mod dialect;
+mod doing;
+pub mod error;
+pub mod flying_master;
+pub mod info;
+pub mod legacy;
+mod listen;
+pub mod lss;
+pub(crate) mod recognise;
+pub mod scan;
+pub mod session;
+mod timing;
+
+pub use self::device_type::DeviceType;
+pub use self::dialect::Dialect;
+pub use self::doing::{Doing, LssDoing};
+pub use self::error::Error;
+pub use self::info::{info, DeviceInfo};
+pub use self::listen::listen;
+pub use self::recognise::recognise;
+pub use self::scan::{scan, ScanOptions};
+pub use self::session::Session;
+pub use self::timing::{Timing, Transfers};

@@ -1,0 +1,133 @@
+//! Who is on the bus.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::AtomicBool;
+use std::sync::Arc;
+use std::time::Duration;
+
+use canopen::nmt::{parse_state_message, NmtState};
+use canopen::program::DEVICE_TYPE;
+use canopen::sdo::wire::Request;
+use canopen::{AbortCode, Address, CobId, Frame, NodeId};
+use embedded_can::Frame as _;
+
+use super::error::Error;
+use super::info::{info, DeviceInfo};
+use super::listen::listen;
+use super::session::Session;
+use super::timing::Timing;
+use crate::bus::Adapter;
+
+/// A node that was seen or heard.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Found {
+    /// The last boot-up or heartbeat message heard.
+    pub state: Option<NmtState>,
+    /// What it told by SDO, if it answers.
+    pub info: Option<DeviceInfo>,
+}
+
+/// How to search.
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub struct ScanOptions {
+    /// Whom to ask.
+    pub nodes: Vec<NodeId>,
+    /// How long to listen to what the bus says by itself; heartbeats come once a second in most
+    /// networks.
+    pub listen: Duration,
+    /// How long to wait for what.
+    pub timing: Timing,
+    /// Whether to ask at all.
+    pub ask: bool,
+}
+
+impl ScanOptions {
+    setters! {
+        nodes: Vec<NodeId>,
+        listen: Duration,
+        timing: Timing,
+        ask: bool,
+    }
+}
+
+impl Default for ScanOptions {
+    fn default() -> Self {
+        Self {
+            nodes: (1..=127).filter_map(NodeId::new).collect(),
+            listen: Duration::from_millis(1100),
+            timing: Timing::default(),
+            ask: true,
+        }
+    }
+}
+
+/// How many nodes are asked at once: each that is there answers, and an adapter must not lose
+/// answers.
+const AT_ONCE: usize = 16;
+
+/// Asks all nodes what they are, and listens to what the bus says by itself.
+///
+/// A transfer that is under way with a node is aborted first: within a block download a question could
+/// be taken for a segment, and go unanswered.
+///
+/// # Errors
+/// [`Error::Adapter`] or [`Error::Cancelled`]; nobody there is no error.
+pub fn scan(
+    adapter: &mut dyn Adapter,
+    options: &ScanOptions,
+    cancelled: &Arc<AtomicBool>,
+) -> Result<BTreeMap<NodeId, Found>, Error> {
+    let mut found: BTreeMap<NodeId, Found> = BTreeMap::new();
+    let mut answered: Vec<NodeId> = Vec::new();
+    if options.ask {
+        let device_type = Address::new(DEVICE_TYPE, 0);
+        let requests =
+            [Request::Abort(device_type, AbortCode::GENERAL), Request::InitiateUpload(device_type)];
+        for nodes in options.nodes.chunks(AT_ONCE) {
+            for node in nodes {
+                for request in &requests {
+                    adapter.send(&Frame::of(CobId::sdo_request(*node), &request.emit()))?;
+                }
+            }
+            let mut silent: Vec<NodeId> = nodes.to_vec();
+            listen(adapter, options.timing.sdo.min(AT_ONCE_LIMIT), cancelled, &mut |frame| {
+                note_state(&mut found, frame);
+                let answering = silent.iter().position(|node| is_answer(frame, *node));
+                answered.extend(answering.map(|at| silent.remove(at)));
+                silent.is_empty()
+            })?;
+        }
+    }
+    listen(adapter, options.listen, cancelled, &mut |frame| {
+        note_state(&mut found, frame);
+        false
+    })?;
+    for node in answered {
+        let mut session = Session::new(adapter, node, options.timing);
+        session.cancel_by(cancelled.clone());
+        let told = match info(&mut session) {
+            Ok(told) => Some(told),
+            Err(error @ (Error::Adapter(_) | Error::Cancelled)) => return Err(error),
+            // It answered once, so that it is there; what it does not tell is left out.
+            Err(_) => None,
+        };
+        found.entry(node).or_default().info = told;
+    }
+    Ok(found)
+}
+
+/// Nobody on a bus that works takes longer for the first answer.
+const AT_ONCE_LIMIT: Duration = Duration::from_millis(200);
+
+/// Whether the node answers something by SDO, be it an abort.
+fn is_answer(frame: &Frame, node: NodeId) -> bool {
+    frame.cob_id() == Some(CobId::sdo_response(node)) && frame.dlc() == 8
+}
+
+fn note_state(found: &mut BTreeMap<NodeId, Found>, frame: &Frame) {
+    if let Some((node, state)) = parse_state_message(frame) {
+        found.entry(node).or_default().state = Some(state);
+    }
+}

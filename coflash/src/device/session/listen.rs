@@ -1,0 +1,139 @@
+//! What a session hears on the bus, and what it says beside SDO.
+
+use std::time::Duration;
+
+use canopen::nmt::NmtCommand;
+use canopen::{CobId, Frame, NodeId};
+
+use super::{Session, Way};
+use crate::device::doing::Doing;
+use crate::device::error::{of_gateway, Error};
+
+/// The longest wait in one piece: how soon a cancelled session notices.
+pub(super) const SLICE: Duration = Duration::from_millis(100);
+
+impl Session<'_> {
+    /// Lets time pass on the bus. Frames that come are not for anyone.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn wait(&mut self, time: Duration) -> Result<(), Error> {
+        self.listen(time, |_| false).map(|_| ())
+    }
+
+    /// Listens to everything on the bus for a time.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn observe(&mut self, time: Duration, heard: &mut dyn FnMut(&Frame)) -> Result<(), Error> {
+        self.listen(time, |frame| {
+            heard(frame);
+            false
+        })
+        .map(|_| ())
+    }
+
+    /// Listens to everything on the bus until `enough` says so, `time` at most; tells whether it
+    /// did.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn observe_until(
+        &mut self,
+        time: Duration,
+        enough: &mut dyn FnMut(&Frame) -> bool,
+    ) -> Result<bool, Error> {
+        self.listen(time, enough)
+    }
+
+    /// Waits for the node's boot-up message, `time` at most; tells whether it came.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn await_boot_up(&mut self, time: Duration) -> Result<bool, Error> {
+        let boot_up = Frame::of(CobId::heartbeat(self.node), &[0]);
+        self.listen(time, |frame| *frame == boot_up)
+    }
+
+    /// Waits for the boot-up message of any other node, `time` at most; gives which one it was.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn await_boot_up_of_another(&mut self, time: Duration) -> Result<Option<NodeId>, Error> {
+        let (this, mut other) = (self.node, None);
+        self.listen(time, |frame| {
+            let of = |node: &NodeId| *frame == Frame::of(CobId::heartbeat(*node), &[0]);
+            other = (1..=127).filter_map(NodeId::new).filter(|node| *node != this).find(of);
+            other.is_some()
+        })?;
+        Ok(other)
+    }
+
+    /// Tells the node by network management to restart (NMT reset node); it gives no answer.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`].
+    pub fn reset_node(&mut self) -> Result<(), Error> {
+        let node = self.node;
+        match &mut self.way {
+            Way::Bus(adapter) => {
+                Ok(adapter.send(&Frame::of(CobId::NMT, &[NmtCommand::ResetNode as u8, node.get()]))?)
+            }
+            Way::Gateway(gateway) => {
+                gateway.reset_node(node).map_err(|error| of_gateway(error, node, Doing::Restart))
+            }
+        }
+    }
+
+    /// Sends a frame that is no SDO. A gateway carries none, and none is sent there.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`].
+    pub fn send(&mut self, frame: &Frame) -> Result<(), Error> {
+        match &mut self.way {
+            Way::Bus(adapter) => Ok(adapter.send(frame)?),
+            Way::Gateway(_) => Ok(()),
+        }
+    }
+
+    /// The next frame from the bus. Those that somebody else waits for are answered on the way. Of a
+    /// gateway, boot-up messages are all there is to hear.
+    pub(super) fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, Error> {
+        let adapter = match &mut self.way {
+            Way::Bus(adapter) => adapter,
+            Way::Gateway(gateway) => {
+                let booted = gateway.wait(timeout);
+                let booted = booted.map_err(|error| of_gateway(error, self.node, Doing::Restart))?;
+                return Ok(booted.map(|node| Frame::of(CobId::heartbeat(node), &[0])));
+            }
+        };
+        let frame = adapter.receive(timeout)?;
+        if let (Some(answer), Some(frame)) = (self.answer, &frame) {
+            if let Some(answer) = answer(frame) {
+                adapter.send(&answer)?;
+            }
+        }
+        Ok(frame)
+    }
+
+    /// Receives until `enough` says so, `time` at most; tells whether it did.
+    pub(super) fn listen(
+        &mut self,
+        time: Duration,
+        mut enough: impl FnMut(&Frame) -> bool,
+    ) -> Result<bool, Error> {
+        let deadline = self.now() + time;
+        loop {
+            self.check_cancelled()?;
+            let left = deadline.saturating_sub(self.now());
+            if let Some(frame) = self.receive(left.min(SLICE))? {
+                if enough(&frame) {
+                    return Ok(true);
+                }
+            }
+            if self.now() >= deadline {
+                return Ok(false);
+            }
+        }
+    }
+}

@@ -1,0 +1,281 @@
+//! A conversation with one node: SDO reads and writes, commands and their outcome, over any
+//! [`Adapter`] or [`Gateway`].
+
+use std::fmt;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::Arc;
+use std::time::Duration;
+
+use canopen::program::{self, FlashStatus, ProgramControl};
+use canopen::{AbortCode, Address, Frame, NodeId};
+
+use super::device_type::DeviceType;
+use super::doing::Doing;
+use super::error::Error;
+use super::timing::{Timing, Transfers};
+use crate::bus::adapter::Adapter;
+use crate::bus::gateway::Gateway;
+use crate::bus::Link;
+
+mod listen;
+mod remote;
+mod transfer;
+
+/// The most bytes that are read at all: more than any microcontroller's flash has.
+pub const UPLOAD_MAX: usize = 64 * 1024 * 1024;
+
+/// The way to the node.
+enum Way<'a> {
+    /// Frames: the SDO client is ours.
+    Bus(&'a mut dyn Adapter),
+    /// Objects: the SDO client is the gateway's.
+    Gateway(&'a mut dyn Gateway),
+}
+
+/// A conversation with one node.
+pub struct Session<'a> {
+    way: Way<'a>,
+    node: NodeId,
+    timing: Timing,
+    transfers: Transfers,
+    cancelled: Option<Arc<AtomicBool>>,
+    answer: Option<fn(&Frame) -> Option<Frame>>,
+}
+
+impl fmt::Debug for Session<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Session")
+            .field("node", &self.node)
+            .field("timing", &self.timing)
+            .finish_non_exhaustive()
+    }
+}
+
+impl<'a> Session<'a> {
+    /// A conversation with `node`. Nothing is sent yet.
+    pub fn new(adapter: &'a mut dyn Adapter, node: NodeId, timing: Timing) -> Self {
+        Self::over(Way::Bus(adapter), node, timing)
+    }
+
+    /// The same with a node behind a gateway.
+    pub fn through(gateway: &'a mut dyn Gateway, node: NodeId, timing: Timing) -> Self {
+        Self::over(Way::Gateway(gateway), node, timing)
+    }
+
+    /// The same over whatever a URL has led to.
+    pub fn on(link: &'a mut Link, node: NodeId, timing: Timing) -> Self {
+        match link {
+            Link::Bus(adapter) => Self::new(&mut **adapter, node, timing),
+            Link::Gateway(gateway) => Self::through(&mut **gateway, node, timing),
+        }
+    }
+
+    fn over(way: Way<'a>, node: NodeId, timing: Timing) -> Self {
+        Self { way, node, timing, transfers: Transfers::default(), cancelled: None, answer: None }
+    }
+
+    /// The same conversation with another node, or with other patience, for a while.
+    #[must_use]
+    pub fn with(&mut self, node: NodeId, timing: Timing) -> Session<'_> {
+        let (transfers, cancelled, answer) = (self.transfers, self.cancelled.clone(), self.answer);
+        let way = match &mut self.way {
+            Way::Bus(adapter) => Way::Bus(&mut **adapter),
+            Way::Gateway(gateway) => Way::Gateway(&mut **gateway),
+        };
+        Session { way, node, timing, transfers, cancelled, answer }
+    }
+
+    /// Goes on with another node.
+    pub fn talk_to(&mut self, node: NodeId) {
+        self.node = node;
+    }
+
+    /// Ends with [`Error::Cancelled`] as soon as `flag` is set: a transfer under way is aborted.
+    pub fn cancel_by(&mut self, flag: Arc<AtomicBool>) {
+        self.cancelled = Some(flag);
+    }
+
+    /// Answers by this to frames that come meanwhile, whatever else is under way: what it gives is
+    /// sent.
+    pub fn answer_by(&mut self, answer: Option<fn(&Frame) -> Option<Frame>>) {
+        self.answer = answer;
+    }
+
+    /// Writes this way from now on.
+    pub fn transfer_by(&mut self, transfers: Transfers) {
+        self.transfers = transfers;
+    }
+
+    /// How long values are written at present.
+    #[must_use]
+    pub fn transfers(&self) -> Transfers {
+        self.transfers
+    }
+
+    /// The node.
+    #[must_use]
+    pub fn node(&self) -> NodeId {
+        self.node
+    }
+
+    /// How long it waits for what.
+    #[must_use]
+    pub fn timing(&self) -> &Timing {
+        &self.timing
+    }
+
+    /// The time on the bus.
+    #[must_use]
+    pub fn now(&self) -> Duration {
+        match &self.way {
+            Way::Bus(adapter) => adapter.now(),
+            Way::Gateway(gateway) => gateway.now(),
+        }
+    }
+
+    /// Whether it hears what others say on the bus. Behind a gateway it does not.
+    #[must_use]
+    pub fn hears_the_bus(&self) -> bool {
+        matches!(self.way, Way::Bus(_))
+    }
+
+    /// Reads a value of up to 4096 bytes. A read that gets no answer is repeated.
+    ///
+    /// # Errors
+    /// [`Error::NoAnswer`], [`Error::Refused`], [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn read(&mut self, at: Address) -> Result<Vec<u8>, Error> {
+        let attempts = self.timing.attempts.max(1);
+        let mut attempt = 1;
+        loop {
+            match self.read_once(at) {
+                // An answer that came late, to a request given up, spoils the next one: then, too,
+                // ask again.
+                Err(Error::NoAnswer { .. } | Error::Protocol { .. }) if attempt < attempts => attempt += 1,
+                result => return result,
+            }
+        }
+    }
+
+    /// Reads an unsigned number of up to 32 bits.
+    ///
+    /// # Errors
+    /// As [`read`](Self::read), and [`Error::Protocol`] for a value of another length.
+    pub fn read_number(&mut self, at: Address) -> Result<u32, Error> {
+        let bytes = self.read(at)?;
+        number(&bytes).ok_or(Error::Protocol { doing: Doing::Read(at), code: AbortCode::LENGTH })
+    }
+
+    /// Reads a text. What is not ASCII, or would move the cursor, is replaced.
+    ///
+    /// # Errors
+    /// As [`read`](Self::read).
+    pub fn read_text(&mut self, at: Address) -> Result<String, Error> {
+        let bytes = self.read(at)?;
+        let text = bytes.split(|byte| *byte == 0).next().unwrap_or_default();
+        let visible = |byte: &u8| if matches!(byte, b' '..=b'~') { char::from(*byte) } else { '?' };
+        Ok(text.iter().map(visible).collect())
+    }
+
+    /// Writes a command to 1F51h of a program, once; how it went is in [`status`](Self::status).
+    ///
+    /// # Errors
+    /// As [`write`](Self::write).
+    pub fn command(&mut self, number: u8, command: ProgramControl) -> Result<(), Error> {
+        let at = Address::new(program::PROGRAM_CONTROL, number);
+        self.write(at, &[command as u8], Doing::Command(command), &mut |_| {})
+    }
+
+    /// Reads 1F57h of a program.
+    ///
+    /// # Errors
+    /// As [`read_number`](Self::read_number).
+    pub fn status(&mut self, number: u8) -> Result<FlashStatus, Error> {
+        self.read_number(Address::new(program::FLASH_STATUS, number)).map(FlashStatus::from_word)
+    }
+
+    /// Waits until 1F57h of a program is no longer busy, and gives what it says then. Silence
+    /// counts as busy: a device may be unable to answer while it erases.
+    ///
+    /// # Errors
+    /// [`Error::Busy`] or [`Error::NoAnswer`] when [`Timing::command`] has passed, and what
+    /// [`read`](Self::read) has.
+    pub fn await_idle(&mut self, number: u8, doing: Doing) -> Result<FlashStatus, Error> {
+        let began = self.now();
+        let at = Address::new(program::FLASH_STATUS, number);
+        let mut pause = self.timing.poll_first;
+        loop {
+            let silence = match self.read_once(at) {
+                Ok(bytes) => {
+                    let word = self::number(&bytes)
+                        .ok_or(Error::Protocol { doing: Doing::Read(at), code: AbortCode::LENGTH })?;
+                    let status = FlashStatus::from_word(word);
+                    if !status.busy {
+                        return Ok(status);
+                    }
+                    None
+                }
+                Err(error @ (Error::NoAnswer { .. } | Error::Protocol { .. })) => Some(error),
+                Err(error) => return Err(error),
+            };
+            let waited = self.now().saturating_sub(began);
+            if waited >= self.timing.command {
+                return Err(silence.unwrap_or(Error::Busy { node: self.node, doing, waited }));
+            }
+            self.wait(pause)?;
+            pause = (pause * 2).min(self.timing.poll_most);
+        }
+    }
+
+    /// Reads 1000h once: `None` where no answer comes.
+    ///
+    /// # Errors
+    /// What [`read`](Self::read) has apart from [`Error::NoAnswer`].
+    pub fn device_type(&mut self) -> Result<Option<DeviceType>, Error> {
+        let at = Address::new(program::DEVICE_TYPE, 0);
+        match self.read_once(at) {
+            Ok(bytes) => {
+                let value = number(&bytes);
+                let value =
+                    value.ok_or(Error::Protocol { doing: Doing::Read(at), code: AbortCode::LENGTH })?;
+                Ok(Some(DeviceType(value)))
+            }
+            Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// What is running, or [`Error::NoAnswer`]. A device that was just reset misses a few requests,
+    /// so that the question is repeated for as long as a restart may take.
+    ///
+    /// # Errors
+    /// [`Error::NoAnswer`], and what a [read](Self::read) has.
+    pub fn find(&mut self) -> Result<DeviceType, Error> {
+        let deadline = self.now() + self.timing.boot;
+        loop {
+            if let Some(running) = self.device_type()? {
+                return Ok(running);
+            }
+            if self.now() >= deadline {
+                let at = Address::new(program::DEVICE_TYPE, 0);
+                return Err(Error::NoAnswer { node: self.node, doing: Doing::Read(at) });
+            }
+            let pause = self.timing.poll_first;
+            self.await_boot_up(pause)?;
+        }
+    }
+
+    fn check_cancelled(&self) -> Result<(), Error> {
+        match &self.cancelled {
+            Some(flag) if flag.load(Ordering::Relaxed) => Err(Error::Cancelled),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// A little-endian number of one to four bytes.
+fn number(bytes: &[u8]) -> Option<u32> {
+    if !(1..=4).contains(&bytes.len()) {
+        return None;
+    }
+    Some(bytes.iter().rev().fold(0, |number, byte| number << 8 | u32::from(*byte)))
+}

@@ -1,0 +1,78 @@
+//! A session with a node behind a gateway: the gateway's SDO client does the transfers.
+
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use canopen::{AbortCode, Address};
+
+use super::transfer::{VALUE_MAX, WORTH_BLOCKS};
+use super::{Session, Way};
+use crate::bus::gateway::{Ask, Gateway, GatewayError};
+use crate::device::doing::Doing;
+use crate::device::error::{of_gateway, Error};
+
+/// How much longer than its node a gateway may take for a short value.
+const GATEWAY_GRACE: Duration = Duration::from_secs(5);
+/// What the slowest bus carries of a value in a second: 10 kbit/s in segments, and others talk, too.
+const GATEWAY_BYTES: u64 = 250;
+
+impl Session<'_> {
+    /// Reads a short value there.
+    pub(super) fn read_there(&mut self, at: Address) -> Result<Vec<u8>, Error> {
+        let value = self.upload_there(at, self.timing.sdo + GATEWAY_GRACE, &mut |_| {})?;
+        let long = Error::Protocol { doing: Doing::Read(at), code: AbortCode::OUT_OF_MEMORY };
+        if value.len() > VALUE_MAX {
+            Err(long)
+        } else {
+            Ok(value)
+        }
+    }
+
+    /// Reads a value of any length there, with this patience for each part of it.
+    pub(super) fn upload_there(
+        &mut self,
+        at: Address,
+        patience: Duration,
+        progress: &mut dyn FnMut(u32),
+    ) -> Result<Vec<u8>, Error> {
+        self.through_gateway(at, Doing::Read(at), patience, |gateway, ask| gateway.upload(ask, progress))
+    }
+
+    /// Writes a value there.
+    pub(super) fn write_there(
+        &mut self,
+        at: Address,
+        data: &[u8],
+        doing: Doing,
+        progress: &mut dyn FnMut(u32),
+    ) -> Result<(), Error> {
+        let patience = match data.len() {
+            0..=WORTH_BLOCKS => self.timing.sdo + GATEWAY_GRACE,
+            len => self.timing.command + Duration::from_secs(len as u64 / GATEWAY_BYTES),
+        };
+        self.through_gateway(at, doing, patience, |gateway, ask| gateway.download(ask, data, progress))
+    }
+
+    /// Has a gateway do something with an object, and tells what came of it as a transfer of our own
+    /// does.
+    fn through_gateway<T>(
+        &mut self,
+        at: Address,
+        doing: Doing,
+        patience: Duration,
+        act: impl FnOnce(&mut dyn Gateway, &Ask<'_>) -> Result<T, GatewayError>,
+    ) -> Result<T, Error> {
+        self.check_cancelled()?;
+        let flag = self.cancelled.clone();
+        let cancelled = move || flag.as_ref().is_some_and(|flag| flag.load(Ordering::Relaxed));
+        let (node, sdo) = (self.node, self.timing.sdo);
+        let ask = Ask { node, at, sdo, patience, cancelled: &cancelled };
+        match &mut self.way {
+            Way::Gateway(gateway) => {
+                act(&mut **gateway, &ask).map_err(|error| of_gateway(error, node, doing))
+            }
+            // Nobody comes here without one.
+            Way::Bus(_) => Err(Error::NoAnswer { node, doing }),
+        }
+    }
+}

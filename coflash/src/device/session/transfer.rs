@@ -1,0 +1,207 @@
+//! The transfers of a session over the bus: reads and writes of any length by the SDO client.
+
+use std::time::Duration;
+
+use canopen::sdo::client::{Block, Buffer, Config, Sink};
+use canopen::sdo::{Download, SdoError, Step, Transfer, Upload};
+use canopen::{AbortCode, Address, CobId, Instant};
+
+use super::listen::SLICE;
+use super::{Session, UPLOAD_MAX};
+use crate::device::doing::Doing;
+use crate::device::error::Error;
+use crate::device::timing::Transfers;
+
+/// The largest value that is read as a whole. No object of a bootloader comes near it.
+pub(super) const VALUE_MAX: usize = 4096;
+/// Grows with what really arrives; what a device merely announces takes no memory.
+struct Grown(Vec<u8>);
+
+impl Sink for Grown {
+    fn write(&mut self, data: &[u8]) -> Result<(), AbortCode> {
+        if self.0.len() + data.len() > UPLOAD_MAX {
+            return Err(AbortCode::OUT_OF_MEMORY);
+        }
+        self.0.extend_from_slice(data);
+        Ok(())
+    }
+}
+
+/// After so long without an abort, no more come for the segments of a transfer that was refused. A
+/// frame on the slowest bus takes 13 ms.
+const QUIET: Duration = Duration::from_millis(30);
+/// After so many frames in a row, a look whether the node has something against them.
+const BURST: u32 = 8;
+/// Less is not worth the frames around a block transfer.
+pub(super) const WORTH_BLOCKS: usize = 4 * 7;
+
+/// What [`Timing::command`] limits in a transfer. The SDO time-out alone does not end one: it
+/// counts from answer to answer, and a device that babbles always has one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Patience {
+    /// The transfer.
+    InAll,
+    /// The time without progress.
+    ForEachStep,
+}
+
+impl Session<'_> {
+    /// Reads a value without repetition; otherwise as [`read`](Self::read).
+    ///
+    /// # Errors
+    /// As [`read`](Self::read).
+    pub fn read_once(&mut self, at: Address) -> Result<Vec<u8>, Error> {
+        if !self.hears_the_bus() {
+            return self.read_there(at);
+        }
+        let mut bytes = [0; VALUE_MAX];
+        let mut upload = Upload::new(self.node, at, Buffer::new(&mut bytes), self.config());
+        // A value is short: all of it has to be here in time.
+        self.run(&mut upload, Doing::Read(at), Patience::InAll, &mut |_| {})?;
+        Ok(upload.sink().filled().to_vec())
+    }
+
+    /// Reads a value of any length, as blocks where the device knows them. `progress` is told how
+    /// many bytes are here.
+    ///
+    /// # Errors
+    /// As [`read`](Self::read); [`Error::Protocol`] for more than [`UPLOAD_MAX`] bytes.
+    pub fn upload(&mut self, at: Address, progress: &mut dyn FnMut(u32)) -> Result<Vec<u8>, Error> {
+        if !self.hears_the_bus() {
+            return self.upload_there(at, self.timing.command, progress);
+        }
+        let (sink, config) = (Grown(Vec::new()), self.config());
+        let mut upload = match self.transfers {
+            Transfers::Blocks => Upload::as_blocks(self.node, at, sink, config, Block::default()),
+            Transfers::Segments => Upload::new(self.node, at, sink, config),
+        };
+        self.run(&mut upload, Doing::Read(at), Patience::ForEachStep, progress)?;
+        Ok(upload.into_sink().0)
+    }
+
+    /// Writes a value, once. `progress` is told how many bytes have arrived.
+    ///
+    /// # Errors
+    /// [`Error::NoAnswer`], [`Error::Refused`], [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn write(
+        &mut self,
+        at: Address,
+        data: &[u8],
+        doing: Doing,
+        progress: &mut dyn FnMut(u32),
+    ) -> Result<(), Error> {
+        if !self.hears_the_bus() {
+            return self.write_there(at, data, doing, progress);
+        }
+        if self.transfers == Transfers::Blocks && data.len() > WORTH_BLOCKS {
+            let block = Block { fallback: false, ..Block::default() };
+            let mut download = Download::as_blocks(self.node, at, data, self.config(), block);
+            match self.run(&mut download, doing, Patience::ForEachStep, progress) {
+                // It is no use asking again for each value.
+                Err(Error::Refused { code, .. }) if download.progress() == 0 && means_no_blocks(code) => {
+                    self.transfers = Transfers::Segments;
+                }
+                Err(error @ Error::Refused { .. }) => {
+                    self.settle_after_burst()?;
+                    return Err(error);
+                }
+                result => return result,
+            }
+        }
+        let mut download = Download::new(self.node, at, data, self.config());
+        self.run(&mut download, doing, Patience::ForEachStep, progress)
+    }
+
+    /// Waits until the node has said nothing for a while: segments that were on their way when it
+    /// refused a block transfer draw an abort each, and none of these is the answer to what is
+    /// asked next.
+    fn settle_after_burst(&mut self) -> Result<(), Error> {
+        let deadline = self.now() + self.timing.sdo;
+        let response = CobId::sdo_response(self.node);
+        while self.now() < deadline && self.listen(QUIET, |frame| frame.cob_id() == Some(response))? {}
+        Ok(())
+    }
+
+    fn config(&self) -> Config {
+        Config { timeout_ms: u32::try_from(self.timing.sdo.as_millis()).unwrap_or(u32::MAX / 4) }
+    }
+
+    /// Runs one transfer to its end.
+    fn run(
+        &mut self,
+        transfer: &mut impl Transfer,
+        doing: Doing,
+        patience: Patience,
+        progress: &mut dyn FnMut(u32),
+    ) -> Result<(), Error> {
+        self.check_cancelled()?;
+        // Answers to requests that were given up are no answers to this one.
+        let mut stale = 0;
+        while stale < 1000 && self.receive(Duration::ZERO)?.is_some() {
+            stale += 1;
+        }
+        let mut deadline = self.now() + self.timing.command;
+        let mut cancelled = false;
+        let mut told = 0;
+        let mut burst = 0;
+        loop {
+            if !cancelled && self.check_cancelled().is_err() {
+                cancelled = true;
+                transfer.abort(AbortCode::GENERAL);
+            }
+            if self.now() >= deadline {
+                transfer.abort(AbortCode::TIMEOUT);
+            }
+            match transfer.poll(self.instant()) {
+                Step::Send(frame) => {
+                    self.send(&frame)?;
+                    burst += 1;
+                    if burst % BURST == 0 {
+                        if let Some(frame) = self.receive(Duration::ZERO)? {
+                            let now = self.instant();
+                            transfer.handle(&frame, now);
+                        }
+                    }
+                }
+                Step::Wait(until) => {
+                    burst = 0;
+                    let now = self.instant();
+                    let left = if now.has_reached(until) { 0 } else { until.since(now) };
+                    let left = Duration::from_millis(left.into());
+                    if let Some(frame) = self.receive(left.min(SLICE))? {
+                        let now = self.instant();
+                        transfer.handle(&frame, now);
+                        if transfer.progress() != told {
+                            told = transfer.progress();
+                            progress(told);
+                            if patience == Patience::ForEachStep {
+                                deadline = self.now() + self.timing.command;
+                            }
+                        }
+                    }
+                }
+                Step::Done(_) if cancelled => return Err(Error::Cancelled),
+                Step::Done(Ok(())) => return Ok(()),
+                Step::Done(Err(SdoError::NoAnswer)) => {
+                    return Err(Error::NoAnswer { node: self.node, doing })
+                }
+                Step::Done(Err(SdoError::Server(code))) => {
+                    return Err(Error::Refused { node: self.node, doing, code })
+                }
+                Step::Done(Err(SdoError::Client(code))) => return Err(Error::Protocol { doing, code }),
+            }
+        }
+    }
+
+    /// The bus time as the state machines count it: they compare by difference, so wrapping is
+    /// right.
+    fn instant(&self) -> Instant {
+        Instant::from_millis(self.now().as_millis() as u32)
+    }
+}
+
+/// Whether this is how a server says that it does not know block transfer. Some use the general
+/// error for it.
+fn means_no_blocks(code: AbortCode) -> bool {
+    matches!(code, AbortCode::COMMAND | AbortCode::UNSUPPORTED_ACCESS | AbortCode::GENERAL)
+}

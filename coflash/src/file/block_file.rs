@@ -1,0 +1,419 @@
+//! Block files: read, verified and written. The format itself is in [`shared_abi::block_file`].
+
+use std::fmt;
+
+use crc::{Crc, Table, CRC_16_XMODEM, CRC_32_ISO_HDLC};
+use shared_abi::block_file::{
+    Control, Header, Last, CRC_SIZE, HEADER_SIZE, LAST_SIZE, LAST_SIZE_2008, NUMBER_CONTROL, NUMBER_LAST,
+};
+pub use shared_abi::block_file::{Identity, FRAMING, MAX_BLOCK_SIZE};
+
+use super::fault::{Cause, Place, ReadError};
+use super::image::{Image, Pieces};
+use super::range::AddressRange;
+
+/// The CRC of blocks and programs: polynomial EDB88320h reflected (manual L-1112d_10, chapter 3.1).
+pub const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISO_HDLC);
+
+/// The CRC that a bootloader built for it takes instead: polynomial 1021h, start value 0, as SDO
+/// block transfer has it (manual L-1112d_10, table 8, `--crc16`).
+const CRC16: Crc<u16, Table<16>> = Crc::<u16, Table<16>>::new(&CRC_16_XMODEM);
+
+/// With what the blocks and the program are checked. The file does not say it: host and bootloader
+/// have to agree.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Checksum {
+    /// [`CRC`].
+    #[default]
+    Crc32,
+    /// The 16-bit CRC with polynomial 1021h, stored in 32 bits.
+    Crc16,
+}
+
+impl Checksum {
+    /// Over all of the parts, one behind the other.
+    fn of<'a>(self, parts: impl Iterator<Item = &'a [u8]>) -> u32 {
+        match self {
+            Self::Crc32 => {
+                let mut digest = CRC.digest();
+                parts.for_each(|part| digest.update(part));
+                digest.finalize()
+            }
+            Self::Crc16 => {
+                let mut digest = CRC16.digest();
+                parts.for_each(|part| digest.update(part));
+                digest.finalize().into()
+            }
+        }
+    }
+}
+
+impl fmt::Display for Checksum {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Crc32 => "CRC-32",
+            Self::Crc16 => "CRC-16",
+        })
+    }
+}
+
+/// The most data bytes that a block can have.
+pub const MAX_DATA: usize = MAX_BLOCK_SIZE - FRAMING;
+
+/// The most bytes from a program's start to its last one. No microcontroller's flash comes near it;
+/// what exceeds it holds data for two memories.
+pub const MAX_PROGRAM_SIZE: u32 = 64 * 1024 * 1024;
+
+/// The form of the last block.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum LastBlock {
+    /// Size and CRC of the program: the manual of 2015.
+    #[default]
+    Of2015,
+    /// 32 reserved bytes in front of them: the manual of 2008.
+    Of2008,
+}
+
+/// One block, as one SDO download takes it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Block {
+    /// 0, 1…N or FFFFFFFFh.
+    pub number: u32,
+    /// Where the data goes.
+    pub flash_address: u32,
+    /// The data: control, program, or size and CRC of it.
+    pub data: Vec<u8>,
+}
+
+impl Block {
+    /// The bytes of the block with header and CRC-32.
+    #[must_use]
+    pub fn emit(&self) -> Vec<u8> {
+        self.emit_with(Checksum::Crc32)
+    }
+
+    /// The bytes of the block with header and CRC.
+    #[must_use]
+    pub fn emit_with(&self, checksum: Checksum) -> Vec<u8> {
+        let header = Header {
+            number: self.number,
+            flash_address: self.flash_address,
+            size: match (self.number, self.data.len()) {
+                // The manual of 2008 does not count the reserved bytes.
+                (NUMBER_LAST, LAST_SIZE_2008) => LAST_SIZE as u32,
+                // A block is never larger than `MAX_DATA`.
+                (_, size) => size as u32,
+            },
+        };
+        let mut bytes = Vec::with_capacity(FRAMING + self.data.len());
+        bytes.extend_from_slice(&header.emit());
+        bytes.extend_from_slice(&self.data);
+        let crc = checksum.of([bytes.as_slice()].into_iter());
+        bytes.extend_from_slice(&crc.to_le_bytes());
+        bytes
+    }
+}
+
+/// A whole block file whose numbers, sizes and CRCs are right.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct BlockFile {
+    blocks: Vec<Block>,
+    control: Control,
+    last: Last,
+    checksum: Checksum,
+}
+
+impl BlockFile {
+    /// Puts a file together from the blocks of the program, whose region starts at `start`.
+    ///
+    /// `blocks` are (address, data) in address order and not before `start`; each has at most
+    /// [`MAX_DATA`] bytes. `control` makes block 0 when the program's size is known.
+    pub(crate) fn new(
+        start: u32,
+        blocks: Vec<(u32, Vec<u8>)>,
+        control: impl FnOnce(u32) -> Control,
+        checksum: Checksum,
+        last_block: LastBlock,
+    ) -> Self {
+        let program_size = blocks.last().map_or(0, |(address, data)| address - start + data.len() as u32);
+        let program_crc =
+            program_crc(checksum, start, program_size, blocks.iter().map(|(a, d)| (*a, d.as_slice())));
+        let control = control(program_size);
+        // Flash address 0: the older manual (L-1112e_5) asks for it, the newer one allows anything.
+        let last = Last { program_size, program_crc };
+        let (bytes, len) = control.emit();
+        let block = |number, flash_address, data| Block { number, flash_address, data };
+        let mut all = vec![block(NUMBER_CONTROL, 0, bytes[..len].to_vec())];
+        all.extend((1..).zip(blocks).map(|(number, (address, data))| block(number, address, data)));
+        let reserved = match last_block {
+            LastBlock::Of2015 => 0,
+            LastBlock::Of2008 => LAST_SIZE_2008 - LAST_SIZE,
+        };
+        all.push(block(NUMBER_LAST, 0, [&vec![0; reserved][..], &last.emit()].concat()));
+        Self { blocks: all, control, last, checksum }
+    }
+
+    /// Whether bytes begin like a block file: block 0 at address 0 with one of the known lengths.
+    #[must_use]
+    pub fn looks_like(bytes: &[u8]) -> bool {
+        bytes.first_chunk().is_some_and(|header| {
+            let Header { number, flash_address, size } = Header::parse(header);
+            number == NUMBER_CONTROL && flash_address == 0 && matches!(size, 8 | 12 | 24)
+        })
+    }
+
+    /// Reads a file and checks every number, size and CRC in it. Which CRC it is, the first block
+    /// tells.
+    ///
+    /// # Errors
+    /// The first fault, with its offset.
+    pub fn parse(bytes: &[u8]) -> Result<Self, ReadError> {
+        let mut blocks: Vec<Block> = Vec::new();
+        let mut offset = 0;
+        let mut checksum = Checksum::Crc32;
+        if parse_block(bytes, Checksum::Crc16, Place::Offset(0)).is_ok() {
+            checksum = Checksum::Crc16;
+        }
+        let last = loop {
+            let place = Place::Offset(offset);
+            let (block, len) = parse_block(&bytes[offset..], checksum, place)?;
+            let expected = blocks.len() as u32;
+            let is_last = block.number == NUMBER_LAST && expected > 0;
+            if block.number != expected && !is_last {
+                return Err(place.fault(Cause::BlockNumber { found: block.number, expected }));
+            }
+            offset += len;
+            let data_len = block.data.len();
+            let last = is_last.then(|| Last::parse(&block.data));
+            check_order(blocks.last(), &block, place)?;
+            blocks.push(block);
+            match last {
+                Some(Some(last)) => break last,
+                Some(None) => return Err(place.fault(Cause::LastSize(data_len))),
+                None if offset == bytes.len() => {
+                    return Err(Place::File.fault(Cause::NoEnd("its last block (number FFFFFFFFh)")))
+                }
+                None => {}
+            }
+        };
+        if offset != bytes.len() {
+            let words = "there is more behind the last block: not one block file, or damaged";
+            return Err(Place::Offset(offset).fault(Cause::Malformed(words)));
+        }
+        let control = &blocks[0].data;
+        let control =
+            Control::parse(control).ok_or(Place::Offset(0).fault(Cause::ControlSize(control.len())))?;
+        let file = Self { blocks, control, last, checksum };
+        if file.program_blocks().is_empty() {
+            return Err(Place::File.fault(Cause::NoData));
+        }
+        // The file does not say where its program starts. It is the first byte, or whatever lies
+        // the program's size before the end of the last byte.
+        let span = file.span();
+        let by_end = (u64::from(span.last) + 1).checked_sub(last.program_size.into());
+        let fits = |start| file.starts_at(start);
+        if fits(span.first) || by_end.and_then(|start| u32::try_from(start).ok()).is_some_and(fits) {
+            return Ok(file);
+        }
+        Err(Place::Offset(offset - FRAMING - 8).fault(file.program_fault()))
+    }
+
+    /// Checks a file that was read from elsewhere against the region that it is to go into: every
+    /// block inside, and size and CRC counted from the region's start, as the device counts them.
+    ///
+    /// # Errors
+    /// [`Cause::Outside`] or [`Cause::ProgramCrc`].
+    pub fn check_region(&self, region: AddressRange) -> Result<(), ReadError> {
+        let mut offset = self.blocks[0].data.len() + FRAMING;
+        for block in self.program_blocks() {
+            let (first, last) = (block.flash_address, last_address(block));
+            if !region.contains(&AddressRange { first, last }) {
+                return Err(Place::Offset(offset).fault(Cause::Outside { first, last, region }));
+            }
+            offset += block.data.len() + FRAMING;
+        }
+        if self.starts_at(region.first) {
+            Ok(())
+        } else {
+            Err(Place::Offset(offset).fault(self.program_fault()))
+        }
+    }
+
+    /// Whether size and CRC of the last block are those of the blocks, counted from `start`.
+    fn starts_at(&self, start: u32) -> bool {
+        let span = self.span();
+        let Last { program_size, program_crc: crc } = self.last;
+        // Blocks that reach behind the size would not be covered by the CRC.
+        let covered = start <= span.first
+            && program_size <= MAX_PROGRAM_SIZE
+            && u64::from(start) + u64::from(program_size) > u64::from(span.last);
+        let blocks = self.program_blocks().iter().map(|block| (block.flash_address, block.data.as_slice()));
+        covered && program_crc(self.checksum, start, program_size, blocks) == crc
+    }
+
+    fn program_fault(&self) -> Cause {
+        Cause::ProgramCrc { size: self.last.program_size, crc: self.last.program_crc }
+    }
+
+    /// All blocks in the order of their downloads: control, program, last.
+    #[must_use]
+    pub fn blocks(&self) -> &[Block] {
+        &self.blocks
+    }
+
+    /// The blocks that carry the program: 1…N.
+    #[must_use]
+    pub fn program_blocks(&self) -> &[Block] {
+        let end = self.blocks.len().saturating_sub(1).max(1);
+        &self.blocks[1..end]
+    }
+
+    /// From the program's first byte in a block to its last one.
+    #[must_use]
+    pub fn span(&self) -> AddressRange {
+        let blocks = self.program_blocks();
+        AddressRange {
+            first: blocks.first().map_or(0, |block| block.flash_address),
+            last: blocks.last().map_or(0, last_address),
+        }
+    }
+
+    /// What block 0 says.
+    #[must_use]
+    pub fn control(&self) -> &Control {
+        &self.control
+    }
+
+    /// With what it is checked.
+    #[must_use]
+    pub fn checksum(&self) -> Checksum {
+        self.checksum
+    }
+
+    /// The memory contents that the blocks carry.
+    #[must_use]
+    pub fn image(&self) -> Image {
+        let mut pieces = Pieces::default();
+        let mut offset = 0;
+        for block in &self.blocks {
+            if !matches!(block.number, NUMBER_CONTROL | NUMBER_LAST) {
+                pieces.add(block.flash_address, block.data.clone(), Place::Offset(offset));
+            }
+            offset += FRAMING + block.data.len();
+        }
+        pieces.in_order()
+    }
+
+    /// Where the program starts: its region's first address, as far as the file tells it.
+    #[must_use]
+    pub fn program_start(&self) -> u32 {
+        let span = self.span();
+        if self.starts_at(span.first) {
+            return span.first;
+        }
+        span.last.wrapping_add(1).wrapping_sub(self.last.program_size)
+    }
+
+    /// The flash from the program's start to its last byte, as the device will have it.
+    #[must_use]
+    pub fn flash_image(&self) -> Vec<u8> {
+        let start = self.program_start();
+        // `parse` and `convert` bound the size by `MAX_PROGRAM_SIZE`.
+        let mut flash = vec![0xFF; self.last.program_size as usize];
+        for block in self.program_blocks() {
+            let at = block.flash_address.wrapping_sub(start) as usize;
+            if let Some(place) = flash.get_mut(at..at + block.data.len()) {
+                place.copy_from_slice(&block.data);
+            }
+        }
+        flash
+    }
+
+    /// Bytes of the program, from its region's start on.
+    #[must_use]
+    pub fn program_size(&self) -> u32 {
+        self.last.program_size
+    }
+
+    /// CRC of the program: what 1F56h reads when it is in the device.
+    #[must_use]
+    pub fn program_crc(&self) -> u32 {
+        self.last.program_crc
+    }
+
+    /// The bytes of the file.
+    #[must_use]
+    pub fn emit(&self) -> Vec<u8> {
+        self.blocks.iter().flat_map(|block| block.emit_with(self.checksum)).collect()
+    }
+}
+
+fn last_address(block: &Block) -> u32 {
+    block.flash_address.saturating_add((block.data.len() as u32).saturating_sub(1))
+}
+
+/// One block from the front of `bytes`, and how long it is.
+fn parse_block(bytes: &[u8], checksum: Checksum, place: Place) -> Result<(Block, usize), ReadError> {
+    let cut_off = |what, needed| place.fault(Cause::CutOff { what, needed, found: bytes.len() });
+    let header = bytes.first_chunk().ok_or_else(|| cut_off("the header of a block", HEADER_SIZE))?;
+    let Header { number, flash_address, size } = Header::parse(header);
+    if size as usize > MAX_DATA {
+        return Err(place.fault(Cause::BlockSize { number, size }));
+    }
+    let mut crc_at = HEADER_SIZE + size as usize;
+    let of_2008 = HEADER_SIZE + LAST_SIZE_2008;
+    // The manual of 2008 does not count the reserved bytes. The last block ends with the file.
+    if number == NUMBER_LAST && size as usize == LAST_SIZE && bytes.len() == of_2008 + CRC_SIZE {
+        crc_at = of_2008;
+    }
+    let crc = bytes.get(crc_at..).and_then(|rest| rest.first_chunk::<CRC_SIZE>());
+    let crc = crc.ok_or_else(|| cut_off("a block", crc_at + CRC_SIZE))?;
+    let (found, needed) = (u32::from_le_bytes(*crc), checksum.of([&bytes[..crc_at]].into_iter()));
+    if found != needed {
+        return Err(place.fault(Cause::BlockCrc { number, found, needed }));
+    }
+    let data = bytes[HEADER_SIZE..crc_at].to_vec();
+    Ok((Block { number, flash_address, data }, crc_at + CRC_SIZE))
+}
+
+/// Checks that a program block has data, ends inside the address space and lies behind the one
+/// before it.
+fn check_order(before: Option<&Block>, block: &Block, place: Place) -> Result<(), ReadError> {
+    if matches!(block.number, NUMBER_CONTROL | NUMBER_LAST) {
+        return Ok(());
+    }
+    let address = block.flash_address;
+    if block.data.is_empty() {
+        return Err(place.fault(Cause::Malformed("the block has no data")));
+    }
+    if u64::from(address) + block.data.len() as u64 > 1 << 32 {
+        return Err(place.fault(Cause::AddressOverflow { address, what: "the address space" }));
+    }
+    match before {
+        Some(before) if before.number != NUMBER_CONTROL && address <= last_address(before) => {
+            Err(place.fault(Cause::Malformed("the block does not lie behind the one before it")))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// CRC of the first `size` bytes from `start`, as they are to lie in flash: erased bytes read FFh.
+///
+/// The blocks lie between `start` and `start + size`, in address order.
+fn program_crc<'a>(
+    checksum: Checksum,
+    start: u32,
+    size: u32,
+    blocks: impl Iterator<Item = (u32, &'a [u8])>,
+) -> u32 {
+    const ERASED: [u8; 4096] = [0xFF; 4096];
+    let end = u64::from(start) + u64::from(size);
+    let blocks = blocks.map(|(address, data)| (u64::from(address), data)).chain([(end, [].as_slice())]);
+    let mut at = u64::from(start);
+    checksum.of(blocks.flat_map(move |(address, data)| {
+        let gap = address.saturating_sub(at) as usize;
+        at = at.max(address) + data.len() as u64;
+        let full = std::iter::repeat_n(ERASED.as_slice(), gap / ERASED.len());
+        full.chain([&ERASED[..gap % ERASED.len()], data])
+    }))
+}

@@ -1,0 +1,212 @@
+//! Memory contents with holes, as a firmware file tells them.
+
+use super::fault::{Cause, Place, ReadError};
+use super::range::AddressRange;
+
+/// Bytes of one record or segment of a file.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Piece {
+    pub(crate) address: u32,
+    /// Never empty.
+    pub(crate) data: Vec<u8>,
+    pub(crate) place: Place,
+}
+
+impl Piece {
+    pub(crate) fn range(&self) -> AddressRange {
+        // `Pieces::add` lets nothing empty in, and the readers nothing that leaves the address
+        // space.
+        AddressRange { first: self.address, last: self.address + (self.data.len() - 1) as u32 }
+    }
+}
+
+/// Pieces in the order of the file, on their way to an [`Image`].
+#[derive(Debug, Default)]
+pub(crate) struct Pieces(Vec<Piece>);
+
+impl Pieces {
+    /// Adds what the file has at `place`; the caller has checked that it ends inside the address
+    /// space.
+    pub(crate) fn add(&mut self, address: u32, data: Vec<u8>, place: Place) {
+        if !data.is_empty() {
+            self.0.push(Piece { address, data, place });
+        }
+    }
+
+    /// Brings the pieces into address order.
+    pub(crate) fn into_image(self) -> Result<Image, ReadError> {
+        let Self(mut pieces) = self;
+        if pieces.is_empty() {
+            return Err(Place::File.fault(Cause::NoData));
+        }
+        // The sort is stable: of two pieces at one address the earlier one in the file stays in
+        // front.
+        pieces.sort_by_key(|piece| piece.address);
+        for pair in pieces.windows(2) {
+            let (low, high) = (&pair[0], &pair[1]);
+            if low.range().last >= high.address {
+                let (with, place) = (low.place.min(high.place), low.place.max(high.place));
+                return Err(place.fault(Cause::Overlap { address: high.address, with }));
+            }
+        }
+        Ok(Image { pieces })
+    }
+
+    /// Pieces that are in address order and without overlap already.
+    pub(crate) fn in_order(self) -> Image {
+        Image { pieces: self.0 }
+    }
+}
+
+/// What stands in front of the software version in a program (CiA 814-1, section 6.5), its final
+/// zero included.
+const VERSION_MARK: &[u8] = b"$CANopenSoftwareVersion\0";
+/// The longest software version that is looked at.
+const VERSION_MAX: usize = 255;
+
+/// The memory contents of a firmware file: at least one byte, no two of them at one address.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Image {
+    /// In address order, without overlap.
+    pieces: Vec<Piece>,
+}
+
+impl Image {
+    /// From the first byte to the last, holes included.
+    #[must_use]
+    pub fn span(&self) -> AddressRange {
+        // An image has at least one piece; the fallback is never taken.
+        let first = self.pieces.first().map_or(0, |piece| piece.address);
+        let last = self.pieces.last().map_or(0, |piece| piece.range().last);
+        AddressRange { first, last }
+    }
+
+    /// How many bytes the file tells, holes not counted.
+    #[must_use]
+    pub fn byte_count(&self) -> u64 {
+        self.pieces.iter().map(|piece| piece.data.len() as u64).sum()
+    }
+
+    /// The runs of bytes without a hole, in address order.
+    pub fn segments(&self) -> impl Iterator<Item = (u32, Vec<u8>)> + '_ {
+        let mut pieces = self.pieces.iter().peekable();
+        std::iter::from_fn(move || {
+            let piece = pieces.next()?;
+            let (address, mut data) = (piece.address, piece.data.clone());
+            let mut last = piece.range().last;
+            while let Some(next) = pieces.next_if(|next| Some(next.address) == last.checked_add(1)) {
+                data.extend_from_slice(&next.data);
+                last = next.range().last;
+            }
+            Some((address, data))
+        })
+    }
+
+    /// The same, so many bytes further up in memory, or `None` where the address space ends before
+    /// it does. An offset of 2³² − n is one of −n.
+    #[must_use]
+    pub fn moved(&self, offset: u32) -> Option<Self> {
+        let mut pieces = self.pieces.clone();
+        for piece in &mut pieces {
+            piece.address = piece.address.wrapping_add(offset);
+            piece.address.checked_add((piece.data.len() - 1) as u32)?;
+        }
+        // Where some pieces went over the border and some did not, the order is lost.
+        let in_order = pieces.windows(2).all(|pair| pair[0].address < pair[1].address);
+        in_order.then_some(Self { pieces })
+    }
+
+    /// The software version that the program has behind `$CANopenSoftwareVersion` (CiA 814-1,
+    /// section 6.5): the text of object 100Ah, encoded as ISO 8859-1. What would move a cursor is
+    /// replaced.
+    #[must_use]
+    pub fn software_version(&self) -> Option<String> {
+        self.segments().find_map(|(_, data)| {
+            let at = data.windows(VERSION_MARK.len()).position(|window| window == VERSION_MARK)?;
+            let text =
+                data[at + VERSION_MARK.len()..].iter().take(VERSION_MAX).take_while(|byte| **byte != 0);
+            let visible = |byte: &u8| match char::from(*byte) {
+                letter if letter.is_control() => '?',
+                letter => letter,
+            };
+            Some(text.map(visible).collect())
+        })
+    }
+
+    pub(crate) fn pieces(&self) -> &[Piece] {
+        &self.pieces
+    }
+
+    /// Says where the first data outside `range` is, if there is any.
+    ///
+    /// # Errors
+    /// [`Cause::Outside`] with the place in the file.
+    pub fn check_inside(&self, range: AddressRange) -> Result<(), ReadError> {
+        match self.pieces.iter().find(|piece| !range.contains(&piece.range())) {
+            None => Ok(()),
+            Some(piece) => {
+                let AddressRange { first, last } = piece.range();
+                Err(piece.place.fault(Cause::Outside { first, last, region: range }))
+            }
+        }
+    }
+
+    /// The part inside `range`, or `None` where nothing is inside.
+    #[must_use]
+    pub fn part(&self, range: AddressRange) -> Option<Self> {
+        let pieces: Vec<Piece> = self
+            .pieces
+            .iter()
+            .filter_map(|piece| {
+                let own = piece.range();
+                let (first, last) = (own.first.max(range.first), own.last.min(range.last));
+                (first <= last).then(|| {
+                    let data = &piece.data[(first - own.first) as usize..=(last - own.first) as usize];
+                    Piece { address: first, data: data.to_vec(), place: piece.place }
+                })
+            })
+            .collect();
+        (!pieces.is_empty()).then_some(Self { pieces })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn image(pieces: &[(u32, &[u8])]) -> Image {
+        let mut all = Pieces::default();
+        for (line, (address, data)) in pieces.iter().enumerate() {
+            all.add(*address, data.to_vec(), Place::Line(line + 1));
+        }
+        all.into_image().unwrap()
+    }
+
+    #[test]
+    fn neighbours_become_one_segment_whatever_their_order() {
+        let image = image(&[(8, &[3]), (4, &[1, 2]), (6, &[9, 9]), (u32::MAX, &[7])]);
+        assert!(image.segments().eq([(4, vec![1, 2, 9, 9, 3]), (u32::MAX, vec![7])]));
+        assert_eq!(image.span(), AddressRange { first: 4, last: u32::MAX });
+    }
+
+    #[test]
+    fn an_inner_overlap_names_the_later_line() {
+        let mut all = Pieces::default();
+        all.add(0x10, vec![1], Place::Line(1));
+        all.add(0x20, vec![0; 4], Place::Line(2));
+        all.add(0x0F, vec![0; 2], Place::Line(3));
+        let error = all.into_image().unwrap_err().to_string();
+        assert_eq!(error, "line 3: the data at 0x00000010 overlaps that of line 1");
+    }
+
+    #[test]
+    fn a_part_is_cut_at_both_ends() {
+        let image = image(&[(4, &[1, 2, 3, 4]), (12, &[5])]);
+        let range = AddressRange { first: 5, last: 6 };
+        assert!(image.part(range).unwrap().segments().eq([(5, vec![2, 3])]));
+        assert_eq!(image.part(AddressRange { first: 8, last: 11 }), None);
+        assert!(image.check_inside(AddressRange { first: 4, last: 12 }).is_ok());
+        let error = image.check_inside(AddressRange { first: 4, last: 11 }).unwrap_err().to_string();
+        assert!(error.starts_with("line 2: the data at 0x0000000c..=0x0000000c lies outside"), "{error}");
+    }
+}

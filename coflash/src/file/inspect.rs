@@ -1,0 +1,250 @@
+//! What a firmware file holds, told without a device. Reading it has checked it already.
+
+use std::fmt;
+
+use shared_abi::block_file::{Control, Identity, NUMBER_CONTROL, NUMBER_LAST};
+
+use super::block_file::{Block, BlockFile, Checksum};
+use super::image::Image;
+use super::range::AddressRange;
+use super::read::{Firmware, Format};
+
+/// What a firmware file holds. `Display` has words for people.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Inspection {
+    /// The file's format.
+    pub format: Format,
+    /// The runs of bytes without a hole, in address order.
+    pub segments: Vec<AddressRange>,
+    /// Bytes that the file has for the flash.
+    pub bytes: u64,
+    /// What the program has behind `$CANopenSoftwareVersion`.
+    pub software_version: Option<String>,
+    /// What only a block file tells.
+    pub blocks: Option<Blocks>,
+}
+
+/// What only a block file tells.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Blocks {
+    /// All blocks in the file's order.
+    pub all: Vec<BlockLine>,
+    /// With what they are checked.
+    pub checksum: Checksum,
+    /// What block 0 says.
+    pub control: Control,
+    /// Where the program's region starts.
+    pub program_start: u32,
+    /// Bytes of the program from there on.
+    pub program_size: u32,
+    /// What 1F56h reads when the program is in the device.
+    pub program_crc: u32,
+}
+
+/// One block in short.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BlockLine {
+    /// 0, 1…N or FFFFFFFFh.
+    pub number: u32,
+    /// Where its data goes.
+    pub flash_address: u32,
+    /// Data bytes.
+    pub size: usize,
+    /// Its CRC.
+    pub crc: u32,
+}
+
+impl Inspection {
+    /// Looks at what a file of this format has turned out to hold.
+    #[must_use]
+    pub fn of(firmware: &Firmware, format: Format) -> Self {
+        match firmware {
+            Firmware::Image(image) => Self::of_image(image, format),
+            Firmware::Blocks(file) => {
+                let inspection = Self::of_image(&file.image(), format);
+                Self { blocks: Some(Blocks::of(file)), ..inspection }
+            }
+        }
+    }
+
+    fn of_image(image: &Image, format: Format) -> Self {
+        let segments = image.segments().map(|(first, data)| {
+            // A segment is never empty and ends inside the address space.
+            AddressRange { first, last: first + (data.len() as u32 - 1) }
+        });
+        Self {
+            format,
+            segments: segments.collect(),
+            bytes: image.byte_count(),
+            software_version: image.software_version(),
+            blocks: None,
+        }
+    }
+
+    /// What lies between the segments.
+    pub fn gaps(&self) -> impl Iterator<Item = AddressRange> + '_ {
+        self.segments.windows(2).map(|pair| AddressRange { first: pair[0].last + 1, last: pair[1].first - 1 })
+    }
+}
+
+impl Blocks {
+    fn of(file: &BlockFile) -> Self {
+        let line = |block: &Block| {
+            let bytes = block.emit_with(file.checksum());
+            let crc = bytes.last_chunk().map_or(0, |crc| u32::from_le_bytes(*crc));
+            BlockLine {
+                number: block.number,
+                flash_address: block.flash_address,
+                size: block.data.len(),
+                crc,
+            }
+        };
+        Self {
+            all: file.blocks().iter().map(line).collect(),
+            checksum: file.checksum(),
+            control: *file.control(),
+            program_start: file.program_start(),
+            program_size: file.program_size(),
+            program_crc: file.program_crc(),
+        }
+    }
+
+    /// For whom the program is, if block 0 says it.
+    #[must_use]
+    pub fn identity(&self) -> Option<&Identity> {
+        match &self.control {
+            Control::Plain => None,
+            Control::Identity(identity) | Control::Dated { identity, .. } => Some(identity),
+        }
+    }
+
+    /// Version and date (seconds since 1970 UTC), if block 0 says them.
+    #[must_use]
+    pub fn release(&self) -> Option<(Version, u64)> {
+        match self.control {
+            Control::Dated { version, date, .. } => Some((Version(version), date)),
+            Control::Plain | Control::Identity(_) => None,
+        }
+    }
+}
+
+/// The version in block 0: major in bits 0–7, minor in bits 8–15, release in bits 16–31 (manual,
+/// figure 13). `Display` writes it as the manual does: `V1.10r100`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Version(pub u32);
+
+impl fmt::Display for Version {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [major, minor, ..] = self.0.to_le_bytes();
+        write!(f, "V{major}.{minor}r{}", self.0 >> 16)
+    }
+}
+
+/// Seconds since 1970 UTC as `2015-01-01 00:00:00 UTC`. What no calendar needs is shown as seconds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Date(pub u64);
+
+impl fmt::Display for Date {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        const DAY: u64 = 86_400;
+        let (mut days, seconds) = (self.0 / DAY, self.0 % DAY);
+        if days > 3_000_000 {
+            return write!(f, "{} s after 1970", self.0);
+        }
+        let leap =
+            |year: u64| year.is_multiple_of(4) && (!year.is_multiple_of(100) || year.is_multiple_of(400));
+        let mut year = 1970;
+        while days >= 365 + u64::from(leap(year)) {
+            days -= 365 + u64::from(leap(year));
+            year += 1;
+        }
+        let lengths = [31, 28 + u64::from(leap(year)), 31, 30, 31, 30, 31, 31, 30, 31, 30, 31];
+        let mut month = 0;
+        while days >= lengths[month] {
+            days -= lengths[month];
+            month += 1;
+        }
+        let (hour, minute, second) = (seconds / 3600, seconds / 60 % 60, seconds % 60);
+        let (month, day) = (month + 1, days + 1);
+        write!(f, "{year:04}-{month:02}-{day:02} {hour:02}:{minute:02}:{second:02} UTC")
+    }
+}
+
+impl fmt::Display for Inspection {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.blocks {
+            None => writeln!(f, "{}, well-formed", self.format)?,
+            Some(blocks) => {
+                let count = blocks.all.len();
+                writeln!(f, "{}, {count} blocks, every {} is right", self.format, blocks.checksum)?;
+            }
+        }
+        if let Some(blocks) = &self.blocks {
+            let Blocks { program_start, program_size, program_crc, .. } = blocks;
+            let digits = match blocks.checksum {
+                Checksum::Crc32 => 8,
+                Checksum::Crc16 => 4,
+            };
+            writeln!(f, "  program      {program_size} bytes from {program_start:#010x} on, CRC {program_crc:0digits$X}h")?;
+            if let Some(Identity { vendor_id, product_code, .. }) = blocks.identity() {
+                writeln!(f, "  for          vendor-ID {vendor_id:08X}h, product code {product_code:08X}h")?;
+            }
+            if let Some((version, date)) = blocks.release() {
+                writeln!(f, "  version      {version} of {}", Date(date))?;
+            }
+        }
+        if let Some(version) = &self.software_version {
+            writeln!(f, "  software     {version}")?;
+        }
+        let (bytes, pieces) = (self.bytes, self.segments.len());
+        writeln!(
+            f,
+            "  data         {bytes} bytes in {pieces} {}",
+            if pieces == 1 { "piece" } else { "pieces" }
+        )?;
+        for segment in &self.segments {
+            writeln!(f, "    {segment}  {:>7} bytes", segment.len())?;
+        }
+        for gap in self.gaps() {
+            writeln!(f, "  gap          {gap}, {} bytes", gap.len())?;
+        }
+        let Some(blocks) = &self.blocks else { return Ok(()) };
+        writeln!(f, "  block  address      bytes  CRC")?;
+        for BlockLine { number, flash_address, size, crc } in &blocks.all {
+            match *number {
+                NUMBER_CONTROL => write!(f, "      0  control   ")?,
+                NUMBER_LAST => write!(f, "     -1  last      ")?,
+                number => write!(f, "  {number:>5}  {flash_address:#010x}")?,
+            }
+            writeln!(f, "  {size:>6}  {crc:08X}h")?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Second column: GNU `date -u -d @…`.
+    #[test]
+    fn a_date_is_that_of_the_calendar() {
+        for (seconds, words) in [
+            (0, "1970-01-01 00:00:00 UTC"),
+            (951_782_400, "2000-02-29 00:00:00 UTC"),
+            (1_420_070_400, "2015-01-01 00:00:00 UTC"),
+            (4_107_542_399, "2100-02-28 23:59:59 UTC"),
+            (4_107_542_400, "2100-03-01 00:00:00 UTC"),
+            (253_402_300_799, "9999-12-31 23:59:59 UTC"),
+        ] {
+            assert_eq!(Date(seconds).to_string(), words);
+        }
+        assert_eq!(Date(u64::MAX).to_string(), "18446744073709551615 s after 1970");
+    }
+
+    /// The manual's own example: 0x00640A01 is V1.10r100.
+    #[test]
+    fn a_version_reads_as_in_the_manual() {
+        assert_eq!(Version(0x0064_0A01).to_string(), "V1.10r100");
+    }
+}

@@ -1,0 +1,21 @@
+//! Firmware files: read, checked, converted and written. No device, and no bus.
+
+pub mod block_file;
+pub mod convert;
+pub mod elf;
+pub mod fault;
+pub mod ihex;
+pub mod image;
+pub mod inspect;
+mod range;
+pub mod raw;
+pub mod read;
+pub mod srec;
+mod text;
+
+pub use self::block_file::BlockFile;
+pub use self::convert::{blocks_of, convert};
+pub use self::fault::{Cause, FileError, Place, ReadError};
+pub use self::image::Image;
+pub use self::range::AddressRange;
+pub use self::read::{load, read, Firmware, Format};

@@ -1,0 +1,116 @@
+//! Readers of firmware files: bytes in, [`Image`] or [`BlockFile`] out. No reader touches a device
+//! or the file system except [`load`].
+
+use std::fmt;
+use std::path::Path;
+
+use super::block_file::BlockFile;
+use super::fault::{Cause, FileError, Place, ReadError};
+use super::image::Image;
+use super::{elf, ihex, raw, srec};
+
+/// What a firmware file can be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Format {
+    /// Intel HEX.
+    IntelHex,
+    /// Motorola S-record.
+    SRecord,
+    /// ELF executable, 32 bit, little-endian, Arm.
+    Elf,
+    /// Block file, ready for 1F50h.
+    BlockFile,
+    /// The bytes of the flash and nothing else; where they go must be told.
+    Raw,
+}
+
+impl Format {
+    /// Finds out by the first bytes. A raw file looks like nothing in particular and is never
+    /// found.
+    #[must_use]
+    pub fn detect(bytes: &[u8]) -> Option<Self> {
+        let text = bytes.trim_ascii_start();
+        match bytes {
+            [0x7F, b'E', b'L', b'F', ..] => Some(Self::Elf),
+            _ if BlockFile::looks_like(bytes) => Some(Self::BlockFile),
+            _ if text.starts_with(b":") => Some(Self::IntelHex),
+            _ if text.first() == Some(&b'S') && text.get(1).is_some_and(u8::is_ascii_digit) => {
+                Some(Self::SRecord)
+            }
+            _ => None,
+        }
+    }
+}
+
+impl fmt::Display for Format {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::IntelHex => "Intel HEX",
+            Self::SRecord => "Motorola S-record",
+            Self::Elf => "ELF",
+            Self::BlockFile => "block file",
+            Self::Raw => "raw binary",
+        })
+    }
+}
+
+/// What a firmware file turned out to hold.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Firmware {
+    /// Memory contents that have yet to be [converted](super::convert::convert).
+    Image(Image),
+    /// Blocks ready for the device; every CRC was checked.
+    Blocks(BlockFile),
+}
+
+/// Reads a firmware file that is already in memory.
+///
+/// `format` overrides what the first bytes say. `raw_address` is where a [`Format::Raw`] file goes.
+///
+/// # Errors
+/// The first fault, with its place.
+pub fn read(bytes: &[u8], format: Option<Format>, raw_address: Option<u32>) -> Result<Firmware, ReadError> {
+    read_telling(bytes, format, raw_address).map(|(firmware, _)| firmware)
+}
+
+/// Reads a firmware file from disk; otherwise as [`read`].
+///
+/// # Errors
+/// The first fault, with file and place.
+pub fn load(path: &Path, format: Option<Format>, raw_address: Option<u32>) -> Result<Firmware, FileError> {
+    load_telling(path, format, raw_address).map(|(firmware, _)| firmware)
+}
+
+/// The same, and which format it turned out to be.
+///
+/// # Errors
+/// The first fault, with file and place.
+pub fn load_telling(
+    path: &Path,
+    format: Option<Format>,
+    raw_address: Option<u32>,
+) -> Result<(Firmware, Format), FileError> {
+    std::fs::read(path)
+        .map_err(|error| Place::File.fault(Cause::Io(error)))
+        .and_then(|bytes| read_telling(&bytes, format, raw_address))
+        .map_err(|error| error.of(path.display()))
+}
+
+fn read_telling(
+    bytes: &[u8],
+    format: Option<Format>,
+    raw_address: Option<u32>,
+) -> Result<(Firmware, Format), ReadError> {
+    if bytes.is_empty() {
+        return Err(Place::File.fault(Cause::Empty));
+    }
+    let format = format.or_else(|| Format::detect(bytes)).ok_or(Place::File.fault(Cause::NotFirmware))?;
+    let firmware = match format {
+        Format::IntelHex => ihex::read(bytes).map(Firmware::Image),
+        Format::SRecord => srec::read(bytes).map(Firmware::Image),
+        Format::Elf => elf::read(bytes).map(Firmware::Image),
+        Format::Raw => raw::read(bytes, raw_address).map(Firmware::Image),
+        Format::BlockFile => BlockFile::parse(bytes).map(Firmware::Blocks),
+    };
+    Ok((firmware?, format))
+}

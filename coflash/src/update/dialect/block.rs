@@ -1,0 +1,129 @@
+//! The dialect `block`, of SYS TEC and coboot: a block file, an SDO download for each block.
+
+use canopen::program::{self, FlashError};
+use canopen::Address;
+
+use super::procedure::{enter_by_call, Downloaded, Procedure};
+use crate::device::{DeviceType, Dialect, Doing, Error, Session, Transfers};
+use crate::file::block_file::{Block as FileBlock, BlockFile};
+use crate::update::course::Course;
+use crate::update::event::{DeviceState, Event, RepeatReason};
+use crate::update::judge::{judge, Judgement};
+use crate::update::options::FlashOptions;
+use crate::update::{steps, trial};
+
+/// See the [module](self).
+pub(super) struct Block;
+
+impl Procedure for Block {
+    fn enter(
+        &self,
+        session: &mut Session<'_>,
+        running: DeviceType,
+        options: &FlashOptions,
+        course: &mut Course<'_>,
+    ) -> Result<Dialect, Error> {
+        enter_by_call(session, running, Dialect::Block, options, course)
+    }
+
+    /// Erases, sends the blocks, compares, tries if it is asked to, and signs.
+    fn download(
+        &self,
+        session: &mut Session<'_>,
+        file: &BlockFile,
+        options: &FlashOptions,
+        course: &mut Course<'_>,
+    ) -> Result<Downloaded, Error> {
+        let number = options.program;
+        let before = std::mem::replace(&mut course.state, DeviceState::Erased);
+        steps::erase(session, number, &mut |event| course.tell(event))?;
+        let began = session.now();
+        let sent = send_blocks(session, file, options, course);
+        if sent.as_ref().is_err_and(Error::refuses_control_block)
+            && steps::identification(session, number).is_ok_and(|crc| crc != 0)
+        {
+            // The device erases with the first good block, and there was none: it still has the CRC
+            // of its program.
+            course.state = before;
+        }
+        let repeats = sent?;
+        let took = session.now().saturating_sub(began);
+        steps::verify(session, number, file.program_crc(), &mut |event| course.tell(event))?;
+        course.state = DeviceState::Unsigned;
+        if options.trial_run {
+            trial::run(session, options, course)?;
+        }
+        steps::sign(session, number, &mut |event| course.tell(event))?;
+        course.state = DeviceState::Signed;
+        Ok(Downloaded { repeats, took })
+    }
+}
+
+/// Steps 6 to 9: all blocks; gives how many had to be repeated.
+fn send_blocks(
+    session: &mut Session<'_>,
+    file: &BlockFile,
+    options: &FlashOptions,
+    course: &mut Course<'_>,
+) -> Result<u32, Error> {
+    let blocks: Vec<(&FileBlock, Vec<u8>)> =
+        file.blocks().iter().map(|block| (block, block.emit_with(file.checksum()))).collect();
+    let total = blocks.iter().map(|(_, bytes)| bytes.len()).sum();
+    let mut done = 0;
+    let mut repeats = 0;
+    course.tell(Event::Progress { done, total });
+    for (block, bytes) in &blocks {
+        repeats += send_block(session, block.number, bytes, options, &mut |event| match event {
+            Event::Progress { done: part, .. } => course.tell(Event::Progress { done: done + part, total }),
+            event => course.tell(event),
+        })?;
+        done += bytes.len();
+        course.tell(Event::Progress { done, total });
+    }
+    Ok(repeats)
+}
+
+/// Steps 7 and 8 for one block, with repetition; gives how often it was repeated.
+fn send_block(
+    session: &mut Session<'_>,
+    block: u32,
+    bytes: &[u8],
+    options: &FlashOptions,
+    tell: &mut dyn FnMut(Event),
+) -> Result<u32, Error> {
+    let doing = Doing::Block(block);
+    let at = Address::new(program::PROGRAM_DATA, options.program);
+    let mut repeat = 0;
+    // Whether a transfer ended without our knowing how: its block may have arrived.
+    let mut in_doubt = false;
+    loop {
+        let mut progress = |part: u32| tell(Event::Progress { done: part as usize, total: bytes.len() });
+        let sent = session.write(at, bytes, doing, &mut progress);
+        if let Err(error @ (Error::Adapter(_) | Error::Cancelled)) = sent {
+            return Err(error);
+        }
+        let status = session.await_idle(options.program, doing)?;
+        // It had arrived, and the bootloader waits for the next one. Should that not be so, the
+        // next one and at the latest the program's CRC will tell.
+        if in_doubt && status.error == Some(FlashError::Sequence) {
+            return Ok(repeat);
+        }
+        let (why, error) = match judge(sent, status.error.map(|error| (error, status.detail)), doing) {
+            Judgement::Good => return Ok(repeat),
+            Judgement::Bad { why, error } => (why, error),
+        };
+        in_doubt |= why == Some(RepeatReason::NoAnswer);
+        match why {
+            Some(why) if repeat < options.repeats => {
+                repeat += 1;
+                // A device, or an adapter, that cannot cope with block transfers may cope with
+                // segments.
+                if repeat > 1 && matches!(why, RepeatReason::Broken(_) | RepeatReason::NoAnswer) {
+                    session.transfer_by(Transfers::Segments);
+                }
+                tell(Event::Repeating { block, repeat, of: options.repeats, why });
+            }
+            _ => return Err(error),
+        }
+    }
+}

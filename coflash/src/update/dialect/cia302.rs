@@ -1,0 +1,96 @@
+//! What the dialects of CiA 302-3 have in common: STOP, CLEAR, one download, START.
+
+use canopen::program::{self, ProgramControl, ProgramState};
+use canopen::Address;
+
+use super::procedure::Downloaded;
+use super::whole::{self, Whole};
+use crate::device::error::{absent, optional};
+use crate::device::{DeviceType, Dialect, Error, Session};
+use crate::update::course::Course;
+use crate::update::event::{DeviceState, Event};
+use crate::update::options::FlashOptions;
+use crate::update::steps::{call_back, clear_and_wait, CALL_BACK};
+
+/// Afterwards the bootloader is running.
+pub(super) fn enter(
+    session: &mut Session<'_>,
+    running: DeviceType,
+    dialect: Dialect,
+    number: u8,
+    course: &mut Course<'_>,
+) -> Result<Dialect, Error> {
+    if !running.is_bootloader() {
+        course.state = DeviceState::Called;
+        stop_program(session, number, course)?;
+    }
+    course.tell(Event::Speaks(dialect));
+    Ok(dialect)
+}
+
+/// Erases, and sends this.
+pub(super) fn download(
+    session: &mut Session<'_>,
+    dialect: Dialect,
+    content: &[u8],
+    crc: u32,
+    options: &FlashOptions,
+    course: &mut Course<'_>,
+) -> Result<Downloaded, Error> {
+    let number = options.program;
+    let prepare = |session: &mut Session<'_>, course: &mut Course<'_>| {
+        clear_and_wait(session, number, &mut |event| course.tell(event))
+    };
+    let whole = Whole { dialect, content, crc, prepare: &prepare, status: whole::status };
+    whole::download(session, &whole, options, course)
+}
+
+/// Asks an application of a device that knows CiA 302-3 alone for its bootloader: STOP; a
+/// bootloader is what answers then. One that refuses may know coboot's and SYS TEC's call.
+///
+/// # Errors
+/// [`Error::NoBootloader`].
+fn stop_program(session: &mut Session<'_>, number: u8, course: &mut Course<'_>) -> Result<(), Error> {
+    const RUNNING: u32 = ProgramState::Running as u32;
+    let control = |number| Address::new(program::PROGRAM_CONTROL, number);
+    // The one that runs may be another one than the one that is to be written.
+    let mut running = None;
+    for number in [number, CALL_BACK] {
+        if optional(session.read_number(control(number)))? == Some(RUNNING) {
+            running = Some(number);
+            break;
+        }
+    }
+    let Some(running) = running else {
+        // Its bootloader runs already, or nobody can tell.
+        return Ok(());
+    };
+    let at = control(running);
+    course.tell(Event::CallingBack);
+    match session.command(running, ProgramControl::Stop) {
+        Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
+        Err(Error::Refused { .. }) => {
+            call_back(session)?;
+            course.tell(Event::InBootloader);
+            return Ok(());
+        }
+        Err(error) => return Err(error),
+    }
+    let deadline = session.now() + session.timing().boot;
+    loop {
+        match session.read_number(at) {
+            Ok(RUNNING) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
+            Ok(_) => break,
+            Err(Error::Refused { code, .. }) if absent(code) => break,
+            Err(error) => return Err(error),
+        }
+        if session.now() >= deadline {
+            let (node, running) = (session.node(), session.device_type()?);
+            return Err(Error::NoBootloader { node, running, code: None });
+        }
+        let pause = session.timing().sdo;
+        session.await_boot_up(pause)?;
+    }
+    course.tell(Event::InBootloader);
+    Ok(())
+}

@@ -1,0 +1,101 @@
+//! The dialect `esacademy`: Intel HEX text behind a password, which erases.
+
+use std::time::Duration;
+
+use canopen::program::{self, FlashError};
+use canopen::{AbortCode, Address, NodeId};
+
+use super::procedure::{enter_by_call, Downloaded, Procedure};
+use super::restart::{arrived, reset_program};
+use super::whole::{self, idle, Said, Whole};
+use crate::device::error::{absent, optional};
+use crate::device::{DeviceType, Dialect, Doing, Error, Session, Timing};
+use crate::file::{ihex, BlockFile};
+use crate::update::course::Course;
+use crate::update::event::Event;
+use crate::update::options::FlashOptions;
+use crate::update::steps::await_application;
+
+/// The password of 7F50h as ESAcademy gives it: "INIT".
+pub const PASSWORD: u32 = 0x494E_4954;
+/// How long a program that starts by itself may take until its bootloader is told to.
+const BY_ITSELF: Duration = Duration::from_secs(1);
+/// Generic error and manufacturer-specific error of 1001h: a flash operation went wrong.
+const ERROR_BITS: u32 = 0x81;
+
+/// See the [module](self).
+pub(super) struct EsAcademy;
+
+impl Procedure for EsAcademy {
+    fn enter(
+        &self,
+        session: &mut Session<'_>,
+        running: DeviceType,
+        options: &FlashOptions,
+        course: &mut Course<'_>,
+    ) -> Result<Dialect, Error> {
+        enter_by_call(session, running, Dialect::EsAcademy, options, course)
+    }
+
+    fn download(
+        &self,
+        session: &mut Session<'_>,
+        file: &BlockFile,
+        options: &FlashOptions,
+        course: &mut Course<'_>,
+    ) -> Result<Downloaded, Error> {
+        let content = ihex::emit(&file.image()).into_bytes();
+        let prepare = |session: &mut Session<'_>, course: &mut Course<'_>| unlock(session, options, course);
+        let (dialect, crc) = (Dialect::EsAcademy, file.program_crc());
+        let whole = Whole { dialect, content: &content, crc, prepare: &prepare, status };
+        whole::download(session, &whole, options, course)
+    }
+
+    fn start(&self, session: &mut Session<'_>, _: NodeId, number: u8) -> Result<DeviceType, Error> {
+        let boot = session.timing().boot;
+        if let Some(running) = await_application(session, BY_ITSELF.min(boot))? {
+            return Ok(running);
+        }
+        reset_program(session, number)?;
+        arrived(session, number)
+    }
+}
+
+/// Writes the password, which erases. It is optional; without it the download alone has to do.
+fn unlock(session: &mut Session<'_>, options: &FlashOptions, course: &mut Course<'_>) -> Result<(), Error> {
+    let node = session.node();
+    let password = match options.unlock {
+        None => PASSWORD,
+        Some(password) => password.number().ok_or(Error::NotInDialect {
+            dialect: Dialect::EsAcademy,
+            what: "the password is a number of 32 bits: 0x and up to 8 digits, or 4 characters",
+        })?,
+    };
+    let at = Address::new(program::ENABLE_FLASH, options.program);
+    // It erases before it answers.
+    let patient = Timing { sdo: session.timing().command, ..*session.timing() };
+    let written = session.with(node, patient).write(at, &password.to_le_bytes(), Doing::Unlock, &mut |_| {});
+    match written {
+        Ok(()) => course.tell(Event::Unlocked),
+        Err(Error::Refused { code: AbortCode::NO_OBJECT, .. }) => {}
+        Err(error) => return Err(error),
+    }
+    Ok(())
+}
+
+/// What the device says of the download: by 1F57h if it has that, otherwise by 1001h.
+fn status(session: &mut Session<'_>, number: u8) -> Result<Said, Error> {
+    match session.read(Address::new(program::FLASH_STATUS, number)) {
+        Err(Error::Refused { code, .. }) if absent(code) => {}
+        // What took the whole program may restart at once.
+        Err(Error::NoAnswer { .. }) => return Ok(None),
+        Ok(_) | Err(Error::Protocol { .. }) => return idle(session, number),
+        Err(error) => return Err(error),
+    }
+    let register = match session.read_number(Address::new(program::ERROR_REGISTER, 0)) {
+        Err(Error::NoAnswer { .. }) => None,
+        register => optional(register)?,
+    };
+    let failed = register.is_some_and(|bits| bits & ERROR_BITS == ERROR_BITS);
+    Ok(failed.then_some((FlashError::Unspecified, 0)))
+}

@@ -1,0 +1,35 @@
+//! The dialect `hex`: CiA 302-3 with Intel HEX text.
+
+use super::cia302;
+use super::procedure::{Downloaded, Procedure};
+use crate::device::{DeviceType, Dialect, Error, Session};
+use crate::file::ihex;
+use crate::file::BlockFile;
+use crate::update::course::Course;
+use crate::update::options::FlashOptions;
+
+/// See the [module](self).
+pub(super) struct Hex;
+
+impl Procedure for Hex {
+    fn enter(
+        &self,
+        session: &mut Session<'_>,
+        running: DeviceType,
+        options: &FlashOptions,
+        course: &mut Course<'_>,
+    ) -> Result<Dialect, Error> {
+        cia302::enter(session, running, Dialect::Hex, options.program, course)
+    }
+
+    fn download(
+        &self,
+        session: &mut Session<'_>,
+        file: &BlockFile,
+        options: &FlashOptions,
+        course: &mut Course<'_>,
+    ) -> Result<Downloaded, Error> {
+        let content = ihex::emit(&file.image()).into_bytes();
+        cia302::download(session, Dialect::Hex, &content, file.program_crc(), options, course)
+    }
+}

@@ -1,0 +1,227 @@
+//! The dialect `lift`: CiA 417, as CiA 814-1 describes it. The bootloader is node 126.
+
+use std::time::Duration;
+
+use canopen::nmt::parse_state_message;
+use canopen::program::LIFT_NODE_ID;
+use canopen::{AbortCode, Address, NodeId};
+
+use super::procedure::{Downloaded, Procedure};
+use super::restart::{arrived, reset_program};
+use super::whole::{self, Whole};
+use crate::device::flying_master::{self, Asked};
+use crate::device::info::nameplate;
+use crate::device::recognise::UNLOCK;
+use crate::device::{recognise, DeviceType, Dialect, Doing, Error, Session, Timing};
+use crate::file::BlockFile;
+use crate::update::course::Course;
+use crate::update::event::{DeviceState, Event};
+use crate::update::options::FlashOptions;
+use crate::update::password::Password;
+
+/// The program of a lift; what else 1F50h holds are data, which are not started (CiA 814-1 clause
+/// 6.4).
+const LIFT_PROGRAM: u8 = 1;
+/// How long a lift bootloader may take to come up (CiA 814-1 clause 6.3).
+const LIFT_WAIT: Duration = Duration::from_secs(10);
+/// How often it is asked for meanwhile: a device that listens for the bit rate needs somebody who
+/// talks.
+const LIFT_PAUSE: Duration = Duration::from_millis(125);
+/// How long it takes to hear a heartbeat: they come once a second in most networks.
+const HEARTBEAT: Duration = Duration::from_millis(1200);
+
+/// See the [module](self).
+pub(super) struct Lift;
+
+impl Procedure for Lift {
+    fn enter(
+        &self,
+        session: &mut Session<'_>,
+        running: DeviceType,
+        options: &FlashOptions,
+        course: &mut Course<'_>,
+    ) -> Result<Dialect, Error> {
+        if !options.follow {
+            let what = "the bootloaders share a node-ID: update the devices one after the other";
+            return Err(Error::NotInDialect { dialect: Dialect::Lift, what });
+        }
+        course.tell(Event::Speaks(Dialect::Lift));
+        course.tell(Event::Nameplate(Box::new(nameplate(session)?)));
+        check(session, running, options.unlock)?;
+        if options.mastership {
+            match flying_master::ask(session)? {
+                Asked::Nobody => {}
+                Asked::Kept(master) => course.tell(Event::MasterKept(master.node)),
+                Asked::Taken(taken) => {
+                    course.tell(Event::MasterTaken(taken.from.node));
+                    course.mastership = Some(taken);
+                }
+            }
+        }
+        unlock_bootloader(session, options.unlock, course)?;
+        Ok(Dialect::Lift)
+    }
+
+    fn download(
+        &self,
+        session: &mut Session<'_>,
+        file: &BlockFile,
+        options: &FlashOptions,
+        course: &mut Course<'_>,
+    ) -> Result<Downloaded, Error> {
+        let (dialect, content, crc) = (Dialect::Lift, file.flash_image(), file.program_crc());
+        // Unlocked already; what is there is overwritten.
+        let prepare = |_: &mut Session<'_>, _: &mut Course<'_>| Ok(());
+        let whole = Whole { dialect, content: &content, crc, prepare: &prepare, status: whole::status };
+        whole::download(session, &whole, options, course)
+    }
+
+    fn start(&self, session: &mut Session<'_>, original: NodeId, number: u8) -> Result<DeviceType, Error> {
+        reset_program(session, LIFT_PROGRAM)?;
+        if original == lift_node() {
+            let boot = session.timing().boot;
+            if let Some(node) = session.await_boot_up_of_another(boot)? {
+                session.talk_to(node);
+            }
+        } else {
+            session.talk_to(original);
+        }
+        arrived(session, number)
+    }
+}
+
+/// Brings a lift device into its bootloader and unlocks it there (CiA 814-1 clause 6.3). From then
+/// on the session is with node 126. [`check`] comes before.
+///
+/// # Errors
+/// [`Error::NoPassword`], [`Error::NoBootloader`], and [`Error::Refused`] for a wrong password.
+fn unlock_bootloader(
+    session: &mut Session<'_>,
+    password: Option<Password>,
+    course: &mut Course<'_>,
+) -> Result<(), Error> {
+    let node = session.node();
+    let password = password.ok_or(Error::NoPassword { node })?;
+    let lift = lift_node();
+    if node != lift {
+        unlock(session, password)?;
+        course.tell(Event::Unlocked);
+        course.state = DeviceState::Called;
+        course.tell(Event::CallingBack);
+        reset_program(session, LIFT_PROGRAM)?;
+        session.talk_to(lift);
+        await_lift(session)?;
+        course.tell(Event::Moved(lift));
+        course.tell(Event::InBootloader);
+    }
+    unlock(session, password)?;
+    course.tell(Event::Unlocked);
+    Ok(())
+}
+
+/// Looks whether a lift device can be updated, before anything is done to it: a password is there,
+/// and no other device has node-ID 126, be it one that only sends heartbeats (CiA 814-1 clause 6.3).
+///
+/// # Errors
+/// [`Error::NoPassword`], [`Error::Occupied`], [`Error::NoBootloader`].
+fn check(session: &mut Session<'_>, running: DeviceType, password: Option<Password>) -> Result<(), Error> {
+    let (node, lift) = (session.node(), lift_node());
+    if password.is_none() {
+        return Err(Error::NoPassword { node });
+    }
+    if node == lift {
+        return if running.is_bootloader() {
+            Ok(())
+        } else {
+            Err(Error::NoBootloader { node, running: Some(running), code: None })
+        };
+    }
+    let mut look = session.with(lift, brief(session.timing()));
+    let there = look.device_type()?.is_some()
+        || look.hears_the_bus()
+            && look.observe_until(HEARTBEAT, &mut |frame| {
+                parse_state_message(frame).is_some_and(|(node, _)| node == lift)
+            })?;
+    if there {
+        return Err(Error::Occupied { node: lift });
+    }
+    Ok(())
+}
+
+/// Node 126.
+fn lift_node() -> NodeId {
+    const { NodeId::new(LIFT_NODE_ID).expect("1 to 127") }
+}
+
+/// Asks once, and not for long.
+fn brief(timing: &Timing) -> Timing {
+    Timing { sdo: LIFT_PAUSE.min(timing.sdo), attempts: 1, ..*timing }
+}
+
+/// Waits until a lift bootloader answers.
+fn await_lift(session: &mut Session<'_>) -> Result<(), Error> {
+    let deadline = session.now() + LIFT_WAIT.max(session.timing().boot);
+    let timing = brief(session.timing());
+    loop {
+        // A boot-up message says when to look; it may get lost.
+        session.await_boot_up(LIFT_PAUSE)?;
+        let node = session.node();
+        let running = session.with(node, timing).device_type()?;
+        if running.is_some_and(DeviceType::is_bootloader) {
+            return Ok(());
+        }
+        if session.now() >= deadline {
+            return Err(Error::NoBootloader { node: session.node(), running, code: None });
+        }
+    }
+}
+
+/// Writes the password of a lift.
+fn unlock(session: &mut Session<'_>, password: Password) -> Result<(), Error> {
+    let [first, second] = UNLOCK;
+    match session.write(first, password.text(), Doing::Unlock, &mut |_| {}) {
+        Err(Error::Refused { code: AbortCode::NO_SUB_INDEX, .. }) => {
+            session.write(second, password.text(), Doing::Unlock, &mut |_| {})
+        }
+        result => result,
+    }
+}
+
+/// Reads an object of a device that has to be unlocked for it: a lift's program or parameter set,
+/// from its bootloader. A device that was not there before is restarted afterwards, whatever came
+/// of it.
+///
+/// # Errors
+/// [`Error::NotInDialect`] for a device that is no lift, and what [`Error::NoPassword`], [`Error::Occupied`], [`Error::NoBootloader`] and an
+/// [upload](Session::upload) have.
+pub fn read_locked(
+    session: &mut Session<'_>,
+    at: Address,
+    dialect: Option<Dialect>,
+    password: Option<Password>,
+    tell: &mut dyn FnMut(Event),
+) -> Result<Vec<u8>, Error> {
+    let running = session.find()?;
+    let dialect = match dialect {
+        Some(dialect) => dialect,
+        None => recognise(session, running, LIFT_PROGRAM)?,
+    };
+    let what = match dialect {
+        Dialect::Lift => None,
+        Dialect::EsAcademy => Some("the password erases the program, so there is nothing to read behind it"),
+        Dialect::Block | Dialect::Raw | Dialect::Hex => Some("no password opens anything for reading"),
+    };
+    if let Some(what) = what {
+        return Err(Error::NotInDialect { dialect, what });
+    }
+    let original = session.node();
+    check(session, running, password)?;
+    unlock_bootloader(session, password, &mut Course::new(tell))?;
+    let bytes = session.upload(at, &mut |_| {});
+    if original != session.node() && !matches!(bytes, Err(Error::Adapter(_))) {
+        let restarted = reset_program(session, LIFT_PROGRAM);
+        session.talk_to(original);
+        restarted?;
+    }
+    bytes
+}

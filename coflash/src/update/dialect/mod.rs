@@ -1,0 +1,39 @@
+//! Dialects: what different bootloaders make of the same objects, a file for each.
+//!
+//! | dialect | the program goes as | before | afterwards |
+//! |---|---|---|---|
+//! | [`Block`](Dialect::Block) | block file, an SDO download for each block | CLEAR | signature, START |
+//! | [`Raw`](Dialect::Raw) | image from the program's start, one download | CLEAR | START |
+//! | [`Hex`](Dialect::Hex) | Intel HEX text, one download | CLEAR | START |
+//! | [`EsAcademy`](Dialect::EsAcademy) | Intel HEX text, one download | password in 7F50h, which erases | it runs by itself |
+//! | [`Lift`](Dialect::Lift) | image, one download, at node-ID 126 | password in 6005h, in application and bootloader | "reset program" |
+//!
+//! Another dialect is a file that implements [`Procedure`], and a line of [`of`]. The steps that all
+//! have in common are in [`steps`](super::steps).
+
+use crate::device::Dialect;
+
+mod block;
+mod cia302;
+mod esacademy;
+mod hex;
+mod lift;
+mod procedure;
+mod raw;
+mod restart;
+mod whole;
+
+pub use self::esacademy::PASSWORD as ESACADEMY_PASSWORD;
+pub use self::lift::read_locked;
+pub(super) use self::procedure::{Downloaded, Procedure};
+
+/// What this dialect makes of the procedure.
+pub(super) fn of(dialect: Dialect) -> &'static dyn Procedure {
+    match dialect {
+        Dialect::Block => &block::Block,
+        Dialect::Raw => &raw::Raw,
+        Dialect::Hex => &hex::Hex,
+        Dialect::Lift => &lift::Lift,
+        Dialect::EsAcademy => &esacademy::EsAcademy,
+    }
+}

@@ -1,0 +1,29 @@
+//! The restart into a program in the dialects that have no START.
+
+use canopen::program::{self, ProgramControl};
+use canopen::Address;
+
+use crate::device::error::absent;
+use crate::device::{DeviceType, Doing, Error, Session};
+use crate::update::steps::await_application;
+
+/// "Reset program" (2 of 1F51h); where there is no such object, NMT reset node.
+pub(super) fn reset_program(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
+    let at = Address::new(program::PROGRAM_CONTROL, number);
+    match session.write(at, &[ProgramControl::ResetStat as u8], Doing::Restart, &mut |_| {}) {
+        Err(Error::Refused { code, .. }) if absent(code) => session.reset_node(),
+        // A device that resets at once may not get its answer out.
+        Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => Ok(()),
+        Err(error) => Err(error),
+    }
+}
+
+/// Waits for the application.
+pub(super) fn arrived(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Error> {
+    let boot = session.timing().boot;
+    if let Some(running) = await_application(session, boot)? {
+        return Ok(running);
+    }
+    let (node, running) = (session.node(), session.device_type()?);
+    Err(Error::StartFailed { node, running, status: session.status(number).ok() })
+}

@@ -1,0 +1,135 @@
+//! A program that goes to its device as one SDO download.
+
+use std::time::Duration;
+
+use canopen::program::{self, FlashError};
+use canopen::Address;
+
+use super::procedure::Downloaded;
+use crate::device::error::absent;
+use crate::device::{Dialect, Doing, Error, Session, Timing, Transfers};
+use crate::update::course::Course;
+use crate::update::event::{DeviceState, Event, RepeatReason};
+use crate::update::judge::{judge, Judgement};
+use crate::update::options::FlashOptions;
+use crate::update::steps;
+
+/// A device that takes the whole program at once may erase behind any of its segments: 2 s at
+/// worst, and some more.
+const SLOW_SEGMENT: Duration = Duration::from_secs(5);
+
+/// What 1F57h says: an error, and its detail.
+pub(super) type Said = Option<(FlashError, u16)>;
+
+/// What is sent, and what a dialect does around it.
+pub(super) struct Whole<'w> {
+    pub(super) dialect: Dialect,
+    /// All that is sent.
+    pub(super) content: &'w [u8],
+    /// CRC of the program.
+    pub(super) crc: u32,
+    /// What each attempt begins with.
+    pub(super) prepare: &'w dyn Fn(&mut Session<'_>, &mut Course<'_>) -> Result<(), Error>,
+    /// What the device says of the download.
+    pub(super) status: fn(&mut Session<'_>, u8) -> Result<Said, Error>,
+}
+
+/// Steps 4 to 9 with one download.
+///
+/// # Errors
+/// [`Error::NotInDialect`] for a trial run, and what the device objects to.
+pub(super) fn download(
+    session: &mut Session<'_>,
+    whole: &Whole<'_>,
+    options: &FlashOptions,
+    course: &mut Course<'_>,
+) -> Result<Downloaded, Error> {
+    if options.trial_run {
+        let what = "there are no signatures, so no trial either";
+        return Err(Error::NotInDialect { dialect: whole.dialect, what });
+    }
+    let began = session.now();
+    let repeats = send(session, whole, options, course)?;
+    let took = session.now().saturating_sub(began);
+    course.state = DeviceState::Written;
+    // What 1F56h reads is a CRC in this bootloader and its like; elsewhere it is whatever its maker
+    // took.
+    if knows_crc(session)? {
+        steps::verify(session, options.program, whole.crc, &mut |event| course.tell(event))?;
+    }
+    Ok(Downloaded { repeats, took })
+}
+
+/// Sends the program, with what each attempt begins with; gives how often it was repeated.
+fn send(
+    session: &mut Session<'_>,
+    whole: &Whole<'_>,
+    options: &FlashOptions,
+    course: &mut Course<'_>,
+) -> Result<u32, Error> {
+    let at = Address::new(program::PROGRAM_DATA, options.program);
+    let content = whole.content;
+    let total = content.len();
+    let mut repeat = 0;
+    loop {
+        let before = std::mem::replace(&mut course.state, DeviceState::Erased);
+        if let Err(error) = (whole.prepare)(session, course) {
+            // A password that is refused erases nothing.
+            if matches!(error, Error::Refused { doing: Doing::Unlock, .. } | Error::NotInDialect { .. }) {
+                course.state = before;
+            }
+            return Err(error);
+        }
+        course.tell(Event::Progress { done: 0, total });
+        let slow = Timing { sdo: SLOW_SEGMENT.max(session.timing().sdo), ..*session.timing() };
+        let node = session.node();
+        let mut long = session.with(node, slow);
+        let mut progress = |part: u32| course.tell(Event::Progress { done: part as usize, total });
+        let sent = long.write(at, content, Doing::Program, &mut progress);
+        let transfers = long.transfers();
+        session.transfer_by(transfers);
+        if let Err(error @ (Error::Adapter(_) | Error::Cancelled)) = sent {
+            return Err(error);
+        }
+        let status = (whole.status)(session, options.program)?;
+        let (why, error) = match judge(sent, status, Doing::Program) {
+            Judgement::Good => return Ok(repeat),
+            Judgement::Bad { why, error } => (why, error),
+        };
+        match why {
+            Some(why) if repeat < options.repeats => {
+                repeat += 1;
+                if repeat > 1 && matches!(why, RepeatReason::Broken(_) | RepeatReason::NoAnswer) {
+                    session.transfer_by(Transfers::Segments);
+                }
+                course.tell(Event::Again { repeat, of: options.repeats, why });
+            }
+            _ => return Err(error),
+        }
+    }
+}
+
+/// What the device says of the download by 1F57h; nothing where it has no such object.
+pub(super) fn status(session: &mut Session<'_>, number: u8) -> Result<Said, Error> {
+    match session.read(Address::new(program::FLASH_STATUS, number)) {
+        Err(Error::Refused { code, .. }) if absent(code) => Ok(None),
+        Ok(_) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => idle(session, number),
+        Err(error) => Err(error),
+    }
+}
+
+/// What 1F57h says when it is no longer busy.
+pub(super) fn idle(session: &mut Session<'_>, number: u8) -> Result<Said, Error> {
+    let status = session.await_idle(number, Doing::Program)?;
+    Ok(status.error.map(|error| (error, status.detail)))
+}
+
+/// Whether 1F56h of this bootloader is the CRC of the program, as far as its device type tells:
+/// coboot's, and SYS TEC's.
+///
+/// # Errors
+/// What a [read](Session::read) has.
+fn knows_crc(session: &mut Session<'_>) -> Result<bool, Error> {
+    let running = session.device_type()?;
+    Ok(running.is_some_and(|running| running.0 == program::BOOTLOADER_DEVICE_TYPE))
+}

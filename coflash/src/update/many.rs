@@ -1,0 +1,135 @@
+//! The update of many devices over one bus: while one erases, another receives.
+
+use std::sync::atomic::AtomicBool;
+use std::sync::Arc;
+
+use canopen::NodeId;
+
+use super::event::{DeviceState, Event};
+use super::flash::{flash, Report};
+use super::options::FlashOptions;
+use crate::bus::{hub, Adapter, Gateway};
+use crate::device::{Error, Session, Timing, Transfers};
+use crate::file::BlockFile;
+
+/// What one device is to get.
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub struct Job {
+    /// Which device.
+    pub node: NodeId,
+    /// The program.
+    pub file: Arc<BlockFile>,
+    /// How.
+    pub options: FlashOptions,
+}
+
+impl Job {
+    /// This program for this device.
+    #[must_use]
+    pub fn new(node: NodeId, file: Arc<BlockFile>, options: FlashOptions) -> Self {
+        Self { node, file, options }
+    }
+}
+
+/// How to treat all of them.
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub struct ManyOptions {
+    /// How long to wait for what. Answers wait behind those of other devices: the SDO time-out is
+    /// taken as many times as there are devices at once.
+    pub timing: Timing,
+    /// How to write.
+    pub transfers: Transfers,
+    /// How many devices are at work at the same time.
+    pub at_once: usize,
+    /// Ends all of them as soon as it is set.
+    pub cancelled: Arc<AtomicBool>,
+}
+
+impl ManyOptions {
+    setters! {
+        timing: Timing,
+        transfers: Transfers,
+        at_once: usize,
+        cancelled: Arc<AtomicBool>,
+    }
+}
+
+impl Default for ManyOptions {
+    fn default() -> Self {
+        Self {
+            timing: Timing::default(),
+            transfers: Transfers::default(),
+            at_once: 8,
+            cancelled: Arc::default(),
+        }
+    }
+}
+
+/// A device that failed, and how it was left.
+#[derive(Debug)]
+pub struct Failed {
+    /// What went wrong.
+    pub error: Error,
+    /// How far it had come.
+    pub left: DeviceState,
+}
+
+/// Updates all devices; a failure of one does not stop the others. `tell` hears what happens to
+/// which job, in threads of their own. The results are in the order of the jobs.
+pub fn flash_many(
+    adapter: &mut dyn Adapter,
+    jobs: &[Job],
+    options: &ManyOptions,
+    tell: &(dyn Fn(usize, Event) + Sync),
+) -> Vec<Result<Report, Failed>> {
+    let at_once = options.at_once.clamp(1, jobs.len().max(1));
+    let sdo = options.timing.sdo.saturating_mul(at_once as u32);
+    let timing = Timing { sdo, ..options.timing };
+    let conversation = |(number, job): (usize, &Job)| -> (NodeId, hub::Conversation<'_, _>) {
+        let (node, job, all) = (job.node, job.clone(), options.clone());
+        let act = move |port: &mut hub::Port| {
+            let mut session = Session::new(port, job.node, timing);
+            let one = FlashOptions { follow: false, ..job.options };
+            update(&mut session, &job, &one, &all, &mut |event| tell(number, event))
+        };
+        (node, Box::new(act))
+    };
+    let conversations = jobs.iter().enumerate().map(conversation).collect();
+    hub::run(adapter, conversations, at_once)
+}
+
+/// The same behind a gateway, which does one thing at a time: one device after the other.
+pub fn flash_in_turn(
+    gateway: &mut dyn Gateway,
+    jobs: &[Job],
+    options: &ManyOptions,
+    tell: &dyn Fn(usize, Event),
+) -> Vec<Result<Report, Failed>> {
+    let one = |(number, job): (usize, &Job)| {
+        let mut session = Session::through(&mut *gateway, job.node, options.timing);
+        update(&mut session, job, &job.options, options, &mut |event| tell(number, event))
+    };
+    jobs.iter().enumerate().map(one).collect()
+}
+
+/// Updates one of them.
+fn update(
+    session: &mut Session<'_>,
+    job: &Job,
+    one: &FlashOptions,
+    all: &ManyOptions,
+    tell: &mut dyn FnMut(Event),
+) -> Result<Report, Failed> {
+    session.cancel_by(all.cancelled.clone());
+    session.transfer_by(all.transfers);
+    let mut left = DeviceState::Untouched;
+    let result = flash(session, &job.file, one, &mut |event| {
+        if let Event::Left(state) = event {
+            left = state;
+        }
+        tell(event);
+    });
+    result.map_err(|error| Failed { error, left })
+}

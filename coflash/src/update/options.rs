@@ -1,0 +1,95 @@
+//! What to do in an update beyond the download itself.
+
+use shared_abi::block_file::Control;
+
+use super::password::Password;
+use crate::device::Dialect;
+use crate::file::BlockFile;
+
+/// What to do beyond the download itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct FlashOptions {
+    /// The program: sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
+    pub program: u8,
+    /// How often one block is sent again after a CRC error or a broken transfer.
+    pub repeats: u32,
+    /// Compare the device's identity with this before anything is erased, and once more with that
+    /// of the program on trial.
+    pub check_target: Option<Target>,
+    /// Start the program once and call it back before it is signed (steps 10 to 13).
+    pub trial_run: bool,
+    /// Start the program at the end (step 15).
+    pub start: bool,
+    /// Compare the CRC once more at the very end: the one that the program itself tells when it
+    /// runs.
+    pub verify: bool,
+    /// The dialect that the device speaks; `None` to find it out.
+    pub dialect: Option<Dialect>,
+    /// What opens the device, in dialects that ask for it.
+    pub unlock: Option<Password>,
+    /// Whether the session can follow a device to another node-ID, which lifts need. One of several
+    /// at once cannot.
+    pub follow: bool,
+    /// Search until the bootloader is there or the user gives up (manual, chapter 5.2, step 1):
+    /// neither silence nor an application that stays ends the procedure.
+    pub wait: bool,
+    /// Ask for the NMT mastership around a lift's update, and give it back (CiA 814-1 clause 6.3).
+    pub mastership: bool,
+}
+
+impl FlashOptions {
+    setters! {
+        program: u8,
+        repeats: u32,
+        check_target: Option<Target>,
+        trial_run: bool,
+        start: bool,
+        verify: bool,
+        dialect: Option<Dialect>,
+        unlock: Option<Password>,
+        follow: bool,
+        wait: bool,
+        mastership: bool,
+    }
+}
+
+/// The device that a program is for: what 1018h/1 and 1018h/2 have to read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Target {
+    /// Vendor-ID.
+    pub vendor_id: u32,
+    /// Product code.
+    pub product_code: u32,
+}
+
+impl Target {
+    /// The device that a block file names in its block 0, if it names one.
+    #[must_use]
+    pub fn of(file: &BlockFile) -> Option<Self> {
+        match *file.control() {
+            Control::Plain => None,
+            Control::Identity(identity) | Control::Dated { identity, .. } => {
+                Some(Self { vendor_id: identity.vendor_id, product_code: identity.product_code })
+            }
+        }
+    }
+}
+
+impl Default for FlashOptions {
+    fn default() -> Self {
+        Self {
+            program: 1,
+            repeats: 3,
+            check_target: None,
+            trial_run: false,
+            start: true,
+            verify: false,
+            dialect: None,
+            unlock: None,
+            follow: true,
+            wait: false,
+            mastership: true,
+        }
+    }
+}

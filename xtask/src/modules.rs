@@ -1,0 +1,220 @@
+//! Which file of a crate uses which: the module graph, read off the sources.
+//!
+//! A use is a path that names a module: in a `use` item, nested groups included, or in code, by
+//! `crate::`, `super::`, `self::` or the name of a child module. `mod x;` declares and uses nothing.
+//! What tests use is theirs.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+/// A module by its path below the crate's root: `device::session`. The root is the empty one.
+pub type Module = Vec<String>;
+
+/// Which file uses which.
+pub type Graph = BTreeMap<Module, BTreeSet<Module>>;
+
+/// Reads the graph off the sources of a crate: the path of each below `src/`, and its text. `krate`
+/// is the name by which a binary beside the library calls that.
+pub fn graph(krate: &str, sources: &[(String, String)]) -> Graph {
+    let modules: Vec<(Module, &str)> =
+        sources.iter().filter_map(|(path, text)| Some((module(path)?, text.as_str()))).collect();
+    let known: BTreeSet<Module> = modules.iter().map(|(module, _)| module.clone()).collect();
+    let krate = krate.replace('-', "_");
+    let mut graph = Graph::new();
+    for (own, text) in &modules {
+        let uses = graph.entry(own.clone()).or_default();
+        for path in paths(&code(text)) {
+            let Some(target) = resolve(&path, own, &krate, &known) else { continue };
+            if target != *own {
+                uses.insert(target);
+            }
+        }
+    }
+    graph
+}
+
+/// The module of a file; `None` for the root of a binary, which nobody can use.
+fn module(path: &str) -> Option<Module> {
+    let path = path.strip_suffix(".rs")?;
+    if path == "main" || path.starts_with("bin/") {
+        return None;
+    }
+    let mut parts: Module = path.split('/').map(str::to_owned).collect();
+    if parts.last().is_some_and(|last| last == "mod" || last == "lib" && path == "lib") {
+        parts.pop();
+    }
+    Some(parts)
+}
+
+/// A source without comments, texts and tests.
+pub fn code(text: &str) -> String {
+    let text = text.split("#[cfg(test)]\nmod ").next().unwrap_or_default();
+    let mut code = String::new();
+    for line in text.lines().filter(|line| !line.trim_start().starts_with("//")) {
+        // What stands between quotation marks is no path.
+        code.extend(line.split('"').step_by(2));
+        code.push('\n');
+    }
+    code
+}
+
+/// All paths of two or more segments, groups taken apart: `a::{b, c::d}` is `a::b` and `a::c::d`.
+pub fn paths(code: &str) -> Vec<Vec<String>> {
+    let tokens = tokens(code);
+    let mut found = Vec::new();
+    let mut at = 0;
+    while at < tokens.len() {
+        let next = tokens.get(at + 1).map(String::as_str);
+        if tokens[at] == "pub" && next == Some("(") {
+            // For whom it is visible.
+            at += tokens[at..].iter().position(|token| token == ")").unwrap_or(1);
+        } else if is_name(&tokens[at]) && next == Some("::") {
+            at = tree(&tokens, at, &mut Vec::new(), &mut found);
+        } else if tokens[at] == "use" && next.is_some_and(is_name) {
+            // A name alone is a path, too: `use x;`.
+            at = tree(&tokens, at + 1, &mut Vec::new(), &mut found);
+        } else {
+            at += 1;
+        }
+    }
+    found
+}
+
+/// Reads one path from a token on; gives where it ends.
+fn tree(tokens: &[String], from: usize, before: &mut Vec<String>, found: &mut Vec<Vec<String>>) -> usize {
+    let mut at = from;
+    let depth = before.len();
+    loop {
+        match tokens.get(at).map(String::as_str) {
+            Some("{") => {
+                at += 1;
+                while tokens.get(at).is_some_and(|token| token != "}") {
+                    // A comma, the star of a glob, `as` and what behind it is.
+                    let other = !tokens.get(at).is_some_and(|token| is_name(token) && token != "as");
+                    at = if other { at + 1 } else { tree(tokens, at, before, found) };
+                }
+                at += 1;
+                break;
+            }
+            Some(name) if is_name(name) => {
+                before.push(name.to_owned());
+                at += 1;
+                if tokens.get(at).is_some_and(|token| token == "::") {
+                    at += 1;
+                    continue;
+                }
+                found.push(before.clone());
+                break;
+            }
+            _ => {
+                found.push(before.clone());
+                break;
+            }
+        }
+    }
+    before.truncate(depth);
+    at
+}
+
+/// Names, `::`, and everything else letter by letter.
+fn tokens(code: &str) -> Vec<String> {
+    let mut tokens: Vec<String> = Vec::new();
+    let mut letters = code.chars().peekable();
+    while let Some(letter) = letters.next() {
+        if letter.is_alphanumeric() || letter == '_' {
+            let mut word = letter.to_string();
+            while let Some(next) = letters.next_if(|next| next.is_alphanumeric() || *next == '_') {
+                word.push(next);
+            }
+            tokens.push(word);
+        } else if letter == ':' && letters.next_if_eq(&':').is_some() {
+            tokens.push("::".to_owned());
+        } else if !letter.is_whitespace() {
+            tokens.push(letter.to_string());
+        }
+    }
+    tokens
+}
+
+fn is_name(token: &str) -> bool {
+    token.starts_with(|letter: char| letter.is_alphabetic() || letter == '_')
+}
+
+/// The file that a path leads into: the longest part of it that is a module.
+fn resolve(path: &[String], own: &[String], krate: &str, known: &BTreeSet<Module>) -> Option<Module> {
+    let mut at = own.to_vec();
+    let mut rest = path;
+    match rest.first().map(String::as_str)? {
+        "self" => rest = &rest[1..],
+        "super" => {
+            while rest.first().is_some_and(|name| name == "super") {
+                at.pop();
+                rest = &rest[1..];
+            }
+        }
+        name if name == "crate" || name == krate => {
+            at.clear();
+            rest = &rest[1..];
+        }
+        // A child's name; any other is of another crate, or was brought in by a `use`.
+        name => {
+            at.push(name.to_owned());
+            if !known.contains(&at) {
+                return None;
+            }
+            rest = &rest[1..];
+        }
+    }
+    for name in rest {
+        at.push(name.clone());
+        if !known.contains(&at) {
+            at.pop();
+            break;
+        }
+    }
+    // Inside a module without a file of its own: of no interest here.
+    known.contains(&at).then_some(at)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn uses(own: &str, text: &str) -> Vec<String> {
+        let files = ["lib.rs", "main.rs", "a/mod.rs", "a/b.rs", "a/b/deep.rs", "a/c.rs", "d.rs", "e/mod.rs"];
+        let sources: Vec<_> = files
+            .iter()
+            .map(|file| ((*file).to_owned(), if *file == own { text.to_owned() } else { String::new() }))
+            .collect();
+        let graph = graph("my-crate", &sources);
+        graph[&module(own).unwrap()].iter().map(|module| module.join("::")).collect()
+    }
+
+    #[test]
+    fn paths_lead_into_files() {
+        assert_eq!(uses("a/b.rs", "use super::c::X;"), ["a::c"]);
+        assert_eq!(uses("a/b.rs", "use super::X;"), ["a"]);
+        assert_eq!(uses("a/b.rs", "use super::{c, X};"), ["a", "a::c"]);
+        assert_eq!(uses("a/b.rs", "use crate::{a::{c::{Y, Z}, W}, d, e::V};"), ["a", "a::c", "d", "e"]);
+        assert_eq!(uses("a/b/deep.rs", "use super::super::c;\nuse super::X;"), ["a::b", "a::c"]);
+        assert_eq!(uses("a/b.rs", "fn f() { crate::d::g(&crate::e::H) }"), ["d", "e"]);
+        assert_eq!(uses("d.rs", "use my_crate::a::b::X;"), ["a::b"]);
+        assert_eq!(uses("d.rs", "use crate::X;\nuse std::a::b;"), [""]);
+        assert_eq!(uses("a/b.rs", "use crate::d as f;"), ["d"]);
+        assert_eq!(uses("a/b.rs", "use crate::a::c::*;"), ["a::c"]);
+        assert_eq!(uses("a/b.rs", "pub(in crate::a) fn f(x: crate::d::X) {}"), ["d"]);
+    }
+
+    #[test]
+    fn a_child_is_used_by_its_name_and_not_by_its_declaration() {
+        assert_eq!(uses("a/mod.rs", "mod b;\npub mod c;"), [""; 0]);
+        assert_eq!(uses("a/mod.rs", "pub use self::b::X;"), ["a::b"]);
+        assert_eq!(uses("a/mod.rs", "mod b; fn f() { b::g() }"), ["a::b"]);
+        assert_eq!(uses("lib.rs", "pub use a::X;\nuse d;"), ["a", "d"]);
+    }
+
+    #[test]
+    fn comments_texts_and_tests_use_nothing() {
+        let text = "//! crate::d\n// crate::d\nfn f() { \"crate::d\"; }\n#[cfg(test)]\nmod tests { use crate::d::X; }";
+        assert_eq!(uses("a/b.rs", text), [""; 0]);
+    }
+}
