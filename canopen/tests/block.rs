@@ -3,9 +3,9 @@
 mod common;
 
 use canopen::sdo::client::{Block, Buffer, Config, Download, SdoError, Step, Transfer, Upload};
-use canopen::sdo::server::{Config as ServerConfig, SdoServer};
-use canopen::{AbortCode, Address, Frame};
-use common::{at, node, request, response, Device, Event};
+use canopen::sdo::server::Config as ServerConfig;
+use canopen::{AbortCode, Address};
+use common::{at, node, request, response, Bench, Event};
 
 /// CRC of the bytes 1 to 9 (polynomial 1021h, start 0), from an independent calculation:
 /// `python3 -c "import binascii; print(hex(binascii.crc_hqx(bytes(range(1, 10)), 0)))"`.
@@ -15,28 +15,17 @@ const CRC_1_TO_9: u16 = 0x2378;
 const CRC_14: [u8; 2] = [CRC_1_TO_14 as u8, (CRC_1_TO_14 >> 8) as u8];
 const CRC_1_TO_14: u16 = 0x9B92;
 
-struct Bench {
-    server: SdoServer,
-    device: Device,
-    now: u32,
+fn bench(blksize: u8) -> Bench {
+    Bench::with(ServerConfig { timeout_ms: 1000, repeat_ms: 300, blksize, ..ServerConfig::DEFAULT })
 }
 
-impl Bench {
-    fn new(blksize: u8) -> Self {
-        let config = ServerConfig { timeout_ms: 1000, repeat_ms: 300, blksize, ..ServerConfig::DEFAULT };
-        Self { server: SdoServer::new(node(), config), device: Device::default(), now: 0 }
-    }
+/// Requests with all their answers.
+trait Dialogue {
+    fn expect(&mut self, dialogue: &[([u8; 8], &[[u8; 8]])]);
+    fn still_serves(&mut self);
+}
 
-    /// All that the server sends after this frame.
-    fn ask(&mut self, bytes: [u8; 8]) -> Vec<Frame> {
-        self.server.handle(&request(bytes), at(self.now), &mut self.device);
-        self.sent()
-    }
-
-    fn sent(&mut self) -> Vec<Frame> {
-        core::iter::from_fn(|| self.server.poll(at(self.now), &mut self.device)).collect()
-    }
-
+impl Dialogue for Bench {
     #[track_caller]
     fn expect(&mut self, dialogue: &[([u8; 8], &[[u8; 8]])]) {
         for (asked, answered) in dialogue {
@@ -72,7 +61,7 @@ fn nine() -> Vec<u8> {
 
 #[test]
 fn server_takes_a_block_download() {
-    let mut bench = Bench::new(127);
+    let mut bench = bench(127);
     bench.expect(&[
         (INITIATE_9, &[granted(127)]),
         (FIRST, &[]),
@@ -107,7 +96,7 @@ fn server_takes_a_block_download() {
 
 #[test]
 fn server_asks_again_for_what_was_lost() {
-    let mut bench = Bench::new(3);
+    let mut bench = bench(3);
     let segment = |seqno: u8, first: u8| {
         let mut bytes = [seqno, 0, 0, 0, 0, 0, 0, 0];
         bytes[1..].iter_mut().zip(first..).for_each(|(byte, value)| *byte = value);
@@ -132,7 +121,7 @@ fn server_asks_again_for_what_was_lost() {
 
 #[test]
 fn server_acknowledges_a_sub_block_that_stops_short() {
-    let mut bench = Bench::new(127);
+    let mut bench = bench(127);
     bench.expect(&[(INITIATE_9, &[granted(127)])]);
     // Nothing at all came: the client has its reasons, or its own time-out.
     bench.now += 900;
@@ -160,7 +149,7 @@ fn server_acknowledges_a_sub_block_that_stops_short() {
 
 #[test]
 fn server_grants_what_the_consumer_has_room_for() {
-    let mut bench = Bench::new(127);
+    let mut bench = bench(127);
     bench.device.space = Some(6);
     bench.expect(&[(INITIATE_9, &[])]);
     // A segment before the grant is none of this sub-block.
@@ -180,7 +169,7 @@ fn server_grants_what_the_consumer_has_room_for() {
 /// A dialogue that ends in an abort after the domain had begun.
 #[track_caller]
 fn breaks(dialogue: &[([u8; 8], &[[u8; 8]])]) {
-    let mut bench = Bench::new(4);
+    let mut bench = bench(4);
     bench.expect(dialogue);
     assert_eq!(bench.device.events.last(), Some(&Event::Cancel));
     bench.still_serves();
@@ -223,7 +212,7 @@ fn server_aborts_a_block_download_that_is_wrong() {
         ([0x40, 0x00, 0x10, 0, 0, 0, 0, 0], &[[0x43, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x10]]);
     breaks(&[start, (FIRST, &[]), last, read]);
     // Refused before anything began.
-    let mut bench = Bench::new(4);
+    let mut bench = bench(4);
     bench.expect(&[
         ([0xC6, 0x00, 0x10, 0, 4, 0, 0, 0], &[[0x80, 0x00, 0x10, 0, 0x02, 0x00, 0x01, 0x06]]),
         ([0xC6, 0x34, 0x12, 0, 4, 0, 0, 0], &[[0x80, 0x34, 0x12, 0, 0x00, 0x00, 0x02, 0x06]]),
@@ -259,7 +248,7 @@ const END_OF_14: [u8; 8] = [0xC1, CRC_14[0], CRC_14[1], 0, 0, 0, 0, 0];
 
 #[test]
 fn server_gives_a_block_upload() {
-    let mut bench = Bench::new(127);
+    let mut bench = bench(127);
     bench.device.domain = (1..=14).collect();
     bench.device.tells_size = true;
     bench.expect(&[
@@ -298,7 +287,7 @@ fn server_gives_a_block_upload() {
 
 #[test]
 fn server_repeats_what_the_client_did_not_get() {
-    let mut bench = Bench::new(127);
+    let mut bench = bench(127);
     bench.device.domain = (1..=14).collect();
     bench.device.tells_size = true;
     bench.expect(&[
@@ -329,7 +318,7 @@ fn server_repeats_what_the_client_did_not_get() {
 
 #[test]
 fn server_switches_the_protocol_below_the_threshold() {
-    let mut bench = Bench::new(127);
+    let mut bench = bench(127);
     bench.device.domain = (1..=14).collect();
     bench.device.tells_size = true;
     bench.expect(&[
@@ -351,7 +340,7 @@ fn server_switches_the_protocol_below_the_threshold() {
 fn server_without_block_upload_refuses_it() {
     let unknown_request = AbortCode(0x0800_0000);
     let config = ServerConfig { block_upload: false, unknown_request, ..ServerConfig::DEFAULT };
-    let mut bench = Bench { server: SdoServer::new(node(), config), device: Device::default(), now: 0 };
+    let mut bench = Bench::with(config);
     bench.expect(&[(READ_14, &[[0x80, 0, 0, 0, 0x00, 0x00, 0x00, 0x08]])]);
     bench.still_serves();
     for request in [START, acked(1, 127), ENDED] {
@@ -367,7 +356,7 @@ fn server_aborts_a_block_upload_that_is_wrong() {
         [0x80, 0x00, 0x20, 0, a, b, c, d]
     };
     let breaks = |dialogue: &[([u8; 8], &[[u8; 8]])]| {
-        let mut bench = Bench::new(127);
+        let mut bench = bench(127);
         bench.device.domain = (1..=14).collect();
         bench.device.tells_size = true;
         bench.expect(dialogue);
@@ -396,7 +385,7 @@ fn server_aborts_a_block_upload_that_is_wrong() {
     breaks(&[read, start, (acked(2, 127), &[END_OF_14]), give_up]);
     // Silence, at every stage.
     for stage in 1..=3 {
-        let mut bench = Bench::new(127);
+        let mut bench = bench(127);
         bench.device.domain = (1..=14).collect();
         bench.device.tells_size = true;
         bench.expect(&[read, start, (acked(2, 127), &[END_OF_14])][..stage]);
@@ -405,7 +394,7 @@ fn server_aborts_a_block_upload_that_is_wrong() {
         bench.still_serves();
     }
     // Not readable.
-    let mut bench = Bench::new(127);
+    let mut bench = bench(127);
     bench.expect(&[([0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0], &[[0x80, 0x50, 0x1F, 1, 0x01, 0x00, 0x01, 0x06]])]);
 }
 

@@ -8,36 +8,18 @@ mod random;
 
 use canopen::od::Objects;
 use canopen::sdo::client::{Block, Config as ClientConfig, Download, Step, Transfer};
-use canopen::sdo::server::{Config, SdoServer};
+use canopen::sdo::server::Config;
 use canopen::{Address, Frame};
-use common::{at, node, request, response, Device, Event};
+use common::{at, node, response, Bench, Device, Event};
 use random::Random;
 
-struct Bench {
-    server: SdoServer,
-    device: Device,
-    now: u32,
+/// How time goes on, and a download to begin with.
+trait Scene {
+    fn wait(&mut self, ms: u32) -> Vec<(u32, Frame)>;
+    fn begin(&mut self, segments: u8);
 }
 
-impl Bench {
-    fn new() -> Self {
-        Self::with(Config::DEFAULT)
-    }
-
-    fn with(config: Config) -> Self {
-        Self { server: SdoServer::new(node(), config), device: Device::default(), now: 0 }
-    }
-
-    /// All that the server sends after this frame.
-    fn ask(&mut self, bytes: [u8; 8]) -> Vec<Frame> {
-        self.server.handle(&request(bytes), at(self.now), &mut self.device);
-        self.sent()
-    }
-
-    fn sent(&mut self) -> Vec<Frame> {
-        core::iter::from_fn(|| self.server.poll(at(self.now), &mut self.device)).collect()
-    }
-
+impl Scene for Bench {
     /// Time goes on, a millisecond after the other; what is sent meanwhile, and when.
     fn wait(&mut self, ms: u32) -> Vec<(u32, Frame)> {
         let mut sent = Vec::new();
@@ -71,7 +53,7 @@ fn acked(ackseq: u8) -> [u8; 8] {
 /// Clients give up after 0.3 s (python-canopen) to 0.5 s.
 #[test]
 fn a_lost_last_segment_is_acknowledged_after_50_ms() {
-    let mut bench = Bench::new();
+    let mut bench = Bench::with(Config::DEFAULT);
     bench.begin(126);
     assert_eq!(bench.server.next_deadline(), Some(at(50)));
     assert_eq!(bench.wait(300), [(50, response(acked(126)))]);
@@ -89,7 +71,7 @@ fn a_lost_last_segment_is_acknowledged_after_50_ms() {
 /// for another acknowledgement.
 #[test]
 fn the_rest_of_a_sub_block_that_was_acknowledged_early_is_passed_over() {
-    let mut bench = Bench::new();
+    let mut bench = Bench::with(Config::DEFAULT);
     bench.begin(40);
     assert_eq!(bench.wait(60), [(50, response(acked(40)))]);
     for seqno in 41..=127 {
@@ -108,7 +90,7 @@ fn the_rest_of_a_sub_block_that_was_acknowledged_early_is_passed_over() {
     expected.extend([[8; 7], [7; 7]].concat());
     assert_eq!(bench.device.taken, expected);
     // A client that begins anew at the acknowledgement, and whose first segment is lost.
-    let mut bench = Bench::new();
+    let mut bench = Bench::with(Config::DEFAULT);
     bench.begin(40);
     assert_eq!(bench.wait(60), [(50, response(acked(40)))]);
     for seqno in 2..=126 {
@@ -122,7 +104,7 @@ fn the_rest_of_a_sub_block_that_was_acknowledged_early_is_passed_over() {
 #[test]
 fn a_request_ends_a_download_that_stands_still() {
     for (segments, every) in [(0, 100), (0, 2200), (3, 100), (3, 2200), (3, 20), (126, 300)] {
-        let mut bench = Bench::new();
+        let mut bench = Bench::with(Config::DEFAULT);
         bench.begin(segments);
         bench.now = 10;
         let mut answers = bench.ask(READ_1000).into_iter().map(|frame| (10, frame)).collect::<Vec<_>>();
@@ -155,7 +137,7 @@ fn each_kind_of_request_ends_a_download() {
         ([0xC6, 0x50, 0x1F, 1, 9, 0, 0, 0], GRANTED),
     ] {
         for segments in [0, 3] {
-            let mut bench = Bench::new();
+            let mut bench = Bench::with(Config::DEFAULT);
             bench.begin(segments);
             assert_eq!(bench.ask(asked), []);
             assert_eq!(bench.wait(50), [(50, response(answered))], "{asked:02X?} behind {segments}");
@@ -178,7 +160,7 @@ fn each_kind_of_request_ends_a_download() {
         assert_eq!(bench.device.events[..2], [Event::Start(Some(4096)), Event::Cancel]);
     }
     // An abort does so at once, and is not answered.
-    let mut bench = Bench::new();
+    let mut bench = Bench::with(Config::DEFAULT);
     bench.begin(3);
     assert_eq!(bench.ask([0x80, 0, 0, 0, 0, 0, 0, 8]), []);
     assert_eq!(bench.ask(READ_1000), [response(IS_1000)]);
@@ -204,7 +186,7 @@ fn segments_that_read_as_requests_are_data() {
     };
     for lost in [None, Some(0x20), Some(0x2E), Some(0x3F), Some(0x40)] {
         for pause in [0, 49] {
-            let mut bench = Bench::new();
+            let mut bench = Bench::with(Config::DEFAULT);
             bench.begin(0);
             for seqno in (1..=126).filter(|seqno| Some(*seqno) != lost) {
                 bench.wait(if [0x2F, 0x40, 0x41, 0x42].contains(&seqno) { pause } else { 1 });
@@ -225,7 +207,7 @@ fn a_download_that_makes_no_progress_times_out() {
     // A segment that is not its turn, and one of an object that the device does not have.
     for noise in [[0x7E, 0, 0, 0, 0, 0, 0, 0], [0x40, 0x34, 0x12, 0, 0, 0, 0, 0]] {
         for (segments, every) in [(0, 10), (0, 100), (2, 10), (2, 100), (2, 700)] {
-            let mut bench = Bench::new();
+            let mut bench = Bench::with(Config::DEFAULT);
             bench.begin(segments);
             let mut sent = Vec::new();
             let mut noise = noise;
@@ -245,7 +227,7 @@ fn a_download_that_makes_no_progress_times_out() {
         }
     }
     // The last segment again and again, where the end is expected.
-    let mut bench = Bench::new();
+    let mut bench = Bench::with(Config::DEFAULT);
     bench.begin(0);
     let mut sent =
         bench.ask([0x81, 1, 2, 3, 4, 5, 6, 7]).into_iter().map(|frame| (0, frame)).collect::<Vec<_>>();

@@ -4,31 +4,22 @@ mod common;
 
 use canopen::sdo::server::{Config, SdoServer};
 use canopen::{AbortCode, CobId, Frame, Objects};
-use common::{at, node, request, response, Device, Event};
+use common::{at, node, request, response, Bench, Device, Event};
 use embedded_can::{ExtendedId, Frame as _, StandardId};
 
-struct Bench {
-    server: SdoServer,
-    device: Device,
-    now: u32,
+fn bench() -> Bench {
+    Bench::with(Config { timeout_ms: 1000, ..Config::default() })
 }
 
-impl Bench {
-    fn new() -> Self {
-        let server = SdoServer::new(node(), Config { timeout_ms: 1000, ..Config::default() });
-        Self { server, device: Device::default(), now: 0 }
-    }
+/// One request, one answer.
+trait Dialogue {
+    fn answer(&mut self, bytes: [u8; 8]) -> Option<[u8; 8]>;
+    fn expect(&mut self, dialogue: &[([u8; 8], [u8; 8])]);
+}
 
-    fn send(&mut self, frame: &Frame) {
-        self.server.handle(frame, at(self.now), &mut self.device);
-    }
-
-    fn poll(&mut self) -> Option<Frame> {
-        self.server.poll(at(self.now), &mut self.device)
-    }
-
+impl Dialogue for Bench {
     /// The one answer to a request, or that there is none.
-    fn ask(&mut self, bytes: [u8; 8]) -> Option<[u8; 8]> {
+    fn answer(&mut self, bytes: [u8; 8]) -> Option<[u8; 8]> {
         self.send(&request(bytes));
         let answer = self.poll();
         assert_eq!(self.poll(), None);
@@ -41,7 +32,7 @@ impl Bench {
     #[track_caller]
     fn expect(&mut self, dialogue: &[([u8; 8], [u8; 8])]) {
         for (asked, answered) in dialogue {
-            assert_eq!(self.ask(*asked), Some(*answered), "answer to {asked:02X?}");
+            assert_eq!(self.answer(*asked), Some(*answered), "answer to {asked:02X?}");
         }
     }
 }
@@ -56,7 +47,7 @@ fn still_serves(bench: &mut Bench) {
 
 #[test]
 fn uploads_expedited() {
-    let mut bench = Bench::new();
+    let mut bench = bench();
     bench.device.heartbeat = 0x0102;
     bench.device.control = 0xA5;
     bench.expect(&[
@@ -75,7 +66,7 @@ fn uploads_expedited() {
 
 #[test]
 fn downloads_expedited() {
-    let mut bench = Bench::new();
+    let mut bench = bench();
     bench.expect(&[
         ([0x2F, 0x51, 0x1F, 1, 0x83, 0, 0, 0], [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0]),
         ([0x2B, 0x17, 0x10, 0, 0xE8, 0x03, 0, 0], [0x60, 0x17, 0x10, 0, 0, 0, 0, 0]),
@@ -95,7 +86,7 @@ fn downloads_expedited() {
 
 #[test]
 fn uploads_segmented() {
-    let mut bench = Bench::new();
+    let mut bench = bench();
     // "coboot bootloader": 17 bytes = 7 + 7 + 3.
     bench.expect(&[
         ([0x40, 0x08, 0x10, 0, 0, 0, 0, 0], [0x41, 0x08, 0x10, 0, 17, 0, 0, 0]),
@@ -117,7 +108,7 @@ fn uploads_segmented() {
 
 #[test]
 fn uploads_a_domain_with_and_without_its_size() {
-    let mut bench = Bench::new();
+    let mut bench = bench();
     bench.device.domain = (1..=14).collect();
     bench.device.tells_size = true;
     bench.expect(&[
@@ -139,7 +130,7 @@ fn uploads_a_domain_with_and_without_its_size() {
 
 #[test]
 fn downloads_segmented() {
-    let mut bench = Bench::new();
+    let mut bench = bench();
     bench.expect(&[
         ([0x21, 0x50, 0x1F, 1, 9, 0, 0, 0], [0x60, 0x50, 0x1F, 1, 0, 0, 0, 0]),
         ([0x00, 1, 2, 3, 4, 5, 6, 7], [0x20, 0, 0, 0, 0, 0, 0, 0]),
@@ -195,7 +186,7 @@ fn refuses_what_the_table_does_not_allow() {
         ([0x2F, 0x51, 0x1F, 1, 0x7F, 0, 0, 0], [0x80, 0x51, 0x1F, 1, 0x30, 0x00, 0x09, 0x06]),
     ];
     for refusal in refusals {
-        let mut bench = Bench::new();
+        let mut bench = bench();
         bench.expect(&[refusal]);
         assert!(bench.server.is_idle());
         assert_eq!(bench.device.events, []);
@@ -206,7 +197,7 @@ fn refuses_what_the_table_does_not_allow() {
 /// A dialogue that ends in an abort, and what the consumer of the domain hears.
 #[track_caller]
 fn breaks(dialogue: &[([u8; 8], [u8; 8])], events: &[Event]) {
-    let mut bench = Bench::new();
+    let mut bench = bench();
     bench.expect(dialogue);
     assert_eq!(bench.device.events, events);
     still_serves(&mut bench);
@@ -279,19 +270,19 @@ fn commands_out_of_place_or_unknown_abort() {
 
 #[test]
 fn an_abort_of_the_client_is_not_answered() {
-    let mut bench = Bench::new();
-    assert_eq!(bench.ask([0x80, 0x50, 0x1F, 1, 0, 0, 0, 8]), None);
+    let mut bench = bench();
+    assert_eq!(bench.answer([0x80, 0x50, 0x1F, 1, 0, 0, 0, 8]), None);
     bench.expect(&[START_9, FIRST]);
-    assert_eq!(bench.ask([0x80, 0x50, 0x1F, 1, 0, 0, 0, 8]), None);
+    assert_eq!(bench.answer([0x80, 0x50, 0x1F, 1, 0, 0, 0, 8]), None);
     assert_eq!(bench.device.events, [Event::Start(Some(9)), Event::Cancel]);
     bench.expect(&[([0x40, 0x08, 0x10, 0, 0, 0, 0, 0], [0x41, 0x08, 0x10, 0, 17, 0, 0, 0])]);
-    assert_eq!(bench.ask([0x80, 0x08, 0x10, 0, 0, 0, 0, 8]), None);
+    assert_eq!(bench.answer([0x80, 0x08, 0x10, 0, 0, 0, 0, 8]), None);
     still_serves(&mut bench);
 }
 
 #[test]
 fn a_new_initiate_ends_the_old_transfer() {
-    let mut bench = Bench::new();
+    let mut bench = bench();
     bench.expect(&[START_9, FIRST]);
     still_serves(&mut bench);
     assert_eq!(bench.device.events, [Event::Start(Some(9)), Event::Cancel]);
@@ -312,7 +303,7 @@ fn a_new_initiate_ends_the_old_transfer() {
 
 #[test]
 fn a_silent_client_is_aborted() {
-    let mut bench = Bench::new();
+    let mut bench = bench();
     bench.now = u32::MAX - 500;
     bench.expect(&[START_9, FIRST]);
     assert_eq!(bench.server.next_deadline(), Some(at(499)));
@@ -332,7 +323,7 @@ fn a_silent_client_is_aborted() {
 
 #[test]
 fn the_consumer_has_the_last_word() {
-    let mut bench = Bench::new();
+    let mut bench = bench();
     bench.device.refuse_end = Some(AbortCode::HARDWARE);
     let hardware = [0x80, 0x50, 0x1F, 1, 0x00, 0x00, 0x06, 0x06];
     bench.expect(&[START_9, FIRST, ([0x1B, 8, 9, 0, 0, 0, 0, 0], hardware)]);
@@ -343,10 +334,10 @@ fn the_consumer_has_the_last_word() {
 
 #[test]
 fn a_full_consumer_holds_the_answer_back() {
-    let mut bench = Bench::new();
+    let mut bench = bench();
     bench.device.space = Some(8);
     bench.expect(&[START_9]);
-    assert_eq!(bench.ask(FIRST.0), None);
+    assert_eq!(bench.answer(FIRST.0), None);
     bench.now = 900;
     bench.device.space = Some(7);
     assert_eq!(bench.poll(), Some(response(FIRST.1)));
@@ -355,7 +346,7 @@ fn a_full_consumer_holds_the_answer_back() {
     bench.expect(&[([0x1B, 8, 9, 0, 0, 0, 0, 0], [0x30, 0, 0, 0, 0, 0, 0, 0])]);
     // A consumer that never gets done costs the client its transfer, not the server its life.
     bench.device.space = Some(0);
-    assert_eq!(bench.ask(START_9.0), None);
+    assert_eq!(bench.answer(START_9.0), None);
     bench.now += 1000;
     assert_eq!(bench.poll(), Some(response([0x80, 0x50, 0x1F, 1, 0x00, 0x00, 0x04, 0x05])));
     still_serves(&mut bench);
@@ -364,22 +355,22 @@ fn a_full_consumer_holds_the_answer_back() {
 /// Slowed down, but not left alone: a segment every 2 ms, until there is really no room.
 #[test]
 fn a_client_that_is_held_back_is_served_from_the_reserve() {
-    let mut bench = Bench::new();
+    let mut bench = bench();
     bench.device.space = Some(15);
     bench.device.reserve = 10;
-    assert_eq!(bench.ask(START_9.0), None);
+    assert_eq!(bench.answer(START_9.0), None);
     bench.now += 1;
     assert_eq!(bench.poll(), None);
     bench.now += 1;
     assert_eq!(bench.poll(), Some(response(START_9.1)));
-    assert_eq!(bench.ask(FIRST.0), None);
+    assert_eq!(bench.answer(FIRST.0), None);
     bench.now += 2;
     assert_eq!(bench.poll(), Some(response(FIRST.1)), "8 bytes of the reserve are left");
     bench.expect(&[([0x1B, 8, 9, 0, 0, 0, 0, 0], [0x30, 0, 0, 0, 0, 0, 0, 0])]);
     // A sub-block from the reserve is one segment long.
     bench.device.space = Some(100);
     bench.device.reserve = 100;
-    assert_eq!(bench.ask([0xC0, 0x50, 0x1F, 1, 0, 0, 0, 0]), None);
+    assert_eq!(bench.answer([0xC0, 0x50, 0x1F, 1, 0, 0, 0, 0]), None);
     bench.now += 2;
     assert_eq!(bench.poll(), Some(response([0xA4, 0x50, 0x1F, 1, 1, 0, 0, 0])));
 }
@@ -388,10 +379,10 @@ fn a_client_that_is_held_back_is_served_from_the_reserve() {
 #[test]
 fn a_client_that_sends_regardless_of_room_is_refused() {
     let out_of_memory = [0x80, 0x50, 0x1F, 1, 0x05, 0x00, 0x04, 0x05];
-    let mut bench = Bench::new();
+    let mut bench = bench();
     bench.device.space = Some(8);
     bench.expect(&[START_9]);
-    assert_eq!(bench.ask(FIRST.0), None);
+    assert_eq!(bench.answer(FIRST.0), None);
     bench.expect(&[([0x1B, 8, 9, 0, 0, 0, 0, 0], out_of_memory)]);
     assert_eq!(bench.device.events.last(), Some(&Event::Cancel));
     bench.device.space = Some(3);
@@ -404,7 +395,7 @@ fn a_client_that_sends_regardless_of_room_is_refused() {
 
 #[test]
 fn what_is_no_sdo_gets_silence() {
-    let mut bench = Bench::new();
+    let mut bench = bench();
     let good = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
     let id = StandardId::new(0x605).unwrap();
     let others = [
@@ -426,7 +417,7 @@ fn what_is_no_sdo_gets_silence() {
 
 #[test]
 fn reserved_bits_are_not_looked_at() {
-    let mut bench = Bench::new();
+    let mut bench = bench();
     bench.expect(&[
         ([0x5F, 0x00, 0x10, 0, 9, 9, 9, 9], [0x43, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x10]),
         ([0x3F, 0x51, 0x1F, 1, 0x01, 9, 9, 9], [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0]),

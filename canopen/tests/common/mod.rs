@@ -2,6 +2,7 @@
 #![allow(dead_code, missing_docs)]
 
 use canopen::od::{put, Access, DataType, Entry};
+use canopen::sdo::server::{Config, SdoServer};
 use canopen::{AbortCode, Address, CobId, Frame, Instant, NodeId, Objects};
 
 pub const NODE: u8 = 5;
@@ -151,5 +152,38 @@ impl Objects for Device {
         let len = rest.len().min(buf.len());
         buf[..len].copy_from_slice(&rest[..len]);
         Ok(len)
+    }
+}
+
+/// A server on its own.
+pub struct Bench {
+    pub server: SdoServer,
+    pub device: Device,
+    /// In ms.
+    pub now: u32,
+}
+
+impl Bench {
+    pub fn with(config: Config) -> Self {
+        Self { server: SdoServer::new(node(), config), device: Device::default(), now: 0 }
+    }
+
+    pub fn send(&mut self, frame: &Frame) {
+        self.server.handle(frame, at(self.now), &mut self.device);
+    }
+
+    pub fn poll(&mut self) -> Option<Frame> {
+        self.server.poll(at(self.now), &mut self.device)
+    }
+
+    /// All that the server has to send.
+    pub fn sent(&mut self) -> Vec<Frame> {
+        core::iter::from_fn(|| self.poll()).collect()
+    }
+
+    /// All that it sends after this frame.
+    pub fn ask(&mut self, bytes: [u8; 8]) -> Vec<Frame> {
+        self.send(&request(bytes));
+        self.sent()
     }
 }
