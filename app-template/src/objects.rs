@@ -9,11 +9,11 @@ use canopen::device::Device;
 use canopen::emcy::Emcy;
 use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
-use canopen::od::{concat, put, Address, Entry, Objects};
+use canopen::od::{put, Address, Entry, Objects};
 #[cfg(feature = "lift")]
 use canopen::program::UNLOCK;
 use canopen::program::{
-    FlashStatus, ProgramControl, ProgramState, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID,
+    FlashStatus, ProgramControl, ProgramState, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID, UNLOCK_ENTRIES,
 };
 use canopen::slave::SlaveDevice;
 #[cfg(feature = "lift")]
@@ -25,7 +25,7 @@ use shared_abi::warm_start::{BootRequest, Owed};
 
 use crate::coboot::{self, Leave, ReentryPath, Start};
 use crate::debugger;
-use crate::entries::{entries, entry_count, CONFIRMATION, LIFT_ENTRIES, REENTRY_PATH};
+use crate::entries::{entries, entry_count, CONFIRMATION, REENTRY_PATH};
 
 /// 1000h: no standardised profile. Anything but the bootloader's 10000000h tells a host that the
 /// application runs.
@@ -49,13 +49,12 @@ const SOFTWARE_VERSION: &str = version!();
 
 /// Programs of the device, each a sub-index of 1F51h, 1F56h and 1F57h.
 const PROGRAMS: u8 = LAYOUT.programs.len() as u8;
-const ENTRY_COUNT: usize = entry_count(PROGRAMS);
-const DEBUGGER_COUNT: usize = ENTRY_COUNT + debugger::ENTRIES.len();
+const ENTRY_COUNT: usize = entry_count(PROGRAMS) + debugger::ENTRIES.len();
 /// The object dictionary, with 1025h where there is a debugger interface.
-static ENTRIES: [Entry; DEBUGGER_COUNT] =
-    concat::<ENTRY_COUNT, { debugger::ENTRIES.len() }, DEBUGGER_COUNT>(entries(PROGRAMS), debugger::ENTRIES);
+static ENTRIES: [Entry; ENTRY_COUNT] = entries(PROGRAMS).with(&debugger::ENTRIES).entries();
 /// The one of a lift device.
-static WITH_PASSWORD: [Entry; DEBUGGER_COUNT + LIFT_ENTRIES.len()] = concat(ENTRIES, LIFT_ENTRIES);
+static WITH_PASSWORD: [Entry; ENTRY_COUNT + UNLOCK_ENTRIES.len()] =
+    entries(PROGRAMS).with(&debugger::ENTRIES).with(&UNLOCK_ENTRIES).entries();
 
 /// Whom this image is for, at the place where the bootloader looks before it takes a raw image or
 /// HEX file.

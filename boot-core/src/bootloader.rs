@@ -7,13 +7,10 @@ use canopen::device::{self, Device};
 use canopen::emcy::{self, Emcy};
 use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
-use canopen::od::concat;
-use canopen::od::{put, Access, Address, DataType, Entry, Objects};
-use canopen::program::FlashError;
-use canopen::program::SOFTWARE_VERSION;
+use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
-    ProgramControl, ENABLE_FLASH, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, UNLOCK,
-    UNLOCK_FIRMWARE,
+    control_count, FlashError, ProgramControl, ENABLE_FLASH, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL,
+    PROGRAM_DATA, PROGRAM_ID, SOFTWARE_VERSION, UNLOCK, UNLOCK_ENTRIES,
 };
 use canopen::slave::SlaveDevice;
 use canopen::{password::Lock, Instant};
@@ -52,108 +49,36 @@ pub enum PasswordObject {
     Unlock,
 }
 
-/// The objects of a device with `programs` programs (1 to 254), of which there are [`entry_count`]
-/// (SYS TEC manual L-1112d_10, table 1).
+/// The objects of a device with `programs` programs (1 to 254) and what a dialect adds, of which there
+/// are [`entry_count`] (SYS TEC manual L-1112d_10, table 1).
 #[must_use]
-pub const fn entries<const LEN: usize>(programs: u8) -> [Entry; LEN] {
-    entries_with(programs, Extras::NONE)
-}
-
-/// The same with what a dialect adds, of which there are [`entry_count_with`].
-#[must_use]
-pub const fn entries_with<const LEN: usize>(programs: u8, extras: Extras) -> [Entry; LEN] {
-    let mut entries = [COMMON[0]; LEN];
-    let mut len = 0;
-    while len < COMMON.len() {
-        entries[len] = COMMON[len];
-        len += 1;
-    }
-    let mut object = 0;
-    while object < PROGRAM_OBJECTS.len() {
-        let (array, name, mut each) = PROGRAM_OBJECTS[object];
-        if array == PROGRAM_DATA && extras.read_back {
-            each.access = Access::Rw;
-        }
-        entries[len] = Entry::array(array, name, programs);
-        len += 1;
-        let mut number = 1;
-        while number <= programs {
-            entries[len] = Entry { at: Address::new(array, number), ..each };
-            len += 1;
-            number += 1;
-        }
-        object += 1;
-    }
+pub const fn entries<const LEN: usize>(programs: u8, extras: Extras) -> Table<LEN> {
+    let data_access = if extras.read_back { Access::Rw } else { Access::Wo };
+    let data = Entry::sub(PROGRAM_DATA, 1, "Program data of a program", DataType::Domain, data_access);
+    let table = Table::<LEN>::EMPTY.with(&device::ENTRIES).with(&emcy::ENTRIES);
+    let table = table.with_array("Program data", data, programs).with_program_control(programs);
     match extras.password {
-        PasswordObject::None => {}
-        PasswordObject::Unlock => {
-            entries[len] = Entry::record(UNLOCK, "Lock/unlock parameters", UNLOCK_FIRMWARE);
-            entries[len + 1] =
-                Entry::sub(UNLOCK, UNLOCK_FIRMWARE, "Firmware update", DataType::VisibleString, Access::Wo);
-            len += 2;
-        }
+        PasswordObject::None => table,
+        PasswordObject::Unlock => table.with(&UNLOCK_ENTRIES),
         PasswordObject::EnableFlash => {
-            entries[len] = Entry::array(ENABLE_FLASH, "Enable flash programming", programs);
-            len += 1;
-            let mut number = 1;
-            while number <= programs {
-                let name = "Enable flash programming of a program";
-                entries[len] = Entry::sub(ENABLE_FLASH, number, name, DataType::Unsigned32, Access::Wo);
-                len += 1;
-                number += 1;
-            }
+            let name = "Enable flash programming of a program";
+            let element = Entry::sub(ENABLE_FLASH, 1, name, DataType::Unsigned32, Access::Wo);
+            table.with_array("Enable flash programming", element, programs)
         }
     }
-    assert!(len == LEN, "bootloader::entries: the length is not that of entry_count");
-    entries
 }
 
 /// How many entries the object dictionary has.
 #[must_use]
-pub const fn entry_count(programs: u8) -> usize {
-    entry_count_with(programs, Extras::NONE)
-}
-
-/// The same with what a dialect adds.
-#[must_use]
-pub const fn entry_count_with(programs: u8, extras: Extras) -> usize {
+pub const fn entry_count(programs: u8, extras: Extras) -> usize {
     let array = 1 + programs as usize;
     let password = match extras.password {
         PasswordObject::None => 0,
-        PasswordObject::Unlock => 2,
+        PasswordObject::Unlock => UNLOCK_ENTRIES.len(),
         PasswordObject::EnableFlash => array,
     };
-    COMMON.len() + PROGRAM_OBJECTS.len() * array + password
+    device::ENTRIES.len() + emcy::ENTRIES.len() + array + control_count(programs) + password
 }
-
-/// 1F50h, 1F51h, 1F56h, 1F57h: the array, and what each of its elements is.
-const PROGRAM_OBJECTS: [(u16, &str, Entry); 4] = [
-    (
-        PROGRAM_DATA,
-        "Program data",
-        Entry::sub(PROGRAM_DATA, 1, "Program data of a program", DataType::Domain, Access::Wo),
-    ),
-    (
-        PROGRAM_CONTROL,
-        "Program control",
-        // Without a default value, which a configuration tool might write: what is read is a state,
-        // what is written a command.
-        Entry::sub(PROGRAM_CONTROL, 1, "Program control of a program", DataType::Unsigned8, Access::Rw),
-    ),
-    (
-        PROGRAM_ID,
-        "Program software identification",
-        Entry::sub(PROGRAM_ID, 1, "Identification of a program", DataType::Unsigned32, Access::Ro),
-    ),
-    (
-        FLASH_STATUS,
-        "Flash status identification",
-        Entry::sub(FLASH_STATUS, 1, "Flash status of a program", DataType::Unsigned32, Access::Ro).default(0),
-    ),
-];
-
-/// What does not depend on the programs.
-const COMMON: [Entry; 17] = concat(device::ENTRIES, emcy::ENTRIES);
 
 /// 1018h/4.
 const SERIAL_NUMBER: Address = Address::new(IDENTITY, 4);

@@ -7,7 +7,7 @@ mod ihex;
 mod model;
 
 use bench::*;
-use boot_core::bootloader::{entries_with, entry_count_with, Config};
+use boot_core::bootloader::{entries, entry_count, Config};
 use boot_core::control::Policy;
 use boot_core::flash::FlashFault;
 use boot_core::profile::Profile;
@@ -388,8 +388,8 @@ fn a_stream_cut_anywhere_leaves_the_old_the_new_or_no_program() {
 #[test]
 fn a_password_opens_1f50_and_a_wrong_one_is_slowed_down() {
     const ENABLE: Address = Address::new(0x7F50, 1);
-    static ENTRIES: [Entry; entry_count_with(1, Profile::ESACADEMY.extras)] =
-        entries_with(1, Profile::ESACADEMY.extras);
+    static ENTRIES: [Entry; entry_count(1, Profile::ESACADEMY.extras)] =
+        entries(1, Profile::ESACADEMY.extras).entries();
     let policy = Profile::ESACADEMY.download;
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = Bench::with_config(

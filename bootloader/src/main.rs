@@ -46,13 +46,13 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
 
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]
 mod app {
-    use boot_core::bootloader::{self, entries_with, entry_count_with, Bootloader};
+    use boot_core::bootloader::{self, entries, entry_count, Bootloader};
     use boot_core::canopen::bit_rate::Heard;
     use boot_core::canopen::device::Device;
     use boot_core::canopen::line::{Confinement, Status, CONTROLLER_OVERRUN, QUEUE_OVERRUN};
     use boot_core::canopen::lss;
     use boot_core::canopen::node::{self, NmtPolicy};
-    use boot_core::canopen::od::{concat, Entry};
+    use boot_core::canopen::od::Entry;
     use boot_core::canopen::sdo::server::Config as SdoConfig;
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant, NodeId};
@@ -84,9 +84,9 @@ mod app {
     const TICK_MS: u32 = 2;
     /// Programs of the layout, each a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
     const PROGRAMS: usize = LAYOUT.programs.len();
-    const ENTRY_COUNT: usize = entry_count_with(PROGRAMS as u8, PRODUCT.profile.extras);
-    const OWN_ENTRIES: [Entry; ENTRY_COUNT] = entries_with(PROGRAMS as u8, PRODUCT.profile.extras);
-    static ENTRIES: [Entry; ENTRY_COUNT + debugger::ENTRIES.len()] = concat(OWN_ENTRIES, debugger::ENTRIES);
+    const ENTRY_COUNT: usize = entry_count(PROGRAMS as u8, PRODUCT.profile.extras) + debugger::ENTRIES.len();
+    static ENTRIES: [Entry; ENTRY_COUNT] =
+        entries(PROGRAMS as u8, PRODUCT.profile.extras).with(&debugger::ENTRIES).entries();
 
     static CONFIG: bootloader::Config = bootloader::Config {
         entries: &ENTRIES,

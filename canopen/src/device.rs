@@ -1,6 +1,6 @@
 //! The objects that every device has: device type, names and versions, identity.
 //!
-//! A device puts [`ENTRIES`] into its table with [`concat`](crate::od::concat) and asks
+//! A device puts [`ENTRIES`] into its [`Table`](crate::od::Table) and asks
 //! [`Device::read`] first.
 
 use crate::abort::AbortCode;

@@ -277,23 +277,60 @@ pub fn find(entries: &[Entry], at: Address) -> Result<&Entry, AbortCode> {
     Err(code)
 }
 
-/// Both tables as one, in the order given. `N` is the length of both together.
-///
-/// # Panics
-/// If `N` is another number; in a constant, compilation fails.
-#[must_use]
-pub const fn concat<const A: usize, const B: usize, const N: usize>(
-    a: [Entry; A],
-    b: [Entry; B],
-) -> [Entry; N] {
-    assert!(A + B == N && A > 0, "od::concat: the lengths do not add up");
-    let mut entries = [a[0]; N];
-    let mut i = 0;
-    while i < N {
-        entries[i] = if i < A { a[i] } else { b[i - A] };
-        i += 1;
+/// A table of `LEN` entries that is put together in a constant from the parts of a device. In a
+/// constant, whatever panics here fails the compilation.
+#[derive(Clone, Copy, Debug)]
+pub struct Table<const LEN: usize> {
+    entries: [Entry; LEN],
+    len: usize,
+}
+
+impl<const LEN: usize> Table<LEN> {
+    /// Of no part yet.
+    pub const EMPTY: Self = Self { entries: [Entry::array(0, "", 0); LEN], len: 0 };
+
+    /// With these behind.
+    ///
+    /// # Panics
+    /// If they are too many.
+    #[must_use]
+    pub const fn with(mut self, part: &[Entry]) -> Self {
+        assert!(part.len() <= LEN - self.len, "od::Table: LEN is less than the parts have");
+        let mut i = 0;
+        while i < part.len() {
+            self.entries[self.len] = part[i];
+            self.len += 1;
+            i += 1;
+        }
+        self
     }
-    entries
+
+    /// With an array behind whose elements, 1 to `highest`, are all like `element`: 1 + `highest`
+    /// entries.
+    ///
+    /// # Panics
+    /// If they are too many.
+    #[must_use]
+    pub const fn with_array(mut self, name: &'static str, element: Entry, highest: u8) -> Self {
+        let index = element.at.index;
+        self = self.with(&[Entry::array(index, name, highest)]);
+        let mut sub = 1;
+        while sub <= highest {
+            self = self.with(&[Entry { at: Address::new(index, sub), ..element }]);
+            sub += 1;
+        }
+        self
+    }
+
+    /// The table.
+    ///
+    /// # Panics
+    /// If the parts have fewer than `LEN`.
+    #[must_use]
+    pub const fn entries(self) -> [Entry; LEN] {
+        assert!(self.len == LEN, "od::Table: LEN is more than the parts have");
+        self.entries
+    }
 }
 
 /// Copies a value to the start of `buf` and gives its length, as [`Objects::read`] has to.

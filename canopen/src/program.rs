@@ -5,6 +5,7 @@ use core::fmt;
 use core::num::NonZeroU8;
 
 use crate::abort::AbortCode;
+use crate::od::{Access, DataType, Entry, Table};
 
 /// Device type.
 pub const DEVICE_TYPE: u16 = 0x1000;
@@ -33,11 +34,59 @@ pub const PROGRAM_ID: u16 = 0x1F56;
 /// Flash status identification: gives a [`FlashStatus`].
 pub const FLASH_STATUS: u16 = 0x1F57;
 
+/// What 1F51h, 1F56h and 1F57h are called, and what each of their elements is. Bootloader and
+/// application both have them, with an element for each program of the device, whichever runs (SYS
+/// TEC manual L-1112d_10, table 1 and 3.4.1).
+pub const CONTROL_ARRAYS: [(&str, Entry); 3] = [
+    (
+        "Program control",
+        // Without a default value, which a configuration tool might write: what is read is a state,
+        // what is written a command.
+        Entry::sub(PROGRAM_CONTROL, 1, "Program control of a program", DataType::Unsigned8, Access::Rw),
+    ),
+    (
+        "Program software identification",
+        Entry::sub(PROGRAM_ID, 1, "Identification of a program", DataType::Unsigned32, Access::Ro),
+    ),
+    (
+        "Flash status identification",
+        Entry::sub(FLASH_STATUS, 1, "Flash status of a program", DataType::Unsigned32, Access::Ro).default(0),
+    ),
+];
+
+/// How many entries [`CONTROL_ARRAYS`] are on a device with so many programs.
+#[must_use]
+pub const fn control_count(programs: u8) -> usize {
+    CONTROL_ARRAYS.len() * (1 + programs as usize)
+}
+
+impl<const LEN: usize> Table<LEN> {
+    /// With [`CONTROL_ARRAYS`] behind, of [`control_count`] entries.
+    ///
+    /// # Panics
+    /// If they are too many.
+    #[must_use]
+    pub const fn with_program_control(mut self, programs: u8) -> Self {
+        let mut array = 0;
+        while array < CONTROL_ARRAYS.len() {
+            let (name, element) = CONTROL_ARRAYS[array];
+            self = self.with_array(name, element, programs);
+            array += 1;
+        }
+        self
+    }
+}
+
 /// Password of a lift device (CiA 417; CiA 814-1 clause 6.3): sub-index [`UNLOCK_FIRMWARE`] of
 /// "Lock/unlock parameters".
 pub const UNLOCK: u16 = 0x6005;
 /// "Firmware update". CiA 814-1 names object and purpose but no sub-index; this one is coboot's.
 pub const UNLOCK_FIRMWARE: u8 = 1;
+/// What a lift device has of it, in bootloader and application.
+pub const UNLOCK_ENTRIES: [Entry; 2] = [
+    Entry::record(UNLOCK, "Lock/unlock parameters", UNLOCK_FIRMWARE),
+    Entry::sub(UNLOCK, UNLOCK_FIRMWARE, "Firmware update", DataType::VisibleString, Access::Wo),
+];
 /// Enable flash programming (ESAcademy): the password of a program; the sub-index is the program's
 /// number.
 pub const ENABLE_FLASH: u16 = 0x7F50;

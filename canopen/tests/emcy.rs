@@ -7,12 +7,11 @@ use canopen::device::{self, Device};
 use canopen::emcy::{self, code, register, Emcy, Emergency};
 use canopen::nmt::NmtCommand;
 use canopen::node::{Config, NmtPolicy, Node};
-use canopen::od::{concat, Entry};
+use canopen::od::{Entry, Table};
 use canopen::{AbortCode, Address, CobId, Frame, Objects};
 use common::{at, node, request, response};
 
-const ENTRIES: &[Entry] =
-    &concat::<{ device::ENTRIES.len() }, { emcy::ENTRIES.len() }, 17>(device::ENTRIES, emcy::ENTRIES);
+const ENTRIES: &[Entry] = &Table::<17>::EMPTY.with(&device::ENTRIES).with(&emcy::ENTRIES).entries();
 
 const DEVICE: Device = Device {
     device_type: 0x1000_0000,

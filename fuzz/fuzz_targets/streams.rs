@@ -7,7 +7,7 @@
 //! program. A wrong password never opens anything.
 #![no_main]
 
-use boot_core::bootloader::{entries_with, entry_count_with, Bootloader, Config};
+use boot_core::bootloader::{entries, entry_count, Bootloader, Config};
 use boot_core::control::{Policy, Step};
 use boot_core::store::NodeParameters;
 use boot_core::store::Journal;
@@ -30,8 +30,8 @@ const CLEAR: u8 = 3;
 macro_rules! config {
     ($profile:expr) => {{
         const PROFILE: Profile = $profile;
-        static ENTRIES: [Entry; entry_count_with(PROGRAMS as u8, PROFILE.extras)] =
-            entries_with(PROGRAMS as u8, PROFILE.extras);
+        static ENTRIES: [Entry; entry_count(PROGRAMS as u8, PROFILE.extras)] =
+            entries(PROGRAMS as u8, PROFILE.extras).entries();
         static CONFIG: Config = Config {
             entries: &ENTRIES,
             device: Device {

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use boot_core::bootloader::{self, entries_with, entry_count_with, Extras};
+use boot_core::bootloader::{self, entries, entry_count, Extras};
 use boot_core::canopen::device;
 use boot_core::canopen::od::Entry;
 use boot_core::canopen::{BitRate, Instant, NodeId};
@@ -180,13 +180,13 @@ fn main() -> ExitCode {
 }
 
 /// The object dictionary of a device with so many programs.
-fn entries(programs: usize, extras: Extras) -> &'static [Entry] {
+fn table_of(programs: usize, extras: Extras) -> &'static [Entry] {
     macro_rules! one_of {
         ($($programs:literal $extras:expr),*) => {
             match (programs, extras) {
                 $((_, _) if programs == $programs && extras == $extras => {
-                    const LEN: usize = entry_count_with($programs, $extras);
-                    static ENTRIES: [Entry; LEN] = entries_with($programs, $extras);
+                    const LEN: usize = entry_count($programs, $extras);
+                    static ENTRIES: [Entry; LEN] = entries($programs, $extras).entries();
                     &ENTRIES
                 })*
                 _ => unreachable!("one or two programs, and one of the profiles"),
@@ -255,7 +255,7 @@ fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, B
 fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
     let profile: Profile = args.profile.into();
     let config: &'static bootloader::Config = Box::leak(Box::new(bootloader::Config {
-        entries: entries(programs, profile.extras),
+        entries: table_of(programs, profile.extras),
         device: device::Device {
             device_type: profile.device_type,
             name: "coboot-node",

@@ -7,9 +7,9 @@ use std::task::Poll;
 use boot_core::canopen::application::{react, Reaction, Standing};
 use boot_core::canopen::device::{self, Device};
 use boot_core::canopen::lss::{LssAddress, LssDevice, StoreError};
-use boot_core::canopen::od::{put, Access, Address, DataType, Entry, Objects};
+use boot_core::canopen::od::{put, Address, Entry, Objects};
 use boot_core::canopen::program::{
-    FlashStatus, ProgramControl, ProgramState, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID,
+    FlashStatus, ProgramControl, ProgramState, CONTROL_ARRAYS, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID,
 };
 use boot_core::canopen::slave::SlaveDevice;
 use boot_core::canopen::{AbortCode, BitRate, NodeId};
@@ -76,13 +76,10 @@ impl StandIn {
     #[must_use]
     pub fn entries(programs: u8) -> Vec<Entry> {
         let mut entries = device::ENTRIES.to_vec();
-        for (array, name, data_type, access) in [
-            (PROGRAM_CONTROL, "Program control", DataType::Unsigned8, Access::Rw),
-            (PROGRAM_ID, "Program software identification", DataType::Unsigned32, Access::Ro),
-            (FLASH_STATUS, "Flash status identification", DataType::Unsigned32, Access::Ro),
-        ] {
-            entries.push(Entry::array(array, name, programs));
-            entries.extend((1..=programs).map(|number| Entry::sub(array, number, name, data_type, access)));
+        for (name, element) in CONTROL_ARRAYS {
+            let index = element.at.index;
+            entries.push(Entry::array(index, name, programs));
+            entries.extend((1..=programs).map(|sub| Entry { at: Address::new(index, sub), ..element }));
         }
         entries
     }

@@ -6,7 +6,7 @@
 
 use std::fmt::Write;
 
-use boot_core::bootloader::{entries_with, entry_count_with, Extras};
+use boot_core::bootloader::{entries, entry_count, Extras};
 use boot_core::profile::Profile;
 use bsp::can::BitTiming;
 use canopen::device::Device;
@@ -15,7 +15,6 @@ use canopen::program::IDENTITY;
 
 /// The table of the application template. It needs nothing of the chip.
 #[path = "../../app-template/src/entries.rs"]
-#[allow(dead_code, reason = "no EDS is made of a lift's")]
 mod application;
 
 /// CiA 306-1 asks for dates. The contents have none: the same table gives the same file.
@@ -26,17 +25,18 @@ const TIME: &str = "12:00AM";
 const SERIAL_NUMBER: Address = Address::new(IDENTITY, 4);
 
 /// The tables of the bootloader: of the standard and of Paulus, of ESAcademy, of a lift.
-static STANDARD: [Entry; len(Extras::NONE)] = entries_with(PROGRAMS, Extras::NONE);
-static ESACADEMY: [Entry; len(Profile::ESACADEMY.extras)] = entries_with(PROGRAMS, Profile::ESACADEMY.extras);
-static LIFT: [Entry; len(Profile::LIFT.extras)] = entries_with(PROGRAMS, Profile::LIFT.extras);
+static STANDARD: [Entry; len(Extras::NONE)] = entries(PROGRAMS, Extras::NONE).entries();
+static ESACADEMY: [Entry; len(Profile::ESACADEMY.extras)] =
+    entries(PROGRAMS, Profile::ESACADEMY.extras).entries();
+static LIFT: [Entry; len(Profile::LIFT.extras)] = entries(PROGRAMS, Profile::LIFT.extras).entries();
 
 const fn len(extras: Extras) -> usize {
-    entry_count_with(PROGRAMS, extras)
+    entry_count(PROGRAMS, extras)
 }
 
 const PROGRAMS: u8 = bsp::LAYOUT.programs.len() as u8;
 /// The table of the application.
-static APPLICATION: [Entry; application::entry_count(PROGRAMS)] = application::entries(PROGRAMS);
+static APPLICATION: [Entry; application::entry_count(PROGRAMS)] = application::entries(PROGRAMS).entries();
 
 /// One image, as its EDS file describes it.
 pub struct Image {

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::time::Duration;
 use std::{env, fs};
 
-use boot_core::bootloader::{self, entries, entry_count};
+use boot_core::bootloader::{self, entries, entry_count, Extras};
 use boot_core::profile::Profile;
 use boot_core::store::NodeParameters;
 use canopen::device::Device as Says;
@@ -21,7 +21,7 @@ use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
 use crate::bench::NODE;
 
-static ENTRIES: [Entry; entry_count(1)] = entries(1);
+static ENTRIES: [Entry; entry_count(1, Extras::NONE)] = entries(1, Extras::NONE).entries();
 static CONFIG: bootloader::Config = bootloader::Config {
     entries: &ENTRIES,
     device: Says {

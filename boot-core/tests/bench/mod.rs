@@ -1,7 +1,7 @@
 //! A bootloader on the model of the flash, and what a host sends it.
 #![allow(dead_code, reason = "each test file uses some of it")]
 
-use boot_core::bootloader::{entries, entry_count, Bootloader, Config};
+use boot_core::bootloader::{entries, entry_count, Bootloader, Config, Extras};
 use boot_core::control::{Policy, Step};
 use boot_core::crc::CrcKind;
 use boot_core::program::{verify, Invalid};
@@ -29,7 +29,7 @@ pub const START: u8 = 0x01;
 pub const SET_SIGNATURE: u8 = 0x83;
 pub const CLR_SIGNATURE: u8 = 0x84;
 
-pub static ENTRIES: [Entry; entry_count(1)] = entries(1);
+pub static ENTRIES: [Entry; entry_count(1, Extras::NONE)] = entries(1, Extras::NONE).entries();
 
 pub const CONFIG: Config = Config {
     entries: &ENTRIES,

@@ -9,7 +9,7 @@ use std::cell::{RefCell, RefMut};
 use std::rc::Rc;
 use std::task::Poll;
 
-use boot_core::bootloader::{entries_with, entry_count_with, Bootloader, Config, PasswordObject};
+use boot_core::bootloader::{entries, entry_count, Bootloader, Config, PasswordObject};
 use boot_core::control::{Erase, Policy, Step};
 use boot_core::flash::{Flash, FlashFault, Operation};
 use boot_core::profile::Profile;
@@ -46,8 +46,8 @@ static TWO: Layout = TWO_PROGRAMS;
 macro_rules! setup {
     ($name:literal, $programs:literal, $layout:ident, $profile:expr) => {{
         const PROFILE: Profile = $profile;
-        static ENTRIES: [Entry; entry_count_with($programs, PROFILE.extras)] =
-            entries_with($programs, PROFILE.extras);
+        static ENTRIES: [Entry; entry_count($programs, PROFILE.extras)] =
+            entries($programs, PROFILE.extras).entries();
         Setup {
             name: $name,
             profile: PROFILE,

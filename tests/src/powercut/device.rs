@@ -3,7 +3,7 @@
 
 use core::task::Poll;
 
-use boot_core::bootloader::{entries, entries_with, entry_count, entry_count_with, Bootloader, Config};
+use boot_core::bootloader::{entries, entry_count, Bootloader, Config, Extras};
 use boot_core::canopen::device::Device as Identity;
 use boot_core::canopen::lss::LssDevice;
 use boot_core::canopen::od::{Address, Entry, Objects};
@@ -25,7 +25,8 @@ use super::model::{ModelFlash, CHIP, TWO_PROGRAMS};
 pub static LAYOUT: Layout = TWO_PROGRAMS;
 
 const PROGRAMS: usize = 2;
-static ENTRIES: [Entry; entry_count(PROGRAMS as u8)] = entries(PROGRAMS as u8);
+static ENTRIES: [Entry; entry_count(PROGRAMS as u8, Extras::NONE)] =
+    entries(PROGRAMS as u8, Extras::NONE).entries();
 /// 6005h/1.
 const LIFT_PASSWORD: Address = Address::new(0x6005, 1);
 
@@ -64,8 +65,8 @@ static LIFT: Config = Config {
 /// A lift that wants its password.
 static LOCKED_LIFT: Config = Config {
     entries: {
-        static ENTRIES: [Entry; entry_count_with(PROGRAMS as u8, Profile::LIFT.extras)] =
-            entries_with(PROGRAMS as u8, Profile::LIFT.extras);
+        static ENTRIES: [Entry; entry_count(PROGRAMS as u8, Profile::LIFT.extras)] =
+            entries(PROGRAMS as u8, Profile::LIFT.extras).entries();
         &ENTRIES
     },
     download: Policy { locked: true, ..LIFT.download },
@@ -75,8 +76,8 @@ static LOCKED_LIFT: Config = Config {
 /// A password for each program, which voids it.
 static ESACADEMY: Config = Config {
     entries: {
-        static ENTRIES: [Entry; entry_count_with(PROGRAMS as u8, Profile::ESACADEMY.extras)] =
-            entries_with(PROGRAMS as u8, Profile::ESACADEMY.extras);
+        static ENTRIES: [Entry; entry_count(PROGRAMS as u8, Profile::ESACADEMY.extras)] =
+            entries(PROGRAMS as u8, Profile::ESACADEMY.extras).entries();
         &ENTRIES
     },
     download: Policy { identity: CONFIG.download.identity, ..Profile::ESACADEMY.download },
