@@ -32,6 +32,7 @@
 //! ```
 #![forbid(unsafe_code)]
 
+mod json;
 #[macro_use]
 mod setters;
 

@@ -11,6 +11,7 @@ use coflash::file::block_file::BlockFile;
 use coflash::file::convert::{blocks_of, Options};
 use coflash::file::ihex;
 use coflash::update::dialect::{self, read_locked};
+use coflash::update::event::{Note, Phase};
 use coflash::update::many::{flash_many, Job, ManyOptions};
 use coflash::update::{flash, DeviceState, Event, FlashOptions, Password, Report, Target};
 use coflash::Adapter;
@@ -173,7 +174,10 @@ fn a_lift_is_unlocked_twice_moves_to_node_126_and_back() {
             "126: 1F51/1, 1 bytes"
         ]
     );
-    assert!(events.contains(&Event::Moved(node(126))) && !events.contains(&Event::Signed), "{events:?}");
+    assert!(
+        events.contains(&Note::Moved { node: node(126) }.into()) && !events.contains(&Phase::Released.into()),
+        "{events:?}"
+    );
     // "Reset program", byte for byte.
     let reset = [0x2F, 0x51, 0x1F, 1, 2, 0, 0, 0];
     assert_eq!(fake.sent.iter().filter(|frame| frame.data() == reset).count(), 2);
@@ -206,12 +210,12 @@ fn a_lift_that_refuses_is_left_as_it_was_found() {
     let error = result.unwrap_err();
     assert!(matches!(error, Error::Refused { doing: Doing::Unlock, .. }), "{error}");
     assert!(error.advice().contains("password"), "{}", error.advice());
-    assert_eq!(events.last(), Some(&Event::Left(DeviceState::Untouched)));
+    assert_eq!(events.last().and_then(Event::left), Some(DeviceState::Untouched));
 
     let (mut fake, _) = Lift::fake(APPLICATION, |_| {});
     let (result, events, _) = run_at(&mut fake, NODE, &FlashOptions::default());
     assert!(matches!(result, Err(Error::NoPassword { .. })));
-    assert_eq!((events.last(), fake.writes().len()), (Some(&Event::Left(DeviceState::Untouched)), 0));
+    assert_eq!((events.last().and_then(Event::left), fake.writes().len()), (Some(DeviceState::Untouched), 0));
 
     // Another one is in its bootloader already.
     let (fake, _) = Lift::fake(APPLICATION, |_| {});
@@ -349,7 +353,7 @@ fn esacademy_gets_the_password_and_then_intel_hex() {
         let (result, events, _) = run_at(&mut fake, 64, &options);
         let report = result.unwrap();
         assert_eq!((report.dialect, report.running.unwrap().0), (Dialect::EsAcademy, APPLICATION));
-        assert!(events.contains(&Event::Unlocked), "{events:?}");
+        assert!(events.contains(&Note::Unlocked.into()), "{events:?}");
         let password = [0x23, 0x50, 0x7F, 1, 0x54, 0x49, 0x4E, 0x49];
         assert_eq!(fake.sent.iter().filter(|frame| frame.data() == password).count(), 1);
         let text = kept.lock().unwrap().clone();
@@ -367,13 +371,13 @@ fn esacademy_says_what_went_wrong_by_the_error_register_alone() {
     let (mut fake, _) = EsAcademy::fake(|device| device.fails = true);
     let (result, events, _) = run_at(&mut fake, 64, &FlashOptions::default());
     assert!(matches!(result, Err(Error::Failed { doing: Doing::Program, .. })), "{result:?}");
-    assert_eq!(events.last(), Some(&Event::Left(DeviceState::Erased)));
+    assert_eq!(events.last().and_then(Event::left), Some(DeviceState::Erased));
 
     for password in [[1, 2, 3, 4], [0x49, 0x4E, 0x49, 0x54]] {
         let (mut fake, _) = EsAcademy::fake(|device| device.password = Some(password));
         let (result, events, _) = run_at(&mut fake, 64, &FlashOptions::default());
         assert!(matches!(result, Err(Error::Refused { doing: Doing::Unlock, .. })), "{result:?}");
-        assert_eq!(events.last(), Some(&Event::Left(DeviceState::Untouched)));
+        assert_eq!(events.last().and_then(Event::left), Some(DeviceState::Untouched));
     }
     let (mut fake, _) = EsAcademy::fake(|_| {});
     let (result, ..) = run_at(&mut fake, 64, &locked("no number"));

@@ -10,6 +10,7 @@ use canopen::{CobId, Frame, NodeId};
 use coflash::bus::hub::{self, Conversation};
 use coflash::device::Transfers;
 use coflash::file::block_file::BlockFile;
+use coflash::update::event::Phase;
 use coflash::update::many::{flash_many, Failed, Job, ManyOptions};
 use coflash::update::{DeviceState, Event, FlashOptions, Report};
 use coflash::Adapter;
@@ -66,7 +67,7 @@ fn one_erases_while_another_receives() {
     assert!(took < alone * 2, "four took {took:?}, one takes {alone:?}");
     // All are erasing before the first has got anything.
     let first = events.iter().position(|(_, event)| matches!(event, Event::Progress { .. })).unwrap();
-    let erasing = events[..first].iter().filter(|(_, event)| matches!(event, Event::Erasing)).count();
+    let erasing = events[..first].iter().filter(|(_, event)| *event == Phase::Erasing.into()).count();
     assert_eq!(erasing, 4);
 }
 
@@ -144,7 +145,7 @@ fn no_more_than_allowed_are_at_work_at_once() {
         for (_, event) in events {
             match event {
                 Event::Found(_) => now += 1,
-                Event::Started(_) => now -= 1,
+                Event::Phase(Phase::Started(_)) => now -= 1,
                 _ => {}
             }
             most = most.max(now);

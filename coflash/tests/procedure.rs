@@ -10,7 +10,8 @@ use canopen::{CobId, Frame, NodeId};
 use coflash::device::info::info;
 use coflash::device::{Session, Timing, Transfers};
 use coflash::file::block_file::BlockFile;
-use coflash::update::{flash, DeviceState, Event, FlashOptions, RepeatReason, Report, Target};
+use coflash::update::event::{Phase, RepeatReason, Retry};
+use coflash::update::{flash, DeviceState, Event, FlashOptions, Report, Target};
 use coflash::Adapter;
 use coflash::Error;
 use embedded_can::{Frame as _, StandardId};
@@ -102,7 +103,8 @@ fn the_whole_procedure_from_a_running_application() {
         [
             "signed: the program starts by itself from now on",
             "starting the program",
-            "running: an application (device type 00020192h)"
+            "running: an application (device type 00020192h)",
+            report.to_string().as_str()
         ]
     );
 }
@@ -214,7 +216,10 @@ fn a_file_for_another_device_erases_nothing() {
         let error = result.unwrap_err();
         assert_eq!(error.number(), 0x6000_0180);
         assert_eq!(error.to_string(), "the program is for vendor-ID 00000000h, and node 5 has 0000003Fh");
-        assert_eq!((fake.writes().len(), events.last()), (0, Some(&Event::Left(DeviceState::Untouched))));
+        assert_eq!(
+            (fake.writes().len(), events.last().and_then(Event::left)),
+            (0, Some(DeviceState::Untouched))
+        );
 
         let mut fake = Fake::new(running);
         let error = run(&mut fake, check(Target { vendor_id: 0x3F, product_code: 1235 })).0.unwrap_err();
@@ -236,13 +241,14 @@ fn verify_looks_once_more_at_the_running_program() {
     report.unwrap();
     assert_eq!(fake.count("read 1F56/1"), 2);
     assert_eq!(fake.log.last().unwrap(), "read 1F56/1");
-    assert_eq!(events.last(), Some(&Event::VerifiedAgain { crc: file().program_crc() }));
+    let [.., last, Event::Done(_)] = events.as_slice() else { panic!("{events:?}") };
+    assert_eq!(*last, Phase::VerifiedAgain { crc: file().program_crc() }.into());
     // A program that tells another CRC once it runs.
     let mut fake = Fake::new(BOOTLOADER);
     fake.crc_of_application = Some(0x1234_5678);
     let (result, events) = run(&mut fake, options);
     assert_eq!(result.unwrap_err().number(), 0x6000_0001);
-    assert_eq!(events.last(), Some(&Event::Left(DeviceState::Signed)));
+    assert_eq!(events.last().and_then(Event::left), Some(DeviceState::Signed));
 }
 
 #[test]
@@ -252,10 +258,10 @@ fn a_failure_tells_how_it_leaves_the_device() {
         change(&mut fake);
         let (result, events) = run(&mut fake, options);
         assert!(result.is_err());
-        events.last().unwrap().clone()
+        events.last().and_then(Event::left).unwrap()
     };
     let (plain, trial) = (FlashOptions::default(), FlashOptions::default().trial_run(true));
-    let at = |state| Event::Left(state);
+    let at = |state: DeviceState| state;
     assert_eq!(left(BOOTLOADER, &|fake| fake.running = None, plain), at(DeviceState::Untouched));
     let stays = |fake: &mut Fake| fake.on_command = script(0x80, usize::MAX, Outcome::Ignore);
     assert_eq!(left(APPLICATION, &stays, plain), at(DeviceState::Called));
@@ -266,7 +272,7 @@ fn a_failure_tells_how_it_leaves_the_device() {
     assert_eq!(left(BOOTLOADER, &|fake| fake.starts = None, plain), at(DeviceState::Signed));
     // A run that goes well leaves nothing to tell.
     let (_, events) = run(&mut Fake::new(BOOTLOADER), plain);
-    assert!(!events.iter().any(|event| matches!(event, Event::Left(_))));
+    assert!(events.iter().all(|event| event.left().is_none()));
 }
 
 #[test]
@@ -400,7 +406,7 @@ fn a_block_is_repeated_as_often_as_allowed() {
     assert_eq!(report.unwrap().repeats, 2);
     assert_eq!(fake.count("block 2"), 3);
     assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"));
-    let again = Event::Repeating { block: 2, repeat: 2, of: 2, why: RepeatReason::Crc };
+    let again = Event::Retry(Retry::block(2, 2, 2, RepeatReason::Crc));
     assert!(events.contains(&again));
 
     let mut fake = Fake::new(BOOTLOADER);

@@ -12,6 +12,7 @@ use coflash::bus::AdapterError;
 use coflash::device::error::{Error, IdentityPart};
 use coflash::device::{Session, Timing};
 use coflash::file::block_file::BlockFile;
+use coflash::update::event::Phase;
 use coflash::update::{flash, Event, FlashOptions, Report};
 use coflash::Adapter;
 
@@ -65,7 +66,8 @@ fn a_device_that_is_switched_on_later_is_waited_for_and_caught_in_its_rescue_win
         let (result, events) = run(&mut late, &options);
         assert!(result.is_ok(), "{millis}: {result:?}");
         // However long it takes, it is said once.
-        let searching = events.iter().filter(|event| matches!(event, Event::Searching(_))).count();
+        let searching =
+            events.iter().filter(|event| matches!(event, Event::Phase(Phase::Searching { .. }))).count();
         assert_eq!(searching, usize::from(millis > 0), "{events:?}");
     }
     let fake = Fake::new(BOOTLOADER);

@@ -9,6 +9,7 @@ use coflash::device::{Doing, Session, Timing};
 use coflash::file::block_file::BlockFile;
 use coflash::file::convert::{blocks_of, Label, Options, Region};
 use coflash::file::read::{read, Format};
+use coflash::update::event::Phase;
 use coflash::update::{flash, Event, FlashOptions};
 use emulator::frame::Frame;
 
@@ -128,8 +129,8 @@ pub fn load(rate: BitRate, kib: u32, block_size: usize) -> Load {
     let (clock, mut from, mut to) = (bench.clock(), None, None);
     let options = FlashOptions::default().start(false);
     flash(&mut bench.session(), &file, &options, &mut |event| match event {
-        Event::Erased { .. } => from = Some(clock.get()),
-        Event::Verified { .. } => to = Some(clock.get()),
+        Event::Phase(Phase::Erased { .. }) => from = Some(clock.get()),
+        Event::Phase(Phase::Verified { .. }) => to = Some(clock.get()),
         _ => {}
     })
     .expect("a board that is well");

@@ -9,6 +9,7 @@ use coflash::file::block_file::BlockFile;
 use coflash::file::convert::{blocks_of, Options, Region};
 use coflash::file::read::{read, Format};
 use coflash::update::dialect::read_locked;
+use coflash::update::event::{Note, Phase};
 use coflash::update::{flash, DeviceState, Event, FlashOptions, Password, Report};
 use coflash::Error;
 use shared_abi::layout::stm32f407g_disc1_two;
@@ -65,8 +66,8 @@ fn images_and_intel_hex_update_the_standard_firmware() {
             let (result, events) = update(&mut bench, NODE, &blocks, &options);
             let report = result.unwrap();
             assert_eq!((report.dialect, report.repeats), (dialect, 0));
-            assert!(events.contains(&Event::Verified { crc: blocks.program_crc() }), "{events:?}");
-            assert!(!events.contains(&Event::Signed), "{events:?}");
+            assert!(events.contains(&Phase::Verified { crc: blocks.program_crc() }.into()), "{events:?}");
+            assert!(!events.contains(&Phase::Released.into()), "{events:?}");
             assert_eq!(version(&mut bench, NODE), expected);
             let program = firmware::board().programs[0].base - firmware::board().chip.flash.base;
             let stored = &bench.machine().flash()[program as usize..][..report.program_size as usize];
@@ -87,7 +88,7 @@ fn the_profile_of_esacademy_is_recognised_and_updated() {
     let wrong = FlashOptions::default().unlock(Password::new("0x57726F6E"));
     let (result, events) = update(&mut bench, ESACADEMY_NODE, &firmware::blocks(firmware::APP_V1), &wrong);
     assert!(matches!(result, Err(Error::Refused { doing: Doing::Unlock, .. })), "{result:?}");
-    assert_eq!(events.last(), Some(&Event::Left(DeviceState::Untouched)));
+    assert_eq!(events.last().and_then(Event::left), Some(DeviceState::Untouched));
     // The next attempt has to wait.
     bench.run_ms(PENALTY_MS);
 
@@ -96,7 +97,7 @@ fn the_profile_of_esacademy_is_recognised_and_updated() {
             update(&mut bench, ESACADEMY_NODE, &firmware::blocks(image), &FlashOptions::default());
         let report = result.unwrap_or_else(|error| panic!("{error}: {events:?}"));
         assert_eq!(report.dialect, Dialect::EsAcademy);
-        assert!(events.contains(&Event::Unlocked), "{events:?}");
+        assert!(events.contains(&Note::Unlocked.into()), "{events:?}");
         assert_eq!(version(&mut bench, ESACADEMY_NODE), expected);
     }
     power_cycle(&mut bench, ESACADEMY_NODE);
@@ -155,7 +156,7 @@ fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
     let wrong = FlashOptions::default().unlock(Password::new("Coboot"));
     let (result, events) = update(&mut bench, NODE, &blocks(APP_LIFT), &wrong);
     assert!(matches!(result, Err(Error::Refused { doing: Doing::Unlock, .. })), "{result:?}");
-    assert_eq!(events.last(), Some(&Event::Left(DeviceState::Untouched)));
+    assert_eq!(events.last().and_then(Event::left), Some(DeviceState::Untouched));
     assert!(version(&mut bench, NODE).contains("2.0.0"), "it goes on");
     bench.assert_nothing_unmodelled();
 }

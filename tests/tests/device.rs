@@ -5,6 +5,7 @@ use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coflash::device::Doing;
+use coflash::update::event::Phase;
 use coflash::update::{flash, Event, FlashOptions};
 use coflash::Error;
 use emulator::machine::{Options, ResetCause, Stop};
@@ -211,7 +212,7 @@ fn a_trial_run_comes_back_to_the_bootloader_and_an_unsigned_program_does_not_sta
     let options = FlashOptions::default().trial_run(true).start(false);
     let mut trial_passed = false;
     flash(&mut bench.session(), &file, &options, &mut |event| {
-        trial_passed |= matches!(event, Event::TrialPassed(_));
+        trial_passed |= matches!(event, Event::Phase(Phase::TrialPassed(_)));
     })
     .unwrap();
     assert!(trial_passed);

@@ -4,6 +4,7 @@
 use canopen::Address;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
+use coflash::update::event::Phase;
 use coflash::update::{flash, Event, FlashOptions};
 
 #[test]
@@ -34,7 +35,7 @@ fn the_main_job() {
         },
     )
     .unwrap();
-    assert!(matches!(events.last(), Some(Event::Started(_))), "{events:?}");
+    assert!(matches!(events.as_slice(), [.., Event::Phase(Phase::Started(_)), Event::Done(_)]), "{events:?}");
     let mut session = bench.session();
     assert_eq!(session.read_text(Address::new(0x100A, 0)).unwrap(), "1.0.0");
     assert_eq!(

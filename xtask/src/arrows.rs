@@ -40,7 +40,7 @@ const RULES: &[Rule] = &[
     Rule { name: "bootloader", may_use: &["boot-core", "bsp", "shared-abi"] },
     Rule { name: "app-template", may_use: &["canopen", "bsp", "shared-abi"] },
     Rule { name: "coflash", may_use: &["canopen", "shared-abi"] },
-    Rule { name: "coboot-node", may_use: &["boot-core", "coflash", "shared-abi"] },
+    Rule { name: "coboot-node", may_use: &["boot-core", "canopen", "coflash", "shared-abi"] },
     Rule { name: "emulator", may_use: &["shared-abi"] },
     Rule {
         name: "coboot-tests",

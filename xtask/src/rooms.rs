@@ -43,10 +43,11 @@ const BOOT_CORE: &[Rule] = &[
 /// which share an adapter.
 const COFLASH: &[Rule] = &[
     Rule { room: "setters", may_use: &[] },
+    Rule { room: "json", may_use: &["canopen"] },
     Rule { room: "bus", may_use: &["canopen"] },
     Rule { room: "file", may_use: &["setters", "shared_abi"] },
-    Rule { room: "device", may_use: &["bus", "canopen", "setters"] },
-    Rule { room: "update", may_use: &["bus", "canopen", "device", "file", "setters", "shared_abi"] },
+    Rule { room: "device", may_use: &["bus", "canopen", "json", "setters"] },
+    Rule { room: "update", may_use: &["bus", "canopen", "device", "file", "json", "setters", "shared_abi"] },
     Rule { room: "cli", may_use: &["bus", "canopen", "device", "file", "shared_abi", "ui", "update"] },
     Rule { room: "ui", may_use: &["bus", "canopen", "device", "file", "shared_abi", "update"] },
 ];

@@ -12,7 +12,7 @@ use coflash::file::block_file::BlockFile;
 use coflash::file::convert::Label;
 use coflash::update::job::{self, Entry, Settings};
 use coflash::update::many::{flash_in_turn, flash_many, Job, ManyOptions};
-use coflash::update::{flash, Event, FlashOptions, Report, Target};
+use coflash::update::{flash, Event, FlashOptions, Target};
 use serde_json::json;
 
 use super::context::Context;
@@ -21,7 +21,7 @@ use super::device::{cancelled, Patience};
 use super::dialect::Access;
 use super::file::{warn_left_out, Source};
 use super::legacy::Legacy;
-use super::many::{document, report_value, summary, write_report, Board, Outcome};
+use super::many::{document, summary, write_report, Board, Outcome};
 use super::output::Failure;
 use super::progress::Progress;
 use super::values::{nodes, number, program_number};
@@ -259,7 +259,7 @@ impl Flash {
         let mut progress = Progress::new(context.out);
         let mut left = None;
         let result = flash(&mut session, &device.file, &device.options, &mut |event| match event {
-            Event::Left(state) => left = Some(state),
+            Event::Done(done) => left = Some(done.state),
             event => progress.show(event),
         });
         progress.finish();
@@ -277,8 +277,8 @@ impl Flash {
                 outcome.result?
             }
         };
-        context.out.result(Done(&report), || {
-            let mut value = report_value(&report);
+        context.out.result(report, || {
+            let mut value = json!(report);
             value["command"] = "flash".into();
             value["node"] = node.get().into();
             value["program"] = device.options.program.into();
@@ -339,20 +339,6 @@ impl Assignment {
             (Some(node), _) => format!("node {node}"),
             (None, Some(address)) => format!("device with serial number {:08X}h", address.serial_number),
             (None, None) => "device".to_string(),
-        }
-    }
-}
-
-/// The last line for people.
-struct Done<'r>(&'r Report);
-
-impl std::fmt::Display for Done<'_> {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "done in {:.1} s", self.0.took.as_secs_f64())?;
-        match self.0.repeats {
-            0 => Ok(()),
-            1 => f.write_str(", 1 block sent again"),
-            blocks => write!(f, ", {blocks} blocks sent again"),
         }
     }
 }

@@ -2,10 +2,8 @@
 
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
-use std::time::Duration;
 
 use canopen::NodeId;
-use coflash::device::Transfers;
 use coflash::update::many::Failed;
 use coflash::update::{Event, Report};
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -55,7 +53,7 @@ impl Board {
         let Some(name) = self.names.get(device) else { return };
         match (&self.form, event) {
             // The summary tells it.
-            (_, Event::Left(_)) => {}
+            (_, Event::Done(_)) => {}
             (Form::Terminal(bars), Event::Progress { done, total }) => {
                 bars[device].set_length(total as u64);
                 bars[device].set_position(done as u64);
@@ -150,28 +148,10 @@ fn outcome_value(outcome: &Outcome) -> Value {
         "ok": outcome.result.is_ok(),
     });
     match &outcome.result {
-        Ok(report) => all["report"] = report_value(report),
+        Ok(report) => all["report"] = json!(report),
         Err(failure) => all["error"] = failure.value()["error"].clone(),
     }
     all
-}
-
-/// For programs.
-pub(super) fn report_value(report: &Report) -> Value {
-    let seconds = |time: Duration| (time.as_secs_f64() * 1000.0).round() / 1000.0;
-    json!({
-        "size": report.program_size,
-        "crc": report.program_crc,
-        "blocks_repeated": report.repeats,
-        "seconds": seconds(report.took),
-        "transfer_seconds": seconds(report.transfer),
-        "transfer": match report.transfers {
-            Transfers::Blocks => "blocks",
-            Transfers::Segments => "segments",
-        },
-        "running": report.running.map(|running| running.0),
-        "dialect": report.dialect.name(),
-    })
 }
 
 #[cfg(test)]

@@ -4,14 +4,13 @@ use canopen::program::ProgramState;
 use clap::Args;
 use coflash::device::info::{program_info, ProgramInfo};
 use coflash::device::Session;
+use coflash::update::event::{Event, Phase};
 use coflash::update::steps::{call_back, enter_bootloader, erase_at_once, reset_status, sign, start, unsign};
-use coflash::update::Event;
 use coflash::Error;
 use serde_json::{json, Value};
 
 use super::context::Context;
 use super::device::Program;
-use super::info::status;
 use super::output::Failure;
 
 /// Starts the program, and waits until it answers.
@@ -91,9 +90,9 @@ impl Start {
                 if runs(session, number)? {
                     return Ok((format!("{running} is running already"), json!({ "running": running.0 })));
                 }
-                tell(Event::CallingBack);
+                tell(Phase::CallingBack.into());
                 call_back(session)?;
-                tell(Event::InBootloader);
+                tell(Phase::InBootloader.into());
             }
             let running = start(session, number)?;
             Ok((format!("{running} is running"), json!({ "running": running.0 })))
@@ -166,7 +165,7 @@ impl Status {
                 "bootloader": running.is_bootloader(),
                 "control": info.control,
                 "crc": info.crc,
-                "status": info.status.map(status),
+                "status": json!(info)["status"],
             });
             Ok((format!("{running}\n{}", info_words(&info)), value))
         })

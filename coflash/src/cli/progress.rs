@@ -42,6 +42,8 @@ impl Progress {
                     bar.finish();
                 }
             }
+            // The command tells the end.
+            (_, Event::Done(_)) => {}
             (Form::Terminal(Some(bar)), event) if !bar.is_finished() => bar.println(format!("  {event}")),
             (Form::Plain { began, tenths }, Event::Progress { done, total }) => {
                 let began = *began.get_or_insert_with(Instant::now);

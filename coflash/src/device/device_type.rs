@@ -3,6 +3,8 @@
 use std::fmt;
 
 use canopen::program::{BOOTLOADER_DEVICE_TYPE, ESACADEMY_DEVICE_TYPE, LIFT_DEVICE_TYPE};
+use serde::ser::SerializeStruct as _;
+use serde::{Serialize, Serializer};
 
 /// What 1000h reads.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -21,5 +23,15 @@ impl fmt::Display for DeviceType {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let who = if self.is_bootloader() { "the bootloader" } else { "an application" };
         write!(f, "{who} (device type {:08X}h)", self.0)
+    }
+}
+
+impl Serialize for DeviceType {
+    /// `device_type`, and whether it is a `bootloader`.
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut fields = serializer.serialize_struct("DeviceType", 2)?;
+        fields.serialize_field("device_type", &self.0)?;
+        fields.serialize_field("bootloader", &self.is_bootloader())?;
+        fields.end()
     }
 }

@@ -7,6 +7,7 @@ use std::fmt;
 
 use canopen::program::{self, ESACADEMY_DEVICE_TYPE, LIFT_DEVICE_TYPE, LIFT_NODE_ID};
 use canopen::NodeId;
+use serde::{Serialize, Serializer};
 
 use super::device_type::DeviceType;
 
@@ -61,5 +62,11 @@ impl fmt::Display for Dialect {
             Self::Lift => "lift (CiA 417)",
             Self::EsAcademy => "esacademy (Intel HEX behind a password)",
         })
+    }
+}
+
+impl Serialize for Dialect {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.name())
     }
 }

@@ -4,20 +4,25 @@ use std::fmt;
 
 use canopen::program::{self, FlashStatus, ProgramState};
 use canopen::Address;
+use serde::ser::SerializeStruct as _;
+use serde::{Serialize, Serializer};
 
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
 use super::error::{optional, Error};
 use super::recognise::recognise;
 use super::session::Session;
+use crate::json;
 
 /// What a device says about itself. What it does not have is `None`.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct DeviceInfo {
     /// Its node-ID.
+    #[serde(serialize_with = "json::node")]
     pub node: canopen::NodeId,
     /// 1000h: bootloader or application.
+    #[serde(flatten)]
     pub device_type: DeviceType,
     /// 1001h, error register.
     pub error_register: Option<u32>,
@@ -28,6 +33,7 @@ pub struct DeviceInfo {
     /// 100Ah, software version.
     pub software_version: Option<String>,
     /// 1018h/1 to 4: vendor-ID, product code, revision, serial number.
+    #[serde(flatten, serialize_with = "identity_fields")]
     pub identity: Identity,
     /// What its bootloader speaks, as far as that can be seen; `None` for a device without
     /// programs.
@@ -38,7 +44,7 @@ pub struct DeviceInfo {
 
 /// What a device tells people of itself before an update (CiA 814-1 clause 6.3): 1008h, 1009h, 100Ah
 /// and 1018h. `Display` has it in one line.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct Nameplate {
     /// 1008h, device name.
@@ -48,14 +54,25 @@ pub struct Nameplate {
     /// 100Ah, software version.
     pub software_version: Option<String>,
     /// 1018h/1 to 4.
+    #[serde(flatten, serialize_with = "identity_fields")]
     pub identity: Identity,
 }
 
 /// 1018h/1 to 4: vendor-ID, product code, revision, serial number; `None` for what is not told.
 pub type Identity = [Option<u32>; 4];
 
+/// The parts of the identity under their names.
+fn identity_fields<S: Serializer>(identity: &Identity, serializer: S) -> Result<S::Ok, S::Error> {
+    let names = ["vendor_id", "product_code", "revision", "serial_number"];
+    let mut fields = serializer.serialize_struct("Identity", names.len())?;
+    for (name, part) in names.into_iter().zip(identity) {
+        fields.serialize_field(name, part)?;
+    }
+    fields.end()
+}
+
 /// What a device says about one of its programs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct ProgramInfo {
     /// Sub-index of 1F51h, 1F56h and 1F57h.
@@ -65,6 +82,7 @@ pub struct ProgramInfo {
     /// 1F56h: CRC of the program.
     pub crc: Option<u32>,
     /// 1F57h.
+    #[serde(serialize_with = "json::status")]
     pub status: Option<FlashStatus>,
 }
 

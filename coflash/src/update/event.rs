@@ -1,225 +1,160 @@
-//! What happens during an update, for whoever watches it.
+//! What happens during an update, for whoever watches it: one vocabulary for people, programs and
+//! pages.
+//!
+//! Each event has words for people (`Display`), and a form for programs ([`Event::line`]): one
+//! object with the node, the kind of the event as `event`, what belongs to it under names that
+//! stay, and the words as `text`.
 
 use std::fmt;
-use std::time::Duration;
 
-use canopen::{AbortCode, NodeId};
+use canopen::NodeId;
+use serde::{Serialize, Serializer};
 
-use super::options::Target;
-use crate::device::info::Nameplate;
-use crate::device::{DeviceType, Dialect};
-
-/// An erasure that is over sooner than this was put off, or had little to do. Erasing a sector of
-/// flash takes longer.
-pub(super) const PUT_OFF: Duration = Duration::from_millis(100);
+pub use super::phase::{Note, Phase, Warning};
+pub use super::report::Report;
+pub use super::retry::{RepeatReason, Retry};
+pub use super::state::DeviceState;
+use crate::device::{DeviceType, Error};
+use crate::json;
 
 /// What happens during an update. `Display` has words for people.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+#[non_exhaustive]
 pub enum Event {
-    /// Step 1: nothing of a bootloader yet, for this reason; it is looked for until it is there.
-    Searching(String),
     /// Step 2: this is running on the device.
     Found(DeviceType),
-    /// What the device tells of itself.
-    Nameplate(Box<Nameplate>),
-    /// The NMT mastership was taken over from this node.
-    MasterTaken(NodeId),
-    /// This node keeps the NMT mastership.
-    MasterKept(NodeId),
-    /// The NMT mastership was given back; this node has it now, if one says so.
-    MasterBack(Option<NodeId>),
-    /// It is the device that the file is for.
-    TargetRight(Target),
-    /// Step 3: the application is asked to go back to the bootloader.
-    CallingBack,
-    /// Step 3 has worked.
-    InBootloader,
-    /// The bootloader speaks this dialect.
-    Speaks(Dialect),
-    /// The password was right.
-    Unlocked,
-    /// The device goes on under another node-ID.
-    Moved(NodeId),
-    /// Step 4: the program is being erased.
-    Erasing,
-    /// Step 5: it is erased.
-    Erased {
-        /// How long that took.
-        took: Duration,
-    },
+    /// The update has come to here.
+    Phase(Phase),
     /// Steps 6 to 9: so far the transfer has come.
     Progress {
-        /// Bytes of the block file that are in the device.
+        /// Bytes that are in the device.
         done: usize,
-        /// Bytes of the block file.
+        /// Bytes in all.
         total: usize,
     },
-    /// A block is sent again.
-    Repeating {
-        /// Its number.
-        block: u32,
-        /// How often it has been sent again, this time included.
-        repeat: u32,
-        /// How often it may be.
-        of: u32,
-        /// Why.
-        why: RepeatReason,
-    },
-    /// The whole program is sent again.
-    Again {
-        /// How often it has been sent again, this time included.
-        repeat: u32,
-        /// How often it may be.
-        of: u32,
-        /// Why.
-        why: RepeatReason,
-    },
-    /// The bootloader computed the CRC that the file says.
-    Verified {
-        /// The CRC.
-        crc: u32,
-    },
-    /// Step 10: the program starts for a trial.
-    TrialStarting,
-    /// Step 13: it ran, and came back when called.
-    TrialPassed(DeviceType),
-    /// Step 14: the program is signed, so that it starts by itself.
-    Signed,
-    /// Step 15: the program starts.
-    Starting,
-    /// It runs.
-    Started(DeviceType),
-    /// After its end, the procedure's last look: the CRC is still the file's.
-    VerifiedAgain {
-        /// The CRC.
-        crc: u32,
-    },
-    /// The procedure failed, and leaves the device like this.
-    Left(DeviceState),
+    /// A block, or the whole program, is sent again.
+    Retry(Retry),
+    /// Something about the device that is good to know.
+    Note(Note),
+    /// Something that may go wrong because of it.
+    Warning(Warning),
+    /// The end, good or bad. Nothing comes behind it.
+    Done(Box<Done>),
 }
 
-/// In what state a procedure that failed leaves the device, as far as it got.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum DeviceState {
-    /// Nothing was changed.
-    Untouched,
-    /// The bootloader was called; the old program is whole.
-    Called,
-    /// The erasure was begun: there is no program, or an incomplete one.
-    Erased,
-    /// The new program is in, in a dialect without signatures.
-    Written,
-    /// The new program is in and right, but not signed.
-    Unsigned,
-    /// The new program is in and signed.
-    Signed,
+/// How an update ended. `Display` says, of one that failed, how it leaves the device.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[non_exhaustive]
+pub struct Done {
+    /// How the device is left.
+    pub state: DeviceState,
+    /// What was done, if all of it was.
+    pub report: Option<Report>,
+    /// What went wrong otherwise.
+    pub error: Option<Problem>,
 }
 
-impl DeviceState {
-    /// Its name for programs, which stays.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Untouched => "untouched",
-            Self::Called => "called",
-            Self::Erased => "erased",
-            Self::Written => "written",
-            Self::Unsigned => "unsigned",
-            Self::Signed => "signed",
+impl Done {
+    /// The end of an update that has come to this result, and leaves the device like this.
+    pub(super) fn new(state: DeviceState, result: &Result<Report, Error>) -> Self {
+        match result {
+            Ok(report) => Self { state, report: Some(*report), error: None },
+            Err(error) => Self { state, report: None, error: Some(Problem::of(error)) },
         }
     }
 }
 
-impl fmt::Display for DeviceState {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Untouched => "nothing was changed in it",
-            Self::Called => {
-                "it may be in the bootloader; its old program is whole and starts again after a reset"
-            }
-            Self::Erased => {
-                "it has no complete program and stays in the bootloader, ready for the next attempt"
-            }
-            Self::Written => "the new program is in it: it starts after a reset",
-            Self::Unsigned => {
-                "the new program is in it but not signed: after a reset the bootloader waits for the next attempt"
-            }
-            Self::Signed => "the new program is in it and signed: it starts after a reset",
-        })
+/// An [`Error`] that is told on.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[non_exhaustive]
+pub struct Problem {
+    /// [`Error::number`].
+    #[serde(serialize_with = "json::hex")]
+    pub number: u32,
+    /// What happened, in words.
+    pub what: String,
+    /// What to do next.
+    pub advice: String,
+}
+
+impl Problem {
+    /// What this error says of itself.
+    #[must_use]
+    pub fn of(error: &Error) -> Self {
+        Self { number: error.number(), what: error.to_string(), advice: error.advice() }
+    }
+}
+
+/// An event as one line for programs has it.
+#[derive(Debug, Serialize)]
+pub struct Line<'e> {
+    #[serde(serialize_with = "json::node")]
+    node: NodeId,
+    #[serde(flatten)]
+    event: &'e Event,
+    #[serde(serialize_with = "words")]
+    text: &'e Event,
+}
+
+fn words<S: Serializer>(event: &&Event, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(event)
+}
+
+impl Event {
+    /// The event for programs: with the node that it is about, and with its words.
+    #[must_use]
+    pub fn line(&self, node: NodeId) -> Line<'_> {
+        Line { node, event: self, text: self }
+    }
+
+    /// How a failed update leaves the device, if this is the end of one.
+    #[must_use]
+    pub fn left(&self) -> Option<DeviceState> {
+        match self {
+            Self::Done(done) if done.error.is_some() => Some(done.state),
+            _ => None,
+        }
+    }
+}
+
+impl From<Phase> for Event {
+    fn from(phase: Phase) -> Self {
+        Self::Phase(phase)
+    }
+}
+
+impl From<Note> for Event {
+    fn from(note: Note) -> Self {
+        Self::Note(note)
+    }
+}
+
+impl From<Warning> for Event {
+    fn from(warning: Warning) -> Self {
+        Self::Warning(warning)
     }
 }
 
 impl fmt::Display for Event {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Searching(why) => write!(f, "searching for the bootloader, Ctrl-C ends it ({why})"),
             Self::Found(running) => write!(f, "found {running}"),
-            Self::Nameplate(plate) => write!(f, "device: {plate}"),
-            Self::MasterTaken(node) => write!(f, "NMT mastership taken over from node {node}"),
-            Self::MasterKept(node) => {
-                write!(f, "node {node} keeps the NMT mastership: it may disturb the update")
-            }
-            Self::MasterBack(Some(node)) => {
-                write!(f, "NMT mastership given back: node {node} is the master")
-            }
-            Self::MasterBack(None) => {
-                f.write_str("NMT mastership given back, and nobody has said that it is the master")
-            }
-            Self::TargetRight(Target { vendor_id, product_code }) => {
-                write!(
-                    f,
-                    "it is the right device: vendor-ID {vendor_id:08X}h, product code {product_code:08X}h"
-                )
-            }
-            Self::CallingBack => f.write_str("calling the application back to the bootloader"),
-            Self::InBootloader => f.write_str("the bootloader is running"),
-            Self::Speaks(dialect) => write!(f, "its dialect: {dialect}"),
-            Self::Unlocked => f.write_str("unlocked"),
-            Self::Moved(node) => write!(f, "it answers as node {node} now"),
-            Self::Erasing => f.write_str("telling it to erase the old program"),
-            Self::Erased { took } if *took < PUT_OFF => {
-                f.write_str("it will, with the first block that it finds good")
-            }
-            Self::Erased { took } => write!(f, "erased in {:.1} s", took.as_secs_f64()),
+            Self::Phase(phase) => phase.fmt(f),
             Self::Progress { done, total } => write!(f, "{done} of {total} bytes"),
-            Self::Repeating { block, repeat, of, why } => {
-                write!(f, "sending block {block} again, {repeat} of {of}: {why}")
-            }
-            Self::Again { repeat, of, why } => {
-                write!(f, "sending the program again, {repeat} of {of}: {why}")
-            }
-            Self::Verified { crc } => write!(f, "verified: CRC {crc:08X}h"),
-            Self::TrialStarting => f.write_str("starting the program for a trial"),
-            Self::TrialPassed(running) => write!(f, "the trial went well: {running} came up and came back"),
-            Self::Signed => f.write_str("signed: the program starts by itself from now on"),
-            Self::Starting => f.write_str("starting the program"),
-            Self::Started(running) => write!(f, "running: {running}"),
-            Self::VerifiedAgain { crc } => write!(f, "verified once more: CRC {crc:08X}h"),
-            Self::Left(state) => write!(f, "the device: {state}"),
+            Self::Retry(retry) => retry.fmt(f),
+            Self::Note(note) => note.fmt(f),
+            Self::Warning(warning) => warning.fmt(f),
+            Self::Done(done) => done.fmt(f),
         }
     }
 }
 
-/// Why a block is sent again.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum RepeatReason {
-    /// The bootloader found its CRC wrong.
-    Crc,
-    /// The bootloader was still busy with something else.
-    Busy,
-    /// The transfer was aborted by the device with a code that speaks of lost frames.
-    Broken(AbortCode),
-    /// The transfer got no answer.
-    NoAnswer,
-}
-
-impl fmt::Display for RepeatReason {
+impl fmt::Display for Done {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Crc => f.write_str("its CRC arrived wrong"),
-            Self::Busy => f.write_str("the bootloader was busy"),
-            Self::Broken(code) => write!(f, "the transfer broke: {code}"),
-            Self::NoAnswer => f.write_str("no answer"),
+        match &self.report {
+            Some(report) => report.fmt(f),
+            None => write!(f, "the device: {}", self.state),
         }
     }
 }

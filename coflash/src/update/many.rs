@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use canopen::NodeId;
 
-use super::event::{DeviceState, Event};
-use super::flash::{flash, Report};
+use super::event::{DeviceState, Event, Report};
+use super::flash::flash;
 use super::options::FlashOptions;
 use crate::bus::{hub, Adapter, Gateway};
 use crate::device::{Error, Session, Timing, Transfers};
@@ -126,9 +126,7 @@ fn update(
     session.transfer_by(all.transfers);
     let mut left = DeviceState::Untouched;
     let result = flash(session, &job.file, one, &mut |event| {
-        if let Event::Left(state) = event {
-            left = state;
-        }
+        left = event.left().unwrap_or(left);
         tell(event);
     });
     result.map_err(|error| Failed { error, left })

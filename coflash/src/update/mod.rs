@@ -4,20 +4,24 @@
 pub mod config;
 mod course;
 pub mod dialect;
-mod event;
+pub mod event;
 mod flash;
 pub mod job;
 mod judge;
 pub mod many;
 mod options;
 mod password;
+mod phase;
 mod reach;
+mod report;
+mod retry;
+mod state;
 pub mod steps;
 mod toml_line;
 mod trial;
 
-pub use self::event::{DeviceState, Event, RepeatReason};
-pub use self::flash::{flash, Report};
+pub use self::event::{DeviceState, Event, Report};
+pub use self::flash::flash;
 pub use self::many::{flash_in_turn, flash_many, ManyOptions};
 pub use self::options::{FlashOptions, Target};
 pub use self::password::Password;

@@ -1,5 +1,6 @@
 //! What to do in an update beyond the download itself.
 
+use serde::Serialize;
 use shared_abi::block_file::Control;
 
 use super::password::Password;
@@ -55,7 +56,7 @@ impl FlashOptions {
 }
 
 /// The device that a program is for: what 1018h/1 and 1018h/2 have to read.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct Target {
     /// Vendor-ID.
     pub vendor_id: u32,

@@ -6,7 +6,7 @@ use canopen::{program, Address};
 
 use super::course::Course;
 use super::dialect;
-use super::event::Event;
+use super::event::{Event, Note, Phase};
 use super::options::FlashOptions;
 use super::steps::{check_target, CALL_BACK};
 use crate::device::{recognise, Dialect, Doing, Error, Session, Timing};
@@ -26,7 +26,7 @@ pub(super) fn reach(
         knock(session, course)?;
         match attempt(session, options, course) {
             Err(error @ (Error::NoAnswer { .. } | Error::NoBootloader { .. })) => {
-                course.tell(Event::Searching(error.to_string()));
+                course.tell(Phase::Searching { reason: error.to_string() }.into());
                 let pause = session.timing().poll_most;
                 session.wait(pause)?;
             }
@@ -48,7 +48,7 @@ fn attempt(
     course.tell(Event::Found(running));
     if let Some(target) = options.check_target {
         check_target(session, target)?;
-        course.tell(Event::TargetRight(target));
+        course.tell(Note::TargetRight(target).into());
     }
     let found = match options.dialect {
         Some(dialect) => dialect,
@@ -67,7 +67,7 @@ fn knock(session: &mut Session<'_>, course: &mut Course<'_>) -> Result<(), Error
     let timing = Timing { sdo: KNOCK.min(session.timing().sdo), attempts: 1, ..*session.timing() };
     while session.with(node, timing).device_type()?.is_none() {
         let doing = Doing::Read(Address::new(program::DEVICE_TYPE, 0));
-        course.tell(Event::Searching(Error::NoAnswer { node, doing }.to_string()));
+        course.tell(Phase::Searching { reason: Error::NoAnswer { node, doing }.to_string() }.into());
         let pause = session.timing().poll_first;
         session.await_boot_up(pause)?;
     }

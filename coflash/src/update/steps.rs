@@ -5,8 +5,9 @@ use std::time::Duration;
 use canopen::program::{self, ProgramControl};
 use canopen::{AbortCode, Address};
 
-use super::event::{Event, PUT_OFF};
+use super::event::{Event, Phase};
 use super::options::Target;
+use super::phase::PUT_OFF;
 use crate::device::error::{absent, Error, Mismatch};
 use crate::device::{DeviceType, Doing, Session, Timing};
 
@@ -47,9 +48,9 @@ pub fn enter_bootloader(session: &mut Session<'_>, tell: &mut dyn FnMut(Event)) 
     if running.is_bootloader() {
         return Ok(());
     }
-    tell(Event::CallingBack);
+    tell(Phase::CallingBack.into());
     call_back(session)?;
-    tell(Event::InBootloader);
+    tell(Phase::InBootloader.into());
     Ok(())
 }
 
@@ -114,10 +115,10 @@ fn settle(
 /// # Errors
 /// [`Error::Failed`] with what 1F57h says, [`Error::Busy`], [`Error::NoAnswer`].
 pub fn erase(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
-    tell(Event::Erasing);
+    tell(Phase::Erasing.into());
     let began = session.now();
     execute(session, number, ProgramControl::Clear)?;
-    tell(Event::Erased { took: session.now().saturating_sub(began) });
+    tell(Phase::Erased { took: session.now().saturating_sub(began) }.into());
     Ok(())
 }
 
@@ -133,12 +134,12 @@ pub(super) fn clear_and_wait(
         Err(error @ Error::Refused { .. }) => return Err(error),
         _ => return erase(session, number, tell),
     }
-    tell(Event::Erasing);
+    tell(Phase::Erasing.into());
     let began = session.now();
     let node = session.node();
     let patient = Timing { sdo: session.timing().command, ..*session.timing() };
     session.with(node, patient).command(number, ProgramControl::Clear)?;
-    tell(Event::Erased { took: session.now().saturating_sub(began) });
+    tell(Phase::Erased { took: session.now().saturating_sub(began) }.into());
     Ok(())
 }
 
@@ -163,7 +164,7 @@ pub fn erase_at_once(session: &mut Session<'_>, number: u8) -> Result<(), Error>
 /// As [`erase`].
 pub fn sign(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
     execute(session, number, ProgramControl::SetSignature)?;
-    tell(Event::Signed);
+    tell(Phase::Released.into());
     Ok(())
 }
 
@@ -229,7 +230,7 @@ pub fn verify(
     tell: &mut dyn FnMut(Event),
 ) -> Result<(), Error> {
     compare_crc(session, number, crc)?;
-    tell(Event::Verified { crc });
+    tell(Phase::Verified { crc }.into());
     Ok(())
 }
 

@@ -1,7 +1,7 @@
 //! The trial run: a program is started once before it is signed.
 
 use super::course::Course;
-use super::event::Event;
+use super::event::Phase;
 use super::options::FlashOptions;
 use super::steps::{call_back, check_target, start};
 use crate::device::error::{Error, IdentityPart};
@@ -15,7 +15,7 @@ pub(super) fn run(
     course: &mut Course<'_>,
 ) -> Result<(), Error> {
     let bootloader = identity(session)?;
-    course.tell(Event::TrialStarting);
+    course.tell(Phase::TrialStarting.into());
     let running = start(session, options.program)?;
     let right = same_identity(session, bootloader).and_then(|()| match options.check_target {
         Some(target) => check_target(session, target),
@@ -25,7 +25,7 @@ pub(super) fn run(
     let back = call_back(session);
     right?;
     back?;
-    course.tell(Event::TrialPassed(running));
+    course.tell(Phase::TrialPassed(running).into());
     Ok(())
 }
 

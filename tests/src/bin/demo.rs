@@ -173,6 +173,8 @@ fn install(bench: &mut Bench, file: &BlockFile) -> Outcome<()> {
                 print_line(clock.get(), &format!("all {total} bytes are in the device"));
             }
         }
+        // The report below tells the end.
+        Event::Done(_) => {}
         event => print_line(clock.get(), &event.to_string()),
     });
     let report = outcome?;

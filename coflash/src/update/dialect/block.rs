@@ -7,7 +7,7 @@ use super::procedure::{enter_by_call, Downloaded, Procedure};
 use crate::device::{DeviceType, Dialect, Doing, Error, Session, Transfers};
 use crate::file::block_file::{Block as FileBlock, BlockFile};
 use crate::update::course::Course;
-use crate::update::event::{DeviceState, Event, RepeatReason};
+use crate::update::event::{DeviceState, Event, RepeatReason, Retry};
 use crate::update::judge::{judge, Judgement};
 use crate::update::options::FlashOptions;
 use crate::update::{steps, trial};
@@ -121,7 +121,7 @@ fn send_block(
                 if repeat > 1 && matches!(why, RepeatReason::Broken(_) | RepeatReason::NoAnswer) {
                     session.transfer_by(Transfers::Segments);
                 }
-                tell(Event::Repeating { block, repeat, of: options.repeats, why });
+                tell(Event::Retry(Retry::block(block, repeat, options.repeats, why)));
             }
             _ => return Err(error),
         }

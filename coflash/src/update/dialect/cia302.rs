@@ -8,7 +8,7 @@ use super::whole::{self, Whole};
 use crate::device::error::{absent, optional};
 use crate::device::{DeviceType, Dialect, Error, Session};
 use crate::update::course::Course;
-use crate::update::event::{DeviceState, Event};
+use crate::update::event::{DeviceState, Note, Phase};
 use crate::update::options::FlashOptions;
 use crate::update::steps::{call_back, clear_and_wait, CALL_BACK};
 
@@ -24,7 +24,7 @@ pub(super) fn enter(
         course.state = DeviceState::Called;
         stop_program(session, number, course)?;
     }
-    course.tell(Event::Speaks(dialect));
+    course.tell(Note::Dialect { dialect }.into());
     Ok(dialect)
 }
 
@@ -66,12 +66,12 @@ fn stop_program(session: &mut Session<'_>, number: u8, course: &mut Course<'_>) 
         return Ok(());
     };
     let at = control(running);
-    course.tell(Event::CallingBack);
+    course.tell(Phase::CallingBack.into());
     match session.command(running, ProgramControl::Stop) {
         Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
         Err(Error::Refused { .. }) => {
             call_back(session)?;
-            course.tell(Event::InBootloader);
+            course.tell(Phase::InBootloader.into());
             return Ok(());
         }
         Err(error) => return Err(error),
@@ -91,6 +91,6 @@ fn stop_program(session: &mut Session<'_>, number: u8, course: &mut Course<'_>) 
         let pause = session.timing().sdo;
         session.await_boot_up(pause)?;
     }
-    course.tell(Event::InBootloader);
+    course.tell(Phase::InBootloader.into());
     Ok(())
 }

@@ -12,7 +12,7 @@ use crate::device::error::{absent, optional};
 use crate::device::{DeviceType, Dialect, Doing, Error, Session, Timing};
 use crate::file::{ihex, BlockFile};
 use crate::update::course::Course;
-use crate::update::event::Event;
+use crate::update::event::Note;
 use crate::update::options::FlashOptions;
 use crate::update::steps::await_application;
 
@@ -76,7 +76,7 @@ fn unlock(session: &mut Session<'_>, options: &FlashOptions, course: &mut Course
     let patient = Timing { sdo: session.timing().command, ..*session.timing() };
     let written = session.with(node, patient).write(at, &password.to_le_bytes(), Doing::Unlock, &mut |_| {});
     match written {
-        Ok(()) => course.tell(Event::Unlocked),
+        Ok(()) => course.tell(Note::Unlocked.into()),
         Err(Error::Refused { code: AbortCode::NO_OBJECT, .. }) => {}
         Err(error) => return Err(error),
     }

@@ -15,7 +15,7 @@ use crate::device::recognise::UNLOCK;
 use crate::device::{recognise, DeviceType, Dialect, Doing, Error, Session, Timing};
 use crate::file::BlockFile;
 use crate::update::course::Course;
-use crate::update::event::{DeviceState, Event};
+use crate::update::event::{DeviceState, Event, Note, Phase, Warning};
 use crate::update::options::FlashOptions;
 use crate::update::password::Password;
 
@@ -45,15 +45,15 @@ impl Procedure for Lift {
             let what = "the bootloaders share a node-ID: update the devices one after the other";
             return Err(Error::NotInDialect { dialect: Dialect::Lift, what });
         }
-        course.tell(Event::Speaks(Dialect::Lift));
-        course.tell(Event::Nameplate(Box::new(nameplate(session)?)));
+        course.tell(Note::Dialect { dialect: Dialect::Lift }.into());
+        course.tell(Note::Nameplate(Box::new(nameplate(session)?)).into());
         check(session, running, options.unlock)?;
         if options.mastership {
             match flying_master::ask(session)? {
                 Asked::Nobody => {}
-                Asked::Kept(master) => course.tell(Event::MasterKept(master.node)),
+                Asked::Kept(master) => course.tell(Warning::MasterKept { node: master.node }.into()),
                 Asked::Taken(taken) => {
-                    course.tell(Event::MasterTaken(taken.from.node));
+                    course.tell(Note::MasterTaken { node: taken.from.node }.into());
                     course.mastership = Some(taken);
                 }
             }
@@ -105,17 +105,17 @@ fn unlock_bootloader(
     let lift = lift_node();
     if node != lift {
         unlock(session, password)?;
-        course.tell(Event::Unlocked);
+        course.tell(Note::Unlocked.into());
         course.state = DeviceState::Called;
-        course.tell(Event::CallingBack);
+        course.tell(Phase::CallingBack.into());
         reset_program(session, LIFT_PROGRAM)?;
         session.talk_to(lift);
         await_lift(session)?;
-        course.tell(Event::Moved(lift));
-        course.tell(Event::InBootloader);
+        course.tell(Note::Moved { node: lift }.into());
+        course.tell(Phase::InBootloader.into());
     }
     unlock(session, password)?;
-    course.tell(Event::Unlocked);
+    course.tell(Note::Unlocked.into());
     Ok(())
 }
 

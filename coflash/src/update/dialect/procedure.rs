@@ -7,7 +7,7 @@ use canopen::NodeId;
 use crate::device::{DeviceType, Dialect, Error, Session};
 use crate::file::BlockFile;
 use crate::update::course::Course;
-use crate::update::event::{DeviceState, Event};
+use crate::update::event::{DeviceState, Note, Phase};
 use crate::update::options::FlashOptions;
 use crate::update::steps;
 
@@ -69,13 +69,13 @@ pub(super) fn enter_by_call(
     let mut dialect = found;
     if !running.is_bootloader() {
         course.state = DeviceState::Called;
-        course.tell(Event::CallingBack);
+        course.tell(Phase::CallingBack.into());
         let running = steps::call_back(session)?;
-        course.tell(Event::InBootloader);
+        course.tell(Phase::InBootloader.into());
         if options.dialect.is_none() {
             dialect = Dialect::of_bootloader(running, session.node()).unwrap_or(found);
         }
     }
-    course.tell(Event::Speaks(dialect));
+    course.tell(Note::Dialect { dialect }.into());
     Ok(dialect)
 }

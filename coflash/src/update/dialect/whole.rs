@@ -9,7 +9,7 @@ use super::procedure::Downloaded;
 use crate::device::error::absent;
 use crate::device::{Dialect, Doing, Error, Session, Timing, Transfers};
 use crate::update::course::Course;
-use crate::update::event::{DeviceState, Event, RepeatReason};
+use crate::update::event::{DeviceState, Event, RepeatReason, Retry};
 use crate::update::judge::{judge, Judgement};
 use crate::update::options::FlashOptions;
 use crate::update::steps;
@@ -102,7 +102,7 @@ fn send(
                 if repeat > 1 && matches!(why, RepeatReason::Broken(_) | RepeatReason::NoAnswer) {
                     session.transfer_by(Transfers::Segments);
                 }
-                course.tell(Event::Again { repeat, of: options.repeats, why });
+                course.tell(Event::Retry(Retry::program(repeat, options.repeats, why)));
             }
             _ => return Err(error),
         }

@@ -1,0 +1,126 @@
+//! One station of a production line, to be copied: a program into the one device on the bench.
+//!
+//! ```text
+//! production_line BUS BOARD FILE NODE [--lss]
+//! ```
+//!
+//! `BUS` is a URL as `coflash --bus` takes it, `BOARD` the name of a board, `FILE` the firmware and
+//! `NODE` the node-ID. With `--lss` the device has no node-ID yet: it is found by LSS fastscan, and
+//! given this one.
+//!
+//! What happens is written to standard output, one JSON object a line (docs/coflash.md has the
+//! names). The exit code says whose turn it is: 0 the device is good, 1 the station is set up wrong
+//! (arguments, file, adapter), 2 the device is bad.
+
+use std::env;
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use canopen::NodeId;
+use coflash::bus::{self, Adapter};
+use coflash::device::lss::{ensure_node_id, Master, ANSWER};
+use coflash::device::{info, Error, Session, Timing};
+use coflash::file::convert::{blocks_of, Options, Region};
+use coflash::file::{self, BlockFile};
+use coflash::update::event::Problem;
+use coflash::update::{flash, FlashOptions};
+use serde_json::json;
+
+/// Why no device left the station.
+#[derive(Debug)]
+pub enum Stop {
+    /// The station is set up wrong.
+    Station(String),
+    /// The device is bad, or the bus to it.
+    Device(Error),
+}
+
+impl From<Error> for Stop {
+    fn from(error: Error) -> Self {
+        match error {
+            Error::Adapter(error) => Self::Station(format!("{error}; {}", error.advice())),
+            error => Self::Device(error),
+        }
+    }
+}
+
+/// What the station is to do.
+#[derive(Debug)]
+pub struct Order {
+    bus: String,
+    node: NodeId,
+    /// Whether the device has yet to be given its node-ID.
+    lss: bool,
+    program: BlockFile,
+}
+
+impl Order {
+    /// Takes the arguments, and reads the program. All that can be wrong with it is found here,
+    /// before there is a device.
+    fn new(arguments: &[String]) -> Result<Self, Stop> {
+        let station = |what: String| Stop::Station(what);
+        let (bus, board, path, node, lss) = match arguments {
+            [bus, board, path, node] => (bus, board, path, node, false),
+            [bus, board, path, node, word] if word == "--lss" => (bus, board, path, node, true),
+            _ => return Err(station("usage: production_line BUS BOARD FILE NODE [--lss]".to_string())),
+        };
+        let node = node.parse().ok().and_then(NodeId::new);
+        let node = node.ok_or_else(|| station("the node-ID must be 1 to 127".to_string()))?;
+        let layout = shared_abi::layout::by_name(board);
+        let layout = layout.ok_or_else(|| station(format!("there is no board '{board}'")))?;
+        let region = Region::Strict(layout.programs[0].into());
+        let firmware = file::load(Path::new(path), None, None).map_err(|error| station(error.to_string()))?;
+        let blocks = blocks_of(firmware, &Options::default().region(region));
+        let program = blocks.map_err(|error| station(format!("{path}: {error}")))?.file;
+        Ok(Self { bus: bus.clone(), node, lss, program })
+    }
+
+    /// The whole of it; `tell` is given each line.
+    fn carry_out(&self, tell: &mut dyn FnMut(serde_json::Value)) -> Result<(), Stop> {
+        let mut bus = bus::open(&self.bus).map_err(Error::from)?;
+        if self.lss {
+            self.commission(&mut *bus)?;
+        }
+        let mut session = Session::new(&mut *bus, self.node, Timing::default());
+        // `verify`: the running program tells the CRC of the file, too.
+        let options = FlashOptions::default().verify(true);
+        flash(&mut session, &self.program, &options, &mut |event| tell(json!(event.line(self.node))))?;
+        // For the record of this device: serial number, versions, CRC.
+        tell(json!({ "device": info(&mut session)? }));
+        Ok(())
+    }
+
+    /// Gives the one device without a node-ID this one, for good.
+    fn commission(&self, bus: &mut dyn Adapter) -> Result<(), Stop> {
+        let mut master = Master::new(&mut *bus, ANSWER);
+        master.switch_all(false)?;
+        let found = master.fastscan(&mut |_| {})?;
+        let nobody = || Stop::Station("no device without a node-ID is on the bus".to_string());
+        let address = found.ok_or_else(nobody)?;
+        let boot = Timing::default().boot;
+        ensure_node_id(bus, &address, Some(self.node), boot, &Arc::default())?;
+        Ok(())
+    }
+}
+
+/// Does what the arguments say; gives the exit code.
+pub fn run(arguments: &[String], tell: &mut dyn FnMut(serde_json::Value)) -> u8 {
+    match Order::new(arguments).and_then(|order| order.carry_out(tell)) {
+        Ok(()) => 0,
+        Err(Stop::Station(what)) => {
+            tell(json!({ "station": what }));
+            1
+        }
+        Err(Stop::Device(error)) => {
+            tell(json!({ "error": Problem::of(&error) }));
+            2
+        }
+    }
+}
+
+#[allow(dead_code)] // A test runs the station without it.
+fn main() -> ExitCode {
+    let arguments: Vec<String> = env::args().skip(1).collect();
+    ExitCode::from(run(&arguments, &mut |line| println!("{line}")))
+}
