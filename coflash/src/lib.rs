@@ -6,6 +6,7 @@
 //! | [`file`](mod@file) | firmware files: read, checked, converted | |
 //! | [`device`] | SDO with one node, what it says about itself, scan, LSS, errors with numbers and advice | `bus` |
 //! | [`update`] | the procedure, a file for each dialect, many devices at once, job files | `bus`, `device`, `file` |
+//! | `ui` (feature `ui`) | a local web server and its page in the browser | `bus`, `device`, `file`, `update` |
 //!
 //! The command line (`src/cli`, feature `cli`) is a user of this library like any other: what
 //! decides is here, and what prints is there.
@@ -39,6 +40,8 @@ mod setters;
 pub mod bus;
 pub mod device;
 pub mod file;
+#[cfg(feature = "ui")]
+pub mod ui;
 pub mod update;
 
 pub use bus::Adapter;

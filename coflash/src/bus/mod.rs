@@ -10,7 +10,7 @@ pub mod gateway;
 mod hex;
 pub mod hub;
 mod link;
-mod open;
+pub(crate) mod open;
 mod sdo_ids;
 pub mod slcan;
 #[cfg(target_os = "linux")]

@@ -63,7 +63,7 @@ pub fn open_at(url: &str, bit_rate: Option<u32>) -> Result<Box<dyn Adapter + Sen
 }
 
 /// `500k`, `1M`, `125000`, in bit/s.
-fn parse_bit_rate(text: &str) -> Option<u32> {
+pub(crate) fn parse_bit_rate(text: &str) -> Option<u32> {
     let (digits, unit) = match text.strip_suffix(['k', 'K']) {
         Some(digits) => (digits, 1000),
         None => match text.strip_suffix('M') {

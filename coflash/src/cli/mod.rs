@@ -31,6 +31,8 @@ mod read;
 mod reset;
 mod scan;
 mod shell;
+#[cfg(feature = "ui")]
+mod ui;
 mod values;
 
 /// Converts firmware and flashes it over CANopen.
@@ -87,6 +89,8 @@ enum Command {
     Debug(debug::Debug),
     Monitor(monitor::Monitor),
     Shell(shell::Shell),
+    #[cfg(feature = "ui")]
+    Ui(ui::Ui),
     Completions(generate::Completions),
     Man(generate::Manual),
 }
@@ -111,6 +115,8 @@ impl Command {
             Self::Debug(debug) => debug.run(context),
             Self::Monitor(monitor) => monitor.run(context),
             Self::Shell(shell) => shell.run(context, shell_line),
+            #[cfg(feature = "ui")]
+            Self::Ui(ui) => ui.run(context),
             Self::Completions(completions) => completions.run(Cli::command()),
             Self::Man(manual) => manual.run(context, Cli::command()),
         }

@@ -1,0 +1,51 @@
+//! `coflash ui`: the page in the browser.
+
+use clap::Args;
+use coflash::ui::{Options, Server};
+use serde_json::json;
+
+use super::context::Context;
+use super::device::cancelled;
+use super::output::Failure;
+
+/// Serves a page in the browser, to this machine alone: scan, update, LSS and the bus in words.
+///
+/// The page is at the URL that is printed, with a random token in it: who knows it may do all that
+/// the page can. Ctrl-C ends it, and an update that is running in order.
+#[derive(Debug, Args)]
+pub(super) struct Ui {
+    /// The port on 127.0.0.1; otherwise a free one.
+    #[arg(long, value_name = "PORT", default_value = "0", hide_default_value = true)]
+    port: u16,
+
+    /// Print the URL, and open no browser.
+    #[arg(long)]
+    no_open: bool,
+}
+
+impl Ui {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        let end = cancelled()?;
+        let mut options = Options::default();
+        options.bus = context.bus.clone();
+        options.port = self.port;
+        let server = Server::new(options).map_err(|error| {
+            Failure::system(format!("port {} of 127.0.0.1 cannot be served: {error}", self.port))
+        })?;
+        let url = server.url();
+        context
+            .out
+            .result(format_args!("{url}  (Ctrl-C ends it)"), || json!({ "command": "ui", "url": url }));
+        if !self.no_open && open::that_detached(&url).is_err() {
+            context.out.warn("no browser was found: open the URL yourself");
+        }
+        let left = server
+            .run(&end)
+            .map_err(|error| Failure::system(format!("the page cannot be served: {error}")))?;
+        match left {
+            Some(words) => context.out.warn(format_args!("an update was running: {words}")),
+            None => context.out.say("the page has ended"),
+        }
+        Ok(())
+    }
+}

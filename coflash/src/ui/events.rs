@@ -1,0 +1,120 @@
+//! The stream of events to a page: the whole state whenever it has changed, seconds for the plot, and
+//! frames in words for who wants them.
+//!
+//! Nothing is queued for a reader: each pass takes what is there by then. One that reads slowly
+//! misses states that others have replaced, and frames that are too old; one that stops reading is
+//! dropped by its connection's time-out.
+
+use std::convert::Infallible;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::response::sse::{Event, Sse};
+use futures_util::stream::{self, Stream};
+use serde_json::{json, Value};
+use tokio::sync::watch;
+use tokio::time::sleep;
+
+use super::frames::wall;
+use super::shared::{lock, Shared};
+
+/// The shortest time between two events.
+const PACE: Duration = Duration::from_millis(150);
+/// The longest: from silence a page concludes that the connection is lost.
+const BEAT: Duration = Duration::from_secs(1);
+/// Readers at a time.
+const READERS: usize = 32;
+
+/// How many read.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Readers(Arc<AtomicUsize>);
+
+impl Readers {
+    pub(super) fn count(&self) -> usize {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
+/// One of them, as long as it lives.
+struct Place(Readers);
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        self.0 .0.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+struct Reader {
+    shared: Arc<Shared>,
+    changed: watch::Receiver<u64>,
+    arrived: watch::Receiver<u64>,
+    /// The number of the last frame that it has, if it wants frames.
+    frames: Option<u64>,
+    /// The last second of the plot that it has.
+    second: u64,
+    /// The version of the state that it has; 0 for none.
+    version: u64,
+    _place: Place,
+}
+
+/// A stream for one more reader; `None` where there are too many.
+pub(super) fn stream(
+    shared: Arc<Shared>,
+    readers: &Readers,
+    frames: bool,
+) -> Option<Sse<impl Stream<Item = Result<Event, Infallible>>>> {
+    let before = readers.0.fetch_add(1, Ordering::Relaxed);
+    let place = Place(readers.clone());
+    if before >= READERS {
+        return None;
+    }
+    let reader = Reader {
+        changed: shared.changed.subscribe(),
+        arrived: shared.arrived.subscribe(),
+        frames: frames.then_some(0),
+        second: 0,
+        version: 0,
+        shared,
+        _place: place,
+    };
+    Some(Sse::new(stream::unfold(reader, |mut reader| async {
+        let value = reader.next().await;
+        Some((Ok(Event::default().data(value.to_string())), reader))
+    })))
+}
+
+impl Reader {
+    /// Waits until there is something to tell, or it is time to say that there is not.
+    async fn next(&mut self) -> Value {
+        if self.version != 0 {
+            sleep(PACE).await;
+            let wants_frames = self.frames.is_some();
+            // Should the other side of a watch go, the beat goes on.
+            tokio::select! {
+                Ok(()) = self.changed.changed() => {}
+                Ok(()) = self.arrived.changed(), if wants_frames => {}
+                () = sleep(BEAT) => {}
+            }
+        }
+        let mut value = json!({});
+        let version = *self.changed.borrow_and_update();
+        if version != self.version {
+            self.version = version;
+            value["state"] = self.shared.look(|state| json!(state));
+        }
+        let now = wall().as_secs();
+        let frames = lock(&self.shared.frames);
+        let seconds = frames.seconds_after(self.second, now);
+        self.second = seconds.last().map_or(self.second, |last| last.second);
+        value["now"] = now.into();
+        value["seconds"] = json!(seconds);
+        if let Some(last) = self.frames {
+            self.arrived.mark_unchanged();
+            value["frames"] = json!(frames.rows_after(last));
+            self.frames = Some(frames.count());
+        }
+        value["count"] = frames.count().into();
+        value
+    }
+}

@@ -1,0 +1,170 @@
+//! The firmware file that was dropped on the page.
+
+use std::sync::Arc;
+
+use shared_abi::label;
+use shared_abi::layout;
+
+use super::state::{Firmware, Notice, Settings};
+use crate::file::convert::{blocks_of, ConvertError, Options, Region};
+use crate::file::inspect::{Inspection, Version};
+use crate::file::{self, AddressRange, BlockFile, Format};
+
+/// The most bytes of a file: an ELF of the largest program with all that a debugger wants to know.
+pub(super) const FILE_MAX: usize = 32 * 1024 * 1024;
+/// The longest name that is shown.
+const NAME_MAX: usize = 120;
+
+/// A file that was read, checked and cut into blocks.
+#[derive(Debug)]
+pub(super) struct Loaded {
+    /// The file itself: other settings make other blocks of it.
+    pub(super) bytes: Arc<Vec<u8>>,
+    pub(super) blocks: Arc<BlockFile>,
+    pub(super) shown: Firmware,
+}
+
+/// Reads a file and makes its blocks.
+pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Result<Loaded, Notice> {
+    let name = printable(name);
+    let bad = |error: &dyn std::fmt::Display| {
+        let advice = "choose the firmware file itself: Intel HEX, S-record, ELF or block file; a raw binary \
+                      (.bin) needs a board that says where it belongs";
+        Notice::failed(error.to_string(), advice)
+    };
+    if bytes.len() > FILE_MAX {
+        let words = format!("{name}: {} bytes are more than any program has", bytes.len());
+        return Err(Notice::failed(words, "choose the firmware file itself"));
+    }
+    let region = region(settings)?;
+    // A raw file looks like nothing in particular: its name tells it, and the board its place.
+    let raw = name.to_lowercase().ends_with(".bin");
+    let (format, place) = match (Format::detect(&bytes), region) {
+        (Some(format), _) => (Some(format), None),
+        (None, Some(region)) if raw => (Some(Format::Raw), Some(region.first)),
+        (None, _) if raw && !bytes.is_empty() => {
+            let words = format!("{name}: a raw binary does not say where it belongs");
+            return Err(Notice::failed(words, "choose the board"));
+        }
+        (None, _) => (None, None),
+    };
+    let firmware = file::read(&bytes, format, place).map_err(|error| bad(&error.of(&name)))?;
+    let inspection = format.map(|format| Inspection::of(&firmware, format));
+    let options = Options::default().region(region.map_or(Region::Unknown, Region::Strict));
+    let converted = blocks_of(firmware, &options).map_err(|error| match error {
+        ConvertError::File(error) => bad(&error.of(&name)),
+        error => bad(&format!("{name}: {error}")),
+    })?;
+    let blocks = converted.file;
+    let label = label_of(&blocks);
+    let shown = Firmware {
+        size: bytes.len(),
+        inspection: inspection.as_ref().map(Inspection::to_string).unwrap_or_default(),
+        program_size: blocks.program_size(),
+        crc: blocks.program_crc(),
+        vendor_id: label.as_ref().map(|label| label.0),
+        product_code: label.as_ref().map(|label| label.1),
+        version: inspection
+            .and_then(|inspection| inspection.software_version)
+            .or(label.and_then(|label| label.2)),
+        left_out: converted.left_out,
+        name,
+    };
+    Ok(Loaded { bytes, blocks: Arc::new(blocks), shown })
+}
+
+/// For whom the program is: vendor-ID, product code and version, out of block 0 or behind the
+/// vectors.
+fn label_of(file: &BlockFile) -> Option<(u32, u32, Option<String>)> {
+    use shared_abi::block_file::Control;
+    match *file.control() {
+        Control::Identity(identity) => Some((identity.vendor_id, identity.product_code, None)),
+        Control::Dated { identity, version, .. } => {
+            Some((identity.vendor_id, identity.product_code, Some(Version(version).to_string())))
+        }
+        Control::Plain => {
+            let first = file.program_start().checked_add(label::OFFSET)?;
+            let last = first.checked_add(label::SIZE as u32 - 1)?;
+            let part = file.image().part(AddressRange { first, last })?;
+            let (start, bytes) = part.segments().next()?;
+            let bytes = bytes.first_chunk().filter(|_| start == first)?;
+            let label = label::Label::parse(bytes)?;
+            Some((label.vendor_id, label.product_code, Some(format!("{:08X}h", label.version))))
+        }
+    }
+}
+
+/// Where the board has the program, if a board is named.
+fn region(settings: &Settings) -> Result<Option<AddressRange>, Notice> {
+    let Some(layout) = settings.board.and_then(layout::by_name) else { return Ok(None) };
+    match layout.program(settings.program) {
+        Some(region) => Ok(Some(region.into())),
+        None => {
+            let words = format!("{} has no program {}", layout.board, settings.program);
+            Err(Notice::failed(words, format!("its programs are 1 to {}", layout.programs.len())))
+        }
+    }
+}
+
+/// A name from outside: one line, not too long, nothing that moves a cursor or turns text around.
+fn printable(name: &str) -> String {
+    let base = name.rsplit(['/', '\\']).next().unwrap_or(name);
+    let visible = |c: char| if c.is_alphanumeric() || c.is_ascii_graphic() || c == ' ' { c } else { '_' };
+    let name: String = base.chars().take(NAME_MAX).map(visible).collect();
+    if name.trim().is_empty() {
+        "the file".to_string()
+    } else {
+        name
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn words(bytes: &[u8], name: &str) -> String {
+        match load(Arc::new(bytes.to_vec()), name, &Settings::default()) {
+            Ok(loaded) => format!("{:?}", loaded.shown),
+            Err(notice) => notice.words,
+        }
+    }
+
+    #[test]
+    fn what_is_no_firmware_is_refused_with_its_name() {
+        assert_eq!(words(b"", "a.hex"), "a.hex: is empty");
+        assert!(words(b"<!doctype html><p>404", "app.hex").starts_with("app.hex: is no firmware file"));
+        assert!(words(&[0; 100], "app.bin").contains("a raw binary does not say where it belongs"));
+        assert!(words(b":020000040801F1\n", "app.hex").starts_with("app.hex: "));
+    }
+
+    /// Four bytes of Intel HEX at 0801_0000h; the CRC is what GNU `gzip` says of EFh BEh ADh DEh.
+    #[test]
+    fn a_program_is_read_and_a_board_judges_its_place() {
+        let hex = b":020000040801F1\n:04000000EFBEADDEC4\n:00000001FF\n".to_vec();
+        let loaded = load(Arc::new(hex.clone()), "../x/app.hex", &Settings::default()).unwrap();
+        assert_eq!((loaded.shown.name.as_str(), loaded.shown.program_size), ("app.hex", 4));
+        assert!(loaded.shown.inspection.starts_with("Intel HEX, well-formed"), "{}", loaded.shown.inspection);
+        assert_eq!(loaded.shown.vendor_id, None);
+        let board = Settings { board: Some("stm32f407g-disc1"), program: 1 };
+        assert!(load(Arc::new(hex), "app.hex", &board).is_ok());
+        let outside = b":020000040800F2\n:04000000EFBEADDEC4\n:00000001FF\n".to_vec();
+        let refused = load(Arc::new(outside), "app.hex", &board).unwrap_err();
+        assert!(refused.words.starts_with("app.hex"), "{}", refused.words);
+        let raw = load(Arc::new(vec![1, 2, 3, 4]), "app.bin", &board).unwrap();
+        assert_eq!(raw.shown.program_size, 4);
+        let two = Settings { program: 9, ..board };
+        assert!(load(Arc::new(vec![1, 2, 3, 4]), "app.bin", &two)
+            .unwrap_err()
+            .words
+            .contains("no program 9"));
+    }
+
+    #[test]
+    fn a_name_is_one_line_of_text() {
+        assert_eq!(printable("a/b\\c.hex"), "c.hex");
+        assert_eq!(printable("a\n\u{202E}b"), "a__b");
+        assert_eq!(printable("\u{7}").len(), 1);
+        assert_eq!(printable("  "), "the file");
+        assert_eq!(printable(&"x".repeat(500)).len(), NAME_MAX);
+    }
+}

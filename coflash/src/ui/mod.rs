@@ -1,0 +1,38 @@
+//! The page in the browser: a server on 127.0.0.1 for those who do not type (`coflash ui`).
+//!
+//! One thread owns the bus (`worker`) and does one thing after the other; the pages see one state
+//! (`state`), by server-sent events (`events`), and ask for things by requests (`http`), which only
+//! those get through who know the token in the URL (`guard`). The page itself (`page/`) is plain
+//! HTML, CSS and JavaScript, part of the program, and needs neither a build step nor a network.
+//!
+//! | module | what it does |
+//! |---|---|
+//! | `server` | connections, and their limits |
+//! | `guard` | who may ask |
+//! | `http` | what is answered to which request |
+//! | `events` | the stream of events to a page |
+//! | `state` | what all pages show |
+//! | `shared` | what server and bus thread share |
+//! | `worker` | the thread that owns the bus |
+//! | `job` | what can be done |
+//! | `work` | how it is done, by the rest of the library |
+//! | `firmware` | the file that was dropped on the page |
+//! | `frames` | what goes over the bus, in words, counted, and as a log |
+//! | `load` | how long a frame keeps the bus busy |
+//! | `adapters` | what this machine has |
+
+mod adapters;
+mod events;
+mod firmware;
+mod frames;
+mod guard;
+mod http;
+mod job;
+mod load;
+mod server;
+mod shared;
+mod state;
+mod work;
+mod worker;
+
+pub use self::server::{Options, Server};

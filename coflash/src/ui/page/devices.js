@@ -1,0 +1,173 @@
+// The table of devices, and what can be done with them.
+
+import { ask } from "./api.js";
+import { $, el, facts, hex, text } from "./dom.js";
+
+/** Nodes that the user has chosen. */
+const chosen = new Set();
+let shown = "";
+let state = null;
+
+const devices = () => Object.values(state?.devices ?? {});
+const program = (device) => device.programs.find((one) => one.number === state.settings.program);
+
+/** Shows the devices. The rows are made anew only when one has changed. */
+export function show(next) {
+  state = next;
+  const list = devices();
+  for (const node of chosen) if (!list.some((device) => device.node === node)) chosen.delete(node);
+  const now = JSON.stringify([list, state.settings.program]);
+  if (now !== shown) {
+    shown = now;
+    rows(list);
+  }
+  $("table").hidden = list.length === 0;
+  $("no-devices").hidden = list.length !== 0;
+  text($("no-devices"), state.devices === null
+    ? "The bus has not been searched yet."
+    : "Nobody answers, and nobody is heard.");
+  buttons();
+}
+
+function rows(list) {
+  const focused = document.activeElement?.dataset?.key;
+  $("rows").replaceChildren(...list.map(row));
+  if (focused) document.querySelector(`[data-key="${CSS.escape(focused)}"]`)?.focus();
+}
+
+function row(device) {
+  const one = program(device);
+  const cell = (label, ...content) => el("td", { role: "cell", "data-label": label }, ...content);
+  const name = `Node ${device.node}`;
+  const check = el("input", {
+    type: "checkbox", "data-key": `choose-${device.node}`, "aria-label": `Choose node ${device.node}`,
+    onchange: (event) => {
+      if (event.target.checked) chosen.add(device.node);
+      else chosen.delete(device.node);
+      buttons();
+    },
+  });
+  check.checked = chosen.has(device.node);
+  const verdict = device.verdict;
+  return el("tr", { role: "row", "data-node": device.node, class: device.answers ? "" : "silent" },
+    cell("Choose", check),
+    cell("Node", el("strong", {}, String(device.node))),
+    cell("Name", device.name ?? "not told"),
+    cell("Runs", device.runs, device.heartbeat ? el("span", { class: "faint" }, ` · ${device.heartbeat}`) : null),
+    cell("Version", device.software ?? "not told"),
+    cell("CRC", el("code", {}, one?.crc ? hex(one.crc) : "–")),
+    cell("Program", one?.words ?? "not told"),
+    cell("The file", verdict ? el("span", { class: `verdict ${verdict.fits}` }, verdict.words) : "–"),
+    el("td", { role: "cell", class: "more" },
+      el("button", {
+        type: "button", "data-key": `more-${device.node}`, "aria-label": `More about node ${device.node}`,
+        "aria-haspopup": "dialog", title: name, onclick: () => open(device.node),
+      }, "More …")),
+  );
+}
+
+/** What can be pressed now, and why not. */
+function buttons() {
+  const list = devices();
+  const busy = state.task !== null;
+  const ready = state.adapter.state === "open" && !busy;
+  for (const id of ["scan", "fastscan", "assign"]) $(id).disabled = !ready;
+  for (const id of ["connect", "disconnect", "board", "program", "file"]) $(id).disabled = busy;
+  $("drop").classList.toggle("off", busy);
+  $("all").checked = list.length > 0 && chosen.size === list.length;
+  $("all").indeterminate = chosen.size > 0 && chosen.size < list.length;
+  const count = chosen.size;
+  text($("update"), count === 0 ? "Update" : count === 1 ? `Update node ${[...chosen][0]}` : `Update ${count} devices`);
+  const why = busy ? "" : state.adapter.state !== "open" ? "Connect to an adapter first."
+    : !state.firmware ? "Choose a firmware file first." : count === 0 ? "Choose a device in the table." : "";
+  $("update").disabled = busy || why !== "";
+  text($("update-hint"), why);
+}
+
+let opened = null;
+
+function open(node) {
+  opened = node;
+  const device = state.devices?.[node];
+  if (!device) return;
+  const [vendor, product, revision, serial] = device.identity.map(hex);
+  text($("device-head"), `Node ${node}`);
+  facts($("device-facts"), [
+    ["Runs", device.runs],
+    ["Name", device.name ?? "not told"],
+    ["Hardware", device.hardware ?? "not told"],
+    ["Software", device.software ?? "not told"],
+    ["Vendor-ID", vendor], ["Product code", product], ["Revision", revision], ["Serial number", serial],
+    ["Dialect", device.dialect ?? "not told"],
+    ...device.programs.map((one) => [`Program ${one.number}`, `${one.words}${one.crc ? `, CRC ${hex(one.crc)}` : ""}`]),
+  ]);
+  const off = state.task !== null || state.adapter.state !== "open";
+  for (const button of $("device").querySelectorAll("[data-step]")) button.disabled = off;
+  $("use-address").disabled = device.identity.some((part) => part === null);
+  $("device").showModal();
+}
+
+export function start() {
+  $("scan").addEventListener("click", () => ask("scan"));
+  $("cancel").addEventListener("click", () => ask("cancel"));
+  $("all").addEventListener("change", (event) => {
+    chosen.clear();
+    if (event.target.checked) devices().forEach((device) => chosen.add(device.node));
+    shown = "";
+    show(state);
+  });
+  $("update-form").addEventListener("submit", (event) => {
+    event.preventDefault();
+    ask("update", { nodes: [...chosen].sort((a, b) => a - b), trial: $("trial").checked, start: $("start").checked });
+  });
+  for (const button of $("device").querySelectorAll("[data-step]")) {
+    button.addEventListener("click", () => step(button.dataset.step));
+  }
+  $("confirm").addEventListener("close", () => {
+    if ($("confirm").returnValue === "yes") ask("step", { node: opened, program: state.settings.program, step: "erase" });
+    $("confirm").returnValue = "";
+  });
+  $("use-address").addEventListener("click", () => {
+    state.devices?.[opened]?.identity.forEach((part, index) => ($(`lss-${index}`).value = hex(part)));
+    $("device").close();
+    $("lss-node").focus();
+  });
+}
+
+function step(name) {
+  $("device").close();
+  if (name === "erase") {
+    text($("confirm-words"), `Program ${state.settings.program} of node ${opened} will be gone. The device stays in ` +
+      "its bootloader until it gets another one.");
+    $("confirm").showModal();
+    return;
+  }
+  ask("step", { node: opened, program: state.settings.program, step: name });
+}
+
+/** A bar for each device of the update. */
+export function updates(list) {
+  const box = $("updates");
+  const now = list.map((one) => one.node).join();
+  if (box.dataset.nodes !== now) {
+    box.dataset.nodes = now;
+    box.replaceChildren(...list.map((one) => el("div", { class: "update", "data-node": one.node },
+      el("strong", {}, `Node ${one.node}`),
+      el("progress", { max: "1", value: "0", "aria-label": `Update of node ${one.node}` }),
+      el("span", { class: "percent" }),
+      el("p", { class: "words" }),
+      el("details", {}, el("summary", {}, "Steps"), el("ol", {})),
+    )));
+  }
+  list.forEach((one, index) => {
+    const line = box.children[index];
+    line.dataset.phase = one.phase;
+    const part = one.phase === "done" ? 1 : one.total > 0 ? one.done / one.total : 0;
+    const bar = line.querySelector("progress");
+    bar.value = part;
+    text(line.querySelector(".percent"), `${Math.floor(part * 100)} %`);
+    text(line.querySelector(".words"), one.words + (one.advice ? " " + one.advice.charAt(0).toUpperCase() + one.advice.slice(1) + "." : ""));
+    const steps = line.querySelector("ol");
+    if (steps.children.length !== one.lines.length) steps.replaceChildren(...one.lines.map((words) => el("li", {}, words)));
+  });
+}

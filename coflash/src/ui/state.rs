@@ -1,0 +1,425 @@
+//! What all pages show: one state, which each change sends to each of them.
+
+use std::collections::BTreeMap;
+
+use canopen::program::ProgramState;
+use canopen::NodeId;
+use serde::Serialize;
+
+use crate::bus::decode::state_words;
+use crate::device::info::{DeviceInfo, ProgramInfo};
+use crate::device::lss::LssAddress;
+use crate::device::scan::Found;
+use crate::device::Error;
+use crate::update::Event;
+
+/// Reports that are kept; the oldest goes first.
+const REPORTS: usize = 500;
+/// Lines of one device's update that are kept.
+const LINES: usize = 60;
+
+/// All of it, as the page gets it.
+#[derive(Clone, Debug, Default, Serialize)]
+pub(super) struct State {
+    pub(super) adapter: Adapter,
+    /// `None` until the bus has been searched.
+    pub(super) devices: Option<BTreeMap<u8, Device>>,
+    pub(super) settings: Settings,
+    pub(super) firmware: Option<Firmware>,
+    /// What is being done; one thing at a time.
+    pub(super) task: Option<Task>,
+    /// The devices of the update that runs, or of the last one.
+    pub(super) updates: Vec<Update>,
+    /// How the last task, or the last try to open the adapter, went.
+    pub(super) notice: Option<Notice>,
+    /// How many notices there were: tells a new one with the same words.
+    pub(super) notices: u64,
+    /// The device that fastscan has found.
+    pub(super) lss: Option<Lss>,
+    pub(super) readback: Option<Readback>,
+    pub(super) reports: Vec<Report>,
+}
+
+/// The way to the bus.
+#[derive(Clone, Debug, Default, Serialize)]
+pub(super) struct Adapter {
+    pub(super) url: String,
+    pub(super) state: Connection,
+    /// Why it is lost.
+    pub(super) words: Option<String>,
+    /// A gateway shows no frames.
+    pub(super) gateway: bool,
+    /// In bit/s, as far as the URL tells it.
+    pub(super) bit_rate: Option<u32>,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Connection {
+    #[default]
+    Closed,
+    Opening,
+    Open,
+    /// It was open, and is tried again and again.
+    Lost,
+}
+
+/// How files are read, and which program is meant.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Settings {
+    /// The board that tells where a program may lie.
+    pub(super) board: Option<&'static str>,
+    /// Sub-index of 1F50h.
+    pub(super) program: u8,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { board: None, program: 1 }
+    }
+}
+
+/// A node that was seen or heard.
+#[derive(Clone, Debug, Default, Serialize)]
+pub(super) struct Device {
+    pub(super) node: u8,
+    pub(super) answers: bool,
+    /// Whether the bootloader runs.
+    pub(super) bootloader: bool,
+    /// What runs, in words.
+    pub(super) runs: String,
+    pub(super) name: Option<String>,
+    pub(super) hardware: Option<String>,
+    pub(super) software: Option<String>,
+    /// 1018h/1 to 4.
+    pub(super) identity: [Option<u32>; 4],
+    /// NMT state of the last heartbeat.
+    pub(super) heartbeat: Option<&'static str>,
+    pub(super) dialect: Option<&'static str>,
+    pub(super) programs: Vec<Program>,
+    /// What the firmware file's label says against this device.
+    pub(super) verdict: Option<Verdict>,
+}
+
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Program {
+    pub(super) number: u8,
+    pub(super) crc: Option<u32>,
+    /// None, stopped, running; and what the flash status says.
+    pub(super) words: String,
+}
+
+/// A file against a device.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub(super) struct Verdict {
+    pub(super) fits: Fits,
+    pub(super) words: String,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Fits {
+    Yes,
+    No,
+    /// File or device does not say it.
+    Unknown,
+}
+
+/// The firmware file that was chosen.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Firmware {
+    pub(super) name: String,
+    pub(super) size: usize,
+    /// What `inspect` says.
+    pub(super) inspection: String,
+    /// What the conversion to blocks made of it.
+    pub(super) program_size: u32,
+    pub(super) crc: u32,
+    pub(super) vendor_id: Option<u32>,
+    pub(super) product_code: Option<u32>,
+    pub(super) version: Option<String>,
+    /// Bytes that the conversion left out.
+    pub(super) left_out: u64,
+}
+
+/// What is being done.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Task {
+    pub(super) kind: &'static str,
+    pub(super) words: String,
+    pub(super) cancelling: bool,
+    /// Of 100, where that is known.
+    pub(super) percent: Option<u32>,
+}
+
+/// The update of one device.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Update {
+    pub(super) node: u8,
+    pub(super) phase: Phase,
+    pub(super) done: usize,
+    pub(super) total: usize,
+    /// The last thing that happened.
+    pub(super) words: String,
+    pub(super) advice: Option<String>,
+    pub(super) lines: Vec<String>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Phase {
+    Waiting,
+    Running,
+    Done,
+    Failed,
+}
+
+/// How something went.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Notice {
+    pub(super) ok: bool,
+    pub(super) words: String,
+    /// What to do next.
+    pub(super) advice: Option<String>,
+}
+
+/// A device without node-ID.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub(super) struct Lss {
+    pub(super) vendor_id: u32,
+    pub(super) product_code: u32,
+    pub(super) revision: u32,
+    pub(super) serial_number: u32,
+}
+
+/// A program that was read from a device.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Readback {
+    pub(super) node: u8,
+    pub(super) program: u8,
+    pub(super) size: usize,
+}
+
+/// What a run did to a device, to print.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Report {
+    pub(super) number: u64,
+    /// Which run; the devices of one update have the same number.
+    pub(super) run: u64,
+    /// Seconds since 1970, UTC.
+    pub(super) date: u64,
+    pub(super) node: u8,
+    pub(super) ok: bool,
+    pub(super) words: String,
+    pub(super) device: Option<String>,
+    pub(super) serial_number: Option<u32>,
+    pub(super) file: String,
+    /// Of the program that the device has, as it tells it.
+    pub(super) crc: Option<u32>,
+    /// Of the file.
+    pub(super) file_crc: u32,
+    /// What the device tells in 100Ah afterwards.
+    pub(super) version: Option<String>,
+    /// What the file says.
+    pub(super) file_version: Option<String>,
+    pub(super) seconds: f64,
+    pub(super) adapter: String,
+    pub(super) tool: &'static str,
+}
+
+impl State {
+    /// Takes what a scan has found in place of what was known.
+    pub(super) fn found(&mut self, found: &BTreeMap<NodeId, Found>) {
+        let devices = found.iter().map(|(node, found)| {
+            let device = match &found.info {
+                Some(info) => Device::of(info),
+                None => {
+                    Device { node: node.get(), runs: "no answer by SDO".to_string(), ..Device::default() }
+                }
+            };
+            (node.get(), Device { heartbeat: found.state.map(state_words), ..device })
+        });
+        self.devices = Some(devices.collect());
+        self.judge();
+    }
+
+    /// Takes what one device has told anew.
+    pub(super) fn told(&mut self, info: &DeviceInfo) {
+        let devices = self.devices.get_or_insert_default();
+        let heartbeat = devices.get(&info.node.get()).and_then(|device| device.heartbeat);
+        devices.insert(info.node.get(), Device { heartbeat, ..Device::of(info) });
+        self.judge();
+    }
+
+    /// A device that answers no more, or has another node-ID now.
+    pub(super) fn silent(&mut self, node: NodeId) {
+        if let Some(device) = self.devices.as_mut().and_then(|devices| devices.get_mut(&node.get())) {
+            device.answers = false;
+            device.runs = "no answer by SDO".to_string();
+        }
+    }
+
+    /// Holds the file against each device.
+    pub(super) fn judge(&mut self) {
+        let number = self.settings.program;
+        for device in self.devices.iter_mut().flat_map(BTreeMap::values_mut) {
+            device.verdict = self.firmware.as_ref().map(|file| file.against(device, number));
+        }
+    }
+
+    pub(super) fn notice(&mut self, notice: Notice) {
+        self.notices += 1;
+        self.notice = Some(notice);
+    }
+
+    pub(super) fn report(&mut self, report: Report) {
+        if self.reports.len() >= REPORTS {
+            self.reports.remove(0);
+        }
+        self.reports.push(report);
+    }
+
+    /// The number of the next run.
+    pub(super) fn next_run(&self) -> u64 {
+        self.reports.last().map_or(1, |report| report.run + 1)
+    }
+}
+
+impl Device {
+    fn of(info: &DeviceInfo) -> Self {
+        Self {
+            node: info.node.get(),
+            answers: true,
+            bootloader: info.device_type.is_bootloader(),
+            runs: if info.device_type.is_bootloader() { "bootloader" } else { "application" }.to_string(),
+            name: info.name.clone(),
+            hardware: info.hardware_version.clone(),
+            software: info.software_version.clone(),
+            identity: info.identity,
+            heartbeat: None,
+            dialect: info.dialect.map(|dialect| dialect.name()),
+            programs: info.programs.iter().map(Program::of).collect(),
+            verdict: None,
+        }
+    }
+
+    /// What 1018h/1 and 1018h/2 read, where they say something: 0 is nobody.
+    pub(super) fn product(&self) -> Option<(u32, u32)> {
+        match (self.identity[0], self.identity[1]) {
+            (Some(vendor), Some(product)) if vendor != 0 || product != 0 => Some((vendor, product)),
+            _ => None,
+        }
+    }
+
+    /// The CRC of one of its programs.
+    pub(super) fn crc(&self, number: u8) -> Option<u32> {
+        self.programs.iter().find(|program| program.number == number).and_then(|program| program.crc)
+    }
+}
+
+impl Program {
+    fn of(info: &ProgramInfo) -> Self {
+        const STOPPED: u32 = ProgramState::Stopped as u32;
+        const RUNNING: u32 = ProgramState::Running as u32;
+        const ABSENT: u32 = ProgramState::Absent as u32;
+        let mut words = match info.control {
+            // 1F56h reads 0 where there is no program that could be stopped.
+            Some(STOPPED) if info.crc == Some(0) => "none".to_string(),
+            Some(STOPPED) => "stopped".to_string(),
+            Some(RUNNING) => "running".to_string(),
+            Some(ABSENT) => "none".to_string(),
+            Some(other) => format!("state {other:02X}h"),
+            None => "not told".to_string(),
+        };
+        match info.status {
+            Some(status) if status.busy => words += ", busy",
+            Some(status) => {
+                if let Some(error) = status.error {
+                    words += &format!(", {error} ({:02X}h)", error.code());
+                }
+            }
+            None => {}
+        }
+        Self { number: info.number, crc: info.crc, words }
+    }
+}
+
+impl Firmware {
+    /// What the file says against a device.
+    fn against(&self, device: &Device, number: u8) -> Verdict {
+        let verdict = |fits, words: String| Verdict { fits, words };
+        let told = match (self.vendor_id, self.product_code) {
+            (Some(vendor), Some(product)) if vendor != 0 || product != 0 => Some((vendor, product)),
+            _ => None,
+        };
+        match (told, device.product()) {
+            (Some((file, _)), Some((own, _))) if file != own => {
+                verdict(Fits::No, format!("made for vendor-ID {file:08X}h, this device has {own:08X}h"))
+            }
+            (Some((_, file)), Some((_, own))) if file != own => {
+                verdict(Fits::No, format!("made for product code {file:08X}h, this device has {own:08X}h"))
+            }
+            _ if device.crc(number) == Some(self.crc) => {
+                verdict(Fits::Yes, "in the device already (same CRC)".to_string())
+            }
+            (Some(_), Some(_)) => verdict(Fits::Yes, "made for this product".to_string()),
+            (None, _) => verdict(Fits::Unknown, "the file does not say for which device it is".to_string()),
+            (_, None) => verdict(Fits::Unknown, "the device does not say which product it is".to_string()),
+        }
+    }
+}
+
+impl Update {
+    pub(super) fn waiting(node: NodeId) -> Self {
+        Self {
+            node: node.get(),
+            phase: Phase::Waiting,
+            done: 0,
+            total: 0,
+            words: "waiting for its turn".to_string(),
+            advice: None,
+            lines: Vec::new(),
+        }
+    }
+
+    /// Takes what happens to it.
+    pub(super) fn event(&mut self, event: &Event) {
+        self.phase = Phase::Running;
+        if let Event::Progress { done, total } = *event {
+            (self.done, self.total) = (done, total);
+            self.words = "sending the program".to_string();
+            return;
+        }
+        self.words = event.to_string();
+        if self.lines.len() < LINES {
+            self.lines.push(self.words.clone());
+        }
+    }
+
+    pub(super) fn failed(&mut self, error: &Error, left: &str) {
+        self.phase = Phase::Failed;
+        self.words = format!("{error}. The device: {left}.");
+        self.advice = Some(error.advice());
+    }
+}
+
+impl Notice {
+    pub(super) fn done(words: impl Into<String>) -> Self {
+        Self { ok: true, words: words.into(), advice: None }
+    }
+
+    pub(super) fn failed(words: impl Into<String>, advice: impl Into<String>) -> Self {
+        Self { ok: false, words: words.into(), advice: Some(advice.into()) }
+    }
+
+    pub(super) fn error(error: &Error) -> Self {
+        Self::failed(error.to_string(), error.advice())
+    }
+}
+
+impl From<LssAddress> for Lss {
+    fn from(address: LssAddress) -> Self {
+        let LssAddress { vendor_id, product_code, revision, serial_number } = address;
+        Self { vendor_id, product_code, revision, serial_number }
+    }
+}

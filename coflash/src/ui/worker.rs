@@ -1,0 +1,148 @@
+//! The thread that owns the bus: it opens the adapter, listens while nothing is to be done, and does
+//! one thing after the other. Pages come and go; it stays.
+
+use std::panic::{catch_unwind, AssertUnwindSafe};
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::frames::Tap;
+use super::shared::{Order, Shared};
+use super::state::{Adapter, Connection, Notice};
+use super::work;
+use crate::bus::{open::parse_bit_rate, AdapterError, Link};
+
+/// How long it listens before it looks whether it was told something.
+const SLICE: Duration = Duration::from_millis(50);
+/// How long a lost adapter is left alone until it is tried again.
+const AGAIN: Duration = Duration::from_secs(1);
+
+/// The adapter.
+enum Bus {
+    Closed,
+    Open {
+        url: String,
+        link: Link,
+    },
+    /// It is gone; when it is tried next.
+    Lost {
+        url: String,
+        next: Instant,
+    },
+}
+
+/// Works until nobody can tell it anything any more.
+pub(super) fn run(shared: &Arc<Shared>, orders: &Receiver<Order>) {
+    let mut bus = Bus::Closed;
+    loop {
+        let order = match &mut bus {
+            // Its wait is the adapter's.
+            Bus::Open { link: Link::Bus(_), .. } => orders.recv_timeout(Duration::ZERO),
+            Bus::Closed | Bus::Lost { .. } | Bus::Open { .. } => orders.recv_timeout(SLICE),
+        };
+        bus = match (order, bus) {
+            (Err(RecvTimeoutError::Disconnected), _) => return,
+            (Ok(Order::Open(url)), _) => open(shared, url),
+            (Ok(Order::Close), _) => {
+                shared.change(|state| state.adapter = Adapter::default());
+                Bus::Closed
+            }
+            (Ok(Order::Run(job)), Bus::Open { url, mut link }) => {
+                // A fault of ours must not leave the page waiting for ever.
+                let done = catch_unwind(AssertUnwindSafe(|| work::run(job, &mut link, shared)));
+                let notice = done.unwrap_or_else(|_| {
+                    Notice::failed("coflash has a fault of its own", "start coflash ui again and report it")
+                });
+                shared.change(|state| {
+                    state.task = None;
+                    state.notice(notice);
+                });
+                Bus::Open { url, link }
+            }
+            (Ok(Order::Run(_)), bus) => {
+                shared.change(|state| {
+                    state.task = None;
+                    state.notice(Notice::failed("the adapter is gone", "wait until it is back"));
+                });
+                bus
+            }
+            (Err(RecvTimeoutError::Timeout), Bus::Open { url, link }) => listen(shared, url, link),
+            (Err(RecvTimeoutError::Timeout), Bus::Lost { url, next }) if next <= Instant::now() => {
+                reopen(shared, url)
+            }
+            (Err(RecvTimeoutError::Timeout), bus) => bus,
+        };
+    }
+}
+
+/// Opens an adapter, frames noted.
+fn link(shared: &Shared, url: &str) -> Result<Link, AdapterError> {
+    Ok(match Link::open(url, None)? {
+        Link::Bus(adapter) => {
+            let tap = Tap::new(adapter, shared.frames.clone(), shared.arrived.clone());
+            Link::Bus(Box::new(tap))
+        }
+        gateway @ Link::Gateway(_) => gateway,
+    })
+}
+
+fn open(shared: &Shared, url: String) -> Bus {
+    shared.change(|state| {
+        state.adapter = Adapter { url: url.clone(), state: Connection::Opening, ..Adapter::default() };
+        state.devices = None;
+        state.notice = None;
+    });
+    match link(shared, &url) {
+        Ok(link) => opened(shared, url, link),
+        Err(error) => {
+            shared.change(|state| {
+                state.adapter.state = Connection::Closed;
+                state.notice(Notice::failed(error.to_string(), error.advice()));
+            });
+            Bus::Closed
+        }
+    }
+}
+
+fn opened(shared: &Shared, url: String, link: Link) -> Bus {
+    shared.change(|state| {
+        state.adapter.state = Connection::Open;
+        state.adapter.words = None;
+        state.adapter.gateway = matches!(link, Link::Gateway(_));
+        state.adapter.bit_rate = bit_rate(&url);
+    });
+    Bus::Open { url, link }
+}
+
+fn lost(shared: &Shared, url: String, error: &AdapterError) -> Bus {
+    shared.change(|state| {
+        state.adapter.state = Connection::Lost;
+        state.adapter.words = Some(error.to_string());
+    });
+    Bus::Lost { url, next: Instant::now() + AGAIN }
+}
+
+fn reopen(shared: &Shared, url: String) -> Bus {
+    match link(shared, &url) {
+        Ok(link) => opened(shared, url, link),
+        Err(error) => lost(shared, url, &error),
+    }
+}
+
+/// Takes what the bus says by itself. The tap notes it.
+fn listen(shared: &Shared, url: String, mut link: Link) -> Bus {
+    let Link::Bus(adapter) = &mut link else { return Bus::Open { url, link } };
+    match adapter.receive(SLICE) {
+        Ok(_) => Bus::Open { url, link },
+        Err(error) => {
+            // Its place must be free before it is opened again.
+            drop(link);
+            lost(shared, url, &error)
+        }
+    }
+}
+
+/// The bit rate that a URL names behind an `@`, in bit/s.
+fn bit_rate(url: &str) -> Option<u32> {
+    url.strip_prefix("slcan:")?.rsplit_once('@').and_then(|(_, rate)| parse_bit_rate(rate))
+}
