@@ -1,0 +1,514 @@
+"""The page of `coflash ui` in a real Chromium, as a person uses it.
+
+usage: ui_page.py SCENARIO --coflash PROGRAM --node PROGRAM --folder DIR [--bus URL --image FILE] [--pictures DIR]
+
+Each scenario starts its own nodes (coboot-node) and its own `coflash ui`, and looks at nothing but what the page
+shows. What a person does is done by the browser's own input: keys, clicks and drags of files and folders.
+"""
+
+import argparse
+import contextlib
+import os
+import re
+import shutil
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+from playwright.sync_api import expect, sync_playwright
+
+# How long something may take before it counts as hanging, in milliseconds. Nothing is measured with it.
+PATIENCE = int(os.environ.get("P", 120_000))
+expect.set_options(timeout=PATIENCE)
+
+VENDOR, PRODUCT = 0x1A2B, 0x42
+SCENARIOS = {}
+
+
+def scenario(function):
+    SCENARIOS[function.__name__] = function
+    return function
+
+
+class Bench:
+    """Programs, files and browser of one scenario."""
+
+    def __init__(self, arguments, browser, stack):
+        self.arguments, self.browser, self.stack = arguments, browser, stack
+        self.folder = Path(arguments.folder)
+        self.complaints = []
+
+    def free_port(self):
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            return probe.getsockname()[1]
+
+    def spawn(self, *command, until):
+        """Starts a program, and waits for a line with `until`; gives program and line."""
+        # Its errors go where those of this script go.
+        program = subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, text=True)
+        self.stack.callback(end, program)
+        for line in program.stdout:
+            if until in line:
+                return program, line.strip()
+        raise AssertionError(f"{command}: it never says {until!r}")
+
+    def nodes(self, port, *options):
+        node, _ = self.spawn(self.arguments.node, "--listen", f"127.0.0.1:{port}", "--folder", self.folder,
+                             *options, until=f"127.0.0.1:{port}")
+        return node
+
+    def ui(self, bus=None):
+        """Starts the server; gives program and URL."""
+        bus = ["--bus", bus] if bus else []
+        program, line = self.spawn(self.arguments.coflash, *bus, "ui", "--no-open", until="http://127.0.0.1:")
+        return program, re.search(r"http://127\.0\.0\.1:\d+/[0-9a-f]{32}/", line)[0]
+
+    def page(self, url, width=1280, height=900, **options):
+        context = self.browser.new_context(viewport={"width": width, "height": height}, **options)
+        context.set_default_timeout(PATIENCE)
+        page = context.new_page()
+        # A script that fails, or that the page's own policy blocks, says so there. What the server refuses is
+        # told as well, and is no complaint; nor is a connection that is lost on purpose.
+        page.on("console", lambda message: self.complaint(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: self.complaint(str(error)))
+        page.goto(url)
+        expect(page.locator("#version")).to_contain_text("version")
+        return page
+
+    def complaint(self, words):
+        if not words.startswith("Failed to load resource") and "net::ERR" not in words:
+            self.complaints.append(words)
+
+    def image(self, name, size=8 * 1024, seed=1, vendor=VENDOR, product=PRODUCT):
+        """A block file with a program of so many bytes, made by the host tool from a raw image."""
+        words = [0x2001_0000, 0x0801_0201] + [0] * 2
+        body = bytes((seed * 7 + at * 31 + (at >> 8)) & 0xFF for at in range(size - 16))
+        raw, blocks = self.folder / f"{name}.bin", self.folder / f"{name}.blk"
+        raw.write_bytes(struct.pack("<4I", *words) + body)
+        subprocess.run([self.arguments.coflash, "--quiet", "convert", "-I", "binary", "--board", "stm32f407g-disc1",
+                        "--vid", hex(vendor), "--pid", hex(product), raw, blocks], check=True)
+        return blocks
+
+    def picture(self, page, name, what="body"):
+        if self.arguments.pictures:
+            Path(self.arguments.pictures).mkdir(parents=True, exist_ok=True)
+            page.wait_for_timeout(300)
+            page.screenshot(path=f"{self.arguments.pictures}/{name}.png", full_page=what == "all")
+
+
+def end(program):
+    if program.poll() is None:
+        program.kill()
+    program.wait()
+
+
+IDENTITY = ["--vendor-id", hex(VENDOR), "--product-code", hex(PRODUCT)]
+TWO = ["--node", "5", "--count", "2", "--serial", "0x100", "--stand-in", *IDENTITY]
+
+
+def drop(page, *paths):
+    """Drags files or folders from the desktop onto the page, by the browser's own input."""
+    box = page.locator("#drop").bounding_box()
+    at = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+    devtools = page.context.new_cdp_session(page)
+    data = {"items": [], "files": [str(Path(path).resolve()) for path in paths], "dragOperationsMask": 1}
+    for kind in ["dragEnter", "dragOver", "drop"]:
+        devtools.send("Input.dispatchDragEvent", {"type": kind, **at, "data": data})
+    devtools.detach()
+
+
+def connected(page):
+    expect(page.locator("#adapter-state")).to_have_class("pill open")
+
+
+def scan(page, count):
+    page.get_by_role("button", name="Search the bus").click()
+    expect(page.locator("#rows tr")).to_have_count(count)
+    idle(page)
+
+
+def idle(page):
+    expect(page.locator("#task")).to_have_text("Nothing is being done.")
+
+
+def update_line(page, node):
+    return page.locator(f'.update[data-node="{node}"]')
+
+
+def sending(page, node=5):
+    """Waits until the program is being sent: part of it is there, and not all."""
+    page.wait_for_function(
+        "node => { const bar = document.querySelector(`.update[data-node=\"${node}\"] progress`);"
+        " return bar && bar.value > 0.02 && bar.value < 0.95 }", arg=node)
+
+
+@scenario
+def two_nodes(bench):
+    """Two nodes get a program by a file that is dropped; the report has their serial numbers."""
+    port = bench.free_port()
+    bench.nodes(port, *TWO)
+    program, url = bench.ui()
+    page = bench.page(url)
+    expect(page.locator("#update-hint")).to_have_text("Connect to an adapter first.")
+    page.get_by_label("Address of the bus").fill(f"socketcand://127.0.0.1:{port}/can0")
+    page.keyboard.press("Enter")
+    connected(page)
+    # Who reads the address bar or the history gets no more than the page's own address.
+    assert page.url == url, page.url
+    scan(page, 2)
+    expect(page.locator("#rows")).to_contain_text("bootloader")
+    drop(page, bench.image("app", size=300 * 1024))
+    expect(page.locator("#file-facts")).to_contain_text("app.blk")
+    expect(page.locator("#file-facts")).to_contain_text("vendor-ID 00001A2Bh, product code 00000042h")
+    expect(page.locator("#inspection")).to_contain_text("block file")
+    expect(page.locator(".verdict.yes")).to_have_count(2)
+    page.get_by_label("Choose all devices").check()
+    page.get_by_role("button", name="Update 2 devices").click()
+    sending(page)
+    page.locator("#updates").scroll_into_view_if_needed()
+    bench.picture(page, "update", "all")
+    for node in [5, 6]:
+        expect(update_line(page, node)).to_have_attribute("data-phase", "done")
+    idle(page)
+    expect(page.locator("#notice")).to_contain_text("2 of 2 devices updated with app.blk")
+    expect(page.locator("#rows")).to_contain_text("in the device already (same CRC)")
+    expect(page.locator("#rows tr").first).to_contain_text("application")
+    report = page.locator("#report-rows")
+    for serial in ["00000100h", "00000101h"]:
+        expect(report).to_contain_text(serial)
+    # The CRC of the report is the file's, which the host tool tells as well.
+    info = subprocess.run([bench.arguments.coflash, "--json", "inspect", bench.folder / "app.blk"], check=True,
+                          capture_output=True, text=True).stdout
+    crc = f'{int(re.search(r"crc.:([0-9]+),.size.:[0-9]+,.start", info)[1]):08X}h'
+    expect(report.locator("tr").nth(1)).to_contain_text(crc)
+    page.emulate_media(media="print")
+    expect(page.locator("#report-head")).to_be_visible()
+    expect(page.locator("#devices")).to_be_hidden()
+    bench.picture(page, "print", "all")
+    page.emulate_media(media="screen")
+    # What went over the bus stands there in words, and the filter takes its part.
+    page.get_by_label("Show frames with").fill("node 6 heartbeat")
+    expect(page.locator("#frame-rows tr").first).to_contain_text("node 6: heartbeat")
+    expect(page.locator("#frame-rows")).not_to_contain_text("node 5")
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Save the log").click()
+    log = Path(download.value.path()).read_text()
+    first = log.splitlines()[0]
+    assert re.fullmatch(r"\(\d+\.\d{6}\) can0 [0-9A-F]{3}#[0-9A-F]*", first), first
+    assert "605#" in log and "586#" in log, "the transfer is in the log"
+    replay = bench.folder / "page.log"
+    replay.write_text(log)
+    shown = subprocess.run([bench.arguments.coflash, "monitor", "--replay", replay, "--count", "5"], check=True,
+                           capture_output=True, text=True).stdout
+    assert len(shown.splitlines()) == 5, shown
+    # Ctrl-C ends it cleanly.
+    program.send_signal(signal.SIGINT)
+    assert program.wait(timeout=60) == 0
+    expect(page.locator("#lost")).to_be_visible()
+
+
+@scenario
+def unplugged(bench):
+    """The server of the adapter goes away in the middle of an update, and comes back."""
+    port = bench.free_port()
+    node = bench.nodes(port, *TWO)
+    _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
+    page = bench.page(url)
+    connected(page)
+    scan(page, 2)
+    drop(page, bench.image("app", size=300 * 1024))
+    page.get_by_label("Choose node 5").check()
+    page.get_by_role("button", name="Update node 5").click()
+    sending(page)
+    end(node)
+    expect(update_line(page, 5)).to_have_attribute("data-phase", "failed")
+    expect(update_line(page, 5)).to_contain_text("no complete program")
+    expect(page.locator("#adapter-state")).to_have_class("pill lost")
+    expect(page.locator("#adapter-words")).to_contain_text("The adapter is lost")
+    expect(page.locator("#report-rows")).to_contain_text("failed")
+    bench.picture(page, "unplugged", "all")
+    # Nothing can be asked of it meanwhile.
+    expect(page.get_by_role("button", name="Search the bus")).to_be_disabled()
+    bench.nodes(port, *TWO)
+    connected(page)
+    expect(page.locator("#adapter-words")).to_be_hidden()
+    page.get_by_role("button", name="Update node 5").click()
+    expect(update_line(page, 5)).to_have_attribute("data-phase", "done")
+    idle(page)
+
+
+@scenario
+def refused(bench):
+    """An image for another product is refused by its label, and one that is no firmware by what it is."""
+    port = bench.free_port()
+    bench.nodes(port, *TWO)
+    _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
+    page = bench.page(url)
+    connected(page)
+    scan(page, 2)
+    drop(page, bench.image("other", product=0x43))
+    expect(page.locator(".verdict.no").first).to_contain_text("made for product code 00000043h, this device has 00000042h")
+    page.get_by_label("Choose node 5").check()
+    page.get_by_role("button", name="Update node 5").click()
+    expect(page.locator("#notice")).to_have_attribute("role", "alert")
+    expect(page.locator("#notice")).to_contain_text("not for node 5")
+    expect(page.locator("#notice")).to_contain_text("nothing was touched")
+    bench.picture(page, "refused", "all")
+    expect(page.locator(".update")).to_have_count(0)
+    folder = bench.folder / "folder"
+    folder.mkdir(exist_ok=True)
+    (folder / "app.hex").write_text(":00000001FF\n")
+    files = {
+        "empty.hex": (b"", "empty"),
+        "page.html": (b"<!doctype html><title>404 not found</title>", "no firmware file"),
+        "zeros.elf": (bytes(3000), "no firmware file"),
+    }
+    for name, (content, _) in files.items():
+        (bench.folder / name).write_bytes(content)
+    huge = bench.folder / "huge.bin"
+    with open(huge, "wb") as file:
+        # It takes no room on the disk.
+        file.truncate(200 * 1024 * 1024)
+    wrong = [(bench.folder / name, words) for name, (_, words) in files.items()]
+    wrong += [(folder, "hat is a folder"), (huge, "more than any program")]
+    for path, words in wrong:
+        drop(page, path)
+        expect(page.locator("#notice")).to_contain_text(words)
+    drop(page, bench.folder / "other.blk", bench.folder / "empty.hex")
+    expect(page.locator("#notice")).to_contain_text("ne file at a time")
+    # A browser that is dropped a file on opens it, unless the page takes it.
+    assert page.url == url
+    # After all that the right one is taken.
+    drop(page, bench.image("app"))
+    expect(page.locator(".verdict.yes")).to_have_count(2)
+
+
+@scenario
+def reload_in_mid_update(bench):
+    """The page is loaded anew while it updates, a second tab sees the same, and a closed tab stops nothing."""
+    port = bench.free_port()
+    bench.nodes(port, *TWO)
+    _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
+    page = bench.page(url)
+    connected(page)
+    scan(page, 2)
+    drop(page, bench.image("app", size=500 * 1024))
+    page.get_by_label("Choose node 5").check()
+    page.get_by_role("button", name="Update node 5").click()
+    sending(page)
+    page.reload()
+    expect(update_line(page, 5)).to_have_attribute("data-phase", "running")
+    expect(page.locator("#task")).to_contain_text("The update of 1 device with app.blk")
+    expect(page.locator("#file-facts")).to_contain_text("app.blk")
+    second = bench.page(url)
+    expect(update_line(second, 5)).to_have_attribute("data-phase", "running")
+    expect(second.get_by_role("button", name="Update", exact=True)).to_be_disabled()
+    # The page lets nobody press it; the server says no all the same.
+    answer = second.evaluate(
+        "async () => { const response = await fetch('update', { method: 'POST', headers: { 'content-type':"
+        " 'application/json' }, body: JSON.stringify({ nodes: [6], trial: false, start: true }) });"
+        " return [response.status, await response.text()] }")
+    assert answer[0] == 409 and "the update of 1 device with app.blk" in answer[1], answer
+    page.close()
+    expect(update_line(second, 5)).to_have_attribute("data-phase", "done")
+    idle(second)
+    expect(second.locator("#report-rows")).to_contain_text("00000100h")
+
+
+@scenario
+def single_steps(bench):
+    """Call back, release, erase with a question first, by keys alone; LSS gives node-ID and bit rate."""
+    port = bench.free_port()
+    bench.nodes(port, "--unconfigured", "--serial", "0x200", "--stand-in", *IDENTITY)
+    _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
+    page = bench.page(url)
+    connected(page)
+    page.get_by_role("button", name="Find a device without node-ID").click()
+    expect(page.get_by_label("Serial number")).to_have_value("00000200h")
+    expect(page.get_by_label("Vendor-ID")).to_have_value("00001A2Bh")
+    page.get_by_label("New node-ID").fill("9")
+    page.get_by_label("New bit rate").select_option("250")
+    bench.picture(page, "lss", "all")
+    page.get_by_role("button", name="Give it to the device").click()
+    expect(page.locator("#notice")).to_contain_text("the device is node 9 now", ignore_case=True)
+    expect(page.locator("#notice")).to_contain_text("250 kbit/s")
+    idle(page)
+    scan(page, 1)
+    drop(page, bench.image("app"))
+    page.get_by_label("Choose node 9").check()
+    page.get_by_role("button", name="Update node 9").click()
+    expect(update_line(page, 9)).to_have_attribute("data-phase", "done")
+    idle(page)
+    row = page.locator('#rows tr[data-node="9"]')
+    expect(row).to_contain_text("application")
+    more = page.get_by_role("button", name="More about node 9")
+
+    def press(name):
+        """Reaches a button of the device's dialog by the tabulator, and presses it."""
+        more.focus()
+        page.keyboard.press("Enter")
+        expect(page.locator("#device")).to_be_visible()
+        for _ in range(12):
+            if page.evaluate("document.activeElement.textContent") == name:
+                page.keyboard.press("Enter")
+                return
+            page.keyboard.press("Tab")
+        raise AssertionError(f"{name!r} is not reached")
+
+    press("Call back to the bootloader (80h)")
+    expect(page.locator("#notice")).to_contain_text("the bootloader is running")
+    expect(row).to_contain_text("bootloader")
+    idle(page)
+    press("Release for autostart (83h)")
+    expect(page.locator("#notice")).to_contain_text("released for autostart")
+    assert "signed" not in page.locator("body").inner_text().lower()
+    idle(page)
+    press("Erase the program …")
+    # The question comes up with the answer that does no harm.
+    expect(page.locator("#confirm")).to_be_visible()
+    assert page.evaluate("document.activeElement.textContent") == "Keep it"
+    page.keyboard.press("Escape")
+    expect(page.locator("#confirm")).to_be_hidden()
+    expect(row.locator("code")).not_to_have_text("–")
+    press("Erase the program …")
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    expect(page.locator("#notice")).to_contain_text("is erased")
+    expect(row.locator("code")).to_have_text("–")
+    idle(page)
+    # This device lets nobody read its program.
+    press("Read the program back")
+    expect(page.locator("#notice")).to_have_attribute("role", "alert")
+    idle(page)
+
+
+@scenario
+def looks(bench):
+    """Nothing is cut off at 1280 and at 390 pixels, light and dark; every field has a name; no key traps."""
+    port = bench.free_port()
+    bench.nodes(port, *TWO)
+    _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
+    first = bench.page(url)
+    connected(first)
+    scan(first, 2)
+    drop(first, bench.image("app"))
+    first.get_by_label("Choose all devices").check()
+    first.get_by_role("button", name="Update 2 devices").click()
+    expect(update_line(first, 6)).to_have_attribute("data-phase", "done")
+    idle(first)
+    for width, height in [(1280, 900), (390, 844)]:
+        for scheme in ["light", "dark"]:
+            page = bench.page(url, width, height, color_scheme=scheme)
+            expect(page.locator("#rows tr")).to_have_count(2)
+            expect(page.locator("#frame-rows tr").first).to_be_visible()
+            bench.picture(page, f"{width}-{scheme}", "all")
+            wide = page.evaluate("document.documentElement.scrollWidth")
+            assert wide <= width, f"{width}: the page is {wide} wide"
+            out = page.evaluate(
+                "width => [...document.querySelectorAll('main *:not(.hidden, .hidden *, .hidden-input, thead, thead *)')]"
+                ".filter(e => e.checkVisibility() && !e.closest('pre, #frames, #plot') && e.getBoundingClientRect().right"
+                " > width + 1).map(e => e.outerHTML.slice(0, 80))", width)
+            assert out == [], out
+            thin = page.evaluate(CONTRAST)
+            assert thin == [], f"{width} {scheme}: {thin}"
+            nameless = page.evaluate(
+                "[...document.querySelectorAll('input, select, button, progress')].filter(e => e.checkVisibility()"
+                " && !(e.labels?.length || e.ariaLabel || e.textContent.trim())).map(e => e.outerHTML.slice(0, 80))")
+            assert nameless == [], nameless
+            page.context.close()
+    # The tabulator goes through all of it, forwards in the order of the page, and out of it.
+    page = bench.page(url)
+    expect(page.locator("#rows tr")).to_have_count(2)
+    seen = []
+    for _ in range(80):
+        page.keyboard.press("Tab")
+        here = page.evaluate("document.activeElement === document.body ? null : [document.activeElement.id,"
+                             " document.activeElement.getBoundingClientRect().top + scrollY]")
+        if here is None:
+            break
+        seen.append(here[0])
+    else:
+        raise AssertionError(f"the keys do not get out: {seen}")
+    order = ["adapter-list", "adapter-url", "connect", "file", "board", "program", "scan", "all", "trial", "bit-rate",
+             "filter", "trace", "frames", "fastscan", "lss-0", "lss-node", "assign", "run", "print"]
+    places = [seen.index(name) for name in order]
+    assert places == sorted(places), list(zip(order, places))
+    # And what the state is told to a screen reader by.
+    for name in ["task", "notice", "adapter-state"]:
+        assert page.locator(f"#{name}").get_attribute("role") in ("status", "alert"), name
+
+
+# WCAG 2.1, 1.4.3: text has a contrast of 4.5 against what is behind it.
+CONTRAST = """() => {
+  const parts = (colour) => colour.match(/[\\d.]+/g).map(Number);
+  const light = ([r, g, b]) => [r, g, b].map((c) => c / 255)
+    .map((c) => c <= 0.03928 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, c, i) => sum + c * [0.2126, 0.7152, 0.0722][i], 0);
+  const behind = (e) => { for (; e; e = e.parentElement) {
+    const colour = parts(getComputedStyle(e).backgroundColor);
+    if (colour.length < 4 || colour[3] === 1) return colour; } return [255, 255, 255]; };
+  const bad = [];
+  for (const e of document.querySelectorAll("body *")) {
+    const own = [...e.childNodes].some((node) => node.nodeType === 3 && node.textContent.trim());
+    if (!own || !e.checkVisibility() || e.disabled || e.closest(".off")) continue;
+    const [a, b] = [light(parts(getComputedStyle(e).color)), light(behind(e))];
+    const contrast = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+    if (contrast < 4.5) bad.push([e.textContent.trim().slice(0, 30), contrast]);
+  }
+  return bad;
+}"""
+
+
+@scenario
+def emulated(bench):
+    """The emulated board gets an application's ELF through the page."""
+    _, url = bench.ui(bench.arguments.bus)
+    page = bench.page(url)
+    connected(page)
+    scan(page, 1)
+    drop(page, bench.arguments.image)
+    expect(page.locator("#file-facts")).to_contain_text("CRC")
+    page.get_by_label("Choose all devices").check()
+    page.locator("#update").click()
+    line = page.locator(".update")
+    page.wait_for_function("['done', 'failed'].includes(document.querySelector('.update')?.dataset.phase)")
+    expect(line).to_have_attribute("data-phase", "done")
+    idle(page)
+    expect(page.locator("#rows")).to_contain_text("application")
+    # What the running application tells of itself.
+    expect(page.locator("#rows")).to_contain_text("1.0.0")
+    expect(page.locator("#report-rows")).to_contain_text("the program runs")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenario", choices=sorted(SCENARIOS))
+    parser.add_argument("--coflash", required=True)
+    parser.add_argument("--node")
+    parser.add_argument("--folder", required=True)
+    parser.add_argument("--bus")
+    parser.add_argument("--image")
+    parser.add_argument("--pictures")
+    arguments = parser.parse_args()
+    chromium = os.environ.get("COBOOT_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+    if not chromium:
+        sys.exit("there is no chromium: `cargo xtask setup` installs it")
+    # The sandbox of Chromium cannot be had as root.
+    options = ["--no-sandbox"] if os.geteuid() == 0 else []
+    with sync_playwright() as playwright, contextlib.ExitStack() as stack:
+        browser = playwright.chromium.launch(executable_path=chromium, args=options)
+        stack.callback(browser.close)
+        bench = Bench(arguments, browser, stack)
+        SCENARIOS[arguments.scenario](bench)
+        assert not bench.complaints, bench.complaints
+    print(f"{arguments.scenario}: done")
+
+
+if __name__ == "__main__":
+    main()
