@@ -10,6 +10,8 @@ use axum::http::{header, HeaderMap, HeaderValue, Method, StatusCode, Uri};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
+use super::firmware::FILE_MAX;
+
 /// How long a request with a body may take to arrive and to be answered.
 const WITHIN: Duration = Duration::from_secs(60);
 
@@ -59,6 +61,11 @@ impl Guard {
                 StatusCode::FORBIDDEN,
                 "the token is missing or wrong: open the URL that coflash ui printed",
             ));
+        }
+        // A body that says how long it is need not be heard first.
+        let long = text(header::CONTENT_LENGTH).and_then(|len| len.parse::<u64>().ok());
+        if long.is_some_and(|len| len > FILE_MAX as u64) {
+            return Some((StatusCode::PAYLOAD_TOO_LARGE, "this is more than any program has"));
         }
         if !matches!(*method, Method::GET | Method::POST) {
             return Some((StatusCode::METHOD_NOT_ALLOWED, "GET and POST alone are answered"));

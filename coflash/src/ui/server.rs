@@ -118,10 +118,12 @@ impl Server {
     /// The thread for the bus does not start.
     pub fn run(mut self, end: &AtomicBool) -> io::Result<Option<String>> {
         let shared = self.shared.clone();
-        if let Some(orders) = self.orders.take() {
+        let orders = self.orders.take();
+        let worker = {
             let shared = shared.clone();
-            thread::Builder::new().name("bus".to_string()).spawn(move || worker::run(&shared, &orders))?;
-        }
+            let work = move || orders.iter().for_each(|orders| worker::run(&shared, orders));
+            thread::Builder::new().name("bus".to_string()).spawn(work)?
+        };
         if let Some(bus) = self.options.bus.take() {
             // It is the first: there is room for it.
             let _ = shared.order(Order::Open(bus));
@@ -130,13 +132,18 @@ impl Server {
             Site { shared: shared.clone(), readers: self.readers, reading: Arc::new(Semaphore::new(1)) };
         let app = router(site, self.guard);
         let (listener, write_timeout) = (self.listener, self.options.write_timeout);
-        Ok(self.runtime.block_on(async {
+        let left = self.runtime.block_on(async {
             tokio::select! {
                 () = accept(listener, app, write_timeout) => {}
                 () = set(end) => {}
             }
             end_in_order(&shared).await
-        }))
+        });
+        // The adapter is closed in order; one who hangs in a task that does not end is left behind.
+        if shared.order(Order::End).is_ok() && shared.look(|state| state.task.is_none()) {
+            let _ = worker.join();
+        }
+        Ok(left)
     }
 }
 

@@ -17,6 +17,8 @@ pub(super) enum Order {
     Open(String),
     /// Let go of the adapter.
     Close,
+    /// That is all.
+    End,
     /// Do this. [`Shared::begin`] has entered it as the task that runs.
     Run(Job),
 }

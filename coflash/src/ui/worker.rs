@@ -31,7 +31,7 @@ enum Bus {
     },
 }
 
-/// Works until nobody can tell it anything any more.
+/// Works until it is told to end.
 pub(super) fn run(shared: &Arc<Shared>, orders: &Receiver<Order>) {
     let mut bus = Bus::Closed;
     loop {
@@ -41,7 +41,7 @@ pub(super) fn run(shared: &Arc<Shared>, orders: &Receiver<Order>) {
             Bus::Closed | Bus::Lost { .. } | Bus::Open { .. } => orders.recv_timeout(SLICE),
         };
         bus = match (order, bus) {
-            (Err(RecvTimeoutError::Disconnected), _) => return,
+            (Ok(Order::End) | Err(RecvTimeoutError::Disconnected), _) => return,
             (Ok(Order::Open(url)), _) => open(shared, url),
             (Ok(Order::Close), _) => {
                 shared.change(|state| state.adapter = Adapter::default());

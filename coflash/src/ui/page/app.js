@@ -76,14 +76,14 @@ async function take(files) {
   }
   const [given] = files;
   if (given.size > fileMax) {
-    notice(false, `${given.name} has ${given.size} bytes: more than any program`, "choose the firmware file itself");
+    notice(false, `the file ${given.name} has ${given.size} bytes: more than any program`, "choose the firmware file itself");
     return;
   }
   if (state?.task) {
     notice(false, "not now: something is being done", "wait until it is done, or cancel it");
     return;
   }
-  if (await sendFile(given)) notice(true, `${given.name} was read and checked`);
+  if (await sendFile(given)) notice(true, `the file ${given.name} was read and checked`);
 }
 
 function dropping() {

@@ -81,7 +81,8 @@ function draw() {
   const values = data();
   const last = seconds.get(now - 1);
   const load = values[1][values[1].length - 1];
-  text($("load"), `${(load ?? 0).toFixed(1)} % load, ${last?.frames ?? 0} frames in the last second`);
+  const over = load > 100 ? ": this bus is faster than the bit rate that is chosen" : "";
+  text($("load"), `${(load ?? 0).toFixed(1)} % load, ${last?.frames ?? 0} frames in the last second${over}`);
   if (plot) plot.setData(values);
 }
 
