@@ -95,11 +95,14 @@ class Bench:
                         "--vid", hex(vendor), "--pid", hex(product), raw, blocks], check=True)
         return blocks
 
-    def picture(self, page, name, what="body"):
+    def picture(self, page, name, height=None):
+        """Keeps a screenshot, of so many pixels from the top or of the whole page."""
         if self.arguments.pictures:
             Path(self.arguments.pictures).mkdir(parents=True, exist_ok=True)
-            page.wait_for_timeout(300)
-            page.screenshot(path=f"{self.arguments.pictures}/{name}.png", full_page=what == "all")
+            page.evaluate("scrollTo(0, 0)")
+            size = page.viewport_size
+            clip = {"x": 0, "y": 0, "width": size["width"], "height": height} if height else None
+            page.screenshot(path=f"{self.arguments.pictures}/ui-{name}.png", full_page=True, clip=clip)
 
 
 def end(program):
@@ -171,8 +174,7 @@ def two_nodes(bench):
     page.get_by_label("Choose all devices").check()
     page.get_by_role("button", name="Update 2 devices").click()
     sending(page)
-    page.locator("#updates").scroll_into_view_if_needed()
-    bench.picture(page, "update", "all")
+    bench.picture(page, "update", 1090)
     for node in [5, 6]:
         expect(update_line(page, node)).to_have_attribute("data-phase", "done")
     idle(page)
@@ -190,7 +192,7 @@ def two_nodes(bench):
     page.emulate_media(media="print")
     expect(page.locator("#report-head")).to_be_visible()
     expect(page.locator("#devices")).to_be_hidden()
-    bench.picture(page, "print", "all")
+    bench.picture(page, "print")
     page.emulate_media(media="screen")
     # What went over the bus stands there in words, and the filter takes its part.
     page.get_by_label("Show frames with").fill("node 6 heartbeat")
@@ -232,7 +234,7 @@ def unplugged(bench):
     expect(page.locator("#adapter-state")).to_have_class("pill lost")
     expect(page.locator("#adapter-words")).to_contain_text("The adapter is lost")
     expect(page.locator("#report-rows")).to_contain_text("failed")
-    bench.picture(page, "unplugged", "all")
+    bench.picture(page, "unplugged", 1010)
     # Nothing can be asked of it meanwhile.
     expect(page.get_by_role("button", name="Search the bus")).to_be_disabled()
     bench.nodes(port, *TWO)
@@ -259,7 +261,7 @@ def refused(bench):
     expect(page.locator("#notice")).to_have_attribute("role", "alert")
     expect(page.locator("#notice")).to_contain_text("not for node 5")
     expect(page.locator("#notice")).to_contain_text("nothing was touched")
-    bench.picture(page, "refused", "all")
+    bench.picture(page, "refused", 760)
     expect(page.locator(".update")).to_have_count(0)
     folder = bench.folder / "folder"
     folder.mkdir(exist_ok=True)
@@ -294,7 +296,7 @@ def reload_in_mid_update(bench):
     """The page is loaded anew while it updates, a second tab sees the same, and a closed tab stops nothing."""
     port = bench.free_port()
     bench.nodes(port, *TWO)
-    _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
+    program, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
     page = bench.page(url)
     connected(page)
     scan(page, 2)
@@ -319,6 +321,13 @@ def reload_in_mid_update(bench):
     expect(update_line(second, 5)).to_have_attribute("data-phase", "done")
     idle(second)
     expect(second.locator("#report-rows")).to_contain_text("00000100h")
+    # A server that says nothing any more is taken for lost, and found again when it is back.
+    expect(second.locator("#lost")).to_be_hidden()
+    program.send_signal(signal.SIGSTOP)
+    expect(second.locator("#lost")).to_contain_text("connection to coflash is lost")
+    program.send_signal(signal.SIGCONT)
+    expect(second.locator("#lost")).to_be_hidden()
+    expect(second.locator("#report-rows")).to_contain_text("00000100h")
 
 
 @scenario
@@ -334,7 +343,7 @@ def single_steps(bench):
     expect(page.get_by_label("Vendor-ID")).to_have_value("00001A2Bh")
     page.get_by_label("New node-ID").fill("9")
     page.get_by_label("New bit rate").select_option("250")
-    bench.picture(page, "lss", "all")
+    bench.picture(page, "lss")
     page.get_by_role("button", name="Give it to the device").click()
     expect(page.locator("#notice")).to_contain_text("the device is node 9 now", ignore_case=True)
     expect(page.locator("#notice")).to_contain_text("250 kbit/s")
@@ -407,7 +416,9 @@ def looks(bench):
             page = bench.page(url, width, height, color_scheme=scheme)
             expect(page.locator("#rows tr")).to_have_count(2)
             expect(page.locator("#frame-rows tr").first).to_be_visible()
-            bench.picture(page, f"{width}-{scheme}", "all")
+            bench.picture(page, f"{width}-{scheme}")
+            if (width, scheme) == (390, "dark"):
+                bench.picture(page, "small", 1500)
             wide = page.evaluate("document.documentElement.scrollWidth")
             assert wide <= width, f"{width}: the page is {wide} wide"
             out = page.evaluate(

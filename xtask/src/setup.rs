@@ -17,7 +17,7 @@ usage: cargo xtask setup [--yes]
 
 Brings the machine to where every other job runs: the Rust target thumbv7em-none-eabihf, rustfmt and
 clippy (by rustup); cmake, make, pkg-config and libclang to build the emulator's CPU, clang for the application
-in C, gdb-multiarch, python3 with venv (by apt-get); and a Python environment in target/python with tests/python/requirements.txt.
+in C, gdb-multiarch, chromium for the tests of the page, python3 with venv (by apt-get); and a Python environment in target/python with tests/python/requirements.txt.
 
 The other jobs do this themselves, each for what it needs. As root it installs what is missing; for
 anyone else it stops with the line to run, or, with --yes, runs that line.
@@ -38,6 +38,8 @@ pub enum Part {
     Python,
     /// The debugger that loads the images in a test.
     Gdb,
+    /// The browser that the tests of `coflash ui` drive.
+    Browser,
     /// Formatter and linter.
     Lint,
 }
@@ -51,7 +53,15 @@ pub struct Setup {
 pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     args.none_left()?;
-    setup.prepare(&[Part::Firmware, Part::C, Part::Emulator, Part::Python, Part::Gdb, Part::Lint])?;
+    setup.prepare(&[
+        Part::Firmware,
+        Part::C,
+        Part::Emulator,
+        Part::Python,
+        Part::Gdb,
+        Part::Browser,
+        Part::Lint,
+    ])?;
     println!("Everything is there.");
     Ok(())
 }
@@ -151,6 +161,7 @@ enum Tool {
     Python,
     Venv,
     Gdb,
+    Chromium,
 }
 
 impl Tool {
@@ -166,6 +177,7 @@ impl Tool {
             Self::Python => "python3",
             Self::Venv => "python3-venv",
             Self::Gdb => "gdb-multiarch",
+            Self::Chromium => "chromium",
         }
     }
 
@@ -193,6 +205,13 @@ impl Tool {
             // Debian's python3 comes without ensurepip.
             Self::Venv => process::succeeds("python3", &["-c", "import venv, ensurepip"]),
             Self::Gdb => process::succeeds("gdb-multiarch", &["--version"]),
+            // The tests look for it in the same places.
+            Self::Chromium => match env::var_os("COBOOT_CHROMIUM") {
+                Some(chromium) => process::succeeds(chromium, &["--version"]),
+                None => ["chromium", "chromium-browser"]
+                    .iter()
+                    .any(|name| process::succeeds(name, &["--version"])),
+            },
         }
     }
 }
@@ -205,6 +224,7 @@ fn missing_packages(parts: &[Part], is_there: impl Fn(Tool) -> bool) -> Vec<&'st
             Part::Emulator => &[Tool::CCompiler, Tool::Make, Tool::Cmake, Tool::PkgConfig, Tool::Libclang],
             Part::C => &[Tool::Clang],
             Part::Gdb => &[Tool::Gdb],
+            Part::Browser => &[Tool::Chromium],
             Part::Python if !python_environment_is_there() => &[Tool::Python, Tool::Venv],
             Part::Python | Part::Firmware | Part::Lint => &[],
         });
@@ -349,6 +369,7 @@ mod tests {
             ["cmake", "libclang-dev"]
         );
         assert_eq!(missing_packages(&[Part::C], nothing), ["clang"]);
+        assert_eq!(missing_packages(&[Part::Browser], nothing), ["chromium"]);
         assert!(missing_packages(&[Part::C, Part::Emulator, Part::Python], |_| true).is_empty());
     }
 

@@ -23,15 +23,15 @@ among those with the firmware of every other board.
   ARGS            go to cargo test: `cargo xtask test -p canopen sdo`, `cargo xtask test -- --nocapture`
 
 The tests find what was built by these variables: COBOOT_BOARD, COBOOT_FIRMWARE_DIR (bootloader.elf,
-app-v1.elf, app-v2.elf, app-c.elf), COBOOT_COFLASH (the command line of the host tool) and COBOOT_PYTHON (an
-interpreter with tests/python/requirements.txt installed).
+app-v1.elf, app-v2.elf, app-c.elf), COBOOT_COFLASH (the command line of the host tool), COBOOT_NODE (the node
+without hardware) and COBOOT_PYTHON (an interpreter with tests/python/requirements.txt installed).
 ";
 
 pub fn run(mut args: Args) -> Outcome {
     let chosen_board = args.has("--board");
     let board = workspace::board(&mut args)?;
     let setup = Setup::from(&mut args);
-    setup.prepare(&[Part::Firmware, Part::C, Part::Emulator, Part::Python, Part::Gdb])?;
+    setup.prepare(&[Part::Firmware, Part::C, Part::Emulator, Part::Python, Part::Gdb, Part::Browser])?;
     build::all(board)?;
     build::c_applications(board)?;
     // And one board with room for two programs, for the tests of that.
@@ -41,13 +41,17 @@ pub fn run(mut args: Args) -> Outcome {
     }
     // And one that talks through CAN2.
     build::images(&stm32f407g_disc1_can2::LAYOUT, &build::MAIN)?;
-    process::run(process::cargo("build").current_dir(workspace::root()).args(["--package", "coflash"]))?;
-    let coflash =
-        workspace::target_dir().join("debug").join("coflash").with_extension(std::env::consts::EXE_EXTENSION);
+    let programs = ["--package", "coflash", "--package", "coboot-node"];
+    process::run(process::cargo("build").current_dir(workspace::root()).args(programs))?;
+    let built = |name: &str| {
+        let path = workspace::target_dir().join("debug").join(name);
+        path.with_extension(std::env::consts::EXE_EXTENSION).into_os_string()
+    };
 
     let started = Instant::now();
     let python = setup::python().into_os_string();
-    let mut suite = Suite { summary: Summary::default(), coflash: coflash.into_os_string(), python };
+    let mut suite =
+        Suite { summary: Summary::default(), coflash: built("coflash"), node: built("coboot-node"), python };
     let chosen = args.rest();
     if chosen_board {
         suite.run(board, &[build::tests_args(board), chosen].concat())?;
@@ -99,6 +103,7 @@ const MAIN_TESTS: [&str; 11] = [
 struct Suite {
     summary: Summary,
     coflash: OsString,
+    node: OsString,
     python: OsString,
 }
 
@@ -106,10 +111,11 @@ impl Suite {
     /// Runs `cargo test` with these arguments, and the images of a board.
     fn run(&mut self, board: &Layout, arguments: &[String]) -> Outcome {
         let images = workspace::firmware_dir(board);
-        let environment: [(&str, &OsStr); 4] = [
+        let environment: [(&str, &OsStr); 5] = [
             ("COBOOT_BOARD", board.board.as_ref()),
             ("COBOOT_FIRMWARE_DIR", images.as_ref()),
             ("COBOOT_COFLASH", &self.coflash),
+            ("COBOOT_NODE", &self.node),
             ("COBOOT_PYTHON", &self.python),
         ];
         self.summary.run(arguments, environment)
@@ -128,7 +134,7 @@ struct Summary {
 
 impl Summary {
     /// Runs `cargo test` with these arguments, and takes what it prints.
-    fn run(&mut self, arguments: &[String], environment: [(&str, &OsStr); 4]) -> Outcome {
+    fn run(&mut self, arguments: &[String], environment: [(&str, &OsStr); 5]) -> Outcome {
         let mut cargo = process::cargo("test");
         cargo
             .arg("--no-fail-fast")

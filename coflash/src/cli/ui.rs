@@ -25,10 +25,18 @@ pub(super) struct Ui {
 
 impl Ui {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        if context.trace.is_some() {
+            let advice = "leave out --trace, and save the log from the page";
+            return Err(Failure::usage("the page keeps the log of the frames itself", advice));
+        }
         let end = cancelled()?;
         let mut options = Options::default();
         options.bus = context.bus.clone();
         options.port = self.port;
+        options.sdo_ids = match (context.sdo_request, context.sdo_response) {
+            (None, None) => None,
+            (request, response) => Some((request.unwrap_or(0x600), response.unwrap_or(0x580))),
+        };
         let server = Server::new(options).map_err(|error| {
             Failure::system(format!("port {} of 127.0.0.1 cannot be served: {error}", self.port))
         })?;

@@ -40,13 +40,15 @@ pub struct Options {
     pub bus: Option<String>,
     /// The port on 127.0.0.1; 0 for a free one.
     pub port: u16,
+    /// COB-IDs of SDO requests and answers, without the node-ID, where they are not the usual ones.
+    pub sdo_ids: Option<(u16, u16)>,
     /// How long a reader may take nothing of what it is sent until it is dropped.
     pub write_timeout: Duration,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { bus: None, port: 0, write_timeout: Duration::from_secs(10) }
+        Self { bus: None, port: 0, sdo_ids: None, write_timeout: Duration::from_secs(10) }
     }
 }
 
@@ -120,8 +122,8 @@ impl Server {
         let shared = self.shared.clone();
         let orders = self.orders.take();
         let worker = {
-            let shared = shared.clone();
-            let work = move || orders.iter().for_each(|orders| worker::run(&shared, orders));
+            let (shared, sdo_ids) = (shared.clone(), self.options.sdo_ids);
+            let work = move || orders.iter().for_each(|orders| worker::run(&shared, orders, sdo_ids));
             thread::Builder::new().name("bus".to_string()).spawn(work)?
         };
         if let Some(bus) = self.options.bus.take() {

@@ -10,12 +10,15 @@ use super::frames::Tap;
 use super::shared::{Order, Shared};
 use super::state::{Adapter, Connection, Notice};
 use super::work;
-use crate::bus::{open::parse_bit_rate, AdapterError, Link};
+use crate::bus::{open::parse_bit_rate, AdapterError, Link, SdoIds};
 
 /// How long it listens before it looks whether it was told something.
 const SLICE: Duration = Duration::from_millis(50);
 /// How long a lost adapter is left alone until it is tried again.
 const AGAIN: Duration = Duration::from_secs(1);
+
+/// COB-IDs of SDO requests and answers, without the node-ID.
+type SdoBases = (u16, u16);
 
 /// The adapter.
 enum Bus {
@@ -32,7 +35,7 @@ enum Bus {
 }
 
 /// Works until it is told to end.
-pub(super) fn run(shared: &Arc<Shared>, orders: &Receiver<Order>) {
+pub(super) fn run(shared: &Arc<Shared>, orders: &Receiver<Order>, sdo_ids: Option<SdoBases>) {
     let mut bus = Bus::Closed;
     loop {
         let order = match &mut bus {
@@ -42,7 +45,7 @@ pub(super) fn run(shared: &Arc<Shared>, orders: &Receiver<Order>) {
         };
         bus = match (order, bus) {
             (Ok(Order::End) | Err(RecvTimeoutError::Disconnected), _) => return,
-            (Ok(Order::Open(url)), _) => open(shared, url),
+            (Ok(Order::Open(url)), _) => open(shared, url, sdo_ids),
             (Ok(Order::Close), _) => {
                 shared.change(|state| state.adapter = Adapter::default());
                 Bus::Closed
@@ -68,7 +71,7 @@ pub(super) fn run(shared: &Arc<Shared>, orders: &Receiver<Order>) {
             }
             (Err(RecvTimeoutError::Timeout), Bus::Open { url, link }) => listen(shared, url, link),
             (Err(RecvTimeoutError::Timeout), Bus::Lost { url, next }) if next <= Instant::now() => {
-                reopen(shared, url)
+                reopen(shared, url, sdo_ids)
             }
             (Err(RecvTimeoutError::Timeout), bus) => bus,
         };
@@ -76,23 +79,26 @@ pub(super) fn run(shared: &Arc<Shared>, orders: &Receiver<Order>) {
 }
 
 /// Opens an adapter, frames noted.
-fn link(shared: &Shared, url: &str) -> Result<Link, AdapterError> {
+fn link(shared: &Shared, url: &str, sdo_ids: Option<SdoBases>) -> Result<Link, AdapterError> {
     Ok(match Link::open(url, None)? {
         Link::Bus(adapter) => {
             let tap = Tap::new(adapter, shared.frames.clone(), shared.arrived.clone());
-            Link::Bus(Box::new(tap))
+            match sdo_ids {
+                None => Link::Bus(Box::new(tap)),
+                Some((request, response)) => Link::Bus(Box::new(SdoIds::new(tap, request, response))),
+            }
         }
         gateway @ Link::Gateway(_) => gateway,
     })
 }
 
-fn open(shared: &Shared, url: String) -> Bus {
+fn open(shared: &Shared, url: String, sdo_ids: Option<SdoBases>) -> Bus {
     shared.change(|state| {
         state.adapter = Adapter { url: url.clone(), state: Connection::Opening, ..Adapter::default() };
         state.devices = None;
         state.notice = None;
     });
-    match link(shared, &url) {
+    match link(shared, &url, sdo_ids) {
         Ok(link) => opened(shared, url, link),
         Err(error) => {
             shared.change(|state| {
@@ -122,8 +128,8 @@ fn lost(shared: &Shared, url: String, error: &AdapterError) -> Bus {
     Bus::Lost { url, next: Instant::now() + AGAIN }
 }
 
-fn reopen(shared: &Shared, url: String) -> Bus {
-    match link(shared, &url) {
+fn reopen(shared: &Shared, url: String, sdo_ids: Option<SdoBases>) -> Bus {
+    match link(shared, &url, sdo_ids) {
         Ok(link) => opened(shared, url, link),
         Err(error) => lost(shared, url, &error),
     }

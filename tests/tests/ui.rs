@@ -1,0 +1,107 @@
+//! The page of `coflash ui` in a real Chromium, driven by tests/python/ui_page.py: against nodes
+//! (`coboot-node`), which the script starts itself, and against the emulated board.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::{Mutex, PoisonError};
+use std::{env, fs};
+
+use canopen::Address;
+use coboot_tests::bench::Bench;
+use coboot_tests::endpoint::Endpoint;
+use coboot_tests::firmware;
+
+/// One browser at a time: several would only slow each other down.
+static BROWSER: Mutex<()> = Mutex::new(());
+
+/// What `cargo xtask test` has built or installed.
+fn given(name: &str) -> PathBuf {
+    let path =
+        env::var_os(name).unwrap_or_else(|| panic!("{name} is not set: run the tests by `cargo xtask test`"));
+    path.into()
+}
+
+/// The script with what every scenario needs, and a folder for its files.
+fn script(scenario: &str) -> (Command, PathBuf) {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("ui-{scenario}"));
+    let _ = fs::remove_dir_all(&folder);
+    fs::create_dir_all(&folder).unwrap();
+    let mut command = Command::new(given("COBOOT_PYTHON"));
+    command
+        .arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("python/ui_page.py"))
+        .arg(scenario)
+        .arg("--coflash")
+        .arg(given("COBOOT_COFLASH"))
+        .arg("--folder")
+        .arg(&folder);
+    // Where the pictures of the documentation are wanted, they are taken here.
+    if let Some(pictures) = env::var_os("COBOOT_PICTURES") {
+        command.arg("--pictures").arg(pictures);
+    }
+    for variable in ["COFLASH_BUS", "COFLASH_CONFIG"] {
+        command.env_remove(variable);
+    }
+    (command, folder)
+}
+
+#[track_caller]
+fn check(scenario: &str, output: &Output, folder: &Path) {
+    let said = [&output.stdout[..], &output.stderr[..]].concat();
+    let said = String::from_utf8_lossy(&said);
+    assert!(output.status.success() && said.contains(&format!("{scenario}: done")), "{said}");
+    let _ = fs::remove_dir_all(folder);
+}
+
+/// A scenario with nodes of its own.
+#[track_caller]
+fn with_nodes(scenario: &str) {
+    let _alone = BROWSER.lock().unwrap_or_else(PoisonError::into_inner);
+    let (mut command, folder) = script(scenario);
+    let output = command.arg("--node").arg(given("COBOOT_NODE")).output().unwrap();
+    check(scenario, &output, &folder);
+}
+
+#[test]
+fn two_nodes_are_updated_by_dropping_a_file() {
+    with_nodes("two_nodes");
+}
+
+#[test]
+fn an_adapter_that_goes_away_in_mid_update_is_told_and_comes_back() {
+    with_nodes("unplugged");
+}
+
+#[test]
+fn what_is_for_another_product_or_no_firmware_is_refused() {
+    with_nodes("refused");
+}
+
+#[test]
+fn a_reload_a_second_tab_and_a_closed_tab_do_no_harm_in_mid_update() {
+    with_nodes("reload_in_mid_update");
+}
+
+#[test]
+fn single_steps_and_lss_by_keys_alone() {
+    with_nodes("single_steps");
+}
+
+#[test]
+fn the_page_is_readable_wide_and_narrow_in_light_and_dark() {
+    with_nodes("looks");
+}
+
+#[test]
+fn the_emulated_board_is_updated_by_dropping_an_elf() {
+    let _alone = BROWSER.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let mut endpoint = Endpoint::new(bench);
+    let (mut command, folder) = script("emulated");
+    command.args(["--bus", &endpoint.url(), "--image"]).arg(firmware::dir().join(firmware::APP_V1));
+    let output = endpoint.run(&mut command);
+    check("emulated", &output, &folder);
+    assert_eq!(endpoint.bench.session().read_text(Address::new(0x100A, 0)).unwrap(), "1.0.0");
+    endpoint.bench.assert_nothing_unmodelled();
+}
