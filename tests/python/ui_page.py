@@ -261,7 +261,7 @@ def refused(bench):
     expect(page.locator("#notice")).to_have_attribute("role", "alert")
     expect(page.locator("#notice")).to_contain_text("not for node 5")
     expect(page.locator("#notice")).to_contain_text("nothing was touched")
-    bench.picture(page, "refused", 760)
+    bench.picture(page, "refused", 860)
     expect(page.locator(".update")).to_have_count(0)
     folder = bench.folder / "folder"
     folder.mkdir(exist_ok=True)
