@@ -39,7 +39,8 @@ const RULES: &[Rule] = &[
     Rule { name: "bsp", may_use: &["shared-abi"] },
     Rule { name: "bootloader", may_use: &["boot-core", "bsp", "shared-abi"] },
     Rule { name: "app-template", may_use: &["canopen", "bsp", "shared-abi"] },
-    Rule { name: "coflash", may_use: &["canopen", "shared-abi"] },
+    Rule { name: "vendor-can", may_use: &[] },
+    Rule { name: "coflash", may_use: &["canopen", "shared-abi", "vendor-can"] },
     Rule { name: "coboot-node", may_use: &["boot-core", "canopen", "coflash", "shared-abi"] },
     Rule { name: "emulator", may_use: &["shared-abi"] },
     Rule {

@@ -1,0 +1,152 @@
+//! PCANBasic of PEAK-System: the functions that a classic CAN adapter needs.
+//!
+//! Signatures and `TPCANMsg` are those of the public header `PCANBasic.h` (PCAN-Basic 4); the library
+//! for macOS (PCBUSB) exports the same.
+
+use std::ffi::c_void;
+use std::fmt;
+
+use crate::load::Loaded;
+use crate::LoadError;
+
+/// The files in which the library comes, the first choice first.
+#[cfg(windows)]
+pub const FILES: &[&str] = &["PCANBasic.dll"];
+/// The files in which the library comes, the first choice first.
+#[cfg(target_os = "macos")]
+pub const FILES: &[&str] = &["libPCBUSB.dylib", "/usr/local/lib/libPCBUSB.dylib"];
+/// The files in which the library comes, the first choice first.
+#[cfg(not(any(windows, target_os = "macos")))]
+pub const FILES: &[&str] = &["libpcanbasic.so", "libpcanbasic.so.4"];
+
+/// `TPCANMsg`: a frame, an error frame or a status message.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Message {
+    /// The identifier.
+    pub id: u32,
+    /// `MSGTYPE`, bits.
+    pub kind: u8,
+    /// How many bytes of `data` count; 8 at most, if the library does not lie.
+    pub len: u8,
+    /// The data.
+    pub data: [u8; 8],
+}
+
+type Initialize = unsafe extern "system" fn(u16, u16, u8, u32, u16) -> u32;
+type OfChannel = unsafe extern "system" fn(u16) -> u32;
+type Read = unsafe extern "system" fn(u16, *mut Message, *mut c_void) -> u32;
+type Write = unsafe extern "system" fn(u16, *mut Message) -> u32;
+type Value = unsafe extern "system" fn(u16, u8, *mut c_void, u32) -> u32;
+
+/// The library.
+pub struct Pcan {
+    initialize: Initialize,
+    uninitialize: OfChannel,
+    status: OfChannel,
+    read: Read,
+    write: Write,
+    get: Value,
+    set: Value,
+    // Last: the functions above are its.
+    _library: Loaded,
+}
+
+impl fmt::Debug for Pcan {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Pcan(…)")
+    }
+}
+
+impl Pcan {
+    /// Loads the library.
+    ///
+    /// # Errors
+    /// It is not there, or too old.
+    pub fn load() -> Result<Self, LoadError> {
+        // SAFETY: the files are those of the vendor's installer; the types are those of PCANBasic.h,
+        // and the functions live as long as the library beside them.
+        unsafe {
+            let library = Loaded::first_of(FILES)?;
+            Ok(Self {
+                initialize: library.function("CAN_Initialize")?,
+                uninitialize: library.function("CAN_Uninitialize")?,
+                status: library.function("CAN_GetStatus")?,
+                read: library.function("CAN_Read")?,
+                write: library.function("CAN_Write")?,
+                get: library.function("CAN_GetValue")?,
+                set: library.function("CAN_SetValue")?,
+                _library: library,
+            })
+        }
+    }
+
+    /// `CAN_Initialize` of a plug-and-play channel, with the two timing registers of an SJA1000. Gives a
+    /// `TPCANStatus`, like all that follow.
+    pub fn initialize(&self, channel: u16, btr0btr1: u16) -> u32 {
+        // SAFETY: plain numbers.
+        unsafe { (self.initialize)(channel, btr0btr1, 0, 0, 0) }
+    }
+
+    /// `CAN_Uninitialize`.
+    pub fn uninitialize(&self, channel: u16) -> u32 {
+        // SAFETY: plain numbers.
+        unsafe { (self.uninitialize)(channel) }
+    }
+
+    /// `CAN_GetStatus`.
+    pub fn status(&self, channel: u16) -> u32 {
+        // SAFETY: plain numbers.
+        unsafe { (self.status)(channel) }
+    }
+
+    /// `CAN_Read`: the oldest message, if the status says that there is one. Does not wait.
+    pub fn read(&self, channel: u16) -> (u32, Message) {
+        let mut message = Message::default();
+        // SAFETY: the message is ours and of the header's layout; the header allows no time stamp.
+        let status = unsafe { (self.read)(channel, &raw mut message, std::ptr::null_mut()) };
+        (status, message)
+    }
+
+    /// `CAN_Write`. Does not wait.
+    pub fn write(&self, channel: u16, mut message: Message) -> u32 {
+        // SAFETY: the message is ours and of the header's layout.
+        unsafe { (self.write)(channel, &raw mut message) }
+    }
+
+    /// `CAN_GetValue` of a parameter that is a number.
+    pub fn number(&self, channel: u16, parameter: u8) -> (u32, u32) {
+        let mut value = 0_u32;
+        // SAFETY: the buffer is ours, and of the length that is told.
+        let status = unsafe { (self.get)(channel, parameter, (&raw mut value).cast(), 4) };
+        (status, value)
+    }
+
+    /// `CAN_SetValue` of a parameter that is a number.
+    pub fn set_number(&self, channel: u16, parameter: u8, mut value: u32) -> u32 {
+        // SAFETY: the buffer is ours, and of the length that is told.
+        unsafe { (self.set)(channel, parameter, (&raw mut value).cast(), 4) }
+    }
+
+    /// `CAN_GetValue` of a parameter that is text: its bytes up to the first zero.
+    pub fn text(&self, channel: u16, parameter: u8) -> (u32, Vec<u8>) {
+        let mut text = [0_u8; 256];
+        // SAFETY: the buffer is ours, and longer than the length that is told.
+        let status = unsafe { (self.get)(channel, parameter, text.as_mut_ptr().cast(), 255) };
+        (status, text.into_iter().take_while(|byte| *byte != 0).collect())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// `TPCANMsg` of the header: DWORD, BYTE, BYTE, BYTE[8], padded to whole DWORDs.
+    #[test]
+    fn a_message_has_the_headers_layout() {
+        use std::mem::{offset_of, size_of};
+        assert_eq!(size_of::<Message>(), 16);
+        assert_eq!((offset_of!(Message, id), offset_of!(Message, kind)), (0, 4));
+        assert_eq!((offset_of!(Message, len), offset_of!(Message, data)), (5, 6));
+    }
+}
