@@ -162,7 +162,8 @@ impl Canlib {
         for (byte, value) in bytes.iter_mut().zip(data) {
             *byte = *value;
         }
-        let Ok(id) = c_long::try_from(id) else { return CAN_ERR_PARAM };
+        // Identifiers have 29 bits.
+        let id = c_long::try_from(id).unwrap_or_default();
         // SAFETY: the library reads 8 bytes at most, which are there.
         unsafe { (self.write)(handle, id, bytes.as_mut_ptr().cast(), len.min(8), flags) }
     }
@@ -204,6 +205,3 @@ impl Canlib {
         (status, send, receive)
     }
 }
-
-/// `canERR_PARAM`.
-const CAN_ERR_PARAM: i32 = -1;

@@ -6,6 +6,8 @@ use std::time::Duration;
 
 use canopen::Frame;
 
+use super::health::Health;
+
 /// A CAN bus, and the time on it.
 ///
 /// The time belongs to the adapter, so that an emulated bus can serve its own. The rest of this
@@ -28,6 +30,12 @@ pub trait Adapter {
 
     /// The time since an origin of the adapter's choice.
     fn now(&self) -> Duration;
+
+    /// What it knows of its bus beyond the frames; `None` where it tells nothing. It may ask the
+    /// system for it, so it is for when something has gone wrong.
+    fn health(&mut self) -> Option<Health> {
+        None
+    }
 }
 
 impl<A: Adapter + ?Sized> Adapter for &mut A {
@@ -41,6 +49,10 @@ impl<A: Adapter + ?Sized> Adapter for &mut A {
 
     fn now(&self) -> Duration {
         (**self).now()
+    }
+
+    fn health(&mut self) -> Option<Health> {
+        (**self).health()
     }
 }
 
@@ -56,11 +68,16 @@ impl<A: Adapter + ?Sized> Adapter for Box<A> {
     fn now(&self) -> Duration {
         (**self).now()
     }
+
+    fn health(&mut self) -> Option<Health> {
+        (**self).health()
+    }
 }
 
 /// What [`open`](super::open()) understands, for messages and help texts.
-pub const URLS: &str = "socketcand://HOST:PORT/BUS, slcan:PORT@BITRATE, slcan:tcp://HOST:PORT@BITRATE, \
-                        socketcan:INTERFACE (Linux), cia309://HOST:PORT/NET (gateway, SDO alone)";
+pub const URLS: &str = "socketcan:INTERFACE (Linux), slcan:PORT@BITRATE, slcan:tcp://HOST:PORT@BITRATE, \
+                        peak:CHANNEL@BITRATE, kvaser:NUMBER@BITRATE, gs_usb:NUMBER@BITRATE, \
+                        socketcand://HOST:PORT/BUS, cia309://HOST:PORT/NET (gateway, SDO alone)";
 
 /// What an adapter can be out of.
 #[derive(Debug)]
@@ -70,7 +87,7 @@ pub enum AdapterError {
         /// The URL.
         url: String,
         /// What is wrong with it.
-        why: &'static str,
+        why: String,
     },
     /// The adapter is not there, or does not let us in.
     Open {
@@ -78,6 +95,24 @@ pub enum AdapterError {
         adapter: String,
         /// What it said.
         source: io::Error,
+    },
+    /// The adapter is not there, does not let us in or lacks its driver, for a reason that is known.
+    Unusable {
+        /// Which one.
+        adapter: String,
+        /// What is the matter.
+        what: String,
+        /// What to do.
+        advice: String,
+        /// Whether the reason is that another program has it.
+        in_use: bool,
+    },
+    /// The adapter takes no frames any more: those that it has do not leave it.
+    Stuck {
+        /// Which one.
+        adapter: String,
+        /// What it knows of its bus.
+        health: Health,
     },
     /// The adapter did not speak as it must.
     Protocol {
@@ -108,22 +143,41 @@ impl AdapterError {
     pub const fn number(&self) -> u32 {
         match self {
             Self::Url { .. } => 0x6000_0300,
-            Self::Open { .. } => 0x6000_0301,
+            Self::Open { .. } | Self::Unusable { .. } => 0x6000_0301,
             Self::Protocol { .. } => 0x6000_0302,
             Self::Lost { .. } => 0x6000_0303,
             Self::Gateway { .. } => 0x6000_0304,
+            Self::Stuck { .. } => 0x6000_0305,
         }
     }
 
     /// What to do next.
     #[must_use]
-    pub const fn advice(&self) -> &'static str {
+    pub fn advice(&self) -> String {
         match self {
             Self::Url { .. } => {
-                "give the bus as --bus URL or in COFLASH_BUS, for example socketcand://127.0.0.1:29536/can0"
+                "give the bus as --bus URL or in COFLASH_BUS, for example socketcan:can0 or slcan:/dev/ttyACM0@500k; \
+                 coflash adapters lists those that are there"
             }
-            Self::Open { .. } => {
-                "check that the adapter is there, that its name is right and that it is switched on"
+            Self::Open { source, .. } => match source.kind() {
+                io::ErrorKind::ConnectionRefused => {
+                    "nothing listens on this port: start the server (socketcand, coboot-node, an emulated board), and \
+                     check the port's number"
+                }
+                io::ErrorKind::TimedOut | io::ErrorKind::HostUnreachable | io::ErrorKind::NetworkUnreachable => {
+                    "check the address, the network cable and firewalls: the host does not answer"
+                }
+                io::ErrorKind::PermissionDenied => "check who may use it, or write there",
+                io::ErrorKind::NotFound => "check the name: there is nothing of this name",
+                _ => "check that the adapter is there, that its name is right and that it is switched on",
+            },
+            Self::Unusable { advice, .. } => return advice.clone(),
+            Self::Stuck { health, .. } => {
+                return health.advice().unwrap_or_else(|| {
+                    "nobody acknowledges on the bus: check that the device has power, that cable and terminators are \
+                     right, and that both sides use the same bit rate"
+                        .to_string()
+                })
             }
             Self::Protocol { .. } => {
                 "check that the address is that of the adapter, and that it knows this bus"
@@ -136,6 +190,26 @@ impl AdapterError {
                 "check cable, adapter and the program behind it; the device can be flashed again at once"
             }
         }
+        .to_string()
+    }
+
+    /// A vendor's library that cannot be used, and where it is to be had.
+    #[cfg(any(feature = "peak", feature = "kvaser"))]
+    pub(crate) fn library(adapter: &str, error: &vendor_can::LoadError, from: &str) -> Self {
+        let advice = match error {
+            vendor_can::LoadError::Missing { .. } => from.to_string(),
+            vendor_can::LoadError::Old { .. } => format!("it is too old, or another library: {from}"),
+        };
+        Self::unusable(adapter, error.to_string(), advice)
+    }
+
+    /// An adapter that cannot be opened.
+    pub(crate) fn unusable(
+        adapter: impl Into<String>,
+        what: impl Into<String>,
+        advice: impl Into<String>,
+    ) -> Self {
+        Self::Unusable { adapter: adapter.into(), what: what.into(), advice: advice.into(), in_use: false }
     }
 }
 
@@ -144,6 +218,10 @@ impl fmt::Display for AdapterError {
         match self {
             Self::Url { url, why } => write!(f, "bus '{url}': {why} (known are {URLS})"),
             Self::Open { adapter, source } => write!(f, "{adapter} cannot be opened: {source}"),
+            Self::Unusable { adapter, what, .. } => write!(f, "{adapter} cannot be opened: {what}"),
+            Self::Stuck { adapter, .. } => {
+                write!(f, "{adapter} takes no frames any more: what it has does not get onto the bus")
+            }
             Self::Protocol { adapter, said } => write!(f, "{adapter} answered unexpectedly: {said}"),
             Self::Lost { adapter, source } => write!(f, "{adapter} is gone: {source}"),
             Self::Gateway { adapter, what } => write!(f, "{adapter}: {what}"),
@@ -155,7 +233,11 @@ impl std::error::Error for AdapterError {
     fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
         match self {
             Self::Open { source, .. } | Self::Lost { source, .. } => Some(source),
-            Self::Url { .. } | Self::Protocol { .. } | Self::Gateway { .. } => None,
+            Self::Url { .. }
+            | Self::Unusable { .. }
+            | Self::Stuck { .. }
+            | Self::Protocol { .. }
+            | Self::Gateway { .. } => None,
         }
     }
 }

@@ -215,7 +215,16 @@ fn copy(error: &AdapterError) -> AdapterError {
         None => io::Error::new(source.kind(), source.to_string()),
     };
     match error {
-        AdapterError::Url { url, why } => AdapterError::Url { url: url.clone(), why },
+        AdapterError::Url { url, why } => AdapterError::Url { url: url.clone(), why: why.clone() },
+        AdapterError::Unusable { adapter, what, advice, in_use } => AdapterError::Unusable {
+            adapter: adapter.clone(),
+            what: what.clone(),
+            advice: advice.clone(),
+            in_use: *in_use,
+        },
+        AdapterError::Stuck { adapter, health } => {
+            AdapterError::Stuck { adapter: adapter.clone(), health: *health }
+        }
         AdapterError::Open { adapter, source } => {
             AdapterError::Open { adapter: adapter.clone(), source: again(source) }
         }

@@ -3,27 +3,47 @@
 //! Here are frames, and nothing of what a device makes of them: that is [`device`](crate::device).
 
 pub mod adapter;
+mod beacons;
 pub mod candump;
 pub mod cia309;
 pub mod decode;
+#[cfg(any(feature = "peak", feature = "kvaser", feature = "gs_usb"))]
+mod driven;
+mod found;
 pub mod gateway;
+#[cfg(feature = "gs_usb")]
+mod gs_usb;
+pub mod health;
 mod hex;
 pub mod hub;
+mod in_time;
+#[cfg(feature = "kvaser")]
+mod kvaser;
 mod link;
-pub(crate) mod open;
+#[cfg(target_os = "linux")]
+mod links;
+mod list;
+mod open;
+#[cfg(feature = "peak")]
+mod peak;
+mod ports;
 mod sdo_ids;
 pub mod slcan;
 #[cfg(target_os = "linux")]
 mod socketcan;
 pub mod socketcand;
+mod target;
 mod tcp;
 mod trace;
 
 pub use self::adapter::{Adapter, AdapterError, URLS};
 pub use self::cia309::Cia309;
+pub use self::found::{Found, Kind, Missing};
 pub use self::gateway::{Gateway, GatewayError};
+pub use self::health::Health;
 pub use self::link::Link;
-pub use self::open::{open, open_at};
+pub use self::list::{list, List};
+pub use self::open::{check, open, open_at};
 pub use self::sdo_ids::SdoIds;
 pub use self::slcan::{Line, Slcan};
 #[cfg(target_os = "linux")]

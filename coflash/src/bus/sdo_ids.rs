@@ -6,6 +6,7 @@ use canopen::{CobId, Frame, NodeId};
 use embedded_can::Frame as _;
 
 use super::adapter::{Adapter, AdapterError};
+use super::health::Health;
 
 /// An adapter behind which devices listen to SDO requests, and answer them, on identifiers of their
 /// own (`BLCOP_BASE_REQUEST` and `BLCOP_BASE_RESPONSE` of the manual). To its user they are those of
@@ -63,6 +64,10 @@ impl<A: Adapter> Adapter for SdoIds<A> {
 
     fn now(&self) -> Duration {
         self.adapter.now()
+    }
+
+    fn health(&mut self) -> Option<Health> {
+        self.adapter.health()
     }
 }
 

@@ -1,5 +1,6 @@
 //! SLCAN: CAN frames as text over a serial line (Lawicel CAN232 manual, version 3), or over TCP.
 
+use std::collections::VecDeque;
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
@@ -8,13 +9,18 @@ use canopen::Frame;
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 
 use super::adapter::{Adapter, AdapterError};
+use super::found::shown;
+use super::health::{Controller, Health};
 use super::hex::{hex_bytes, hex_number};
+use super::ports;
 use super::tcp::{connect, PATIENCE};
 
 /// How long an adapter may take to answer a command. Some never do, and work nevertheless.
 const ANSWER: Duration = Duration::from_millis(300);
 /// No message of the protocol comes near this length.
 const LONGEST_MESSAGE: usize = 64;
+/// Frames that are kept while an answer is waited for.
+const MOST_EARLY: usize = 1024;
 /// The speed of a serial line; adapters on USB do not look at it.
 const BAUD: u32 = 115_200;
 
@@ -58,6 +64,21 @@ pub struct Slcan<L: Line> {
     partial: Vec<u8>,
     /// What has arrived and was not looked at yet.
     rest: Vec<u8>,
+    /// Frames that came while an answer was waited for.
+    early: VecDeque<Frame>,
+    /// Something that it said while it was opened, and that is not of the protocol.
+    odd: Option<String>,
+}
+
+/// What came of a command.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Answer {
+    /// It was answered as the protocol has it.
+    Done,
+    /// It was refused (BEL).
+    Refused,
+    /// Nothing came, or nothing of the protocol.
+    None,
 }
 
 /// A message of the adapter.
@@ -94,7 +115,7 @@ impl Slcan<Box<dyn serialport::SerialPort>> {
         let line = serialport::new(port, BAUD)
             .timeout(PATIENCE)
             .open()
-            .map_err(|error| AdapterError::Open { adapter: name.clone(), source: io::Error::from(error) })?;
+            .map_err(|error| ports::refused(name.clone(), port, &error))?;
         Self::open(line, name, bit_rate)
     }
 }
@@ -111,34 +132,78 @@ impl<L: Line> Slcan<L> {
         // refused, which is well.
         adapter.send_text("\r\rC\r")?;
         adapter.settle()?;
+        // The version: an adapter that leaves out acknowledgements tells at least that.
+        let version = adapter.command("V\r", |text| text.len() > 1 && text[0] == b'V')?;
         if let Some(rate) = bit_rate {
             let Some(number) = BIT_RATES.iter().position(|known| *known == rate) else {
                 return Err(adapter.unexpected(format!("{rate} bit/s is none of its bit rates")));
             };
-            adapter.command(&format!("S{number}\r"), "the bit rate")?;
+            if adapter.command(&format!("S{number}\r"), <[u8]>::is_empty)? == Answer::Refused {
+                return Err(adapter.unexpected("it refuses the bit rate".to_string()));
+            }
         }
-        adapter.command("O\r", "opening the bus")?;
-        Ok(adapter)
+        match adapter.command("O\r", <[u8]>::is_empty)? {
+            Answer::Refused => Err(adapter.unexpected("it refuses opening the bus".to_string())),
+            Answer::None if version == Answer::None => Err(adapter.mute()),
+            Answer::Done | Answer::None => Ok(adapter),
+        }
     }
 
     /// The adapter at the other end of `line`, whose bus is open already.
     pub fn opened(line: L, name: String) -> Self {
-        Self { opened: line.now(), line, name, partial: Vec::new(), rest: Vec::new() }
+        Self {
+            opened: line.now(),
+            line,
+            name,
+            partial: Vec::new(),
+            rest: Vec::new(),
+            early: VecDeque::new(),
+            odd: None,
+        }
     }
 
-    /// Gives a command and waits for the answer, if one comes.
-    fn command(&mut self, text: &str, what: &str) -> Result<(), AdapterError> {
+    /// Gives a command and waits for the answer that `answers` knows, if one comes.
+    fn command(&mut self, text: &str, answers: impl Fn(&[u8]) -> bool) -> Result<Answer, AdapterError> {
         self.send_text(text)?;
         let deadline = self.line.now() + ANSWER;
-        loop {
-            match self.message(deadline)? {
-                Some(Message::Refused) => return Err(self.unexpected(format!("it refuses {what}"))),
-                Some(Message::Text(text)) if text.is_empty() => return Ok(()),
-                // Frames may come as soon as the bus is open.
-                Some(Message::Text(_)) => {}
-                None => return Ok(()),
+        while let Some(message) = self.message(deadline)? {
+            match message {
+                Message::Refused => return Ok(Answer::Refused),
+                Message::Text(text) if answers(&text) => return Ok(Answer::Done),
+                Message::Text(text) => self.stray(&text),
+            }
+            // A line that never ends its chatter ends the waiting all the same.
+            if self.line.now() >= deadline {
+                break;
             }
         }
+        Ok(Answer::None)
+    }
+
+    /// Keeps what came while something else was waited for.
+    fn stray(&mut self, text: &[u8]) {
+        match parse_frame(text) {
+            // Frames may come as soon as the bus is open.
+            Some(frame) if self.early.len() < MOST_EARLY => self.early.push_back(frame),
+            Some(_) => {}
+            None if text.is_empty() || matches!(text, b"z" | b"Z") => {}
+            None => self.odd = Some(shown(text)),
+        }
+    }
+
+    /// What answers neither V nor O is no SLCAN adapter.
+    fn mute(&self) -> AdapterError {
+        let said = match &self.odd {
+            Some(odd) => format!("; it sent '{odd}'"),
+            None => String::new(),
+        };
+        let what = format!("it answered neither V (version) nor O (open the bus){said}");
+        let advice = format!(
+            "this is no SLCAN adapter, or another port of it: {}; some adapters have to be told to speak SLCAN, or speak gs_usb \
+             (coflash adapters)",
+            ports::those_there()
+        );
+        AdapterError::unusable(self.name.clone(), what, advice)
     }
 
     /// Reads what comes until nothing does.
@@ -146,8 +211,11 @@ impl<L: Line> Slcan<L> {
         let end = self.line.now() + ANSWER;
         while self.line.now() < end {
             let quiet = self.line.now() + Duration::from_millis(50);
-            if self.message(quiet.min(end))?.is_none() {
-                break;
+            match self.message(quiet.min(end))? {
+                Some(Message::Text(text)) if parse_frame(&text).is_none() => self.stray(&text),
+                // Frames of a bus that was open are of a time before ours.
+                Some(_) => {}
+                None => break,
             }
         }
         Ok(())
@@ -235,6 +303,9 @@ impl<L: Line> Adapter for Slcan<L> {
     }
 
     fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        if let Some(frame) = self.early.pop_front() {
+            return Ok(Some(frame));
+        }
         let deadline = self.line.now() + timeout;
         while let Some(message) = self.message(deadline)? {
             // Acknowledgements of what was sent (z, Z, empty) are not for us. A frame that the
@@ -255,6 +326,34 @@ impl<L: Line> Adapter for Slcan<L> {
     fn now(&self) -> Duration {
         self.line.now().saturating_duration_since(self.opened)
     }
+
+    /// Asks for the status flags (`F`), which not all adapters know.
+    fn health(&mut self) -> Option<Health> {
+        let flags = std::cell::Cell::new(None);
+        let answers = |text: &[u8]| {
+            flags.set(status_flags(text).or(flags.get()));
+            flags.get().is_some()
+        };
+        let answer = self.command("F\r", answers);
+        flags.get().filter(|_| matches!(answer, Ok(Answer::Done))).map(|flags| {
+            let controller = match flags {
+                flags if flags & PASSIVE != 0 => Controller::Passive,
+                flags if flags & WARNING != 0 => Controller::Warning,
+                _ => Controller::Active,
+            };
+            Health { controller: Some(controller), ..Health::default() }
+        })
+    }
+}
+
+/// Bits of the status flags: error warning, and error passive.
+const WARNING: u32 = 0x04;
+const PASSIVE: u32 = 0x20;
+
+/// `Fxx`.
+fn status_flags(text: &[u8]) -> Option<u32> {
+    let digits = text.strip_prefix(b"F").filter(|digits| digits.len() == 2)?;
+    hex_number(std::str::from_utf8(digits).ok()?)
 }
 
 /// `t6018400010…`, `T1234567880…`, `r6018`, `R123456788`, with the line's end.
@@ -395,8 +494,13 @@ mod tests {
     #[test]
     fn a_session_sets_the_bit_rate_opens_and_closes() {
         // The bus was closed already; the frame comes right behind the acknowledge.
-        let answers =
-            [("C\r", &b"\r\x07"[..]), ("S6\r", b"\r"), ("O\r", b"\rt70517F\r"), ("t6050\r", b"z\rt5850\r")];
+        let answers = [
+            ("C\r", &b"\r\x07"[..]),
+            ("V\r", b"V1013\r"),
+            ("S6\r", b"\r"),
+            ("O\r", b"\rt70517F\r"),
+            ("t6050\r", b"z\rt5850\r"),
+        ];
         let mut played = Played { answers: answers.into(), ..Played::default() };
         let mut bus = open(&mut played, Some(500_000)).unwrap();
         let soon = Duration::from_millis(20);
@@ -405,12 +509,24 @@ mod tests {
         assert_eq!(bus.receive(soon).unwrap(), Some(frame(0x585, &[])));
         assert_eq!(bus.receive(soon).unwrap(), None);
         drop(bus);
-        assert_eq!(played.written, "\r\rC\rS6\rO\rt6050\rC\r");
+        assert_eq!(played.written, "\r\rC\rV\rS6\rO\rt6050\rC\r");
     }
 
     #[test]
-    fn an_adapter_that_answers_to_nothing_works_and_one_that_refuses_is_named() {
-        assert!(open(&mut Played::default(), None).is_ok());
+    fn an_adapter_that_answers_v_or_o_works_and_one_that_refuses_or_is_mute_is_named() {
+        for answers in [vec![("V\r", &b"V1013\r"[..])], vec![("V\r", b"\x07")], vec![("O\r", b"\r")]] {
+            assert!(open(&mut Played { answers: answers.into(), ..Played::default() }, None).is_ok());
+        }
+        let mute = |played: &mut Played| open(played, None).map(|_| ()).unwrap_err().to_string();
+        let error = mute(&mut Played::default());
+        assert!(error.ends_with("it answered neither V (version) nor O (open the bus)"), "{error}");
+        // A GPS receiver, and a port that echoes.
+        let mut gps = Played { answers: vec![("V\r", &b"$GPGGA,1,2\r\n"[..])].into(), ..Played::default() };
+        let error = mute(&mut gps);
+        assert!(error.ends_with("; it sent '$GPGGA,1,2'"), "{error}");
+        let echo = vec![("C\r", &b"C\r"[..]), ("V\r", b"V\r"), ("O\r", b"O\r")];
+        let error = mute(&mut Played { answers: echo.into(), ..Played::default() });
+        assert!(error.ends_with("; it sent 'O'"), "{error}");
         for (answers, rate, words) in [
             (vec![("S4\r", &b"\x07"[..])], 125_000, "it refuses the bit rate"),
             (vec![("O\r", &b"\x07"[..])], 125_000, "it refuses opening the bus"),
@@ -423,6 +539,26 @@ mod tests {
         let mut gone = Played { gone: true, ..Played::default() };
         let error = open(&mut gone, None).map(|_| ()).unwrap_err();
         assert!(matches!(error, AdapterError::Lost { .. }), "{error}");
+    }
+
+    #[test]
+    fn the_status_flags_tell_the_controllers_state() {
+        for (answer, controller) in [
+            (&b"F00\r"[..], Some(Controller::Active)),
+            (b"t70517F\rF04\r", Some(Controller::Warning)),
+            (b"FA4\r", Some(Controller::Passive)),
+            (b"\x07", None),
+            (b"F1\r", None),
+            (b"", None),
+        ] {
+            let answers = [("V\r", &b"V1013\r"[..]), ("O\r", b"\r"), ("F\r", answer)];
+            let mut played = Played { answers: answers.into(), ..Played::default() };
+            let mut bus = open(&mut played, None).unwrap();
+            assert_eq!(bus.health().and_then(|health| health.controller), controller, "{answer:?}");
+            // A frame that came meanwhile is not lost.
+            let frame_came = answer.starts_with(b"t");
+            assert_eq!(bus.receive(Duration::ZERO).unwrap().is_some(), frame_came);
+        }
     }
 
     #[test]

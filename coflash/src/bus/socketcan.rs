@@ -1,27 +1,42 @@
 //! Linux SocketCAN: the CAN interfaces of the kernel.
 
+use std::fs;
+use std::io;
 use std::io::ErrorKind;
+use std::path::Path;
 use std::thread;
 use std::time::{Duration, Instant};
 
 use canopen::Frame;
 use embedded_can::Frame as _;
-use socketcan::{CanFrame, CanSocket, Socket};
+use socketcan::{CanFrame, CanSocket, Socket, SocketOptions};
 
 use super::adapter::{Adapter, AdapterError};
+use super::found::shown;
+use super::health::{Controller, Health};
+use super::links;
 
 /// How long the interface may take to accept a frame. Its queue is full while nobody acknowledges
 /// on the bus.
 const PATIENCE: Duration = Duration::from_secs(1);
 /// `ENOBUFS`: the interface's queue is full. The kernel does not block for it.
 const QUEUE_FULL: i32 = 105;
+/// `ENODEV` and `ENXIO`: there is no such interface, or it is none of CAN.
+const NONE: [i32; 2] = [19, 6];
+/// `ENETDOWN`: the interface is switched off.
+const DOWN: i32 = 100;
+/// `EAFNOSUPPORT`, `EPROTONOSUPPORT` and `ESOCKTNOSUPPORT`: the kernel has no CAN, or not loaded.
+const NO_CAN: [i32; 3] = [97, 93, 94];
 
 /// A CAN interface of the kernel.
 #[derive(Debug)]
 pub struct SocketCan {
     socket: CanSocket,
+    interface: String,
     name: String,
     opened: Instant,
+    /// What the error frames have told.
+    health: Health,
 }
 
 impl SocketCan {
@@ -29,16 +44,88 @@ impl SocketCan {
     /// link`.
     ///
     /// # Errors
-    /// [`AdapterError::Open`].
+    /// [`AdapterError::Unusable`].
     pub fn open(interface: &str) -> Result<Self, AdapterError> {
         let name = format!("CAN interface {interface}");
-        let socket = CanSocket::open(interface)
-            .map_err(|source| AdapterError::Open { adapter: name.clone(), source })?;
-        Ok(Self { socket, name, opened: Instant::now() })
+        let socket = CanSocket::open(interface).map_err(|source| refused(&name, interface, &source))?;
+        if is_up(interface) == Some(false) {
+            let advice =
+                format!("switch it on, with the bit rate of the bus: sudo ip link set {interface} up type can bitrate 500000");
+            return Err(AdapterError::unusable(name, "it is switched off", advice));
+        }
+        // Without error frames the bus works as well, and less can be told of it.
+        let _ = socket.set_error_filter_accept_all();
+        let interface = interface.to_string();
+        Ok(Self { socket, interface, name, opened: Instant::now(), health: Health::default() })
     }
 
-    fn lost(&self, source: std::io::Error) -> AdapterError {
+    fn lost(&self, source: io::Error) -> AdapterError {
         AdapterError::Lost { adapter: self.name.clone(), source }
+    }
+
+    fn stuck(&mut self) -> AdapterError {
+        let health = self.health().unwrap_or_default();
+        AdapterError::Stuck { adapter: self.name.clone(), health }
+    }
+}
+
+/// Whether an interface is switched on (`IFF_UP`), where that can be told.
+fn is_up(interface: &str) -> Option<bool> {
+    let flags = fs::read_to_string(class(interface)?.join("flags")).ok()?;
+    let flags = u32::from_str_radix(flags.trim().strip_prefix("0x")?, 16).ok()?;
+    Some(flags & 1 != 0)
+}
+
+/// What the kernel tells of an interface.
+fn class(interface: &str) -> Option<std::path::PathBuf> {
+    let path = Path::new("/sys/class/net").join(interface);
+    (!interface.contains('/') && path.exists()).then_some(path)
+}
+
+/// Why an interface did not open, and what to do.
+fn refused(name: &str, interface: &str, error: &io::Error) -> AdapterError {
+    let code = error.raw_os_error().unwrap_or_default();
+    let there = class(interface).is_some();
+    let kind = class(interface).and_then(|class| fs::read_to_string(class.join("type")).ok());
+    // ARPHRD_CAN
+    let can = kind.is_none_or(|kind| kind.trim() == "280");
+    let (what, advice) = if there && !can {
+        ("it is no CAN interface".to_string(), those_there())
+    } else if NO_CAN.contains(&code) {
+        (
+            format!("this kernel has no CAN at present ({error})"),
+            "load it: sudo modprobe can_raw; where that fails, the kernel was built without, and an adapter goes without \
+             it: slcan:, peak:, kvaser: or gs_usb: (coflash adapters)"
+                .to_string(),
+        )
+    } else if NONE.contains(&code) {
+        ("there is no such interface".to_string(), those_there())
+    } else if code == DOWN {
+        (
+            "it is switched off".to_string(),
+            format!("sudo ip link set {interface} up type can bitrate 500000 (with the bit rate of the bus)"),
+        )
+    } else if error.kind() == ErrorKind::PermissionDenied {
+        (
+            "permission denied".to_string(),
+            "CAN interfaces need no rights on Linux; a container or a sandbox may forbid them".to_string(),
+        )
+    } else {
+        (error.to_string(), those_there())
+    };
+    AdapterError::unusable(name, what, advice)
+}
+
+/// The CAN interfaces that are there, for advice.
+fn those_there() -> String {
+    let links = links::all().unwrap_or_default();
+    let names: Vec<String> = links.iter().map(|link| shown(link.name.as_bytes())).take(16).collect();
+    match names.as_slice() {
+        [] => "this computer has no CAN interface at present: plug the adapter in, whose driver makes one (ip link shows it), \
+               then sudo ip link set can0 up type can bitrate 500000; an SLCAN adapter is used without: \
+               slcan:/dev/ttyACM0@500k"
+            .to_string(),
+        names => format!("these CAN interfaces are there: {}", names.join(", ")),
     }
 }
 
@@ -59,6 +146,11 @@ impl Adapter for SocketCan {
                 Err(error) if error.raw_os_error() == Some(QUEUE_FULL) && Instant::now() < deadline => {
                     thread::sleep(Duration::from_millis(1));
                 }
+                Err(error) if error.raw_os_error() == Some(QUEUE_FULL) => return Err(self.stuck()),
+                Err(error) if error.raw_os_error() == Some(DOWN) => {
+                    self.health.controller = Some(Controller::Stopped);
+                    return Err(self.stuck());
+                }
                 Err(error) => return Err(self.lost(error)),
             }
         }
@@ -69,13 +161,14 @@ impl Adapter for SocketCan {
         loop {
             let left = deadline.saturating_duration_since(Instant::now());
             match self.socket.read_frame_timeout(left) {
-                // Error frames and frames of CAN FD are not for us.
                 Ok(CanFrame::Data(frame)) => {
                     if let Some(frame) = Frame::new(frame.id(), frame.data()) {
                         return Ok(Some(frame));
                     }
                 }
-                Ok(_) => {}
+                Ok(CanFrame::Error(frame)) => self.health.error_frame(frame.error_bits(), frame.data()),
+                // Remote frames are not for us.
+                Ok(CanFrame::Remote(_)) => {}
                 Err(error)
                     if matches!(
                         error.kind(),
@@ -92,6 +185,22 @@ impl Adapter for SocketCan {
     fn now(&self) -> Duration {
         self.opened.elapsed()
     }
+
+    /// What the error frames have told, and what the kernel says of the controller now.
+    fn health(&mut self) -> Option<Health> {
+        let link = links::of(&self.interface);
+        let now = link.map(|link| Health {
+            controller: if link.up { link.health.controller } else { Some(Controller::Stopped) },
+            ..link.health
+        });
+        let Some(now) = now else { return Some(self.health) };
+        Some(Health {
+            controller: now.controller.or(self.health.controller),
+            counters: now.counters.or(self.health.counters),
+            bit_rate: now.bit_rate,
+            ..self.health
+        })
+    }
 }
 
 #[cfg(test)]
@@ -101,6 +210,7 @@ mod tests {
     #[test]
     fn an_interface_that_is_not_there_is_named() {
         let error = SocketCan::open("nocan99").unwrap_err();
-        assert!(error.to_string().starts_with("CAN interface nocan99 cannot be opened: "), "{error}");
+        assert_eq!(error.to_string(), "CAN interface nocan99 cannot be opened: there is no such interface");
+        assert!(error.advice().contains("CAN interface"), "{}", error.advice());
     }
 }

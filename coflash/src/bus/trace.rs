@@ -9,6 +9,7 @@ use canopen::Frame;
 
 use super::adapter::{Adapter, AdapterError};
 use super::candump::Line;
+use super::health::Health;
 
 /// An adapter whose frames, sent and received, are written to a file.
 pub struct Trace<A> {
@@ -81,5 +82,9 @@ impl<A: Adapter> Adapter for Trace<A> {
 
     fn now(&self) -> Duration {
         self.adapter.now()
+    }
+
+    fn health(&mut self) -> Option<Health> {
+        self.adapter.health()
     }
 }

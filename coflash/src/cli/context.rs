@@ -2,14 +2,17 @@
 
 use std::path::PathBuf;
 
-use coflash::bus::{self, Adapter, Link, SdoIds, Trace};
+use coflash::bus::{self, Adapter, Kind, Link, SdoIds, Trace};
 
 use super::output::{Failure, Output};
+use super::search::{only, Kinds};
 
 /// What every command is given.
 pub(super) struct Context {
     /// What `--bus`, `COFLASH_BUS` or the configuration says.
     pub(super) bus: Option<String>,
+    /// What `--search` says.
+    pub(super) search: Option<Kinds>,
     pub(super) trace: Option<PathBuf>,
     /// COB-IDs of SDO requests and answers, without the node-ID, where they are not the usual ones.
     pub(super) sdo_request: Option<u16>,
@@ -22,7 +25,7 @@ pub(super) struct Context {
 impl Context {
     /// The CAN bus.
     pub(super) fn open(&self) -> Result<Box<dyn Adapter + Send>, Failure> {
-        let adapter = bus::open(self.url(self.bus.as_deref())?)?;
+        let adapter = bus::open(&self.url(self.bus.as_deref())?)?;
         self.traced(adapter)
     }
 
@@ -33,7 +36,7 @@ impl Context {
 
     /// The same to this bus, at this bit rate if the URL names none and the adapter sets it.
     pub(super) fn link_at(&self, bus: Option<&str>, bit_rate: Option<u32>) -> Result<Link, Failure> {
-        match Link::open(self.url(bus)?, bit_rate)? {
+        match Link::open(&self.url(bus)?, bit_rate)? {
             Link::Bus(adapter) => Ok(Link::Bus(self.traced(adapter)?)),
             gateway => {
                 if self.trace.is_some() {
@@ -44,11 +47,17 @@ impl Context {
         }
     }
 
-    fn url<'u>(&self, bus: Option<&'u str>) -> Result<&'u str, Failure> {
-        bus.ok_or_else(|| {
-            let advice = format!("give --bus URL or set COFLASH_BUS; known are {}", bus::URLS);
-            Failure::usage("it is not said on which CAN bus the device is", advice)
-        })
+    /// The kinds of adapters that are looked for.
+    pub(super) fn kinds(&self) -> Vec<Kind> {
+        self.search.as_ref().map_or_else(|| Kind::ALL.to_vec(), |kinds| kinds.0.clone())
+    }
+
+    /// The bus that is given, or that of the only adapter that is there.
+    fn url(&self, bus: Option<&str>) -> Result<String, Failure> {
+        match bus {
+            Some(bus) => Ok(bus.to_string()),
+            None => only(self.out, &self.kinds()),
+        }
     }
 
     fn traced(&self, adapter: Box<dyn Adapter + Send>) -> Result<Box<dyn Adapter + Send>, Failure> {

@@ -7,8 +7,10 @@ use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use self::context::Context;
 use self::output::{Failure, Output, EXIT_CODES, GLOBAL};
+use self::search::Kinds;
 use self::values::base_id;
 
+mod adapters;
 mod config;
 mod context;
 mod convert;
@@ -30,6 +32,7 @@ mod progress;
 mod read;
 mod reset;
 mod scan;
+mod search;
 mod shell;
 #[cfg(feature = "ui")]
 mod ui;
@@ -39,10 +42,17 @@ mod values;
 #[derive(Debug, Parser)]
 #[command(name = "coflash", version, max_term_width = 100, after_help = EXIT_CODES)]
 struct Cli {
-    /// The CAN bus: socketcand://HOST:PORT/BUS, slcan:PORT@BITRATE, slcan:tcp://HOST:PORT@BITRATE
-    /// or (on Linux) socketcan:INTERFACE; or a gateway to it: cia309://HOST:PORT/NET.
+    /// The CAN bus: socketcan:INTERFACE (on Linux), slcan:PORT@BITRATE, slcan:tcp://HOST:PORT@BITRATE,
+    /// peak:CHANNEL@BITRATE, kvaser:NUMBER@BITRATE, gs_usb:NUMBER@BITRATE or socketcand://HOST:PORT/BUS;
+    /// or a gateway to it: cia309://HOST:PORT/NET. Without it the only adapter is taken.
     #[arg(long, global = true, help_heading = GLOBAL, env = "COFLASH_BUS", value_name = "URL")]
     bus: Option<String>,
+
+    /// Which kinds of adapters are looked for, by the command adapters and where no --bus is given:
+    /// serial, socketcan, peak, kvaser, gs_usb, socketcand (with commas between), or none.
+    #[arg(long, global = true, help_heading = GLOBAL, env = "COFLASH_SEARCH", value_name = "KINDS",
+          value_parser = Kinds::parse)]
+    search: Option<Kinds>,
 
     /// A file with defaults for options; otherwise coflash.toml in the current folder, or the
     /// user's own.
@@ -75,6 +85,7 @@ enum Command {
     Convert(convert::Convert),
     Inspect(inspect::Inspect),
     Flash(Box<flash::Flash>),
+    Adapters(adapters::Adapters),
     Scan(scan::Scan),
     Info(info::Info),
     Status(program::Status),
@@ -96,11 +107,23 @@ enum Command {
 }
 
 impl Command {
+    /// Whether it may talk to a bus.
+    fn takes_a_bus(&self) -> bool {
+        !matches!(
+            self,
+            Self::Convert(_) | Self::Inspect(_) | Self::Adapters(_) | Self::Completions(_) | Self::Man(_)
+        )
+    }
+
     fn run(&self, context: &Context) -> Result<(), Failure> {
+        if let Some(bus) = context.bus.as_deref().filter(|_| self.takes_a_bus()) {
+            coflash::bus::check(bus)?;
+        }
         match self {
             Self::Convert(convert) => convert.run(context),
             Self::Inspect(inspect) => inspect.run(context),
             Self::Flash(flash) => flash.run(context),
+            Self::Adapters(adapters) => adapters.run(context),
             Self::Scan(scan) => scan.run(context),
             Self::Info(info) => info.run(context),
             Self::Status(status) => status.run(context),
@@ -127,6 +150,7 @@ impl Cli {
     fn context(&self) -> Context {
         Context {
             bus: self.bus.clone(),
+            search: self.search.clone(),
             trace: self.trace.clone(),
             sdo_request: self.sdo_request,
             sdo_response: self.sdo_response,
@@ -201,6 +225,7 @@ fn shell_line(context: &Context, words: Vec<String>) -> Result<(), Failure> {
     // What the line does not say, the shell's own command line does.
     let line = Context {
         bus: line.bus.or_else(|| context.bus.clone()),
+        search: line.search.or_else(|| context.search.clone()),
         trace: line.trace.or_else(|| context.trace.clone()),
         sdo_request: line.sdo_request.or(context.sdo_request),
         sdo_response: line.sdo_response.or(context.sdo_response),

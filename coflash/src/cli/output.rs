@@ -88,6 +88,13 @@ impl Output {
         }
     }
 
+    /// Says on standard error what people should know and programs need not.
+    pub(super) fn note(self, words: impl fmt::Display) {
+        if self.for_people() {
+            let _ = writeln!(io::stderr(), "{words}");
+        }
+    }
+
     /// Says something to people who asked for more.
     pub(super) fn detail(self, words: impl fmt::Display) {
         if self.verbose {

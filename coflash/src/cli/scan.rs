@@ -49,23 +49,36 @@ impl Scan {
         let mut adapter = context.open()?;
         context.out.detail("asking and listening");
         let found = scan(&mut *adapter, &options, &cancelled()?)?;
-        context.out.result(Table(&found), || json!({ "command": "scan", "nodes": values(&found) }));
+        let advice = match found.is_empty() {
+            true => adapter.health().and_then(|health| health.advice()),
+            false => None,
+        };
+        let table = Table { found: &found, advice: advice.as_deref() };
+        context.out.result(table, || json!({ "command": "scan", "nodes": values(&found), "advice": advice }));
         Ok(())
     }
 }
 
 /// A line for each node.
-struct Table<'f>(&'f BTreeMap<NodeId, Found>);
+struct Table<'f> {
+    found: &'f BTreeMap<NodeId, Found>,
+    /// Why nobody may answer.
+    advice: Option<&'f str>,
+}
 
 impl std::fmt::Display for Table<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        if self.0.is_empty() {
-            return f.write_str(
-                "nobody answers, and nobody is heard (coflash lss fastscan finds devices without node-ID)",
-            );
+        if self.found.is_empty() {
+            return match self.advice {
+                Some(advice) => write!(f, "nobody answers, and nobody is heard: {advice}"),
+                None => f.write_str(
+                    "nobody answers, and nobody is heard (coflash lss fastscan finds devices without node-ID)",
+                ),
+            };
         }
         let heads = ["node", "runs", "name", "software", "serial", "program 1", "heartbeat"];
-        let rows = std::iter::once(heads.map(String::from)).chain(self.0.iter().map(row)).collect::<Vec<_>>();
+        let rows =
+            std::iter::once(heads.map(String::from)).chain(self.found.iter().map(row)).collect::<Vec<_>>();
         let width = |column: usize| rows.iter().map(|row| row[column].len()).max().unwrap_or_default();
         let widths: Vec<usize> = (0..heads.len()).map(width).collect();
         for row in &rows {

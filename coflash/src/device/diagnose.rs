@@ -10,6 +10,7 @@ use canopen::NodeId;
 use super::error::Error;
 use super::session::Session;
 use crate::bus::decode::state_words;
+use crate::bus::Health;
 
 /// How long to listen: heartbeats come once a second in most networks.
 pub const LISTEN: Duration = Duration::from_millis(1200);
@@ -23,6 +24,8 @@ pub struct Diagnosis {
     pub frames: usize,
     /// Nodes heard, with the state that they told last.
     pub heard: BTreeMap<NodeId, Option<NmtState>>,
+    /// What the adapter knows of its bus, where it tells.
+    pub health: Option<Health>,
 }
 
 /// Listens to the bus for [`LISTEN`].
@@ -30,7 +33,7 @@ pub struct Diagnosis {
 /// # Errors
 /// [`Error::Adapter`] or [`Error::Cancelled`].
 pub fn diagnose(session: &mut Session<'_>) -> Result<Diagnosis, Error> {
-    let mut diagnosis = Diagnosis { node: session.node(), frames: 0, heard: BTreeMap::new() };
+    let mut diagnosis = Diagnosis { node: session.node(), frames: 0, heard: BTreeMap::new(), health: None };
     session.observe(LISTEN, &mut |frame| {
         diagnosis.frames += 1;
         if let Some((node, state)) = parse_state_message(frame) {
@@ -43,18 +46,32 @@ pub fn diagnose(session: &mut Session<'_>) -> Result<Diagnosis, Error> {
             }
         }
     })?;
+    diagnosis.health = session.health();
     Ok(diagnosis)
 }
 
 impl fmt::Display for Diagnosis {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { node, frames, heard } = self;
+        let Self { node, frames, heard, health } = self;
         if *frames == 0 {
+            if let Some(advice) = health.and_then(|health| health.advice()) {
+                return f.write_str(&advice);
+            }
+            if health.is_some_and(|health| health.acknowledged()) {
+                return write!(
+                    f,
+                    "what the adapter sends is acknowledged, so another node is on the bus and the bit rate is right: check that \
+                     node {node} is the right one (coflash scan asks all of them, coflash lss fastscan finds devices without \
+                     node-ID), and that it is switched on; a program that never answers is caught by coflash catch while the \
+                     device is switched off and on, or kept from starting by the entry strap"
+                );
+            }
             return write!(
                 f,
                 "nothing at all is heard on the bus: check that the device has power, that both sides use the same bit \
                  rate, and that cable and terminators are right; a device may also be silent because it has no node-ID \
-                 (coflash lss fastscan) or is off the bus (switch it off and on)"
+                 (coflash lss fastscan), is off the bus (switch it off and on), or runs a program that never answers (coflash \
+                 catch holds it in the bootloader when it is switched on, and so does the entry strap)"
             );
         }
         match heard.get(node) {

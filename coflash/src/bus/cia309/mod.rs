@@ -66,7 +66,7 @@ pub struct Cia309 {
 
 /// `//HOST:PORT/NET`, where NET is 1 unless told otherwise.
 pub(super) fn open(url: &str, rest: &str) -> Result<Cia309, AdapterError> {
-    let bad = |why| AdapterError::Url { url: url.to_string(), why };
+    let bad = |why: &str| AdapterError::Url { url: url.to_string(), why: why.to_string() };
     let rest = rest.strip_prefix("//").ok_or_else(|| bad("it must be cia309://HOST:PORT/NET"))?;
     let (server, network) = rest.split_once('/').unwrap_or((rest, "1"));
     let graphic = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_ascii_graphic());

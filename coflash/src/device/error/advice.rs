@@ -11,7 +11,7 @@ impl Error {
     #[must_use]
     pub fn advice(&self) -> String {
         match self {
-            Self::Adapter(error) => error.advice().to_string(),
+            Self::Adapter(error) => error.advice(),
             Self::Cancelled => "run the same command again when you like".to_string(),
             Self::NoAnswer { node, .. } => format!(
                 "check that node {node} is the right one, that the device has power, that both sides use the same bit \
@@ -44,7 +44,8 @@ impl Error {
                     .to_string()
             }
             Self::NoBootloader { .. } => "switch the device off and on and run the command again; if its application \
-                                          ignores the call, use the entry strap"
+                                          ignores the call, coflash catch holds the device in the bootloader while it is \
+                                          switched off and on (rescue window), and so does the entry strap"
                 .to_string(),
             Self::Lss { doing, failure: LssFailure::NoAnswer } => match doing {
                 LssDoing::Fastscan => "run it again; if it happens again, two devices may have one LSS address",
@@ -75,7 +76,8 @@ impl Error {
                     .to_string()
             }
             Self::StartFailed { .. } => "the program may not speak CANopen, use another node-ID or bit rate, or crash; \
-                                         flash another one after calling the bootloader by power-on or entry strap"
+                                         coflash catch holds the device in the bootloader while it is switched off and on \
+                                         (rescue window), and so does the entry strap; then flash another one"
                 .to_string(),
         }
     }

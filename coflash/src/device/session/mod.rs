@@ -15,7 +15,7 @@ use super::error::Error;
 use super::timing::{Timing, Transfers};
 use crate::bus::adapter::Adapter;
 use crate::bus::gateway::Gateway;
-use crate::bus::Link;
+use crate::bus::{Health, Link};
 
 mod listen;
 mod remote;
@@ -137,6 +137,14 @@ impl<'a> Session<'a> {
     #[must_use]
     pub fn hears_the_bus(&self) -> bool {
         matches!(self.way, Way::Bus(_))
+    }
+
+    /// What the adapter knows of its bus beyond the frames.
+    pub fn health(&mut self) -> Option<Health> {
+        match &mut self.way {
+            Way::Bus(adapter) => adapter.health(),
+            Way::Gateway(_) => None,
+        }
     }
 
     /// Reads a value of up to 4096 bytes. A read that gets no answer is repeated.

@@ -1,0 +1,235 @@
+//! An adapter whose driver runs on a thread of its own.
+//!
+//! A vendor's library may block, lie or never come back; a USB device may stop answering. None of this
+//! may stop the tool: the thread waits for the driver, and the rest of the tool waits for the thread,
+//! with limits.
+
+use std::fmt;
+use std::io;
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError, SyncSender, TryRecvError, TrySendError};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use canopen::Frame;
+
+use super::adapter::{Adapter, AdapterError};
+use super::health::Health;
+
+/// What stands between the thread and the hardware.
+pub(super) trait Driver {
+    /// Hands a frame to the hardware's queue. Does not wait.
+    fn send(&mut self, frame: &Frame) -> Result<Sent, Fault>;
+
+    /// What comes next, after `wait` at most. `None` where that is no frame.
+    fn receive(&mut self, wait: Duration) -> Result<Option<Frame>, Fault>;
+
+    /// What it knows of the bus by now.
+    fn health(&mut self) -> Health;
+
+    /// Leaves the bus.
+    fn close(&mut self);
+}
+
+/// What became of a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Sent {
+    /// The hardware has it.
+    Taken,
+    /// There is no room for it at present.
+    Full,
+}
+
+/// What ends an adapter.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Fault {
+    /// It is gone, and how that showed.
+    Lost(String),
+    /// It says what makes no sense.
+    Nonsense(String),
+    /// It takes no frames any more.
+    Stuck(Health),
+}
+
+/// How long a driver may take to open.
+const OPENING: Duration = Duration::from_secs(10);
+/// How long a frame may wait for room, and a driver for its end.
+const PATIENCE: Duration = Duration::from_secs(1);
+/// How long the thread waits for a frame before it looks for one to send.
+const TURN: Duration = Duration::from_millis(1);
+/// How often the driver is asked for the state of the bus.
+const LOOK: Duration = Duration::from_millis(50);
+/// Frames that may wait to be sent, and to be received. What comes beyond that is lost, as it is in a
+/// controller that nobody reads.
+const OUTGOING: usize = 64;
+const INCOMING: usize = 4096;
+
+/// What the thread leaves behind.
+#[derive(Default)]
+struct Left {
+    health: Health,
+    fault: Option<Fault>,
+}
+
+/// The tool's side.
+pub(super) struct Driven {
+    name: String,
+    opened: Instant,
+    /// `None` while it is dropped.
+    outgoing: Option<SyncSender<Frame>>,
+    incoming: Receiver<Frame>,
+    left: Arc<Mutex<Left>>,
+}
+
+impl fmt::Debug for Driven {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Driven").field("name", &self.name).finish_non_exhaustive()
+    }
+}
+
+impl Driven {
+    /// Opens a driver on its thread. `name` is for messages.
+    pub(super) fn open<D: Driver>(
+        name: String,
+        open: impl FnOnce() -> Result<D, AdapterError> + Send + 'static,
+    ) -> Result<Self, AdapterError> {
+        let (outgoing, commands) = mpsc::sync_channel(OUTGOING);
+        let (frames, incoming) = mpsc::sync_channel(INCOMING);
+        let left = Arc::<Mutex<Left>>::default();
+        let shared = left.clone();
+        let (told, opened) = mpsc::sync_channel(1);
+        thread::spawn(move || {
+            let mut driver = match open() {
+                Ok(driver) => driver,
+                Err(error) => {
+                    let _ = told.send(Err(error));
+                    return;
+                }
+            };
+            // Nobody waits any more: it took too long.
+            if told.send(Ok(())).is_ok() {
+                if let Err(fault) = work(&mut driver, &commands, &frames, &shared) {
+                    lock(&shared).fault = Some(fault);
+                }
+            }
+            driver.close();
+        });
+        match opened.recv_timeout(OPENING) {
+            Ok(Ok(())) => Ok(Self { name, opened: Instant::now(), outgoing: Some(outgoing), incoming, left }),
+            Ok(Err(error)) => Err(error),
+            Err(_) => Err(AdapterError::Open {
+                adapter: name,
+                source: io::Error::new(
+                    io::ErrorKind::TimedOut,
+                    format!("its driver has not come back for {} s", OPENING.as_secs()),
+                ),
+            }),
+        }
+    }
+
+    /// Why the thread has ended.
+    fn fault(&self) -> AdapterError {
+        let adapter = self.name.clone();
+        match lock(&self.left).fault.clone() {
+            Some(Fault::Nonsense(said)) => AdapterError::Protocol { adapter, said },
+            Some(Fault::Stuck(health)) => AdapterError::Stuck { adapter, health },
+            Some(Fault::Lost(how)) => AdapterError::Lost { adapter, source: io::Error::other(how) },
+            None => AdapterError::Lost { adapter, source: io::Error::other("its driver has crashed") },
+        }
+    }
+}
+
+/// A thread that has panicked has left nothing half done here.
+fn lock(left: &Mutex<Left>) -> std::sync::MutexGuard<'_, Left> {
+    left.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Carries frames between the tool and the driver until the tool has gone.
+fn work(
+    driver: &mut impl Driver,
+    commands: &Receiver<Frame>,
+    frames: &SyncSender<Frame>,
+    left: &Mutex<Left>,
+) -> Result<(), Fault> {
+    // A frame for which there was no room, and since when.
+    let mut waiting: Option<(Frame, Instant)> = None;
+    let mut looked = Instant::now();
+    loop {
+        loop {
+            let (frame, since) = match waiting.take() {
+                Some(waiting) => waiting,
+                None => match commands.try_recv() {
+                    Ok(frame) => (frame, Instant::now()),
+                    Err(TryRecvError::Empty) => break,
+                    Err(TryRecvError::Disconnected) => return Ok(()),
+                },
+            };
+            if driver.send(&frame)? == Sent::Full {
+                if since.elapsed() > PATIENCE {
+                    return Err(Fault::Stuck(driver.health()));
+                }
+                waiting = Some((frame, since));
+                break;
+            }
+        }
+        if let Some(frame) = driver.receive(TURN)? {
+            if let Err(TrySendError::Disconnected(_)) = frames.try_send(frame) {
+                return Ok(());
+            }
+        }
+        if looked.elapsed() >= LOOK {
+            looked = Instant::now();
+            lock(left).health = driver.health();
+        }
+    }
+}
+
+impl Drop for Driven {
+    /// What waits to be sent is sent, and the bus is left; if the driver does not come back, so be it.
+    fn drop(&mut self) {
+        self.outgoing = None;
+        let until = Instant::now() + PATIENCE;
+        // The thread's end closes the channel.
+        while let Ok(_) | Err(RecvTimeoutError::Timeout) = self.incoming.recv_timeout(TURN) {
+            if Instant::now() >= until {
+                break;
+            }
+        }
+    }
+}
+
+impl Adapter for Driven {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        let until = Instant::now() + 2 * PATIENCE;
+        loop {
+            let Some(outgoing) = &self.outgoing else { return Err(self.fault()) };
+            match outgoing.try_send(*frame) {
+                Ok(()) => return Ok(()),
+                Err(TrySendError::Full(_)) if Instant::now() < until => {
+                    thread::sleep(Duration::from_micros(200));
+                }
+                Err(TrySendError::Full(_)) => {
+                    let source = io::Error::new(io::ErrorKind::TimedOut, "its driver does not come back");
+                    return Err(AdapterError::Lost { adapter: self.name.clone(), source });
+                }
+                Err(TrySendError::Disconnected(_)) => return Err(self.fault()),
+            }
+        }
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        match self.incoming.recv_timeout(timeout) {
+            Ok(frame) => Ok(Some(frame)),
+            Err(RecvTimeoutError::Timeout) => Ok(None),
+            Err(RecvTimeoutError::Disconnected) => Err(self.fault()),
+        }
+    }
+
+    fn now(&self) -> Duration {
+        self.opened.elapsed()
+    }
+
+    fn health(&mut self) -> Option<Health> {
+        Some(lock(&self.left).health)
+    }
+}

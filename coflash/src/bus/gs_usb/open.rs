@@ -1,0 +1,36 @@
+//! Opens devices, and lists them.
+
+use super::driver::GsUsb;
+use super::usb;
+use super::which::{Choice, Which};
+use crate::bus::adapter::AdapterError;
+use crate::bus::driven::Driven;
+use crate::bus::found::{shown, Found, Kind};
+
+/// Opens a device at a bit rate in bit/s.
+pub(in crate::bus) fn open(which: Which, rate: u32) -> Result<Driven, AdapterError> {
+    let name = format!("gs_usb adapter {which}");
+    let adapter = name.clone();
+    Driven::open(name, move || {
+        let usb = usb::open(&adapter, &which.device)?;
+        GsUsb::start(usb, which.channel, rate).map_err(|what| {
+            let advice = "unplug the adapter, plug it in and run the command again; it must speak gs_usb (candleLight)";
+            AdapterError::unusable(adapter, what, advice)
+        })
+    })
+}
+
+/// The devices that are there, or what the system says instead.
+pub(in crate::bus) fn list() -> Result<Vec<Found>, String> {
+    let devices = usb::list()?;
+    let found = devices.iter().enumerate().map(|(place, device)| {
+        let serial = device
+            .serial
+            .as_deref()
+            .filter(|serial| matches!(Which::parse(serial), Some(Which { device: Choice::Serial(_), .. })));
+        let which = serial.map_or_else(|| place.to_string(), str::to_string);
+        let about = shown(device.product.as_deref().unwrap_or("USB adapter").as_bytes());
+        Found::new(Kind::GsUsb, format!("gs_usb:{}", shown(which.as_bytes())), about)
+    });
+    Ok(found.collect())
+}

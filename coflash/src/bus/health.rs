@@ -1,0 +1,239 @@
+//! What an adapter knows of its bus beyond the frames: the state of its controller, and the errors
+//! that it sees. It tells apart why nobody answers.
+
+use std::fmt;
+
+/// The state of a CAN controller (fault confinement, ISO 11898-1).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Controller {
+    /// Error active: it takes part in full.
+    Active,
+    /// An error counter has reached 96.
+    Warning,
+    /// Error passive: an error counter has reached 128.
+    Passive,
+    /// Bus-off: the error counter of sending has gone beyond 255, and it takes no part any more.
+    Off,
+    /// Switched off, or asleep.
+    Stopped,
+}
+
+impl Controller {
+    /// The words for people.
+    #[must_use]
+    pub const fn words(self) -> &'static str {
+        match self {
+            Self::Active => "error active",
+            Self::Warning => "error warning",
+            Self::Passive => "error passive",
+            Self::Off => "bus-off",
+            Self::Stopped => "switched off",
+        }
+    }
+}
+
+/// What an adapter has seen since it was opened.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Health {
+    /// The controller's state, where the adapter tells it.
+    pub controller: Option<Controller>,
+    /// Attempts to send that no other node acknowledged.
+    pub unacknowledged: u32,
+    /// Bit, stuff, form and CRC errors.
+    pub disturbed: u32,
+    /// The error counters of sending and of receiving, where the adapter tells them.
+    pub counters: Option<(u8, u8)>,
+    /// The bit rate in bit/s, where it is known.
+    pub bit_rate: Option<u32>,
+}
+
+/// What is the matter with a bus.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Trouble {
+    /// The adapter's controller is switched off.
+    Stopped,
+    /// The adapter's controller is bus-off.
+    Off,
+    /// Frames are disturbed.
+    Disturbed,
+    /// Nobody acknowledges what the adapter sends.
+    Unacknowledged,
+    /// The controller is error passive, and the adapter does not tell of which errors.
+    Passive,
+}
+
+/// The error counter of a sender that nobody acknowledges stays here: an error passive sender does not
+/// count missing acknowledgements (ISO 11898-1, fault confinement, exception A).
+const LONELY: u8 = 128;
+
+impl Health {
+    /// What is the matter, if something is.
+    #[must_use]
+    pub fn trouble(&self) -> Option<Trouble> {
+        let passive = self.controller == Some(Controller::Passive);
+        match self.controller {
+            Some(Controller::Stopped) => Some(Trouble::Stopped),
+            Some(Controller::Off) => Some(Trouble::Off),
+            // A disturbed frame does not come as far as its acknowledgement: where both are seen, the
+            // more frequent one is the cause.
+            _ if self.disturbed > self.unacknowledged => Some(Trouble::Disturbed),
+            _ if self.unacknowledged > 0 => Some(Trouble::Unacknowledged),
+            _ if passive
+                && self.counters.is_some_and(|(send, receive)| send == LONELY && receive < LONELY) =>
+            {
+                Some(Trouble::Unacknowledged)
+            }
+            _ if passive => Some(Trouble::Passive),
+            _ => None,
+        }
+    }
+
+    /// Whether other nodes acknowledge what is sent, as far as the adapter tells.
+    #[must_use]
+    pub fn acknowledged(&self) -> bool {
+        self.controller == Some(Controller::Active) && self.trouble().is_none()
+    }
+
+    /// What is the matter and what to do, as a sentence. `None` where nothing is, or nothing is known.
+    #[must_use]
+    pub fn advice(&self) -> Option<String> {
+        let rate = self.bit_rate.map_or(String::new(), |rate| format!(" (the adapter has {})", Rate(rate)));
+        Some(match self.trouble()? {
+            Trouble::Stopped => {
+                "the adapter's CAN controller is switched off: switch the interface on (sudo ip link set can0 up, with \
+                 its own name)"
+                    .to_string()
+            }
+            Trouble::Off => format!(
+                "the adapter is bus-off: all that it sent was disturbed, as by a wrong bit rate{rate} or a short circuit \
+                 between CAN-H and CAN-L; check both, then switch the adapter off and on (sudo ip link set can0 down, \
+                 then up)"
+            ),
+            Trouble::Disturbed => format!(
+                "frames on the bus are disturbed ({} bit, stuff, form or CRC errors): the bit rate is wrong{rate}, or a \
+                 terminator is missing; the others' bit rate must be the adapter's",
+                self.disturbed
+            ),
+            Trouble::Unacknowledged => format!(
+                "nobody acknowledges what the adapter sends: no other node is on this bus; check that the device has \
+                 power, that CAN-H, CAN-L and ground are connected and not swapped, and that it is not silent because \
+                 its bit rate is another one{rate}"
+            ),
+            Trouble::Passive => format!(
+                "the adapter is error passive: nobody acknowledges what it sends, or the bit rate is wrong{rate}; check \
+                 power, cable, terminators and bit rate"
+            ),
+        })
+    }
+
+    /// Takes in an error frame of Linux (`linux/can/error.h`), as SocketCAN and gs_usb have it: the
+    /// identifier's bits below `CAN_ERR_FLAG`, and the data.
+    pub fn error_frame(&mut self, class: u32, data: &[u8]) {
+        let byte = |at: usize| data.get(at).copied().unwrap_or_default();
+        // CAN_ERR_ACK; or CAN_ERR_PROT at the place CAN_ERR_PROT_LOC_ACK.
+        let unacknowledged = class & 0x20 != 0 || class & 0x08 != 0 && byte(3) == 0x19;
+        // CAN_ERR_PROT with BIT, FORM, STUFF, BIT0 or BIT1, or the places of a CRC error.
+        let disturbed = class & 0x08 != 0 && (byte(2) & 0x1F != 0 || matches!(byte(3), 0x08 | 0x18));
+        if unacknowledged {
+            self.unacknowledged = self.unacknowledged.saturating_add(1);
+        } else if disturbed {
+            self.disturbed = self.disturbed.saturating_add(1);
+        }
+        // CAN_ERR_CRTL: TX and RX PASSIVE, TX and RX WARNING, ACTIVE.
+        if class & 0x04 != 0 {
+            self.controller = match byte(1) {
+                state if state & 0x30 != 0 => Some(Controller::Passive),
+                state if state & 0x0C != 0 => Some(Controller::Warning),
+                state if state & 0x40 != 0 => Some(Controller::Active),
+                _ => self.controller,
+            };
+        }
+        // CAN_ERR_CNT, and drivers that are older than this flag.
+        if class & 0x200 != 0 || byte(6) != 0 || byte(7) != 0 {
+            self.counters = Some((byte(6), byte(7)));
+        }
+        // CAN_ERR_BUSOFF, CAN_ERR_RESTARTED.
+        if class & 0x40 != 0 {
+            self.controller = Some(Controller::Off);
+        }
+        if class & 0x100 != 0 {
+            self.controller = Some(Controller::Active);
+        }
+    }
+}
+
+/// A bit rate in the unit that people use.
+struct Rate(u32);
+
+impl fmt::Display for Rate {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.0 {
+            rate if rate % 1_000_000 == 0 => write!(f, "{} Mbit/s", rate / 1_000_000),
+            rate if rate % 1000 == 0 => write!(f, "{} kbit/s", rate / 1000),
+            rate => write!(f, "{rate} bit/s"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn after(frames: &[(u32, [u8; 8])]) -> Health {
+        let mut health = Health::default();
+        for (class, data) in frames {
+            health.error_frame(*class, data);
+        }
+        health
+    }
+
+    /// The bits are those of linux/can/error.h.
+    #[test]
+    fn error_frames_tell_no_acknowledgement_from_a_wrong_bit_rate() {
+        let at = |at: usize, value: u8| {
+            let mut data = [0; 8];
+            data[at] = value;
+            data
+        };
+        for (frames, trouble) in [
+            // CAN_ERR_ACK, as candleLight and flexcan have it; PROT at the ACK slot, as SJA1000 has it.
+            (vec![(0x20, [0; 8])], Some(Trouble::Unacknowledged)),
+            (vec![(0x88, at(3, 0x19))], Some(Trouble::Unacknowledged)),
+            // PROT: BIT 01h, FORM 02h, STUFF 04h, BIT0 08h, BIT1 10h, CRC at 08h.
+            (vec![(0x88, at(2, 0x01))], Some(Trouble::Disturbed)),
+            (vec![(0x88, at(2, 0x02))], Some(Trouble::Disturbed)),
+            (vec![(0x88, at(2, 0x04))], Some(Trouble::Disturbed)),
+            (vec![(0x88, at(2, 0x10))], Some(Trouble::Disturbed)),
+            (vec![(0x88, at(3, 0x08))], Some(Trouble::Disturbed)),
+            (vec![(0x88, at(2, 0x04)), (0x88, at(2, 0x04)), (0x20, [0; 8])], Some(Trouble::Disturbed)),
+            // CRTL: TX_PASSIVE 20h, RX_PASSIVE 10h, TX_WARNING 08h, ACTIVE 40h.
+            (vec![(0x04, at(1, 0x20))], Some(Trouble::Passive)),
+            (vec![(0x04, at(1, 0x10))], Some(Trouble::Passive)),
+            (vec![(0x04, at(1, 0x08))], None),
+            (vec![(0x04, at(1, 0x20)), (0x04, at(1, 0x40))], None),
+            (vec![(0x40, [0; 8])], Some(Trouble::Off)),
+            (vec![(0x40, [0; 8]), (0x100, [0; 8])], None),
+            // CNT: nobody acknowledges, and the counter stays at 128.
+            (vec![(0x204, [0, 0x20, 0, 0, 0, 0, 128, 0])], Some(Trouble::Unacknowledged)),
+            (vec![(0x204, [0, 0x20, 0, 0, 0, 0, 200, 0])], Some(Trouble::Passive)),
+            (vec![], None),
+        ] {
+            assert_eq!(after(&frames).trouble(), trouble, "{frames:X?}");
+        }
+        // Data that is shorter than a driver's.
+        let mut health = Health::default();
+        health.error_frame(0xFFFF_FFFF, &[]);
+        assert_eq!(health.trouble(), Some(Trouble::Unacknowledged));
+    }
+
+    #[test]
+    fn advice_names_the_bit_rate_and_what_to_do() {
+        let health = Health { bit_rate: Some(500_000), disturbed: 3, ..Health::default() };
+        let advice = health.advice().unwrap();
+        assert!(advice.contains("3 bit, stuff") && advice.contains("500 kbit/s"), "{advice}");
+        assert_eq!(Health::default().advice(), None);
+        assert!(!Health::default().acknowledged());
+        assert!(Health { controller: Some(Controller::Active), ..Health::default() }.acknowledged());
+    }
+}

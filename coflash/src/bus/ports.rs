@@ -1,0 +1,121 @@
+//! Serial ports: which are there, and why one cannot be opened.
+
+use serialport::{ErrorKind, SerialPortInfo, SerialPortType};
+
+use super::adapter::AdapterError;
+use super::found::{shown, Found, Kind, Missing};
+
+/// USB vendor and product of adapters that speak SLCAN and nothing else (CANable, now and at first).
+const SLCAN: [(u16, u16); 2] = [(0x16D0, 0x117E), (0xAD50, 0x60C4)];
+
+/// The serial ports. One on USB may have an SLCAN adapter behind it.
+pub(super) fn list() -> Result<Vec<Found>, Missing> {
+    let ports = serialport::available_ports().map_err(|error| Missing {
+        what: format!("the serial ports cannot be listed: {error}"),
+        advice: "name the port: --bus slcan:PORT@500k",
+    })?;
+    // macOS lists each port twice; the side that waits for a modem's carrier is none for us.
+    Ok(ports.iter().filter(|port| !port.port_name.starts_with("/dev/tty.")).map(found).collect())
+}
+
+fn found(port: &SerialPortInfo) -> Found {
+    let (about, certain) = match &port.port_type {
+        SerialPortType::UsbPort(usb) => {
+            let words = usb.product.as_deref().unwrap_or("USB serial port");
+            let certain = SLCAN.contains(&(usb.vid, usb.pid));
+            (format!("{words} (USB {:04x}:{:04x})", usb.vid, usb.pid), certain)
+        }
+        _ => ("serial port".to_string(), false),
+    };
+    let url = format!("slcan:{}", shown(port.port_name.as_bytes()));
+    Found { certain, ..Found::new(Kind::Serial, url, shown(about.as_bytes())) }
+}
+
+/// The ports that are there, for advice.
+pub(super) fn those_there() -> String {
+    let ports: Vec<String> = serialport::available_ports()
+        .unwrap_or_default()
+        .iter()
+        .map(|port| shown(port.port_name.as_bytes()))
+        .filter(|name| !name.starts_with("/dev/tty."))
+        .take(16)
+        .collect();
+    match ports.as_slice() {
+        [] => "this computer has no serial port at present".to_string(),
+        ports => format!("these serial ports are there: {}", ports.join(", ")),
+    }
+}
+
+/// Why a port did not open, and what to do.
+pub(super) fn refused(adapter: String, port: &str, error: &serialport::Error) -> AdapterError {
+    let io = match error.kind() {
+        ErrorKind::Io(kind) => Some(kind),
+        _ => None,
+    };
+    let there = std::path::Path::new(port).exists();
+    let in_use = match (error.kind(), io) {
+        (_, Some(std::io::ErrorKind::PermissionDenied)) => cfg!(windows),
+        (ErrorKind::NoDevice, _) => there,
+        _ => false,
+    };
+    let (what, advice) = match (error.kind(), io) {
+        _ if in_use => busy(port),
+        (_, Some(std::io::ErrorKind::PermissionDenied)) => {
+            let group = group(port);
+            (
+                "permission denied".to_string(),
+                format!(
+                    "the port belongs to the group {group}: sudo usermod -aG {group} $USER, then log out and in; or, for \
+                     this kind of adapter and everybody at this computer, a udev rule: put SUBSYSTEM==\"tty\", \
+                     ATTRS{{idVendor}}==\"16d0\", TAG+=\"uaccess\" (with the vendor that lsusb shows) into \
+                     /etc/udev/rules.d/70-slcan.rules, and plug the adapter in again"
+                ),
+            )
+        }
+        (ErrorKind::NoDevice, _) | (_, Some(std::io::ErrorKind::NotFound)) => (
+            "there is no such serial port".to_string(),
+            format!("{}; plug the adapter in, or name the right one: --bus slcan:PORT@500k", those_there()),
+        ),
+        _ if there => (
+            format!("it is no serial port ({})", shown(error.to_string().as_bytes())),
+            format!("{}; name the right one: --bus slcan:PORT@500k", those_there()),
+        ),
+        _ => (
+            shown(error.to_string().as_bytes()),
+            format!("{}; unplug the adapter and plug it in again", those_there()),
+        ),
+    };
+    AdapterError::Unusable { adapter, what, advice, in_use }
+}
+
+fn busy(port: &str) -> (String, String) {
+    let who = if cfg!(unix) {
+        format!("sudo fuser -v {port} names it; ModemManager takes new ports for some seconds")
+    } else {
+        "a terminal program, for example".to_string()
+    };
+    (
+        "another program uses the port".to_string(),
+        format!("close the other program ({who}), and run the command again"),
+    )
+}
+
+/// The group that may use a port; `dialout` where that cannot be told.
+fn group(port: &str) -> String {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::MetadataExt;
+        let id = std::fs::metadata(port).map(|file| file.gid()).ok();
+        let groups = std::fs::read_to_string("/etc/group").unwrap_or_default();
+        let name = groups.lines().find_map(|line| {
+            let mut words = line.split(':');
+            let (name, _, number) = (words.next()?, words.next()?, words.next()?.parse::<u32>().ok()?);
+            (Some(number) == id && number != 0).then(|| shown(name.as_bytes()))
+        });
+        if let Some(name) = name {
+            return name;
+        }
+    }
+    let _ = port;
+    "dialout".to_string()
+}

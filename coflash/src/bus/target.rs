@@ -1,0 +1,300 @@
+//! The URL of an adapter, judged before anything is opened.
+
+#[cfg(feature = "gs_usb")]
+use super::gs_usb::Which;
+#[cfg(feature = "kvaser")]
+use super::kvaser;
+#[cfg(feature = "peak")]
+use super::peak;
+
+/// What a URL names.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Target {
+    /// A bus of a socketcand server.
+    Socketcand { server: String, bus: String },
+    /// An SLCAN adapter on a serial port.
+    SlcanPort { port: String, rate: Option<u32> },
+    /// The same over TCP.
+    SlcanTcp { server: String, rate: Option<u32> },
+    /// An interface of the Linux kernel.
+    #[cfg(target_os = "linux")]
+    SocketCan { interface: String },
+    /// A PEAK channel.
+    #[cfg(feature = "peak")]
+    Peak { channel: String, rate: Option<u32> },
+    /// A Kvaser channel.
+    #[cfg(feature = "kvaser")]
+    Kvaser { channel: u16, rate: Option<u32> },
+    /// A gs_usb device and its channel.
+    #[cfg(feature = "gs_usb")]
+    GsUsb { which: Which, rate: Option<u32> },
+    /// A gateway, which is no adapter.
+    Gateway,
+}
+
+impl Target {
+    /// Reads a URL.
+    ///
+    /// # Errors
+    /// What is wrong with it, as a sentence about it.
+    pub(super) fn parse(url: &str) -> Result<Self, String> {
+        let Some((scheme, rest)) = url.split_once(':') else { return Err(no_scheme(url)) };
+        let word = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_ascii_graphic());
+        match scheme {
+            "socketcand" => {
+                let rest = rest.strip_prefix("//").ok_or("it must be socketcand://HOST:PORT/BUS")?;
+                let (server, bus) = rest.split_once('/').ok_or("it names no bus: append /can0")?;
+                if !word(server) || !word(bus) || bus.contains(['<', '>', '/']) {
+                    return Err("it must be socketcand://HOST:PORT/BUS".to_string());
+                }
+                if bus.contains('@') {
+                    return Err(
+                        "the server sets the bit rate: leave out what stands behind the @".to_string()
+                    );
+                }
+                Ok(Self::Socketcand { server: server.to_string(), bus: bus.to_string() })
+            }
+            "slcan" => {
+                let (line, rate) = with_rate(rest)?;
+                match line.strip_prefix("tcp://") {
+                    Some(server) if word(server) && server.contains(':') => {
+                        Ok(Self::SlcanTcp { server: server.to_string(), rate })
+                    }
+                    Some(_) => Err("it must be slcan:tcp://HOST:PORT@BITRATE".to_string()),
+                    None if line.is_empty() => {
+                        Err("it names no serial port: slcan:/dev/ttyACM0@500k".to_string())
+                    }
+                    None => Ok(Self::SlcanPort { port: line.to_string(), rate }),
+                }
+            }
+            "socketcan" => interface(rest),
+            "peak" => peak_channel(rest),
+            "kvaser" => kvaser_channel(rest),
+            "gs_usb" => gs_usb_device(rest),
+            "cia309" => Ok(Self::Gateway),
+            // A drive of Windows is no port, but COM7: is often written so.
+            scheme if is_port(scheme) => Err(no_scheme(url.trim_end_matches(':'))),
+            scheme => {
+                let meant = match scheme.to_ascii_lowercase().as_str() {
+                    "pcan" | "pcanbasic" => "peak",
+                    "canlib" => "kvaser",
+                    "candlelight" | "gsusb" | "gs-usb" | "canable" => "gs_usb",
+                    "can" | "vcan" => "socketcan",
+                    "serial" | "lawicel" | "slcand" => "slcan",
+                    lower if lower != scheme && KNOWN.contains(&lower) => {
+                        return Err(format!("there is no such adapter; did you mean {lower}:{rest}?"));
+                    }
+                    _ => return Err("there is no such adapter".to_string()),
+                };
+                Err(format!("there is no such adapter; did you mean {meant}:?"))
+            }
+        }
+    }
+}
+
+/// The schemes.
+const KNOWN: [&str; 7] = ["socketcand", "slcan", "socketcan", "peak", "kvaser", "gs_usb", "cia309"];
+
+#[cfg(target_os = "linux")]
+fn interface(rest: &str) -> Result<Target, String> {
+    match with_rate(rest)? {
+        ("", _) => Err("it names no interface: socketcan:can0".to_string()),
+        (interface, Some(rate)) => Err(format!(
+            "the bit rate of an interface is set beforehand: sudo ip link set {interface} up type can bitrate {rate}; then \
+             socketcan:{interface}"
+        )),
+        (interface, None) => Ok(Target::SocketCan { interface: interface.to_string() }),
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+fn interface(_: &str) -> Result<Target, String> {
+    Err("only Linux has SocketCAN; peak:, kvaser:, gs_usb: and slcan: go without it".to_string())
+}
+
+#[cfg(feature = "peak")]
+fn peak_channel(rest: &str) -> Result<Target, String> {
+    let (channel, rate) = with_rate(rest)?;
+    if peak::channel(channel).is_none() {
+        return Err("it names no channel of PCANBasic: peak:PCAN_USBBUS1@500k".to_string());
+    }
+    if rate.is_some_and(|rate| peak::registers(rate).is_none()) {
+        return Err("PEAK adapters have 1M, 800k, 500k, 250k, 125k, 100k, 50k, 20k, 10k and 5k".to_string());
+    }
+    Ok(Target::Peak { channel: channel.to_string(), rate })
+}
+
+#[cfg(feature = "kvaser")]
+fn kvaser_channel(rest: &str) -> Result<Target, String> {
+    let (channel, rate) = with_rate(rest)?;
+    let digits = channel.bytes().all(|byte| byte.is_ascii_digit());
+    let Some(channel) = channel.parse::<u16>().ok().filter(|_| digits) else {
+        return Err("it names no channel of CANlib by its number: kvaser:0@500k".to_string());
+    };
+    if rate.is_some_and(|rate| kvaser::parameters(rate).is_none()) {
+        return Err("Kvaser adapters have 1M, 800k, 500k, 250k, 125k, 100k, 50k and 20k".to_string());
+    }
+    Ok(Target::Kvaser { channel, rate })
+}
+
+#[cfg(feature = "gs_usb")]
+fn gs_usb_device(rest: &str) -> Result<Target, String> {
+    let (which, rate) = with_rate(rest)?;
+    let which = Which::parse(which).ok_or("it names no device by place or serial number: gs_usb:0@500k")?;
+    Ok(Target::GsUsb { which, rate })
+}
+
+#[cfg(not(feature = "peak"))]
+fn peak_channel(_: &str) -> Result<Target, String> {
+    Err("this coflash was built without peak".to_string())
+}
+
+#[cfg(not(feature = "kvaser"))]
+fn kvaser_channel(_: &str) -> Result<Target, String> {
+    Err("this coflash was built without kvaser".to_string())
+}
+
+#[cfg(not(feature = "gs_usb"))]
+fn gs_usb_device(_: &str) -> Result<Target, String> {
+    Err("this coflash was built without gs_usb".to_string())
+}
+
+/// What stands before the last `@`, and the bit rate behind it.
+fn with_rate(text: &str) -> Result<(&str, Option<u32>), String> {
+    let Some((before, rate)) = text.rsplit_once('@') else { return Ok((text, None)) };
+    let bare = rate.bytes().all(|byte| byte.is_ascii_digit()).then(|| rate.parse::<u32>().ok()).flatten();
+    match (bare, parse_bit_rate(rate)) {
+        // Nobody has a bus of 500 bit/s.
+        (Some(1), _) => Err("1 bit/s is no bit rate; did you mean 1M?".to_string()),
+        (Some(few @ 5..=1000), _) => Err(format!("{few} bit/s is no bit rate; did you mean {few}k?")),
+        (_, Some(rate)) => Ok((before, Some(rate))),
+        (Some(_), None) => Err("its bit rate must be like 125k, 500k or 1M; CAN goes up to 1M".to_string()),
+        (None, None) => {
+            // 500kbit, 500kbps, 500 kbit/s, 0.5M, 500kHz
+            let digits: String = rate.chars().take_while(char::is_ascii_digit).collect();
+            let unit: String = rate
+                .chars()
+                .skip(digits.len())
+                .filter(|c| !c.is_whitespace())
+                .collect::<String>()
+                .to_lowercase();
+            let like = |units: &[&str]| units.contains(&unit.as_str());
+            let meant = match digits.as_str() {
+                "" => None,
+                digits if like(&["kbit", "kbps", "kbit/s", "kbaud", "kb", "khz", "kbd"]) => {
+                    Some(format!("{digits}k"))
+                }
+                digits if like(&["m", "mbit", "mbps", "mbit/s", "mbaud", "mhz"]) => {
+                    Some(format!("{digits}M"))
+                }
+                _ => None,
+            };
+            let meant = meant.filter(|meant| parse_bit_rate(meant).is_some());
+            let meant = meant.map_or(String::new(), |meant| format!("; did you mean {meant}?"));
+            Err(format!("its bit rate must be like 125k, 500k or 1M{meant}"))
+        }
+    }
+}
+
+/// `500k`, `1M`, `125000`, in bit/s.
+fn parse_bit_rate(text: &str) -> Option<u32> {
+    let (digits, unit) = match text.strip_suffix(['k', 'K']) {
+        Some(digits) => (digits, 1000),
+        None => match text.strip_suffix('M') {
+            Some(digits) => (digits, 1_000_000),
+            None => (text, 1),
+        },
+    };
+    let digits = Some(digits).filter(|digits| digits.bytes().all(|byte| byte.is_ascii_digit()))?;
+    digits.parse::<u32>().ok()?.checked_mul(unit).filter(|rate| (1..=1_000_000).contains(rate))
+}
+
+fn is_port(text: &str) -> bool {
+    let lower = text.to_ascii_lowercase();
+    let com = lower
+        .strip_prefix("com")
+        .is_some_and(|number| !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit()));
+    com || text.starts_with("/dev/")
+}
+
+/// What was probably meant where there is no scheme.
+fn no_scheme(text: &str) -> String {
+    let none = "it has no ':' behind the adapter's name";
+    let bare = text.split('@').next().unwrap_or_default();
+    let lower = bare.to_ascii_lowercase();
+    let interface = ["can", "vcan", "slcan"].iter().any(|name| {
+        lower
+            .strip_prefix(name)
+            .is_some_and(|number| !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit()))
+    });
+    if is_port(bare) {
+        let rate = if text.contains('@') { "" } else { "@500k" };
+        format!("{none}; did you mean slcan:{text}{rate}?")
+    } else if interface {
+        format!("{none}; did you mean socketcan:{bare}?")
+    } else if lower.starts_with("pcan_") {
+        format!("{none}; did you mean peak:{text}?")
+    } else {
+        none.to_string()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn urls_name_adapters() {
+        let rate = Some(500_000);
+        for (url, target) in [
+            ("slcan:COM7@500k", Target::SlcanPort { port: "COM7".to_string(), rate }),
+            ("slcan:/dev/ttyACM0", Target::SlcanPort { port: "/dev/ttyACM0".to_string(), rate: None }),
+            ("slcan:tcp://[::1]:7@500000", Target::SlcanTcp { server: "[::1]:7".to_string(), rate }),
+            ("cia309://host/1", Target::Gateway),
+        ] {
+            assert_eq!(Target::parse(url), Ok(target), "{url}");
+        }
+        #[cfg(target_os = "linux")]
+        assert_eq!(Target::parse("socketcan:can0"), Ok(Target::SocketCan { interface: "can0".to_string() }));
+        #[cfg(feature = "peak")]
+        assert_eq!(
+            Target::parse("peak:PCAN_USBBUS1@500k"),
+            Ok(Target::Peak { channel: "PCAN_USBBUS1".to_string(), rate })
+        );
+        #[cfg(feature = "kvaser")]
+        assert_eq!(Target::parse("kvaser:12@500k"), Ok(Target::Kvaser { channel: 12, rate }));
+        #[cfg(feature = "gs_usb")]
+        assert_eq!(
+            Target::parse("gs_usb:0/1@500k"),
+            Ok(Target::GsUsb { which: Which::parse("0/1").unwrap(), rate })
+        );
+    }
+
+    /// Each is a mistake that people make.
+    #[test]
+    fn a_mistake_is_answered_with_what_was_meant() {
+        for (url, words) in [
+            ("slcan:/dev/ttyACM0@500", "did you mean 500k?"),
+            ("slcan:/dev/ttyACM0@1000", "did you mean 1000k?"),
+            ("slcan:/dev/ttyACM0@1", "did you mean 1M?"),
+            ("slcan:/dev/ttyACM0@500kbit", "did you mean 500k?"),
+            ("slcan:/dev/ttyACM0@1Mbit/s", "did you mean 1M?"),
+            ("slcan:/dev/ttyACM0@1m", "did you mean 1M?"),
+            ("slcan:/dev/ttyACM0@2M", "must be like 125k, 500k or 1M"),
+            ("slcan:/dev/ttyACM0@2000000", "CAN goes up to 1M"),
+            ("slcan:/dev/ttyACM0@", "must be like 125k"),
+            ("slcan:/dev/ttyACM0@\u{E9}k", "must be like 125k"),
+            ("can0", "did you mean socketcan:can0?"),
+            ("/dev/ttyACM0", "did you mean slcan:/dev/ttyACM0@500k?"),
+            ("COM7@500k", "did you mean slcan:COM7@500k?"),
+            ("COM7:", "did you mean slcan:COM7@500k?"),
+            ("PCAN_USBBUS1", "did you mean peak:PCAN_USBBUS1?"),
+            ("pcan:1", "did you mean peak:?"),
+            ("SLCAN:COM7", "did you mean slcan:COM7?"),
+            ("socketcand://host/can0@500k", "the server sets the bit rate"),
+        ] {
+            let why = Target::parse(url).unwrap_err();
+            assert!(why.contains(words), "{url}: {why}");
+        }
+    }
+}
