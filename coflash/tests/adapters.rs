@@ -4,15 +4,15 @@ mod fake;
 mod tool;
 
 use std::fs;
-use std::io::{ErrorKind, Read, Write};
+use std::io::{Read, Write};
 use std::net::TcpListener;
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use canopen::Frame;
-use coflash::Adapter;
-use embedded_can::{Frame as _, Id, StandardId};
+use embedded_can::{Frame as _, StandardId};
 use fake::{Blocks, Fake, APPLICATION, BOOTLOADER};
+use tool::kernel::{converse, standard};
 use tool::{coflash, data};
 
 fn device() -> Fake {
@@ -21,42 +21,6 @@ fn device() -> Fake {
     fake.restart_time = Duration::from_millis(20);
     fake.knows_blocks = Blocks::Known(127);
     fake
-}
-
-fn standard(frame: &Frame) -> u16 {
-    match frame.id() {
-        Id::Standard(id) => id.as_raw(),
-        Id::Extended(_) => panic!("CANopen has 11 bits"),
-    }
-}
-
-/// Lets a device take part in a conversation until the other side goes. `words` cuts what was read
-/// into frames for the device; what it answers goes out as `emit` writes it.
-fn converse<S: Read + Write>(
-    mut stream: S,
-    mut fake: Fake,
-    mut words: impl FnMut(&mut Vec<u8>, &mut S) -> Vec<Frame>,
-    emit: impl Fn(&Frame) -> Vec<u8>,
-) -> Fake {
-    let (began, origin) = (Instant::now(), fake.now());
-    let mut text = Vec::new();
-    loop {
-        let mut bytes = [0; 4096];
-        match stream.read(&mut bytes) {
-            Ok(0) => return fake,
-            Ok(len) => text.extend_from_slice(&bytes[..len]),
-            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {}
-            Err(_) => return fake,
-        }
-        for frame in words(&mut text, &mut stream) {
-            fake.send(&frame).unwrap();
-        }
-        while let Ok(Some(frame)) = fake.receive((origin + began.elapsed()).saturating_sub(fake.now())) {
-            if stream.write_all(&emit(&frame)).is_err() {
-                return fake;
-            }
-        }
-    }
 }
 
 /// The adapter's side of SLCAN (CAN232 manual): commands are acknowledged, `said` notes them.
@@ -114,7 +78,7 @@ fn slcan_over_tcp() {
     let (fake, said) = server.join().unwrap();
     check(&fake);
     // Closed before and after, 250 kbit/s is S5.
-    assert_eq!(said, ["", "", "C", "S5", "O", "C"]);
+    assert_eq!(said, ["", "", "C", "V", "S5", "O", "C"]);
 }
 
 #[test]
@@ -159,7 +123,7 @@ fn slcan_over_a_serial_port() {
     drop(slave);
     assert_eq!(flashed.exit, 0, "{}{}", flashed.out, flashed.err);
     check(&fake);
-    assert_eq!(said[2..5], ["C", "S4", "O"]);
+    assert_eq!(said[2..6], ["C", "V", "S4", "O"]);
 }
 
 /// A line that ends when it is told to: a pseudo-terminal does not notice that nobody has the other
@@ -188,47 +152,14 @@ impl<L: Write> Write for Until<L> {
     }
 }
 
-/// `struct can_frame` of the kernel (linux/can.h): identifier, length, padding, eight bytes.
-#[cfg(target_os = "linux")]
-fn can_frame(frame: &Frame) -> Vec<u8> {
-    let mut bytes = vec![0; 16];
-    bytes[..4].copy_from_slice(&u32::from(standard(frame)).to_ne_bytes());
-    bytes[4] = frame.dlc() as u8;
-    bytes[8..8 + frame.dlc()].copy_from_slice(frame.data());
-    bytes
-}
-
 /// Where the kernel has no CAN a library stands in for it: `shim/can.c`, which is compiled here.
 #[cfg(target_os = "linux")]
 #[test]
 fn socketcan() {
-    use std::os::unix::net::UnixListener;
     use std::process::Command;
     let folder = tool::Folder::new("socketcan");
-    let source = format!("{}/tests/shim/can.c", env!("CARGO_MANIFEST_DIR"));
-    let library = folder.path("can.so");
-    let compiled = Command::new("cc")
-        .args(["-shared", "-fPIC", "-Wall", "-Werror", "-o", &library, &source, "-ldl"])
-        .status();
-    assert!(compiled.expect("cc, which links Rust programs too").success());
-    // A Unix socket's name has room for 107 bytes.
-    let path = std::env::temp_dir().join(format!("coflash-shim-{}", std::process::id()));
-    let _ = fs::remove_file(&path);
-    let listener = UnixListener::bind(&path).unwrap();
-    let server = thread::spawn(move || {
-        let (stream, _) = listener.accept().unwrap();
-        stream.set_read_timeout(Some(Duration::from_millis(1))).unwrap();
-        let frames = |bytes: &mut Vec<u8>, _: &mut _| {
-            let whole = bytes.len() / 16 * 16;
-            let frame = |bytes: &[u8]| {
-                let id = u32::from_ne_bytes(bytes[..4].try_into().unwrap());
-                let id = StandardId::new(u16::try_from(id).unwrap()).unwrap();
-                Frame::new(id, &bytes[8..8 + usize::from(bytes[4])]).unwrap()
-            };
-            bytes.drain(..whole).collect::<Vec<u8>>().chunks_exact(16).map(frame).collect()
-        };
-        converse(stream, device(), frames, can_frame)
-    });
+    let library = tool::kernel::library(&folder, "shim/can.c", "can.so", &[]);
+    let (path, server) = tool::kernel::serve(device());
     let call = |interface: &str, path: &std::path::Path| {
         let mut command = Command::new(env!("CARGO_BIN_EXE_coflash"));
         let bus = format!("socketcan:{interface}");

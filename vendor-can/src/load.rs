@@ -53,7 +53,7 @@ impl Loaded {
             // SAFETY: passed on to the caller.
             match unsafe { open(file) } {
                 Ok(library) => return Ok(Self { library, file: (*file).to_string() }),
-                Err(error) => why = one_line(&error.to_string()),
+                Err(error) => why = one_line(&error),
             }
         }
         Err(LoadError::Missing { files: files.iter().map(|file| (*file).to_string()).collect(), why })
@@ -91,7 +91,9 @@ unsafe fn open(file: &str) -> Result<Library, libloading::Error> {
     unsafe { Library::new(file) }
 }
 
-/// Some systems tell of every place that they looked in, a line each.
-fn one_line(text: &str) -> String {
+/// What the system says, in one line: the error's own words are "dlopen failed", its source has more.
+fn one_line(error: &libloading::Error) -> String {
+    let source = std::error::Error::source(error).map(ToString::to_string);
+    let text = source.unwrap_or_else(|| error.to_string());
     text.lines().next().unwrap_or_default().trim().to_string()
 }

@@ -155,9 +155,14 @@ impl AdapterError {
     #[must_use]
     pub fn advice(&self) -> String {
         match self {
+            Self::Url { why, .. } if why.contains("did you mean") => {
+                "give the bus like that, by --bus or in COFLASH_BUS"
+            }
             Self::Url { .. } => {
-                "give the bus as --bus URL or in COFLASH_BUS, for example socketcan:can0 or slcan:/dev/ttyACM0@500k; \
-                 coflash adapters lists those that are there"
+                return format!(
+                    "give the bus as --bus URL or in COFLASH_BUS, for example socketcan:can0 or slcan:/dev/ttyACM0@500k \
+                     (coflash adapters lists those that are there); known are {URLS}"
+                )
             }
             Self::Open { source, .. } => match source.kind() {
                 io::ErrorKind::ConnectionRefused => {
@@ -216,7 +221,7 @@ impl AdapterError {
 impl fmt::Display for AdapterError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Url { url, why } => write!(f, "bus '{url}': {why} (known are {URLS})"),
+            Self::Url { url, why } => write!(f, "bus '{url}': {why}"),
             Self::Open { adapter, source } => write!(f, "{adapter} cannot be opened: {source}"),
             Self::Unusable { adapter, what, .. } => write!(f, "{adapter} cannot be opened: {what}"),
             Self::Stuck { adapter, .. } => {

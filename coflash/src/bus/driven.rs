@@ -52,7 +52,7 @@ pub(super) enum Fault {
 }
 
 /// How long a driver may take to open.
-const OPENING: Duration = Duration::from_secs(10);
+const OPENING: Duration = Duration::from_secs(5);
 /// How long a frame may wait for room, and a driver for its end.
 const PATIENCE: Duration = Duration::from_secs(1);
 /// How long the thread waits for a frame before it looks for one to send.

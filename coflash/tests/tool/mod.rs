@@ -3,6 +3,8 @@
 // Each test uses its part of it.
 #![allow(dead_code)]
 
+pub mod kernel;
+
 use std::fs;
 use std::io::{ErrorKind, Read, Write};
 use std::net::{TcpListener, TcpStream};

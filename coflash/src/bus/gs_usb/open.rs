@@ -30,7 +30,14 @@ pub(in crate::bus) fn list() -> Result<Vec<Found>, String> {
             .filter(|serial| matches!(Which::parse(serial), Some(Which { device: Choice::Serial(_), .. })));
         let which = serial.map_or_else(|| place.to_string(), str::to_string);
         let about = shown(device.product.as_deref().unwrap_or("USB adapter").as_bytes());
-        Found::new(Kind::GsUsb, format!("gs_usb:{}", shown(which.as_bytes())), about)
+        let found = Found::new(Kind::GsUsb, format!("gs_usb:{}", shown(which.as_bytes())), about);
+        match device.kernel {
+            true => {
+                let state = Some("the kernel has it: see socketcan".to_string());
+                Found { state, certain: false, ..found }
+            }
+            false => found,
+        }
     });
     Ok(found.collect())
 }

@@ -23,6 +23,8 @@ const READS: usize = 8;
 pub(super) struct Listed {
     pub(super) serial: Option<String>,
     pub(super) product: Option<String>,
+    /// Whether the kernel's own driver has it: it is a CAN interface then.
+    pub(super) kernel: bool,
 }
 
 fn devices() -> Result<Vec<DeviceInfo>, String> {
@@ -36,8 +38,23 @@ pub(super) fn list() -> Result<Vec<Listed>, String> {
     let listed = |device: &DeviceInfo| Listed {
         serial: text(device.serial_number()),
         product: text(device.product_string()),
+        kernel: kernel_has(device),
     };
     Ok(devices()?.iter().map(listed).collect())
+}
+
+/// Whether a driver of the kernel is bound to the device's first interface.
+#[cfg(target_os = "linux")]
+fn kernel_has(device: &DeviceInfo) -> bool {
+    let path = device.sysfs_path();
+    let interface = path.file_name().map(|name| format!("{}:1.0", name.to_string_lossy()));
+    let driver = interface.and_then(|interface| path.join(interface).join("driver").read_link().ok());
+    driver.is_some_and(|driver| driver.ends_with("gs_usb"))
+}
+
+#[cfg(not(target_os = "linux"))]
+fn kernel_has(_: &DeviceInfo) -> bool {
+    false
 }
 
 /// Opens a device. `name` is for messages.
