@@ -199,6 +199,11 @@ impl Fake {
     }
 
     /// A frame that is on the bus already.
+    /// A frame of somebody else's, so long from now.
+    pub fn later(&mut self, after: Duration, frame: Frame) {
+        self.outbox.push_back((self.now + after, frame));
+    }
+
     pub fn inject(&mut self, frame: Frame) {
         self.outbox.push_back((self.now, frame));
     }
