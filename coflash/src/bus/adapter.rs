@@ -79,6 +79,11 @@ pub const URLS: &str = "socketcan:INTERFACE (Linux), slcan:PORT@BITRATE, slcan:t
                         peak:CHANNEL@BITRATE, kvaser:NUMBER@BITRATE, gs_usb:NUMBER@BITRATE, \
                         socketcand://HOST:PORT/BUS, cia309://HOST:PORT/NET (gateway, SDO alone)";
 
+/// What is wrong with a URL that names no adapter at all.
+pub(super) const NO_SCHEME: &str = "it has no ':' behind the adapter's name";
+/// The same with one that nobody knows.
+pub(super) const NO_ADAPTER: &str = "there is no such adapter";
+
 /// What an adapter can be out of.
 #[derive(Debug)]
 pub enum AdapterError {
@@ -157,6 +162,12 @@ impl AdapterError {
         match self {
             Self::Url { why, .. } if why.contains("did you mean") => {
                 "give the bus like that, by --bus or in COFLASH_BUS"
+            }
+            Self::Url { why, .. }
+                if !why.starts_with(NO_SCHEME)
+                    && !why.starts_with(NO_ADAPTER) =>
+            {
+                "mend the bus in --bus or COFLASH_BUS; coflash adapters lists those that are there"
             }
             Self::Url { .. } => {
                 return format!(

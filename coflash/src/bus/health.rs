@@ -108,7 +108,7 @@ impl Health {
             Trouble::Off => format!(
                 "the adapter is bus-off: all that it sent was disturbed, as by a wrong bit rate{rate} or a short circuit \
                  between CAN-H and CAN-L; check both, then switch the adapter off and on (sudo ip link set can0 down, \
-                 then up)"
+                 then up, with its own name)"
             ),
             Trouble::Disturbed => format!(
                 "frames on the bus are disturbed ({} bit, stuff, form or CRC errors): the bit rate is wrong{rate}, or a \

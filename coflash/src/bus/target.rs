@@ -1,5 +1,6 @@
 //! The URL of an adapter, judged before anything is opened.
 
+use super::adapter::{NO_ADAPTER, NO_SCHEME};
 #[cfg(feature = "gs_usb")]
 use super::gs_usb::Which;
 #[cfg(feature = "kvaser")]
@@ -82,11 +83,11 @@ impl Target {
                     "can" | "vcan" => "socketcan",
                     "serial" | "lawicel" | "slcand" => "slcan",
                     lower if lower != scheme && KNOWN.contains(&lower) => {
-                        return Err(format!("there is no such adapter; did you mean {lower}:{rest}?"));
+                        return Err(format!("{NO_ADAPTER}; did you mean {lower}:{rest}?"));
                     }
-                    _ => return Err("there is no such adapter".to_string()),
+                    _ => return Err(NO_ADAPTER.to_string()),
                 };
-                Err(format!("there is no such adapter; did you mean {meant}:?"))
+                Err(format!("{NO_ADAPTER}; did you mean {meant}:{rest}?"))
             }
         }
     }
@@ -219,7 +220,7 @@ fn is_port(text: &str) -> bool {
 
 /// What was probably meant where there is no scheme.
 fn no_scheme(text: &str) -> String {
-    let none = "it has no ':' behind the adapter's name";
+    let none = NO_SCHEME;
     let bare = text.split('@').next().unwrap_or_default();
     let lower = bare.to_ascii_lowercase();
     let interface = ["can", "vcan", "slcan"].iter().any(|name| {
@@ -289,7 +290,7 @@ mod tests {
             ("COM7@500k", "did you mean slcan:COM7@500k?"),
             ("COM7:", "did you mean slcan:COM7@500k?"),
             ("PCAN_USBBUS1", "did you mean peak:PCAN_USBBUS1?"),
-            ("pcan:1", "did you mean peak:?"),
+            ("pcan:PCAN_USBBUS1", "did you mean peak:PCAN_USBBUS1?"),
             ("SLCAN:COM7", "did you mean slcan:COM7?"),
             ("socketcand://host/can0@500k", "the server sets the bit rate"),
         ] {

@@ -12,7 +12,7 @@ use coflash::device::diagnose::diagnose;
 use coflash::device::error::LssFailure;
 use coflash::device::{legacy, Session};
 use coflash::file::convert::ConvertError;
-use coflash::file::FileError;
+use coflash::file::{Cause, FileError};
 use coflash::update::job::Fault;
 use coflash::update::DeviceState;
 use coflash::Error;
@@ -327,8 +327,24 @@ impl Failure {
 
 impl From<FileError> for Failure {
     fn from(error: FileError) -> Self {
-        let number = Some(error.error.cause.number());
-        Self::new(Exit::File, number, error.to_string(), None)
+        let cause = &error.error.cause;
+        let advice = match cause {
+            Cause::Io(error) => match error.kind() {
+                io::ErrorKind::NotFound => "check the file's name, and the folder that the command runs in",
+                io::ErrorKind::IsADirectory => "name the firmware file in this folder",
+                io::ErrorKind::PermissionDenied => "check who may read the file",
+                _ => "copy the file to this computer's own disk, and try again",
+            },
+            Cause::Empty => "build the program again, or copy the file again: nothing is in it",
+            Cause::NotFirmware => "name the linker's output (ELF, Intel HEX, S-record) or a block file",
+            Cause::CutOff { .. } | Cause::NoEnd(_) | Cause::Checksum { .. } | Cause::BadDigit { .. } => {
+                "copy the file again from where it was built, or build it again"
+            }
+            // Their words say what to do.
+            _ => "",
+        };
+        let advice = Some(advice.to_string()).filter(|advice| !advice.is_empty());
+        Self::new(Exit::File, Some(cause.number()), error.to_string(), advice)
     }
 }
 
