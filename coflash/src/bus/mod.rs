@@ -43,7 +43,7 @@ pub use self::gateway::{Gateway, GatewayError};
 pub use self::health::Health;
 pub use self::link::Link;
 pub use self::list::{list, List};
-pub use self::open::{check, open, open_at};
+pub use self::open::{bit_rate_of, check, open, open_at};
 pub use self::sdo_ids::SdoIds;
 pub use self::slcan::{Line, Slcan};
 #[cfg(target_os = "linux")]

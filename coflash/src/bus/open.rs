@@ -62,3 +62,9 @@ pub fn open_at(url: &str, bit_rate: Option<u32>) -> Result<Box<dyn Adapter + Sen
         Target::Gateway => return Err(bad("a gateway carries SDO alone, and this needs the CAN bus itself")),
     })
 }
+
+/// The bit rate that a URL names, in bit/s.
+#[must_use]
+pub fn bit_rate_of(url: &str) -> Option<u32> {
+    Target::parse(url).ok()?.rate()
+}

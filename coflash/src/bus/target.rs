@@ -34,6 +34,20 @@ pub(super) enum Target {
 }
 
 impl Target {
+    /// The bit rate that it names, in bit/s.
+    pub(super) fn rate(&self) -> Option<u32> {
+        match self {
+            Self::SlcanPort { rate, .. } | Self::SlcanTcp { rate, .. } => *rate,
+            #[cfg(feature = "peak")]
+            Self::Peak { rate, .. } => *rate,
+            #[cfg(feature = "kvaser")]
+            Self::Kvaser { rate, .. } => *rate,
+            #[cfg(feature = "gs_usb")]
+            Self::GsUsb { rate, .. } => *rate,
+            _ => None,
+        }
+    }
+
     /// Reads a URL.
     ///
     /// # Errors

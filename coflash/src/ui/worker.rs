@@ -10,7 +10,7 @@ use super::frames::Tap;
 use super::shared::{Order, Shared};
 use super::state::{Adapter, Connection, Notice};
 use super::work;
-use crate::bus::{open::parse_bit_rate, AdapterError, Link, SdoIds};
+use crate::bus::{bit_rate_of, AdapterError, Link, SdoIds};
 
 /// How long it listens before it looks whether it was told something.
 const SLICE: Duration = Duration::from_millis(50);
@@ -115,7 +115,7 @@ fn opened(shared: &Shared, url: String, link: Link) -> Bus {
         state.adapter.state = Connection::Open;
         state.adapter.words = None;
         state.adapter.gateway = matches!(link, Link::Gateway(_));
-        state.adapter.bit_rate = bit_rate(&url);
+        state.adapter.bit_rate = bit_rate_of(&url);
     });
     Bus::Open { url, link }
 }
@@ -146,9 +146,4 @@ fn listen(shared: &Shared, url: String, mut link: Link) -> Bus {
             lost(shared, url, &error)
         }
     }
-}
-
-/// The bit rate that a URL names behind an `@`, in bit/s.
-fn bit_rate(url: &str) -> Option<u32> {
-    url.strip_prefix("slcan:")?.rsplit_once('@').and_then(|(_, rate)| parse_bit_rate(rate))
 }
