@@ -13,7 +13,8 @@ use canopen::od::{put, Address, Entry, Objects};
 #[cfg(feature = "lift")]
 use canopen::program::UNLOCK;
 use canopen::program::{
-    FlashStatus, ProgramControl, ProgramState, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID, UNLOCK_ENTRIES,
+    region_value, FlashStatus, ProgramControl, ProgramState, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID,
+    PROGRAM_REGION, UNLOCK_ENTRIES,
 };
 use canopen::slave::SlaveDevice;
 #[cfg(feature = "lift")]
@@ -209,6 +210,10 @@ impl Objects for Application {
             PROGRAM_ID if at.sub == self.program => put(buf, &self.program_crc.to_le_bytes()),
             PROGRAM_ID => put(buf, &coboot::program_info(at.sub).map_or(0, |info| info.crc).to_le_bytes()),
             FLASH_STATUS => put(buf, &FlashStatus::OK.to_word().to_le_bytes()),
+            PROGRAM_REGION => {
+                let region = LAYOUT.program(at.sub).ok_or(AbortCode::NO_DATA)?;
+                put(buf, &region_value(region.base, region.size))
+            }
             REENTRY_PATH => put(buf, &[self.path as u8]),
             CONFIRMATION => {
                 let info = coboot::program_info(self.program).map_err(|_| AbortCode::DEVICE_STATE)?;

@@ -49,7 +49,7 @@ pub struct Policy {
     pub reset_starts: bool,
     /// Whether a valid raw image or Intel HEX starts by itself when it is complete.
     pub starts_by_itself: bool,
-    /// Whether a raw image or Intel HEX has to carry a label (`shared_abi::label`). A label that it
+    /// Whether a program has to carry a label (`shared_abi::label`). A label that it
     /// carries has to fit in any case.
     pub wants_label: bool,
     /// The number of a program that is none, but data of the application: any bytes, never started.

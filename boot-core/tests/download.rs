@@ -257,18 +257,45 @@ fn a_program_whose_crc_or_vectors_are_wrong_is_no_program() {
     other[50] ^= 1;
     let mut nowhere = image.clone();
     nowhere[4..8].copy_from_slice(&0x0800_0101_u32.to_le_bytes());
+    // Where the first block has the vectors, they are judged with it, and it is refused. Here it has the
+    // first one alone.
     for (stored, told) in [(&image, &other), (&nowhere, &nowhere)] {
         let mut flash = ModelFlash::new(&CHIP);
         let mut bench = Bench::new(&mut flash);
         assert_eq!(bench.command(CLEAR), 0);
         bench.good(&block(0, 0, &[0; 8]));
-        bench.good(&block(1, PROGRAM.base, stored));
+        bench.good(&block(1, PROGRAM.base, &stored[..4]));
+        bench.good(&block(2, PROGRAM.base + 4, &stored[4..]));
         assert_eq!(bench.block(&last(told)), (Ok(()), 0x02));
         assert_eq!(bench.word(IDENTIFICATION), block_crc(stored), "1F56h shows what is in flash");
         assert_eq!(bench.command(SET_SIGNATURE), 0x02);
         assert_eq!(bench.command(START), 0x02);
         assert_eq!(bench.node.take_boot_request(), None);
         bench.install(&image);
+    }
+}
+
+/// What the first block shows costs nothing: a vector table that is none.
+#[test]
+fn a_program_that_cannot_start_is_refused_before_anything_is_lost() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    bench.install(&program(200, 0x44));
+    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    bench.node.flash().touched.clear();
+    for (at, word) in [(0, 0), (0, u32::MAX), (4, 0x0800_0101), (4, PROGRAM.base + 0x100)] {
+        let mut none = program(200, 0x55);
+        none[at..at + 4].copy_from_slice(&u32::to_le_bytes(word));
+        assert_eq!(bench.command(CLEAR), 0);
+        bench.good(&block(0, 0, &[0; 8]));
+        assert_eq!(
+            bench.block(&block(1, PROGRAM.base, &none)),
+            (Err(AbortCode(0x0800_0020)), 0x04),
+            "{at}: {word:08X}h"
+        );
+        assert_eq!(bench.node.flash().touched, []);
+        assert_eq!(bench.command(START), 0, "the old program is there");
+        assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
     }
 }
 
@@ -350,6 +377,16 @@ fn a_transfer_cut_off_in_the_middle_leaves_no_trace() {
 fn faults_of_the_flash_are_told_and_clear_begins_anew() {
     let image = program(192, 0x99);
     let good = block_file(&image, 96);
+    // The first block makes the record go, and its sector; its last operation writes data.
+    let of_the_block = {
+        let mut flash = full();
+        let mut bench = Bench::new(&mut flash);
+        assert_eq!((bench.command(CLEAR), bench.command(CLEAR), bench.command(CLEAR)), (0, 0, 0));
+        bench.good(&good[0]);
+        let before = bench.node.flash().operations;
+        bench.good(&good[1]);
+        bench.node.flash().operations - before
+    };
     for (fault, status) in
         [(FlashFault::Failed, 0x0A), (FlashFault::Verify, 0x0A), (FlashFault::Protected, 0x0E)]
     {
@@ -366,7 +403,7 @@ fn faults_of_the_flash_are_told_and_clear_begins_anew() {
         assert_eq!(bench.command(CLEAR), 0);
         bench.good(&good[0]);
         let operations = bench.node.flash().operations;
-        bench.node.flash().fail = Some((operations + 5, fault));
+        bench.node.flash().fail = Some((operations + of_the_block, fault));
         assert_eq!(bench.block(&good[1]), (Ok(()), status));
         // Half a block is in flash: only CLEAR helps, and until then the cause stays to be seen.
         assert_eq!(bench.block(&good[1]), (Err(AbortCode(0x0800_0022)), status));

@@ -72,7 +72,7 @@ pub struct Product {
     /// Whether vendor-ID and product code of a program have to be the device's
     /// (`BLCOP_IDENTITY_CHECK`).
     pub identity_check: bool,
-    /// The product's own check of block 0 (`TgtProcessAppInfoData`).
+    /// The product's own check of block 0 and of the label in the image (`TgtProcessAppInfoData`).
     pub check: fn(program: u8, control: &block_file::Control) -> Verdict,
     /// Whether programs may be changed now.
     pub programming_allowed: fn() -> bool,

@@ -34,10 +34,10 @@ pub const PROGRAM_ID: u16 = 0x1F56;
 /// Flash status identification: gives a [`FlashStatus`].
 pub const FLASH_STATUS: u16 = 0x1F57;
 
-/// What 1F51h, 1F56h and 1F57h are called, and what each of their elements is. Bootloader and
+/// What 1F51h, 1F56h, 1F57h and 2004h are called, and what each of their elements is. Bootloader and
 /// application both have them, with an element for each program of the device, whichever runs (SYS
 /// TEC manual L-1112d_10, table 1 and 3.4.1).
-pub const CONTROL_ARRAYS: [(&str, Entry); 3] = [
+pub const CONTROL_ARRAYS: [(&str, Entry); 4] = [
     (
         "Program control",
         // Without a default value, which a configuration tool might write: what is read is a state,
@@ -51,6 +51,10 @@ pub const CONTROL_ARRAYS: [(&str, Entry); 3] = [
     (
         "Flash status identification",
         Entry::sub(FLASH_STATUS, 1, "Flash status of a program", DataType::Unsigned32, Access::Ro).default(0),
+    ),
+    (
+        "Program region",
+        Entry::sub(PROGRAM_REGION, 1, "Address and size of a program", DataType::Unsigned64, Access::Const),
     ),
 ];
 
@@ -75,6 +79,23 @@ impl<const LEN: usize> Table<LEN> {
         }
         self
     }
+}
+
+/// Where the programs lie, an object of coboot: the sub-index is the program's number. The lower 32
+/// bits are the first address of its flash, the upper 32 bits how many bytes it has.
+pub const PROGRAM_REGION: u16 = 0x2004;
+
+/// The value of [`PROGRAM_REGION`] for a program whose flash begins at `base` and has `size` bytes.
+#[must_use]
+pub const fn region_value(base: u32, size: u32) -> [u8; 8] {
+    ((size as u64) << 32 | base as u64).to_le_bytes()
+}
+
+/// First address and size of a program's flash, from the value of [`PROGRAM_REGION`].
+#[must_use]
+pub const fn region_of(value: [u8; 8]) -> (u32, u32) {
+    let value = u64::from_le_bytes(value);
+    (value as u32, (value >> 32) as u32)
 }
 
 /// Password of a lift device (CiA 417; CiA 814-1 clause 6.3): sub-index [`UNLOCK_FIRMWARE`] of

@@ -241,7 +241,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                             fresh: matches!(request, Some(BootRequest::Fresh(_))),
                             bootloader_answers: node.id.filter(|_| config.node_id.is_none()),
                         };
-                        let device = StandIn::new(entries, says, started, flash, config.layout.parameters);
+                        let device = StandIn::new(entries, says, started, flash, config.layout);
                         let address = device.lss_address();
                         let slave = slave(address, node, config.device.heartbeat_ms, NmtPolicy::Follow);
                         Phase::StandIn(Box::new(Running::new(device, slave, node.id)), buffer)

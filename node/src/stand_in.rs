@@ -9,13 +9,15 @@ use boot_core::canopen::device::{self, Device};
 use boot_core::canopen::lss::{LssAddress, LssDevice, StoreError};
 use boot_core::canopen::od::{put, Address, Entry, Objects};
 use boot_core::canopen::program::{
-    FlashStatus, ProgramControl, ProgramState, CONTROL_ARRAYS, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID,
+    region_value, FlashStatus, ProgramControl, ProgramState, CONTROL_ARRAYS, FLASH_STATUS, PROGRAM_CONTROL,
+    PROGRAM_ID, PROGRAM_REGION,
 };
 use boot_core::canopen::slave::SlaveDevice;
 use boot_core::canopen::{AbortCode, BitRate, NodeId};
 use boot_core::flash::run;
 use boot_core::store::{Journal, Key, Parameters as _, ProgramRecord};
 use shared_abi::geometry::Region;
+use shared_abi::layout::Layout;
 use shared_abi::warm_start::{BootRequest, Owed};
 
 use crate::file_flash::FileFlash;
@@ -52,24 +54,23 @@ pub struct StandIn {
     device: Device,
     started: Started,
     flash: FileFlash,
-    /// Where the journal is.
-    parameters: [Region; 2],
+    /// Where programs and journal are.
+    layout: &'static Layout,
     leave: Option<Leave>,
 }
 
 impl StandIn {
-    /// Of this program, on a device with this flash and journal that says this of itself as a
-    /// bootloader.
+    /// Of this program, on a device with this flash that says this of itself as a bootloader.
     #[must_use]
     pub fn new(
         entries: &'static [Entry],
         bootloader: Device,
         started: Started,
         flash: FileFlash,
-        parameters: [Region; 2],
+        layout: &'static Layout,
     ) -> Self {
         let device = Device { device_type: DEVICE_TYPE, software_version: SOFTWARE_VERSION, ..bootloader };
-        Self { entries, device, started, flash, parameters, leave: None }
+        Self { entries, device, started, flash, layout, leave: None }
     }
 
     /// Its object dictionary on a device with so many programs.
@@ -108,13 +109,13 @@ impl StandIn {
 
     /// What is known of a program.
     fn record(&self, program: u8) -> Option<ProgramRecord> {
-        ProgramRecord::load(&Journal::open(&self.flash, self.parameters), &self.flash, program)
+        ProgramRecord::load(&Journal::open(&self.flash, self.layout.parameters), &self.flash, program)
     }
 
     /// What a program does through the callgate: it is signed, and needs no rescue window.
     fn confirm(&mut self, program: u8) -> Result<(), AbortCode> {
         let record = self.record(program).ok_or(AbortCode::HARDWARE)?;
-        let mut journal = Journal::open(&self.flash, self.parameters);
+        let mut journal = Journal::open(&self.flash, self.layout.parameters);
         let confirmed = ProgramRecord { signed: true, confirmed: true, ..record };
         journal.store(Key::Program(program), confirmed.value());
         run(&mut self.flash, |flash, outcome| journal.next(flash, outcome)).map_err(|_| AbortCode::HARDWARE)
@@ -164,6 +165,10 @@ impl Objects for StandIn {
                 put(buf, &crc.to_le_bytes())
             }
             FLASH_STATUS => put(buf, &FlashStatus::OK.to_word().to_le_bytes()),
+            PROGRAM_REGION => {
+                let Region { base, size } = self.layout.program(at.sub).ok_or(AbortCode::NO_DATA)?;
+                put(buf, &region_value(base, size))
+            }
             _ => Err(AbortCode::NO_DATA),
         }
     }

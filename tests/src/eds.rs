@@ -11,7 +11,7 @@ use boot_core::profile::Profile;
 use bsp::can::BitTiming;
 use canopen::device::Device;
 use canopen::od::{Access, Address, DataType, DefaultValue, Entry, Kind};
-use canopen::program::IDENTITY;
+use canopen::program::{region_value, IDENTITY, PROGRAM_REGION};
 
 /// The table of the application template. It needs nothing of the chip.
 #[path = "../../app-template/src/entries.rs"]
@@ -279,6 +279,11 @@ impl Image {
                 return Some(number(entry.data_type, highest.into()));
             }
             (DefaultValue::None, _) if entry.at == SERIAL_NUMBER => return None,
+            (DefaultValue::None, Kind::Sub) if entry.at.index == PROGRAM_REGION => {
+                let region = bsp::LAYOUT.program(entry.at.sub)?;
+                let value = u64::from_le_bytes(region_value(region.base, region.size));
+                return Some(number(entry.data_type, value));
+            }
             _ => {}
         }
         let mut buf = [0; canopen::sdo::server::VALUE_MAX];
@@ -311,6 +316,7 @@ fn access(access: Access) -> &'static str {
 fn number(data_type: DataType, value: u64) -> String {
     match data_type {
         DataType::Unsigned32 => format!("0x{value:08X}"),
+        DataType::Unsigned64 => format!("0x{value:016X}"),
         _ => value.to_string(),
     }
 }

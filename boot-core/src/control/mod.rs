@@ -7,7 +7,7 @@
 //! status is not busy, although the flash works: a host that looks at the status between blocks
 //! sends the next one while those before are being programmed.
 //!
-//! Nothing of an installed program is lost before the first block of another one was judged good:
+//! Nothing of an installed program is lost before the first data of another one were judged good:
 //! CLEAR is carried out with it (SYS TEC manual L-1112d_10, figure 12), see
 //! [`Erase`].
 
@@ -16,7 +16,7 @@ mod transfer;
 
 use core::task::Poll;
 
-use canopen::program::{FlashError, FlashStatus, ProgramState};
+use canopen::program::{region_value, FlashError, FlashStatus, ProgramState};
 use canopen::AbortCode;
 use shared_abi::geometry::Region;
 use shared_abi::label;
@@ -154,6 +154,13 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         self.program(program).map_or(0, |state| state.identification)
     }
 
+    /// 2004h: address and size of the program's flash, little-endian.
+    #[must_use]
+    pub fn region(&self, program: u8) -> [u8; 8] {
+        let Region { base, size } = self.program(program).map_or(Region::new(0, 0), |state| state.region);
+        region_value(base, size)
+    }
+
     /// Whether there is work for [`Downloader::step`].
     #[must_use]
     pub fn busy(&self) -> bool {
@@ -289,9 +296,6 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         {
             return Err(FlashError::NoValidProgram);
         }
-        if expected.crc.is_some() {
-            return Ok(state.version);
-        }
         let mut label = [0; label::SIZE];
         // Behind the program's end is nothing of it.
         if expected.size >= label::OFFSET + label::SIZE as u32 {
@@ -305,7 +309,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             session: state.session,
             installed: false,
         };
-        judge.check_label(&label).map_err(|Refusal(error, _)| error)
+        // A control block's version comes first. (In one expression: it is 190 bytes shorter.)
+        let told = state.version;
+        let checked = judge.check_label(&label).map(|version| if told == 0 { version } else { told });
+        checked.map_err(|Refusal(error, _)| error)
     }
 
     /// A piece of work on a program is over.

@@ -2,7 +2,8 @@
 //! `shared_abi::block_file`).
 //!
 //! A block is judged three times: by its length where the client tells it, by its header as soon as
-//! that is there, and as a whole by its CRC.
+//! that is there, and as a whole by its CRC. The one with the program's start is judged by what it
+//! holds, too: nothing of the old program is lost before it is good.
 
 use canopen::program::FlashError;
 use canopen::AbortCode;
@@ -12,6 +13,7 @@ use shared_abi::block_file::{
 };
 use shared_abi::geometry::Region;
 
+use super::stream::judge_start;
 use super::{Begin, Destination, Format, Judge, Recognition, SMALLEST_PROGRAM};
 use crate::program::Expected;
 use crate::queue::Queue;
@@ -109,6 +111,7 @@ impl Format for BlockFile {
                     Some(Expected { size: last.program_size, crc: Some(last.program_crc) });
             }
             _ => {
+                judge_start(to)?;
                 to.queue.commit();
                 to.progress.block = true;
             }

@@ -104,9 +104,10 @@ impl Stream {
     }
 }
 
-/// Judges the first piece, where it is the start of the program. A HEX file may begin anywhere; its
-/// vectors and its label are then looked at when all is in flash.
-fn judge_start(to: &Destination<'_, '_>) -> Result<(), Refusal> {
+/// Judges the open piece, where it is the start of the program: its vectors and its label, as far as
+/// it holds them. A HEX file may begin anywhere, and a small block ends in front of the label; they
+/// are looked at once more when all is in flash.
+pub(super) fn judge_start(to: &Destination<'_, '_>) -> Result<(), Refusal> {
     if to.judge.is_data() || to.queue.open_address() != to.judge.region.base {
         return Ok(());
     }

@@ -8,7 +8,8 @@
 //!
 //! **No data are touched while their record stands**: [`Programmer::open`] and
 //! [`Programmer::void`] only note that a record has to go, and as long as one has to, nothing is
-//! erased or written.
+//! erased or written. The record of an opened program goes with the first piece, not before: what is
+//! refused until then, or broken off, has cost nothing.
 
 mod write;
 
@@ -63,6 +64,9 @@ struct Target {
     erased: u32,
     /// Up to here it may be erased before there are data.
     ahead: u32,
+    /// While nothing is lost yet, because there was no piece and no command to erase: what `ahead`
+    /// becomes then.
+    untouched: Option<u32>,
     /// All of it is being erased for a command.
     clearing: bool,
     /// See [`ProgramRecord::half_erased`]; without what is being done now.
@@ -139,18 +143,19 @@ impl<'b> Programmer<'b> {
         &mut self.queue
     }
 
-    /// Pieces of this program will come, and of no other. `erase`: its record goes and its sectors
-    /// are erased, those of the first `size` bytes before there are data for them; otherwise each
-    /// piece has to find its place blank.
+    /// Pieces of this program will come, and of no other. With the first one its record goes.
+    /// `erase`: its sectors are erased, those of the first `size` bytes before there are data for
+    /// them; otherwise each piece has to find its place blank.
     pub(crate) fn open(&mut self, program: u8, region: Region, erase: bool, size: u32) {
-        self.void(program);
         let (erased, ahead) = if erase {
             (region.base, region.base + size.min(region.size))
         } else {
             (region.end(), region.end())
         };
-        let (clearing, half_erased, expected) = (false, false, None);
-        self.target = Some(Target { program, region, erased, ahead, clearing, half_erased, expected });
+        let (untouched, clearing, half_erased, expected) = (Some(ahead), false, false, None);
+        let ahead = erased;
+        self.target =
+            Some(Target { program, region, erased, ahead, untouched, clearing, half_erased, expected });
     }
 
     /// The record of a program goes, then all its sectors are erased that are not.
@@ -402,6 +407,16 @@ impl<'b> Programmer<'b> {
         parameters: &mut impl Parameters,
         flash: &F,
     ) -> Result<Option<Job>, FlashError> {
+        let piece = self.queue.first();
+        if let Some(target) = &mut self.target {
+            if piece.is_some() || target.clearing || target.expected.is_some() {
+                if let Some(ahead) = target.untouched.take() {
+                    target.ahead = target.ahead.max(ahead);
+                    let program = target.program;
+                    self.void(program);
+                }
+            }
+        }
         if self.voids != 0 {
             let program = self.voids.trailing_zeros() as u8 + 1;
             let mut half_erased = ProgramRecord::load_half_erased(parameters, flash, program);
@@ -410,7 +425,6 @@ impl<'b> Programmer<'b> {
             }
             return Ok(Some(store(parameters, Change::Void, program, ProgramRecord::none(half_erased))));
         }
-        let piece = self.queue.first();
         let Some(target) = &mut self.target else { return Ok(None) };
         let needed = piece.map_or(target.ahead, |piece| piece.address + piece.size);
         if target.erased < needed {

@@ -1,0 +1,217 @@
+//! The label of a program that comes as a block file: another product's is refused before anything is
+//! lost where the first block has the label, and never becomes a program where a later one has it.
+
+mod bench;
+mod model;
+
+use bench::{
+    autostart, block, block_file, cut_at_every_operation, program, Bench, CLEAR, IDENTIFICATION, LAYOUT,
+    SET_SIGNATURE, START,
+};
+use boot_core::control::{Policy, Verdict};
+use boot_core::store::{Journal, ProgramRecord};
+use canopen::program::FlashError;
+use canopen::AbortCode;
+use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP};
+use shared_abi::block_file::Control;
+use shared_abi::label::{self, Label};
+use shared_abi::warm_start::BootRequest;
+
+const DEVICE: (u32, u32) = (0x0102_0304, 0x0A0B_0C0D);
+const POLICY: Policy = Policy { identity: Some(DEVICE), ..Policy::DEFAULT };
+const UNFIT: AbortCode = AbortCode(0x0800_0020);
+const OLD: u8 = 0xA0;
+const NEW: u8 = 0xB0;
+
+/// A program of 700 bytes with this label.
+fn labelled(seed: u8, label: &Label) -> Vec<u8> {
+    let mut bytes = program(700, seed);
+    let Label { magic, vendor_id, product_code, version, reserved: [a, b, c], check } = *label;
+    let words = [magic, vendor_id, product_code, version, a, b, c, check];
+    let at = label::OFFSET as usize;
+    for (place, word) in bytes[at..at + label::SIZE].chunks_mut(4).zip(words) {
+        place.copy_from_slice(&word.to_le_bytes());
+    }
+    bytes
+}
+
+/// A device with a queue for large blocks, and the old program in it.
+fn updated(flash: &mut ModelFlash) -> Bench<'_> {
+    let mut bench = Bench::with_buffer(flash, POLICY, 2048);
+    bench.install(&program(200, OLD));
+    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    bench.node.flash().touched.clear();
+    bench
+}
+
+/// The programs of other products, and what 1F57h reads for them.
+fn others() -> [(Vec<u8>, u32); 2] {
+    [
+        (labelled(NEW, &Label::new(DEVICE.0 ^ 1, DEVICE.1, 7)), 0x80),
+        (labelled(NEW, &Label::new(DEVICE.0, DEVICE.1 ^ 1, 7)), 0x82),
+    ]
+}
+
+#[test]
+fn a_label_in_the_first_block_is_judged_before_anything_is_lost() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = updated(&mut flash);
+    for (other, status) in others() {
+        // What block 0 tells does not help, not even as much as it may erase ahead.
+        for control in [vec![0; 8], [700, DEVICE.0, DEVICE.1].map(u32::to_le_bytes).concat()] {
+            assert_eq!(bench.command(CLEAR), 0);
+            bench.good(&block(0, 0, &control));
+            assert_eq!(bench.block(&block_file(&other, 512)[1]), (Err(UNFIT), status));
+            assert_eq!(bench.node.flash().touched, [], "nothing is lost");
+            // The next one is refused, too: there is no way past the first.
+            assert_eq!(bench.block(&block_file(&other, 512)[2]).0, Err(AbortCode(0x0800_0022)));
+            assert_eq!(bench.command(START), 0);
+            assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
+        }
+    }
+    assert_eq!(autostart(&flash), Ok(OLD));
+}
+
+#[test]
+fn a_label_in_a_later_block_keeps_the_program_from_becoming_one() {
+    // The label lies in one block, across two, and across many.
+    for chunk in [240, 484, 20] {
+        for (other, status) in others() {
+            let mut flash = ModelFlash::new(&CHIP);
+            let mut bench = updated(&mut flash);
+            assert_eq!(bench.command(CLEAR), 0);
+            let blocks = block_file(&other, chunk);
+            let (end, data) = blocks.split_last().unwrap();
+            data.iter().for_each(|block| bench.good(block));
+            assert_eq!(bench.block(end), (Ok(()), status), "blocks of {chunk}");
+            assert_eq!(bench.read_state(), 3, "no program");
+            assert_eq!(bench.command(SET_SIGNATURE), 0x02, "NOVALPROG");
+            assert_eq!(bench.command(START), 0x02);
+            assert_eq!(bench.node.take_boot_request(), None);
+            assert!(autostart(&flash).is_err());
+            let mut bench = Bench::with_buffer(&mut flash, POLICY, 2048);
+            assert_eq!((bench.read_state(), bench.word(IDENTIFICATION)), (3, 0), "nor after a reset");
+            bench.install(&program(200, OLD));
+        }
+    }
+}
+
+#[test]
+fn a_label_that_fits_is_taken_and_tells_the_version() {
+    let mut damaged = labelled(NEW, &Label::new(DEVICE.0 ^ 1, DEVICE.1, 7));
+    damaged[label::OFFSET as usize + 20] ^= 1;
+    let dated = |version: u32| [700, DEVICE.0, DEVICE.1, version, 0, 0].map(u32::to_le_bytes).concat();
+    for (image, control, version) in [
+        (labelled(NEW, &Label::new(DEVICE.0, DEVICE.1, 7)), vec![0; 8], 7),
+        (labelled(NEW, &Label::new(0, 0, 7)), vec![0; 8], 7),
+        (labelled(NEW, &Label::new(0, DEVICE.1, 7)), dated(9), 9),
+        // One that is damaged is none.
+        (damaged, vec![0; 8], 0),
+        (program(700, NEW), dated(9), 9),
+        // Behind the end of a program is none of its label, whatever is left there.
+        (program(200, NEW), vec![0; 8], 0),
+    ] {
+        for chunk in [512, 96] {
+            let mut flash = ModelFlash::new(&CHIP);
+            let mut bench = updated(&mut flash);
+            assert_eq!(bench.command(CLEAR), 0);
+            bench.good(&block(0, 0, &control));
+            block_file(&image, chunk)[1..].iter().for_each(|block| bench.good(block));
+            assert_eq!(bench.command(SET_SIGNATURE), 0);
+            let journal = Journal::open(&flash, LAYOUT.parameters);
+            assert_eq!(ProgramRecord::load(&journal, &flash, 1).unwrap().version, version);
+            assert_eq!(autostart(&flash), Ok(NEW));
+        }
+    }
+}
+
+/// The product's own check is asked about the label, too: block 0 cannot tell it another version.
+#[test]
+fn a_products_own_check_sees_the_label() {
+    fn no_downgrade(_: u8, control: &Control) -> Verdict {
+        match control {
+            Control::Dated { version: 0..=7, .. } => Verdict::Refuse(FlashError::Unspecified),
+            _ => Verdict::Standard,
+        }
+    }
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with_buffer(&mut flash, Policy { check: no_downgrade, ..POLICY }, 2048);
+    for (version, outcome) in [(7, (Err(UNFIT), 0x7E)), (8, (Ok(()), 0))] {
+        let image = labelled(NEW, &Label::new(DEVICE.0, DEVICE.1, version));
+        assert_eq!(bench.command(CLEAR), 0);
+        bench.good(&block(0, 0, &[0; 8]));
+        assert_eq!(bench.block(&block_file(&image, 512)[1]), outcome);
+    }
+}
+
+/// Block 0 alone loses nothing, however much it tells of the program: a reset behind it finds the old
+/// one.
+#[test]
+fn a_control_block_alone_loses_nothing() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = updated(&mut flash);
+    assert_eq!(bench.command(CLEAR), 0);
+    bench.good(&block(0, 0, &[700, DEVICE.0, DEVICE.1].map(u32::to_le_bytes).concat()));
+    assert_eq!(bench.node.flash().touched, []);
+    // Broken off and begun anew, it still loses nothing.
+    assert_eq!(bench.command(CLEAR), 0);
+    bench.good(&block(0, 0, &[0; 8]));
+    assert_eq!(bench.node.flash().touched, []);
+    assert_eq!(autostart(&flash), Ok(OLD));
+}
+
+/// An update to another product's program in small blocks, cut at every operation: what starts is the
+/// old program or none.
+#[test]
+fn no_power_cut_makes_a_program_of_another_products() {
+    quiet_power_cuts();
+    let (other, _) = &others()[1];
+    let mut installed = ModelFlash::new(&CHIP);
+    updated(&mut installed);
+    let cells = installed.cells(CHIP.flash).to_vec();
+    let fresh = || {
+        let mut flash = ModelFlash::new(&CHIP);
+        flash.poke(CHIP.flash.base, &cells);
+        flash
+    };
+    let update = |flash: &mut ModelFlash| {
+        let mut bench = Bench::with(flash, POLICY);
+        bench.command(CLEAR);
+        for block in block_file(other, 96) {
+            bench.block(&block).0.unwrap();
+        }
+        bench.command(SET_SIGNATURE);
+    };
+    let mut flash = fresh();
+    update(&mut flash);
+    assert!(autostart(&flash).is_err());
+    let (operations, mut seen) = (flash.operations, [0; 2]);
+    for operation in 1..=operations {
+        for cut in [Cut::Before, Cut::After, Cut::Torn(7), Cut::Torn(8)] {
+            let mut flash = fresh();
+            flash.cut = Some((operation, cut));
+            assert!(until_power_cut(|| update(&mut flash)));
+            flash.power_on();
+            match autostart(&flash) {
+                Ok(OLD) => seen[0] += 1,
+                Err(_) => seen[1] += 1,
+                other => panic!("cut {cut:?} at operation {operation}: {other:?} would start"),
+            }
+        }
+    }
+    assert!(operations > 150 && seen.iter().all(|count| *count > 0), "{operations}: {seen:?}");
+}
+
+/// The same to a program of this product: it may be cut anywhere, and completes.
+#[test]
+fn a_labelled_update_cut_anywhere_leaves_the_old_the_new_or_none() {
+    let new = labelled(NEW, &Label::new(DEVICE.0, DEVICE.1, 7));
+    let mut installed = ModelFlash::new(&CHIP);
+    updated(&mut installed);
+    cut_at_every_operation(&installed, OLD, NEW, |flash| {
+        let mut bench = Bench::with_buffer(flash, POLICY, 2048);
+        assert_eq!(bench.command(CLEAR), 0);
+        block_file(&new, 512).iter().for_each(|block| bench.good(block));
+        assert_eq!(bench.command(SET_SIGNATURE), 0);
+    });
+}
