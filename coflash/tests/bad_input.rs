@@ -109,6 +109,48 @@ fn a_damaged_block_file_is_named_with_its_offset() {
     assert!(error.starts_with("offset 0x35b: the last block says 4001 bytes"), "{error}");
 }
 
+/// An ELF file for Arm (System V ABI, chapters 4 and 5) with so many load segments, each of which
+/// shows this many bytes from `offset` on.
+fn elf(segments: u16, len: usize, segment: impl Fn(u32) -> (u32, u32, u32)) -> Vec<u8> {
+    let mut bytes = b"\x7FELF\x01\x01\x01\0\0\0\0\0\0\0\0\0".to_vec();
+    for half in [2_u16, 40] {
+        bytes.extend(half.to_le_bytes());
+    }
+    for word in [1_u32, 0x0801_0189, 52, 0, 0x0500_0000] {
+        bytes.extend(word.to_le_bytes());
+    }
+    for half in [52, 32, segments, 40, 0, 0] {
+        bytes.extend(half.to_le_bytes());
+    }
+    for number in 0..segments.into() {
+        let (offset, address, size) = segment(number);
+        for word in [1, offset, address, address, size, size, 5, 1] {
+            bytes.extend(word.to_le_bytes());
+        }
+    }
+    bytes.resize(len.max(bytes.len()), 0x5A);
+    bytes
+}
+
+/// Headers are cheap: 20 000 of them that all show the same 2.6 MB would be 52 GB.
+#[test]
+fn the_segments_of_an_elf_file_are_added_up_before_they_are_copied() {
+    const LEN: u32 = 2_600_000;
+    let bomb = elf(20_000, LEN as usize, |_| (0, 0x0801_0000, LEN));
+    let error = meaning(&bomb, None).unwrap_err();
+    assert!(
+        error.starts_with("the file: its load segments have more than 67108864 bytes together"),
+        "{error}"
+    );
+    // So many headers are no fault by themselves.
+    let bytes = elf(20_000, 0, |number| (52 + 4 * number, 0x0801_0000 + 4 * number, 4));
+    assert_eq!(meaning(&bytes, None).unwrap().program_size(), 80_000);
+    // The gap between two segments counts as well.
+    let apart = elf(2, 0, |number| (52, 0x0801_0000 + number * 0x0400_0000, 4));
+    let error = meaning(&apart, None).unwrap_err();
+    assert!(error.contains("too much for one program"), "{error}");
+}
+
 fn format() -> impl Strategy<Value = Option<Format>> {
     prop::sample::select(vec![
         None,

@@ -147,6 +147,121 @@ fn inspect_tells_what_a_file_holds() {
     assert!(done.exit == 3 && done.err.contains("lies outside"), "{}", done.err);
 }
 
+/// What has no end, or is too large for any firmware, is said so and not read.
+#[test]
+#[cfg(unix)]
+fn what_is_no_file_or_too_large_is_not_read() {
+    let folder = Folder::new("endless");
+    let fifo = folder.path("fifo");
+    assert!(Command::new("mkfifo").arg(&fifo).status().unwrap().success());
+    let large = folder.path("large.elf");
+    fs::File::create(&large).unwrap().set_len(64 * 1024 * 1024 + 1).unwrap();
+    let settings = folder.path("large.toml");
+    fs::File::create(&settings).unwrap().set_len(2 * 1024 * 1024).unwrap();
+    for (file, words) in [
+        ("/dev/zero", "/dev/zero: is a device, pipe or socket and no file"),
+        (&fifo, "fifo: is a device, pipe or socket and no file"),
+        (folder.0.to_str().unwrap(), "endless: is a folder and no file"),
+        (&large, "large.elf: has 67108865 bytes, and no firmware file has more than 67108864"),
+    ] {
+        for command in [&["inspect"][..], &["convert"], &["--bus", "nowhere", "flash"]] {
+            let done = coflash(&[command, &[file]].concat());
+            assert!(done.exit == 3 && done.err.contains(words), "{command:?} {}", done.err);
+        }
+    }
+    for (option, file) in [("--job", "/dev/zero"), ("--job", settings.as_str())] {
+        let done = coflash(&["--bus", "nowhere", "flash", option, file]);
+        assert!(done.exit == 3 && done.err.contains("has more than 1048576 bytes"), "{}", done.err);
+    }
+    let done = coflash(&["--config", "/dev/zero", "inspect", &data("program.hex")]);
+    assert!(done.exit == 3 && done.err.contains("has more than 1048576 bytes"), "{}", done.err);
+}
+
+/// The image of a bootloader is refused before anybody looks for the bus, and so is what is none.
+#[test]
+fn what_can_be_no_program_is_refused_without_a_bus() {
+    let folder = Folder::new("no-program");
+    let vectors = [0x2001_FFC0_u32, 0x0800_0189].map(u32::to_le_bytes).concat();
+    let bootloader = folder.file("bootloader.bin", &[&vectors[..], &[0x5A; 1000]].concat());
+    let zeros = folder.file("zeros.bin", &[0; 1000]);
+    let flash = |file: &str, options: &[&str]| {
+        coflash(&[&["--bus", "nowhere", "flash", file, "-I", "binary"], options].concat())
+    };
+    for (file, options, words) in [
+        (
+            &bootloader,
+            &["--start-address", "0x08000000"][..],
+            "bootloader.bin: begins at the start of the flash",
+        ),
+        (&bootloader, &["--dialect", "raw"], "bootloader.bin: begins at the start of the flash"),
+        (&bootloader, &["--board", "stm32f407g-disc1"], "its reset vector is 08000189h, outside 0x08010000"),
+        (&zeros, &["--board", "stm32f407g-disc1"], "zeros.bin: is no program: all of its bytes are 00h"),
+        (&zeros, &["--dialect", "lift", "--unlock", "x"], "zeros.bin: is no program"),
+    ] {
+        let done = flash(file, options);
+        assert!(
+            done.exit == 3 && done.err.contains(words) && done.err.contains("0x60000021"),
+            "{}",
+            done.err
+        );
+        // It may be forced, and then it fails for want of a bus; so do data, which may be anything.
+        let done = flash(file, &[options, &["--force"]].concat());
+        assert!(done.exit != 3 && done.err.contains("nowhere"), "{}", done.err);
+    }
+    let done = flash(&zeros, &["--dialect", "lift", "--unlock", "x", "--program", "2"]);
+    assert!(done.exit != 3 && done.err.contains("nowhere"), "{}", done.err);
+}
+
+/// The label of an image (`docs/dialects.md`) is told by `inspect`, and goes into block 0.
+#[test]
+fn the_label_is_shown_and_goes_into_block_0() {
+    let folder = Folder::new("label");
+    let mut image = vec![0x5A; 1024];
+    image[..8].copy_from_slice(&[0x2001_FFC0_u32, 0x0801_0201].map(u32::to_le_bytes).concat());
+    let mut label = [u32::from_le_bytes(*b"CBL1"), 0x319, 0x4007_D151, 0x0001_0203, 0, 0, 0].to_vec();
+    label.push(shared_abi::check_word(&label));
+    image[0x1E0..0x200]
+        .copy_from_slice(&label.iter().flat_map(|word| word.to_le_bytes()).collect::<Vec<_>>());
+    let file = folder.file("app.bin", &image);
+    let raw = ["-I", "binary", "--board", "stm32f407g-disc1"];
+
+    let done = coflash(&[&["inspect", &file][..], &raw].concat());
+    assert!(
+        done.out.contains("  label        vendor-ID 00000319h, product code 4007D151h, version 00010203h\n")
+            && done.out.contains("  judged       can be a program"),
+        "{}",
+        done.out
+    );
+    let done = coflash(&[&["--json", "inspect", &file][..], &raw].concat());
+    let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
+    assert_eq!(json["label"]["product_code"], 0x4007_D151);
+    assert_eq!(json["fault"], serde_json::Value::Null);
+
+    let out = folder.path("app.blk");
+    for (options, data) in [
+        // Size of the program, vendor-ID, product code, version, date of 64 bits (manual, table 6).
+        (&[][..], vec![1024, 0x319, 0x4007_D151, 0x0001_0203, 0, 0]),
+        (&["--date", "1420070400"], vec![1024, 0x319, 0x4007_D151, 0x0001_0203, 1_420_070_400, 0]),
+        (&["--vid", "1", "--pid", "2"], vec![1024, 1, 2]),
+        (&["--no-label"], vec![0, 0]),
+    ] {
+        let done = run(Command::new(env!("CARGO_BIN_EXE_coflash"))
+            .args(["convert", &file, &out])
+            .args(raw)
+            .args(options)
+            .env_remove("SOURCE_DATE_EPOCH"));
+        assert_eq!(done.exit, 0, "{}", done.err);
+        let block: Vec<u8> = data.iter().flat_map(|word: &u32| word.to_le_bytes()).collect();
+        let bytes = fs::read(&out).unwrap();
+        assert_eq!(bytes[8..12], (block.len() as u32).to_le_bytes(), "{options:?}");
+        assert_eq!(bytes[12..12 + block.len()], block, "{options:?}");
+        assert_eq!(done.out.contains("as its label says"), data.len() == 6, "{}", done.out);
+    }
+    // The block file has the label, too, and tells both.
+    let done = coflash(&["inspect", &out]);
+    assert!(done.out.contains("  label        vendor-ID 00000319h"), "{}", done.out);
+}
+
 #[test]
 fn quiet_says_nothing_and_json_says_one_document() {
     let folder = Folder::new("quiet");

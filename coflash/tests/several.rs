@@ -64,7 +64,8 @@ fn a_list_of_nodes_is_updated_and_a_failure_stops_no_other() {
 #[test]
 fn a_job_file_says_who_gets_what() {
     let folder = Folder::new("job");
-    let small = folder.file("small.hex", b":020000040801F1\n:050000000102030405EC\n:00000001FF\n");
+    let small =
+        folder.file("small.hex", b":020000040801F1\n:0C000000001000200900010801020304A8\n:00000001FF\n");
     folder.file("plain.blk", &fs::read(data("plain-400.blk")).unwrap());
     let job = folder.file(
         "job.toml",
@@ -78,14 +79,18 @@ fn a_job_file_says_who_gets_what() {
     let bus = server.join().unwrap();
     let plain = fs::read(data("plain-400.blk")).unwrap();
     assert_eq!((bus.0[0].blocks.concat(), bus.0[2].blocks.concat()), (plain.clone(), plain));
-    // Block 0 and the last one around five bytes.
-    assert_eq!(
-        (bus.0[1].blocks[1][12..17].to_vec(), bus.0[1].running),
-        (vec![1, 2, 3, 4, 5], Some(BOOTLOADER))
-    );
+    // Block 0 and the last one around twelve bytes.
+    assert_eq!((bus.0[1].blocks[1][20..24].to_vec(), bus.0[1].running), (vec![1, 2, 3, 4], Some(BOOTLOADER)));
     assert_eq!((bus.0[0].count("command 80"), bus.0[2].count("command 80")), (0, 1));
     assert!(done.out.ends_with("3 of 3 devices are done\n"), "{}", done.out);
     // A bad image, and nobody is touched.
+    fs::write(&small, b":020000040801F1\n:050000000102030405EC\n:00000001FF\n").unwrap();
+    let done = coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--job", &job]);
+    assert!(
+        done.exit == 3 && done.err.contains("small.hex: is no program: it does not begin"),
+        "{}",
+        done.err
+    );
     fs::write(small, b"hello").unwrap();
     let done = coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--job", &job]);
     assert!(done.exit == 3 && done.err.contains("small.hex: is no firmware file"), "{}", done.err);

@@ -5,6 +5,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Command;
+use coflash::file::limit::read_text;
 use coflash::update::config::{parse, Fault, KEYS};
 
 use super::output::Failure;
@@ -24,7 +25,7 @@ pub(super) fn find(named: Option<PathBuf>) -> Option<PathBuf> {
 
 /// The command line with the file's values as defaults.
 pub(super) fn apply(command: Command, path: &Path) -> Result<Command, Failure> {
-    let text = std::fs::read_to_string(path).map_err(|error| Failure::unreadable(path, &error))?;
+    let text = read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
     let settings = parse(&text).map_err(|fault| match fault {
         Fault::Line(line, what) => Failure::line(path, line, &what),
         Fault::Setting(what) => {

@@ -8,6 +8,7 @@ use coflash::file::block_file::FRAMING;
 use coflash::file::convert::{Converted, Label};
 use coflash::file::read::Firmware;
 use serde_json::json;
+use shared_abi::block_file::{Control, Identity};
 
 use super::context::Context;
 use super::file::{warn_left_out, Input, Source};
@@ -56,7 +57,8 @@ pub(super) struct Convert {
 /// For whom the program is: what goes into block 0.
 #[derive(Debug, Args)]
 pub(super) struct Labels {
-    /// Vendor-ID of the devices that may take this program (1018h/1).
+    /// Vendor-ID of the devices that may take this program (1018h/1). Without --vid and --pid, block
+    /// 0 gets what the label in the image tells: vendor-ID, product code and version.
     #[arg(long, value_name = "NUMBER", value_parser = number, requires = "pid")]
     vid: Option<u32>,
 
@@ -69,10 +71,14 @@ pub(super) struct Labels {
     #[arg(long, value_name = "NUMBER", value_parser = number, requires = "vid")]
     ver: Option<u32>,
 
-    /// The date that goes with --ver, in seconds since 1970; otherwise SOURCE_DATE_EPOCH, otherwise
-    /// now.
+    /// The date that goes with --ver or with the image's label, in seconds since 1970; otherwise
+    /// SOURCE_DATE_EPOCH, otherwise now for --ver and none for the label.
     #[arg(long, value_name = "SECONDS", env = "SOURCE_DATE_EPOCH")]
     date: Option<u64>,
+
+    /// Tell nothing in block 0, whatever the label in the image says.
+    #[arg(long, conflicts_with = "vid")]
+    no_label: bool,
 }
 
 /// What the manual's converter could do and no bootloader of this house undoes: better no file than
@@ -99,6 +105,7 @@ impl Convert {
             return Err(Failure::usage(what, "name another file for the result"));
         }
         let (firmware, _) = self.source.load(input, self.program)?;
+        let of_image = self.labels.vid.is_none() && matches!(firmware, Firmware::Image(_));
         if let Firmware::Blocks(blocks) = &firmware {
             // Blocks are taken as they are, their CRC among it.
             let (file, kept) = (input.display(), blocks.checksum());
@@ -118,6 +125,14 @@ impl Convert {
             let flash = PathBuf::from(name.file_name().unwrap_or_default());
             write(&flash, &done.file.flash_image())?;
             context.out.say(format_args!("{}: the program as it lies in flash", flash.display()));
+        }
+        if let (true, Control::Dated { identity, version, .. }) = (of_image, done.file.control()) {
+            let Identity { vendor_id, product_code, .. } = identity;
+            let output = output.display();
+            context.out.say(format_args!(
+                "{output}: for vendor-ID {vendor_id:08X}h, product code {product_code:08X}h, version {version:08X}h, \
+                 as its label says"
+            ));
         }
         self.tell(context, &output, &done);
         Ok(())
@@ -152,7 +167,12 @@ impl Convert {
 
 impl Labels {
     pub(super) fn label(&self) -> Result<Label, Failure> {
-        let (Some(vendor_id), Some(product_code)) = (self.vid, self.pid) else { return Ok(Label::None) };
+        if self.no_label {
+            return Ok(Label::None);
+        }
+        let (Some(vendor_id), Some(product_code)) = (self.vid, self.pid) else {
+            return Ok(Label::OfImage { date: self.date.unwrap_or(0) });
+        };
         let Some(version) = self.ver else { return Ok(Label::Device { vendor_id, product_code }) };
         let date = match self.date {
             Some(date) => date,

@@ -6,6 +6,7 @@ use std::time::Duration;
 use canopen::debugger::Stop;
 use clap::{Args, Subcommand};
 use coflash::device::debugger::{Debugger, NoBreakpoint, Registers, Stopped, BREAKPOINTS, NAMES};
+use coflash::file::{limit, Place};
 use coflash::Error;
 use serde_json::{json, Value};
 
@@ -254,7 +255,8 @@ impl Write {
             (Some(Bytes(bytes)), ..) => bytes.clone(),
             (None, Some(word), _) => word.to_le_bytes().to_vec(),
             (None, None, Some(path)) => {
-                std::fs::read(path).map_err(|error| Failure::unreadable(path, &error))?
+                let read = limit::read(path).map_err(|cause| Place::File.fault(cause).of(path.display()));
+                read.map_err(Failure::from)?
             }
             // clap asks for one of them.
             (None, None, None) => Vec::new(),

@@ -10,6 +10,9 @@ use coflash::device::lss::{ensure_node_id, LssAddress};
 use coflash::device::Dialect;
 use coflash::file::block_file::BlockFile;
 use coflash::file::convert::Label;
+use coflash::file::judge::judge;
+use coflash::file::limit::read_text;
+use coflash::update::dialect::is_data;
 use coflash::update::job::{self, Entry, Settings};
 use coflash::update::many::{flash_in_turn, flash_many, Job, ManyOptions};
 use coflash::update::{flash, Event, FlashOptions, Target};
@@ -109,6 +112,12 @@ pub(super) struct Flash {
     #[arg(long, value_name = "TIMES", value_parser = number, default_value = "3")]
     block_repeats: u32,
 
+    /// Leave it to the device to judge the image. Otherwise an image that can be no program of an
+    /// STM32F4 (vector table, a bootloader, nothing but zeros), and one for another device or another
+    /// place in flash, is refused before anything is done to the device.
+    #[arg(long)]
+    force: bool,
+
     #[command(flatten)]
     access: Access,
 
@@ -158,6 +167,7 @@ impl Flash {
         let image = self.file.as_deref().or(self.legacy_file.as_deref()).ok_or_else(unnamed)?;
         let done = self.source().blocks(image, self.program, self.labels.label()?)?;
         warn_left_out(context, image, &done);
+        self.judge(image, &done.file, self.program)?;
         let options = self.options(&done.file, &Settings::default())?;
         let (size, crc) = (done.file.program_size(), done.file.program_crc());
         context.out.say(format_args!("{}: program of {size} bytes, CRC {crc:08X}h", image.display()));
@@ -188,7 +198,7 @@ impl Flash {
         // Devices that get the same share it.
         let mut known: Vec<(PathBuf, Option<String>, u8, Arc<BlockFile>)> = Vec::new();
         let mut devices = Vec::new();
-        let text = std::fs::read_to_string(job).map_err(|error| Failure::unreadable(job, &error))?;
+        let text = read_text(job).map_err(|error| Failure::unreadable(job, &error))?;
         let entries = job::parse(&text, job.parent().unwrap_or(Path::new("")));
         for entry in entries.map_err(|fault| Failure::job(job, &fault))? {
             let Entry { node, address, settings, .. } = entry;
@@ -204,8 +214,9 @@ impl Flash {
                         Some(board) => self.source().for_board(board)?,
                         None => self.source(),
                     };
-                    let done = source.blocks(&image, program, Label::None)?;
+                    let done = source.blocks(&image, program, Label::default())?;
                     warn_left_out(context, &image, &done);
+                    self.judge(&image, &done.file, program)?;
                     let file = Arc::new(done.file);
                     known.push((image.clone(), settings.board.clone(), program, file.clone()));
                     file
@@ -215,6 +226,16 @@ impl Flash {
             devices.push(Assignment { node, address, image, file, options });
         }
         Ok(devices)
+    }
+
+    /// Refuses what can be no program, before a device is asked anything. Whether another number than
+    /// 1 is a program's is not known without the device, if it may be a lift's.
+    fn judge(&self, path: &Path, file: &BlockFile, program: u8) -> Result<(), Failure> {
+        let dialect = self.access.dialect();
+        if self.force || is_data(dialect.unwrap_or(Dialect::Lift), program) {
+            return Ok(());
+        }
+        judge(&file.image(), file.program_start()).map_err(|fault| Failure::no_program(path, fault))
     }
 
     /// What the command line says, unless a device's own settings say otherwise.
@@ -233,7 +254,8 @@ impl Flash {
             .dialect(self.access.dialect())
             .unlock(self.access.unlock())
             .wait(self.wait)
-            .mastership(!self.no_mastership))
+            .mastership(!self.no_mastership)
+            .force(self.force))
     }
 
     /// The node-ID of a device, which is given it first if it is named by its LSS address.

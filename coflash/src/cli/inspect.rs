@@ -33,10 +33,12 @@ impl Inspect {
         let (firmware, format) = self.source.load(path, self.program)?;
         // What conversion would refuse is worth knowing now; an image without a board has no region
         // to leave.
+        let mut start = None;
         if self.source.has_region() || matches!(firmware, Firmware::Blocks(_)) {
-            self.source.convert(firmware.clone(), path, self.program, Default::default())?;
+            let done = self.source.convert(firmware.clone(), path, self.program, Default::default())?;
+            start = Some(done.file.program_start());
         }
-        let inspection = Inspection::of(&firmware, format);
+        let inspection = Inspection::of(&firmware, format, start);
         context.out.result(format_args!("{}: {inspection}", path.display()), || value(&inspection));
         Ok(())
     }
@@ -77,6 +79,10 @@ fn value(inspection: &Inspection) -> Value {
         "segments": inspection.segments.iter().map(segment).collect::<Vec<_>>(),
         "gaps": gaps.iter().map(segment).collect::<Vec<_>>(),
         "software_version": inspection.software_version,
+        "label": inspection.label.map(|label| json!({
+            "vendor_id": label.vendor_id, "product_code": label.product_code, "version": label.version,
+        })),
+        "fault": inspection.judgement.err().map(|fault| fault.to_string()),
         "blocks": blocks,
     })
 }

@@ -12,7 +12,7 @@ use coflash::device::diagnose::diagnose;
 use coflash::device::error::LssFailure;
 use coflash::device::{legacy, Session};
 use coflash::file::convert::ConvertError;
-use coflash::file::{Cause, FileError};
+use coflash::file::{judge, Cause, FileError};
 use coflash::update::job::Fault;
 use coflash::update::DeviceState;
 use coflash::Error;
@@ -299,6 +299,12 @@ impl Failure {
         Self::new(Exit::NoAnswer, Some(0x6000_0013), what, advice)
     }
 
+    /// A firmware file that holds no program.
+    pub(super) fn no_program(path: &Path, fault: judge::Fault) -> Self {
+        let (what, advice) = (format!("{}: {fault}", path.display()), fault.advice().to_string());
+        Self::new(Exit::File, Some(judge::Fault::NUMBER), what, Some(advice))
+    }
+
     /// A conversion of `file` that failed.
     pub(super) fn convert(error: ConvertError, file: &Path) -> Self {
         match error {
@@ -368,6 +374,8 @@ impl From<Error> for Failure {
             | Error::Busy { .. }
             | Error::WrongCrc { .. }
             | Error::WrongTarget { .. }
+            | Error::NoProgram { .. }
+            | Error::OtherRegion { .. }
             | Error::Lss { .. } => Exit::Device,
             Error::NoBootloader { .. }
             | Error::Occupied { .. }

@@ -78,6 +78,24 @@ pub enum Error {
         /// What the file says.
         file: u32,
     },
+    /// The image can be no program.
+    NoProgram {
+        /// What is wrong with it, as what follows "the image".
+        why: String,
+        /// What to do next.
+        advice: &'static str,
+    },
+    /// The device has its program elsewhere than the image is for.
+    OtherRegion {
+        /// Which device was looked at.
+        node: NodeId,
+        /// The program's number.
+        program: u8,
+        /// First and last address of the image.
+        image: (u32, u32),
+        /// First and last address of the device's program, as 2004h tells it.
+        region: (u32, u32),
+    },
     /// The program on trial is another device than its bootloader.
     OtherIdentity {
         /// Which device was looked at.
@@ -212,13 +230,14 @@ impl From<AdapterError> for Error {
 }
 
 impl Error {
-    /// Whether the device has refused the very first block: one that erases with the first good
-    /// block has lost nothing then.
+    /// Whether the device has refused block 0 or the first one with data: one that erases with the
+    /// first good data has lost nothing then.
     #[must_use]
-    pub fn refuses_control_block(&self) -> bool {
+    pub fn refuses_first_blocks(&self) -> bool {
         matches!(
             self,
-            Self::Refused { doing: Doing::Block(0), .. } | Self::Failed { doing: Doing::Block(0), .. }
+            Self::Refused { doing: Doing::Block(0 | 1), .. }
+                | Self::Failed { doing: Doing::Block(0 | 1), .. }
         )
     }
 
@@ -232,6 +251,9 @@ impl Error {
             Self::WrongCrc { .. } => 0x6000_0001,
             Self::Failed { error, .. } => flash_error_number(*error),
             Self::WrongTarget { what, .. } => flash_error_number(what.error()),
+            // Those of a firmware file for which the same is known without a device.
+            Self::OtherRegion { .. } => 0x6000_0015,
+            Self::NoProgram { .. } => 0x6000_0021,
             Self::NoBootloader { .. } => 0x6000_0010,
             Self::Cancelled => 0x6000_0011,
             Self::NoAnswer { .. } => 0x6000_0013,
@@ -296,6 +318,14 @@ impl fmt::Display for Error {
                     Mismatch::ProductCode => "product code",
                 };
                 write!(f, "the program is for {what} {file:08X}h, and node {node} has {device:08X}h")
+            }
+            Self::NoProgram { why, .. } => write!(f, "the image {why}"),
+            Self::OtherRegion { node, program, image: (first, last), region: (from, to) } => {
+                write!(
+                    f,
+                    "the image is for {first:#010x}..={last:#010x}, and node {node} has program {program} at \
+                     {from:#010x}..={to:#010x}"
+                )
             }
             Self::OtherIdentity { node, what, bootloader, application } => {
                 let number = |number: &Option<u32>| {

@@ -13,6 +13,7 @@ pub mod legacy;
 mod listen;
 pub mod lss;
 pub(crate) mod recognise;
+pub mod region;
 pub mod scan;
 pub mod session;
 mod timing;

@@ -7,6 +7,7 @@ use shared_abi::block_file::{Control, Identity};
 use super::block_file::{BlockFile, Checksum, LastBlock, FRAMING, MAX_BLOCK_SIZE, MAX_PROGRAM_SIZE};
 use super::fault::{Cause, Place, ReadError};
 use super::image::Image;
+use super::label::label_of;
 use super::range::AddressRange;
 use super::read::Firmware;
 
@@ -61,10 +62,14 @@ impl Default for GapFill {
 }
 
 /// For whom the program is and which one it is: what goes into block 0.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Label {
+    /// What the image's own label tells, if it has one, and otherwise nothing.
+    OfImage {
+        /// Seconds since 1970-01-01 UTC, 0 where it is not told: a label has no date.
+        date: u64,
+    },
     /// Nothing is told.
-    #[default]
     None,
     /// Vendor-ID and product code, compared with 1018h by the bootloader.
     Device {
@@ -86,10 +91,27 @@ pub enum Label {
     },
 }
 
+impl Default for Label {
+    fn default() -> Self {
+        Self::OfImage { date: 0 }
+    }
+}
+
 impl Label {
+    /// What is to be told of a program that starts at `start`.
+    fn resolved(self, image: &Image, start: u32) -> Self {
+        let Self::OfImage { date } = self else { return self };
+        label_of(image, start).map_or(Self::None, |label| Self::Release {
+            vendor_id: label.vendor_id,
+            product_code: label.product_code,
+            version: label.version,
+            date,
+        })
+    }
+
     fn control(self, app_size: u32) -> Control {
         match self {
-            Self::None => Control::Plain,
+            Self::OfImage { .. } | Self::None => Control::Plain,
             Self::Device { vendor_id, product_code } => {
                 Control::Identity(Identity { app_size, vendor_id, product_code })
             }
@@ -209,8 +231,9 @@ pub struct Converted {
 /// # Errors
 /// See [`ConvertError`].
 pub fn convert(image: &Image, options: &Options) -> Result<Converted, ConvertError> {
-    let payload = payload(options)?;
     let (image, start, left_out) = place(image, options)?;
+    let label = options.label.resolved(&image, start);
+    let payload = payload(options.block_size, label)?;
     if !start.is_multiple_of(WORD) {
         return Err(ConvertError::Start(start));
     }
@@ -219,8 +242,8 @@ pub fn convert(image: &Image, options: &Options) -> Result<Converted, ConvertErr
         return Err(Place::File.fault(Cause::TooSparse { first: start, last }).into());
     }
     let blocks = blocks(&image, payload, options);
-    let label = |app_size| options.label.control(app_size);
-    let file = BlockFile::new(start, blocks, label, options.checksum, options.last_block);
+    let control = |app_size| label.control(app_size);
+    let file = BlockFile::new(start, blocks, control, options.checksum, options.last_block);
     Ok(Converted { file, left_out })
 }
 
@@ -249,10 +272,9 @@ pub fn blocks_of(firmware: Firmware, options: &Options) -> Result<Converted, Con
 }
 
 /// Data bytes of the largest block: whole words.
-fn payload(options: &Options) -> Result<usize, ConvertError> {
-    let given = options.block_size;
+fn payload(given: usize, label: Label) -> Result<usize, ConvertError> {
     // The last block has 8 data bytes, block 0 at least as many.
-    let (min, max) = (options.label.block_size(), MAX_BLOCK_SIZE);
+    let (min, max) = (label.block_size(), MAX_BLOCK_SIZE);
     if !(min..=max).contains(&given) {
         return Err(ConvertError::BlockSize { given, min, max });
     }

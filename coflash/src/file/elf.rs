@@ -4,6 +4,7 @@ use object::elf::{FileHeader32, EM_ARM, ET_EXEC, PT_LOAD};
 use object::read::elf::{FileHeader, ProgramHeader};
 use object::Endianness;
 
+use super::block_file::MAX_PROGRAM_SIZE;
 use super::fault::{Cause, Place, ReadError};
 use super::image::{Image, Pieces};
 
@@ -47,12 +48,17 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
         .program_headers(endian, bytes)
         .map_err(|_| cut_off("the table of program headers", table_end))?;
 
+    let loads = || {
+        let with_size = program_headers.iter().map(|segment| (segment, u64::from(segment.p_filesz(endian))));
+        with_size.filter(|(segment, size)| segment.p_type(endian) == PT_LOAD && *size != 0)
+    };
+    // Headers are cheap and may all show the same bytes: their sum is looked at before any is
+    // copied. It cannot overflow: there are 65535 headers at most, of 32 bits each.
+    if loads().map(|(_, size)| size).sum::<u64>() > MAX_PROGRAM_SIZE.into() {
+        return Err(Place::File.fault(Cause::SegmentsTooLarge { most: MAX_PROGRAM_SIZE }));
+    }
     let mut pieces = Pieces::default();
-    for segment in program_headers {
-        let size = u64::from(segment.p_filesz(endian));
-        if segment.p_type(endian) != PT_LOAD || size == 0 {
-            continue;
-        }
+    for (segment, size) in loads() {
         let offset = u64::from(segment.p_offset(endian));
         let data = segment.data(endian, bytes).map_err(|()| cut_off("the file", offset + size))?;
         let place = Place::Offset(offset as usize);

@@ -84,6 +84,23 @@ pub enum Cause {
     /// The file cannot be read at all.
     #[error("cannot be read: {0}")]
     Io(#[source] std::io::Error),
+    /// Something that has no end, or none that can be known.
+    #[error("is {0} and no file: give a file, or save into one what comes from there")]
+    NoRegularFile(&'static str),
+    /// A file larger than any firmware.
+    #[error("has {size} bytes, and no firmware file has more than {most}: it is another file, or an ELF file whose symbols must be stripped first")]
+    TooLarge {
+        /// Bytes that it has, or at least has.
+        size: u64,
+        /// The most that are read.
+        most: u64,
+    },
+    /// Load segments that hold more together than any program.
+    #[error("its load segments have more than {most} bytes together: the file is damaged, or no firmware")]
+    SegmentsTooLarge {
+        /// The most that they may have.
+        most: u32,
+    },
     /// No bytes.
     #[error("is empty")]
     Empty,
@@ -246,9 +263,11 @@ impl Cause {
     pub fn number(&self) -> u32 {
         match self {
             Self::Io(error) => error.raw_os_error().and_then(|code| u32::try_from(code).ok()).unwrap_or(5),
-            Self::Outside { .. } | Self::TooSparse { .. } => 0x6000_0015,
+            Self::Outside { .. } | Self::TooSparse { .. } | Self::SegmentsTooLarge { .. } => 0x6000_0015,
             Self::Checksum { .. } | Self::BlockCrc { .. } | Self::ProgramCrc { .. } => 0x6000_0020,
             Self::Empty
+            | Self::NoRegularFile(_)
+            | Self::TooLarge { .. }
             | Self::NotFirmware
             | Self::NoAddress
             | Self::WrongElf(_)

@@ -133,6 +133,32 @@ impl Image {
         })
     }
 
+    /// The bytes from an address on, or `None` where the file does not tell all of them.
+    #[must_use]
+    pub fn bytes<const N: usize>(&self, address: u32) -> Option<[u8; N]> {
+        let mut bytes = [0; N];
+        let mut told = 0;
+        let end = u64::from(address) + N as u64;
+        for piece in &self.pieces {
+            let from = u64::from(piece.address);
+            let (first, behind) = (from.max(address.into()), (from + piece.data.len() as u64).min(end));
+            if first < behind {
+                let data = &piece.data[(first - from) as usize..(behind - from) as usize];
+                let at = (first - u64::from(address)) as usize;
+                bytes[at..at + data.len()].copy_from_slice(data);
+                told += data.len();
+            }
+        }
+        (told == N).then_some(bytes)
+    }
+
+    /// The byte that all of its bytes are, if they are one.
+    pub(crate) fn only_byte(&self) -> Option<u8> {
+        let first = self.pieces.first()?.data[0];
+        let all = self.pieces.iter().flat_map(|piece| &piece.data);
+        all.into_iter().all(|byte| *byte == first).then_some(first)
+    }
+
     pub(crate) fn pieces(&self) -> &[Piece] {
         &self.pieces
     }
@@ -197,6 +223,17 @@ mod tests {
         all.add(0x0F, vec![0; 2], Place::Line(3));
         let error = all.into_image().unwrap_err().to_string();
         assert_eq!(error, "line 3: the data at 0x00000010 overlaps that of line 1");
+    }
+
+    #[test]
+    fn bytes_are_told_when_all_of_them_are_there() {
+        let image = image(&[(4, &[1, 2]), (6, &[3]), (8, &[5]), (u32::MAX, &[9])]);
+        assert_eq!(image.bytes(4), Some([1, 2, 3]));
+        assert_eq!(image.bytes(5), Some([2, 3]));
+        assert_eq!(image.bytes::<4>(5), None, "7 is a hole");
+        assert_eq!(image.bytes::<2>(3), None);
+        assert_eq!(image.bytes(u32::MAX), Some([9]));
+        assert_eq!(image.bytes::<2>(u32::MAX), None);
     }
 
     #[test]

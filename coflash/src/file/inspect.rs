@@ -3,9 +3,12 @@
 use std::fmt;
 
 use shared_abi::block_file::{Control, Identity, NUMBER_CONTROL, NUMBER_LAST};
+use shared_abi::label::Label;
 
 use super::block_file::{Block, BlockFile, Checksum};
 use super::image::Image;
+use super::judge::{judge, Fault};
+use super::label::{label_of, Words};
 use super::range::AddressRange;
 use super::read::{Firmware, Format};
 
@@ -20,6 +23,10 @@ pub struct Inspection {
     pub bytes: u64,
     /// What the program has behind `$CANopenSoftwareVersion`.
     pub software_version: Option<String>,
+    /// For whom the program is, by its own label.
+    pub label: Option<Label>,
+    /// Whether it can be a program at all.
+    pub judgement: Result<(), Fault>,
     /// What only a block file tells.
     pub blocks: Option<Blocks>,
 }
@@ -55,19 +62,21 @@ pub struct BlockLine {
 }
 
 impl Inspection {
-    /// Looks at what a file of this format has turned out to hold.
+    /// Looks at what a file of this format has turned out to hold. `start` is where the program
+    /// starts, if that is known otherwise; an image starts with its first byte.
     #[must_use]
-    pub fn of(firmware: &Firmware, format: Format) -> Self {
+    pub fn of(firmware: &Firmware, format: Format, start: Option<u32>) -> Self {
         match firmware {
-            Firmware::Image(image) => Self::of_image(image, format),
+            Firmware::Image(image) => Self::of_image(image, format, start.unwrap_or(image.span().first)),
             Firmware::Blocks(file) => {
-                let inspection = Self::of_image(&file.image(), format);
+                let start = start.unwrap_or_else(|| file.program_start());
+                let inspection = Self::of_image(&file.image(), format, start);
                 Self { blocks: Some(Blocks::of(file)), ..inspection }
             }
         }
     }
 
-    fn of_image(image: &Image, format: Format) -> Self {
+    fn of_image(image: &Image, format: Format, start: u32) -> Self {
         let segments = image.segments().map(|(first, data)| {
             // A segment is never empty and ends inside the address space.
             AddressRange { first, last: first + (data.len() as u32 - 1) }
@@ -77,6 +86,8 @@ impl Inspection {
             segments: segments.collect(),
             bytes: image.byte_count(),
             software_version: image.software_version(),
+            label: label_of(image, start),
+            judgement: judge(image, start),
             blocks: None,
         }
     }
@@ -190,11 +201,23 @@ impl fmt::Display for Inspection {
                 writeln!(f, "  for          vendor-ID {vendor_id:08X}h, product code {product_code:08X}h")?;
             }
             if let Some((version, date)) = blocks.release() {
-                writeln!(f, "  version      {version} of {}", Date(date))?;
+                match date {
+                    0 => writeln!(f, "  version      {version}")?,
+                    date => writeln!(f, "  version      {version} of {}", Date(date))?,
+                }
             }
         }
         if let Some(version) = &self.software_version {
             writeln!(f, "  software     {version}")?;
+        }
+        if let Some(label) = &self.label {
+            writeln!(f, "  label        {}", Words(label))?;
+        }
+        match &self.judgement {
+            Ok(()) => {
+                writeln!(f, "  judged       can be a program: stack pointer and reset vector are plausible")?
+            }
+            Err(fault) => writeln!(f, "  judged       {fault}: coflash flash refuses it")?,
         }
         let (bytes, pieces) = (self.bytes, self.segments.len());
         writeln!(

@@ -29,6 +29,12 @@ impl AddressRange {
         self.last < self.first
     }
 
+    /// Whether an address lies inside.
+    #[must_use]
+    pub const fn has(&self, address: u32) -> bool {
+        self.first <= address && address <= self.last
+    }
+
     /// Whether both ends of `other` lie inside.
     #[must_use]
     pub const fn contains(&self, other: &Self) -> bool {

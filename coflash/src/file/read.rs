@@ -7,7 +7,7 @@ use std::path::Path;
 use super::block_file::BlockFile;
 use super::fault::{Cause, FileError, Place, ReadError};
 use super::image::Image;
-use super::{elf, ihex, raw, srec};
+use super::{elf, ihex, limit, raw, srec};
 
 /// What a firmware file can be.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -90,8 +90,8 @@ pub fn load_telling(
     format: Option<Format>,
     raw_address: Option<u32>,
 ) -> Result<(Firmware, Format), FileError> {
-    std::fs::read(path)
-        .map_err(|error| Place::File.fault(Cause::Io(error)))
+    limit::read(path)
+        .map_err(|cause| Place::File.fault(cause))
         .and_then(|bytes| read_telling(&bytes, format, raw_address))
         .map_err(|error| error.of(path.display()))
 }

@@ -49,7 +49,8 @@ pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Resu
         (None, _) => (None, None),
     };
     let firmware = file::read(&bytes, format, place).map_err(|error| bad(&error.of(&name)))?;
-    let inspection = format.map(|format| Inspection::of(&firmware, format));
+    let start = region.map(|region| region.first);
+    let inspection = format.map(|format| Inspection::of(&firmware, format, start));
     let options = Options::default().region(region.map_or(Region::Unknown, Region::Strict));
     let converted = blocks_of(firmware, &options).map_err(|error| match error {
         ConvertError::File(error) => bad(&error.of(&name)),

@@ -2,7 +2,7 @@
 //! 2 to 15.
 //!
 //! Step 1, making the blocks, is [`convert`](crate::file::convert). Everything that can be judged
-//! without the device was judged there.
+//! before the device is touched is judged there and in `admission`.
 
 use super::course::Course;
 use super::dialect::{self, Downloaded};
@@ -54,7 +54,7 @@ fn procedure(
 ) -> Result<Report, Error> {
     let began = session.now();
     let original = session.node();
-    let dialect = reach(session, options, course)?;
+    let dialect = reach(session, file, options, course)?;
     let its = dialect::of(dialect);
     let Downloaded { repeats, took: transfer } = its.download(session, file, options, course)?;
     let running = if options.start {

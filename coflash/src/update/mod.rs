@@ -1,6 +1,7 @@
 //! The update of devices: the procedure with its events, what each dialect makes of it, its single
 //! steps, and the same for many devices at once.
 
+mod admission;
 pub mod config;
 mod course;
 pub mod dialect;

@@ -2,9 +2,12 @@
 
 use serde::Serialize;
 use shared_abi::block_file::Control;
+use shared_abi::label::Label;
 
 use super::password::Password;
 use crate::device::Dialect;
+use crate::file::image::Image;
+use crate::file::label::label_of;
 use crate::file::BlockFile;
 
 /// What to do beyond the download itself.
@@ -37,6 +40,9 @@ pub struct FlashOptions {
     pub wait: bool,
     /// Ask for the NMT mastership around a lift's update, and give it back (CiA 814-1 clause 6.3).
     pub mastership: bool,
+    /// Leave it to the device to judge the image: without that, what can be no program, or is for
+    /// another device or another place, is refused before anything is done.
+    pub force: bool,
 }
 
 impl FlashOptions {
@@ -52,6 +58,7 @@ impl FlashOptions {
         follow: bool,
         wait: bool,
         mastership: bool,
+        force: bool,
     }
 }
 
@@ -65,9 +72,20 @@ pub struct Target {
 }
 
 impl Target {
-    /// The device that a block file names in its block 0, if it names one.
+    /// The device that a file names in its block 0, or in the program's label, if it names one.
     #[must_use]
     pub fn of(file: &BlockFile) -> Option<Self> {
+        Self::of_control(file).or_else(|| Self::of_label(&file.image(), file.program_start()))
+    }
+
+    /// The device that the label of a program names which starts at `start`.
+    pub(super) fn of_label(image: &Image, start: u32) -> Option<Self> {
+        let Label { vendor_id, product_code, .. } = label_of(image, start)?;
+        Some(Self { vendor_id, product_code })
+    }
+
+    /// The device that block 0 names.
+    pub(super) fn of_control(file: &BlockFile) -> Option<Self> {
         match *file.control() {
             Control::Plain => None,
             Control::Identity(identity) | Control::Dated { identity, .. } => {
@@ -91,6 +109,7 @@ impl Default for FlashOptions {
             follow: true,
             wait: false,
             mastership: true,
+            force: false,
         }
     }
 }

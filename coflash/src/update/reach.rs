@@ -4,27 +4,30 @@ use std::time::Duration;
 
 use canopen::{program, Address};
 
+use super::admission::{admit, admit_to_bootloader};
 use super::course::Course;
 use super::dialect;
 use super::event::{Event, Note, Phase};
 use super::options::FlashOptions;
 use super::steps::{check_target, CALL_BACK};
 use crate::device::{recognise, Dialect, Doing, Error, Session, Timing};
+use crate::file::BlockFile;
 
 /// Steps 2 and 3: finds the device, and brings it into its bootloader; again and again until it
 /// works or the user gives up, if that is asked for. Gives what the bootloader speaks.
 pub(super) fn reach(
     session: &mut Session<'_>,
+    file: &BlockFile,
     options: &FlashOptions,
     course: &mut Course<'_>,
 ) -> Result<Dialect, Error> {
     if !options.wait {
-        return attempt(session, options, course);
+        return attempt(session, file, options, course);
     }
     course.tell_once(true);
     loop {
         knock(session, course)?;
-        match attempt(session, options, course) {
+        match attempt(session, file, options, course) {
             Err(error @ (Error::NoAnswer { .. } | Error::NoBootloader { .. })) => {
                 course.tell(Phase::Searching { reason: error.to_string() }.into());
                 let pause = session.timing().poll_most;
@@ -41,6 +44,7 @@ pub(super) fn reach(
 /// Steps 2 and 3, once.
 fn attempt(
     session: &mut Session<'_>,
+    file: &BlockFile,
     options: &FlashOptions,
     course: &mut Course<'_>,
 ) -> Result<Dialect, Error> {
@@ -54,7 +58,12 @@ fn attempt(
         Some(dialect) => dialect,
         None => recognise(session, running, CALL_BACK)?,
     };
-    dialect::of(found).enter(session, running, options, course)
+    let admitted = admit(session, file, found, options)?;
+    let dialect = dialect::of(found).enter(session, running, options, course)?;
+    if !admitted && !running.is_bootloader() {
+        admit_to_bootloader(session, file, dialect, options)?;
+    }
+    Ok(dialect)
 }
 
 /// A device that is only just switched on is caught if it is asked often enough: a program that was

@@ -34,6 +34,10 @@ impl Error {
                 .to_string(),
             Self::Failed { error, .. } => failure_advice(*error).to_string(),
             Self::WrongTarget { what, .. } => failure_advice(what.error()).to_string(),
+            Self::NoProgram { advice, .. } => (*advice).to_string(),
+            Self::OtherRegion { .. } => "link the program for that place, or check --program and --board; \
+                                         --force leaves that to the device"
+                .to_string(),
             Self::OtherIdentity { .. } => "check that the program was made for this device: it is not signed; one that has an \
                                            identity of its own is flashed without --trial-run"
                 .to_string(),

@@ -39,10 +39,10 @@ impl Procedure for Block {
         steps::erase(session, number, &mut |event| course.tell(event))?;
         let began = session.now();
         let sent = send_blocks(session, file, options, course);
-        if sent.as_ref().is_err_and(Error::refuses_control_block)
+        if sent.as_ref().is_err_and(Error::refuses_first_blocks)
             && steps::identification(session, number).is_ok_and(|crc| crc != 0)
         {
-            // The device erases with the first good block, and there was none: it still has the CRC
+            // The device erases with the first good data, and there were none: it still has the CRC
             // of its program.
             course.state = before;
         }

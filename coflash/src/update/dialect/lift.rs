@@ -21,7 +21,7 @@ use crate::update::password::Password;
 
 /// The program of a lift; what else 1F50h holds are data, which are not started (CiA 814-1 clause
 /// 6.4).
-const LIFT_PROGRAM: u8 = 1;
+pub(super) const LIFT_PROGRAM: u8 = 1;
 /// How long a lift bootloader may take to come up (CiA 814-1 clause 6.3).
 const LIFT_WAIT: Duration = Duration::from_secs(10);
 /// How often it is asked for meanwhile: a device that listens for the bit rate needs somebody who

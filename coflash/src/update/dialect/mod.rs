@@ -27,6 +27,13 @@ pub use self::esacademy::PASSWORD as ESACADEMY_PASSWORD;
 pub use self::lift::read_locked;
 pub(super) use self::procedure::{Downloaded, Procedure};
 
+/// Whether what goes to this number is no program but data, which may be any bytes and are never
+/// started: whatever a lift has besides its program (CiA 814-1 clause 6.4).
+#[must_use]
+pub const fn is_data(dialect: Dialect, program: u8) -> bool {
+    matches!(dialect, Dialect::Lift) && program != lift::LIFT_PROGRAM
+}
+
 /// What this dialect makes of the procedure.
 pub(super) fn of(dialect: Dialect) -> &'static dyn Procedure {
     match dialect {

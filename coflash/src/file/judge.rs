@@ -1,0 +1,221 @@
+//! Whether an image can be a program of an STM32F4: what can be told without a device and without
+//! its memory map.
+//!
+//! It is not stricter than the device, with two exceptions: an image at the start of the flash is a
+//! bootloader's and not a program's, and behind the end of an image is nothing that a reset vector
+//! could point to.
+
+use std::fmt;
+
+use super::image::Image;
+use super::range::AddressRange;
+
+/// Main flash of the family: at most 2 MiB.
+pub(crate) const FLASH: AddressRange = AddressRange { first: 0x0800_0000, last: 0x081F_FFFF };
+/// Its first sector, which has 16 KiB on every chip and which no program can have for itself: a reset
+/// starts what is in it.
+const FIRST_SECTOR: AddressRange = AddressRange { first: 0x0800_0000, last: 0x0800_3FFF };
+/// Where a stack may end: right behind the last byte of the RAM, or inside. At most 320 KiB (STM32F413,
+/// STM32F469) and 64 KiB of core-coupled RAM.
+const STACKS: [AddressRange; 2] = [
+    AddressRange { first: 0x2000_0008, last: 0x2005_0000 },
+    AddressRange { first: 0x1000_0008, last: 0x1001_0000 },
+];
+
+/// Why an image can be no program.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Fault {
+    /// It begins where the bootloader is.
+    Bootloader,
+    /// All of its bytes are this one, 00h or FFh.
+    Blank(u8),
+    /// It does not hold the first two vectors.
+    NoVectors,
+    /// The first word is no pointer to the end of a stack.
+    StackPointer(u32),
+    /// The second word does not point into the program.
+    ResetVector {
+        /// The word.
+        vector: u32,
+        /// Where it must point.
+        range: AddressRange,
+    },
+    /// It does, but its bit 0 is clear, as that of no code for this CPU is.
+    NotThumb(u32),
+}
+
+impl Fault {
+    /// The stable number: that of a file that is no firmware.
+    pub const NUMBER: u32 = 0x6000_0021;
+
+    /// What to do next.
+    #[must_use]
+    pub fn advice(&self) -> &'static str {
+        match self {
+            Self::Bootloader => {
+                "give the program, linked behind the bootloader; a bootloader is written by a debug probe"
+            }
+            _ => {
+                "check that it is the right file, and that its first word is the vector table's; \
+                 --force leaves that to the device"
+            }
+        }
+    }
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Bootloader => {
+                f.write_str("begins at the start of the flash, as a bootloader does and a program does not")
+            }
+            Self::Blank(byte) => write!(f, "is no program: all of its bytes are {byte:02X}h"),
+            Self::NoVectors => {
+                f.write_str("is no program: it does not begin with an initial stack pointer and a reset vector")
+            }
+            Self::StackPointer(word) => write!(
+                f,
+                "is no program: its first word is {word:08X}h, and no initial stack pointer (a multiple of 8 in the RAM)"
+            ),
+            Self::ResetVector { vector, range } => {
+                write!(f, "is no program: its reset vector is {vector:08X}h, outside {range}")
+            }
+            Self::NotThumb(vector) => {
+                write!(f, "is no program: its reset vector is {vector:08X}h, without the Thumb bit")
+            }
+        }
+    }
+}
+
+impl std::error::Error for Fault {}
+
+/// Judges an image whose program starts at `start`; 0 for one that came without addresses.
+///
+/// # Errors
+/// The first thing that is wrong with it.
+pub fn judge(image: &Image, start: u32) -> Result<(), Fault> {
+    let end = image.span().last;
+    if start == FLASH.first
+        || image.part(AddressRange { first: FLASH.first, last: FLASH.first + 3 }).is_some()
+    {
+        return Err(Fault::Bootloader);
+    }
+    if let Some(byte) = image.only_byte().filter(|byte| matches!(byte, 0 | 0xFF)) {
+        return Err(Fault::Blank(byte));
+    }
+    let [stack_pointer, vector] = vectors(image, start).ok_or(Fault::NoVectors)?;
+    if !stack_pointer.is_multiple_of(8) || !STACKS.iter().any(|stacks| stacks.has(stack_pointer)) {
+        return Err(Fault::StackPointer(stack_pointer));
+    }
+    let code = vector & !1;
+    if start == 0 && FIRST_SECTOR.has(code) {
+        return Err(Fault::Bootloader);
+    }
+    let range = if start == 0 { FLASH } else { AddressRange { first: start, last: end } };
+    judge_reset_vector(vector, range)
+}
+
+/// Judges the reset vector of an image that came without addresses, when it is known where it goes.
+///
+/// # Errors
+/// [`Fault::ResetVector`], [`Fault::NotThumb`] or [`Fault::NoVectors`].
+pub fn judge_place(image: &Image, region: AddressRange) -> Result<(), Fault> {
+    let [_, vector] = vectors(image, 0).ok_or(Fault::NoVectors)?;
+    judge_reset_vector(vector, region)
+}
+
+fn judge_reset_vector(vector: u32, range: AddressRange) -> Result<(), Fault> {
+    if !range.has(vector & !1) {
+        return Err(Fault::ResetVector { vector, range });
+    }
+    if vector & 1 == 0 {
+        return Err(Fault::NotThumb(vector));
+    }
+    Ok(())
+}
+
+/// Initial stack pointer and reset vector.
+fn vectors(image: &Image, start: u32) -> Option<[u32; 2]> {
+    let bytes: [u8; 8] = image.bytes(start)?;
+    let [a, b, c, d, e, f, g, h] = bytes;
+    Some([[a, b, c, d], [e, f, g, h]].map(u32::from_le_bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::raw;
+    use super::*;
+
+    const START: u32 = 0x0801_0000;
+
+    fn with(stack_pointer: u32, vector: u32, at: u32) -> Result<(), Fault> {
+        let mut bytes = vec![0x5A; 0x400];
+        bytes[..4].copy_from_slice(&stack_pointer.to_le_bytes());
+        bytes[4..8].copy_from_slice(&vector.to_le_bytes());
+        judge(&raw::read(&bytes, Some(at)).unwrap(), at)
+    }
+
+    #[test]
+    fn what_a_device_takes_is_taken() {
+        for stack_pointer in [0x2000_0008, 0x2001_FFC0, 0x2002_0000, 0x2005_0000, 0x1001_0000, 0x1000_0008] {
+            assert_eq!(with(stack_pointer, START + 0x189, START), Ok(()), "{stack_pointer:08X}h");
+        }
+        for vector in [START + 9, START + 0x3FF] {
+            assert_eq!(with(0x2001_FFC0, vector, START), Ok(()), "{vector:08X}h");
+        }
+        // Without addresses it may be linked for any place of the flash that a program may have.
+        for vector in [0x0800_4189, 0x0801_0189, 0x081F_FFFF] {
+            assert_eq!(with(0x2001_FFC0, vector, 0), Ok(()), "{vector:08X}h");
+        }
+    }
+
+    #[test]
+    fn what_no_device_starts_is_refused() {
+        for stack_pointer in [0, 0x2000_0000, 0x2001_FFC4, 0x2005_0008, 0x1000_0000, 0x1001_0008, 0x0801_0000]
+        {
+            let fault = Err(Fault::StackPointer(stack_pointer));
+            assert_eq!(with(stack_pointer, START + 0x189, START), fault);
+        }
+        let range = AddressRange { first: START, last: START + 0x3FF };
+        for vector in [0, START - 1, START + 0x401, 0x0800_0189, 0xFFFF_FFFF] {
+            assert_eq!(with(0x2001_FFC0, vector, START), Err(Fault::ResetVector { vector, range }));
+        }
+        assert_eq!(with(0x2001_FFC0, START + 0x188, START), Err(Fault::NotThumb(START + 0x188)));
+        assert_eq!(
+            with(0x2001_FFC0, 0x2000_0189, 0).unwrap_err(),
+            Fault::ResetVector { vector: 0x2000_0189, range: FLASH }
+        );
+    }
+
+    #[test]
+    fn a_bootloader_is_no_program_with_addresses_and_without() {
+        assert_eq!(with(0x2001_FFC0, 0x0800_0189, 0x0800_0000), Err(Fault::Bootloader));
+        assert_eq!(with(0x2001_FFC0, 0x0800_0189, 0), Err(Fault::Bootloader));
+        // It is said before the rest, whatever that is.
+        assert_eq!(with(0, 0, 0x0800_0000), Err(Fault::Bootloader));
+    }
+
+    #[test]
+    fn blank_and_short_images_are_no_programs() {
+        for (byte, len) in [(0, 8), (0xFF, 0x2000), (0, 1)] {
+            let image = raw::read(&vec![byte; len], Some(START)).unwrap();
+            assert_eq!(judge(&image, START), Err(Fault::Blank(byte)));
+        }
+        let image = raw::read(&[0, 0, 1, 0x20, 0x89, 1, 1], Some(START)).unwrap();
+        assert_eq!(judge(&image, START), Err(Fault::NoVectors));
+        // Vectors that are not at the start are none.
+        let image = raw::read(&[0x5A; 64], Some(START + 4)).unwrap();
+        assert_eq!(judge(&image, START), Err(Fault::NoVectors));
+    }
+
+    #[test]
+    fn an_image_without_addresses_is_judged_by_the_place_that_it_goes_to() {
+        let mut bytes = vec![0x5A; 0x400];
+        bytes[4..8].copy_from_slice(&0x0801_0189_u32.to_le_bytes());
+        let image = raw::read(&bytes, Some(0)).unwrap();
+        let region = |first| AddressRange { first, last: first + 0xFFFF };
+        assert_eq!(judge_place(&image, region(START)), Ok(()));
+        let other = Fault::ResetVector { vector: 0x0801_0189, range: region(0x0808_0000) };
+        assert_eq!(judge_place(&image, region(0x0808_0000)), Err(other));
+    }
+}

@@ -1,0 +1,109 @@
+//! What is judged before anything is done to a device: whether the image can be a program, whom it is
+//! for, and where the device has room for it.
+
+use canopen::program::IDENTITY;
+use canopen::Address;
+
+use super::dialect::is_data;
+use super::options::{FlashOptions, Target};
+use crate::device::error::{optional, Error, Mismatch};
+use crate::device::region::program_region;
+use crate::device::{Dialect, Session};
+use crate::file::image::Image;
+use crate::file::judge::{judge, judge_place, Fault};
+use crate::file::{AddressRange, BlockFile};
+
+/// Judges what is to go into a device that speaks this dialect. Tells whether there is nothing left
+/// to ask: an application may not know its region, and its bootloader does.
+///
+/// # Errors
+/// [`Error::NoProgram`], [`Error::WrongTarget`], [`Error::OtherRegion`], and what a
+/// [read](Session::read) has.
+pub(super) fn admit(
+    session: &mut Session<'_>,
+    file: &BlockFile,
+    dialect: Dialect,
+    options: &FlashOptions,
+) -> Result<bool, Error> {
+    if options.force {
+        return Ok(true);
+    }
+    let image = file.image();
+    if !is_data(dialect, options.program) {
+        judge(&image, file.program_start()).map_err(no_program)?;
+        for target in [Target::of_control(file), Target::of_label(&image, file.program_start())] {
+            check_identity(session, target)?;
+        }
+    }
+    admit_place(session, file, &image, dialect, options.program)
+}
+
+/// Judges the place alone; tells whether the device has told where it has its program.
+///
+/// # Errors
+/// As [`admit`].
+pub(super) fn admit_to_bootloader(
+    session: &mut Session<'_>,
+    file: &BlockFile,
+    dialect: Dialect,
+    options: &FlashOptions,
+) -> Result<bool, Error> {
+    admit_place(session, file, &file.image(), dialect, options.program)
+}
+
+fn admit_place(
+    session: &mut Session<'_>,
+    file: &BlockFile,
+    image: &Image,
+    dialect: Dialect,
+    program: u8,
+) -> Result<bool, Error> {
+    let Some(told) = program_region(session, program)? else { return Ok(false) };
+    let region = AddressRange { first: told.base, last: told.last() };
+    let (start, size) = (file.program_start(), u64::from(file.program_size()));
+    let fits = match dialect {
+        // The CRC over the program counts from the region's start.
+        Dialect::Block => file.check_region(region).is_ok(),
+        Dialect::Hex | Dialect::EsAcademy => region.contains(&file.span()),
+        Dialect::Raw | Dialect::Lift if start == 0 => {
+            if !is_data(dialect, program) {
+                judge_place(image, region).map_err(no_program)?;
+            }
+            size <= region.len()
+        }
+        Dialect::Raw | Dialect::Lift => start == region.first && size <= region.len(),
+    };
+    if fits {
+        return Ok(true);
+    }
+    let AddressRange { first, .. } = region;
+    let last = u64::from(start) + size.saturating_sub(1);
+    Err(Error::OtherRegion {
+        node: session.node(),
+        program,
+        image: (start, u32::try_from(last).unwrap_or(u32::MAX)),
+        region: (first, region.last),
+    })
+}
+
+/// Compares what the file tells with 1018h. 0 in the file is any device, as it is for a bootloader;
+/// what a device does not tell cannot differ.
+fn check_identity(session: &mut Session<'_>, target: Option<Target>) -> Result<(), Error> {
+    let Some(Target { vendor_id, product_code }) = target else { return Ok(()) };
+    for (sub, file, what) in [(1, vendor_id, Mismatch::VendorId), (2, product_code, Mismatch::ProductCode)] {
+        if file == 0 {
+            continue;
+        }
+        match optional(session.read_number(Address::new(IDENTITY, sub)))? {
+            Some(device) if device != file => {
+                return Err(Error::WrongTarget { node: session.node(), what, device, file });
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+fn no_program(fault: Fault) -> Error {
+    Error::NoProgram { why: fault.to_string(), advice: fault.advice() }
+}
