@@ -22,8 +22,8 @@ pub const LEAST_STACK: u32 = 4096;
 pub struct Header {
     /// [`MAGIC`].
     pub magic: u32,
-    /// CRC-32/ISO-HDLC over everything behind this word: the rest of the header and the stored
-    /// bytes. 0 for not checked, with [`Method::Raw`] alone.
+    /// CRC-32/ISO-HDLC over the bootloader's flash in front of the header, the rest of the header
+    /// behind this word, and the stored bytes. 0 for not checked, with [`Method::Raw`] alone.
     pub crc: u32,
     /// [`SERVICES_VERSION`].
     pub services: u32,
@@ -41,15 +41,16 @@ pub struct Header {
 pub enum Method {
     /// As they are in RAM.
     Raw = 0,
-    /// As a ZX0 stream, format version 2 (Einar Saukas), with offsets in units of [`OFFSET_UNIT`], of
-    /// the image with absolute calls: in each pair of half-words 11110… 11111… (`BL`) the 22 bits
-    /// that are left of both are the distance in half-words, to which half the address of the second
-    /// half-word was added.
+    /// As a ZX0 stream, format version 2 (Einar Saukas), with three changes. Offsets count half-words.
+    /// Their lower part has eight bits, and the length behind it all of its own. A copy that comes
+    /// from in front of the output comes from the end of the bootloader's flash in front of the
+    /// header, and ends there at the latest.
+    ///
+    /// It unpacks to the image with absolute calls: in each pair of half-words 11110… 11111… (`BL`)
+    /// the 22 bits that are left of both are the distance in half-words, to which half the address of
+    /// the second half-word was added.
     Zx0 = 1,
 }
-
-/// Bytes that the offsets of a packed image count: half-words, which Thumb code consists of.
-pub const OFFSET_UNIT: usize = 2;
 
 /// Why the RAM image cannot run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -82,7 +83,7 @@ impl Damage {
 impl Header {
     /// Bytes of it in flash.
     pub const SIZE: u32 = size_of::<Self>() as u32;
-    /// Offset of the first byte that the CRC runs over.
+    /// Offset of the first byte of the header that the CRC runs over.
     pub const CRC_FROM: u32 = 8;
 
     /// Judges a header: `flash` bytes are behind it in the bootloader's region, and `ram` bytes are

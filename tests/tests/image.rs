@@ -79,10 +79,19 @@ impl Packed {
         words(&self.flash[self.header..self.header + HEADER])[word]
     }
 
+    /// What lies in front of the header.
+    fn front(&self) -> &[u8] {
+        &self.flash[..self.header]
+    }
+
+    /// What the CRC should be: over the flash without the first two words of the header.
+    fn right_crc(&self) -> u32 {
+        crc32(&[self.front(), &self.flash[self.header + 8..]].concat())
+    }
+
     /// Makes the CRC right.
     fn seal(&mut self) {
-        let crc = crc32(&self.flash[self.header + 8..]);
-        self.set(1, crc);
+        self.set(CRC, self.right_crc());
     }
 }
 
@@ -120,9 +129,8 @@ fn the_format() {
     let stream = [0x0E, b'a', b'b', b'c', b'd', 126 << 1, 0x28, b'X', 0xD5, 0x55, 0x60];
     let unpacked = zx0decompress::decompress(&mut stream.as_slice()).unwrap();
     assert_eq!(unpacked, b"abcdcdcdcXcX");
-    assert_eq!(zx0::unpack(&stream, 1), Some(unpacked));
-    assert_eq!(zx0::unpack(&stream, 2).as_deref(), Some(&b"abcdabcdaXcd"[..]));
-    assert_eq!(zx0::unpack(&stream[..10], 1), None, "without its end");
+    assert_eq!(zx0::unpack(&[], &stream, zx0::BYTES), Some(unpacked));
+    assert_eq!(zx0::unpack(&[], &stream[..10], zx0::BYTES), None, "without its end");
 }
 
 #[test]
@@ -133,9 +141,9 @@ fn what_is_packed_is_what_was_linked() {
         assert_eq!(packed.get(MAGIC), u32::from_le_bytes(*b"CBI1"));
         assert_eq!([packed.get(SERVICES), packed.get(METHOD)], [SERVICES_VERSION, 1]);
         assert_eq!([packed.get(STORED), packed.get(UNPACKED)], [stored.len() as u32, ram as u32]);
-        assert_eq!(packed.get(CRC), crc32(&packed.flash[packed.header + 8..]));
-        // By the format's description, with offsets in half-words and the calls put back.
-        let mut unpacked = zx0::unpack(&stored, 2).unwrap();
+        assert_eq!(packed.get(CRC), packed.right_crc());
+        // By the format's description, with offsets of our own and the calls put back.
+        let mut unpacked = zx0::unpack(packed.front(), &stored, zx0::HALF_WORDS).unwrap();
         let calls = restore_calls(&mut unpacked, firmware::board().ram.base);
         assert!(unpacked == packed.ram, "{image}");
         assert!(calls > 100, "{image}: {calls} calls");
@@ -276,6 +284,8 @@ fn damages() -> Vec<(&'static str, Packed, u32)> {
         ("one byte less", damaged(&|image| image.set(STORED, image.get(STORED) - 1)), BY_CRC),
         ("a word more in RAM", damaged(&|image| image.set(UNPACKED, image.get(UNPACKED) + 4)), BY_CRC),
         ("the first bit", damaged(&|image| image.stored()[0] ^= 0x80), BY_CRC),
+        // A vector that nobody takes here.
+        ("a bit in front of it", damaged(&|image| image.flash[60] ^= 0x10), BY_CRC),
         (
             "the last bit",
             damaged(&|image| {
@@ -441,28 +451,75 @@ fn outcome(bench: &mut Bench) -> Option<(u32, u32)> {
     panic!("the boot stage does not come to an end");
 }
 
-/// A copy from in front of the image is refused, though the stream ends where it should.
+/// A stream by the format's description: the literals "AB", a copy from so many half-words before,
+/// the end.
+fn one_copy(offset: usize, length: usize) -> Vec<u8> {
+    fn number(bits: &mut Vec<bool>, number: usize, inverted: bool) {
+        for digit in (0..number.ilog2()).rev() {
+            bits.extend([false, (number >> digit & 1 == 1) != inverted]);
+        }
+        bits.push(true);
+    }
+    let mut bits = Vec::new();
+    number(&mut bits, 2, false);
+    let literals = bits.len();
+    bits.push(true);
+    number(&mut bits, (offset - 1) / 256 + 1, true);
+    let lower = bits.len();
+    number(&mut bits, length - 1, false);
+    bits.push(true);
+    number(&mut bits, 256, true);
+    // A byte of bits stands where its first bit is asked for.
+    let mut stream = Vec::new();
+    for (at, byte) in bits.chunks(8).enumerate() {
+        stream.push((0..8).fold(0, |out, i| out << 1 | u8::from(byte.get(i) == Some(&true))));
+        let asked_for_here = at * 8 + 1..at * 8 + 9;
+        if asked_for_here.contains(&literals) {
+            stream.extend(*b"AB");
+        }
+        if asked_for_here.contains(&lower) {
+            stream.push(255 - ((offset - 1) % 256) as u8);
+        }
+    }
+    stream
+}
+
+/// A copy may come from the flash in front of the header. One from before that is refused, and so is
+/// one that goes on behind it, though the stream ends where it should.
 #[test]
-fn an_offset_in_front_of_the_image_is_damage() {
-    // Bits 0 0 1 (two literals), 1 (then a copy from another offset), 1 (upper part 1); the lower part
-    // is 127 in seven bits, for an offset of one half-word, and a 1 (two bytes); 1 (another offset),
-    // and 256 for the end, inverted: 01 eight times, 1.
-    let stream = [0b0011_1101, b'A', b'B', 127 << 1 | 1, 0b0101_0101, 0b0101_0110];
+fn a_copy_from_in_front_of_the_image() {
+    let front = Packed::of(firmware::BOOTLOADER).front().to_vec();
+    let end = front.len();
     let mut bench = Bench::new();
-    for (lower, damage) in [(127 << 1 | 1, None), (126 << 1 | 1, Some((DAMAGED, BY_STREAM)))] {
+    let cases: [(usize, usize, Option<&[u8]>); 8] = [
+        (1, 2, Some(b"AB")),
+        (1, 5, Some(b"ABABA")),
+        (2, 2, Some(&front[end - 2..])),
+        (2, 3, None),
+        (end / 2 + 1, 2, Some(&front[..2])),
+        (end / 2 + 1, 14, Some(&front[..14])),
+        (end / 2 + 2, 2, None),
+        (255 * 256, 2, None),
+    ];
+    for (offset, length, copied) in cases {
+        let stream = one_copy(offset, length);
+        let unpacked = copied.map(|copied| [b"AB", copied].concat());
+        assert_eq!(zx0::unpack(&front, &stream, zx0::HALF_WORDS), unpacked, "{length} from {offset}");
         let mut image = Packed::of(firmware::BOOTLOADER);
         image.flash.truncate(image.header + HEADER);
-        image.flash.extend(stream);
-        image.stored()[3] = lower;
-        image.set(STORED, 6);
-        image.set(UNPACKED, 4);
+        image.flash.extend(&stream);
+        image.set(STORED, stream.len() as u32);
+        image.set(UNPACKED, 2 + length as u32);
         image.seal();
         load(&mut bench, &image.flash);
         bench.power_on();
-        assert_eq!(outcome(&mut bench), damage);
-        let mut found = [0; 4];
+        let damage = copied.is_none().then_some((DAMAGED, BY_STREAM));
+        assert_eq!(outcome(&mut bench), damage, "{length} from {offset}");
+        let mut found = vec![0; 2 + length];
         bench.machine().read_memory(firmware::board().ram.base, &mut found).unwrap();
-        assert_eq!(found == *b"ABAB", damage.is_none(), "{found:x?}");
+        let is_there = unpacked.is_some_and(|unpacked| unpacked == found);
+        // A stream that is refused leaves the literals, and nothing of the copy.
+        assert_eq!(is_there, damage.is_none(), "{length} from {offset}");
         bench.power_off();
     }
 }

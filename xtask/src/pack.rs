@@ -11,7 +11,7 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::{fs, process};
 
 use crc::{Crc, CRC_32_ISO_HDLC};
-use shared_abi::ram_image::{Method, MAGIC, OFFSET_UNIT, SERVICES_VERSION};
+use shared_abi::ram_image::{Method, MAGIC, SERVICES_VERSION};
 
 use crate::elf::{Elf, Section};
 use crate::{workspace, zx0, Outcome};
@@ -20,6 +20,8 @@ use crate::{workspace, zx0, Outcome};
 const HEADER: &str = ".ram_image";
 /// The section of the image, at its addresses in RAM.
 pub const IMAGE: &str = ".data";
+/// How the stream tells offsets (`shared_abi::ram_image::Method`).
+const OFFSETS: zx0::Offsets = zx0::Offsets { unit: 2, is_low_byte: true };
 /// The section of the packed bytes.
 pub const PACKED: &str = ".ram_image.packed";
 
@@ -47,15 +49,39 @@ pub fn pack(file: &[u8]) -> Outcome<Vec<u8>> {
         return Err(format!("{HEADER} is not what the bootloader's start.rs puts there."));
     }
 
-    let packed = compressed(&with_absolute_calls(contents(image), image.address));
+    let front = in_front(&elf, header, contents)?;
+    let packed = compressed(&front, &with_absolute_calls(contents(image), image.address));
     // The words behind the CRC, which runs over them too.
     let rest = bytes(&[SERVICES_VERSION, Method::Zx0 as u32, word(packed.len())?, image.size]);
-    let crc = Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(&[&rest[..], &packed].concat());
+    let crc = Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(&[&front[..], &rest, &packed].concat());
     let packed_header = [bytes(&[MAGIC, crc]), rest].concat();
 
     let mut out = file.to_vec();
     out[header.offset as usize..][..packed_header.len()].copy_from_slice(&packed_header);
     load_instead(out, image, behind_header, &packed)
+}
+
+/// The bootloader's flash in front of the header: the stream copies from it.
+fn in_front<'a>(elf: &Elf, header: &Section, contents: impl Fn(&Section) -> &'a [u8]) -> Outcome<Vec<u8>> {
+    let mut sections: Vec<_> = elf
+        .sections
+        .iter()
+        .filter_map(|section| Some((elf.load_address(section)?, section)))
+        .filter(|(address, _)| *address < header.address)
+        .collect();
+    sections.sort_by_key(|(address, _)| *address);
+    let mut front = Vec::new();
+    let from = sections.first().map_or(header.address, |(address, _)| *address);
+    for (address, section) in sections {
+        if address != from + word(front.len())? {
+            return Err(format!("there is a gap, or an overlap, in front of {}.", section.name));
+        }
+        front.extend(contents(section));
+    }
+    if header.address != from + word(front.len())? {
+        return Err(format!("there is a gap, or an overlap, in front of {HEADER}."));
+    }
+    Ok(front)
 }
 
 /// The image, which stands at this address, with absolute calls (`shared_abi::ram_image::Method`):
@@ -81,13 +107,13 @@ fn with_absolute_calls(image: &[u8], address: u32) -> Vec<u8> {
 
 /// Compresses, the best that the format can do. That takes seconds, so what was compressed before
 /// is kept in the folder of what is built, under a hash of it.
-fn compressed(raw: &[u8]) -> Vec<u8> {
+fn compressed(front: &[u8], raw: &[u8]) -> Vec<u8> {
     let mut hasher = DefaultHasher::new();
-    (raw, OFFSET_UNIT).hash(&mut hasher);
+    (front, raw, OFFSETS.unit, OFFSETS.is_low_byte).hash(&mut hasher);
     let folder = workspace::target_dir().join("packed");
     let kept = folder.join(format!("{:016x}.zx0", hasher.finish()));
     fs::read(&kept).unwrap_or_else(|_| {
-        let packed = zx0::compress(raw, OFFSET_UNIT);
+        let packed = zx0::compress(front, raw, OFFSETS);
         // Under another name until it is whole. Where it cannot be kept, only time is lost.
         let part = kept.with_extension(process::id().to_string());
         let written = fs::create_dir_all(&folder).and_then(|()| fs::write(&part, &packed));
@@ -227,7 +253,7 @@ mod tests {
         assert_eq!(after[0x118..0x158], before[0x118..0x158]);
         // It has no calls; what the stream holds is the business of `zx0`.
         let stream = &after[packed.offset as usize..][..packed.size as usize];
-        assert_eq!(stream, zx0::compress(&before[0x118..0x158], OFFSET_UNIT));
+        assert_eq!(stream, zx0::compress(&[], &before[0x118..0x158], OFFSETS));
         let header: Vec<u32> = (0..6).map(|word| get(&after, 0x100 + word * 4)).collect();
         assert_eq!(header[2..], [SERVICES_VERSION, 1, packed.size, 64]);
         let crc = Crc::<u32>::new(&CRC_32_ISO_HDLC);

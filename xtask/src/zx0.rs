@@ -4,15 +4,40 @@
 //! alone; a copy from another offset. Numbers are interlaced Elias gamma codes. Which of them to
 //! take is found by trying all: for each prefix of the input, what is the cheapest stream of it?
 //!
-//! The format counts offsets in bytes. Thumb code consists of half-words, and nearly every copy in
-//! it comes from an even offset; so the *unit* of an offset is a choice here. With 2 a bootloader is
-//! some 460 bytes smaller (docs/adr/0011-packed-ram-image.md).
+//! The format counts offsets in bytes, and has seven bits for their lower part. Thumb code consists
+//! of half-words, and nearly every copy in it comes from an even offset, often from far away; so both
+//! are a choice here ([`Offsets`]). A copy may come from in front of the output, too, where the
+//! unpacker has bytes to copy from. What that saves stands in docs/adr/0011-packed-ram-image.md.
 
 /// The upper part of an offset that stands for the end of the stream.
 const END: usize = 256;
-/// Values of the lower part of an offset.
-const LOW: usize = 128;
 
+/// How a stream tells offsets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Offsets {
+    /// Bytes that they count.
+    pub unit: usize,
+    /// Whether the lower part fills its byte. Else it has seven bits, and the eighth is the first
+    /// one of the length.
+    pub is_low_byte: bool,
+}
+
+impl Offsets {
+    /// Those of the format.
+    #[cfg(test)]
+    const ZX0: Self = Self { unit: 1, is_low_byte: false };
+
+    /// Bits of the lower part.
+    fn low_bits(self) -> u32 {
+        7 + u32::from(self.is_low_byte)
+    }
+
+    /// The upper part, from 1 on, and the lower part, which goes downwards to 0.
+    fn parts(self, offset: usize) -> (usize, usize) {
+        let values = 1 << self.low_bits();
+        ((offset - 1) / values + 1, values - 1 - (offset - 1) % values)
+    }
+}
 /// A piece of a stream: literals, or a copy.
 #[derive(Clone, Copy)]
 struct Piece {
@@ -37,17 +62,19 @@ struct Offset {
     literals: Option<usize>,
 }
 
-/// Packs some bytes, at least one, with offsets in units of so many bytes.
-pub fn compress(input: &[u8], unit: usize) -> Vec<u8> {
-    write(input, unit, &cheapest(input, unit))
+/// Packs some bytes, at least one, behind `before`, whose length is a multiple of the unit.
+pub fn compress(before: &[u8], bytes: &[u8], offsets: Offsets) -> Vec<u8> {
+    let input = [before, bytes].concat();
+    write(&input, before.len(), offsets, &cheapest(&input, before.len(), offsets))
 }
 
-/// The pieces of the smallest stream, in order.
-fn cheapest(input: &[u8], unit: usize) -> Vec<Piece> {
+/// The pieces of the smallest stream of `input` from `start` on, in order.
+fn cheapest(input: &[u8], start: usize, coding: Offsets) -> Vec<Piece> {
     // Before the first byte the last offset is 1, and the flag in front of the first literals is
     // left out.
     const START: usize = 0;
-    let mut pieces = vec![Piece { bits: u32::MAX, end: 0, offset: 1, before: START }];
+    let unit = coding.unit;
+    let mut pieces = vec![Piece { bits: u32::MAX, end: start, offset: 1, before: START }];
     // For each prefix, the last piece of its cheapest stream.
     let mut best = vec![START; input.len() + 1];
     let mut offsets = vec![Offset::default(); input.len() / unit + 2];
@@ -55,13 +82,17 @@ fn cheapest(input: &[u8], unit: usize) -> Vec<Piece> {
     // For each number of equal bytes, how many of them a copy should take.
     let mut lengths = vec![2; input.len() + 3];
 
-    for end in 1..=input.len() {
+    for end in start + 1..=input.len() {
         let mut known = 2;
         let mut cheapest: Option<usize> = None;
         for offset in 1..=((end - 1) / unit).max(1) {
             let state = &mut offsets[offset];
             let here = end - 1;
-            let is_equal = here >= offset * unit && input[here] == input[here - offset * unit];
+            // A stream begins with a literal. In RAM the output does not follow what is in front of
+            // it: no copy goes over there.
+            let from =
+                here.checked_sub(offset * unit).filter(|from| here > start && (*from != start || start == 0));
+            let is_equal = from.is_some_and(|from| input[here] == input[from]);
             let mut candidate = None;
             if is_equal {
                 if state.equal == 0 {
@@ -85,7 +116,7 @@ fn cheapest(input: &[u8], unit: usize) -> Vec<Piece> {
                         lengths[known] = if cost(known) <= cost(shorter) { known } else { shorter };
                     }
                     let length = lengths[state.equal];
-                    let bits = cost(length) + 8 + number_bits((offset - 1) / LOW + 1);
+                    let bits = cost(length) + 1 + coding.low_bits() + number_bits(coding.parts(offset).0);
                     if candidate.is_none_or(|other| bits < other.bits) {
                         candidate = Some(Piece { bits, end, offset, before: best[end - length] });
                     }
@@ -135,9 +166,9 @@ fn number_bits(number: usize) -> u32 {
 }
 
 /// Writes the pieces down.
-fn write(input: &[u8], unit: usize, pieces: &[Piece]) -> Vec<u8> {
+fn write(input: &[u8], start: usize, offsets: Offsets, pieces: &[Piece]) -> Vec<u8> {
     let mut stream = Stream { bytes: Vec::new(), bits: 0, left: 0, in_last: false };
-    let (mut at, mut offset) = (0, 1);
+    let (mut at, mut offset) = (start, 1);
     let mut before = None;
     for piece in pieces {
         let length = piece.end - at;
@@ -154,10 +185,10 @@ fn write(input: &[u8], unit: usize, pieces: &[Piece]) -> Vec<u8> {
             (_, other) => {
                 offset = other;
                 stream.bit(true);
-                stream.number((offset - 1) / LOW + 1, true);
-                // Downwards from 127; the last bit of the byte is the first one of the length.
-                stream.bytes.push(((LOW - 1 - (offset - 1) % LOW) << 1) as u8);
-                stream.in_last = true;
+                let (upper, lower) = offsets.parts(offset);
+                stream.number(upper, true);
+                stream.bytes.push((lower << (8 - offsets.low_bits())) as u8);
+                stream.in_last = !offsets.is_low_byte;
                 stream.number(length - 1, false);
             }
         }
@@ -166,7 +197,7 @@ fn write(input: &[u8], unit: usize, pieces: &[Piece]) -> Vec<u8> {
         }
         (at, before) = (piece.end, Some(piece.offset));
     }
-    debug_assert!(at == input.len() && unit > 0);
+    debug_assert!(at == input.len());
     stream.bit(true);
     stream.number(END, true);
     stream.bytes
@@ -178,7 +209,7 @@ struct Stream {
     /// Where the byte of bits stands, and how many of its bits are free.
     bits: usize,
     left: u32,
-    /// The next bit is the last one of the byte that was written last.
+    /// The next bit is the lowest one of the byte that was written last.
     in_last: bool,
 }
 
@@ -236,7 +267,7 @@ mod tests {
     fn with_offsets_in_bytes_it_is_the_format() {
         for (seed, len) in [(1, 1), (2, 2), (3, 40), (4, 1000), (5, 6000)] {
             let input = sample(seed, len);
-            let stream = compress(&input, 1);
+            let stream = compress(&[], &input, Offsets::ZX0);
             assert_eq!(zx0decompress::decompress(&mut stream.as_slice()).unwrap(), input, "seed {seed}");
             assert_eq!(stream.len(), zx0::compress(&input).len(), "seed {seed}");
         }
@@ -257,6 +288,24 @@ mod tests {
             0b0110_0000,
         ];
         let stream = [bits[0], b'a', b'b', b'c', b'd', 126 << 1, bits[1], b'X', bits[2], bits[3], bits[4]];
-        assert_eq!(compress(b"abcdabcdaXcd", 2), stream);
+        let offsets = Offsets { unit: 2, is_low_byte: false };
+        assert_eq!(compress(&[], b"abcdabcdaXcd", offsets), stream);
+    }
+
+    /// By hand, as the bootloader has it.
+    #[test]
+    fn with_a_byte_for_the_lower_part_and_behind_other_bytes() {
+        let bits = [
+            // One literal, though it could be copied, too. A copy of 6 from four units before, which is
+            // in front of the output: 1, the upper part 1, all bits of 5.
+            0b1110_0011,
+            // One literal, the end.
+            0b0110_1010,
+            0b1010_1010,
+            0b1011_0000,
+        ];
+        let stream = [bits[0], b'-', 252, bits[1], b'Y', bits[2], bits[3]];
+        let offsets = Offsets { unit: 2, is_low_byte: true };
+        assert_eq!(compress(b"-abcdef-", b"-abcdefY", offsets), stream);
     }
 }

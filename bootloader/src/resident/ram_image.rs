@@ -24,21 +24,27 @@ pub unsafe fn load(header: *const Header, flash: &ResidentFlash) -> Result<(), D
     let header = unsafe { &*header };
     let data = at + Header::SIZE;
     let method = header.check(LAYOUT.bootloader.end() - data, LAYOUT.ram.size - LEAST_STACK)?;
+    let front = Region::new(LAYOUT.bootloader.base, at - LAYOUT.bootloader.base);
     if header.has_crc() {
-        let checked = Region::new(at + Header::CRC_FROM, Header::SIZE - Header::CRC_FROM + header.stored);
-        if flash.crc32(0, checked) != header.crc {
+        let behind = Region::new(at + Header::CRC_FROM, Header::SIZE - Header::CRC_FROM + header.stored);
+        if flash.crc32(flash.crc32(0, front), behind) != header.crc {
             return Err(Damage::Crc);
         }
     }
-    // SAFETY: `check` has found the stored bytes to end with the bootloader's flash at the latest,
-    // and nothing writes to it meanwhile.
-    let stored = unsafe { slice::from_raw_parts(data as *const u8, header.stored as usize) };
+    // SAFETY: the caller vouches that the header lies in the bootloader's flash, and `check` has
+    // found the stored bytes to end there at the latest. Nothing writes to it meanwhile.
+    let (front, stored) = unsafe {
+        (
+            slice::from_raw_parts(front.base as *const u8, front.size as usize),
+            slice::from_raw_parts(data as *const u8, header.stored as usize),
+        )
+    };
     // SAFETY: `check` has found this to be RAM, and the caller vouches that nobody else uses it.
     let ram = unsafe { slice::from_raw_parts_mut(LAYOUT.ram.base as *mut u8, header.unpacked as usize) };
     match method {
         // SAFETY: the two slices, which `check` has found to be of one length.
         Method::Raw => unsafe { stored.as_ptr().copy_to_nonoverlapping(ram.as_mut_ptr(), stored.len()) },
-        Method::Zx0 if !unpack(stored, ram) => return Err(Damage::Stream),
+        Method::Zx0 if !unpack(front, stored, ram) => return Err(Damage::Stream),
         Method::Zx0 => restore_calls(ram),
     }
     Ok(())

@@ -1,6 +1,6 @@
-//! The unpacker of ZX0 streams (format version 2, Einar Saukas) with offsets in half-words. It is in
-//! assembly: half as long and three times as fast as what the compiler makes of one in Rust, and it
-//! is on the way from "call back" to the answer.
+//! The unpacker of ZX0 streams (format version 2, Einar Saukas) with offsets of our own
+//! (`shared_abi::ram_image::Method`). It is in assembly: half as long and three times as fast as what
+//! the compiler makes of one in Rust, and it is on the way from "call back" to the answer.
 //!
 //! A stream is literals and copies in turn. Flags and numbers are bits, which stand in bytes between
 //! the other bytes; literals and the lower parts of offsets are bytes. A number is an interlaced
@@ -9,20 +9,31 @@
 use core::arch::global_asm;
 
 extern "C" {
-    fn zx0_unpack(packed: *const u8, packed_end: *const u8, to: *mut u8, to_end: *mut u8) -> u32;
+    fn zx0_unpack(
+        packed: *const u8,
+        packed_end: *const u8,
+        to: *mut u8,
+        to_end: *mut u8,
+        front_end: *const u8,
+        front_len: usize,
+    ) -> u32;
     fn calls_to_relative(image: *mut u8, end: *mut u8);
 }
 
 /// Unpacks a stream into all of `to`, and takes all of `packed` for it; whether that went well.
+/// `front` is what copies from in front of the output come from.
 ///
-/// Whatever the stream says, nothing outside the two is written or read, and it comes to an end:
+/// Whatever the stream says, nothing outside the three is written or read, and it comes to an end:
 /// every step takes from `packed` or writes to `to`.
-pub fn unpack(packed: &[u8], to: &mut [u8]) -> bool {
+pub fn unpack(front: &[u8], packed: &[u8], to: &mut [u8]) -> bool {
     let (packed, to) = (packed.as_ptr_range(), to.as_mut_ptr_range());
-    // SAFETY: the two slices. The code reads the first between its ends, and writes and reads the
-    // second between its own: `literals`, `another` and `refill` compare with the end of the
-    // first, `copy` with that of the second, and `match` with its start.
-    unsafe { zx0_unpack(packed.start, packed.end, to.start, to.end) == 0 }
+    // SAFETY: the three slices. The code reads `packed` between its ends, and writes and reads `to`
+    // between its own: `literals`, `another` and `refill` compare with the end of `packed`, `copy`
+    // with that of `to`, and `match` with its start. A copy from in front of that is compared with
+    // the length of `front`, and its own length with what is left there.
+    unsafe {
+        zx0_unpack(packed.start, packed.end, to.start, to.end, front.as_ptr_range().end, front.len()) == 0
+    }
 }
 
 /// Puts calls back as the core wants them. Before the image was packed, the target of each `BL` was
@@ -36,7 +47,8 @@ pub fn restore_calls(image: &mut [u8]) {
 
 // r0 next byte of the stream, r1 its end; r2 next byte of the output, r3 its end, r4 its start;
 // r5 offset of the last copy; r6 the bits that are left of a byte of bits, from bit 31 on, and a 1
-// behind them; r7 the number; r8 what to copy from; r12 is free.
+// behind them; r7 the number; r8 what to copy from; r9 the end of what is in front of the output,
+// r10 its length; r12 is free.
 global_asm!(
     ".section .text.zx0_unpack, \"ax\"",
     ".syntax unified",
@@ -44,7 +56,8 @@ global_asm!(
     ".type zx0_unpack,%function",
     ".thumb_func",
     "zx0_unpack:",
-    "push {{r4-r8, lr}}",
+    "push {{r4-r10, lr}}",
+    "ldrd r9, r10, [sp, #32]",
     "mov r4, r2",
     "movs r5, #2",
     "mov r6, #0x80000000",
@@ -62,17 +75,24 @@ global_asm!(
     // A copy from the last offset.
     "movs r7, #1",
     "bl .Lzx0_number",
-    // A copy: from where something was written already. (An offset of 0 reads what is overwritten.)
+    // A copy: from what was written already, or from what is in front of the output. (An offset of 0
+    // reads what is overwritten.)
     ".Lzx0_match:",
-    "subs r12, r2, r4",
-    "cmp r5, r12",
-    "bhi .Lzx0_damaged",
     "subs r8, r2, r5",
+    "subs r12, r2, r4",
+    "subs r12, r5, r12",
+    "bls .Lzx0_from_output",
+    // From r12 bytes in front of the output.
+    "cmp r12, r10",
+    "bhi .Lzx0_damaged",
+    "cmp r7, r12",
+    "bhi .Lzx0_damaged",
+    "sub r8, r9, r12",
+    ".Lzx0_from_output:",
     "bl .Lzx0_copy",
     "bcc .Lzx0_literals",
     // A copy from another offset: the upper part is a number, whose bits are inverted; the end of
-    // the stream is 256 in its place. The lower part is seven bits of a byte. The last one is the
-    // first bit of the length. Offsets count half-words.
+    // the stream is 256 in its place. The lower part is a byte. Offsets count half-words.
     ".Lzx0_another:",
     "mvn r7, #1",
     "bl .Lzx0_number",
@@ -82,10 +102,8 @@ global_asm!(
     "cmp r0, r1",
     "bhs .Lzx0_damaged",
     "ldrb r12, [r0], #1",
-    "lsrs r12, r12, #1",
-    "rsb r5, r12, r7, lsl #7",
-    "lsl r5, r5, #1",
-    "rrx r6, r6",
+    "rsb r5, r12, r7, lsl #8",
+    "lsls r5, r5, #1",
     "movs r7, #1",
     "bl .Lzx0_number",
     "adds r7, #1",
@@ -93,13 +111,13 @@ global_asm!(
     // Stopped: the stream is damaged.
     ".Lzx0_damaged:",
     "movs r0, #1",
-    "pop {{r4-r8, pc}}",
+    "pop {{r4-r10, pc}}",
     // The end: well if both end here.
     ".Lzx0_end:",
     "subs r0, r1",
     "subs r2, r3",
     "orrs r0, r2",
-    "pop {{r4-r8, pc}}",
+    "pop {{r4-r10, pc}}",
     // Shifts a number into r7. One that is too long goes over its upper end; who uses it looks.
     ".Lzx0_number:",
     "mov r12, lr",

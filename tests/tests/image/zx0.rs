@@ -1,9 +1,24 @@
-//! The packed image's format by its description, slowly: a ZX0 stream whose offsets count units of
-//! some bytes.
+//! The packed image's format by its description, slowly: a ZX0 stream, or one whose offsets count
+//! half-words, behind other bytes.
 
-/// What a stream unpacks to; `None` when it ends too early, reads what is not there, or goes on behind
-/// its end.
-pub fn unpack(stream: &[u8], unit: usize) -> Option<Vec<u8>> {
+/// How a stream tells offsets.
+#[derive(Clone, Copy)]
+pub struct Offsets {
+    /// Bytes that they count.
+    unit: usize,
+    /// Whether the lowest bit of the lower part's byte is the first one of the length: whether that
+    /// is 1.
+    shares_byte: bool,
+}
+
+/// As in the format.
+pub const BYTES: Offsets = Offsets { unit: 1, shares_byte: true };
+/// As in the bootloader.
+pub const HALF_WORDS: Offsets = Offsets { unit: 2, shares_byte: false };
+
+/// What a stream unpacks to behind `front`; `None` when it ends too early, reads what is not there,
+/// copies over the end of `front`, or goes on behind its end.
+pub fn unpack(front: &[u8], stream: &[u8], Offsets { unit, shares_byte }: Offsets) -> Option<Vec<u8>> {
     let mut bits = Bits { stream: stream.iter(), byte: 0, left: 0 };
     let (mut out, mut offset) = (Vec::new(), 1);
     loop {
@@ -13,7 +28,7 @@ pub fn unpack(stream: &[u8], unit: usize) -> Option<Vec<u8>> {
         let mut from_another = bits.bit()?;
         if !from_another {
             let length = bits.number(1, false)?;
-            copy(&mut out, offset * unit, length)?;
+            copy(front, &mut out, offset * unit, length)?;
             from_another = bits.bit()?;
         }
         while from_another {
@@ -22,16 +37,29 @@ pub fn unpack(stream: &[u8], unit: usize) -> Option<Vec<u8>> {
                 return bits.stream.next().is_none().then_some(out);
             }
             let lower = usize::from(*bits.stream.next()?);
-            offset = upper * 128 - lower / 2;
-            // The last bit of the byte is the first one of the length: whether that is 1.
-            let length = if lower % 2 == 1 { 1 } else { bits.digits(1, false)? };
-            copy(&mut out, offset * unit, length + 1)?;
+            let length = if shares_byte {
+                offset = upper * 128 - lower / 2;
+                if lower % 2 == 1 {
+                    1
+                } else {
+                    bits.digits(1, false)?
+                }
+            } else {
+                offset = upper * 256 - lower;
+                bits.number(1, false)?
+            };
+            copy(front, &mut out, offset * unit, length + 1)?;
             from_another = bits.bit()?;
         }
     }
 }
 
-fn copy(out: &mut Vec<u8>, offset: usize, length: usize) -> Option<()> {
+fn copy(front: &[u8], out: &mut Vec<u8>, offset: usize, length: usize) -> Option<()> {
+    if let Some(before) = offset.checked_sub(out.len()).filter(|before| *before > 0) {
+        let from = front.len().checked_sub(before)?;
+        out.extend(front.get(from..from + length)?);
+        return Some(());
+    }
     for _ in 0..length {
         out.push(*out.get(out.len().checked_sub(offset)?)?);
     }
