@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, fs};
 
+include!("packs_well.rs");
+
 use shared_abi::layout::{Image, BOARDS};
 
 fn main() {
@@ -65,9 +67,9 @@ fn resident(package: &Path, out: &Path) {
     let triple = env::var("TARGET").expect("cargo sets it");
 
     let mut cargo = Command::new(env::var_os("CARGO").expect("cargo sets it"));
-    cargo.current_dir(&workspace).args(["build", "--quiet", "--package=bootloader", "--bin=resident"]);
+    cargo.current_dir(&workspace).args(["rustc", "--quiet", "--package=bootloader", "--bin=resident"]);
     cargo.args(["--profile=firmware", "--no-default-features", "--target", &triple, "--features"]);
-    cargo.arg(features.join(",")).arg("--target-dir").arg(&target);
+    cargo.arg(features.join(",")).arg("--target-dir").arg(&target).args(["--", PACKS_WELL]);
     // What the outer build was told about itself.
     let own = ["CARGO_HOME", "CARGO_MAKEFLAGS", "CARGO_NET_OFFLINE"];
     let told = env::vars_os().map(|(name, _)| name).filter(|name| {

@@ -285,11 +285,7 @@ pub fn tests_args(board: &Layout) -> Vec<String> {
     ["--package=coboot-tests", "--no-default-features", &features].map(str::to_owned).to_vec()
 }
 
-/// What the compiler is told beside `.cargo/config.toml` where the code is packed: to write the same
-/// thing in the same way. No calls in the place of short pieces of code that stand several times,
-/// the first register that is free, and no reordering behind that. A bootloader gets larger by that
-/// as it runs from RAM, and some 500 bytes smaller in flash (found by trial).
-const PACKS_WELL: &str = "-Cllvm-args=--enable-machine-outliner=never --regalloc=basic --disable-post-ra=1";
+include!("../../linker/packs_well.rs");
 
 /// A call of cargo that builds an image. What it adds to the compiler's arguments holds for the last
 /// crate; code for the chip is made there and nowhere else (`lto`).
