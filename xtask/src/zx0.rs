@@ -85,8 +85,8 @@ fn cheapest(input: &[u8], start: usize, coding: Offsets) -> Vec<Piece> {
     for end in start + 1..=input.len() {
         let mut known = 2;
         let mut cheapest: Option<usize> = None;
-        for offset in 1..=((end - 1) / unit).max(1) {
-            let state = &mut offsets[offset];
+        let reach = ((end - 1) / unit).max(1);
+        for (offset, state) in offsets[..=reach].iter_mut().enumerate().skip(1) {
             let here = end - 1;
             // A stream begins with a literal. In RAM the output does not follow what is in front of
             // it: no copy goes over there.
