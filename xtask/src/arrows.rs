@@ -41,6 +41,7 @@ const RULES: &[Rule] = &[
     Rule { name: "app-template", may_use: &["canopen", "bsp", "shared-abi"] },
     Rule { name: "vendor-can", may_use: &[] },
     Rule { name: "coflash", may_use: &["canopen", "shared-abi", "vendor-can"] },
+    Rule { name: "coflash-python", may_use: &["canopen", "coflash", "shared-abi"] },
     Rule { name: "coboot-node", may_use: &["boot-core", "canopen", "coflash", "shared-abi"] },
     Rule { name: "emulator", may_use: &["shared-abi"] },
     Rule {

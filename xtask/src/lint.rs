@@ -7,8 +7,9 @@ use crate::{build, process, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask lint [--board BOARD] [--yes]
 
-Checks the formatting of every crate, runs clippy over host crates (with their tests) and over the
-firmware of a board, and makes the documentation of the host crates, all with warnings denied.
+Checks the formatting of every crate, runs clippy over host crates (with their tests; the Python
+package, too) and over the firmware of a board, and makes the documentation of the host crates, all
+with warnings denied.
 
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -31,6 +32,9 @@ pub fn run(mut args: Args) -> Outcome {
         problems.extend(process::run(&mut clippy).err());
     };
     clippy(&["--all-targets", "--keep-going"].map(str::to_owned));
+    // The library without the command line; and the package for Python, which is no default member.
+    clippy(&["--package", "coflash", "--lib", "--no-default-features"].map(str::to_owned));
+    clippy(&["--package", "coflash-python"].map(str::to_owned));
     clippy(&build::firmware_args("bsp", board, ""));
     for variant in build::Variant::of(board) {
         clippy(&build::firmware_args(variant.package, board, variant.features));

@@ -27,6 +27,9 @@ pub enum Dialect {
 }
 
 impl Dialect {
+    /// All of them.
+    pub const ALL: [Self; 5] = [Self::Block, Self::Raw, Self::Hex, Self::Lift, Self::EsAcademy];
+
     /// Its name on the command line.
     #[must_use]
     pub const fn name(self) -> &'static str {

@@ -1,0 +1,46 @@
+//! What went wrong, and the exception that Python gets for it (`coflash/errors.py`).
+
+use coflash::device::Error;
+use coflash::file::FileError;
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+
+/// What went wrong.
+#[derive(Debug)]
+pub enum Fault {
+    /// An argument is no good.
+    Value(String),
+    /// The file is.
+    File(FileError),
+    /// Bus or device are.
+    Device(Error),
+}
+
+impl From<Error> for Fault {
+    fn from(error: Error) -> Self {
+        Self::Device(error)
+    }
+}
+
+impl Fault {
+    /// The exception for it.
+    pub fn raise(self, py: Python<'_>) -> PyErr {
+        let (class, number, what, advice) = match self {
+            Self::Value(what) => return PyValueError::new_err(what),
+            Self::File(error) => ("FileError", error.error.cause.number(), error.to_string(), String::new()),
+            Self::Device(error) => {
+                let class = match &error {
+                    Error::Adapter(_) => "BusError",
+                    Error::Cancelled => "Cancelled",
+                    _ => "DeviceError",
+                };
+                (class, error.number(), error.to_string(), error.advice())
+            }
+        };
+        let exception = py
+            .import("coflash.errors")
+            .and_then(|errors| errors.getattr(class))
+            .and_then(|class| class.call1((number, what, advice)));
+        exception.map_or_else(|error| error, PyErr::from_value)
+    }
+}

@@ -1,0 +1,250 @@
+//! coflash for Python: the library's procedure, `info` and `scan` as functions of a module.
+//!
+//! The work is done in a thread of its own without Python's lock (GIL). The thread that called
+//! waits for it without the lock, too, and takes it for each event and to look for Ctrl-C.
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{channel, RecvTimeoutError, Sender};
+use std::sync::Arc;
+use std::thread;
+use std::time::Duration;
+
+use canopen::NodeId;
+use coflash::bus::decode::state_words;
+use coflash::bus::Link;
+use coflash::device::{self, Dialect, ScanOptions, Session, Timing};
+use coflash::file::convert::{blocks_of, ConvertError, Options, Region};
+use coflash::file::{self, BlockFile, Format};
+use coflash::update::{self, FlashOptions, Password, Target};
+use pyo3::exceptions::{PyRuntimeError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use serde::Serialize;
+use serde_json::{json, Value};
+
+mod fault;
+
+use self::fault::Fault;
+
+/// How long Ctrl-C may go unnoticed.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// Converts firmware and flashes it over CANopen; the package `coflash` hands these on.
+#[pymodule]
+mod _native {
+    use pyo3::prelude::*;
+
+    #[pymodule_export]
+    use super::{flash, info, scan};
+
+    #[pymodule_init]
+    fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        module.add("__version__", env!("CARGO_PKG_VERSION"))
+    }
+}
+
+/// Puts a program into a device, and starts it.
+///
+/// `bus` is a URL as the command line's `--bus` takes it. The file is read and checked before the
+/// bus is opened. `on_event` is called with a dictionary for each thing that happens, the last one
+/// being `done`; what it raises ends the update in order and is raised again.
+#[pyfunction]
+#[pyo3(signature = (bus, node, file, on_event=None, *, board=None, address=None, program=1, check_target=false,
+                    trial_run=false, start=true, verify=false, repeats=3, dialect=None, unlock=None,
+                    sdo_timeout=0.5))]
+#[allow(clippy::too_many_arguments, reason = "they are named in Python")]
+fn flash<'py>(
+    py: Python<'py>,
+    bus: String,
+    node: u8,
+    file: PathBuf,
+    on_event: Option<Bound<'py, PyAny>>,
+    board: Option<String>,
+    address: Option<u32>,
+    program: u8,
+    check_target: bool,
+    trial_run: bool,
+    start: bool,
+    verify: bool,
+    repeats: u32,
+    dialect: Option<String>,
+    unlock: Option<String>,
+    sdo_timeout: f64,
+) -> PyResult<Bound<'py, PyAny>> {
+    let (node, timing) = (node_id(node)?, timing(sdo_timeout)?);
+    if !(1..=254).contains(&program) {
+        return Err(PyValueError::new_err("programs are 1 to 254"));
+    }
+    let blocks = program_of(&file, board.as_deref(), address, program).map_err(|fault| fault.raise(py))?;
+    let target = match check_target {
+        false => None,
+        true => Some(Target::of(&blocks).ok_or_else(|| {
+            PyValueError::new_err("check_target: the file does not say for which device it is")
+        })?),
+    };
+    let options = FlashOptions::default()
+        .program(program)
+        .check_target(target)
+        .trial_run(trial_run)
+        .start(start)
+        .verify(verify)
+        .repeats(repeats)
+        .dialect(dialect.as_deref().map(dialect_of).transpose()?)
+        .unlock(unlock.as_deref().map(password).transpose()?);
+    let report = work(py, on_event.as_ref(), |cancelled, events| {
+        let mut link = Link::open(&bus, None).map_err(device::Error::from)?;
+        let mut session = Session::on(&mut link, node, timing);
+        session.cancel_by(cancelled);
+        // Who listens is gone only when the update was given up.
+        let mut tell = |event: update::Event| drop(events.send(json!(event.line(node))));
+        Ok(update::flash(&mut session, &blocks, &options, &mut tell)?)
+    })?;
+    object(py, &report)
+}
+
+/// Asks a device what it is, and for the state of its programs.
+#[pyfunction]
+#[pyo3(signature = (bus, node, *, sdo_timeout=0.5))]
+fn info(py: Python<'_>, bus: String, node: u8, sdo_timeout: f64) -> PyResult<Bound<'_, PyAny>> {
+    let (node, timing) = (node_id(node)?, timing(sdo_timeout)?);
+    let info = work(py, None, |cancelled, _| {
+        let mut link = Link::open(&bus, None).map_err(device::Error::from)?;
+        let mut session = Session::on(&mut link, node, timing);
+        session.cancel_by(cancelled);
+        Ok(device::info(&mut session)?)
+    })?;
+    object(py, &info)
+}
+
+/// Asks who is on the bus, and listens for heartbeats for so many seconds; gives what was found by
+/// node-ID.
+#[pyfunction]
+#[pyo3(signature = (bus, nodes=None, *, listen=1.1))]
+fn scan<'py>(
+    py: Python<'py>,
+    bus: String,
+    nodes: Option<Vec<u8>>,
+    listen: f64,
+) -> PyResult<Bound<'py, PyDict>> {
+    let mut options = ScanOptions::default().listen(seconds("listen", listen)?);
+    if let Some(nodes) = nodes {
+        options = options.nodes(nodes.into_iter().map(node_id).collect::<PyResult<_>>()?);
+    }
+    let found = work(py, None, |cancelled, _| {
+        let mut adapter = coflash::bus::open(&bus).map_err(device::Error::from)?;
+        Ok(device::scan(&mut *adapter, &options, &cancelled)?)
+    })?;
+    let nodes = PyDict::new(py);
+    for (node, found) in found {
+        let value = json!({ "state": found.state.map(state_words), "info": found.info });
+        nodes.set_item(node.get(), object(py, &value)?)?;
+    }
+    Ok(nodes)
+}
+
+/// Does something in a thread of its own, and hands its events to Python meanwhile.
+fn work<T: Send>(
+    py: Python<'_>,
+    on_event: Option<&Bound<'_, PyAny>>,
+    act: impl FnOnce(Arc<AtomicBool>, &Sender<Value>) -> Result<T, Fault> + Send,
+) -> PyResult<T> {
+    let cancelled = Arc::new(AtomicBool::new(false));
+    let (events, mut inbox) = channel();
+    let (result, raised) = thread::scope(|scope| {
+        let flag = cancelled.clone();
+        // `events` moves into the thread: the channel ends when the work does.
+        let worker = scope.spawn(move || act(flag, &events));
+        let mut raised: Option<PyErr> = None;
+        loop {
+            let received;
+            (inbox, received) = py.detach(move || {
+                let received = inbox.recv_timeout(LOOK);
+                (inbox, received)
+            });
+            let outcome = match received {
+                Ok(_) if raised.is_some() => Ok(()),
+                Ok(event) => tell(py, on_event, &event).and_then(|()| py.check_signals()),
+                Err(RecvTimeoutError::Timeout) if raised.is_some() => Ok(()),
+                Err(RecvTimeoutError::Timeout) => py.check_signals(),
+                Err(RecvTimeoutError::Disconnected) => break,
+            };
+            if let Err(error) = outcome {
+                cancelled.store(true, Ordering::Relaxed);
+                raised = Some(error);
+            }
+        }
+        (py.detach(|| worker.join()), raised)
+    });
+    if let Some(raised) = raised {
+        return Err(raised);
+    }
+    match result {
+        Ok(result) => result.map_err(|fault| fault.raise(py)),
+        Err(_) => Err(PyRuntimeError::new_err("coflash has a fault of its own: its thread has panicked")),
+    }
+}
+
+fn tell(py: Python<'_>, on_event: Option<&Bound<'_, PyAny>>, event: &Value) -> PyResult<()> {
+    match on_event {
+        Some(on_event) => on_event.call1((object(py, event)?,)).map(drop),
+        None => Ok(()),
+    }
+}
+
+/// A value as Python has it.
+fn object<'py>(py: Python<'py>, value: &impl Serialize) -> PyResult<Bound<'py, PyAny>> {
+    Ok(pythonize::pythonize(py, value)?)
+}
+
+/// The blocks of a file, for this board if one is named; a raw binary goes to its address.
+fn program_of(
+    path: &std::path::Path,
+    board: Option<&str>,
+    address: Option<u32>,
+    program: u8,
+) -> Result<BlockFile, Fault> {
+    let region = match board {
+        None => Region::Unknown,
+        Some(name) => {
+            let layout = shared_abi::layout::by_name(name)
+                .ok_or_else(|| Fault::Value(format!("there is no board '{name}'")))?;
+            let region = layout.programs.get(usize::from(program) - 1);
+            let region = region.ok_or_else(|| Fault::Value(format!("{name} has no program {program}")))?;
+            Region::Strict((*region).into())
+        }
+    };
+    let format = address.map(|_| Format::Raw);
+    let firmware = file::load(path, format, address).map_err(Fault::File)?;
+    match blocks_of(firmware, &Options::default().region(region)) {
+        Ok(converted) => Ok(converted.file),
+        Err(ConvertError::File(error)) => Err(Fault::File(error.of(path.display()))),
+        Err(error) => Err(Fault::Value(error.to_string())),
+    }
+}
+
+fn node_id(number: u8) -> PyResult<NodeId> {
+    NodeId::new(number).ok_or_else(|| PyValueError::new_err("node-IDs are 1 to 127"))
+}
+
+fn dialect_of(name: &str) -> PyResult<Dialect> {
+    let known = || Dialect::ALL.map(Dialect::name).join(", ");
+    let dialect = Dialect::ALL.into_iter().find(|dialect| dialect.name() == name);
+    dialect
+        .ok_or_else(|| PyValueError::new_err(format!("there is no dialect '{name}'; known are {}", known())))
+}
+
+fn password(text: &str) -> PyResult<Password> {
+    Password::new(text).ok_or_else(|| PyValueError::new_err("a password has 1 to 64 bytes"))
+}
+
+fn timing(sdo: f64) -> PyResult<Timing> {
+    Ok(Timing::default().sdo(seconds("sdo_timeout", sdo)?))
+}
+
+/// A time that Python gives in seconds; a day is more than anybody waits.
+fn seconds(name: &str, time: f64) -> PyResult<Duration> {
+    let sound = (0.0..=86_400.0).contains(&time);
+    let wrong = || PyValueError::new_err(format!("{name} must be seconds, 0 to 86400"));
+    sound.then(|| Duration::from_secs_f64(time)).ok_or_else(wrong)
+}

@@ -1,0 +1,231 @@
+"""The package against `coboot-node` over TCP (socketcand), as a test bench uses it.
+
+``COBOOT_NODE`` names the program; ``tests/tests/python_package.rs`` builds all of it and runs this.
+"""
+
+import ast
+import inspect
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+import zlib
+
+import pytest
+
+import coflash
+
+BASE = 0x0801_0000
+BOARD = "stm32f407g-disc1"
+
+
+def program() -> bytes:
+    """A program as far as a bootloader looks at one: stack pointer in RAM, reset vector inside."""
+    vectors = (0x2001_0000).to_bytes(4, "little") + (BASE + 0x201).to_bytes(4, "little")
+    return vectors + bytes([0xA5]) * (20 * 1024 - 8)
+
+
+def crc32(data: bytes) -> int:
+    """The CRC of 1F56h (manual L-1112d_10, chapter 3.1), computed by Python's own library."""
+    return zlib.crc32(data)
+
+
+class Nodes:
+    """Nodes with a bus of their own."""
+
+    def __init__(self, folder, *arguments):
+        command = [os.environ["COBOOT_NODE"], "--listen", "127.0.0.1:0", *arguments]
+        self.process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True)
+        line = self.process.stdout.readline()
+        assert line.startswith("bus: "), line
+        self.bus = line.removeprefix("bus: ").strip()
+        # Somebody has to read on, lest the pipe fill up.
+        threading.Thread(target=self.process.stdout.read, daemon=True).start()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.wait()
+
+
+@pytest.fixture
+def nodes(tmp_path):
+    with Nodes(tmp_path, "--node", "5", "--count", "2", "--flash", "instant", "--stand-in") as nodes:
+        yield nodes
+
+
+@pytest.fixture
+def image(tmp_path):
+    path = tmp_path / "program.bin"
+    path.write_bytes(program())
+    return path
+
+
+def test_flash_info_and_scan(nodes, image):
+    events = []
+    report = coflash.flash(nodes.bus, 5, image, events.append, board=BOARD, address=BASE, verify=True)
+    assert report["size"] == len(program())
+    assert report["crc"] == crc32(program())
+    assert report["dialect"] == "block"
+
+    kinds = [event["event"] for event in events]
+    assert kinds[0] == "found" and kinds[-1] == "done"
+    assert {event["node"] for event in events} == {5}
+    progress = [event for event in events if event["event"] == "progress"]
+    assert progress[-1]["done"] == progress[-1]["total"] > len(program())
+    assert events[-1]["state"] == "signed" and events[-1]["error"] is None
+    assert events[-1]["report"] == report
+    assert all(isinstance(event["text"], str) for event in events)
+
+    info = coflash.info(nodes.bus, 5)
+    assert (info["node"], info["bootloader"]) == (5, False)
+    assert info["programs"][0]["crc"] == crc32(program())
+
+    found = coflash.scan(nodes.bus, [4, 5, 6], listen=0)
+    assert sorted(found) == [5, 6]
+    assert found[6]["info"]["bootloader"] is True
+
+
+def test_without_a_listener(nodes, image):
+    assert coflash.flash(nodes.bus, 6, str(image), board=BOARD, address=BASE)["blocks_repeated"] == 0
+
+
+def test_an_error_has_number_text_and_advice(nodes, image):
+    with pytest.raises(coflash.DeviceError) as caught:
+        coflash.info(nodes.bus, 99, sdo_timeout=0.01)
+    error = caught.value
+    # The manual's number for a device that does not answer (L-1112e_5, table 5).
+    assert error.number == 0x6000_0013
+    assert "node 99 does not answer" in error.what and error.advice
+    assert "[0x60000013]" in str(error) and isinstance(error, coflash.Error)
+
+    with pytest.raises(coflash.BusError) as caught:
+        coflash.info("socketcand://127.0.0.1:1/can0", 5)
+    assert caught.value.number == 0x6000_0301
+    with pytest.raises(coflash.BusError):
+        coflash.scan("nothing")
+
+
+def test_the_file_is_read_before_the_bus_is_opened(tmp_path):
+    nowhere = "socketcand://127.0.0.1:1/can0"
+    with pytest.raises(coflash.FileError) as caught:
+        coflash.flash(nowhere, 5, tmp_path / "absent.elf")
+    assert "absent.elf" in caught.value.what and caught.value.number == 2  # ENOENT
+    path = tmp_path / "program.bin"
+    path.write_bytes(program())
+    with pytest.raises(coflash.FileError) as caught:
+        coflash.flash(nowhere, 5, path, board=BOARD, address=0x0900_0000)
+    # "Data outside": the manual's number.
+    assert caught.value.number == 0x6000_0015
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"node": 0},
+        {"node": 128},
+        {"program": 0},
+        {"program": 2},
+        {"board": "nothing"},
+        {"dialect": "latin"},
+        {"unlock": ""},
+        {"sdo_timeout": -1.0},
+        {"sdo_timeout": float("nan")},
+        {"check_target": True},
+    ],
+)
+def test_wrong_arguments_are_value_errors(image, arguments):
+    arguments = {"node": 5, "board": BOARD, "address": BASE, **arguments}
+    with pytest.raises(ValueError):
+        coflash.flash("socketcand://127.0.0.1:1/can0", arguments.pop("node"), image, **arguments)
+
+
+def test_what_the_listener_raises_ends_the_update_and_comes_out(nodes, image):
+    class Enough(Exception):
+        pass
+
+    heard = []
+
+    def listen(event):
+        heard.append(event["event"])
+        if event["event"] == "progress" and event["done"] > 4096:
+            raise Enough
+
+    with pytest.raises(Enough):
+        coflash.flash(nodes.bus, 5, image, listen, board=BOARD, address=BASE)
+    # It has heard nothing since, and the device takes the next attempt.
+    assert heard[-1] == "progress"
+    assert coflash.info(nodes.bus, 5)["bootloader"] is True
+    assert coflash.flash(nodes.bus, 5, image, board=BOARD, address=BASE)["size"] == len(program())
+
+
+def test_other_threads_run_while_it_works(nodes):
+    ticks = queue.Queue()
+    stop = threading.Event()
+
+    def tick():
+        while not stop.is_set():
+            ticks.put(None)
+            stop.wait(0.001)
+
+    ticker = threading.Thread(target=tick)
+    ticker.start()
+    try:
+        before = ticks.qsize()
+        with pytest.raises(coflash.DeviceError):
+            # It asks for five seconds, and gives Python's lock away all that time.
+            coflash.info(nodes.bus, 99, sdo_timeout=0.1)
+        during = ticks.qsize() - before
+    finally:
+        stop.set()
+        ticker.join()
+    # Five seconds have room for thousands. Without the lock there would be none but by chance.
+    assert during > 20, during
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no such signal")
+def test_ctrl_c_ends_it(nodes):
+    main = threading.main_thread().ident
+
+    def interrupt():
+        # Once the work has begun: it goes on for five seconds by itself.
+        time.sleep(0.3)
+        signal.pthread_kill(main, signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(KeyboardInterrupt):
+        coflash.info(nodes.bus, 99, sdo_timeout=5.0)
+    # The bus is free again.
+    assert coflash.info(nodes.bus, 5)["node"] == 5
+
+
+def test_the_stubs_are_those_of_the_functions():
+    stubs = os.path.join(os.path.dirname(coflash.__file__), "_native.pyi")
+    with open(stubs, encoding="utf-8") as file:
+        tree = ast.parse(file.read())
+    stubs = {item.name: item.args for item in tree.body if isinstance(item, ast.FunctionDef)}
+    assert set(stubs) == {"flash", "info", "scan"}
+    for name, stub in stubs.items():
+        positional = stub.args
+        told = {argument.arg: None for argument in positional}
+        for argument, default in zip(positional[len(positional) - len(stub.defaults) :], stub.defaults):
+            told[argument.arg] = ast.literal_eval(default)
+        for argument, default in zip(stub.kwonlyargs, stub.kw_defaults):
+            told[argument.arg] = ast.literal_eval(default)
+        empty = inspect.Parameter.empty
+        real = inspect.signature(getattr(coflash, name)).parameters.values()
+        assert told == {it.name: None if it.default is empty else it.default for it in real}
+        keyword = [it.name for it in real if it.kind is it.KEYWORD_ONLY]
+        assert keyword == [argument.arg for argument in stub.kwonlyargs]
+
+
+def test_the_package_is_typed():
+    folder = os.path.dirname(coflash.__file__)
+    assert os.path.exists(os.path.join(folder, "py.typed"))
+    assert os.path.exists(os.path.join(folder, "_native.pyi"))
+    assert coflash.__version__.count(".") == 2
