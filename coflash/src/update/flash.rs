@@ -1,7 +1,7 @@
 //! The update of a device: the procedure of the manual (L-1112d_10, "Prinzipieller Ablauf"), steps
 //! 2 to 15.
 //!
-//! Step 1, making the blocks, is [`convert`](crate::file::convert). Everything that can be judged
+//! Step 1, making the blocks, is [`convert`](mod@crate::file::convert). Everything that can be judged
 //! before the device is touched is judged there and in `admission`.
 
 use super::course::Course;

@@ -91,8 +91,8 @@ pub fn call_back(session: &mut Session<'_>) -> Result<DeviceType, Error> {
     Err(Error::NoBootloader { node, running: seen, code: None })
 }
 
-/// Waits for a restarting device, [`Timing::boot`](crate::session::Timing::boot) at most, until
-/// what it runs is what is `wanted`; gives what answered last.
+/// Waits for a restarting device, [`Timing::boot`] at most, until what it runs is what is `wanted`;
+/// gives what answered last.
 fn settle(
     session: &mut Session<'_>,
     wanted: impl Fn(DeviceType) -> bool,

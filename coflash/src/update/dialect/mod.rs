@@ -8,7 +8,7 @@
 //! | [`EsAcademy`](Dialect::EsAcademy) | Intel HEX text, one download | password in 7F50h, which erases | it runs by itself |
 //! | [`Lift`](Dialect::Lift) | image, one download, at node-ID 126 | password in 6005h, in application and bootloader | "reset program" |
 //!
-//! Another dialect is a file that implements [`Procedure`], and a line of [`of`]. The steps that all
+//! Another dialect is a file that implements `Procedure`, and a line of `of`. The steps that all
 //! have in common are in [`steps`](super::steps).
 
 use crate::device::Dialect;
