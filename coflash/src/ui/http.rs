@@ -26,6 +26,7 @@ use super::shared::{lock, Order, Refusal, Shared};
 use super::state::{Fits, Notice, Settings};
 
 use crate::device::lss::{BitRate, LssAddress};
+use crate::update::FlashOptions;
 
 /// The most bytes of a request that is no file.
 const BODY_MAX: usize = 64 * 1024;
@@ -158,7 +159,13 @@ async fn take_events(State(site): State<Site>, Query(wanted): Query<Wanted>) -> 
 async fn list() -> Response {
     let found = tokio::task::spawn_blocking(adapters::list).await.unwrap_or_default();
     let boards: Vec<&str> = layout::BOARDS.iter().map(|layout| layout.board).collect();
-    let value = json!({ "adapters": found, "boards": boards, "version": env!("CARGO_PKG_VERSION"), "file_max": FILE_MAX });
+    let value = json!({
+        "adapters": found,
+        "boards": boards,
+        "trial": FlashOptions::default().trial_run,
+        "version": env!("CARGO_PKG_VERSION"),
+        "file_max": FILE_MAX,
+    });
     json_response(StatusCode::OK, &value)
 }
 

@@ -390,6 +390,10 @@ impl Update {
             self.words = "sending the program".to_string();
             return;
         }
+        // The result tells it, with what was left behind.
+        if let Event::Done(_) = event {
+            return;
+        }
         self.words = event.to_string();
         if self.lines.len() < LINES {
             self.lines.push(self.words.clone());

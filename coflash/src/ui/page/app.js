@@ -114,6 +114,7 @@ function dropping() {
 async function adapters() {
   const found = await (await fetch("adapters")).json();
   fileMax = found.file_max;
+  $("trial").checked = found.trial;
   text($("version"), `version ${found.version}`);
   $("adapter-list").append(...found.adapters.map((one) => el("option", { value: one.url }, one.words)));
   $("board").append(...found.boards.map((board) => el("option", { value: board }, board)));
