@@ -134,6 +134,8 @@ def connected(page):
 
 def scan(page, count):
     page.get_by_role("button", name="Search the bus").click()
+    # The table may have had as many rows before: that the search is over is told by its result.
+    expect(page.locator("#notice")).to_contain_text(re.compile(rf"{count} devices? found"))
     expect(page.locator("#rows tr")).to_have_count(count)
     idle(page)
 
