@@ -132,3 +132,14 @@ pub fn elf(name: &str) -> Vec<u8> {
         )
     })
 }
+
+/// Bytes that a bootloader takes for the start of program 1: initial stack pointer in RAM, reset vector
+/// inside, the rest as `byte` says.
+#[must_use]
+pub fn made_up(len: usize, byte: impl Fn(usize) -> u8) -> Vec<u8> {
+    let (ram, program) = (board().ram, board().programs[0]);
+    let mut bytes: Vec<u8> = (0..len).map(byte).collect();
+    bytes[..4].copy_from_slice(&ram.end().to_le_bytes());
+    bytes[4..8].copy_from_slice(&(program.base + 0x201).to_le_bytes());
+    bytes
+}

@@ -228,8 +228,7 @@ fn a_burst_of_127_segments_back_to_back_at_1_mbit_is_taken_without_loss() {
 
     // Two sub-blocks of 127 segments; the bits of the data change so often that no stuff bit makes
     // the frames longer.
-    let data: Vec<u8> =
-        (0..2 * 127 * 7 - 16).map(|n| if n % 64 == 0 { (n / 64) as u8 } else { 0x55 }).collect();
+    let data = firmware::made_up(2 * 127 * 7 - 16, |n| if n % 64 == 0 { (n / 64) as u8 } else { 0x55 });
     let block = block(1, firmware::board().programs[0].base, &data);
     assert_eq!(block.len(), 1778);
     // The first burst meets the device's own heartbeat, which finds no room on the bus: that keeps

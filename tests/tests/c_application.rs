@@ -12,6 +12,7 @@ use coflash::device::{Doing, Session, Timing};
 use coflash::file::convert::{self, blocks_of, Options};
 use coflash::file::read::read;
 use coflash::update::{flash, FlashOptions, Report};
+use coflash::Error;
 use shared_abi::callgate;
 use shared_abi::geometry::Region;
 use shared_abi::layout::stm32f407g_disc1_two;
@@ -598,9 +599,13 @@ fn the_other_program_and_a_program_for_the_other_place() {
     let mut bench = Bench::of_image(&image(firmware::BOOTLOADER));
     bench.power_on();
     bench.await_boot_up(100);
-    let once = FlashOptions::default().repeats(0);
-    // A host that does not know the board: the bootloader sees it.
+    // A host that does not know the board is told by the device, and sends nothing.
     let blocks = blocks_of(elf(firmware::APP_C_PROGRAM_2), &Options::default()).unwrap().file;
+    let refused = flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).unwrap_err();
+    assert!(matches!(refused, Error::OtherRegion { .. }), "{refused}");
+    assert_eq!(number(&mut bench, Address::new(0x1F57, 1)), 0, "untouched");
+    // One that does not judge: the bootloader sees it.
+    let once = FlashOptions::default().repeats(0).force(true);
     let refused = flash(&mut bench.session(), &blocks, &once, &mut |_| {}).unwrap_err();
     assert_eq!(number(&mut bench, Address::new(0x1F57, 1)), 0x0C, "ADDRESS: {refused}");
     println!("{refused}");
@@ -613,7 +618,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
     let refused = flash(&mut bench.session(), &blocks, &once, &mut |_| {}).unwrap_err();
     println!("{refused}");
     let status = number(&mut bench, Address::new(0x1F57, 1));
-    assert_eq!(status & 0xFF, 0x02, "NOVALPROG: {refused}");
+    assert_eq!(status & 0xFF, 0x04, "FORMAT: {refused}");
     bench.power_off();
     bench.run_ms(10);
     bench.power_on();

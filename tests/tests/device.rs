@@ -108,9 +108,10 @@ fn wrong_blocks_are_refused_with_abort_and_status_and_the_right_one_is_taken() {
         assert_eq!(send(&mut bench, &bad), (Some(abort), status), "{what}");
         assert_eq!(program_flash(&mut bench), blank, "{what}");
     }
-    assert_eq!(send(&mut bench, &block(1, program_start(), &[1; 100])), (None, 0));
+    let good = firmware::made_up(1000, |_| 1);
+    assert_eq!(send(&mut bench, &block(1, program_start(), &good)), (None, 0));
     bench.run_ms(2000);
-    assert_eq!(program_flash(&mut bench)[..101], [&[1; 100][..], &[0xFF]].concat());
+    assert_eq!(program_flash(&mut bench)[..1001], [&good[..], &[0xFF]].concat());
 }
 
 #[test]
@@ -119,7 +120,7 @@ fn the_largest_block_of_the_manual_is_taken() {
     bench.session().command(1, ProgramControl::Clear).unwrap();
     bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
     assert_eq!(send(&mut bench, &block(0, 0, &[0; 8])), (None, 0));
-    let data: Vec<u8> = (0..16384 - 16).map(|i| (i % 251) as u8).collect();
+    let data = firmware::made_up(16384 - 16, |i| (i % 251) as u8);
     assert_eq!(send(&mut bench, &block(1, program_start(), &data)), (None, 0));
     // Erased and programmed in the background.
     bench.run_ms(2000);
@@ -162,7 +163,7 @@ fn a_transfer_that_breaks_off_does_not_block_the_next_one() {
     let said: Vec<_> = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == RESPONSE).collect();
     assert_eq!(said.len(), 1, "{said:?}");
     assert_eq!(said[0].2, [0x80, 0x50, 0x1F, 0x01, 0x00, 0x00, 0x04, 0x05]);
-    assert_eq!(send(&mut bench, &block(1, program_start(), &[7; 64])), (None, 0));
+    assert_eq!(send(&mut bench, &block(1, program_start(), &firmware::made_up(1000, |_| 7))), (None, 0));
 }
 
 /// The power goes at eleven points of an update: before anything is lost, during the erase, between
