@@ -147,6 +147,9 @@ fn inspect_tells_what_a_file_holds() {
     assert!(done.exit == 3 && done.err.contains("lies outside"), "{}", done.err);
 }
 
+/// A bus that can be named and is not there.
+const NOWHERE: &str = "socketcand://127.0.0.1:1/x";
+
 /// What has no end, or is too large for any firmware, is said so and not read.
 #[test]
 #[cfg(unix)]
@@ -164,13 +167,13 @@ fn what_is_no_file_or_too_large_is_not_read() {
         (folder.0.to_str().unwrap(), "endless: is a folder and no file"),
         (&large, "large.elf: has 67108865 bytes, and no firmware file has more than 67108864"),
     ] {
-        for command in [&["inspect"][..], &["convert"], &["--bus", "nowhere", "flash"]] {
+        for command in [&["inspect"][..], &["convert"], &["--bus", NOWHERE, "flash"]] {
             let done = coflash(&[command, &[file]].concat());
             assert!(done.exit == 3 && done.err.contains(words), "{command:?} {}", done.err);
         }
     }
     for (option, file) in [("--job", "/dev/zero"), ("--job", settings.as_str())] {
-        let done = coflash(&["--bus", "nowhere", "flash", option, file]);
+        let done = coflash(&["--bus", NOWHERE, "flash", option, file]);
         assert!(done.exit == 3 && done.err.contains("has more than 1048576 bytes"), "{}", done.err);
     }
     let done = coflash(&["--config", "/dev/zero", "inspect", &data("program.hex")]);
@@ -185,7 +188,7 @@ fn what_can_be_no_program_is_refused_without_a_bus() {
     let bootloader = folder.file("bootloader.bin", &[&vectors[..], &[0x5A; 1000]].concat());
     let zeros = folder.file("zeros.bin", &[0; 1000]);
     let flash = |file: &str, options: &[&str]| {
-        coflash(&[&["--bus", "nowhere", "flash", file, "-I", "binary"], options].concat())
+        coflash(&[&["--bus", NOWHERE, "flash", file, "-I", "binary"], options].concat())
     };
     for (file, options, words) in [
         (
@@ -206,10 +209,10 @@ fn what_can_be_no_program_is_refused_without_a_bus() {
         );
         // It may be forced, and then it fails for want of a bus; so do data, which may be anything.
         let done = flash(file, &[options, &["--force"]].concat());
-        assert!(done.exit != 3 && done.err.contains("nowhere"), "{}", done.err);
+        assert!(done.exit != 3 && done.err.contains("127.0.0.1:1"), "{}", done.err);
     }
     let done = flash(&zeros, &["--dialect", "lift", "--unlock", "x", "--program", "2"]);
-    assert!(done.exit != 3 && done.err.contains("nowhere"), "{}", done.err);
+    assert!(done.exit != 3 && done.err.contains("127.0.0.1:1"), "{}", done.err);
 }
 
 /// The label of an image (`docs/dialects.md`) is told by `inspect`, and goes into block 0.

@@ -250,7 +250,8 @@ fn a_binary_without_an_address_goes_to_devices_that_have_none() {
     };
     let binary = ["flash", "-N", "5", &file, "-I", "binary"];
     // This one is no program, and is not taken for one without a word.
-    let done = coflash(&[&["--bus", "nowhere"][..], &binary, &["--dialect", "raw"]].concat());
+    let done =
+        coflash(&[&["--bus", "socketcand://127.0.0.1:1/x"][..], &binary, &["--dialect", "raw"]].concat());
     assert!(done.exit == 3 && done.err.contains("is no program: its first word"), "{}", done.err);
     let done = coflash(&[&["--bus", &bus][..], &binary, &["--dialect", "raw", "--force"]].concat());
     assert_eq!(done.exit, 0, "{}\n{}", done.err, done.out);

@@ -333,12 +333,7 @@ const MISTAKES: &[Mistake] = &[
         3,
         &["missing.blk", "No such file", "check the file's name"],
     ),
-    Mistake(
-        "flash {folder} --bus {bus}",
-        Device(absent),
-        3,
-        &["directory", "name the firmware file in this folder"],
-    ),
+    Mistake("flash {folder} --bus {bus}", Device(absent), 3, &["is a folder and no file", "give a file"]),
     Mistake("flash {empty} --bus {bus}", Device(absent), 3, &["is empty", "build the program again"]),
     Mistake("flash {html} --bus {bus}", Device(absent), 3, &["no firmware file", "name the linker's output"]),
     Mistake("convert {cut} {out}", Nothing, 3, &["line 25", "cut off", "copy the file again"]),

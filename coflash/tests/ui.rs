@@ -159,8 +159,8 @@ impl Drop for Ui {
     }
 }
 
-/// A program of four bytes in Intel HEX.
-const HEX: &[u8] = b":020000040801F1\n:04000000EFBEADDEC4\n:00000001FF\n";
+/// A program of twelve bytes in Intel HEX: initial stack pointer 2001_FFC0h, reset vector 0801_0009h.
+const HEX: &[u8] = b":020000040801F1\n:0C000000C0FF012009000108EFBEADDECA\n:00000001FF\n";
 
 #[test]
 fn without_the_token_nothing_is_told() {
@@ -330,7 +330,7 @@ fn files_of_every_kind_are_taken_or_refused_with_their_name() {
     let state = ui.until("the file", |state| !state["firmware"].is_null());
     assert_eq!(
         (&state["firmware"]["name"], &state["firmware"]["program_size"]),
-        (&json!("app.hex"), &json!(4))
+        (&json!("app.hex"), &json!(12))
     );
     // One that is refused leaves none: what was there is not what the person means.
     ui.file("bad.hex", b"no");

@@ -10,6 +10,7 @@ use coflash::file::block_file::BlockFile;
 use coflash::file::convert::{blocks_of, Options, Region};
 use coflash::file::read::read;
 use coflash::update::{flash, FlashOptions};
+use coflash::Error;
 use emulator::time::Span;
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
 
@@ -118,7 +119,10 @@ fn a_block_for_the_other_program_is_refused() {
     bench.await_boot_up(100);
     let second = blocks(firmware::PROGRAM_2, 2);
     let options = FlashOptions::default().program(1).start(false).repeats(0);
+    // The host is told by the device, and sends nothing; one that does not judge gets the refusal.
     let refused = flash(&mut bench.session(), &second, &options, &mut |_| {}).unwrap_err();
+    assert!(matches!(refused, Error::OtherRegion { .. }), "{refused}");
+    let refused = flash(&mut bench.session(), &second, &options.force(true), &mut |_| {}).unwrap_err();
     let status = bench.ask(0x601, &[0x40, 0x57, 0x1F, 1, 0, 0, 0, 0], 0x581).unwrap();
     assert_eq!(status[4], 0x0C, "ADDRESS: {refused}");
     let (start, end) = (0x1_0000, LAYOUT.chip.flash.size as usize);
