@@ -6,6 +6,8 @@ use std::{env, fs};
 use coflash::file::block_file::BlockFile;
 use coflash::file::convert::{blocks_of, Options, Region};
 use coflash::file::read::{read, Firmware};
+use object::read::elf::ElfFile32;
+use object::{Endianness, Object, ObjectSection};
 use shared_abi::layout::{self, Layout};
 
 /// The images by the names that `cargo xtask build` gives them.
@@ -142,4 +144,15 @@ pub fn made_up(len: usize, byte: impl Fn(usize) -> u8) -> Vec<u8> {
     bytes[..4].copy_from_slice(&ram.end().to_le_bytes());
     bytes[4..8].copy_from_slice(&(program.base + 0x201).to_le_bytes());
     bytes
+}
+
+/// A section of an ELF file: its address, and what it holds.
+///
+/// # Panics
+/// If it is no ELF file, or has no such section.
+#[must_use]
+pub fn section(elf: &[u8], name: &str) -> (u32, Vec<u8>) {
+    let file = ElfFile32::<Endianness>::parse(elf).expect("an ELF file");
+    let section = file.section_by_name(name).unwrap_or_else(|| panic!("no section {name}"));
+    (section.address() as u32, section.data().expect("its bytes").to_vec())
 }

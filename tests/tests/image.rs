@@ -23,13 +23,6 @@ use shared_abi::ram_image::SERVICES_VERSION;
 /// Bytes of the header (shared_abi::ram_image, typed again).
 const HEADER: usize = 24;
 
-/// A section of an ELF file: its address, and what it holds.
-fn section(elf: &[u8], name: &str) -> (u32, Vec<u8>) {
-    let file = ElfFile32::<Endianness>::parse(elf).unwrap();
-    let section = file.section_by_name(name).unwrap_or_else(|| panic!("no section {name}"));
-    (section.address() as u32, section.data().unwrap().to_vec())
-}
-
 fn words(bytes: &[u8]) -> Vec<u32> {
     bytes.chunks_exact(4).map(|word| u32::from_le_bytes(word.try_into().unwrap())).collect()
 }
@@ -54,14 +47,14 @@ impl Packed {
         let base = firmware::board().bootloader.base;
         let mut flash = Vec::new();
         for name in [".vector_table", ".callgate", ".boot", ".ram_image", ".ram_image.packed"] {
-            let (address, data) = section(&elf, name);
+            let (address, data) = firmware::section(&elf, name);
             let at = (address - base) as usize;
             assert!(at >= flash.len(), "{name} overlaps the section before");
             flash.resize(at, 0xFF);
             flash.extend(data);
         }
-        let header = (section(&elf, ".ram_image").0 - base) as usize;
-        Self { flash, header, ram: section(&elf, ".data").1 }
+        let header = (firmware::section(&elf, ".ram_image").0 - base) as usize;
+        Self { flash, header, ram: firmware::section(&elf, ".data").1 }
     }
 
     /// The stored bytes.
@@ -168,7 +161,7 @@ fn vectors() {
     let handlers: Vec<_> = in_ram[2..].iter().filter(|vector| **vector != 0).collect();
     assert!(handlers.iter().all(|vector| board.ram.contains(**vector & !1, 2)), "{in_ram:x?}");
     assert!(handlers.len() > 80);
-    let (address, _) = section(&firmware::elf(firmware::BOOTLOADER), ".data");
+    let (address, _) = firmware::section(&firmware::elf(firmware::BOOTLOADER), ".data");
     assert_eq!(address, board.ram.base);
 }
 
