@@ -33,3 +33,11 @@ pub(crate) fn status<S: Serializer>(status: &Option<FlashStatus>, serializer: S)
     fields.serialize_field("detail", &status.detail)?;
     fields.end()
 }
+
+/// What has words for people, in these words.
+pub(crate) fn words<T: std::fmt::Display, S: Serializer>(
+    value: &T,
+    serializer: S,
+) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(value)
+}

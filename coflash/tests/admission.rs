@@ -51,7 +51,11 @@ fn refused(fake: &mut Fake, file: &BlockFile, options: FlashOptions) -> Error {
     let (result, events) = run(fake, file, options);
     let error = result.unwrap_err();
     assert_eq!(fake.writes(), [] as [&str; 0], "{error}");
-    assert_eq!(events.last().and_then(Event::left), Some(DeviceState::Untouched), "{error}");
+    assert_eq!(
+        events.last().and_then(Event::left).map(|left| left.state),
+        Some(DeviceState::Untouched),
+        "{error}"
+    );
     error
 }
 
@@ -224,7 +228,7 @@ fn the_bootloader_is_asked_where_the_application_does_not_know() {
     let (result, events) = run(&mut fake, &file, FlashOptions::default());
     assert_eq!(result.unwrap_err().number(), 0x6000_0015);
     assert_eq!(fake.writes(), ["command 80"]);
-    assert_eq!(events.last().and_then(Event::left), Some(DeviceState::Called));
+    assert_eq!(events.last().and_then(Event::left).map(|left| left.state), Some(DeviceState::Called));
     // What is no place in the flash of such a device is something else of another maker.
     for (base, size) in [(0x2000_0000, 0x1_0000), (START + 0x1_0000, 0), (START + 0x1_0000, u32::MAX)] {
         run(&mut at(base, size, APPLICATION, &[APPLICATION, BOOTLOADER]), &file, FlashOptions::default())

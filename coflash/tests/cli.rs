@@ -419,7 +419,6 @@ fn flash_and_info_over_a_socket() {
         "5",
         "--board",
         "stm32f407g-disc1",
-        "--trial-run",
         &data("program.elf"),
     ]);
     assert_eq!(done.exit, 0, "{}", done.err);
@@ -431,7 +430,7 @@ fn flash_and_info_over_a_socket() {
         "the bootloader is running",
         "100 %  883 of 883 bytes",
         "the trial went well",
-        "signed",
+        "released for autostart",
         "running: an application",
         "done in ",
     ] {
@@ -454,7 +453,7 @@ fn a_script_for_the_manuals_download_tools_works() {
         ["-P", "1", "-B", "4", "-N", "5", "--delay", "20", "--repeats", "0x000400", "--timeout", "500"];
     let dot_net = ["--node_id", "0x05", "--br_idx", "4", "--device_no", "255", "--prog_no", "1", "--chk_run"];
     let dot_net_2 = ["--sdo_timeout", "500", "--chk_tgt", "0", "--vxd_type", "4", "--baudrate", "500"];
-    for (options, trial) in [
+    for (options, dot_net) in [
         ([&download[..], &[&file]].concat(), false),
         ([&["-F", &file][..], &dot_net, &dot_net_2].concat(), true),
     ] {
@@ -464,10 +463,10 @@ fn a_script_for_the_manuals_download_tools_works() {
         let (bus, server) = serve(fake);
         let done = coflash(&[&["--bus", &bus, "flash"][..], &options].concat());
         assert_eq!(done.exit, 0, "{}", done.err);
-        assert_eq!(done.err.contains("--vxd_type is passed over"), trial, "{}", done.err);
+        assert_eq!(done.err.contains("--vxd_type is passed over"), dot_net, "{}", done.err);
         let fake = server.join().unwrap();
         assert_eq!(fake.blocks.concat(), fs::read(&file).unwrap());
-        assert_eq!(fake.count("command 80"), usize::from(trial));
+        assert_eq!(fake.count("command 80"), 1, "a trial in both, asked for or not");
     }
     for (option, value, words) in [("--gateway_id", "3", "SDO gateway"), ("-B", "9", "0 (1 Mbit/s) to 8")] {
         let done = coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", &file, option, value]);
@@ -535,6 +534,7 @@ fn a_failure_in_json_has_the_manuals_number_and_the_devices_state() {
     let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
     assert_eq!(json["error"]["number"], "0x60000007");
     assert_eq!((&json["error"]["exit"], &json["error"]["device"]), (&6.into(), &"erased".into()));
+    assert_eq!(json["error"]["seen"]["bootloader"], true);
     server.join().unwrap();
 }
 
@@ -549,9 +549,13 @@ fn a_device_that_fails_has_the_exit_code_of_its_failure() {
     dead.erase_time = Duration::from_millis(5);
     dead.starts = Some(BOOTLOADER);
     for (fake, exit, words) in [
-        (refusing, 6, "[0x60000006]\n  the device: it has no complete program and stays in the bootloader"),
+        (
+            refusing,
+            6,
+            "[0x60000006]\n  the device: its bootloader is running; there is no complete program in it",
+        ),
         (absent, 5, "node 5 does not answer (reading 1000h/0) [0x60000013]"),
-        (dead, 7, "the program does not start"),
+        (dead, 7, "the trial failed, and the program is not released for autostart: it does not start"),
     ] {
         let (bus, server) = serve(fake);
         let file = data("plain-400.blk");

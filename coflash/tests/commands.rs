@@ -59,11 +59,11 @@ fn the_steps_of_an_update_one_by_one() {
     let (_, _, fake) = on(|| quick(BOOTLOADER), &["erase"]);
     assert_eq!(fake.writes(), ["command 03"; 2]);
 
-    let (said, _, fake) = on(|| quick(BOOTLOADER), &["sign"]);
-    assert_eq!(said.out, "node 5: program 1 is signed: it starts by itself from now on\n");
+    let (said, _, fake) = on(|| quick(BOOTLOADER), &["release"]);
+    assert_eq!(said.out, "node 5: program 1 is released for autostart: it starts by itself from now on\n");
     assert_eq!(fake.writes(), ["command 83"]);
-    let (said, _, fake) = on(|| quick(BOOTLOADER), &["unsign"]);
-    assert!(said.out.contains("is not signed any more"), "{}", said.out);
+    let (said, _, fake) = on(|| quick(BOOTLOADER), &["withdraw"]);
+    assert!(said.out.contains("is not released for autostart any more"), "{}", said.out);
     assert_eq!(fake.writes(), ["command 84"]);
 
     let (said, json, fake) = on(|| quick(BOOTLOADER), &["start"]);
@@ -82,10 +82,10 @@ fn a_step_that_fails_has_the_words_and_numbers_of_the_manual() {
             fake
         }
     };
-    let (said, json, _) = on(refusing(0x83, Outcome::Status(0x10)), &["sign"]);
+    let (said, json, _) = on(refusing(0x83, Outcome::Status(0x10)), &["release"]);
     assert_eq!((said.exit, &json["error"]["number"]), (6, &"0x60000110".into()));
-    assert!(said.err.starts_with("error: setting the signature failed: "), "{}", said.err);
-    let (said, json, _) = on(refusing(0x84, Outcome::AbortStatus(0x0800_0022, 0x84)), &["unsign"]);
+    assert!(said.err.starts_with("error: releasing the program for autostart failed: "), "{}", said.err);
+    let (said, json, _) = on(refusing(0x84, Outcome::AbortStatus(0x0800_0022, 0x84)), &["withdraw"]);
     assert_eq!((said.exit, &json["error"]["number"]), (6, &"0x60000184".into()));
     let (said, json, _) = on(refusing(0x01, Outcome::AbortStatus(0x0800_0022, 2)), &["start"]);
     assert_eq!((said.exit, &json["error"]["number"]), (7, &"0x60000014".into()));

@@ -18,7 +18,7 @@ use coflash::Adapter;
 use coflash::Error;
 use embedded_can::Frame as _;
 
-use fake::{Blocks, Bus, Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
+use fake::{left, Blocks, Bus, Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
 
 /// Abort codes (CiA 301 table 22).
 const WRITE_ONLY: u32 = 0x0601_0001;
@@ -210,12 +210,12 @@ fn a_lift_that_refuses_is_left_as_it_was_found() {
     let error = result.unwrap_err();
     assert!(matches!(error, Error::Refused { doing: Doing::Unlock, .. }), "{error}");
     assert!(error.advice().contains("password"), "{}", error.advice());
-    assert_eq!(events.last().and_then(Event::left), Some(DeviceState::Untouched));
+    assert_eq!(left(&events), DeviceState::Untouched);
 
     let (mut fake, _) = Lift::fake(APPLICATION, |_| {});
     let (result, events, _) = run_at(&mut fake, NODE, &FlashOptions::default());
     assert!(matches!(result, Err(Error::NoPassword { .. })));
-    assert_eq!((events.last().and_then(Event::left), fake.writes().len()), (Some(DeviceState::Untouched), 0));
+    assert_eq!((left(&events), fake.writes().len()), (DeviceState::Untouched, 0));
 
     // Another one is in its bootloader already.
     let (fake, _) = Lift::fake(APPLICATION, |_| {});
@@ -371,13 +371,13 @@ fn esacademy_says_what_went_wrong_by_the_error_register_alone() {
     let (mut fake, _) = EsAcademy::fake(|device| device.fails = true);
     let (result, events, _) = run_at(&mut fake, 64, &FlashOptions::default());
     assert!(matches!(result, Err(Error::Failed { doing: Doing::Program, .. })), "{result:?}");
-    assert_eq!(events.last().and_then(Event::left), Some(DeviceState::Erased));
+    assert_eq!(left(&events), DeviceState::Erased);
 
     for password in [[1, 2, 3, 4], [0x49, 0x4E, 0x49, 0x54]] {
         let (mut fake, _) = EsAcademy::fake(|device| device.password = Some(password));
         let (result, events, _) = run_at(&mut fake, 64, &FlashOptions::default());
         assert!(matches!(result, Err(Error::Refused { doing: Doing::Unlock, .. })), "{result:?}");
-        assert_eq!(events.last().and_then(Event::left), Some(DeviceState::Untouched));
+        assert_eq!(left(&events), DeviceState::Untouched);
     }
     let (mut fake, _) = EsAcademy::fake(|_| {});
     let (result, ..) = run_at(&mut fake, 64, &locked("no number"));
@@ -470,11 +470,6 @@ fn a_standard_device_is_stopped_cleared_written_and_started() {
             assert_eq!(commands, expected);
         }
     }
-    let (mut fake, _) = Standard::fake(0);
-    let options = FlashOptions::default().trial_run(true);
-    let (result, ..) = run_at(&mut fake, NODE, &options);
-    assert!(matches!(result, Err(Error::NotInDialect { dialect: Dialect::Raw, .. })), "{result:?}");
-    assert!(fake.writes().is_empty());
 }
 
 // --- telling them apart

@@ -57,6 +57,8 @@ fn an_update_tells_its_course_and_ends_with_done() {
             "phase erased",
             "progress",
             "phase verified",
+            "phase trial_starting",
+            "phase trial_passed",
             "phase released",
             "phase starting",
             "phase started",
@@ -72,7 +74,7 @@ fn an_update_tells_its_course_and_ends_with_done() {
     let last = lines.iter().rfind(|line| line["event"] == "progress").unwrap();
     assert_eq!((&last["done"], &last["total"]), (&json!(total), &json!(total)));
     let done = lines.last().unwrap();
-    assert_eq!((&done["state"], &done["error"]), (&json!("signed"), &Value::Null));
+    assert_eq!((&done["state"], &done["error"]), (&json!("released"), &Value::Null));
     assert_eq!(done["report"]["size"], 4001);
     assert_eq!(done["report"]["running"], APPLICATION);
 }

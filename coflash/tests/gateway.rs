@@ -178,7 +178,7 @@ fn block_files_go_through_a_gateway() {
         let mut fake = quick(APPLICATION);
         fake.knows_blocks = blocks;
         let (bus, lines, device) = behind(fake);
-        let options = ["--trial-run", "--sdo-timeout", "50"];
+        let options = ["--sdo-timeout", "50"];
         let done = coflash(&[&["--bus", &bus, "flash", "-N", "5", &file][..], &options].concat());
         assert_eq!(done.exit, 0, "{}\n{}", done.err, done.out);
         let device = device.lock().unwrap();

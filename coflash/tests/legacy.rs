@@ -181,7 +181,7 @@ fn attempts_of_a_request_are_as_many_as_said() {
         let mut fake = quick(BOOTLOADER);
         fake.on_command = Box::new(|_| Outcome::LoseRequest);
         let (bus, server) = serve(fake);
-        let words = ["--bus", &bus, "sign", "-N", "5", "--sdo-timeout", "40"];
+        let words = ["--bus", &bus, "release", "-N", "5", "--sdo-timeout", "40"];
         let done = coflash(&[&words[..], options].concat());
         assert_eq!(done.exit, 5, "{}", done.err);
         assert_eq!(server.join().unwrap().count("command 83"), times);

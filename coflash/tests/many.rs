@@ -109,9 +109,21 @@ fn a_port_waits_as_long_as_it_says_and_hears_its_own_node() {
         vec![(node(3), conversation(100)), (node(4), conversation(7)), (node(5), conversation(30))];
     let ended = hub::run(&mut bus, conversations, 3);
     let ms = Duration::from_millis;
-    assert_eq!(ended[0], (ms(100), vec![frame(0x583), frame(0x703), frame(0x083)]));
+    assert_eq!(ended[0], (ms(100), vec![frame(0x583), frame(0x603), frame(0x703), frame(0x083)]));
     assert_eq!(ended[1], (ms(7), vec![frame(0x584)]));
     assert_eq!(ended[2], (ms(30), vec![]));
+}
+
+/// Somebody else speaks to one of the devices: that one is left alone.
+#[test]
+fn somebody_else_is_heard_through_the_hub() {
+    let mut bus = devices([1, 2, 3]);
+    bus.0[1].inject(Frame::of(CobId::new(0x602).unwrap(), &[0x40, 0x57, 0x1F, 1, 0, 0, 0, 0]));
+    let results = flash_many(&mut bus, &jobs([1, 2, 3]), &ManyOptions::default(), &|_, _| {});
+    let not_alone =
+        matches!(&results[1], Err(failed) if matches!(failed.error, coflash::Error::NotAlone { .. }));
+    assert!(not_alone, "{results:?}");
+    assert!(results[0].is_ok() && results[2].is_ok() && bus.0[1].writes().is_empty(), "{results:?}");
 }
 
 #[test]
@@ -124,10 +136,10 @@ fn a_failure_stops_nobody_else() {
     bus.0[3].on_command = Box::new(|command| if command == 0x80 { Outcome::Ignore } else { Outcome::Accept });
     let (results, _) = run(&mut bus, &jobs(nodes), 3);
     let failed = |number: usize| results[number].as_ref().unwrap_err();
-    assert_eq!((failed(0).error.number(), failed(0).left), (0x6000_0013, DeviceState::Untouched));
-    assert_eq!((failed(1).error.number(), failed(1).left), (0x6000_0006, DeviceState::Erased));
-    assert_eq!((failed(2).error.number(), failed(2).left), (0x6000_0014, DeviceState::Signed));
-    assert_eq!((failed(3).error.number(), failed(3).left), (0x6000_0010, DeviceState::Called));
+    assert_eq!((failed(0).error.number(), failed(0).left.state), (0x6000_0013, DeviceState::Untouched));
+    assert_eq!((failed(1).error.number(), failed(1).left.state), (0x6000_0006, DeviceState::Erased));
+    assert_eq!((failed(2).error.number(), failed(2).left.state), (0x6000_0014, DeviceState::Unreleased));
+    assert_eq!((failed(3).error.number(), failed(3).left.state), (0x6000_0010, DeviceState::Untouched));
     for (result, fake) in results.iter().zip(&bus.0).skip(4) {
         assert!(result.is_ok(), "{result:?}");
         assert_eq!(fake.blocks.concat(), FILE);

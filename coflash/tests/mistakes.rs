@@ -284,17 +284,16 @@ const MISTAKES: &[Mistake] = &[
         Device(|| starts(None)),
         7,
         &[
-            "the program does not start: node 5 does not answer",
+            "node 5 does not answer since the program was started",
+            "switch the device off and on",
             "coflash catch",
-            "entry strap",
-            "rescue window",
         ],
     ),
     Mistake(
         "flash -N 5 {blk} {quick} --bus {bus}",
         Device(|| starts(Some(BOOTLOADER))),
         7,
-        &["the program does not start", "linked for this board"],
+        &["it does not start", "linked for this board"],
     ),
     Mistake(
         "flash -N 5 {blk} {quick} --bus {bus}",

@@ -10,12 +10,12 @@ use canopen::{CobId, Frame, NodeId};
 use coflash::device::info::info;
 use coflash::device::{Session, Timing, Transfers};
 use coflash::file::block_file::BlockFile;
-use coflash::update::event::{Phase, RepeatReason, Retry};
+use coflash::update::event::{Phase, RepeatReason, Retry, Warning};
 use coflash::update::{flash, DeviceState, Event, FlashOptions, Report, Target};
 use coflash::Adapter;
 use coflash::Error;
 use embedded_can::{Frame as _, StandardId};
-use fake::{Blocks, Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
+use fake::{left, Blocks, Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use proptest::prelude::*;
 
 fn file() -> BlockFile {
@@ -61,7 +61,7 @@ fn the_whole_procedure_from_a_running_application() {
     let mut fake = Fake::new(APPLICATION);
     let (report, events) = run(&mut fake, FlashOptions::default());
     let report = report.unwrap();
-    // Commands and their order: the manual's steps 3, 4, 6 to 9, 14 and 15.
+    // Commands and their order: the manual's steps 3, 4, 6 to 9, 10, 12, 14 and 15.
     let steps = [
         "command 80",
         "command 03",
@@ -71,6 +71,9 @@ fn the_whole_procedure_from_a_running_application() {
         "block 3",
         "block 4",
         "block -1",
+        // The trial.
+        "command 01",
+        "command 80",
         "command 83",
         "command 01",
     ];
@@ -101,7 +104,9 @@ fn the_whole_procedure_from_a_running_application() {
     assert_eq!(
         words[7..],
         [
-            "signed: the program starts by itself from now on",
+            "starting the program for a trial",
+            "the trial went well: an application (device type 00020192h) came up and came back",
+            "released for autostart (83h): the program starts by itself from now on",
             "starting the program",
             "running: an application (device type 00020192h)",
             report.to_string().as_str()
@@ -216,10 +221,7 @@ fn a_file_for_another_device_erases_nothing() {
         let error = result.unwrap_err();
         assert_eq!(error.number(), 0x6000_0180);
         assert_eq!(error.to_string(), "the program is for vendor-ID 00000000h, and node 5 has 0000003Fh");
-        assert_eq!(
-            (fake.writes().len(), events.last().and_then(Event::left)),
-            (0, Some(DeviceState::Untouched))
-        );
+        assert_eq!((fake.writes().len(), left(&events)), (0, DeviceState::Untouched));
 
         let mut fake = Fake::new(running);
         let error = run(&mut fake, check(Target { vendor_id: 0x3F, product_code: 1235 })).0.unwrap_err();
@@ -227,7 +229,7 @@ fn a_file_for_another_device_erases_nothing() {
 
         let mut fake = Fake::new(running);
         let right = check(Target { vendor_id: 0x3F, product_code: 1234 });
-        run(&mut fake, right.trial_run(true)).0.unwrap();
+        run(&mut fake, right).0.unwrap();
         // At first; bootloader and program on trial, which are compared; and the program with the file. What
         // block 0 tells is compared without being asked to, but for the vendor-ID, which is any there.
         assert_eq!((fake.count("read 1018/1"), fake.count("read 1018/2")), (4, 5));
@@ -240,7 +242,8 @@ fn verify_looks_once_more_at_the_running_program() {
     let mut fake = Fake::new(BOOTLOADER);
     let (report, events) = run(&mut fake, options);
     report.unwrap();
-    assert_eq!(fake.count("read 1F56/1"), 2);
+    // Before the erasure, behind the download, and at the end.
+    assert_eq!(fake.count("read 1F56/1"), 3);
     assert_eq!(fake.log.last().unwrap(), "read 1F56/1");
     let [.., last, Event::Done(_)] = events.as_slice() else { panic!("{events:?}") };
     assert_eq!(*last, Phase::VerifiedAgain { crc: file().program_crc() }.into());
@@ -249,51 +252,68 @@ fn verify_looks_once_more_at_the_running_program() {
     fake.crc_of_application = Some(0x1234_5678);
     let (result, events) = run(&mut fake, options);
     assert_eq!(result.unwrap_err().number(), 0x6000_0001);
-    assert_eq!(events.last().and_then(Event::left), Some(DeviceState::Signed));
-}
-
-#[test]
-fn a_failure_tells_how_it_leaves_the_device() {
-    let left = |running, change: &dyn Fn(&mut Fake), options| {
-        let mut fake = Fake::new(running);
-        change(&mut fake);
-        let (result, events) = run(&mut fake, options);
-        assert!(result.is_err());
-        events.last().and_then(Event::left).unwrap()
-    };
-    let (plain, trial) = (FlashOptions::default(), FlashOptions::default().trial_run(true));
-    let at = |state: DeviceState| state;
-    assert_eq!(left(BOOTLOADER, &|fake| fake.running = None, plain), at(DeviceState::Untouched));
-    let stays = |fake: &mut Fake| fake.on_command = script(0x80, usize::MAX, Outcome::Ignore);
-    assert_eq!(left(APPLICATION, &stays, plain), at(DeviceState::Called));
-    let refuses = |fake: &mut Fake| fake.on_block = script(2, 1, Outcome::Status(0x0C));
-    assert_eq!(left(BOOTLOADER, &refuses, plain), at(DeviceState::Erased));
-    assert_eq!(left(BOOTLOADER, &|fake| fake.crc = Some(1), plain), at(DeviceState::Erased));
-    assert_eq!(left(BOOTLOADER, &|fake| fake.starts = None, trial), at(DeviceState::Unsigned));
-    assert_eq!(left(BOOTLOADER, &|fake| fake.starts = None, plain), at(DeviceState::Signed));
-    // A run that goes well leaves nothing to tell.
-    let (_, events) = run(&mut Fake::new(BOOTLOADER), plain);
-    assert!(events.iter().all(|event| event.left().is_none()));
+    assert_eq!(left(&events), DeviceState::Released);
 }
 
 #[test]
 fn in_the_bootloader_no_call_and_without_start_none() {
     let mut fake = Fake::new(BOOTLOADER);
-    let report = run(&mut fake, FlashOptions::default().start(false)).0.unwrap();
-    assert_eq!((fake.writes()[0], *fake.writes().last().unwrap()), ("command 03", "command 83"));
-    assert_eq!((report.running, fake.running), (None, Some(BOOTLOADER)));
+    let (report, events) = run(&mut fake, FlashOptions::default().start(false));
+    let report = report.unwrap();
+    // Neither tried nor released for autostart.
+    assert_eq!((fake.writes()[0], *fake.writes().last().unwrap()), ("command 03", "block -1"));
+    assert_eq!((report.running, report.released, fake.running), (None, Some(false), Some(BOOTLOADER)));
+    assert!(events.contains(&Phase::NotReleased.into()), "{events:?}");
 }
 
 #[test]
-fn a_trial_run_comes_before_the_signature() {
+fn a_trial_run_comes_before_the_release() {
     let mut fake = Fake::new(BOOTLOADER);
-    run(&mut fake, FlashOptions::default().trial_run(true)).0.unwrap();
+    let report = run(&mut fake, FlashOptions::default()).0.unwrap();
     assert_eq!(fake.writes()[1 + BLOCKS..], ["command 01", "command 80", "command 83", "command 01"]);
-    // A program that fails its trial is never signed.
+    assert_eq!(report.released, Some(true));
     let mut fake = Fake::new(BOOTLOADER);
-    fake.starts = None;
-    let error = run(&mut fake, FlashOptions::default().trial_run(true)).0.unwrap_err();
-    assert_eq!((error.number(), fake.count("command 83")), (0x6000_0014, 0));
+    run(&mut fake, FlashOptions::default().trial_run(false)).0.unwrap();
+    assert_eq!(fake.writes()[1 + BLOCKS..], ["command 83", "command 01"]);
+}
+
+/// A program that fails its trial, however it does, is never released for autostart; what is said
+/// names that and the way back.
+#[test]
+fn a_program_that_fails_its_trial_is_not_released() {
+    let trial = |change: &dyn Fn(&mut Fake)| {
+        let mut fake = Fake::new(BOOTLOADER);
+        change(&mut fake);
+        let error = run(&mut fake, FlashOptions::default()).0.unwrap_err();
+        assert_eq!(fake.count("command 83"), 0, "{error}");
+        let start = "the trial failed, and the program is not released for autostart: ";
+        let text = error.to_string();
+        let rest = text.strip_prefix(start).unwrap_or_else(|| panic!("{text}")).to_string();
+        (error.number(), rest, error.advice())
+    };
+    let (number, words, advice) = trial(&|fake| fake.starts = None);
+    assert_eq!((number, &*words), (0x6000_0014, "node 5 does not answer since the program was started"));
+    assert!(
+        advice.contains("switch the device off and on") && advice.contains("coflash catch --node 5"),
+        "{advice}"
+    );
+    let (number, words, _) = trial(&|fake| fake.starts = Some(BOOTLOADER));
+    assert_eq!(number, 0x6000_0014);
+    assert!(
+        words.starts_with("it does not start, node 5 stays in the bootloader; there is no valid"),
+        "{words}"
+    );
+    let (number, words, _) = trial(&|fake| fake.on_command = script(0x80, usize::MAX, Outcome::Ignore));
+    assert_eq!(number, 0x6000_0010);
+    assert_eq!(words, "it runs in node 5, and does not go back to the bootloader when called");
+    let refused = Outcome::Abort(0x0602_0000);
+    let (number, words, advice) = trial(&|fake| fake.on_command = script(0x80, usize::MAX, refused));
+    assert_eq!(number, 0x6000_0010);
+    assert!(
+        words.starts_with("it runs in node 5, and refuses the call to the bootloader with abort 06020000h"),
+        "{words}"
+    );
+    assert!(advice.contains("--no-trial"), "{advice}");
 }
 
 #[test]
@@ -317,7 +337,7 @@ fn a_device_that_is_just_restarting_is_waited_for() {
     let mut fake = Fake::new(APPLICATION);
     fake.restart_time = Duration::from_millis(3500);
     run(&mut fake, FlashOptions::default()).0.unwrap();
-    assert_eq!((fake.count("command 80"), fake.count("command 01")), (1, 1));
+    assert_eq!((fake.count("command 80"), fake.count("command 01")), (2, 2));
 }
 
 #[test]
@@ -325,7 +345,7 @@ fn a_device_that_answers_on_before_it_restarts_is_not_taken_for_one_that_stays()
     let mut fake = Fake::new(APPLICATION);
     fake.leave_time = Duration::from_millis(1200);
     let report = run(&mut fake, FlashOptions::default()).0.unwrap();
-    assert_eq!((fake.count("command 80"), fake.count("command 01")), (1, 1));
+    assert_eq!((fake.count("command 80"), fake.count("command 01")), (2, 2));
     assert_eq!(report.running.map(|running| running.0), Some(APPLICATION));
 }
 
@@ -384,8 +404,8 @@ fn every_status_of_the_manual_has_its_number_and_words() {
             fake.on_command = script(0x83, usize::MAX, outcome);
             let error = fails(&mut fake);
             assert_eq!(error.number(), number);
-            assert!(error.to_string().starts_with("setting the signature failed: "), "{error}");
-            assert_eq!(fake.count("command 01"), 0);
+            assert!(error.to_string().starts_with("releasing the program for autostart failed: "), "{error}");
+            assert_eq!(fake.count("command 01"), 1, "that of the trial");
         }
     }
 }
@@ -452,7 +472,7 @@ fn a_lost_answer_or_request_costs_a_repeat_and_nothing_else() {
         for outcome in [Outcome::LoseAnswer, Outcome::LoseRequest] {
             let mut fake = Fake::new(APPLICATION);
             fake.on_command = script(command, 1, outcome);
-            let result = run(&mut fake, FlashOptions::default()).0;
+            let result = run(&mut fake, FlashOptions::default().trial_run(false)).0;
             // START is given once: a program that is already running would not know what to do with
             // it.
             let fatal = command == 0x01 && outcome == Outcome::LoseRequest;
@@ -463,9 +483,9 @@ fn a_lost_answer_or_request_costs_a_repeat_and_nothing_else() {
 
 #[test]
 fn a_long_erase_is_waited_for_without_flooding_the_bus() {
-    for deaf in [false, true] {
+    for (deaf, seconds) in [(false, 16), (true, 9)] {
         let mut fake = Fake::new(BOOTLOADER);
-        fake.erase_time = Duration::from_secs(16);
+        fake.erase_time = Duration::from_secs(seconds);
         fake.deaf_while_busy = deaf;
         run(&mut fake, FlashOptions::default()).0.unwrap();
         let reads = fake.count("read 1F57/1");
@@ -486,11 +506,48 @@ fn busy_for_ever_is_given_up() {
     assert_eq!(fails(&mut fake).number(), 0x6000_0013);
 }
 
+/// The power is cut while it erases: that is told after 2 s, and after 10 s it is over. A device that is
+/// busy and answers is waited for as long as a command may take.
+#[test]
+fn silence_is_told_and_comes_to_an_end_soon() {
+    for (silent, end) in [(None, 10), (Some(Duration::from_secs(4)), 4)] {
+        let mut fake = Fake::new(BOOTLOADER);
+        fake.erase_time = Duration::from_secs(100_000);
+        fake.deaf_while_busy = true;
+        let began = fake.now;
+        let timing = silent.map_or(Timing::default(), |silent| Timing::default().silent(silent));
+        let mut session = Session::new(&mut fake, node(), timing);
+        let mut events = Vec::new();
+        let error = flash(&mut session, &file(), &FlashOptions::default(), &mut |event| events.push(event))
+            .unwrap_err();
+        assert_eq!(error.to_string(), "node 5 does not answer (erasing the program)");
+        // The last look takes a second, and what came before the erasure some milliseconds.
+        let took = fake.now - began;
+        assert!(took >= Duration::from_secs(end) && took < Duration::from_secs(end + 3), "{took:?}");
+        let told: Vec<String> = events
+            .iter()
+            .filter(|event| matches!(event, Event::Warning(Warning::Silent { .. })))
+            .map(Event::to_string)
+            .collect();
+        let line = format!("no answer for 2 s (erasing the program), waiting up to {end} s");
+        assert_eq!(told, [line], "once");
+    }
+    // A device that answers all the while has nothing of the kind.
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.erase_time = Duration::from_secs(30);
+    let (result, events) = run(&mut fake, FlashOptions::default());
+    assert!(
+        result.is_ok() && !events.iter().any(|event| matches!(event, Event::Warning(Warning::Silent { .. }))),
+        "{result:?}"
+    );
+}
+
 /// A program that was started right behind its download takes the first 80h for "confirm": it answers,
 /// and goes on. It is asked again, and soon.
 #[test]
 fn an_application_that_takes_the_first_call_for_a_confirmation_is_called_again() {
     let mut fake = Fake::new(APPLICATION);
+    fake.erase_time = Duration::from_millis(500);
     let mut calls = 0;
     fake.on_command = Box::new(move |command| {
         calls += u32::from(command == 0x80);
@@ -501,7 +558,7 @@ fn an_application_that_takes_the_first_call_for_a_confirmation_is_called_again()
         }
     });
     let began = fake.now;
-    let report = run(&mut fake, FlashOptions::default()).0.unwrap();
+    let report = run(&mut fake, FlashOptions::default().trial_run(false)).0.unwrap();
     assert_eq!((fake.count("command 80"), fake.count("command 03")), (2, 1));
     assert_eq!(report.running.map(|running| running.0), Some(APPLICATION));
     let took = fake.now - began;
@@ -538,7 +595,7 @@ fn an_application_that_does_not_go_back() {
 }
 
 #[test]
-fn a_wrong_program_crc_is_never_signed() {
+fn a_wrong_program_crc_is_never_released() {
     let mut fake = Fake::new(BOOTLOADER);
     fake.crc = Some(0x1234_5678);
     let error = fails(&mut fake);
@@ -549,6 +606,7 @@ fn a_wrong_program_crc_is_never_signed() {
 
 #[test]
 fn a_program_that_does_not_come_up() {
+    let fails = |fake: &mut Fake| run(fake, FlashOptions::default().trial_run(false)).0.unwrap_err();
     let mut fake = Fake::new(BOOTLOADER);
     fake.starts = Some(BOOTLOADER);
     let error = fails(&mut fake);
@@ -615,7 +673,9 @@ fn cancelling_aborts_the_transfer() {
             }
         });
         assert_eq!(result.unwrap_err().number(), 0x6000_0011);
-        assert_eq!(*fake.log.last().unwrap(), "abort 08000000");
+        // What is asked then is how it was left.
+        let aborts = fake.log.iter().rposition(|entry| entry == "abort 08000000").unwrap();
+        assert!(fake.log[aborts + 1..].iter().all(|entry| entry.starts_with("read ")), "{:?}", fake.log);
         // The next run needs nothing but to be started.
         run(&mut fake, FlashOptions::default()).0.unwrap();
     }
@@ -637,8 +697,8 @@ fn an_adapter_that_goes_away_ends_it_at_any_frame() {
 fn another_program_number_is_another_sub_index() {
     let mut fake = Fake::new(BOOTLOADER);
     let error = run(&mut fake, FlashOptions::default().program(2)).0.unwrap_err();
-    let first = fake.sent.iter().find(|frame| frame.data()[0] & 0xE0 == 0x20).unwrap();
-    assert!(first.data()[..4] == [0x2F, 0x51, 0x1F, 2], "{first:?}");
+    let clear = fake.sent.iter().any(|frame| frame.data()[..5] == [0x2F, 0x51, 0x1F, 2, 3]);
+    assert!(clear, "{:?}", fake.sent);
     assert_eq!(error.number(), 0x6000_0025);
 }
 

@@ -7,13 +7,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
-use canopen::{Frame, NodeId};
+use canopen::{CobId, Frame, NodeId};
 use coflash::bus::AdapterError;
 use coflash::device::error::{Error, IdentityPart};
 use coflash::device::{Session, Timing};
 use coflash::file::block_file::BlockFile;
 use coflash::update::event::Phase;
-use coflash::update::{flash, Event, FlashOptions, Report};
+use coflash::update::{catch, flash, CatchOptions, Event, FlashOptions, Report};
 use coflash::Adapter;
 
 use fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
@@ -76,6 +76,136 @@ fn a_device_that_is_switched_on_later_is_waited_for_and_caught_in_its_rescue_win
     assert!(matches!(run(&mut late, &FlashOptions::default()).0, Err(Error::NoAnswer { .. })));
 }
 
+/// The same by itself: it is held, and nothing else is done to it.
+#[test]
+fn a_device_that_is_switched_on_is_caught() {
+    for (millis, within) in [(0, None), (50, None), (60_037, None), (59_000, Some(Duration::from_secs(60)))] {
+        let fake = Fake::new(BOOTLOADER);
+        let on = fake.now + Duration::from_millis(millis);
+        let mut late = Late { fake, on, asked: false };
+        let mut session = Session::new(&mut late, NodeId::new(NODE).unwrap(), Timing::default());
+        let mut events = Vec::new();
+        let options = CatchOptions::default().within(within);
+        let caught = catch(&mut session, &options, &mut |event| events.push(event)).unwrap();
+        assert_eq!(caught.node, NodeId::new(NODE));
+        assert!(caught.running.is_some_and(|running| running.is_bootloader()), "{caught:?}");
+        let searching =
+            events.iter().filter(|event| matches!(event, Event::Phase(Phase::Searching { .. }))).count();
+        assert_eq!(searching, usize::from(millis > 0), "{events:?}");
+        let took = session.now().saturating_sub(on);
+        assert!(took < Duration::from_millis(300), "{took:?}");
+        // Requests that were given up are aborted.
+        assert!(late.fake.writes().iter().all(|entry| entry.starts_with("abort ")), "{:?}", late.fake.log);
+    }
+    let fake = Fake::new(BOOTLOADER);
+    let (from, on) = (fake.now, fake.now + Duration::from_secs(59));
+    let mut late = Late { fake, on, asked: false };
+    let mut session = Session::new(&mut late, NodeId::new(NODE).unwrap(), Timing::default());
+    let options = CatchOptions::default().within(Some(Duration::from_secs(30)));
+    assert!(matches!(catch(&mut session, &options, &mut |_| {}), Err(Error::NoAnswer { .. })));
+    let took = session.now() - from;
+    assert!(took >= Duration::from_secs(30) && took < Duration::from_secs(31), "{took:?}");
+}
+
+#[test]
+fn an_application_that_answers_is_called_back_until_it_goes() {
+    let caught = |outcome, times, within| {
+        let mut fake = Fake::new(APPLICATION);
+        let mut calls = 0;
+        fake.on_command = Box::new(move |_| {
+            calls += 1;
+            if calls <= times {
+                outcome
+            } else {
+                Outcome::Accept
+            }
+        });
+        let mut session = Session::new(&mut fake, NodeId::new(NODE).unwrap(), Timing::default());
+        let caught = catch(&mut session, &CatchOptions::default().within(within), &mut |_| {});
+        (caught, fake.writes().len())
+    };
+    for outcome in [Outcome::Ignore, Outcome::Abort(0x0800_0022)] {
+        let (result, calls) = caught(outcome, 5, None);
+        assert_eq!((result.unwrap().node, calls), (NodeId::new(NODE), 6));
+        let (result, _) = caught(outcome, usize::MAX, Some(Duration::from_secs(20)));
+        assert!(matches!(result, Err(Error::NoBootloader { .. })), "{result:?}");
+    }
+}
+
+/// What comes up of which nobody knows the node-ID.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Kind {
+    /// A bootloader that starts its program 300 ms later unless it is asked, or a layer setting
+    /// service comes.
+    Bootloader,
+    /// An application.
+    Application,
+    /// A bootloader without node-ID, which answers "identify non-configured slave" alone (CiA 305).
+    WithoutNodeId,
+}
+
+struct Unknown {
+    fake: Fake,
+    on: Duration,
+    kind: Kind,
+    up: bool,
+    held: bool,
+}
+
+impl Adapter for Unknown {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        let (there, window) = (self.fake.now >= self.on, self.on + Duration::from_millis(300));
+        self.held |= there && self.fake.now < window;
+        if frame.cob_id().unwrap().get() == 0x7E5 {
+            let question = Some(&[0x4C, 0, 0, 0, 0, 0, 0, 0]);
+            assert_eq!(frame.exactly(), question, "nothing that changes a device");
+            if there && self.kind == Kind::WithoutNodeId {
+                self.fake.inject(Frame::of(CobId::LSS_RESPONSE, &[0x50, 0, 0, 0, 0, 0, 0, 0]));
+            }
+            self.fake.now += Duration::from_micros(250);
+            return Ok(());
+        }
+        self.fake.running = match self.kind {
+            _ if !there => None,
+            Kind::WithoutNodeId => None,
+            Kind::Bootloader if self.held => Some(BOOTLOADER),
+            Kind::Bootloader | Kind::Application => Some(APPLICATION),
+        };
+        self.fake.send(frame)
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        let there = self.fake.now >= self.on && self.kind != Kind::WithoutNodeId;
+        if there && !std::mem::replace(&mut self.up, true) {
+            self.fake.inject(Frame::of(CobId::new(0x700 + u16::from(NODE)).unwrap(), &[0]));
+        }
+        self.fake.receive(timeout)
+    }
+
+    fn now(&self) -> Duration {
+        self.fake.now
+    }
+}
+
+#[test]
+fn whoever_comes_up_is_caught_under_whatever_node_id() {
+    for kind in [Kind::Bootloader, Kind::Application, Kind::WithoutNodeId] {
+        let fake = Fake::new(BOOTLOADER);
+        let on = fake.now + Duration::from_millis(4_321);
+        let mut unknown = Unknown { fake, on, kind, up: false, held: false };
+        let mut session = Session::new(&mut unknown, NodeId::new(1).unwrap(), Timing::default());
+        let options = CatchOptions::default().any(true).within(Some(Duration::from_secs(10)));
+        let caught = catch(&mut session, &options, &mut |_| {});
+        match kind {
+            Kind::Bootloader => assert_eq!(caught.unwrap().node, NodeId::new(NODE)),
+            Kind::WithoutNodeId => assert_eq!(caught.unwrap().node, None),
+            // It may be another device than the one that is waited for: it is left alone.
+            Kind::Application => assert!(matches!(caught, Err(Error::NoAnswer { .. })), "{caught:?}"),
+        }
+        assert!(unknown.fake.writes().is_empty());
+    }
+}
+
 #[test]
 fn an_application_that_stays_is_asked_until_it_goes() {
     let stubborn = |refusal: Outcome| {
@@ -95,7 +225,7 @@ fn an_application_that_stays_is_asked_until_it_goes() {
         let mut fake = stubborn(refusal);
         let options = FlashOptions::default().wait(true);
         run(&mut fake, &options).0.unwrap();
-        assert_eq!(fake.count("command 80"), 6);
+        assert_eq!(fake.count("command 80"), 7, "the last one ends the trial");
         let error = run(&mut stubborn(refusal), &FlashOptions::default()).0.unwrap_err();
         assert!(matches!(error, Error::NoBootloader { .. }), "{error}");
     }
@@ -158,8 +288,8 @@ impl Maker for Told {
 }
 
 #[test]
-fn a_program_on_trial_that_is_another_device_is_called_back_and_never_signed() {
-    let trial = FlashOptions::default().trial_run(true);
+fn a_program_on_trial_that_is_another_device_is_called_back_and_never_released() {
+    let trial = FlashOptions::default();
     let fake = |told: Told, options: &FlashOptions| {
         let mut fake = Fake::new(BOOTLOADER);
         fake.maker = Some(Box::new(told));
@@ -216,5 +346,5 @@ fn a_program_on_trial_that_is_another_device_is_called_back_and_never_signed() {
     }
     // Without a trial nobody looks.
     let other = Told(|sub| (sub == 1).then_some(Ok(0x40)), None);
-    assert!(fake(other, &FlashOptions::default()).0.is_ok());
+    assert!(fake(other, &FlashOptions::default().trial_run(false)).0.is_ok());
 }

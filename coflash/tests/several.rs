@@ -42,7 +42,7 @@ fn a_list_of_nodes_is_updated_and_a_failure_stops_no_other() {
         "node 10: 100 %\n",
         "node 10: running: an application",
         "\nnode 9: error: writing block 0 failed: this part of the flash is protected (1F57h reads 0Eh) [0x60000007]\n  \
-         the device: it has no complete program and stays in the bootloader, ready for the next attempt\n",
+         the device: its bootloader is running; there is no complete program in it\n",
         "\n2 of 3 devices are done\n",
     ] {
         assert!(done.out.contains(words), "{words} is not in\n{}", done.out);
@@ -70,7 +70,7 @@ fn a_job_file_says_who_gets_what() {
     let job = folder.file(
         "job.toml",
         b"image = 'plain.blk'\n[[device]]\nnode = 5\n[[device]]\nnode = 6\nimage = 'small.hex'\nstart = false\n\
-          [[device]]\nnode = 7\ntrial-run = true\n",
+          [[device]]\nnode = 7\ntrial-run = false\n",
     );
     let (url, server) =
         serve(Bus(vec![device(5, BOOTLOADER), device(6, APPLICATION), device(7, BOOTLOADER)]));
@@ -81,7 +81,7 @@ fn a_job_file_says_who_gets_what() {
     assert_eq!((bus.0[0].blocks.concat(), bus.0[2].blocks.concat()), (plain.clone(), plain));
     // Block 0 and the last one around twelve bytes.
     assert_eq!((bus.0[1].blocks[1][20..24].to_vec(), bus.0[1].running), (vec![1, 2, 3, 4], Some(BOOTLOADER)));
-    assert_eq!((bus.0[0].count("command 80"), bus.0[2].count("command 80")), (0, 1));
+    assert_eq!((bus.0[0].count("command 80"), bus.0[2].count("command 80")), (1, 0));
     assert!(done.out.ends_with("3 of 3 devices are done\n"), "{}", done.out);
     // A bad image, and nobody is touched.
     fs::write(&small, b":020000040801F1\n:050000000102030405EC\n:00000001FF\n").unwrap();
@@ -285,8 +285,8 @@ fn an_interruption_aborts_the_transfer_and_tells_how_the_device_is_left() {
     assert_eq!(done.status.code(), Some(130), "{err}");
     assert_eq!(
         err,
-        "error: cancelled [0x60000011]\n  the device: it has no complete program and stays in the bootloader, ready for \
-         the next attempt\n  what to do: run the same command again when you like\n"
+        "error: cancelled [0x60000011]\n  the device: its bootloader is running; there is no complete program in it\n  \
+         what to do: run the same command again when you like\n"
     );
     let mut fake = server.join().unwrap();
     assert!(

@@ -47,13 +47,16 @@ fn the_steps_of_an_update_one_by_one() {
     assert!(on(&["status"]).contains("running"));
     assert_eq!(on(&["enter"]), "node 5: the bootloader is running\n");
     assert_eq!(on(&["enter"]), "node 5: the bootloader is running already\n");
-    assert!(on(&["unsign"]).contains("not signed any more"));
+    assert!(on(&["withdraw"]).contains("not released for autostart any more"));
     // START is a trial then, and the next reset ends in the bootloader.
     assert!(on(&["start"]).contains("an application"));
     nodes.await_line("serial 1, node 5: would start program 1, on trial");
     on(&["reset"]);
     nodes.await_line("serial 1, node 5: bootloader (Unsigned)");
-    assert_eq!(on(&["sign"]), "node 5: program 1 is signed: it starts by itself from now on\n");
+    assert_eq!(
+        on(&["release"]),
+        "node 5: program 1 is released for autostart: it starts by itself from now on\n"
+    );
     assert!(on(&["start"]).contains("an application"));
     // The application is called back before it is erased; then nothing is left of it.
     assert!(rest(&folder) > 190 * 1024);
@@ -61,7 +64,7 @@ fn the_steps_of_an_update_one_by_one() {
     assert_eq!(rest(&folder), 0, "erased, not only marked");
     let status = coflash.json(&["status", "-N", "5"]);
     assert_eq!((&status["crc"], &status["bootloader"]), (&json!(0), &json!(true)));
-    let refused = coflash.run(&["sign", "-N", "5"]);
+    let refused = coflash.run(&["release", "-N", "5"]);
     assert_eq!(refused.exit, 6, "{}", refused.err);
     assert_ne!(coflash.json(&["status", "-N", "5"])["status"]["error"], Value::Null);
     assert_eq!(coflash.json(&["status", "--clear", "-N", "5"])["status"]["error"], Value::Null);
@@ -104,7 +107,7 @@ fn an_update_in_all_its_ways() {
     let region = ["--start-address", "0x08010000", "--end-address", "0x0801FFFF"];
     let ways: [(&[&str], &[&str]); 6] = [
         (&board, &["--segmented", "--no-start"]),
-        (&board, &["--trial-run", "--verify", "--check-target"]),
+        (&board, &["--no-trial", "--verify", "--check-target"]),
         // The spellings of the manual's tools.
         (
             &board,
@@ -206,14 +209,20 @@ fn no_bus_no_node_no_sense() {
     let folder = folder("nobody");
     let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant"]);
     let coflash = Coflash::new(&folder, &nodes);
-    let quick = ["--sdo-timeout", "50", "-N", "9"];
+    // Each asks a node of its own: an update notices who else does.
+    let quick =
+        |number: usize| ["--sdo-timeout".to_string(), "50".into(), "-N".into(), (9 + number).to_string()];
     let commands: [&[&str]; 8] =
-        [&["info"], &["status"], &["start"], &["enter"], &["erase"], &["sign"], &["unsign"], FLASH];
-    let running = commands.map(|command| coflash.spawn(&[command, &quick].concat()));
-    for (running, command) in running.into_iter().zip(commands) {
+        [&["info"], &["status"], &["start"], &["enter"], &["erase"], &["release"], &["withdraw"], FLASH];
+    let running = commands.iter().enumerate().map(|(number, command)| {
+        let quick = quick(number);
+        coflash.spawn(&[command, &quick.each_ref().map(String::as_str)[..]].concat())
+    });
+    let running: Vec<_> = running.collect();
+    for (number, (running, command)) in running.into_iter().zip(commands).enumerate() {
         let done = running.wait();
         assert_eq!(done.exit, 5, "{command:?}: {}{}", done.out, done.err);
-        assert!(done.err.contains("node 9 does not answer"), "{}", done.err);
+        assert!(done.err.contains(&format!("node {} does not answer", 9 + number)), "{}", done.err);
     }
     let done = coflash.run(&["info", "-N", "5", "--bus", "socketcand://127.0.0.1:1/can0"]);
     assert_eq!(done.exit, 4, "{}", done.err);
@@ -228,28 +237,69 @@ fn no_bus_no_node_no_sense() {
     assert_eq!(done.exit, 7, "{}{}", done.out, done.err);
 }
 
-/// Two hosts at work on one node: each comes to an end and says what happened, and the node takes
-/// the next update.
+/// Two hosts at one node: the second one notices before it changes anything, by the lock of the first
+/// or by its requests, and the first one comes to its end.
 #[test]
-fn a_second_host_on_the_same_node_ends_in_words() {
+fn a_second_host_on_the_same_node_leaves_it_alone() {
     let folder = folder("two-hosts");
     let nodes = Nodes::start(&folder, &["--node", "5", "--stand-in"]);
     let coflash = Coflash::new(&folder, &nodes);
-    for round in 1..=2 {
+    let elsewhere = folder.path("elsewhere");
+    std::fs::create_dir_all(&elsewhere).unwrap();
+    let update = [FLASH, &["-N", "5", "-v", "--command-timeout", "5000"]].concat();
+    for (round, locks) in [(1, None), (2, Some(&elsewhere))] {
         folder.write("program.bin", &program(round));
-        let update = [FLASH, &["-N", "5", "-v", "--command-timeout", "5000"]].concat();
         let first = coflash.spawn(&update);
         first.await_text("10 %");
-        let second = coflash.spawn(&update);
-        for host in [first, second] {
-            let done = host.wait();
-            assert!(matches!(done.exit, 0 | 5 | 6 | 7), "{}: {}{}", done.exit, done.out, done.err);
-            assert_eq!(done.exit == 0, !done.err.contains("error: "), "{}", done.err);
-            assert!(!done.err.contains("panicked"), "{}", done.err);
-        }
-        coflash.done(&update);
+        let second = match locks {
+            None => coflash.spawn(&update),
+            Some(locks) => coflash.spawn_at(&update, locks),
+        };
+        let done = second.wait();
+        assert_eq!(done.exit, 6, "{}{}", done.out, done.err);
+        let how = if locks.is_none() {
+            "another coflash on this computer, process "
+        } else {
+            "another tool is at work"
+        };
+        assert!(done.err.contains(how) && done.err.contains("[0x60000012]"), "{}", done.err);
+        assert!(!done.out.contains("erase"), "{}", done.out);
+        let done = first.wait();
+        assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
         assert_eq!(folder.read("1.flash")[0x1_0000..0x4_2000], program(round));
     }
+    // Whoever is gone holds nothing.
+    coflash.done(&update);
+}
+
+/// Requests of another client of the same bus.
+#[test]
+fn a_client_that_asks_the_node_keeps_an_update_from_beginning() {
+    let folder = folder("two-clients");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let (stop, stopped) = std::sync::mpsc::channel::<()>();
+    let (ready, is_ready) = std::sync::mpsc::channel();
+    let address = nodes.address().to_owned();
+    let asks = std::thread::spawn(move || {
+        let mut stream = TcpStream::connect(address).unwrap();
+        assert_eq!(bus::message(&mut stream), "< hi >");
+        stream.write_all(b"< open can0 >").unwrap();
+        assert_eq!(bus::message(&mut stream), "< ok >");
+        ready.send(()).unwrap();
+        // Reads 1008h.
+        while stopped.recv_timeout(Duration::from_millis(50)) == Err(RecvTimeoutError::Timeout) {
+            stream.write_all(b"< send 605 8 40 8 10 0 0 0 0 0 >").unwrap();
+        }
+    });
+    is_ready.recv().unwrap();
+    let refused = coflash.run(&[FLASH, &["-N", "5"]].concat());
+    assert_eq!(refused.exit, 6, "{}", refused.err);
+    assert!(refused.err.contains("another tool is at work on node 5"), "{}", refused.err);
+    assert!(!refused.out.contains("erase"), "{}", refused.out);
+    drop(stop);
+    asks.join().unwrap();
+    coflash.done(&[FLASH, &["-N", "5"]].concat());
 }
 
 /// Somebody else fills the bus, also with frames that look like answers of other nodes and like
@@ -277,7 +327,7 @@ fn frames_of_others_are_passed_over() {
         }
         rounds
     });
-    coflash.done(&[FLASH, &["-N", "5", "--trial-run", "--verify"]].concat());
+    coflash.done(&[FLASH, &["-N", "5", "--verify"]].concat());
     drop(stop);
     assert!(noise.join().unwrap() > 10);
     assert_eq!(folder.read("1.flash")[0x1_0000..0x4_2000], program(0xA5));
@@ -299,10 +349,6 @@ fn dialects_are_found_out_or_named() {
             assert_eq!(done["running"], 0, "{done}");
         }
         assert_eq!(folder.read("1.flash")[0x1_0000..][..200 * 1024], program(0xA5));
-        // There is no signature to be tried without.
-        let refused = coflash.run(&[FLASH, &["-N", "5", "--dialect", "raw", "--trial-run"]].concat());
-        assert_eq!(refused.exit, 2, "{}", refused.err);
-        assert!(refused.err.contains("in the dialect raw"), "{}", refused.err);
     }
     let nodes =
         Nodes::start(&folder, &[&stand_in[..], &["--serial", "2", "--profile", "esacademy"]].concat());

@@ -47,6 +47,8 @@ fn the_file_holds_the_program_and_nothing_else() {
     let coflash = Coflash::new(&folder, &nodes);
     let said = coflash.done(&[FLASH, &["-N", "5", "--no-start"]].concat());
     assert!(said.contains(&format!("verified: CRC {CRC}")), "{said}");
+    assert!(said.contains("not released for autostart"), "{said}");
+    coflash.done(&["release", "-N", "5"]);
     let flash = folder.read("1.flash");
     assert!(flash[..0x8000].iter().all(|byte| *byte == 0xFF), "where the chip has its bootloader");
     assert!(flash[0x8000..0xC000].iter().any(|byte| *byte != 0xFF), "the parameters");
@@ -72,7 +74,7 @@ fn a_stand_in_answers_for_the_program_and_lets_itself_be_called_back() {
     let folder = folder("stand-in");
     let nodes = Nodes::start(&folder, &["--node", "7", "--flash", "instant", "--stand-in"]);
     let coflash = Coflash::new(&folder, &nodes);
-    let said = coflash.done(&[FLASH, &["-N", "7", "--trial-run", "--verify"]].concat());
+    let said = coflash.done(&[FLASH, &["-N", "7", "--verify"]].concat());
     assert!(said.contains("running: an application"), "{said}");
     nodes.await_line("serial 1, node 7: would start program 1, on trial");
     nodes.await_line("serial 1, node 7: bootloader (Requested)");
@@ -84,7 +86,6 @@ fn a_stand_in_answers_for_the_program_and_lets_itself_be_called_back() {
     assert!(said.contains("the bootloader is running"), "{said}");
     // The old program is no obstacle to the next one.
     coflash.done(&[FLASH, &["-N", "7", "--no-start"]].concat());
-    coflash.done(&["unsign", "-N", "7"]);
     coflash.done(&["reset", "-N", "7"]);
     nodes.await_line("serial 1, node 7: bootloader (Unsigned)");
     // What the bus was told is in the file when it is told.

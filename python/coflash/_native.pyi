@@ -15,7 +15,7 @@ def flash(
     address: Optional[int] = None,
     program: int = 1,
     check_target: bool = False,
-    trial_run: bool = False,
+    trial_run: bool = True,
     start: bool = True,
     verify: bool = False,
     repeats: int = 3,

@@ -51,7 +51,7 @@ mod _native {
 /// being `done`; what it raises ends the update in order and is raised again.
 #[pyfunction]
 #[pyo3(signature = (bus, node, file, on_event=None, *, board=None, address=None, program=1, check_target=false,
-                    trial_run=false, start=true, verify=false, repeats=3, dialect=None, unlock=None,
+                    trial_run=true, start=true, verify=false, repeats=3, dialect=None, unlock=None,
                     sdo_timeout=0.5))]
 #[allow(clippy::too_many_arguments, reason = "they are named in Python")]
 fn flash<'py>(

@@ -78,7 +78,7 @@ def test_flash_info_and_scan(nodes, image):
     assert {event["node"] for event in events} == {5}
     progress = [event for event in events if event["event"] == "progress"]
     assert progress[-1]["done"] == progress[-1]["total"] > len(program())
-    assert events[-1]["state"] == "signed" and events[-1]["error"] is None
+    assert events[-1]["state"] == "released" and events[-1]["error"] is None
     assert events[-1]["report"] == report
     assert all(isinstance(event["text"], str) for event in events)
 

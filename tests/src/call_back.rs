@@ -44,7 +44,8 @@ pub fn at_every_bit_rate(image: &str, mut then: impl FnMut(BitRate, Bench)) {
         bench.set_host_bit_rate(bits);
         bench.power_on();
         bench.await_boot_up(1000);
-        flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).expect("it is installed");
+        flash(&mut bench.session(), &blocks, &FlashOptions::default().trial_run(false), &mut |_| {})
+            .expect("it is installed");
         bench.events();
         let from = bench.time();
         bench.session().command(1, ProgramControl::StartBootloader).expect("it is answered");

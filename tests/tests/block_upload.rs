@@ -24,8 +24,13 @@ fn bootloader() -> Bench {
 
 fn application() -> Bench {
     let mut bench = bootloader();
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
-        .expect("a good program");
+    flash(
+        &mut bench.session(),
+        &firmware::blocks(firmware::APP_V1),
+        &FlashOptions::default().trial_run(false),
+        &mut |_| {},
+    )
+    .expect("a good program");
     bench
 }
 

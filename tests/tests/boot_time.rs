@@ -47,7 +47,8 @@ fn a_program_of_400_kib_is_checked_and_started_within_5_ms() {
     let mut bench = Bench::new();
     bench.power_on();
     bench.await_boot_up(100);
-    flash(&mut bench.session(), &large_program(), &FlashOptions::default(), &mut |_| {}).unwrap();
+    flash(&mut bench.session(), &large_program(), &FlashOptions::default().trial_run(false), &mut |_| {})
+        .unwrap();
     bench.confirm_program();
     bench.power_off();
     bench.run_ms(10);
@@ -65,8 +66,13 @@ fn the_bootloader_is_there_soon_after_a_power_on_and_a_call_back() {
     let mut bench = Bench::new();
     bench.power_on();
     let power_on = bench.await_boot_up(100) - Time(0);
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
-        .unwrap();
+    flash(
+        &mut bench.session(),
+        &firmware::blocks(firmware::APP_V1),
+        &FlashOptions::default().trial_run(false),
+        &mut |_| {},
+    )
+    .unwrap();
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     let answered = bench.time();
     let call_back = bench.await_boot_up(1000) - answered;

@@ -61,7 +61,7 @@ mod probe {
 const PAGE: u32 = 4096;
 
 fn install(bench: &mut Bench, image: &str) -> Report {
-    let options = FlashOptions::default().verify(true);
+    let options = FlashOptions::default().verify(true).trial_run(false);
     flash(&mut bench.session(), &firmware::blocks(image), &options, &mut |_| {}).unwrap()
 }
 
@@ -627,7 +627,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
 
     // And the right ones.
     let blocks = blocks_of(elf(firmware::APP_C), &Options::default().region(strict(1))).unwrap().file;
-    flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).unwrap();
+    flash(&mut bench.session(), &blocks, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
     assert_eq!(call(&mut bench, PROGRAM_INFO, [2, 9, 9, 9, 9]).words, [2, 0, 0, 0, 0]);
     for selector in [CONFIRM, INVALIDATE] {
         assert_eq!(call(&mut bench, selector, [2; 5]).status, NO_PROGRAM);
@@ -636,7 +636,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
     bench.await_boot_up(1000);
     let options = Options::default().region(strict(2));
     let blocks = blocks_of(elf(firmware::APP_C_PROGRAM_2), &options).unwrap().file;
-    let second = FlashOptions::default().program(2);
+    let second = FlashOptions::default().program(2).trial_run(false);
     let report = flash(&mut bench.session(), &blocks, &second, &mut |_| {}).unwrap();
     assert_eq!(number(&mut bench, Address::new(0x1F56, 2)), report.program_crc, "its own");
     let info = call(&mut bench, PROGRAM_INFO, [2, 9, 9, 9, 9]).words;

@@ -88,7 +88,7 @@ fn the_profile_of_esacademy_is_recognised_and_updated() {
     let wrong = FlashOptions::default().unlock(Password::new("0x57726F6E"));
     let (result, events) = update(&mut bench, ESACADEMY_NODE, &firmware::blocks(firmware::APP_V1), &wrong);
     assert!(matches!(result, Err(Error::Refused { doing: Doing::Unlock, .. })), "{result:?}");
-    assert_eq!(events.last().and_then(Event::left), Some(DeviceState::Untouched));
+    assert_eq!(events.last().and_then(Event::left).map(|left| left.state), Some(DeviceState::Untouched));
     // The next attempt has to wait.
     bench.run_ms(PENALTY_MS);
 
@@ -156,7 +156,7 @@ fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
     let wrong = FlashOptions::default().unlock(Password::new("Coboot"));
     let (result, events) = update(&mut bench, NODE, &blocks(APP_LIFT), &wrong);
     assert!(matches!(result, Err(Error::Refused { doing: Doing::Unlock, .. })), "{result:?}");
-    assert_eq!(events.last().and_then(Event::left), Some(DeviceState::Untouched));
+    assert_eq!(events.last().and_then(Event::left).map(|left| left.state), Some(DeviceState::Untouched));
     assert!(version(&mut bench, NODE).contains("2.0.0"), "it goes on");
     bench.assert_nothing_unmodelled();
 }

@@ -38,8 +38,13 @@ fn board(rate: BitRate) -> Bench {
 /// A board that runs the application template.
 fn running_board() -> Bench {
     let mut bench = board(BitRate::K125);
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
-        .expect("a good program");
+    flash(
+        &mut bench.session(),
+        &firmware::blocks(firmware::APP_V1),
+        &FlashOptions::default().trial_run(false),
+        &mut |_| {},
+    )
+    .expect("a good program");
     bench
 }
 

@@ -54,7 +54,7 @@ fn application() -> Bench {
     bench.power_on();
     bench.await_boot_up(100);
     let file = firmware::blocks(firmware::APP_DEBUGGER);
-    flash(&mut bench.session(), &file, &FlashOptions::default(), &mut |_| {}).unwrap();
+    flash(&mut bench.session(), &file, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
     bench.confirm_program();
     bench.events();
     bench
@@ -316,8 +316,13 @@ fn without_the_feature_there_is_no_interface() {
     bench.power_on();
     bench.await_boot_up(100);
     assert_eq!(command(&mut bench, 0, 0x2000_0000, 4), Some(0x0602_0000));
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
-        .unwrap();
+    flash(
+        &mut bench.session(),
+        &firmware::blocks(firmware::APP_V1),
+        &FlashOptions::default().trial_run(false),
+        &mut |_| {},
+    )
+    .unwrap();
     assert_eq!(command(&mut bench, 0, 0x2000_0000, 4), Some(0x0602_0000));
 }
 

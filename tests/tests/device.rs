@@ -6,6 +6,7 @@ use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coflash::device::Doing;
 use coflash::update::event::Phase;
+use coflash::update::steps::enter_bootloader;
 use coflash::update::{flash, Event, FlashOptions};
 use coflash::Error;
 use emulator::machine::{Options, ResetCause, Stop};
@@ -182,7 +183,9 @@ fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
         let flag = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
         let mut session = bench.session();
         session.cancel_by(std::sync::Arc::clone(&flag));
-        let outcome = flash(&mut session, &file, &FlashOptions::default(), &mut |_| {
+        // Without listening first, so that the times are those of the update itself.
+        let options = FlashOptions::default().alone(false);
+        let outcome = flash(&mut session, &file, &options, &mut |_| {
             if clock.get() >= deadline {
                 flag.store(true, std::sync::atomic::Ordering::Relaxed);
             }
@@ -210,13 +213,15 @@ fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
 fn a_trial_run_comes_back_to_the_bootloader_and_an_unsigned_program_does_not_start_by_itself() {
     let mut bench = empty_board();
     let file = firmware::blocks(firmware::APP_V1);
-    let options = FlashOptions::default().trial_run(true).start(false);
+    let options = FlashOptions::default();
     let mut trial_passed = false;
     flash(&mut bench.session(), &file, &options, &mut |event| {
         trial_passed |= matches!(event, Event::Phase(Phase::TrialPassed(_)));
     })
     .unwrap();
     assert!(trial_passed);
+    // It runs, and is called back for what follows.
+    enter_bootloader(&mut bench.session(), &mut |_| {}).unwrap();
     bench.session().command(1, ProgramControl::ClrSignature).unwrap();
     bench.session().await_idle(1, Doing::Command(ProgramControl::ClrSignature)).unwrap();
     let running = |bench: &mut Bench| {

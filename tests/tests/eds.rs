@@ -103,7 +103,8 @@ fn board() -> Bench {
 fn board_with_application() -> Bench {
     let mut bench = board();
     let file = firmware::blocks(firmware::APP_V1);
-    flash(&mut bench.session(), &file, &FlashOptions::default(), &mut |_| {}).expect("it takes the program");
+    flash(&mut bench.session(), &file, &FlashOptions::default().trial_run(false), &mut |_| {})
+        .expect("it takes the program");
     assert_eq!(bench.session().device_type().unwrap().map(|running| running.is_bootloader()), Some(false));
     bench
 }

@@ -10,6 +10,7 @@ use coboot_tests::firmware;
 use coflash::device::Doing;
 use coflash::file::convert::{blocks_of, Options};
 use coflash::file::read::{read, Format};
+use coflash::update::steps::release;
 use coflash::update::{flash, FlashOptions};
 
 /// The application template's way back (object 2000h), and that of the three which is a jump.
@@ -124,6 +125,7 @@ fn the_application_finds_the_chip_as_after_a_reset() {
     bench.await_boot_up(100);
     let options = FlashOptions::default().start(false);
     flash(&mut bench.session(), &blocks, &options, &mut |_| {}).unwrap();
+    release(&mut bench.session(), 1, &mut |_| {}).unwrap();
     bench.machine().reset_pin();
     bench.run_ms(RESCUE_WINDOW_MS + 100);
     assert_eq!(bench.machine().pc(), first, "it was started");

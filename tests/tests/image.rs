@@ -226,8 +226,13 @@ fn board_with_a_program() -> Bench {
     let mut bench = Bench::new();
     bench.power_on();
     bench.await_boot_up(100);
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
-        .unwrap();
+    flash(
+        &mut bench.session(),
+        &firmware::blocks(firmware::APP_V1),
+        &FlashOptions::default().trial_run(false),
+        &mut |_| {},
+    )
+    .unwrap();
     bench.confirm_program();
     bench.power_off();
     bench

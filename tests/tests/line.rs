@@ -85,7 +85,8 @@ fn stored_node_id_and_bit_rate_serve_bootloader_and_application_after_a_reset() 
 
     let file = firmware::blocks(firmware::APP_V1);
     let from = bench.time();
-    flash(&mut session(&mut bench, 42), &file, &FlashOptions::default(), &mut |_| {}).unwrap();
+    flash(&mut session(&mut bench, 42), &file, &FlashOptions::default().trial_run(false), &mut |_| {})
+        .unwrap();
     assert!(boot_up(&bench, 42, from).is_some());
     // And the application tells the same by LSS.
     configuration_state(&mut bench);
@@ -224,8 +225,13 @@ fn finds_the_bit_rate_of_a_bus_where_it_is_alone_with_the_master() {
 #[test]
 fn an_application_finds_the_bit_rate_too() {
     let mut bench = empty_board();
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
-        .unwrap();
+    flash(
+        &mut bench.session(),
+        &firmware::blocks(firmware::APP_V1),
+        &FlashOptions::default().trial_run(false),
+        &mut |_| {},
+    )
+    .unwrap();
     bench.session().command(1, canopen::program::ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
     store(&mut bench, NODE, BitRate::Auto);

@@ -24,7 +24,13 @@ fn board_at(rate: BitRate, bits: u32, image: &str) -> Bench {
     }
     bench.power_on();
     bench.await_boot_up(1000);
-    flash(&mut bench.session(), &firmware::blocks(image), &FlashOptions::default(), &mut |_| {}).unwrap();
+    flash(
+        &mut bench.session(),
+        &firmware::blocks(image),
+        &FlashOptions::default().trial_run(false),
+        &mut |_| {},
+    )
+    .unwrap();
     bench.run_ms(100);
     bench.events();
     bench

@@ -234,6 +234,7 @@ fn a_product_with_crc_16_is_updated_by_block_file() {
     let crc = crc16(&crc[..file.program_size() as usize]);
     flash(&mut bench.session(), &file, &options, &mut |_| {}).unwrap();
     let mut session = bench.session();
+    coflash::update::steps::release(&mut session, 1, &mut |_| {}).unwrap();
     assert_eq!(session.read_number(Address::new(0x1F56, 1)).unwrap(), crc);
 
     // Nobody confirmed it yet: boot-up of the bootloader, and that of the program 300 ms later.

@@ -99,6 +99,7 @@ fn a_pin_says_whether_a_program_is_valid() {
         let mut session = Session::new(&mut ids, node, Timing::default());
         let options = FlashOptions::default().start(false);
         flash(&mut session, &file, &options, &mut |_| {}).unwrap();
+        coflash::update::steps::release(&mut session, 1, &mut |_| {}).unwrap();
     }
     let restart = |bench: &mut Bench, valid: bool| {
         bench.power_off();

@@ -396,7 +396,7 @@ fn every_other_80h_is_a_call() {
         let mut bench = Bench::new();
         bench.power_on();
         bench.await_boot_up(100);
-        let options = FlashOptions::default().trial_run(true);
+        let options = FlashOptions::default();
         let began = bench.time();
         flash(&mut bench.session(), &firmware::blocks(image), &options, &mut |_| {}).unwrap();
         assert!(bench.time() - began < Span::from_millis(3000), "{image}: nobody was asked twice");

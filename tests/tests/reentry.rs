@@ -19,8 +19,13 @@ const INSTALLED: u32 = 1;
 const SIGNED: u32 = 2;
 
 fn install(bench: &mut Bench, node: u8, image: &str) {
-    flash(&mut bench.session_with(node), &firmware::blocks(image), &FlashOptions::default(), &mut |_| {})
-        .unwrap();
+    flash(
+        &mut bench.session_with(node),
+        &firmware::blocks(image),
+        &FlashOptions::default().trial_run(false),
+        &mut |_| {},
+    )
+    .unwrap();
 }
 
 /// A board that runs version 1.
@@ -129,13 +134,10 @@ fn a_trial_confirms_itself_through_the_callgate() {
     let mut bench = Bench::new();
     bench.power_on();
     bench.await_boot_up(100);
-    let options = FlashOptions::default().trial_run(true).start(false);
+    let options = FlashOptions::default().start(false);
     flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
-    for command in [ProgramControl::ClrSignature, ProgramControl::Start] {
-        bench.session().command(1, command).unwrap();
-        bench.run_ms(50);
-    }
-    bench.run_ms(500);
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    bench.run_ms(550);
     assert!(!bench.is_bootloader(NODE));
     assert_eq!(bench.session().read_number(CONFIRMATION).unwrap(), INSTALLED);
     power_cycle(&mut bench);

@@ -40,6 +40,7 @@ fn blocks(image: &str, program: usize) -> BlockFile {
 fn install(bench: &mut Bench, program: u8, file: &BlockFile) {
     let options = FlashOptions::default().program(program).start(false);
     flash(&mut bench.session(), file, &options, &mut |_| {}).unwrap();
+    coflash::update::steps::release(&mut bench.session(), program, &mut |_| {}).unwrap();
 }
 
 fn restart(bench: &mut Bench) {
@@ -145,7 +146,7 @@ fn a_second_program_is_written_to_a_running_device() {
         bench.power_on();
         bench.await_boot_up(100);
         let (one, two) = (blocks(first, 1), blocks(second, 2));
-        flash(&mut bench.session(), &one, &FlashOptions::default(), &mut |_| {}).unwrap();
+        flash(&mut bench.session(), &one, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
         let read = |bench: &mut Bench, index: u8, sub: u8| {
             bench.ask(0x601, &[0x40, index, 0x1F, sub, 0, 0, 0, 0], 0x581).expect("an answer")
         };

@@ -74,7 +74,7 @@ fn a_fault_of_the_bootloader_is_told_after_the_reset_that_follows() {
     bench.await_boot_up(100);
     // With a program installed: without the fault it would start.
     let file = firmware::blocks(firmware::APP_V1);
-    flash(&mut bench.session(), &file, &FlashOptions::default(), &mut |_| {}).unwrap();
+    flash(&mut bench.session(), &file, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
     bench.run_ms(20);
@@ -96,7 +96,7 @@ fn an_application_that_the_watchdog_ends_again_and_again_is_given_up() {
     bench.power_on();
     bench.await_boot_up(100);
     let file = firmware::blocks(firmware::APP_V1);
-    flash(&mut bench.session(), &file, &FlashOptions::default(), &mut |_| {}).unwrap();
+    flash(&mut bench.session(), &file, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
     bench.confirm_program();
     for crash in 1..=3 {
         bench.events();

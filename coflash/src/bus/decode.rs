@@ -385,8 +385,8 @@ fn worded(at: Address, data: &[u8]) -> String {
                     ProgramControl::ResetStat => "reset status",
                     ProgramControl::Clear => "clear",
                     ProgramControl::StartBootloader => "start the bootloader",
-                    ProgramControl::SetSignature => "set the signature",
-                    ProgramControl::ClrSignature => "clear the signature",
+                    ProgramControl::SetSignature => "release for autostart",
+                    ProgramControl::ClrSignature => "withdraw the release",
                 }
                 .to_string(),
             )

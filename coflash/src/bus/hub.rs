@@ -202,9 +202,11 @@ fn serve(adapter: &mut dyn Adapter, lines: &mut [Option<Line>], lost: &mut Optio
     }
 }
 
-/// Whether a frame comes from this node: answer, heartbeat or emergency.
+/// Whether a frame comes from this node (answer, heartbeat or emergency), or is somebody's request
+/// to it.
 fn concerns(frame: &Frame, node: NodeId) -> bool {
-    let from = |id: u16| id & 0x7F == u16::from(node.get()) && matches!(id & 0x780, 0x080 | 0x580 | 0x700);
+    let from =
+        |id: u16| id & 0x7F == u16::from(node.get()) && matches!(id & 0x780, 0x080 | 0x580 | 0x600 | 0x700);
     frame.cob_id().is_some_and(|id| from(id.get()))
 }
 

@@ -12,8 +12,8 @@ use super::health::Health;
 /// own (`BLCOP_BASE_REQUEST` and `BLCOP_BASE_RESPONSE` of the manual). To its user they are those of
 /// the predefined connection set, 600h and 580h with the node-ID on top.
 ///
-/// What comes on 580h itself and its node-IDs is of devices that the user does not speak to, and is
-/// left out.
+/// What comes on 580h and 600h themselves and their node-IDs is of devices that the user does not speak
+/// to, and is left out.
 #[derive(Debug)]
 pub struct SdoIds<A> {
     adapter: A,
@@ -56,7 +56,11 @@ impl<A: Adapter> Adapter for SdoIds<A> {
             if let Some(answer) = moved(&frame, self.response, RESPONSE) {
                 return Ok(Some(answer));
             }
-            if moved(&frame, RESPONSE, RESPONSE).is_none() {
+            // What others ask the node.
+            if let Some(request) = moved(&frame, self.request, REQUEST) {
+                return Ok(Some(request));
+            }
+            if [RESPONSE, REQUEST].iter().all(|base| moved(&frame, *base, *base).is_none()) {
                 return Ok(Some(frame));
             }
         }
@@ -107,13 +111,17 @@ mod tests {
             frame(0x4AA, &[0x60, 0, 0, 0, 0, 0, 0, 0]),
             // Another device, of the predefined connection set.
             frame(0x5AA, &[0x60, 1, 1, 1, 1, 1, 1, 1]),
+            frame(0x62A, &[0x40, 1, 1, 1, 1, 1, 1, 1]),
             frame(0x72A, &[0x7F]),
+            // Somebody else asks the device.
+            frame(0x6AA, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]),
         ];
         let mut adapter = SdoIds::new(Script { coming, ..Script::default() }, 0x680, 0x480);
         adapter.send(&frame(0x62A, &[0x40, 0, 0x10, 0, 0, 0, 0, 0])).unwrap();
         adapter.send(&frame(0x000, &[0x81, 0x2A])).unwrap();
         assert_eq!(adapter.adapter.sent, [CobId::new(0x6AA), CobId::new(0x000)]);
         let mut received = || adapter.receive(Duration::ZERO).unwrap().and_then(|frame| frame.cob_id());
-        assert_eq!([received(), received(), received()], [CobId::new(0x5AA), CobId::new(0x72A), None]);
+        let all = [received(), received(), received(), received()];
+        assert_eq!(all, [CobId::new(0x5AA), CobId::new(0x72A), CobId::new(0x62A), None]);
     }
 }

@@ -2,7 +2,9 @@
 
 use std::path::PathBuf;
 
+use canopen::NodeId;
 use coflash::bus::{self, Adapter, Kind, Link, SdoIds, Trace};
+use coflash::device::lock::Lock;
 
 use super::output::{Failure, Output};
 use super::search::{only, Kinds};
@@ -58,6 +60,11 @@ impl Context {
             Some(bus) => Ok(bus.to_string()),
             None => only(self.out, &self.kinds()),
         }
+    }
+
+    /// Sees to it that no other process of this computer is at work on the node.
+    pub(super) fn lock(&self, bus: Option<&str>, node: NodeId) -> Result<Lock, Failure> {
+        Ok(Lock::of(&self.url(bus)?, node)?)
     }
 
     fn traced(&self, adapter: Box<dyn Adapter + Send>) -> Result<Box<dyn Adapter + Send>, Failure> {

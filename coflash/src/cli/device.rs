@@ -56,6 +56,10 @@ pub(super) struct Patience {
     #[arg(long, default_value = "60000", value_parser = milliseconds, value_name = "MS")]
     command_timeout: Duration,
 
+    /// How long a device may say nothing at all while it carries out a command, in milliseconds.
+    #[arg(long, default_value = "10000", value_parser = milliseconds, value_name = "MS")]
+    silence_timeout: Duration,
+
     /// How long a restart may take, in milliseconds.
     #[arg(long, default_value = "5000", value_parser = milliseconds, value_name = "MS")]
     boot_timeout: Duration,
@@ -101,6 +105,7 @@ impl Patience {
             .sdo(self.sdo_timeout)
             .attempts(self.sdo_attempts)
             .command(self.command_timeout)
+            .silent(self.silence_timeout)
             .boot(self.boot_timeout);
         if self.delay.is_none() && self.repeats.is_none() {
             return timing;

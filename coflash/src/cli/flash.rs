@@ -6,6 +6,7 @@ use std::sync::Arc;
 use canopen::NodeId;
 use clap::Args;
 use coflash::bus::Link;
+use coflash::device::lock::Lock;
 use coflash::device::lss::{ensure_node_id, LssAddress};
 use coflash::device::Dialect;
 use coflash::file::block_file::BlockFile;
@@ -85,22 +86,32 @@ pub(super) struct Flash {
     #[arg(long)]
     check_target: bool,
 
-    /// Start the program once, compare its identity (1018h) with the bootloader's, and call it back,
-    /// before it is signed.
-    #[arg(long, alias = "chk_run")]
-    trial_run: bool,
+    /// Release the program for autostart without a trial. Otherwise, where the dialect has such a
+    /// release, it is started once, its identity (1018h) is compared with the bootloader's, and it is
+    /// called back.
+    #[arg(long)]
+    no_trial: bool,
+
+    /// The trial in the manual's spelling: there is one anyway.
+    #[arg(long = "chk_run", hide = true)]
+    chk_run: bool,
 
     /// Search until the bootloader is there or Ctrl-C ends it: the device may still be switched on,
     /// and an application that stays is asked again and again.
     #[arg(long)]
     wait: bool,
 
+    /// Go on although another tool speaks to the device, or another coflash of this computer is at work
+    /// on it.
+    #[arg(long)]
+    not_alone: bool,
+
     /// Leave a flying NMT master alone (CiA 302-2); otherwise it is asked for its place around the
     /// update of a lift device.
     #[arg(long)]
     no_mastership: bool,
 
-    /// Leave the device in the bootloader.
+    /// Leave the device in the bootloader, and the program untried and not released for autostart.
     #[arg(long)]
     no_start: bool,
 
@@ -248,12 +259,13 @@ impl Flash {
             .program(self.program)
             .repeats(self.block_repeats)
             .check_target(check_target)
-            .trial_run(settings.trial_run.unwrap_or(self.trial_run))
+            .trial_run(settings.trial_run.unwrap_or(!self.no_trial))
             .start(settings.start.unwrap_or(!self.no_start))
             .verify(settings.verify.unwrap_or(self.verify))
             .dialect(self.access.dialect())
             .unlock(self.access.unlock())
             .wait(self.wait)
+            .alone(!self.not_alone)
             .mastership(!self.no_mastership)
             .force(self.force))
     }
@@ -275,13 +287,24 @@ impl Flash {
         }
     }
 
+    /// Sees to it that no other process of this computer is at work on the node.
+    fn lock(&self, context: &Context, node: NodeId) -> Result<Option<Lock>, Failure> {
+        let bus = context.bus.clone().or_else(|| self.legacy.bus());
+        if self.not_alone {
+            Ok(None)
+        } else {
+            context.lock(bus.as_deref(), node).map(Some)
+        }
+    }
+
     fn one(&self, context: &Context, link: &mut Link, device: &Assignment) -> Result<(), Failure> {
         let node = self.node_of(link, device)?;
+        let _lock = self.lock(context, node)?;
         let mut session = self.patience.session(link, node)?;
         let mut progress = Progress::new(context.out);
         let mut left = None;
         let result = flash(&mut session, &device.file, &device.options, &mut |event| match event {
-            Event::Done(done) => left = Some(done.state),
+            Event::Done(done) => left = Some(done.left),
             event => progress.show(event),
         });
         progress.finish();
@@ -312,6 +335,7 @@ impl Flash {
     fn many(&self, context: &Context, link: &mut Link, devices: &[Assignment]) -> Result<(), Failure> {
         let mut outcomes: Vec<Option<Outcome>> = Vec::new();
         let mut jobs: Vec<(usize, Job)> = Vec::new();
+        let mut locks = Vec::new();
         for (number, device) in devices.iter().enumerate() {
             let image = device.image.display().to_string();
             let twice = |node| jobs.iter().any(|(_, job): &(usize, Job)| job.node == node);
@@ -321,10 +345,16 @@ impl Flash {
                     let failure = Failure::usage(format!("node {node} is in the job twice"), advice);
                     Some(Outcome { node: Some(node), name: device.name(), image, result: Err(failure) })
                 }
-                Ok(node) => {
-                    jobs.push((number, Job::new(node, device.file.clone(), device.options)));
-                    None
-                }
+                Ok(node) => match self.lock(context, node) {
+                    Ok(lock) => {
+                        locks.push(lock);
+                        jobs.push((number, Job::new(node, device.file.clone(), device.options)));
+                        None
+                    }
+                    Err(failure) => {
+                        Some(Outcome { node: Some(node), name: device.name(), image, result: Err(failure) })
+                    }
+                },
                 Err(failure) => {
                     Some(Outcome { node: device.node, name: device.name(), image, result: Err(failure) })
                 }

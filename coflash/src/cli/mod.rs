@@ -11,6 +11,7 @@ use self::search::Kinds;
 use self::values::base_id;
 
 mod adapters;
+mod catch;
 mod config;
 mod context;
 mod convert;
@@ -91,9 +92,10 @@ enum Command {
     Status(program::Status),
     Start(program::Start),
     Enter(program::Enter),
+    Catch(catch::Catch),
     Erase(program::Erase),
-    Sign(program::Sign),
-    Unsign(program::Unsign),
+    Release(program::Release),
+    Withdraw(program::Withdraw),
     Reset(reset::Reset),
     Read(read::Read),
     Lss(lss::Lss),
@@ -129,9 +131,10 @@ impl Command {
             Self::Status(status) => status.run(context),
             Self::Start(start) => start.run(context),
             Self::Enter(enter) => enter.run(context),
+            Self::Catch(catch) => catch.run(context),
             Self::Erase(erase) => erase.run(context),
-            Self::Sign(sign) => sign.run(context),
-            Self::Unsign(unsign) => unsign.run(context),
+            Self::Release(release) => release.run(context),
+            Self::Withdraw(withdraw) => withdraw.run(context),
             Self::Reset(reset) => reset.run(context),
             Self::Read(read) => read.run(context),
             Self::Lss(lss) => lss.run(context),

@@ -14,7 +14,7 @@ use coflash::device::{legacy, Session};
 use coflash::file::convert::ConvertError;
 use coflash::file::{judge, Cause, FileError};
 use coflash::update::job::Fault;
-use coflash::update::DeviceState;
+use coflash::update::{Left, Look};
 use coflash::Error;
 use serde_json::{json, Value};
 
@@ -212,7 +212,7 @@ pub(super) struct Failure {
     pub(super) legacy: u32,
     what: String,
     /// In what state the device is left, where that is known.
-    left: Option<DeviceState>,
+    left: Option<Left>,
     advice: Option<String>,
     /// Whether the document on standard output has it already.
     told: bool,
@@ -260,7 +260,7 @@ impl Failure {
     }
 
     /// The same, with the state in which the device is left.
-    pub(super) fn leaving(self, left: Option<DeviceState>) -> Self {
+    pub(super) fn leaving(self, left: Option<Left>) -> Self {
         Self { left, ..self }
     }
 
@@ -324,7 +324,16 @@ impl Failure {
                 "number": self.number.map(|number| format!("{number:#010x}")),
                 "exit": self.exit as u8,
                 "what": self.what,
-                "device": self.left.map(DeviceState::name),
+                "device": self.left.map(|left| left.state.name()),
+                "seen": self.left.and_then(|left| match left.look {
+                    Look::Seen(seen) => Some(json!({
+                        "device_type": seen.running.0,
+                        "bootloader": seen.running.is_bootloader(),
+                        "control": seen.control,
+                        "crc": seen.crc,
+                    })),
+                    Look::Silent | Look::NotAsked => None,
+                }),
                 "advice": self.advice,
             }
         })
@@ -376,10 +385,12 @@ impl From<Error> for Failure {
             | Error::WrongTarget { .. }
             | Error::NoProgram { .. }
             | Error::OtherRegion { .. }
+            | Error::NotAlone { .. }
             | Error::Lss { .. } => Exit::Device,
             Error::NoBootloader { .. }
             | Error::Occupied { .. }
             | Error::StartFailed { .. }
+            | Error::TrialFailed { .. }
             | Error::OtherIdentity { .. } => Exit::NoStart,
         };
         let legacy = legacy::exit_code(&error);

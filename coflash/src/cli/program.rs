@@ -1,14 +1,17 @@
-//! `coflash start`, `enter`, `erase`, `sign`, `unsign` and `status`: the single steps of an update.
+//! `coflash start`, `enter`, `erase`, `release`, `withdraw` and `status`: the single steps of an update.
 
 use canopen::program::ProgramState;
 use clap::Args;
 use coflash::device::info::{program_info, ProgramInfo};
 use coflash::device::Session;
 use coflash::update::event::{Event, Phase};
-use coflash::update::steps::{call_back, enter_bootloader, erase_at_once, reset_status, sign, start, unsign};
+use coflash::update::steps::{
+    call_back, enter_bootloader, erase_at_once, release, reset_status, start, withdraw,
+};
 use coflash::Error;
 use serde_json::{json, Value};
 
+use super::catch::{self, Limit};
 use super::context::Context;
 use super::device::Program;
 use super::output::Failure;
@@ -25,6 +28,14 @@ pub(super) struct Start {
 pub(super) struct Enter {
     #[command(flatten)]
     program: Program,
+
+    /// Wait for a device that does not answer yet, as coflash catch does: it may still be switched
+    /// on.
+    #[arg(long)]
+    wait: bool,
+
+    #[command(flatten)]
+    limit: Limit,
 }
 
 /// Erases the program. A running application is called back to the bootloader first.
@@ -34,16 +45,17 @@ pub(super) struct Erase {
     program: Program,
 }
 
-/// Signs the program, so that it starts by itself.
+/// Releases the program for autostart (83h of 1F51h), so that it starts by itself.
 #[derive(Debug, Args)]
-pub(super) struct Sign {
+pub(super) struct Release {
     #[command(flatten)]
     program: Program,
 }
 
-/// Takes the program's signature away, so that the device stays in the bootloader after a reset.
+/// Withdraws the program's release for autostart, so that the device stays in the bootloader after a
+/// reset.
 #[derive(Debug, Args)]
-pub(super) struct Unsign {
+pub(super) struct Withdraw {
     #[command(flatten)]
     program: Program,
 }
@@ -68,6 +80,8 @@ fn with(
 ) -> Result<(), Failure> {
     let mut link = context.link()?;
     let mut session = program.device.session(&mut link)?;
+    let _lock =
+        if command == "erase" { Some(context.lock(context.bus.as_deref(), session.node())?) } else { None };
     let (words, more) = act(&mut session, program.program, &mut |event| context.out.detail(event))
         .map_err(|error| Failure::diagnosed(error, &mut session))?;
     let node = session.node();
@@ -102,6 +116,9 @@ impl Start {
 
 impl Enter {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        if self.wait || self.limit.is_set() {
+            return catch::run(context, "enter", &self.program.device, &self.limit, false);
+        }
         with(context, "enter", &self.program, |session, _, tell| {
             let running = session.find()?;
             tell(Event::Found(running));
@@ -119,6 +136,7 @@ impl Enter {
 impl Erase {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         with(context, "erase", &self.program, |session, number, tell| {
+            session.ensure_alone()?;
             enter_bootloader(session, tell)?;
             let began = session.now();
             erase_at_once(session, number)?;
@@ -128,24 +146,27 @@ impl Erase {
     }
 }
 
-impl Sign {
+impl Release {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, "sign", &self.program, |session, number, tell| {
+        with(context, "release", &self.program, |session, number, tell| {
             // Nobody there is told at once; a command that goes unanswered is waited for.
             tell(Event::Found(session.find()?));
-            sign(session, number, tell)?;
-            Ok((format!("program {number} is signed: it starts by itself from now on"), json!({})))
+            release(session, number, tell)?;
+            let words =
+                format!("program {number} is released for autostart: it starts by itself from now on");
+            Ok((words, json!({})))
         })
     }
 }
 
-impl Unsign {
+impl Withdraw {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, "unsign", &self.program, |session, number, tell| {
+        with(context, "withdraw", &self.program, |session, number, tell| {
             tell(Event::Found(session.find()?));
-            unsign(session, number)?;
-            let words =
-                format!("program {number} is not signed any more: the device stays in the bootloader");
+            withdraw(session, number)?;
+            let words = format!(
+                "program {number} is not released for autostart any more: the device stays in the bootloader"
+            );
             Ok((words, json!({})))
         })
     }

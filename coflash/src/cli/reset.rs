@@ -15,7 +15,7 @@ use super::values::{milliseconds, node_id};
 
 /// Resets a device, or all of them, and shows who comes back.
 ///
-/// After a reset a device starts its program if that is signed and its autostart is on.
+/// After a reset a device starts its program if that is released for autostart and its autostart is on.
 #[derive(Debug, Args)]
 pub(super) struct Reset {
     /// The device's node-ID.

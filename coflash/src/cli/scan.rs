@@ -3,9 +3,11 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use canopen::program::ProgramState;
 use canopen::NodeId;
 use clap::Args;
 use coflash::bus::decode::state_words;
+use coflash::device::info::ProgramInfo;
 use coflash::device::scan::{scan, Found, ScanOptions};
 use coflash::device::Timing;
 use serde_json::{json, Value};
@@ -76,7 +78,7 @@ impl std::fmt::Display for Table<'_> {
                 ),
             };
         }
-        let heads = ["node", "runs", "name", "software", "serial", "program 1", "heartbeat"];
+        let heads = ["node", "runs", "name", "software", "serial", "program", "heartbeat"];
         let rows =
             std::iter::once(heads.map(String::from)).chain(self.found.iter().map(row)).collect::<Vec<_>>();
         let width = |column: usize| rows.iter().map(|row| row[column].len()).max().unwrap_or_default();
@@ -99,12 +101,33 @@ fn row((node, found): (&NodeId, &Found)) -> [String; 7] {
     let runs = if info.device_type.is_bootloader() { "bootloader" } else { "application" };
     let text = |text: &Option<String>| text.clone().unwrap_or_else(none);
     let serial = info.identity[3].map_or_else(none, |serial| format!("{serial:08X}h"));
-    let program = match info.programs.first().and_then(|program| program.status) {
-        None => none(),
-        Some(status) if status.busy => "busy".to_string(),
-        Some(status) => status.error.map_or("ok".to_string(), |error| format!("error {:02X}h", error.code())),
+    let program = match info.programs.as_slice() {
+        [] => none(),
+        [program] => cell(program),
+        programs => {
+            let cells = programs.iter().map(|program| format!("{} {}", program.number, cell(program)));
+            cells.collect::<Vec<_>>().join("; ")
+        }
     };
     [node, runs.to_string(), text(&info.name), text(&info.software_version), serial, program, state]
+}
+
+/// What is there of a program: the state that 1F51h tells, and the CRC of 1F56h. Its version is the
+/// software version of a device that runs it.
+fn cell(program: &ProgramInfo) -> String {
+    if program.status.is_some_and(|status| status.busy) {
+        return "busy".to_string();
+    }
+    let state = match program.state() {
+        Some(ProgramState::Absent) => return "none".to_string(),
+        Some(ProgramState::Running) => "running",
+        Some(ProgramState::Stopped) => "stopped",
+        None => "-",
+    };
+    match program.crc.filter(|crc| *crc != 0) {
+        None => state.to_string(),
+        Some(crc) => format!("{state}, CRC {crc:08X}h"),
+    }
 }
 
 fn values(found: &BTreeMap<NodeId, Found>) -> Vec<Value> {

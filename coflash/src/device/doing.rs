@@ -40,8 +40,8 @@ impl fmt::Display for Doing {
                 ProgramControl::ResetStat => "clearing the status",
                 ProgramControl::Clear => "erasing the program",
                 ProgramControl::StartBootloader => "calling the bootloader",
-                ProgramControl::SetSignature => "setting the signature",
-                ProgramControl::ClrSignature => "clearing the signature",
+                ProgramControl::SetSignature => "releasing the program for autostart",
+                ProgramControl::ClrSignature => "withdrawing the release for autostart",
             }),
         }
     }

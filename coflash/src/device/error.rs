@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use canopen::program::{FlashError, FlashStatus};
 use canopen::AbortCode;
-use canopen::NodeId;
+use canopen::{Address, NodeId};
 
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
@@ -140,12 +140,27 @@ pub enum Error {
         /// The node-ID.
         node: NodeId,
     },
+    /// Somebody else is at work on the device.
+    NotAlone {
+        /// Which device.
+        node: NodeId,
+        /// How that showed.
+        who: Intruder,
+    },
     /// A layer setting service failed.
     Lss {
         /// What the master was about.
         doing: LssDoing,
         /// How it failed.
         failure: LssFailure,
+    },
+    /// The program on trial was not heard of, or could not be called back: it is not released for
+    /// autostart.
+    TrialFailed {
+        /// Which device.
+        node: NodeId,
+        /// How it failed.
+        how: TrialFailure,
     },
     /// The program does not come up.
     StartFailed {
@@ -156,6 +171,28 @@ pub enum Error {
         /// What 1F57h says, if something.
         status: Option<FlashStatus>,
     },
+}
+
+/// How the trial of a program failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TrialFailure {
+    /// It was started, and nothing answers.
+    Silent,
+    /// The device stays in its bootloader; with what 1F57h says, if something.
+    NotStarted(Option<FlashStatus>),
+    /// It runs, and does not let itself be called back; with the abort code, where it refused.
+    Stays(Option<AbortCode>),
+    /// It was called back, and nothing answers any more.
+    Lost,
+}
+
+/// How it showed that somebody else is at work on a device.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Intruder {
+    /// Its SDO requests were heard; the object of the last one, where it said it.
+    Requests(Option<Address>),
+    /// Another process of this computer has the node locked; its number, where it says it.
+    Process(Option<u32>),
 }
 
 /// How a layer setting service failed.
@@ -230,6 +267,13 @@ impl From<AdapterError> for Error {
 }
 
 impl Error {
+    /// Whether the device has refused what it was told, at once and by an abort: it has not begun with
+    /// it.
+    #[must_use]
+    pub const fn is_refusal(&self) -> bool {
+        matches!(self, Self::Refused { .. } | Self::Failed { code: Some(_), .. })
+    }
+
     /// Whether the device has refused block 0 or the first one with data: one that erases with the
     /// first good data has lost nothing then.
     #[must_use]
@@ -256,13 +300,15 @@ impl Error {
             Self::NoProgram { .. } => 0x6000_0021,
             Self::NoBootloader { .. } => 0x6000_0010,
             Self::Cancelled => 0x6000_0011,
+            Self::NotAlone { .. } => 0x6000_0012,
             Self::NoAnswer { .. } => 0x6000_0013,
             Self::Lss { failure: LssFailure::NoAnswer, .. } => 0x6000_0013,
             Self::Lss { failure: LssFailure::None, .. } => 0x6000_0017,
             Self::NotInDialect { .. } | Self::NoPassword { .. } => 0x6000_0018,
             Self::Occupied { .. } => 0x6000_0010,
             Self::Lss { failure: LssFailure::Refused { code, .. }, .. } => 0x6000_0200 + *code as u32,
-            Self::StartFailed { .. } | Self::OtherIdentity { .. } => 0x6000_0014,
+            Self::TrialFailed { how: TrialFailure::Stays(_) | TrialFailure::Lost, .. } => 0x6000_0010,
+            Self::StartFailed { .. } | Self::TrialFailed { .. } | Self::OtherIdentity { .. } => 0x6000_0014,
             Self::Busy { .. } => 0x6000_0016,
             Self::Refused { .. } | Self::Protocol { .. } => 0x6000_0025,
         }
@@ -353,6 +399,20 @@ impl fmt::Display for Error {
             Self::Occupied { node } => {
                 write!(f, "node {node} answers already: another device is in its bootloader")
             }
+            Self::NotAlone { node, who } => match who {
+                Intruder::Requests(None) => {
+                    write!(f, "another tool is at work on node {node}: its SDO requests are heard")
+                }
+                Intruder::Requests(Some(at)) => {
+                    write!(f, "another tool is at work on node {node}: its SDO requests are heard, the last one for {at}")
+                }
+                Intruder::Process(None) => {
+                    write!(f, "another coflash on this computer is at work on node {node}")
+                }
+                Intruder::Process(Some(id)) => {
+                    write!(f, "another coflash on this computer, process {id}, is at work on node {node}")
+                }
+            },
             Self::Lss { doing, failure: LssFailure::NoAnswer } => {
                 write!(f, "no device answers ({})", doing.words())
             }
@@ -362,6 +422,33 @@ impl fmt::Display for Error {
                 match detail {
                     0 => Ok(()),
                     detail => write!(f, ", {detail} of its maker"),
+                }
+            }
+            Self::TrialFailed { node, how } => {
+                write!(f, "the trial failed, and the program is not released for autostart: ")?;
+                match how {
+                    TrialFailure::Silent => {
+                        write!(f, "node {node} does not answer since the program was started")
+                    }
+                    TrialFailure::NotStarted(status) => {
+                        write!(f, "it does not start, node {node} stays in the bootloader")?;
+                        match status.and_then(|status| status.error) {
+                            Some(error) => write!(f, "; {error} (1F57h reads {:02X}h)", error.code()),
+                            None => Ok(()),
+                        }
+                    }
+                    TrialFailure::Stays(None) => {
+                        write!(
+                            f,
+                            "it runs in node {node}, and does not go back to the bootloader when called"
+                        )
+                    }
+                    TrialFailure::Stays(Some(code)) => {
+                        write!(f, "it runs in node {node}, and refuses the call to the bootloader with abort {code}")
+                    }
+                    TrialFailure::Lost => {
+                        write!(f, "node {node} does not answer since the program was called back")
+                    }
                 }
             }
             Self::StartFailed { node, running, status } => {

@@ -86,6 +86,23 @@ pub struct ProgramInfo {
     pub status: Option<FlashStatus>,
 }
 
+impl ProgramInfo {
+    /// Whether there is a program, and whether it runs, as far as the device tells: some say by 1F51h
+    /// that there is none, others by a CRC of 0.
+    #[must_use]
+    pub const fn state(&self) -> Option<ProgramState> {
+        const STOPPED: u32 = ProgramState::Stopped as u32;
+        const RUNNING: u32 = ProgramState::Running as u32;
+        const ABSENT: u32 = ProgramState::Absent as u32;
+        match (self.control, self.crc) {
+            (Some(RUNNING), _) => Some(ProgramState::Running),
+            (Some(ABSENT), _) | (Some(STOPPED), Some(0)) => Some(ProgramState::Absent),
+            (Some(STOPPED), _) => Some(ProgramState::Stopped),
+            _ => None,
+        }
+    }
+}
+
 /// Asks a device for all of it.
 ///
 /// # Errors

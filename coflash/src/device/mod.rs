@@ -11,6 +11,7 @@ pub mod flying_master;
 pub mod info;
 pub mod legacy;
 mod listen;
+pub mod lock;
 pub mod lss;
 pub(crate) mod recognise;
 pub mod region;

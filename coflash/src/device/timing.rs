@@ -12,9 +12,12 @@ pub struct Timing {
     pub sdo: Duration,
     /// How often a read, or a write that may be repeated, is tried when no answer comes.
     pub attempts: u32,
-    /// A command's execution (erase, program, check): how long 1F57h may read busy, or the device
-    /// be silent.
+    /// A command's execution (erase, program, check): how long 1F57h may read busy.
     pub command: Duration,
+    /// How long a device may be silent while it carries out a command. Devices of other makers may be
+    /// unable to answer while they erase a sector, 2 s at worst on an STM32F4; those that erase all of
+    /// it before they answer have three times as long.
+    pub silent: Duration,
     /// A restart: how long a device may take until it answers again.
     pub boot: Duration,
     /// The first pause between two looks at a device that is at work. It doubles from look to look
@@ -29,9 +32,15 @@ impl Timing {
         sdo: Duration,
         attempts: u32,
         command: Duration,
+        silent: Duration,
         boot: Duration,
         poll_first: Duration,
         poll_most: Duration,
+    }
+
+    /// Patience with a device that may erase all of its flash before it answers.
+    pub(crate) fn erasing(&self) -> Self {
+        Self { sdo: self.sdo.max((3 * self.silent).min(self.command)), ..*self }
     }
 }
 
@@ -41,6 +50,7 @@ impl Default for Timing {
             sdo: Duration::from_millis(500),
             attempts: 3,
             command: Duration::from_secs(60),
+            silent: Duration::from_secs(10),
             boot: Duration::from_secs(5),
             poll_first: Duration::from_millis(10),
             poll_most: Duration::from_millis(250),

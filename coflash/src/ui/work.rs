@@ -98,12 +98,12 @@ fn single(session: &mut Session<'_>, shared: &Shared, number: u8, step: Step) ->
         }
         Step::Release => {
             tell(Event::Found(session.find()?));
-            steps::sign(session, number, &mut tell)?;
+            steps::release(session, number, &mut tell)?;
             format!("program {number} is released for autostart: it starts by itself from now on")
         }
         Step::Withhold => {
             tell(Event::Found(session.find()?));
-            steps::unsign(session, number)?;
+            steps::withdraw(session, number)?;
             format!(
                 "program {number} is not released any more: the device stays in the bootloader after a reset"
             )

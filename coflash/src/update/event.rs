@@ -10,10 +10,10 @@ use std::fmt;
 use canopen::NodeId;
 use serde::{Serialize, Serializer};
 
+pub use super::left::{DeviceState, Left};
 pub use super::phase::{Note, Phase, Warning};
 pub use super::report::Report;
 pub use super::retry::{RepeatReason, Retry};
-pub use super::state::DeviceState;
 use crate::device::{DeviceType, Error};
 use crate::json;
 
@@ -48,7 +48,8 @@ pub enum Event {
 #[non_exhaustive]
 pub struct Done {
     /// How the device is left.
-    pub state: DeviceState,
+    #[serde(flatten)]
+    pub left: Left,
     /// What was done, if all of it was.
     pub report: Option<Report>,
     /// What went wrong otherwise.
@@ -57,10 +58,10 @@ pub struct Done {
 
 impl Done {
     /// The end of an update that has come to this result, and leaves the device like this.
-    pub(super) fn new(state: DeviceState, result: &Result<Report, Error>) -> Self {
+    pub(super) fn new(left: Left, result: &Result<Report, Error>) -> Self {
         match result {
-            Ok(report) => Self { state, report: Some(*report), error: None },
-            Err(error) => Self { state, report: None, error: Some(Problem::of(error)) },
+            Ok(report) => Self { left, report: Some(*report), error: None },
+            Err(error) => Self { left, report: None, error: Some(Problem::of(error)) },
         }
     }
 }
@@ -110,9 +111,9 @@ impl Event {
 
     /// How a failed update leaves the device, if this is the end of one.
     #[must_use]
-    pub fn left(&self) -> Option<DeviceState> {
+    pub fn left(&self) -> Option<Left> {
         match self {
-            Self::Done(done) if done.error.is_some() => Some(done.state),
+            Self::Done(done) if done.error.is_some() => Some(done.left),
             _ => None,
         }
     }
@@ -154,7 +155,7 @@ impl fmt::Display for Done {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match &self.report {
             Some(report) => report.fmt(f),
-            None => write!(f, "the device: {}", self.state),
+            None => write!(f, "the device: {}", self.left),
         }
     }
 }

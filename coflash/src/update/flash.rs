@@ -4,44 +4,64 @@
 //! Step 1, making the blocks, is [`convert`](mod@crate::file::convert). Everything that can be judged
 //! before the device is touched is judged there and in `admission`.
 
+use std::cell::RefCell;
+
+use super::aftermath::look;
 use super::course::Course;
 use super::dialect::{self, Downloaded};
 use super::event::{Done, Event, Note, Phase, Report, Warning};
+use super::left::{Left, Look};
 use super::options::FlashOptions;
 use super::reach::reach;
 use super::steps::compare_crc;
+use crate::device::session::Silence;
 use crate::device::{flying_master, Error, Session};
 use crate::file::BlockFile;
 
 /// Puts a program into a device: finds out what runs there, calls the bootloader, erases, sends the
-/// blocks, compares the CRC, and as the options say tries, signs and starts it.
+/// blocks, compares the CRC, tries the program, releases it for autostart and starts it.
 ///
 /// `tell` hears what happens; the last it hears is [`Event::Done`], however it ends.
 ///
 /// A run that was interrupted at any point can be started again at once.
 ///
 /// # Errors
-/// The first step that fails ends the procedure. Until the program is signed, the device comes up
-/// in the bootloader.
+/// The first step that fails ends the procedure. Until the program is released for autostart, the
+/// device comes up in the bootloader.
 pub fn flash(
     session: &mut Session<'_>,
     file: &BlockFile,
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Report, Error> {
-    let mut course = Course::new(tell);
-    let result = procedure(session, file, options, &mut course);
-    if let Some(taken) = course.mastership {
+    let tell = RefCell::new(tell);
+    let silence = |silence: Silence| {
+        let Silence { doing, silent, limit, .. } = silence;
+        (tell.borrow_mut())(Warning::Silent { doing, silent, limit }.into());
+    };
+    let mut tell = |event| (tell.borrow_mut())(event);
+    let (original, timing) = (session.node(), *session.timing());
+    let mut inner = session.with(original, timing).tell_silence(&silence);
+    let mut course = Course::new(&mut tell);
+    let result = procedure(&mut inner, file, options, &mut course);
+    let left = match &result {
+        Ok(_) => Left { state: course.state, look: Look::NotAsked },
+        Err(error) => look(&mut inner, error, &course, original, options.program, file.program_crc()),
+    };
+    if let Some(taken) = course.mastership.take() {
         // What became of the update stands, whatever becomes of this.
-        if let Ok(master) = flying_master::give_back(session, taken) {
+        if let Ok(master) = flying_master::give_back(&mut inner, taken) {
             course.tell(match master {
                 Some(master) => Note::MasterBack { node: master.node }.into(),
                 None => Warning::MasterMissing.into(),
             });
         }
     }
-    let done = Done::new(course.state, &result);
-    course.tell(Event::Done(Box::new(done)));
+    course.tell(Event::Done(Box::new(Done::new(left, &result))));
+    // It may have followed the device to another node-ID.
+    let (node, transfers) = (inner.node(), inner.transfers());
+    session.talk_to(node);
+    session.transfer_by(transfers);
     result
 }
 
@@ -56,7 +76,10 @@ fn procedure(
     let original = session.node();
     let dialect = reach(session, file, options, course)?;
     let its = dialect::of(dialect);
-    let Downloaded { repeats, took: transfer } = its.download(session, file, options, course)?;
+    if options.alone {
+        session.still_alone()?;
+    }
+    let Downloaded { repeats, took: transfer, released } = its.download(session, file, options, course)?;
     let running = if options.start {
         course.tell(Phase::Starting.into());
         let running = its.start(session, original, options.program)?;
@@ -73,5 +96,5 @@ fn procedure(
     let took = session.now().saturating_sub(began);
     let (program_size, program_crc) = (file.program_size(), file.program_crc());
     let transfers = session.transfers();
-    Ok(Report { program_size, program_crc, repeats, took, transfer, transfers, running, dialect })
+    Ok(Report { program_size, program_crc, repeats, took, transfer, transfers, running, released, dialect })
 }

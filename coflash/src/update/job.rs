@@ -32,7 +32,7 @@ pub struct Settings {
     pub program: Option<u8>,
     /// Compare the device's identity first.
     pub check_target: Option<bool>,
-    /// Start the program once and call it back before it is signed.
+    /// Start the program once and call it back before it is released for autostart.
     pub trial_run: Option<bool>,
     /// Start the program at the end.
     pub start: Option<bool>,

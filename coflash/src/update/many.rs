@@ -5,8 +5,9 @@ use std::sync::Arc;
 
 use canopen::NodeId;
 
-use super::event::{DeviceState, Event, Report};
+use super::event::{Event, Report};
 use super::flash::flash;
+use super::left::{DeviceState, Left, Look};
 use super::options::FlashOptions;
 use crate::bus::{hub, Adapter, Gateway};
 use crate::device::{Error, Session, Timing, Transfers};
@@ -72,8 +73,8 @@ impl Default for ManyOptions {
 pub struct Failed {
     /// What went wrong.
     pub error: Error,
-    /// How far it had come.
-    pub left: DeviceState,
+    /// How it was left.
+    pub left: Left,
 }
 
 /// Updates all devices; a failure of one does not stop the others. `tell` hears what happens to
@@ -124,7 +125,7 @@ fn update(
 ) -> Result<Report, Failed> {
     session.cancel_by(all.cancelled.clone());
     session.transfer_by(all.transfers);
-    let mut left = DeviceState::Untouched;
+    let mut left = Left { state: DeviceState::Untouched, look: Look::NotAsked };
     let result = flash(session, &job.file, one, &mut |event| {
         left = event.left().unwrap_or(left);
         tell(event);

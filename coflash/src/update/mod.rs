@@ -2,6 +2,8 @@
 //! steps, and the same for many devices at once.
 
 mod admission;
+mod aftermath;
+mod catch;
 pub mod config;
 mod course;
 pub mod dialect;
@@ -9,6 +11,7 @@ pub mod event;
 mod flash;
 pub mod job;
 mod judge;
+mod left;
 pub mod many;
 mod options;
 mod password;
@@ -16,13 +19,14 @@ mod phase;
 mod reach;
 mod report;
 mod retry;
-mod state;
 pub mod steps;
 mod toml_line;
 mod trial;
 
-pub use self::event::{DeviceState, Event, Report};
+pub use self::catch::{catch, CatchOptions, Caught};
+pub use self::event::{Event, Report};
 pub use self::flash::flash;
+pub use self::left::{DeviceState, Left, Look, Seen};
 pub use self::many::{flash_in_turn, flash_many, ManyOptions};
 pub use self::options::{FlashOptions, Target};
 pub use self::password::Password;

@@ -21,9 +21,11 @@ pub struct FlashOptions {
     /// Compare the device's identity with this before anything is erased, and once more with that
     /// of the program on trial.
     pub check_target: Option<Target>,
-    /// Start the program once and call it back before it is signed (steps 10 to 13).
+    /// Start the program once and call it back before it is released for autostart (steps 10 to 13),
+    /// where the dialect has such a release and the program is to be started.
     pub trial_run: bool,
-    /// Start the program at the end (step 15).
+    /// Start the program at the end (step 15). One that is not to be started is not tried and not
+    /// released for autostart either.
     pub start: bool,
     /// Compare the CRC once more at the very end: the one that the program itself tells when it
     /// runs.
@@ -38,6 +40,8 @@ pub struct FlashOptions {
     /// Search until the bootloader is there or the user gives up (manual, chapter 5.2, step 1):
     /// neither silence nor an application that stays ends the procedure.
     pub wait: bool,
+    /// Stop before anything is changed where somebody else speaks to the device.
+    pub alone: bool,
     /// Ask for the NMT mastership around a lift's update, and give it back (CiA 814-1 clause 6.3).
     pub mastership: bool,
     /// Leave it to the device to judge the image: without that, what can be no program, or is for
@@ -57,6 +61,7 @@ impl FlashOptions {
         unlock: Option<Password>,
         follow: bool,
         wait: bool,
+        alone: bool,
         mastership: bool,
         force: bool,
     }
@@ -101,13 +106,14 @@ impl Default for FlashOptions {
             program: 1,
             repeats: 3,
             check_target: None,
-            trial_run: false,
+            trial_run: true,
             start: true,
             verify: false,
             dialect: None,
             unlock: None,
             follow: true,
             wait: false,
+            alone: true,
             mastership: true,
             force: false,
         }

@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::options::Target;
 use crate::device::info::Nameplate;
-use crate::device::{DeviceType, Dialect};
+use crate::device::{DeviceType, Dialect, Doing};
 use crate::json;
 
 /// An erasure that is over sooner than this was put off, or had little to do. Erasing a sector of
@@ -48,6 +48,8 @@ pub enum Phase {
     TrialPassed(DeviceType),
     /// Step 14: the program is released for autostart (83h).
     Released,
+    /// The program is left as it is, not released for autostart, because it is not to be started.
+    NotReleased,
     /// Step 15: the program starts.
     Starting,
     /// It runs.
@@ -108,6 +110,18 @@ pub enum Warning {
     },
     /// The NMT mastership was given back, and no node says that it has it.
     MasterMissing,
+    /// The device has not answered for a while, and is waited for.
+    Silent {
+        /// What it was told.
+        #[serde(serialize_with = "json::words")]
+        doing: Doing,
+        /// How long nothing has been heard of it.
+        #[serde(rename = "seconds", serialize_with = "json::seconds")]
+        silent: Duration,
+        /// How long it is waited for in all.
+        #[serde(rename = "limit_seconds", serialize_with = "json::seconds")]
+        limit: Duration,
+    },
 }
 
 impl fmt::Display for Phase {
@@ -126,7 +140,13 @@ impl fmt::Display for Phase {
             Self::Verified { crc } => write!(f, "verified: CRC {crc:08X}h"),
             Self::TrialStarting => f.write_str("starting the program for a trial"),
             Self::TrialPassed(running) => write!(f, "the trial went well: {running} came up and came back"),
-            Self::Released => f.write_str("signed: the program starts by itself from now on"),
+            Self::Released => {
+                f.write_str("released for autostart (83h): the program starts by itself from now on")
+            }
+            Self::NotReleased => f.write_str(
+                "not released for autostart: the device stays in the bootloader; coflash start tries the \
+                 program, coflash release releases it",
+            ),
             Self::Starting => f.write_str("starting the program"),
             Self::Started(running) => write!(f, "running: {running}"),
             Self::VerifiedAgain { crc } => write!(f, "verified once more: CRC {crc:08X}h"),
@@ -164,6 +184,12 @@ impl fmt::Display for Warning {
             Self::MasterMissing => {
                 f.write_str("NMT mastership given back, and nobody has said that it is the master")
             }
+            Self::Silent { doing, silent, limit } => write!(
+                f,
+                "no answer for {:.0} s ({doing}), waiting up to {:.0} s",
+                silent.as_secs_f64(),
+                limit.as_secs_f64()
+            ),
         }
     }
 }

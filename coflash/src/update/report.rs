@@ -33,6 +33,8 @@ pub struct Report {
     /// What runs now, if the program was started.
     #[serde(serialize_with = "running")]
     pub running: Option<DeviceType>,
+    /// Whether the program is released for autostart (83h); `None` in a dialect that knows no release.
+    pub released: Option<bool>,
     /// The dialect that the device speaks.
     pub dialect: Dialect,
 }

@@ -97,7 +97,8 @@ fn settle(
     session: &mut Session<'_>,
     wanted: impl Fn(DeviceType) -> bool,
 ) -> Result<Option<DeviceType>, Error> {
-    let deadline = session.now() + session.timing().boot;
+    let (began, boot) = (session.now(), session.timing().boot);
+    let deadline = began + boot;
     loop {
         // The boot-up message says when to look; without it (it may get lost) a look now and then
         // does.
@@ -107,6 +108,7 @@ fn settle(
         if seen.is_some_and(&wanted) || session.now() >= deadline {
             return Ok(seen);
         }
+        session.note_silence(began, boot, Doing::Restart);
     }
 }
 
@@ -137,7 +139,7 @@ pub(super) fn clear_and_wait(
     tell(Phase::Erasing.into());
     let began = session.now();
     let node = session.node();
-    let patient = Timing { sdo: session.timing().command, ..*session.timing() };
+    let patient = session.timing().erasing();
     session.with(node, patient).command(number, ProgramControl::Clear)?;
     tell(Phase::Erased { took: session.now().saturating_sub(began) }.into());
     Ok(())
@@ -158,21 +160,21 @@ pub fn erase_at_once(session: &mut Session<'_>, number: u8) -> Result<(), Error>
     Ok(())
 }
 
-/// Step 14: signs the program, so that it starts by itself.
+/// Step 14: releases the program for autostart (83h): from then on it starts by itself.
 ///
 /// # Errors
 /// As [`erase`].
-pub fn sign(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
+pub fn release(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
     execute(session, number, ProgramControl::SetSignature)?;
     tell(Phase::Released.into());
     Ok(())
 }
 
-/// Takes the signature away: the program does not start by itself any more.
+/// Withdraws the release for autostart (84h): the program does not start by itself any more.
 ///
 /// # Errors
 /// As [`erase`].
-pub fn unsign(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
+pub fn withdraw(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
     execute(session, number, ProgramControl::ClrSignature)
 }
 
@@ -237,6 +239,17 @@ pub fn verify(
 /// 1F56h: the CRC over the program that is in the device, 0 for none.
 pub(super) fn identification(session: &mut Session<'_>, number: u8) -> Result<u32, Error> {
     session.read_number(Address::new(program::PROGRAM_ID, number))
+}
+
+/// What 1F56h reads before the erasure, if it tells something: what it reads behind a failure can be
+/// compared with it.
+pub(super) fn told_before(session: &mut Session<'_>, number: u8) -> Result<Option<u32>, Error> {
+    match identification(session, number) {
+        Ok(crc) => Ok(Some(crc)),
+        Err(error @ (Error::Adapter(_) | Error::Cancelled)) => Err(error),
+        // It is no reason to fail: what comes next will tell.
+        Err(_) => Ok(None),
+    }
 }
 
 pub(super) fn compare_crc(session: &mut Session<'_>, number: u8, crc: u32) -> Result<(), Error> {

@@ -1,10 +1,10 @@
-//! The trial run: a program is started once before it is signed.
+//! The trial run: a program is started once before it is released for autostart.
 
 use super::course::Course;
 use super::event::Phase;
 use super::options::FlashOptions;
 use super::steps::{call_back, check_target, start};
-use crate::device::error::{Error, IdentityPart};
+use crate::device::error::{Error, IdentityPart, TrialFailure};
 use crate::device::info::{identity, Identity};
 use crate::device::Session;
 
@@ -16,17 +16,29 @@ pub(super) fn run(
 ) -> Result<(), Error> {
     let bootloader = identity(session)?;
     course.tell(Phase::TrialStarting.into());
-    let running = start(session, options.program)?;
+    let running = start(session, options.program).map_err(failed)?;
     let right = same_identity(session, bootloader).and_then(|()| match options.check_target {
         Some(target) => check_target(session, target),
         None => Ok(()),
     });
     // A program that is not the right one does not stay, either.
-    let back = call_back(session);
+    let back = call_back(session).map_err(failed);
     right?;
     back?;
     course.tell(Phase::TrialPassed(running).into());
     Ok(())
+}
+
+/// The same error, where it is one of a program that was just tried.
+fn failed(error: Error) -> Error {
+    let (node, how) = match error {
+        Error::StartFailed { node, running: Some(_), status } => (node, TrialFailure::NotStarted(status)),
+        Error::StartFailed { node, running: None, .. } => (node, TrialFailure::Silent),
+        Error::NoBootloader { node, running: Some(_), code } => (node, TrialFailure::Stays(code)),
+        Error::NoBootloader { node, running: None, .. } => (node, TrialFailure::Lost),
+        error => return error,
+    };
+    Error::TrialFailed { node, how }
 }
 
 /// Compares what the application on trial tells as its identity with what its bootloader told

@@ -11,6 +11,15 @@ use std::time::Duration;
 
 use canopen::{CobId, Frame};
 use coflash::bus::{Adapter, AdapterError};
+use coflash::update::{DeviceState, Event};
+
+/// What an update that failed has left in the device, by the events that it told.
+pub fn left(events: &[Event]) -> DeviceState {
+    match events.last() {
+        Some(Event::Done(done)) => done.left.state,
+        other => panic!("{other:?}"),
+    }
+}
 
 pub const NODE: u8 = 5;
 pub const APPLICATION: u32 = 0x0002_0192;

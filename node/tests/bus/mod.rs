@@ -189,6 +189,11 @@ impl<'a> Coflash<'a> {
     }
 
     pub fn spawn(&self, arguments: &[&str]) -> Running {
+        self.spawn_at(arguments, &self.folder.0)
+    }
+
+    /// The same, with its locks in this folder, as on another computer.
+    pub fn spawn_at(&self, arguments: &[&str], locks: &Path) -> Running {
         let nowhere = self.folder.path("nowhere");
         Running::start(
             Command::new(program())
@@ -197,6 +202,7 @@ impl<'a> Coflash<'a> {
                 .env("COFLASH_BUS", self.url)
                 .env("XDG_CONFIG_HOME", &nowhere)
                 .env("XDG_STATE_HOME", &nowhere)
+                .env("XDG_RUNTIME_DIR", locks)
                 .env_remove("COFLASH_CONFIG"),
         )
     }

@@ -353,7 +353,7 @@ impl Story {
 }
 
 fn write(bench: &mut Bench, file: &BlockFile) -> Result<(), String> {
-    match flash(&mut bench.session(), file, &FlashOptions::default(), &mut |_| {}) {
+    match flash(&mut bench.session(), file, &FlashOptions::default().trial_run(false), &mut |_| {}) {
         Ok(_) => Ok(()),
         Err(error) => Err(error.to_string()),
     }

@@ -3,7 +3,7 @@
 use canopen::program::FlashError;
 use canopen::AbortCode;
 
-use super::{Error, LssFailure};
+use super::{Error, LssFailure, TrialFailure};
 use crate::device::doing::{Doing, LssDoing};
 
 impl Error {
@@ -29,6 +29,9 @@ impl Error {
             Self::Occupied { node } => format!(
                 "finish the update of the device that is node {node} now, or switch that off, and run the command again"
             ),
+            Self::NotAlone { .. } => "wait until the other one is done, or end it, and run the command again; coflash flash \
+                                      --not-alone goes on all the same, at the risk that both fail"
+                .to_string(),
             Self::Protocol { .. } => "look for a second tool or a second device with this node-ID on the bus; a longer \
                                       --sdo-timeout helps against answers that come late"
                 .to_string(),
@@ -38,8 +41,8 @@ impl Error {
             Self::OtherRegion { .. } => "link the program for that place, or check --program and --board; \
                                          --force leaves that to the device"
                 .to_string(),
-            Self::OtherIdentity { .. } => "check that the program was made for this device: it is not signed; one that has an \
-                                           identity of its own is flashed without --trial-run"
+            Self::OtherIdentity { .. } => "check that the program was made for this device: it is not released for autostart; \
+                                           one that has an identity of its own is flashed with --no-trial"
                 .to_string(),
             Self::Busy { .. } => "give it more time with --command-timeout, or switch the device off and on".to_string(),
             Self::NoBootloader { code: Some(_), .. } => {
@@ -74,22 +77,36 @@ impl Error {
                 "check that the file was made for this board and this program number, and run the command again"
                     .to_string()
             }
+            Self::TrialFailed { how: TrialFailure::NotStarted(_), .. } => {
+                "check that the program was linked for this board and program number; the device waits in the \
+                 bootloader for another one"
+                    .to_string()
+            }
+            Self::TrialFailed { node, how: TrialFailure::Silent | TrialFailure::Lost } => format!(
+                "switch the device off and on: it comes up in the bootloader, ready for another program (coflash catch \
+                 --node {node} waits for it); the program may crash or have a wrong bit rate; for one that answers \
+                 under another node-ID than its bootloader there is --no-trial"
+            ),
+            Self::TrialFailed { node, how: TrialFailure::Stays(_) } => format!(
+                "switch the device off and on: it comes up in the bootloader, ready for another program (coflash catch \
+                 --node {node} waits for it); a program that cannot be called back is flashed with --no-trial"
+            ),
             Self::StartFailed { running: Some(running), .. } if running.is_bootloader() => {
                 "check that the program was linked for this board and program number; the device waits in the \
                  bootloader for another one"
                     .to_string()
             }
-            Self::StartFailed { .. } => "the program may not speak CANopen, use another node-ID or bit rate, or crash; \
-                                         coflash catch holds the device in the bootloader while it is switched off and on \
-                                         (rescue window), and so does the entry strap; then flash another one"
-                .to_string(),
+            Self::StartFailed { node, .. } => format!(
+                "the program may not speak CANopen, use another node-ID or bit rate, or crash: run coflash catch --node \
+                 {node}, switch the device off and on, and flash another one; if it is not caught, use its entry strap"
+            ),
         }
     }
 }
 
 fn failure_advice(error: FlashError) -> &'static str {
     match error {
-        FlashError::NoValidProgram => "flash a program, and let it be signed",
+        FlashError::NoValidProgram => "flash a program, and let it be released for autostart",
         FlashError::Format => "check that the file is a block file for this bootloader, or convert it again",
         FlashError::Crc => "run the command again; if it happens again, check bus and terminators",
         FlashError::NotCleared => {

@@ -91,9 +91,11 @@ impl Session<'_> {
     /// [`Error::Adapter`].
     pub fn send(&mut self, frame: &Frame) -> Result<(), Error> {
         match &mut self.way {
-            Way::Bus(adapter) => Ok(adapter.send(frame)?),
-            Way::Gateway(_) => Ok(()),
+            Way::Bus(adapter) => adapter.send(frame)?,
+            Way::Gateway(_) => return Ok(()),
         }
+        self.watch().sent(frame, self.node);
+        Ok(())
     }
 
     /// The next frame from the bus. Those that somebody else waits for are answered on the way. Of a
@@ -112,6 +114,9 @@ impl Session<'_> {
             if let Some(answer) = answer(frame) {
                 adapter.send(&answer)?;
             }
+        }
+        if let Some(frame) = &frame {
+            self.watch().received(frame, self.node, self.now());
         }
         Ok(frame)
     }

@@ -3,7 +3,7 @@
 
 use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use canopen::program::{self, FlashStatus, ProgramControl};
@@ -17,9 +17,14 @@ use crate::bus::adapter::Adapter;
 use crate::bus::gateway::Gateway;
 use crate::bus::{Health, Link};
 
+mod attention;
 mod listen;
 mod remote;
 mod transfer;
+mod watch;
+
+use self::watch::Watch;
+pub use self::watch::{Silence, SILENCE};
 
 /// The most bytes that are read at all: more than any microcontroller's flash has.
 pub const UPLOAD_MAX: usize = 64 * 1024 * 1024;
@@ -40,6 +45,8 @@ pub struct Session<'a> {
     transfers: Transfers,
     cancelled: Option<Arc<AtomicBool>>,
     answer: Option<fn(&Frame) -> Option<Frame>>,
+    watch: Arc<Mutex<Watch>>,
+    on_silence: Option<&'a dyn Fn(Silence)>,
 }
 
 impl fmt::Debug for Session<'_> {
@@ -71,7 +78,16 @@ impl<'a> Session<'a> {
     }
 
     fn over(way: Way<'a>, node: NodeId, timing: Timing) -> Self {
-        Self { way, node, timing, transfers: Transfers::default(), cancelled: None, answer: None }
+        Self {
+            way,
+            node,
+            timing,
+            transfers: Transfers::default(),
+            cancelled: None,
+            answer: None,
+            watch: Arc::default(),
+            on_silence: None,
+        }
     }
 
     /// The same conversation with another node, or with other patience, for a while.
@@ -82,7 +98,8 @@ impl<'a> Session<'a> {
             Way::Bus(adapter) => Way::Bus(&mut **adapter),
             Way::Gateway(gateway) => Way::Gateway(&mut **gateway),
         };
-        Session { way, node, timing, transfers, cancelled, answer }
+        let (watch, on_silence) = (self.watch.clone(), self.on_silence);
+        Session { way, node, timing, transfers, cancelled, answer, watch, on_silence }
     }
 
     /// Goes on with another node.
@@ -93,6 +110,11 @@ impl<'a> Session<'a> {
     /// Ends with [`Error::Cancelled`] as soon as `flag` is set: a transfer under way is aborted.
     pub fn cancel_by(&mut self, flag: Arc<AtomicBool>) {
         self.cancelled = Some(flag);
+    }
+
+    /// Goes on although the user gave up: for a last question.
+    pub(crate) fn cancel_by_nobody(&mut self) {
+        self.cancelled = None;
     }
 
     /// Answers by this to frames that come meanwhile, whatever else is under way: what it gives is
@@ -202,17 +224,17 @@ impl<'a> Session<'a> {
     }
 
     /// Waits until 1F57h of a program is no longer busy, and gives what it says then. Silence
-    /// counts as busy: a device may be unable to answer while it erases.
+    /// counts as busy for a while: a device may be unable to answer while it erases.
     ///
     /// # Errors
-    /// [`Error::Busy`] or [`Error::NoAnswer`] when [`Timing::command`] has passed, and what
-    /// [`read`](Self::read) has.
+    /// [`Error::Busy`] when [`Timing::command`] has passed, [`Error::NoAnswer`] when nothing has been
+    /// heard for [`Timing::silent`], and what [`read`](Self::read) has.
     pub fn await_idle(&mut self, number: u8, doing: Doing) -> Result<FlashStatus, Error> {
         let began = self.now();
         let at = Address::new(program::FLASH_STATUS, number);
         let mut pause = self.timing.poll_first;
         loop {
-            let silence = match self.read_once(at) {
+            match self.read_once(at) {
                 Ok(bytes) => {
                     let word = self::number(&bytes)
                         .ok_or(Error::Protocol { doing: Doing::Read(at), code: AbortCode::LENGTH })?;
@@ -220,14 +242,17 @@ impl<'a> Session<'a> {
                     if !status.busy {
                         return Ok(status);
                     }
-                    None
                 }
-                Err(error @ (Error::NoAnswer { .. } | Error::Protocol { .. })) => Some(error),
+                Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
                 Err(error) => return Err(error),
-            };
+            }
+            if self.silent_since(began) >= self.timing.silent {
+                return Err(Error::NoAnswer { node: self.node, doing });
+            }
+            self.note_silence(began, self.timing.silent, doing);
             let waited = self.now().saturating_sub(began);
             if waited >= self.timing.command {
-                return Err(silence.unwrap_or(Error::Busy { node: self.node, doing, waited }));
+                return Err(Error::Busy { node: self.node, doing, waited });
             }
             self.wait(pause)?;
             pause = (pause * 2).min(self.timing.poll_most);
@@ -258,15 +283,16 @@ impl<'a> Session<'a> {
     /// # Errors
     /// [`Error::NoAnswer`], and what a [read](Self::read) has.
     pub fn find(&mut self) -> Result<DeviceType, Error> {
-        let deadline = self.now() + self.timing.boot;
+        let began = self.now();
+        let doing = Doing::Read(Address::new(program::DEVICE_TYPE, 0));
         loop {
             if let Some(running) = self.device_type()? {
                 return Ok(running);
             }
-            if self.now() >= deadline {
-                let at = Address::new(program::DEVICE_TYPE, 0);
-                return Err(Error::NoAnswer { node: self.node, doing: Doing::Read(at) });
+            if self.now() >= began + self.timing.boot {
+                return Err(Error::NoAnswer { node: self.node, doing });
             }
+            self.note_silence(began, self.timing.boot, doing);
             let pause = self.timing.poll_first;
             self.await_boot_up(pause)?;
         }

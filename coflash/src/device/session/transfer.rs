@@ -7,7 +7,7 @@ use canopen::sdo::{Download, SdoError, Step, Transfer, Upload};
 use canopen::{AbortCode, Address, CobId, Instant};
 
 use super::listen::SLICE;
-use super::{Session, UPLOAD_MAX};
+use super::{Session, SILENCE, UPLOAD_MAX};
 use crate::device::doing::Doing;
 use crate::device::error::Error;
 use crate::device::timing::Transfers;
@@ -140,7 +140,8 @@ impl Session<'_> {
         while stale < 1000 && self.receive(Duration::ZERO)?.is_some() {
             stale += 1;
         }
-        let mut deadline = self.now() + self.timing.command;
+        let began = self.now();
+        let mut deadline = began + self.timing.command;
         let mut cancelled = false;
         let mut told = 0;
         let mut burst = 0;
@@ -168,7 +169,11 @@ impl Session<'_> {
                     let now = self.instant();
                     let left = if now.has_reached(until) { 0 } else { until.since(now) };
                     let left = Duration::from_millis(left.into());
-                    if let Some(frame) = self.receive(left.min(SLICE))? {
+                    let received = self.receive(left.min(SLICE))?;
+                    if received.is_none() && self.timing.sdo > SILENCE {
+                        self.note_silence(began, self.timing.sdo.max(self.timing.silent), doing);
+                    }
+                    if let Some(frame) = received {
                         let now = self.instant();
                         transfer.handle(&frame, now);
                         if transfer.progress() != told {

@@ -7,8 +7,9 @@ use super::procedure::{enter_by_call, Downloaded, Procedure};
 use crate::device::{DeviceType, Dialect, Doing, Error, Session, Transfers};
 use crate::file::block_file::{Block as FileBlock, BlockFile};
 use crate::update::course::Course;
-use crate::update::event::{DeviceState, Event, RepeatReason, Retry};
+use crate::update::event::{Event, Phase, RepeatReason, Retry};
 use crate::update::judge::{judge, Judgement};
+use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
 use crate::update::{steps, trial};
 
@@ -26,7 +27,8 @@ impl Procedure for Block {
         enter_by_call(session, running, Dialect::Block, options, course)
     }
 
-    /// Erases, sends the blocks, compares, tries if it is asked to, and signs.
+    /// Erases, sends the blocks, compares, tries the program and releases it for autostart. One that
+    /// is not to be started is neither tried nor released.
     fn download(
         &self,
         session: &mut Session<'_>,
@@ -35,27 +37,29 @@ impl Procedure for Block {
         course: &mut Course<'_>,
     ) -> Result<Downloaded, Error> {
         let number = options.program;
-        let before = std::mem::replace(&mut course.state, DeviceState::Erased);
-        steps::erase(session, number, &mut |event| course.tell(event))?;
-        let began = session.now();
-        let sent = send_blocks(session, file, options, course);
-        if sent.as_ref().is_err_and(Error::refuses_first_blocks)
-            && steps::identification(session, number).is_ok_and(|crc| crc != 0)
-        {
-            // The device erases with the first good data, and there were none: it still has the CRC
-            // of its program.
-            course.state = before;
+        let before = steps::told_before(session, number)?;
+        course.erases(before);
+        if let Err(error) = steps::erase(session, number, &mut |event| course.tell(event)) {
+            if error.is_refusal() {
+                course.erases_not();
+            }
+            return Err(error);
         }
-        let repeats = sent?;
+        let began = session.now();
+        let repeats = send_blocks(session, file, options, course)?;
         let took = session.now().saturating_sub(began);
         steps::verify(session, number, file.program_crc(), &mut |event| course.tell(event))?;
-        course.state = DeviceState::Unsigned;
+        course.state = DeviceState::Unreleased;
+        if !options.start {
+            course.tell(Phase::NotReleased.into());
+            return Ok(Downloaded { repeats, took, released: Some(false) });
+        }
         if options.trial_run {
             trial::run(session, options, course)?;
         }
-        steps::sign(session, number, &mut |event| course.tell(event))?;
-        course.state = DeviceState::Signed;
-        Ok(Downloaded { repeats, took })
+        steps::release(session, number, &mut |event| course.tell(event))?;
+        course.state = DeviceState::Released;
+        Ok(Downloaded { repeats, took, released: Some(true) })
     }
 }
 
@@ -73,10 +77,14 @@ fn send_blocks(
     let mut repeats = 0;
     course.tell(Event::Progress { done, total });
     for (block, bytes) in &blocks {
-        repeats += send_block(session, block.number, bytes, options, &mut |event| match event {
+        let sent = send_block(session, block.number, bytes, options, &mut |event| match event {
             Event::Progress { done: part, .. } => course.tell(Event::Progress { done: done + part, total }),
             event => course.tell(event),
-        })?;
+        });
+        // A device that puts the erasure off begins it with the first good data: with block 0 alone
+        // nothing is lost.
+        course.wrote |= block.number != 0 && !sent.as_ref().is_err_and(Error::refuses_first_blocks);
+        repeats += sent?;
         done += bytes.len();
         course.tell(Event::Progress { done, total });
     }

@@ -8,7 +8,8 @@ use super::whole::{self, Whole};
 use crate::device::error::{absent, optional};
 use crate::device::{DeviceType, Dialect, Error, Session};
 use crate::update::course::Course;
-use crate::update::event::{DeviceState, Note, Phase};
+use crate::update::event::{Note, Phase};
+use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
 use crate::update::steps::{call_back, clear_and_wait, CALL_BACK};
 
@@ -31,7 +32,6 @@ pub(super) fn enter(
 /// Erases, and sends this.
 pub(super) fn download(
     session: &mut Session<'_>,
-    dialect: Dialect,
     content: &[u8],
     crc: u32,
     options: &FlashOptions,
@@ -41,7 +41,7 @@ pub(super) fn download(
     let prepare = |session: &mut Session<'_>, course: &mut Course<'_>| {
         clear_and_wait(session, number, &mut |event| course.tell(event))
     };
-    let whole = Whole { dialect, content, crc, prepare: &prepare, status: whole::status };
+    let whole = Whole { content, crc, prepare: &prepare, status: whole::status };
     whole::download(session, &whole, options, course)
 }
 

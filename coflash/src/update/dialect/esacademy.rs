@@ -9,7 +9,7 @@ use super::procedure::{enter_by_call, Downloaded, Procedure};
 use super::restart::{arrived, reset_program};
 use super::whole::{self, idle, Said, Whole};
 use crate::device::error::{absent, optional};
-use crate::device::{DeviceType, Dialect, Doing, Error, Session, Timing};
+use crate::device::{DeviceType, Dialect, Doing, Error, Session};
 use crate::file::{ihex, BlockFile};
 use crate::update::course::Course;
 use crate::update::event::Note;
@@ -46,8 +46,8 @@ impl Procedure for EsAcademy {
     ) -> Result<Downloaded, Error> {
         let content = ihex::emit(&file.image()).into_bytes();
         let prepare = |session: &mut Session<'_>, course: &mut Course<'_>| unlock(session, options, course);
-        let (dialect, crc) = (Dialect::EsAcademy, file.program_crc());
-        let whole = Whole { dialect, content: &content, crc, prepare: &prepare, status };
+        let crc = file.program_crc();
+        let whole = Whole { content: &content, crc, prepare: &prepare, status };
         whole::download(session, &whole, options, course)
     }
 
@@ -73,7 +73,7 @@ fn unlock(session: &mut Session<'_>, options: &FlashOptions, course: &mut Course
     };
     let at = Address::new(program::ENABLE_FLASH, options.program);
     // It erases before it answers.
-    let patient = Timing { sdo: session.timing().command, ..*session.timing() };
+    let patient = session.timing().erasing();
     let written = session.with(node, patient).write(at, &password.to_le_bytes(), Doing::Unlock, &mut |_| {});
     match written {
         Ok(()) => course.tell(Note::Unlocked.into()),

@@ -30,6 +30,6 @@ impl Procedure for Hex {
         course: &mut Course<'_>,
     ) -> Result<Downloaded, Error> {
         let content = ihex::emit(&file.image()).into_bytes();
-        cia302::download(session, Dialect::Hex, &content, file.program_crc(), options, course)
+        cia302::download(session, &content, file.program_crc(), options, course)
     }
 }

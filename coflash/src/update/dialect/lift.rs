@@ -15,7 +15,8 @@ use crate::device::recognise::UNLOCK;
 use crate::device::{recognise, DeviceType, Dialect, Doing, Error, Session, Timing};
 use crate::file::BlockFile;
 use crate::update::course::Course;
-use crate::update::event::{DeviceState, Event, Note, Phase, Warning};
+use crate::update::event::{Event, Note, Phase, Warning};
+use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
 use crate::update::password::Password;
 
@@ -69,10 +70,10 @@ impl Procedure for Lift {
         options: &FlashOptions,
         course: &mut Course<'_>,
     ) -> Result<Downloaded, Error> {
-        let (dialect, content, crc) = (Dialect::Lift, file.flash_image(), file.program_crc());
+        let (content, crc) = (file.flash_image(), file.program_crc());
         // Unlocked already; what is there is overwritten.
         let prepare = |_: &mut Session<'_>, _: &mut Course<'_>| Ok(());
-        let whole = Whole { dialect, content: &content, crc, prepare: &prepare, status: whole::status };
+        let whole = Whole { content: &content, crc, prepare: &prepare, status: whole::status };
         whole::download(session, &whole, options, course)
     }
 

@@ -2,7 +2,7 @@
 //!
 //! | dialect | the program goes as | before | afterwards |
 //! |---|---|---|---|
-//! | [`Block`](Dialect::Block) | block file, an SDO download for each block | CLEAR | signature, START |
+//! | [`Block`](Dialect::Block) | block file, an SDO download for each block | CLEAR | trial, release for autostart (83h), START |
 //! | [`Raw`](Dialect::Raw) | image from the program's start, one download | CLEAR | START |
 //! | [`Hex`](Dialect::Hex) | Intel HEX text, one download | CLEAR | START |
 //! | [`EsAcademy`](Dialect::EsAcademy) | Intel HEX text, one download | password in 7F50h, which erases | it runs by itself |

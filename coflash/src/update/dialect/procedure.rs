@@ -7,7 +7,8 @@ use canopen::NodeId;
 use crate::device::{DeviceType, Dialect, Error, Session};
 use crate::file::BlockFile;
 use crate::update::course::Course;
-use crate::update::event::{DeviceState, Note, Phase};
+use crate::update::event::{Note, Phase};
+use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
 use crate::update::steps;
 
@@ -55,6 +56,8 @@ pub(in crate::update) struct Downloaded {
     pub(in crate::update) repeats: u32,
     /// How long the blocks took.
     pub(in crate::update) took: Duration,
+    /// Whether it is released for autostart; `None` in a dialect that knows no release.
+    pub(in crate::update) released: Option<bool>,
 }
 
 /// Asks an application for its bootloader as coboot's and SYS TEC's take it. Gives what the

@@ -29,6 +29,6 @@ impl Procedure for Raw {
         course: &mut Course<'_>,
     ) -> Result<Downloaded, Error> {
         let content = file.flash_image();
-        cia302::download(session, Dialect::Raw, &content, file.program_crc(), options, course)
+        cia302::download(session, &content, file.program_crc(), options, course)
     }
 }

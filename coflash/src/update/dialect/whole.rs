@@ -7,10 +7,11 @@ use canopen::Address;
 
 use super::procedure::Downloaded;
 use crate::device::error::absent;
-use crate::device::{Dialect, Doing, Error, Session, Timing, Transfers};
+use crate::device::{Doing, Error, Session, Timing, Transfers};
 use crate::update::course::Course;
-use crate::update::event::{DeviceState, Event, RepeatReason, Retry};
+use crate::update::event::{Event, RepeatReason, Retry};
 use crate::update::judge::{judge, Judgement};
+use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
 use crate::update::steps;
 
@@ -23,7 +24,6 @@ pub(super) type Said = Option<(FlashError, u16)>;
 
 /// What is sent, and what a dialect does around it.
 pub(super) struct Whole<'w> {
-    pub(super) dialect: Dialect,
     /// All that is sent.
     pub(super) content: &'w [u8],
     /// CRC of the program.
@@ -37,17 +37,13 @@ pub(super) struct Whole<'w> {
 /// Steps 4 to 9 with one download.
 ///
 /// # Errors
-/// [`Error::NotInDialect`] for a trial run, and what the device objects to.
+/// What the device objects to.
 pub(super) fn download(
     session: &mut Session<'_>,
     whole: &Whole<'_>,
     options: &FlashOptions,
     course: &mut Course<'_>,
 ) -> Result<Downloaded, Error> {
-    if options.trial_run {
-        let what = "there are no signatures, so no trial either";
-        return Err(Error::NotInDialect { dialect: whole.dialect, what });
-    }
     let began = session.now();
     let repeats = send(session, whole, options, course)?;
     let took = session.now().saturating_sub(began);
@@ -57,7 +53,7 @@ pub(super) fn download(
     if knows_crc(session)? {
         steps::verify(session, options.program, whole.crc, &mut |event| course.tell(event))?;
     }
-    Ok(Downloaded { repeats, took })
+    Ok(Downloaded { repeats, took, released: None })
 }
 
 /// Sends the program, with what each attempt begins with; gives how often it was repeated.
@@ -72,11 +68,12 @@ fn send(
     let total = content.len();
     let mut repeat = 0;
     loop {
-        let before = std::mem::replace(&mut course.state, DeviceState::Erased);
+        let before = if repeat == 0 { steps::told_before(session, options.program)? } else { None };
+        course.erases(before);
         if let Err(error) = (whole.prepare)(session, course) {
-            // A password that is refused erases nothing.
-            if matches!(error, Error::Refused { doing: Doing::Unlock, .. } | Error::NotInDialect { .. }) {
-                course.state = before;
+            // A password that is refused erases nothing, and no more does a command.
+            if error.is_refusal() || matches!(error, Error::NotInDialect { .. }) {
+                course.erases_not();
             }
             return Err(error);
         }
@@ -84,10 +81,15 @@ fn send(
         let slow = Timing { sdo: SLOW_SEGMENT.max(session.timing().sdo), ..*session.timing() };
         let node = session.node();
         let mut long = session.with(node, slow);
-        let mut progress = |part: u32| course.tell(Event::Progress { done: part as usize, total });
+        let mut progress = |part: u32| {
+            course.wrote |= part > 0;
+            course.tell(Event::Progress { done: part as usize, total });
+        };
         let sent = long.write(at, content, Doing::Program, &mut progress);
         let transfers = long.transfers();
         session.transfer_by(transfers);
+        // What got no answer may have arrived.
+        course.wrote |= !matches!(sent, Err(Error::Refused { .. }));
         if let Err(error @ (Error::Adapter(_) | Error::Cancelled)) = sent {
             return Err(error);
         }

@@ -1,0 +1,139 @@
+//! A program that never answers: it is not released for autostart, and one that was released by force
+//! is caught in its rescue window. The built firmware, in virtual time.
+
+use std::time::Duration;
+
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::firmware;
+use coflash::bus::{Adapter, AdapterError};
+use coflash::device::error::TrialFailure;
+use coflash::device::{Session, Timing};
+use coflash::file::block_file::BlockFile;
+use coflash::file::convert::{blocks_of, Options};
+use coflash::file::read::{read, Format};
+use coflash::update::{catch, flash, CatchOptions, Caught, DeviceState, FlashOptions, Left, Look};
+use coflash::Error;
+
+/// A jump to itself, in Thumb.
+const HERE: [u8; 2] = [0xFE, 0xE7];
+/// For so long nobody has power while it is knocked already.
+const DARK: Duration = Duration::from_millis(2345);
+
+/// A vector table, and a reset handler that does nothing for ever.
+fn mute() -> BlockFile {
+    let program = firmware::board().programs[0].base;
+    let mut image = vec![0; 0x400];
+    image[..4].copy_from_slice(&firmware::board().ram.end().to_le_bytes());
+    image[4..8].copy_from_slice(&((program + 0x200) | 1).to_le_bytes());
+    image[0x200..0x202].copy_from_slice(&HERE);
+    let image = read(&image, Some(Format::Raw), Some(program)).unwrap();
+    blocks_of(image, &Options::default()).unwrap().file
+}
+
+fn board() -> Bench {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    bench
+}
+
+fn fails(bench: &mut Bench, options: &FlashOptions) -> (Error, Left) {
+    let mut left = None;
+    let error = flash(&mut bench.session(), &mute(), options, &mut |event| {
+        if let Some(state) = event.left() {
+            left = Some(state);
+        }
+    });
+    (error.unwrap_err(), left.expect("how it was left"))
+}
+
+/// A bench whose boards get power at this time, while somebody knocks.
+struct Later<'b> {
+    bench: &'b mut Bench,
+    on: Option<Duration>,
+}
+
+impl Later<'_> {
+    fn tick(&mut self) {
+        if self.on.is_some_and(|on| self.bench.now() >= on) {
+            self.on = None;
+            self.bench.power_on();
+        }
+    }
+}
+
+impl Adapter for Later<'_> {
+    fn send(&mut self, frame: &canopen::Frame) -> Result<(), AdapterError> {
+        self.tick();
+        self.bench.send(frame)
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<canopen::Frame>, AdapterError> {
+        self.tick();
+        let until = self.bench.now() + timeout;
+        if let Some(on) = self.on.filter(|on| *on <= until) {
+            if let Some(frame) = self.bench.receive(on - self.bench.now())? {
+                return Ok(Some(frame));
+            }
+            self.tick();
+        }
+        self.bench.receive(until.saturating_sub(self.bench.now()))
+    }
+
+    fn now(&self) -> Duration {
+        self.bench.now()
+    }
+}
+
+/// Switches the board off, begins to knock, and switches it on.
+fn caught(bench: &mut Bench, options: CatchOptions) -> Caught {
+    bench.power_off();
+    bench.run_ms(100);
+    let on = Some(bench.now() + DARK);
+    let mut later = Later { bench, on };
+    let node = canopen::NodeId::new(NODE).unwrap();
+    let mut session = Session::new(&mut later, node, Timing::default());
+    catch(&mut session, &options.within(Some(DARK * 2)), &mut |_| {}).unwrap()
+}
+
+#[test]
+fn a_mute_program_is_not_released_and_the_device_comes_back() {
+    let mut bench = board();
+    let (error, left) = fails(&mut bench, &FlashOptions::default());
+    assert!(matches!(error, Error::TrialFailed { how: TrialFailure::Silent, .. }), "{error}");
+    assert!(error.to_string().contains("not released for autostart"), "{error}");
+    assert_eq!((left.state, left.look), (DeviceState::Unreleased, Look::Silent));
+    assert!(bench.session().device_type().unwrap().is_none(), "it runs, and says nothing");
+    let caught = caught(&mut bench, CatchOptions::default());
+    assert!(caught.running.is_some_and(|running| running.is_bootloader()), "{caught:?}");
+    // The next update needs nothing else.
+    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
+        .unwrap();
+    assert!(!bench.is_bootloader(NODE));
+    bench.assert_nothing_unmodelled();
+}
+
+#[test]
+fn a_mute_program_that_was_released_by_force_is_caught_in_its_rescue_window() {
+    for options in [CatchOptions::default(), CatchOptions::default().any(true)] {
+        let mut bench = board();
+        let (error, left) = fails(&mut bench, &FlashOptions::default().trial_run(false));
+        assert!(matches!(error, Error::StartFailed { running: None, .. }), "{error}");
+        assert_eq!((left.state, left.look), (DeviceState::Released, Look::Silent));
+        // It starts by itself: behind a power-on nobody answers. The first one is held back by what the
+        // host's controller still has to send, as nobody has acknowledged it.
+        for _ in 0..2 {
+            bench.power_off();
+            bench.run_ms(100);
+            bench.power_on();
+            bench.run_ms(1000);
+        }
+        assert!(bench.session().device_type().unwrap().is_none(), "the program runs");
+        let caught = caught(&mut bench, options);
+        assert_eq!(caught.node.map(canopen::NodeId::get), Some(NODE));
+        // It stays, however long nobody asks.
+        bench.run_ms(5000);
+        assert!(bench.is_bootloader(NODE));
+        bench.assert_nothing_unmodelled();
+    }
+}
