@@ -33,6 +33,7 @@ impl Ui {
         let mut options = Options::default();
         options.bus = context.bus.clone();
         options.port = self.port;
+        options.kinds = context.kinds();
         options.sdo_ids = match (context.sdo_request, context.sdo_response) {
             (None, None) => None,
             (request, response) => Some((request.unwrap_or(0x600), response.unwrap_or(0x580))),

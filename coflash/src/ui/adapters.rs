@@ -1,45 +1,34 @@
 //! The adapters that a page can offer: what this machine has.
 
+use std::time::Duration;
+
 use serde::Serialize;
+
+use crate::bus::{self, Found, Kind};
 
 /// One of them.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(super) struct Listed {
-    /// What goes into the field; a serial line lacks its bit rate, which the user knows.
+    /// What goes into the field; where the adapter sets the bit rate, the user corrects it.
     url: String,
     words: String,
 }
 
-/// Serial ports, and on Linux the CAN interfaces of the kernel.
-pub(super) fn list() -> Vec<Listed> {
-    let mut all = interfaces();
-    for port in serialport::available_ports().unwrap_or_default() {
-        let words = format!("{}, a serial line (SLCAN)", port.port_name);
-        all.push(Listed { url: format!("slcan:{}@500k", port.port_name), words });
-    }
-    all
+/// Those of these kinds, but for servers on the network: they are heard after 3 s only, and the page
+/// does not wait for them.
+pub(super) fn list(kinds: &[Kind]) -> Vec<Listed> {
+    let kinds: Vec<Kind> = kinds.iter().copied().filter(|kind| *kind != Kind::Socketcand).collect();
+    bus::list(&kinds, Duration::ZERO).found.into_iter().map(listed).collect()
 }
 
-#[cfg(target_os = "linux")]
-fn interfaces() -> Vec<Listed> {
-    /// ARPHRD_CAN of the kernel.
-    const CAN: &str = "280";
-    let mut all = Vec::new();
-    for entry in std::fs::read_dir("/sys/class/net").into_iter().flatten().flatten() {
-        let kind = std::fs::read_to_string(entry.path().join("type")).unwrap_or_default();
-        let name = entry.file_name().to_string_lossy().into_owned();
-        if kind.trim() == CAN {
-            all.push(Listed {
-                url: format!("socketcan:{name}"),
-                words: format!("{name}, a CAN interface of this machine"),
-            });
-        }
-    }
-    all.sort_by(|a, b| a.url.cmp(&b.url));
-    all
-}
-
-#[cfg(not(target_os = "linux"))]
-fn interfaces() -> Vec<Listed> {
-    Vec::new()
+fn listed(found: Found) -> Listed {
+    let url = match found.kind {
+        Kind::SocketCan | Kind::Socketcand => found.url,
+        Kind::Serial | Kind::Peak | Kind::Kvaser | Kind::GsUsb => format!("{}@500k", found.url),
+    };
+    let words = match found.state {
+        Some(state) => format!("{}, {state}", found.about),
+        None => found.about,
+    };
+    Listed { url, words }
 }

@@ -2,13 +2,12 @@
 
 use std::sync::Arc;
 
-use shared_abi::label;
 use shared_abi::layout;
 
 use super::state::{Firmware, Notice, Settings};
 use crate::file::convert::{blocks_of, ConvertError, Options, Region};
 use crate::file::inspect::{Inspection, Version};
-use crate::file::{self, AddressRange, BlockFile, Format};
+use crate::file::{self, label, AddressRange, BlockFile, Format};
 
 /// The most bytes of a file: an ELF of the largest program with all that a debugger wants to know.
 pub(super) const FILE_MAX: usize = 32 * 1024 * 1024;
@@ -84,12 +83,7 @@ fn label_of(file: &BlockFile) -> Option<(u32, u32, Option<String>)> {
             Some((identity.vendor_id, identity.product_code, Some(Version(version).to_string())))
         }
         Control::Plain => {
-            let first = file.program_start().checked_add(label::OFFSET)?;
-            let last = first.checked_add(label::SIZE as u32 - 1)?;
-            let part = file.image().part(AddressRange { first, last })?;
-            let (start, bytes) = part.segments().next()?;
-            let bytes = bytes.first_chunk().filter(|_| start == first)?;
-            let label = label::Label::parse(bytes)?;
+            let label = label::label_of(&file.image(), file.program_start())?;
             Some((label.vendor_id, label.product_code, Some(format!("{:08X}h", label.version))))
         }
     }

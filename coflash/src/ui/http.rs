@@ -25,6 +25,7 @@ use super::job::{Job, Step};
 use super::shared::{lock, Order, Refusal, Shared};
 use super::state::{Fits, Notice, Settings};
 
+use crate::bus::Kind;
 use crate::device::lss::{BitRate, LssAddress};
 use crate::update::FlashOptions;
 
@@ -36,6 +37,8 @@ const BODY_MAX: usize = 64 * 1024;
 pub(super) struct Site {
     pub(super) shared: Arc<Shared>,
     pub(super) readers: Readers,
+    /// The kinds of adapters that are offered.
+    pub(super) kinds: Vec<Kind>,
     /// One file is read at a time: it may be large.
     pub(super) reading: Arc<Semaphore>,
 }
@@ -156,8 +159,8 @@ async fn take_events(State(site): State<Site>, Query(wanted): Query<Wanted>) -> 
     }
 }
 
-async fn list() -> Response {
-    let found = tokio::task::spawn_blocking(adapters::list).await.unwrap_or_default();
+async fn list(State(site): State<Site>) -> Response {
+    let found = tokio::task::spawn_blocking(move || adapters::list(&site.kinds)).await.unwrap_or_default();
     let boards: Vec<&str> = layout::BOARDS.iter().map(|layout| layout.board).collect();
     let value = json!({
         "adapters": found,

@@ -20,6 +20,7 @@ use super::guard::Guard;
 use super::http::{router, Site};
 use super::shared::{Order, Shared};
 use super::worker;
+use crate::bus::Kind;
 
 /// Connections at a time. A browser has six for each page.
 const CONNECTIONS: usize = 64;
@@ -42,13 +43,21 @@ pub struct Options {
     pub port: u16,
     /// COB-IDs of SDO requests and answers, without the node-ID, where they are not the usual ones.
     pub sdo_ids: Option<(u16, u16)>,
+    /// The kinds of adapters that the page offers.
+    pub kinds: Vec<Kind>,
     /// How long a reader may take nothing of what it is sent until it is dropped.
     pub write_timeout: Duration,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { bus: None, port: 0, sdo_ids: None, write_timeout: Duration::from_secs(10) }
+        Self {
+            bus: None,
+            port: 0,
+            sdo_ids: None,
+            kinds: Kind::ALL.to_vec(),
+            write_timeout: Duration::from_secs(10),
+        }
     }
 }
 
@@ -130,8 +139,12 @@ impl Server {
             // It is the first: there is room for it.
             let _ = shared.order(Order::Open(bus));
         }
-        let site =
-            Site { shared: shared.clone(), readers: self.readers, reading: Arc::new(Semaphore::new(1)) };
+        let site = Site {
+            shared: shared.clone(),
+            readers: self.readers,
+            kinds: self.options.kinds.clone(),
+            reading: Arc::new(Semaphore::new(1)),
+        };
         let app = router(site, self.guard);
         let (listener, write_timeout) = (self.listener, self.options.write_timeout);
         let left = self.runtime.block_on(async {
