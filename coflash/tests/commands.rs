@@ -525,6 +525,25 @@ fn completions_and_manual_pages_are_written() {
     assert_eq!(coflash(&["man", "--out", &folder.path("pages")]).exit, 0);
     let page = fs::read_to_string(folder.path("pages/coflash-flash.1")).unwrap();
     assert!(page.contains("check\\-target"), "{page}");
+    let mut rest = page.as_str();
+    for (section, words) in [
+        ("SYNOPSIS", "coflash"),
+        ("EXAMPLES", "coflash flash app.elf \\-\\-board"),
+        ("FILES", "coflash.toml"),
+        ("ENVIRONMENT", "COFLASH_UNLOCK"),
+        ("EXIT STATUS", "the device does not answer"),
+    ] {
+        let (_, behind) = rest
+            .split_once(&format!(".SH \"{section}\""))
+            .or_else(|| rest.split_once(&format!(".SH {section}")))
+            .unwrap_or_else(|| panic!("{section}: {page}"));
+        let own = behind.split(".SH ").next().unwrap_or_default();
+        assert!(own.contains(words), "{section}: {own}");
+        rest = behind;
+    }
+    for command in ["", "-read", "-write", "-nmt", "-lss-assign"] {
+        assert!(fs::metadata(folder.path(&format!("pages/coflash{command}.1"))).is_ok(), "{command}");
+    }
 }
 
 #[test]
@@ -579,7 +598,9 @@ fn the_configuration_gives_defaults_and_the_command_line_wins() {
 #[test]
 fn help_is_complete() {
     let mut text = String::new();
-    for command in [&["--help"][..], &["flash", "--help"], &["lss", "assign", "--help"]] {
+    for command in
+        [&["-h"][..], &["--help"], &["flash", "-h"], &["flash", "--help"], &["lss", "assign", "--help"]]
+    {
         let mut tool = Command::new(env!("CARGO_BIN_EXE_coflash"));
         let done = run(tool
             .args(command)

@@ -25,6 +25,12 @@ impl Region {
         self.base + self.size
     }
 
+    /// Whether it has a byte, and its end is an address.
+    #[must_use]
+    pub const fn is_possible(&self) -> bool {
+        self.size > 0 && self.base.checked_add(self.size).is_some()
+    }
+
     /// Whether the `len` bytes from `address` all lie inside; no address and no length overflows
     /// it.
     #[must_use]
@@ -158,37 +164,52 @@ pub const CHIPS: &[&Geometry] = &[&STM32F407VG, &STM32F429ZI, &STM32F446RE];
 
 impl Geometry {
     /// Gives the geometry back if it can be that of a chip; fails the build with the broken rule's
-    /// name if not.
+    /// words if not.
     #[must_use]
     pub const fn checked(self) -> Self {
+        match self.check() {
+            Ok(()) => self,
+            Err(rule) => panic!("{}", rule),
+        }
+    }
+
+    /// Whether it can be that of a chip; otherwise the first rule that it breaks, in words. No number
+    /// makes it panic.
+    ///
+    /// # Errors
+    /// The broken rule.
+    pub const fn check(&self) -> Result<(), &'static str> {
+        if !self.flash.is_possible() || !self.sram.is_possible() {
+            return Err("flash or SRAM of the chip is empty, or reaches over the end of the address space");
+        }
         let (mut total, mut count, mut run) = (0, 0, 0);
         while run < self.sectors.len() {
             let SectorRun { count: many, size } = self.sectors[run];
-            assert!(
-                many > 0 && (size == 16 * KIB || size == 64 * KIB || size == 128 * KIB),
-                "chip: a sector of the STM32F4 has 16, 64 or 128 KiB"
-            );
-            total += many as u32 * size;
+            if many == 0 || (size != 16 * KIB && size != 64 * KIB && size != 128 * KIB) {
+                return Err("a sector of the STM32F4 has 16, 64 or 128 KiB");
+            }
             count += many as u32;
+            if count > 24 {
+                return Err("no STM32F4 has more than 24 sectors");
+            }
+            total += many as u32 * size;
             run += 1;
         }
-        assert!(total == self.flash.size, "chip: the sectors do not add up to the flash");
-        assert!(count <= 24, "chip: no STM32F4 has more than 24 sectors");
-        if let Some(first) = self.second_bank {
-            assert!(
-                first == 12 && self.sector(first).is_some(),
-                "chip: the second bank of an STM32F4 begins with sector 12"
-            );
+        if total != self.flash.size {
+            return Err("the sectors do not add up to the flash");
         }
-        assert!(
-            self.interrupts > 0 && self.vector_table_alignment() <= 512,
-            "chip: no STM32F4 has more than 112 interrupt lines"
-        );
-        assert!(
-            self.sram.base.is_multiple_of(4096) && self.sram.size.is_multiple_of(4096) && self.sram.size > 0,
-            "chip: the SRAM must be whole pages of 4 KiB"
-        );
-        self
+        if let Some(first) = self.second_bank {
+            if first != 12 || self.sector(first).is_none() {
+                return Err("the second bank of an STM32F4 begins with sector 12");
+            }
+        }
+        if self.interrupts == 0 || self.vector_table_alignment() > 512 {
+            return Err("no STM32F4 has more than 112 interrupt lines");
+        }
+        if !self.sram.base.is_multiple_of(4096) || !self.sram.size.is_multiple_of(4096) {
+            return Err("the SRAM must be whole pages of 4 KiB");
+        }
+        Ok(())
     }
 
     /// What `FLASH_CR.SNB` takes for a sector: its number, but bit 4 chooses the second bank, whose

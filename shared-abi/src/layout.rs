@@ -15,6 +15,7 @@ pub mod stm32f407g_disc1;
 pub mod stm32f407g_disc1_can2;
 pub mod stm32f407g_disc1_two;
 pub mod stm32f429i_disc1;
+pub mod toml;
 
 /// Every board that coboot knows, for tools that take a board by name.
 pub const BOARDS: &[&Layout] = &[
@@ -56,102 +57,129 @@ pub struct Layout {
 }
 
 impl Layout {
-    /// Gives the layout back if every rule holds; fails the build with the broken rule's name if
+    /// Gives the layout back if every rule holds; fails the build with the broken rule's words if
     /// not.
     #[must_use]
     pub const fn checked(self) -> Self {
+        match self.check() {
+            Ok(()) => self,
+            Err(rule) => panic!("{}", rule),
+        }
+    }
+
+    /// Whether every rule holds; otherwise the first one that is broken, in words. No number makes it
+    /// panic: a layout may come from a file.
+    ///
+    /// # Errors
+    /// The broken rule.
+    pub const fn check(&self) -> Result<(), &'static str> {
+        const REGION: &str = "a region is empty, or reaches over the end of the address space";
+        let fixed = [
+            self.bootloader,
+            self.parameters[0],
+            self.parameters[1],
+            self.ram,
+            self.handoff,
+            self.warm_start,
+        ];
+        let mut f = 0;
+        while f < fixed.len() {
+            if !fixed[f].is_possible() {
+                return Err(REGION);
+            }
+            f += 1;
+        }
+        let mut q = 0;
+        while q < self.programs.len() {
+            if !self.programs[q].is_possible() {
+                return Err(REGION);
+            }
+            q += 1;
+        }
         let chip = self.chip;
-        assert!(
-            self.bootloader.base == chip.flash.base,
-            "layout: the bootloader must start at the base of the flash, where the core fetches its vectors after a reset"
-        );
-        assert!(
-            chip.is_whole_sectors(&self.bootloader),
-            "layout: the bootloader must end at a sector border"
-        );
-        assert!(
-            self.callgate_offset >= CORE_VECTORS_SIZE,
-            "layout: the callgate overlaps the bootloader's vector table"
-        );
-        assert!(
-            self.bootloader.contains(self.bootloader.base + self.callgate_offset, callgate::TABLE_SIZE),
-            "layout: the callgate lies outside the bootloader"
-        );
+        if self.bootloader.base != chip.flash.base {
+            return Err("the bootloader must start at the base of the flash, where the core fetches its vectors after a reset");
+        }
+        if !chip.is_whole_sectors(&self.bootloader) {
+            return Err("the bootloader must end at a sector border");
+        }
+        if self.callgate_offset < CORE_VECTORS_SIZE {
+            return Err("the callgate overlaps the bootloader's vector table");
+        }
+        if self.callgate_offset >= self.bootloader.size
+            || !self.bootloader.contains(self.bootloader.base + self.callgate_offset, callgate::TABLE_SIZE)
+        {
+            return Err("the callgate lies outside the bootloader");
+        }
         let mut i = 0;
         while i < 2 {
             let parameters = &self.parameters[i];
-            assert!(
-                chip.is_whole_sectors(parameters),
-                "layout: a parameter region must start and end at sector borders"
-            );
-            assert!(
-                !parameters.overlaps(&self.bootloader),
-                "layout: a parameter region overlaps the bootloader"
-            );
+            if !chip.is_whole_sectors(parameters) {
+                return Err("a parameter region must start and end at sector borders");
+            }
+            if parameters.overlaps(&self.bootloader) {
+                return Err("a parameter region overlaps the bootloader");
+            }
             i += 1;
         }
-        assert!(
-            !self.parameters[0].overlaps(&self.parameters[1]),
-            "layout: the two parameter regions overlap"
-        );
-        assert!(
-            !self.programs.is_empty() && self.programs.len() <= 254,
-            "layout: there must be 1 to 254 programs (sub-indices 1 to 254 of 1F50h)"
-        );
+        if self.parameters[0].overlaps(&self.parameters[1]) {
+            return Err("the two parameter regions overlap");
+        }
+        if self.programs.is_empty() || self.programs.len() > 254 {
+            return Err("there must be 1 to 254 programs (sub-indices 1 to 254 of 1F50h)");
+        }
         let mut p = 0;
         while p < self.programs.len() {
             let program = &self.programs[p];
-            assert!(chip.is_whole_sectors(program), "layout: a program must start and end at sector borders");
-            assert!(
-                program.base.is_multiple_of(chip.vector_table_alignment()),
-                "layout: a program's vector table is not aligned as VTOR demands"
-            );
-            assert!(!program.overlaps(&self.bootloader), "layout: a program overlaps the bootloader");
-            assert!(
-                !program.overlaps(&self.parameters[0]) && !program.overlaps(&self.parameters[1]),
-                "layout: a program overlaps a parameter region"
-            );
+            if !chip.is_whole_sectors(program) {
+                return Err("a program must start and end at sector borders");
+            }
+            if !program.base.is_multiple_of(chip.vector_table_alignment()) {
+                return Err("a program's vector table is not aligned as VTOR demands");
+            }
+            if program.overlaps(&self.bootloader) {
+                return Err("a program overlaps the bootloader");
+            }
+            if program.overlaps(&self.parameters[0]) || program.overlaps(&self.parameters[1]) {
+                return Err("a program overlaps a parameter region");
+            }
             let mut q = 0;
             while q < p {
-                assert!(!program.overlaps(&self.programs[q]), "layout: two programs overlap");
+                if program.overlaps(&self.programs[q]) {
+                    return Err("two programs overlap");
+                }
                 q += 1;
             }
             p += 1;
         }
-        assert!(
-            chip.sram.contains(self.ram.base, self.ram.size),
-            "layout: the RAM of the images lies outside the chip's SRAM"
-        );
-        assert!(
-            self.ram.size.is_multiple_of(8),
-            "layout: the initial stack pointer must be a multiple of 8 (AAPCS)"
-        );
-        assert!(
-            !self.ram.overlaps(&self.handoff) && !self.ram.overlaps(&self.warm_start),
-            "layout: the handoff or the warm-start cell lies inside the RAM of the images"
-        );
-        assert!(!self.handoff.overlaps(&self.warm_start), "layout: the handoff overlaps the warm-start cell");
-        assert!(
-            self.handoff.size as usize == size_of::<handoff::Handoff>(),
-            "layout: the handoff region has not the size of the handoff"
-        );
-        assert!(
-            self.warm_start.size as usize == size_of::<warm_start::WarmStart>(),
-            "layout: the warm-start region has not the size of the warm-start cell"
-        );
-        assert!(
-            self.handoff.base.is_multiple_of(4) && self.warm_start.base.is_multiple_of(4),
-            "layout: the handoff and the warm-start cell must be word-aligned"
-        );
-        assert!(
-            self.warm_start.end() == chip.sram.end(),
-            "layout: the warm-start cell must be the last RAM cell of the chip"
-        );
-        assert!(
-            chip.sram.contains(self.handoff.base, self.handoff.size),
-            "layout: the handoff lies outside the chip's SRAM"
-        );
-        self
+        if !chip.sram.contains(self.ram.base, self.ram.size) {
+            return Err("the RAM of the images lies outside the chip's SRAM");
+        }
+        if !self.ram.size.is_multiple_of(8) {
+            return Err("the initial stack pointer must be a multiple of 8 (AAPCS)");
+        }
+        if self.ram.overlaps(&self.handoff) || self.ram.overlaps(&self.warm_start) {
+            return Err("the handoff or the warm-start cell lies inside the RAM of the images");
+        }
+        if self.handoff.overlaps(&self.warm_start) {
+            return Err("the handoff overlaps the warm-start cell");
+        }
+        if self.handoff.size as usize != size_of::<handoff::Handoff>() {
+            return Err("the handoff region has not the size of the handoff");
+        }
+        if self.warm_start.size as usize != size_of::<warm_start::WarmStart>() {
+            return Err("the warm-start region has not the size of the warm-start cell");
+        }
+        if !self.handoff.base.is_multiple_of(4) || !self.warm_start.base.is_multiple_of(4) {
+            return Err("the handoff and the warm-start cell must be word-aligned");
+        }
+        if self.warm_start.end() != chip.sram.end() {
+            return Err("the warm-start cell must be the last RAM cell of the chip");
+        }
+        if !chip.sram.contains(self.handoff.base, self.handoff.size) {
+            return Err("the handoff lies outside the chip's SRAM");
+        }
+        Ok(())
     }
 
     /// Address of the callgate table.

@@ -96,7 +96,11 @@ fn a_geometry_that_no_chip_has_is_refused() {
     ];
     for (message, geometry) in wrong {
         let panic = catch_unwind(|| geometry.checked()).expect_err(message);
-        let said = panic.downcast_ref::<&str>().copied().unwrap_or_default();
+        let said = panic
+            .downcast_ref::<&str>()
+            .copied()
+            .or_else(|| panic.downcast_ref::<String>().map(String::as_str))
+            .unwrap_or_default();
         assert!(said.contains(message), "{said}, not {message}");
     }
 }

@@ -1,25 +1,31 @@
 //! `cargo xtask layout`: the memory map, for people and for linkers.
 
+use shared_abi::layout::toml::Toml;
 use shared_abi::layout::{Image, Layout};
 
 use crate::args::Args;
 use crate::{workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask layout [--board BOARD] [--ld IMAGE]
+usage: cargo xtask layout [--board BOARD] [--ld IMAGE | --toml]
 
 Prints the memory map of a board from the one source of truth, shared-abi/src/layout/.
 
   --board BOARD   the board (default: stm32f407g-disc1)
   --ld IMAGE      prints the linker's MEMORY and border symbols instead, for an IMAGE of
                   `bootloader` or `program-N` (N from 1); a C application includes it too
+  --toml          prints the map for `coflash --layout FILE` instead: for a coflash that was built
+                  without the board
 ";
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let ld = args.value("--ld")?;
+    let toml = args.flag("--toml");
     args.none_left()?;
     match ld {
+        Some(_) if toml => return Err("--ld and --toml exclude each other.".to_string()),
+        None if toml => print!("{}", Toml(board)),
         None => print!("{board}"),
         Some(image) => print!("{}", board.linker_script(image_by_name(board, &image)?)),
     }

@@ -27,11 +27,13 @@ mod open;
 #[cfg(feature = "peak")]
 mod peak;
 mod ports;
+pub mod redact;
 mod sdo_ids;
 pub mod slcan;
 #[cfg(target_os = "linux")]
 mod socketcan;
 pub mod socketcand;
+mod tap;
 mod target;
 mod tcp;
 mod trace;
@@ -49,6 +51,7 @@ pub use self::slcan::{Line, Slcan};
 #[cfg(target_os = "linux")]
 pub use self::socketcan::SocketCan;
 pub use self::socketcand::Socketcand;
+pub use self::tap::{Ear, Tap};
 pub use self::trace::{OnFailure, Trace};
 
 #[cfg(test)]
@@ -70,6 +73,7 @@ mod tests {
         moves::<Cia309>();
         moves::<SdoIds<Box<dyn Adapter + Send>>>();
         moves::<Trace<Box<dyn Adapter + Send>>>();
+        moves::<Tap<Box<dyn Adapter + Send>>>();
         moves::<hub::Port>();
     }
 }

@@ -7,7 +7,9 @@ use coflash::bus::{self, Adapter, Kind, Link, SdoIds, Trace};
 use coflash::device::lock::Lock;
 
 use super::output::{Failure, Output};
+use super::record;
 use super::search::{only, Kinds};
+use super::waiting::Waiting;
 
 /// What every command is given.
 pub(super) struct Context {
@@ -67,6 +69,11 @@ impl Context {
         Ok(Lock::of(&self.url(bus)?, node)?)
     }
 
+    /// Shows what is waited for, as in "node 5 answers", until it is dropped.
+    pub(super) fn waiting(&self, what: impl Into<String>) -> Waiting {
+        Waiting::new(self.out, what)
+    }
+
     fn traced(&self, adapter: Box<dyn Adapter + Send>) -> Result<Box<dyn Adapter + Send>, Failure> {
         let traced: Box<dyn Adapter + Send> = match &self.trace {
             Some(path) => {
@@ -77,11 +84,12 @@ impl Context {
             }
             None => adapter,
         };
-        Ok(match (self.sdo_request, self.sdo_response) {
+        // Passwords are known by the usual COB-IDs: what is kept for service is taken behind these.
+        Ok(record::tapped(match (self.sdo_request, self.sdo_response) {
             (None, None) => traced,
             (request, response) => {
                 Box::new(SdoIds::new(traced, request.unwrap_or(0x600), response.unwrap_or(0x580)))
             }
-        })
+        }))
     }
 }

@@ -6,6 +6,7 @@ use std::time::Duration;
 use canopen::debugger::Stop;
 use clap::{Args, Subcommand};
 use coflash::device::debugger::{Debugger, NoBreakpoint, Registers, Stopped, BREAKPOINTS, NAMES};
+use coflash::device::value::hex_digits;
 use coflash::file::{limit, Place};
 use coflash::Error;
 use serde_json::{json, Value};
@@ -15,7 +16,7 @@ use super::device::Device;
 use super::output::Failure;
 use super::values::{milliseconds, number};
 
-/// Looks into the memory of a device on the bench, and stops its program.
+/// Memory, breakpoints and steps of a device on the bench.
 ///
 /// For firmware that was built with the feature `debugger` (docs/debugger.md); no product has it.
 /// Addresses are in C notation, like 0x20000000.
@@ -339,14 +340,8 @@ fn hex(bytes: &[u8]) -> String {
 
 /// `DE AD BE EF`, `DEADBEEF`.
 fn bytes(text: &str) -> Result<Bytes, String> {
-    let digits: Vec<char> = text.chars().filter(|c| !c.is_whitespace()).collect();
     let wrong = || "bytes are pairs of hexadecimal digits, like \"DE AD BE EF\"".to_string();
-    if !digits.len().is_multiple_of(2) || digits.is_empty() {
-        return Err(wrong());
-    }
-    let digit = |c: char| c.to_digit(16).map(|digit| digit as u8);
-    let pair = |pair: &[char]| Some(digit(pair[0])? << 4 | digit(pair[1])?);
-    digits.chunks_exact(2).map(pair).collect::<Option<_>>().map(Bytes).ok_or_else(wrong)
+    hex_digits(text).map(Bytes).ok_or_else(wrong)
 }
 
 #[cfg(test)]

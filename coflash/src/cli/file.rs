@@ -1,15 +1,17 @@
 //! The firmware file and how to read it: what `convert` and `flash` share.
 
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 
 use clap::{Args, ValueEnum};
 use coflash::file::block_file::{Checksum, LastBlock};
 use coflash::file::convert::{blocks_of, Converted, GapFill, Label, Options, Region, DEFAULT_BLOCK_SIZE};
 use coflash::file::read::{self, Firmware, Format};
-use coflash::file::AddressRange;
+use coflash::file::{self, AddressRange};
 use shared_abi::layout;
 
 use super::context::Context;
+use super::objects::bytes_of;
 use super::output::Failure;
 use super::values::number;
 
@@ -20,12 +22,21 @@ pub(super) struct Source {
     #[arg(long, value_name = "BOARD", value_parser = board)]
     board: Option<&'static layout::Layout>,
 
+    /// The same for a board that this tool was not built with: its memory map, as `cargo xtask
+    /// layout --toml` writes it.
+    #[arg(long, value_name = "FILE", conflicts_with = "board")]
+    layout: Option<PathBuf>,
+
+    /// What that file says, once it was read.
+    #[arg(skip)]
+    loaded: OnceLock<&'static layout::Layout>,
+
     /// The first address of the program's region; data before it is left out.
-    #[arg(long, alias = "start_address", value_name = "ADDRESS", value_parser = number, conflicts_with = "board")]
+    #[arg(long, alias = "start_address", value_name = "ADDRESS", value_parser = number, conflicts_with_all = ["board", "layout"])]
     start_address: Option<u32>,
 
     /// The last address of the program's region; data behind it is left out.
-    #[arg(long, alias = "end_address", value_name = "ADDRESS", value_parser = number, conflicts_with = "board")]
+    #[arg(long, alias = "end_address", value_name = "ADDRESS", value_parser = number, conflicts_with_all = ["board", "layout"])]
     end_address: Option<u32>,
 
     /// Bytes of a block, its 16 bytes of framing included: at most the bootloader's buffer.
@@ -147,7 +158,7 @@ impl Source {
     pub(super) fn for_board(&self, name: &str) -> Result<Self, Failure> {
         let layout =
             board(name).map_err(|known| Failure::usage(format!("there is no board '{name}'"), known))?;
-        Ok(Self { board: Some(layout), ..self.clone() })
+        Ok(Self { board: Some(layout), layout: None, ..self.clone() })
     }
 
     /// The same for a device that takes images without addresses.
@@ -162,11 +173,26 @@ impl Source {
 
     /// Whether it was said where the program may lie.
     pub(super) fn has_region(&self) -> bool {
-        self.board.is_some() || self.start_address.is_some() || self.end_address.is_some()
+        self.board.is_some()
+            || self.layout.is_some()
+            || self.start_address.is_some()
+            || self.end_address.is_some()
+    }
+
+    /// The board, by its name or by its file.
+    fn board(&self) -> Result<Option<&'static layout::Layout>, Failure> {
+        let Some(path) = &self.layout else { return Ok(self.board) };
+        if let Some(layout) = self.loaded.get() {
+            return Ok(Some(layout));
+        }
+        let bytes = bytes_of(path, file::board::MAX as u64)?;
+        let text = String::from_utf8_lossy(&bytes);
+        let layout = file::board::parse(&text).map_err(|error| Failure::file(path, &error.to_string()))?;
+        Ok(Some(self.loaded.get_or_init(|| layout)))
     }
 
     fn region(&self, program: u8) -> Result<Region, Failure> {
-        match (self.board, self.start_address, self.end_address) {
+        match (self.board()?, self.start_address, self.end_address) {
             (Some(layout), ..) => match layout.program(program) {
                 Some(region) => Ok(Region::Strict(region.into())),
                 None => {

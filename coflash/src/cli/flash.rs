@@ -25,7 +25,7 @@ use super::device::{cancelled, Patience};
 use super::dialect::Access;
 use super::file::{warn_left_out, Source};
 use super::legacy::Legacy;
-use super::many::{document, summary, write_report, Board, Outcome};
+use super::many::{diagnose_silence, document, summary, write_report, Board, Outcome};
 use super::output::Failure;
 use super::progress::Progress;
 use super::values::{nodes, number, program_number};
@@ -301,14 +301,19 @@ impl Flash {
         let node = self.node_of(link, device)?;
         let _lock = self.lock(context, node)?;
         let mut session = self.patience.session(link, node)?;
-        let mut progress = Progress::new(context.out);
+        let mut progress = Progress::new(context.out, node);
         let mut left = None;
         let result = flash(&mut session, &device.file, &device.options, &mut |event| match event {
-            Event::Done(done) => left = Some(done.left),
+            Event::Done(done) => {
+                left = Some(done.left);
+                progress.show(Event::Done(done));
+            }
             event => progress.show(event),
         });
         progress.finish();
+        let waiting = result.is_err().then(|| context.waiting("it is known what the bus says"));
         let result = result.map_err(|error| Failure::diagnosed(error, &mut session).leaving(left));
+        drop(waiting);
         let report = match (&self.report, result) {
             (None, result) => result?,
             (Some(path), result) => {
@@ -375,9 +380,16 @@ impl Flash {
             Link::Gateway(gateway) => flash_in_turn(&mut **gateway, &jobs, &options, &show),
         };
         board.finish();
+        let waiting =
+            results.iter().any(Result::is_err).then(|| context.waiting("it is known what the bus says"));
+        let diagnosis = match nodes.first() {
+            Some(node) => diagnose_silence(&mut self.patience.session(link, *node)?, &results),
+            None => None,
+        };
+        drop(waiting);
         for ((number, node), result) in numbers.into_iter().zip(nodes).zip(results) {
             let image = devices[number].image.display().to_string();
-            outcomes[number] = Some(Outcome::new(node, image, result));
+            outcomes[number] = Some(Outcome::new(node, image, result, diagnosis.as_ref()));
         }
         let outcomes: Vec<Outcome> = outcomes.into_iter().flatten().collect();
         summary(context.out, &outcomes, self.report.as_deref())

@@ -1,14 +1,15 @@
 //! `coflash completions` and `coflash man`: what an installer puts beside the program.
 
-use std::io::Write as _;
-use std::path::PathBuf;
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
 
-use clap::{Args, Command};
+use clap::{Arg, Args, Command};
 use clap_complete::Shell;
 use clap_mangen::Man;
 
 use super::context::Context;
-use super::output::Failure;
+use super::help;
+use super::output::{Failure, EXIT_CODES};
 
 /// Writes the completions for a shell to standard output.
 #[derive(Debug, Args)]
@@ -17,7 +18,9 @@ pub(super) struct Completions {
     shell: Shell,
 }
 
-/// Writes the manual page to standard output, or one page for each command into a folder.
+/// Writes the manual pages.
+///
+/// That of the program goes to standard output, or with --out one for each command into a folder.
 #[derive(Debug, Args)]
 pub(super) struct Manual {
     /// The folder.
@@ -37,21 +40,103 @@ impl Completions {
 
 impl Manual {
     pub(super) fn run(&self, context: &Context, commands: Command) -> Result<(), Failure> {
+        let mut commands = commands.disable_help_subcommand(true);
+        commands.build();
         let Some(folder) = &self.out else {
-            let mut page = Vec::new();
-            Man::new(commands)
-                .render(&mut page)
+            let page = page(&commands)
                 .map_err(|error| Failure::system(format!("the page cannot be made: {error}")))?;
             let _ = std::io::stdout().write_all(&page);
             return Ok(());
         };
         let write = || {
             std::fs::create_dir_all(folder)?;
-            clap_mangen::generate_to(commands, folder)
+            write_pages(&commands, folder)
         };
         write()
             .map_err(|error| Failure::system(format!("{}: cannot be written: {error}", folder.display())))?;
         context.out.say(format_args!("{}: manual pages", folder.display()));
         Ok(())
+    }
+}
+
+/// A page for each command, and for each command of a command.
+fn write_pages(command: &Command, folder: &Path) -> io::Result<()> {
+    let name = Man::new(command.clone()).get_filename();
+    std::fs::write(folder.join(name), page(command)?)?;
+    let shown = command.get_subcommands().filter(|below| !below.is_hide_set());
+    shown.into_iter().try_for_each(|below| write_pages(below, folder))
+}
+
+/// A page in the order of man-pages(7).
+fn page(command: &Command) -> io::Result<Vec<u8>> {
+    let mut page = Vec::new();
+    let man = Man::new(command.clone());
+    man.render_title(&mut page)?;
+    man.render_name_section(&mut page)?;
+    man.render_synopsis_section(&mut page)?;
+    man.render_description_section(&mut page)?;
+    man.render_options_section(&mut page)?;
+    if command.get_subcommands().any(|below| !below.is_hide_set()) {
+        man.render_subcommands_section(&mut page)?;
+    }
+    let name = command.get_display_name().unwrap_or_default();
+    let name = name.strip_prefix("coflash-").unwrap_or_default();
+    if let Some(examples) = help::examples(name) {
+        let lines = examples.lines().filter_map(|line| line.strip_prefix("  "));
+        section(&mut page, "EXAMPLES", &lines.map(|line| (line, "")).collect::<Vec<_>>())?;
+    }
+    section(&mut page, "FILES", &FILES)?;
+    let variables = variables(command);
+    let variables: Vec<(&str, &str)> =
+        variables.iter().map(|(name, what)| (name.as_str(), what.as_str())).collect();
+    section(&mut page, "ENVIRONMENT", &variables)?;
+    let codes = EXIT_CODES.lines().filter_map(|line| line.trim().split_once(' '));
+    let codes: Vec<(&str, &str)> = codes.map(|(code, what)| (code, what.trim())).skip(1).collect();
+    section(&mut page, "EXIT STATUS", &codes)?;
+    if command.get_version().is_some() {
+        man.render_version_section(&mut page)?;
+    }
+    Ok(page)
+}
+
+/// The files that the tool looks for by itself.
+const FILES: [(&str, &str); 3] = [
+    ("coflash.toml", "Defaults for options, in the current folder."),
+    ("~/.config/coflash/coflash.toml", "The same for a user, where the current folder has none."),
+    ("~/.local/state/coflash/history", "What was typed into coflash shell."),
+];
+
+/// The environment, as the options tell it.
+fn variables(command: &Command) -> Vec<(String, String)> {
+    let variable = |argument: &Arg| {
+        let name = argument.get_env()?.to_string_lossy().into_owned();
+        let option = argument.get_long().map_or_else(String::new, |long| format!("In place of --{long}. "));
+        Some((name, format!("{option}{}", argument.get_help().map(ToString::to_string).unwrap_or_default())))
+    };
+    let mut all: Vec<_> = command.get_arguments().filter_map(variable).collect();
+    all.push(("NO_COLOR".to_string(), "Where it is set, there are no colours.".to_string()));
+    all
+}
+
+/// Words with what they mean; or, without a meaning, lines as they stand.
+fn section(page: &mut Vec<u8>, title: &str, rows: &[(&str, &str)]) -> io::Result<()> {
+    writeln!(page, ".SH \"{title}\"")?;
+    for (word, meaning) in rows {
+        if meaning.is_empty() {
+            writeln!(page, ".nf\n{}\n.fi", escaped(word))?;
+        } else {
+            writeln!(page, ".TP\n\\fB{}\\fR\n{}", escaped(word), escaped(meaning))?;
+        }
+    }
+    Ok(())
+}
+
+/// Text as roff takes it: no backslash and no dot in front mean something else.
+fn escaped(text: &str) -> String {
+    let text = text.replace('\\', "\\e").replace('-', "\\-");
+    if text.starts_with(['.', '\'']) {
+        format!("\\&{text}")
+    } else {
+        text
     }
 }

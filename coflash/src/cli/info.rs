@@ -19,7 +19,9 @@ impl Info {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let mut link = context.link()?;
         let mut session = self.device.session(&mut link)?;
+        let waiting = context.waiting(format!("node {} answers", session.node()));
         let info = info(&mut session).map_err(|error| Failure::diagnosed(error, &mut session))?;
+        drop(waiting);
         context.out.result(&info, || value(&info));
         Ok(())
     }

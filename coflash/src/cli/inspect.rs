@@ -10,7 +10,9 @@ use super::file::{Input, Source};
 use super::output::Failure;
 use super::values::program_number;
 
-/// Shows what a firmware file or block file holds, and checks every record, size and CRC in it.
+/// Shows what a firmware file holds, and checks all of it.
+///
+/// That is every record, size and CRC, of a block file, too.
 ///
 /// With --board it also checks that the program lies where the board has room for it. No device is
 /// needed.

@@ -149,6 +149,7 @@ impl Which {
 impl Lss {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let mut adapter = context.open()?;
+        let waiting = context.waiting("the devices have answered");
         let done = {
             let mut master = self.master(&mut *adapter)?;
             let done = match &self.service {
@@ -172,6 +173,7 @@ impl Lss {
         if let Some(node) = done.reset {
             adapter.send(&NmtCommand::ResetCommunication.emit(Some(node)))?;
         }
+        drop(waiting);
         context.out.result(done.words, || {
             let mut value = done.value;
             value["command"] = "lss".into();

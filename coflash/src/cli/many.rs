@@ -4,19 +4,26 @@ use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
 use canopen::NodeId;
+use coflash::device::diagnose::{diagnose, Diagnosis};
+use coflash::device::Session;
 use coflash::update::many::Failed;
 use coflash::update::{Event, Report};
+use coflash::Error;
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{json, Value};
 
+use super::events::Lines;
 use super::output::{Exit, Failure, Output};
+use super::progress::with_rate;
+use super::record;
 
-const STYLE: &str = "{prefix:<9} {bar:30} {percent:>3} %  {bytes_per_sec:>12}  {msg}";
+const STYLE: &str = "{prefix:<9} {bar:30} {percent:>3} %  {rate:>12}  {msg}";
 
 /// A line of progress for each device: a bar on a terminal, and elsewhere lines with the node in
 /// front.
 pub(super) struct Board {
     out: Output,
+    nodes: Vec<NodeId>,
     names: Vec<String>,
     form: Form,
 }
@@ -25,18 +32,22 @@ enum Form {
     Terminal(Vec<ProgressBar>),
     /// Tenths that were shown, for each device.
     Plain(Mutex<Vec<usize>>),
+    /// For programs.
+    Lines(Mutex<Vec<Lines>>),
 }
 
 impl Board {
     pub(super) fn new(out: Output, nodes: &[NodeId]) -> Self {
         let names: Vec<String> = nodes.iter().map(|node| format!("node {node}")).collect();
-        let form = if out.on_terminal() {
+        let form = if out.shows_events() {
+            Form::Lines(Mutex::new(nodes.iter().map(|node| Lines::new(out, *node)).collect()))
+        } else if out.on_terminal() {
             let all = MultiProgress::with_draw_target(ProgressDrawTarget::stdout());
             let bar = |name: &String| {
                 let bar = all.add(ProgressBar::new(1)).with_prefix(name.clone());
                 // The template is a constant; should it ever be wrong, a bar in another style does.
                 if let Ok(style) = ProgressStyle::with_template(STYLE) {
-                    bar.set_style(style.progress_chars("=> "));
+                    bar.set_style(with_rate(style).progress_chars("=> "));
                 }
                 bar.set_message("waiting");
                 bar
@@ -45,13 +56,18 @@ impl Board {
         } else {
             Form::Plain(Mutex::new(vec![0; names.len()]))
         };
-        Self { out, names, form }
+        Self { out, nodes: nodes.to_vec(), names, form }
     }
 
     /// Shows what happens to a device.
     pub(super) fn show(&self, device: usize, event: Event) {
-        let Some(name) = self.names.get(device) else { return };
+        let (Some(name), Some(node)) = (self.names.get(device), self.nodes.get(device)) else { return };
+        record::event(*node, &event);
         match (&self.form, event) {
+            (Form::Lines(lines), event) => {
+                let mut lines = lines.lock().unwrap_or_else(PoisonError::into_inner);
+                lines[device].show(&event);
+            }
             // The summary tells it.
             (_, Event::Done(_)) => {}
             (Form::Terminal(bars), Event::Progress { done, total }) => {
@@ -92,10 +108,32 @@ pub(super) struct Outcome {
 }
 
 impl Outcome {
-    pub(super) fn new(node: NodeId, image: String, result: Result<Report, Failed>) -> Self {
-        let result = result.map_err(|failed| Failure::from(failed.error).leaving(Some(failed.left)));
+    pub(super) fn new(
+        node: NodeId,
+        image: String,
+        result: Result<Report, Failed>,
+        diagnosis: Option<&Diagnosis>,
+    ) -> Self {
+        let failure =
+            |failed: Failed| Failure::diagnosed_by(failed.error, diagnosis, node).leaving(Some(failed.left));
+        let result = result.map_err(failure);
         Self { node: Some(node), name: format!("node {node}"), image, result }
     }
+}
+
+/// What the bus says while devices of several are silent: it is listened to once for all of them, as
+/// for one alone.
+pub(super) fn diagnose_silence(
+    session: &mut Session<'_>,
+    results: &[Result<Report, Failed>],
+) -> Option<Diagnosis> {
+    let silent =
+        |result: &Result<Report, Failed>| matches!(result, Err(Failed { error: Error::NoAnswer { .. }, .. }));
+    if !session.hears_the_bus() || !results.iter().any(silent) {
+        return None;
+    }
+    // The first reason stands, should the bus be gone.
+    diagnose(session).ok()
 }
 
 /// Tells the summary, and gives what the command comes to.

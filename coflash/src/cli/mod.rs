@@ -1,12 +1,13 @@
 //! The commands, one file each, and what they share.
 
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+use clap::{ArgMatches, CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use self::context::Context;
-use self::output::{Failure, Output, EXIT_CODES, GLOBAL};
+use self::output::{Failure, Output, GLOBAL};
 use self::search::Kinds;
 use self::values::base_id;
 
@@ -18,30 +19,40 @@ mod convert;
 mod debug;
 mod device;
 mod dialect;
+mod events;
 mod file;
 mod flash;
 mod generate;
+mod help;
 mod info;
 mod inspect;
 mod legacy;
 mod lss;
 mod many;
 mod monitor;
+mod nmt;
+mod objects;
 mod output;
 mod program;
 mod progress;
 mod read;
+mod record;
 mod reset;
 mod scan;
 mod search;
+mod secrets;
 mod shell;
 #[cfg(feature = "ui")]
 mod ui;
+mod units;
 mod values;
+mod waiting;
+mod words;
+mod write;
 
 /// Converts firmware and flashes it over CANopen.
 #[derive(Debug, Parser)]
-#[command(name = "coflash", version, max_term_width = 100, after_help = EXIT_CODES)]
+#[command(name = "coflash", version, max_term_width = 100)]
 struct Cli {
     /// The CAN bus: socketcan:INTERFACE (on Linux), slcan:PORT@BITRATE, slcan:tcp://HOST:PORT@BITRATE,
     /// peak:CHANNEL@BITRATE, kvaser:NUMBER@BITRATE, gs_usb:NUMBER@BITRATE or socketcand://HOST:PORT/BUS;
@@ -63,6 +74,16 @@ struct Cli {
     /// Write all frames to this file, as candump -L does; monitor --replay shows it in words.
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "FILE")]
     trace: Option<PathBuf>,
+
+    /// Write everything that happens to this file, with the time: events, words, frames. No
+    /// passwords are in it.
+    #[arg(long, global = true, help_heading = GLOBAL, value_name = "FILE")]
+    log_file: Option<PathBuf>,
+
+    /// Make a folder in this one for what service sends back: versions, command line, events, log,
+    /// trace. No passwords are in it.
+    #[arg(long, global = true, help_heading = GLOBAL, value_name = "FOLDER")]
+    report_dir: Option<PathBuf>,
 
     /// SDO requests go to this COB-ID and the node-ID on top, for devices that do not listen on 0x600
     /// (BLCOP_BASE_REQUEST of the manual).
@@ -98,6 +119,8 @@ enum Command {
     Withdraw(program::Withdraw),
     Reset(reset::Reset),
     Read(read::Read),
+    Write(write::Write),
+    Nmt(nmt::Nmt),
     Lss(lss::Lss),
     Debug(debug::Debug),
     Monitor(monitor::Monitor),
@@ -137,14 +160,16 @@ impl Command {
             Self::Withdraw(withdraw) => withdraw.run(context),
             Self::Reset(reset) => reset.run(context),
             Self::Read(read) => read.run(context),
+            Self::Write(write) => write.run(context),
+            Self::Nmt(nmt) => nmt.run(context),
             Self::Lss(lss) => lss.run(context),
             Self::Debug(debug) => debug.run(context),
             Self::Monitor(monitor) => monitor.run(context),
             Self::Shell(shell) => shell.run(context, shell_line),
             #[cfg(feature = "ui")]
             Self::Ui(ui) => ui.run(context),
-            Self::Completions(completions) => completions.run(Cli::command()),
-            Self::Man(manual) => manual.run(context, Cli::command()),
+            Self::Completions(completions) => completions.run(commands()),
+            Self::Man(manual) => manual.run(context, commands()),
         }
     }
 }
@@ -163,53 +188,85 @@ impl Cli {
     }
 }
 
+/// The commands and their options, their help in order.
+fn commands() -> clap::Command {
+    help::in_order(Cli::command())
+}
+
 /// Runs the command that the user gave.
 pub fn main() -> ExitCode {
-    let cli = match command_line() {
-        Ok(cli) => cli,
+    let (name, cli) = match command_line() {
+        Ok(read) => read,
         Err(failure) => {
             let output = early_output();
             output.failure(&failure);
             output.exit(&failure)
         }
     };
-    match cli.command.run(&cli.context()) {
+    let (log, reports) = (cli.log_file.as_deref(), cli.report_dir.as_deref());
+    let begun = record::begin(log, reports, &name, &words(), cli.bus.as_deref());
+    let result = begun.map_err(Failure::system).and_then(|()| cli.command.run(&cli.context()));
+    if let Err(failure) = &result {
+        cli.output.failure(failure);
+    }
+    if let Some(folder) = record::folder() {
+        cli.output.say(format_args!("report: {}", folder.display()));
+    }
+    let failure = result.as_ref().err();
+    let error = failure.map(|failure| failure.value()["error"].clone());
+    let kept = record::end(failure.map_or(0, |failure| cli.output.code(failure)), error);
+    let kept = kept.map_err(Failure::system);
+    let result = result.and_then(|()| kept.inspect_err(|failure| cli.output.failure(failure)));
+    match result {
         Ok(()) => ExitCode::SUCCESS,
-        Err(failure) => {
-            cli.output.failure(&failure);
-            cli.output.exit(&failure)
-        }
+        Err(failure) => cli.output.exit(&failure),
     }
 }
 
 /// What the command line says about output, as far as it can be read.
 fn early_output() -> Output {
-    let matches = Cli::command().ignore_errors(true).get_matches();
+    let matches = commands().ignore_errors(true).get_matches_from(words());
     Output::from_arg_matches(&matches).unwrap_or_default().or(Output::of_words())
 }
 
-/// Reads the command line, with defaults from the configuration file. Help and wrong usage end the
+/// The words of the command line, in the order in which they are read.
+fn words() -> Vec<OsString> {
+    words::ordered(std::env::args_os().collect(), &commands())
+}
+
+/// Reads the command line and the command's name, with defaults from the configuration file. Help and wrong usage end the
 /// program here.
-fn command_line() -> Result<Cli, Failure> {
+fn command_line() -> Result<(String, Cli), Failure> {
     // The file has to be known before the command line can be read in earnest.
-    let first = Cli::command().ignore_errors(true).get_matches();
+    let first = commands().ignore_errors(true).get_matches_from(words());
     let named = first.get_one::<PathBuf>("config").cloned();
-    let matches = configured(named)?.try_get_matches();
+    let matches = configured(named, &first)?.try_get_matches_from(words());
     let mut matches = matches.unwrap_or_else(|error| {
+        let out = early_output();
+        if error.use_stderr() {
+            let failure = Failure::unreadable_line(&error);
+            if out.for_programs() {
+                out.failure(&failure);
+            } else {
+                let _ = error.print();
+            }
+            out.exit(&failure)
+        }
         // Help goes to standard output and is no error; both have their colours.
         let _ = error.print();
-        if error.use_stderr() {
-            early_output().exit(&Failure::unreadable_line(&error))
-        }
         std::process::exit(0)
     });
-    Cli::from_arg_matches_mut(&mut matches).map_err(|error| Failure::bare_usage(error.to_string()))
+    let name = matches.subcommand_name().unwrap_or_default().to_string();
+    let cli = Cli::from_arg_matches_mut(&mut matches);
+    Ok((name, cli.map_err(|error| Failure::bare_usage(error.to_string()))?))
 }
 
 /// Runs one line of the shell.
 fn shell_line(context: &Context, words: Vec<String>) -> Result<(), Failure> {
-    let words = std::iter::once("coflash".to_string()).chain(words);
-    let read = configured(context.config.clone())?
+    let words = std::iter::once("coflash".to_string()).chain(words).map(OsString::from);
+    let words = words::ordered(words.collect(), &commands());
+    let first = commands().ignore_errors(true).get_matches_from(&words);
+    let read = configured(context.config.clone(), &first)?
         .try_get_matches_from(words)
         .and_then(|mut matches| Cli::from_arg_matches_mut(&mut matches));
     let cli = match read {
@@ -223,6 +280,10 @@ fn shell_line(context: &Context, words: Vec<String>) -> Result<(), Failure> {
     };
     if matches!(cli.command, Command::Shell(_)) {
         return Err(Failure::usage("this is the shell already", "leave the word shell out"));
+    }
+    if cli.log_file.is_some() || cli.report_dir.is_some() {
+        let advice = "start the shell with them: coflash shell --log-file FILE";
+        return Err(Failure::usage("--log-file and --report-dir are for the shell as a whole", advice));
     }
     let line = cli.context();
     // What the line does not say, the shell's own command line does.
@@ -239,10 +300,10 @@ fn shell_line(context: &Context, words: Vec<String>) -> Result<(), Failure> {
 }
 
 /// The commands and their options, with defaults from the configuration file.
-fn configured(named: Option<PathBuf>) -> Result<clap::Command, Failure> {
+fn configured(named: Option<PathBuf>, given: &ArgMatches) -> Result<clap::Command, Failure> {
     match config::find(named) {
-        Some(path) => config::apply(Cli::command(), &path),
-        None => Ok(Cli::command()),
+        Some(path) => config::apply(commands(), &path, given),
+        None => Ok(commands()),
     }
 }
 
@@ -253,13 +314,12 @@ mod pages;
 #[cfg(test)]
 mod tests {
     use clap::error::ErrorKind;
-    use clap::CommandFactory;
 
     use super::*;
 
     #[test]
     fn the_arguments_are_well_formed() {
-        Cli::command().debug_assert();
+        commands().debug_assert();
     }
 
     /// Every call of this tool on every page, for the command line's own reader.
@@ -273,7 +333,8 @@ mod tests {
             let words = std::iter::once("coflash".to_string()).chain(words.iter().map(of));
             let words: Vec<String> = words.filter(|word| word != "COMMAND").collect();
             count += 1;
-            let Err(error) = Cli::try_parse_from(&words) else { continue };
+            let words = words::ordered(words.iter().map(OsString::from).collect(), &commands());
+            let Err(error) = commands().try_get_matches_from(&words) else { continue };
             let mention = shown.inline
                 && (matches!(
                     error.kind(),

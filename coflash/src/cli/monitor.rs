@@ -17,7 +17,9 @@ use super::device::cancelled;
 use super::output::Failure;
 use super::values::{milliseconds, nodes};
 
-/// Shows what goes over the bus, in words: SDO, NMT, EMCY, heartbeat, LSS. Ctrl-C ends it.
+/// Shows what goes over the bus, in words.
+///
+/// That is SDO, NMT, EMCY, heartbeat, LSS. Ctrl-C ends it.
 #[derive(Debug, Args)]
 pub(super) struct Monitor {
     /// Show a log of candump -L or --trace instead of the bus.

@@ -8,7 +8,7 @@ use canopen::NodeId;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::Args;
 use coflash::bus::AdapterError;
-use coflash::device::diagnose::diagnose;
+use coflash::device::diagnose::{diagnose, Diagnosis};
 use coflash::device::error::LssFailure;
 use coflash::device::{legacy, Session};
 use coflash::file::convert::ConvertError;
@@ -17,6 +17,8 @@ use coflash::update::job::Fault;
 use coflash::update::{Left, Look};
 use coflash::Error;
 use serde_json::{json, Value};
+
+use super::record;
 
 /// Under this the options that all commands have are listed.
 pub(super) const GLOBAL: &str = "For all commands";
@@ -27,6 +29,11 @@ pub(super) struct Output {
     /// Write one JSON document to standard output in place of words for people.
     #[arg(long, global = true, help_heading = GLOBAL)]
     json: bool,
+
+    /// Write what happens to standard output as it happens, one JSON object a line: found, phase,
+    /// progress, retry, done; then the result, or the error.
+    #[arg(long, global = true, help_heading = GLOBAL, conflicts_with = "json")]
+    json_events: bool,
 
     /// Say nothing unless something goes wrong.
     #[arg(long, short, global = true, help_heading = GLOBAL, conflicts_with = "verbose")]
@@ -46,9 +53,10 @@ pub(super) struct Output {
 impl Output {
     /// What either of two says.
     pub(super) fn or(self, other: Self) -> Self {
-        let Self { json, quiet, verbose, legacy_exit_codes } = other;
+        let Self { json, json_events, quiet, verbose, legacy_exit_codes } = other;
         Self {
             json: self.json || json,
+            json_events: self.json_events || json_events,
             quiet: self.quiet || quiet,
             verbose: self.verbose || verbose,
             legacy_exit_codes: self.legacy_exit_codes || legacy_exit_codes,
@@ -59,20 +67,50 @@ impl Output {
     pub(super) fn of_words() -> Self {
         let set = std::env::var("COFLASH_LEGACY_EXIT_CODES").unwrap_or_default().to_lowercase();
         let falsey = matches!(set.as_str(), "" | "0" | "n" | "no" | "f" | "false" | "off");
-        let word = std::env::args().any(|word| word == "--legacy-exit-codes");
-        Self { legacy_exit_codes: word || !falsey, ..Self::default() }
+        let said = |option: &str| std::env::args_os().any(|word| word == *option);
+        let legacy_exit_codes = said("--legacy-exit-codes") || !falsey;
+        Self {
+            legacy_exit_codes,
+            json: said("--json"),
+            json_events: said("--json-events"),
+            ..Self::default()
+        }
+    }
+
+    /// The code that the program ends with for a failure.
+    pub(super) fn code(self, failure: &Failure) -> u32 {
+        if self.legacy_exit_codes {
+            failure.legacy
+        } else {
+            failure.exit as u32
+        }
     }
 
     /// Ends the program for a failure.
     pub(super) fn exit(self, failure: &Failure) -> ! {
-        let code = if self.legacy_exit_codes { failure.legacy } else { failure.exit as u32 };
+        let code = self.code(failure);
         // All numbers are below 2^31.
         std::process::exit(code as i32)
     }
 
     /// Whether people read along.
     pub(super) fn for_people(self) -> bool {
-        !self.json && !self.quiet
+        !self.for_programs() && !self.quiet
+    }
+
+    /// Whether a program reads along, and people do not.
+    pub(super) fn for_programs(self) -> bool {
+        self.json || self.json_events
+    }
+
+    /// Whether a program is told what happens.
+    pub(super) fn shows_events(self) -> bool {
+        self.json_events
+    }
+
+    /// Whether a person may want to know what is waited for; that goes to standard error.
+    pub(super) fn shows_waiting(self) -> bool {
+        self.for_people() && io::stderr().is_terminal()
     }
 
     /// Whether a bar that moves makes sense.
@@ -83,6 +121,7 @@ impl Output {
     /// Says something to people. A reader that has gone away (`| head`) is no reason to stop an
     /// update.
     pub(super) fn say(self, words: impl fmt::Display) {
+        record::note("said", &words.to_string());
         if self.for_people() {
             let _ = writeln!(io::stdout(), "{words}");
         }
@@ -97,6 +136,7 @@ impl Output {
 
     /// Says something to people who asked for more.
     pub(super) fn detail(self, words: impl fmt::Display) {
+        record::note("detail", &words.to_string());
         if self.verbose {
             let _ = writeln!(io::stderr(), "{words}");
         }
@@ -104,17 +144,37 @@ impl Output {
 
     /// The result of a command: words for people, the value for programs.
     pub(super) fn result(self, words: impl fmt::Display, value: impl FnOnce() -> Value) {
-        if self.json {
+        let text = words.to_string();
+        record::note("result", &text);
+        if self.for_programs() || record::is_kept() {
             self.value(&value());
-        } else if !self.quiet {
-            let text = words.to_string();
+        }
+        if self.for_people() {
             let _ = writeln!(io::stdout(), "{}", text.trim_end());
         }
     }
 
-    /// One JSON document in one line.
+    /// What a command came to, as one JSON document in one line.
     pub(super) fn value(self, value: &Value) {
-        if self.json {
+        record::result(value);
+        self.document("result", value);
+    }
+
+    /// Something that happens, for programs.
+    pub(super) fn event(self, line: &Value) {
+        if self.json_events {
+            let _ = writeln!(io::stdout(), "{line}");
+        }
+    }
+
+    fn document(self, event: &str, value: &Value) {
+        if self.json_events {
+            let mut line = json!({ "event": event });
+            if let (Some(line), Some(value)) = (line.as_object_mut(), value.as_object()) {
+                line.extend(value.clone());
+            }
+            self.event(&line);
+        } else if self.json {
             let _ = writeln!(io::stdout(), "{value}");
         }
     }
@@ -122,7 +182,7 @@ impl Output {
     /// A line of an endless list: words for people, a value for programs. Tells whether anybody
     /// still reads.
     pub(super) fn listed(self, words: impl fmt::Display, value: impl FnOnce() -> Value) -> bool {
-        if self.json {
+        if self.for_programs() {
             writeln!(io::stdout(), "{}", value()).is_ok()
         } else {
             self.quiet || writeln!(io::stdout(), "{words}").is_ok()
@@ -131,14 +191,16 @@ impl Output {
 
     /// Something that people should know although the command goes on. Never on standard output.
     pub(super) fn warn(self, words: impl fmt::Display) {
+        record::note("warning", &words.to_string());
         let _ = writeln!(io::stderr(), "{} {words}", paint("warning:", "33"));
     }
 
     /// A failure, as the last thing that a command says.
     pub(super) fn failure(self, failure: &Failure) {
-        if self.json {
+        record::note("error", failure.to_string().trim_end());
+        if self.for_programs() {
             if !failure.told {
-                self.value(&failure.value());
+                self.document("error", &failure.value());
             }
         } else {
             let _ = write!(io::stderr(), "{failure}");
@@ -231,11 +293,31 @@ impl Failure {
         }
     }
 
+    /// A conversation of several that failed: where the device was silent, this is why.
+    pub(super) fn diagnosed_by(error: Error, diagnosis: Option<&Diagnosis>, node: NodeId) -> Self {
+        let silent = matches!(error, Error::NoAnswer { .. });
+        let failure = Self::from(error);
+        match diagnosis.filter(|_| silent) {
+            Some(diagnosis) => {
+                let its = Diagnosis { node, ..diagnosis.clone() };
+                Self { advice: Some(its.to_string()), ..failure }
+            }
+            None => failure,
+        }
+    }
+
     /// Devices of several have failed, and the summary has told why; the manual's tools, which know
     /// one device, would have ended with `legacy` for the first of them.
     pub(super) fn told(exit: Exit, legacy: u32, failed: usize, of: usize) -> Self {
         let what = format!("{failed} of {of} devices failed");
         Self { told: true, legacy, ..Self::new(exit, None, what, None) }
+    }
+
+    /// Objects of several that the device refused, each of which was told; it ends as the first of
+    /// them would have.
+    pub(super) fn unread(first: &Self, failed: usize, of: usize) -> Self {
+        let what = format!("{failed} of {of} objects could not be read");
+        Self { told: true, legacy: first.legacy, ..Self::new(first.exit, None, what, None) }
     }
 
     fn new(exit: Exit, number: Option<u32>, what: String, advice: Option<String>) -> Self {
@@ -251,7 +333,7 @@ impl Failure {
         });
         let wrong_value = matches!(error.kind(), ErrorKind::ValueValidation | ErrorKind::InvalidValue);
         let legacy = if of_node && wrong_value { legacy::INVALID_NODE_ID } else { legacy::INVALID_PARAMETER };
-        Self { legacy, ..Self::new(Exit::Usage, None, error.to_string(), None) }
+        Self { legacy, ..Self::bare_usage(error.render().to_string()) }
     }
 
     /// A fault in a job file.
@@ -279,6 +361,11 @@ impl Failure {
         let number = error.raw_os_error().and_then(|code| u32::try_from(code).ok());
         let what = format!("{}: cannot be read: {error}", path.display());
         Self::new(Exit::File, number, what, None)
+    }
+
+    /// A file, other than firmware, that is not what it should be.
+    pub(super) fn file(path: &Path, why: &str) -> Self {
+        Self::new(Exit::File, None, format!("{}: {why}", path.display()), None)
     }
 
     /// A fault in a line of a file, other than firmware.

@@ -82,8 +82,10 @@ fn with(
     let mut session = program.device.session(&mut link)?;
     let _lock =
         if command == "erase" { Some(context.lock(context.bus.as_deref(), session.node())?) } else { None };
+    let waiting = context.waiting(format!("node {} is done ({command})", session.node()));
     let (words, more) = act(&mut session, program.program, &mut |event| context.out.detail(event))
         .map_err(|error| Failure::diagnosed(error, &mut session))?;
+    drop(waiting);
     let node = session.node();
     context.out.result(format_args!("node {node}: {words}"), || {
         let mut value = json!({ "command": command, "node": node.get(), "program": program.program });

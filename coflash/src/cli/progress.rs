@@ -1,86 +1,122 @@
-//! What a person sees of an update: a bar on a terminal, plain lines elsewhere.
+//! What is seen of an update: a bar on a terminal, plain lines elsewhere, an object a line for
+//! programs.
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
+use canopen::NodeId;
 use coflash::update::Event;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-
-const STYLE: &str = "{bar:40} {percent:>3} %  {bytes} of {total_bytes}, {bytes_per_sec}, {eta} left";
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
 use super::output::Output;
+use super::units::{rate, Pace};
+use super::waiting::{waits_until, Waiting};
+use super::{events, record};
+
+const STYLE: &str = "{bar:40} {percent:>3} %  {pos} of {len} bytes, {rate}, {left} left";
 
 /// Shows the events of an update.
 pub(super) struct Progress {
     out: Output,
+    node: NodeId,
     form: Form,
 }
 
 enum Form {
-    /// On a terminal.
-    Terminal(Option<ProgressBar>),
+    /// On a terminal: a bar while blocks go, and what is waited for around it.
+    Terminal { bar: Option<ProgressBar>, waiting: Option<Waiting> },
     /// In a file or a pipe: a line for each tenth.
     Plain {
         began: Option<Instant>,
         /// How many tenths have been shown.
         tenths: usize,
     },
+    /// For programs.
+    Lines(events::Lines),
 }
 
 impl Progress {
-    pub(super) fn new(out: Output) -> Self {
-        let form =
-            if out.on_terminal() { Form::Terminal(None) } else { Form::Plain { began: None, tenths: 0 } };
-        Self { out, form }
+    pub(super) fn new(out: Output, node: NodeId) -> Self {
+        let form = if out.shows_events() {
+            Form::Lines(events::Lines::new(out, node))
+        } else if out.on_terminal() {
+            let waiting = Some(Waiting::new(out, format!("node {node} answers")));
+            Form::Terminal { bar: None, waiting }
+        } else {
+            Form::Plain { began: None, tenths: 0 }
+        };
+        Self { out, node, form }
     }
 
     pub(super) fn show(&mut self, event: Event) {
+        record::event(self.node, &event);
         match (&mut self.form, event) {
-            (Form::Terminal(shown), Event::Progress { done, total }) => {
-                let bar = shown.get_or_insert_with(|| bar(total));
-                bar.set_position(done as u64);
+            (Form::Lines(lines), event) => lines.show(&event),
+            (Form::Terminal { bar, waiting }, Event::Progress { done, total }) => {
+                let shown = bar.get_or_insert_with(|| new_bar(total));
+                // The end is told by more than one answer.
+                if shown.is_finished() {
+                    return;
+                }
+                *waiting = None;
+                shown.set_position(done as u64);
                 if done == total {
-                    bar.finish();
+                    shown.finish();
+                    *waiting = Some(Waiting::new(self.out, waits_until(&Event::Progress { done, total })));
                 }
             }
             // The command tells the end.
-            (_, Event::Done(_)) => {}
-            (Form::Terminal(Some(bar)), event) if !bar.is_finished() => bar.println(format!("  {event}")),
+            (Form::Terminal { waiting, .. }, Event::Done(_)) => *waiting = None,
+            (Form::Plain { .. }, Event::Done(_)) => {}
+            (Form::Terminal { bar: Some(bar), .. }, event) if !bar.is_finished() => {
+                bar.println(format!("  {event}"));
+            }
+            (Form::Terminal { waiting, .. }, event) => {
+                *waiting = None;
+                self.out.say(format_args!("  {event}"));
+                *waiting = Some(Waiting::new(self.out, waits_until(&event)));
+            }
             (Form::Plain { began, tenths }, Event::Progress { done, total }) => {
                 let began = *began.get_or_insert_with(Instant::now);
                 let now = (done * 10).checked_div(total).unwrap_or(10);
                 if now > *tenths {
                     *tenths = now;
-                    self.out.say(format_args!("  {}", line(done, total, began.elapsed())));
+                    self.out.say(format_args!("  {}", Pace::new(done, total, began.elapsed())));
                 }
             }
-            (_, event) => self.out.say(format_args!("  {event}")),
+            (Form::Plain { .. }, event) => self.out.say(format_args!("  {event}")),
         }
     }
 
     /// Leaves the bar where it stands.
     pub(super) fn finish(&mut self) {
-        match &self.form {
-            Form::Terminal(Some(bar)) if !bar.is_finished() => bar.abandon(),
-            _ => {}
+        if let Form::Terminal { bar, waiting } = &mut self.form {
+            *waiting = None;
+            if let Some(bar) = bar.as_ref().filter(|bar| !bar.is_finished()) {
+                bar.abandon();
+            }
         }
     }
 }
 
-fn bar(total: usize) -> ProgressBar {
+/// A bar's rate and remaining time, in this tool's units.
+pub(super) fn with_rate(style: ProgressStyle) -> ProgressStyle {
+    // A bar that cannot be drawn is no reason to stop.
+    style
+        .with_key("rate", |state: &ProgressState, text: &mut dyn std::fmt::Write| {
+            let _ = write!(text, "{}", rate(state.per_sec()));
+        })
+        .with_key("left", |state: &ProgressState, text: &mut dyn std::fmt::Write| {
+            let _ = write!(text, "{:.0} s", state.eta().as_secs_f64());
+        })
+}
+
+fn new_bar(total: usize) -> ProgressBar {
     let bar = ProgressBar::with_draw_target(Some(total as u64), ProgressDrawTarget::stdout());
     match ProgressStyle::with_template(STYLE) {
-        Ok(style) => bar.with_style(style.progress_chars("=> ")),
+        Ok(style) => bar.with_style(with_rate(style).progress_chars("=> ")),
         // The template is a constant; should it ever be wrong, a bar in another style does.
         Err(_) => bar,
     }
-}
-
-/// `30 %  1234 of 4100 bytes, 2.5 kB/s, 3 s left`.
-fn line(done: usize, total: usize, took: Duration) -> String {
-    let percent = (done * 100).checked_div(total).unwrap_or(100);
-    let rate = done as f64 / took.as_secs_f64().max(1e-3);
-    let left = (total - done) as f64 / rate.max(1.0);
-    format!("{percent:>3} %  {done} of {total} bytes, {:.1} kB/s, {left:.0} s left", rate / 1000.0)
 }
 
 #[cfg(test)]
@@ -90,12 +126,5 @@ mod tests {
     #[test]
     fn the_bar_has_its_style() {
         assert!(ProgressStyle::with_template(STYLE).is_ok());
-    }
-
-    #[test]
-    fn a_line_has_rate_and_remaining_time() {
-        assert_eq!(line(1000, 4000, Duration::from_secs(2)), " 25 %  1000 of 4000 bytes, 0.5 kB/s, 6 s left");
-        assert_eq!(line(0, 4000, Duration::ZERO), "  0 %  0 of 4000 bytes, 0.0 kB/s, 4000 s left");
-        assert_eq!(line(0, 0, Duration::ZERO), "100 %  0 of 0 bytes, 0.0 kB/s, 0 s left");
     }
 }

@@ -1,28 +1,39 @@
-//! `coflash read`: the value of any object.
+//! `coflash read`: the values of any objects.
 
 use std::path::PathBuf;
 
-use canopen::Address;
 use clap::{Args, ValueEnum};
-use coflash::device::Dialect;
+use coflash::device::value::visible;
+use coflash::device::{Dialect, Session};
 use coflash::update::dialect::read_locked;
-use serde_json::json;
+use serde_json::{json, Value};
 
 use super::context::Context;
 use super::device::Device;
 use super::dialect::Access;
-use super::output::Failure;
+use super::objects::{self, Names, Object};
+use super::output::{Exit, Failure};
 
-/// Reads an object, or a program where the device allows it (1F50/1).
+/// Reads objects, or a program where the device allows it (1F50/1).
+///
+/// An object is a hexadecimal index and, behind a slash, a decimal sub-index: 1018/4, or 100A for
+/// sub-index 0. 1018/1..4 is a range of sub-indices. With --eds an object may be named: "Program
+/// control/1". An object that the device refuses does not keep the others from being read.
 ///
 /// With --unlock a lift device is brought into its bootloader, unlocked there and restarted
 /// afterwards, so that its program (1F50/1) and its parameter set (1F50/2) can be saved.
 #[derive(Debug, Args)]
 pub(super) struct Read {
-    /// The object: hexadecimal index and, behind a slash, decimal sub-index: 1018/4, or 100A for
-    /// sub-index 0.
-    #[arg(value_name = "INDEX[/SUB]", value_parser = address)]
-    object: Address,
+    /// The objects: INDEX, INDEX/SUB, INDEX/FIRST..LAST, or with --eds names.
+    #[arg(value_name = "OBJECT", required_unless_present = "file")]
+    objects: Vec<String>,
+
+    /// Read the objects that this file lists, one a line; # begins a comment.
+    #[arg(long, value_name = "LIST")]
+    file: Option<PathBuf>,
+
+    #[command(flatten)]
+    names: Names,
 
     #[command(flatten)]
     device: Device,
@@ -30,11 +41,11 @@ pub(super) struct Read {
     #[command(flatten)]
     access: Access,
 
-    /// How to show the value.
+    /// How to show the values.
     #[arg(long = "as", value_name = "KIND", default_value = "auto", value_enum)]
     kind: Kind,
 
-    /// Write the bytes to this file instead.
+    /// Write the bytes of the one object to this file instead.
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
 }
@@ -53,47 +64,94 @@ enum Kind {
 
 impl Read {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        let mut words = self.objects.clone();
+        if let Some(list) = &self.file {
+            words.extend(objects::list(list)?);
+        }
+        let objects = self.names.objects(&words)?;
+        if let (Some(_), [_, _, ..]) = (&self.output, objects.as_slice()) {
+            let advice = "read one object at a time with --output";
+            return Err(Failure::usage("several objects do not go into one file", advice));
+        }
         let mut link = context.link()?;
         let mut session = self.device.session(&mut link)?;
-        let (node, object) = (session.node(), self.object);
+        let node = session.node().get();
+        let mut values = Vec::new();
+        let mut refused = None;
+        for object in &objects {
+            match self.one(context, &mut session, object) {
+                Ok(value) => values.push(value),
+                // The next object may be readable.
+                Err(failure) if objects.len() > 1 && failure.exit == Exit::Device => {
+                    if !context.out.for_programs() {
+                        context.out.failure(&failure);
+                    }
+                    let mut value = object.value();
+                    value["error"] = failure.value()["error"].clone();
+                    values.push(value);
+                    refused.get_or_insert(failure);
+                }
+                Err(failure) => return Err(failure),
+            }
+        }
+        match values.as_mut_slice() {
+            [value] if objects.len() == 1 => {
+                value["command"] = "read".into();
+                value["node"] = node.into();
+                context.out.value(value);
+            }
+            values => context.out.value(&json!({ "command": "read", "node": node, "objects": values })),
+        }
+        match refused {
+            None => Ok(()),
+            Some(first) => {
+                let failed = values.iter().filter(|value| value.get("error").is_some()).count();
+                Err(Failure::unread(&first, failed, objects.len()))
+            }
+        }
+    }
+
+    /// Reads one object and shows it to people; gives what programs get.
+    fn one(&self, context: &Context, session: &mut Session<'_>, object: &Object) -> Result<Value, Failure> {
+        let (node, at) = (session.node(), object.at);
         let (dialect, unlock) = (self.access.dialect(), self.access.unlock());
+        let waiting = context.waiting(format!("{at} of node {node} is read"));
         let bytes = match (dialect, unlock) {
             (None | Some(Dialect::Block | Dialect::Raw | Dialect::Hex), None) => {
-                session.upload(object, &mut |_| {})
+                session.upload(at, &mut |_| {})
             }
-            _ => read_locked(&mut session, object, dialect, unlock, &mut |event| context.out.detail(event)),
+            _ => read_locked(session, at, dialect, unlock, &mut |event| context.out.detail(event)),
         }
-        .map_err(|error| Failure::diagnosed(error, &mut session))?;
+        .map_err(|error| Failure::diagnosed(error, session))?;
+        drop(waiting);
         if let Some(path) = &self.output {
             std::fs::write(path, &bytes).map_err(|error| {
                 Failure::system(format!("{}: cannot be written: {error}", path.display()))
             })?;
         }
+        let typed = || object.kind().filter(|_| self.kind == Kind::Auto)?.show(&bytes);
         let shown = match &self.output {
             Some(path) => format!("{} bytes to {}", bytes.len(), path.display()),
-            None => show(&bytes, self.kind)?,
+            None => match typed() {
+                Some(shown) => shown,
+                None => show(&bytes, self.kind)?,
+            },
         };
-        context.out.result(format_args!("node {node}, {object}: {shown}"), || {
-            json!({
-                "command": "read",
-                "node": node.get(),
-                "index": object.index,
-                "sub": object.sub,
-                "size": bytes.len(),
-                "hex": self.output.is_none().then(|| hex(&bytes, "")),
-                "number": number(&bytes),
-                "text": text(&bytes),
-                "file": self.output.as_ref().map(|path| path.display().to_string()),
-            })
-        });
-        Ok(())
+        context.out.say(format_args!("node {node}, {object}: {shown}"));
+        let mut value = object.value();
+        value["size"] = bytes.len().into();
+        value["hex"] = self.output.is_none().then(|| hex(&bytes, "")).into();
+        value["number"] = number(&bytes).into();
+        value["text"] = visible(&bytes).into();
+        value["file"] = self.output.as_ref().map(|path| path.display().to_string()).into();
+        Ok(value)
     }
 }
 
 fn show(bytes: &[u8], kind: Kind) -> Result<String, Failure> {
     let as_number =
         || number(bytes).map(|number| format!("{number} ({number:0digits$X}h)", digits = bytes.len() * 2));
-    let as_text = || text(bytes).map(|text| format!("{text:?}"));
+    let as_text = || visible(bytes).map(|text| format!("{text:?}"));
     let wrong = |what: &str| {
         Failure::usage(format!("{} bytes are no {what}", bytes.len()), "show them with --as hex")
     };
@@ -113,47 +171,14 @@ fn number(bytes: &[u8]) -> Option<u64> {
     Some(bytes.iter().rev().fold(0, |number, byte| number << 8 | u64::from(*byte)))
 }
 
-/// The text, if all of it is printable ASCII; a zero may end it.
-fn text(bytes: &[u8]) -> Option<String> {
-    let bytes = bytes.strip_suffix(&[0]).unwrap_or(bytes);
-    let printable = !bytes.is_empty() && bytes.iter().all(|byte| matches!(byte, b' '..=b'~'));
-    printable.then(|| bytes.iter().map(|byte| char::from(*byte)).collect())
-}
-
 fn hex(bytes: &[u8], between: &str) -> String {
     let pairs: Vec<String> = bytes.iter().map(|byte| format!("{byte:02X}")).collect();
     pairs.join(between)
 }
 
-/// `1018/4`, `1018h/4`, `0x1018/0x04`, `100A`.
-fn address(words: &str) -> Result<Address, String> {
-    let (index, sub) = words.split_once('/').unwrap_or((words, "0"));
-    let index = index.strip_prefix("0x").or_else(|| index.strip_prefix("0X")).unwrap_or(index);
-    let index = index.strip_suffix(['h', 'H']).unwrap_or(index);
-    let wrong = || "an object is a hexadecimal index and a sub-index, like 1018/4".to_string();
-    if index.is_empty() || !index.bytes().all(|digit| digit.is_ascii_hexdigit()) {
-        return Err(wrong());
-    }
-    let index = u16::from_str_radix(index, 16).map_err(|_| wrong())?;
-    let sub = super::values::number(sub).ok().and_then(|sub| u8::try_from(sub).ok()).ok_or_else(wrong)?;
-    Ok(Address::new(index, sub))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn objects_are_an_index_and_a_sub_index() {
-        for (words, index, sub) in
-            [("1018/4", 0x1018, 4), ("100A", 0x100A, 0), ("1f57h/1", 0x1F57, 1), ("0x1F50/0xFE", 0x1F50, 254)]
-        {
-            assert_eq!(address(words), Ok(Address::new(index, sub)), "{words}");
-        }
-        for words in ["", "/1", "10018", "1018/256", "1018/", "name", "+1018", "1018/1/1"] {
-            assert!(address(words).is_err(), "{words}");
-        }
-    }
 
     #[test]
     fn a_value_is_shown_as_what_it_looks_like() {

@@ -43,6 +43,7 @@ impl Reset {
         let mut adapter = context.open()?;
         adapter.send(&command.emit(node))?;
         let mut back: Vec<NodeId> = Vec::new();
+        let waiting = context.waiting("a boot-up message comes");
         listen(&mut *adapter, self.boot_timeout, &cancelled()?, &mut |frame| {
             if let Some((node, NmtState::Initialisation)) = parse_state_message(frame) {
                 if !back.contains(&node) {
@@ -53,6 +54,7 @@ impl Reset {
             // waiting.
             node.is_some_and(|node| back.contains(&node))
         })?;
+        drop(waiting);
         let words = match back.as_slice() {
             [] => "nobody has sent a boot-up message".to_string(),
             nodes => {

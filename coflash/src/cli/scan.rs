@@ -18,7 +18,9 @@ use super::info;
 use super::output::Failure;
 use super::values::{milliseconds, nodes};
 
-/// Shows who is on the bus: asks all node-IDs by SDO, and listens for heartbeats.
+/// Shows who is on the bus.
+///
+/// Asks all node-IDs by SDO, and listens for heartbeats.
 ///
 /// It aborts an SDO transfer that another tool has under way with a node, or has left unfinished;
 /// --listen-only asks nothing.
@@ -50,7 +52,9 @@ impl Scan {
             .ask(!self.listen_only);
         let mut adapter = context.open()?;
         context.out.detail("asking and listening");
+        let waiting = context.waiting("everybody was asked, and had time to be heard");
         let found = scan(&mut *adapter, &options, &cancelled()?)?;
+        drop(waiting);
         let advice = match found.is_empty() {
             true => adapter.health().and_then(|health| health.advice()),
             false => None,

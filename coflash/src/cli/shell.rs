@@ -12,7 +12,9 @@ use super::context::Context;
 use super::device::cancelled;
 use super::output::Failure;
 
-/// Reads commands from the keyboard, with history; or from standard input, one a line.
+/// Reads commands, from the keyboard or from standard input.
+///
+/// From the keyboard with history, from standard input one a line.
 ///
 /// What was said on the command line (--bus, --json and so on) holds for all of them. `exit` or
 /// Ctrl-D ends it. From standard input the first command that fails ends it.

@@ -2,22 +2,17 @@
 
 use std::time::Duration;
 
-use canopen::NodeId;
+use canopen::{Address, NodeId};
+use coflash::device::value::integer;
 
 /// A number of up to 32 bits in C notation: `4096`, `0x1000`, `010000` (octal), with an `u` or `l`
 /// behind it if need be.
 pub(super) fn number(text: &str) -> Result<u32, String> {
     let bare = text.trim_end_matches(['u', 'U', 'l', 'L']);
-    let (digits, radix) = match bare.strip_prefix("0x").or_else(|| bare.strip_prefix("0X")) {
-        Some(digits) => (digits, 16),
-        None if bare.len() > 1 && bare.starts_with('0') => (&bare[1..], 8),
-        None => (bare, 10),
-    };
-    // `from_str_radix` would take a sign.
-    if digits.is_empty() || !digits.chars().all(|digit| digit.is_digit(radix)) {
-        return Err("it is no number in C notation (4096, 0x1000 or octal 010000)".to_string());
-    }
-    u32::from_str_radix(digits, radix).map_err(|_| "it is no number of up to 32 bits".to_string())
+    let number = integer(bare).filter(|_| !bare.starts_with('-'));
+    let number =
+        number.ok_or_else(|| "it is no number in C notation (4096, 0x1000 or octal 010000)".to_string())?;
+    u32::try_from(number).map_err(|_| "it is no number of up to 32 bits".to_string())
 }
 
 pub(super) fn node_id(text: &str) -> Result<NodeId, String> {
@@ -72,9 +67,34 @@ pub(super) fn attempts(text: &str) -> Result<u32, String> {
     }
 }
 
+/// An object: `1018/4`, `1018h/4`, `0x1018/0x04`, `100A`.
+pub(super) fn address(words: &str) -> Option<Address> {
+    let (index, sub) = words.split_once('/').unwrap_or((words, "0"));
+    let index = index.strip_prefix("0x").or_else(|| index.strip_prefix("0X")).unwrap_or(index);
+    let index = index.strip_suffix(['h', 'H']).unwrap_or(index);
+    if index.is_empty() || !index.bytes().all(|digit| digit.is_ascii_hexdigit()) {
+        return None;
+    }
+    let index = u16::from_str_radix(index, 16).ok()?;
+    let sub = u8::try_from(number(sub).ok()?).ok()?;
+    Some(Address::new(index, sub))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn objects_are_an_index_and_a_sub_index() {
+        for (words, index, sub) in
+            [("1018/4", 0x1018, 4), ("100A", 0x100A, 0), ("1f57h/1", 0x1F57, 1), ("0x1F50/0xFE", 0x1F50, 254)]
+        {
+            assert_eq!(address(words), Some(Address::new(index, sub)), "{words}");
+        }
+        for words in ["", "/1", "10018", "1018/256", "1018/", "name", "+1018", "1018/1/1"] {
+            assert_eq!(address(words), None, "{words}");
+        }
+    }
 
     #[test]
     fn numbers_are_those_of_c() {

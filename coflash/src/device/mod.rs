@@ -6,6 +6,7 @@ mod device_type;
 pub mod diagnose;
 mod dialect;
 mod doing;
+pub mod eds;
 pub mod error;
 pub mod flying_master;
 pub mod info;
@@ -18,6 +19,7 @@ pub mod region;
 pub mod scan;
 pub mod session;
 mod timing;
+pub mod value;
 
 pub use self::device_type::DeviceType;
 pub use self::dialect::Dialect;

@@ -1,0 +1,161 @@
+//! Frames without passwords, for records that are handed on.
+
+use std::collections::BTreeMap;
+
+use canopen::{Address, Frame, NodeId};
+use embedded_can::{Frame as _, Id};
+
+/// The objects that passwords are written to: the access code of CiA 814-1, and the password of
+/// ESAcademy's bootloader.
+const PASSWORDS: [u16; 2] = [0x6005, 0x7F50];
+
+/// Whether what is written to this object is a password.
+#[must_use]
+pub fn is_password(at: Address) -> bool {
+    PASSWORDS.contains(&at.index)
+}
+
+/// Makes the bytes of passwords 0 in SDO downloads, whatever their form.
+#[derive(Debug, Default)]
+pub struct Redactor {
+    /// Nodes that are being sent a password.
+    under_way: BTreeMap<NodeId, Form>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Form {
+    Segments,
+    Blocks,
+}
+
+impl Redactor {
+    /// The frame as it may be shown: frames have to come in the order of the bus.
+    pub fn frame(&mut self, frame: &Frame) -> Frame {
+        let Id::Standard(id) = frame.id() else { return *frame };
+        let Some(node) = NodeId::new((id.as_raw() & 0x7F) as u8) else { return *frame };
+        let data = frame.data();
+        let Some(first) = data.first() else { return *frame };
+        match id.as_raw() & 0x780 {
+            0x580 => {
+                // An abort, or the answer to the end of a block download.
+                if *first == 0x80 || first & 0xE3 == 0xA1 {
+                    self.under_way.remove(&node);
+                }
+                *frame
+            }
+            0x600 => self.request(frame, node, *first),
+            _ => *frame,
+        }
+    }
+
+    fn request(&mut self, frame: &Frame, node: NodeId, first: u8) -> Frame {
+        let data = frame.data();
+        let secret = data.len() >= 3 && PASSWORDS.contains(&u16::from_le_bytes([data[1], data[2]]));
+        match (self.under_way.get(&node), first >> 5) {
+            (_, 0b100) if first == 0x80 => {
+                self.under_way.remove(&node);
+                *frame
+            }
+            (Some(Form::Blocks), _) => without(frame, 1),
+            (Some(Form::Segments), 0) => {
+                if first & 1 != 0 {
+                    self.under_way.remove(&node);
+                }
+                without(frame, 1)
+            }
+            (_, 1) if secret && first & 2 != 0 => {
+                self.under_way.remove(&node);
+                without(frame, 4)
+            }
+            (_, 1) if secret => {
+                self.under_way.insert(node, Form::Segments);
+                *frame
+            }
+            (_, 6) if secret && first & 1 == 0 => {
+                self.under_way.insert(node, Form::Blocks);
+                *frame
+            }
+            _ => {
+                self.under_way.remove(&node);
+                *frame
+            }
+        }
+    }
+}
+
+/// The frame with zeros from this byte on.
+fn without(frame: &Frame, from: usize) -> Frame {
+    let mut data = frame.data().to_vec();
+    data.iter_mut().skip(from).for_each(|byte| *byte = 0);
+    Frame::new(frame.id(), &data).unwrap_or(*frame)
+}
+
+#[cfg(test)]
+mod tests {
+    use canopen::CobId;
+
+    use super::*;
+
+    fn shown(frames: &[(bool, [u8; 8])]) -> Vec<[u8; 8]> {
+        let node = NodeId::new(5).unwrap();
+        let mut redactor = Redactor::default();
+        let id = |to_node| if to_node { CobId::sdo_request(node) } else { CobId::sdo_response(node) };
+        let shown = frames.iter().map(|(to_node, data)| redactor.frame(&Frame::full(id(*to_node), *data)));
+        shown.map(|frame| frame.data().try_into().unwrap()).collect()
+    }
+
+    #[test]
+    fn a_password_is_not_in_what_is_shown() {
+        // CiA 301: expedited, in segments, and as a block; what follows is shown.
+        let after = (true, [0x2F, 0x51, 0x1F, 1, 0x80, 0, 0, 0]);
+        let cases: [&[(bool, [u8; 8])]; 3] = [
+            &[
+                (true, [0x23, 0x50, 0x7F, 1, b'I', b'N', b'I', b'T']),
+                (false, [0x60, 0x50, 0x7F, 1, 0, 0, 0, 0]),
+            ],
+            &[
+                (true, [0x21, 0x05, 0x60, 1, 10, 0, 0, 0]),
+                (false, [0x60, 0x05, 0x60, 1, 0, 0, 0, 0]),
+                (true, [0x00, b'o', b'p', b'e', b'n', b's', b'e', b's']),
+                (false, [0x20, 0, 0, 0, 0, 0, 0, 0]),
+                (true, [0x19, b'a', b'm', b'e', 0, 0, 0, 0]),
+            ],
+            &[
+                (true, [0xC6, 0x05, 0x60, 1, 10, 0, 0, 0]),
+                (false, [0xA4, 0x05, 0x60, 1, 127, 0, 0, 0]),
+                (true, [0x01, b'o', b'p', b'e', b'n', b's', b'e', b's']),
+                (true, [0x82, b'a', b'm', b'e', 0, 0, 0, 0]),
+                (false, [0xA2, 2, 127, 0, 0, 0, 0, 0]),
+                (true, [0xD1, 0x12, 0x34, 0, 0, 0, 0, 0]),
+                (false, [0xA1, 0, 0, 0, 0, 0, 0, 0]),
+            ],
+        ];
+        for case in cases {
+            let all = shown(&[case, &[after]].concat());
+            let letters =
+                all.iter().flat_map(|data| &data[1..]).filter(|byte| byte.is_ascii_lowercase()).count();
+            assert_eq!(letters, 0, "{all:?}");
+            assert!(!all.iter().any(|data| data[4..] == *b"INIT"), "{all:?}");
+            assert_eq!(all.last(), Some(&after.1));
+            assert_eq!(all[0][..4], case[0].1[..4]);
+        }
+    }
+
+    #[test]
+    fn what_is_no_password_is_shown_as_it_is() {
+        let frames = [
+            (true, [0x21, 0x50, 0x1F, 1, 10, 0, 0, 0]),
+            (true, [0x00, 1, 2, 3, 4, 5, 6, 7]),
+            (false, [0x43, 0x05, 0x60, 1, 1, 2, 3, 4]),
+            (true, [0x40, 0x05, 0x60, 1, 0, 0, 0, 0]),
+        ];
+        assert_eq!(shown(&frames), frames.map(|(_, data)| data));
+        // An abort ends it.
+        let aborted = [
+            (true, [0x21, 0x05, 0x60, 1, 10, 0, 0, 0]),
+            (false, [0x80, 0x05, 0x60, 1, 0, 0, 1, 6]),
+            (true, [0x00, 1, 2, 3, 4, 5, 6, 7]),
+        ];
+        assert_eq!(shown(&aborted), aborted.map(|(_, data)| data));
+    }
+}

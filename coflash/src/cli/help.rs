@@ -1,0 +1,272 @@
+//! How help is put in order: options in groups, `-h` short and with examples, `--help` with all.
+//!
+//! The options say what they do where they are; here is said where they stand.
+
+use clap::{Arg, Command};
+
+use super::output::EXIT_CODES;
+
+/// The groups of `--help`, with the options in each.
+const GROUPS: [(&str, &[&str]); 5] = [
+    ("Devices", &["node", "job", "at_once", "program", "report"]),
+    (
+        "Firmware file",
+        &[
+            "board",
+            "layout",
+            "start_address",
+            "end_address",
+            "block_size",
+            "gap_fill",
+            "block_max_gap",
+            "adjust_start",
+            "crc16",
+            "last_block_2008",
+            "format",
+            "vid",
+            "pid",
+            "ver",
+            "date",
+        ],
+    ),
+    (
+        "Update",
+        &["check_target", "trial_run", "wait", "no_mastership", "no_start", "verify", "block_repeats"],
+    ),
+    (
+        "Time and transfer",
+        &["sdo_timeout", "sdo_attempts", "command_timeout", "boot_timeout", "delay", "repeats", "segmented"],
+    ),
+    ("Devices of other makers", &["dialect", "unlock"]),
+];
+
+/// Options for special cases: `--help` has them, `-h` does not.
+const RARE: [&str; 33] = [
+    "trace",
+    "log_file",
+    "report_dir",
+    "json_events",
+    "quiet",
+    "verbose",
+    "block_size",
+    "at_once",
+    "report",
+    "end_address",
+    "gap_fill",
+    "block_max_gap",
+    "adjust_start",
+    "crc16",
+    "last_block_2008",
+    "ver",
+    "date",
+    "no_mastership",
+    "block_repeats",
+    "sdo_attempts",
+    "command_timeout",
+    "boot_timeout",
+    "delay",
+    "repeats",
+    "segmented",
+    "sdo_request",
+    "sdo_response",
+    "legacy_exit_codes",
+    "config",
+    "index",
+    "baudrate",
+    "vxd_type",
+    "temp",
+];
+
+/// Options of the manual's tools; their group is not in `-h`.
+const LEGACY: [&str; 4] = ["serial", "revision", "product", "vendor"];
+
+/// What people type, by command; the empty name is the program.
+const EXAMPLES: [(&str, &str); 13] = [
+    (
+        "",
+        "\
+Examples:
+  coflash scan --bus socketcan:can0
+  coflash flash app.elf --board stm32f407g-disc1 --node 5
+  coflash read 1008 1018/1..4 --node 5
+  coflash monitor --bus slcan:/dev/ttyACM0@500k
+
+Without --bus, COFLASH_BUS or coflash.toml says where the bus is.
+coflash COMMAND -h has a command's options in short, --help all of them.",
+    ),
+    (
+        "flash",
+        "\
+Examples:
+  coflash flash app.elf --board stm32f407g-disc1 --node 5
+  coflash flash app.blk --node 5-9 --check-target --trial-run
+  coflash flash app.hex --layout my-board.toml
+  coflash flash --job line.toml --report result.json",
+    ),
+    (
+        "convert",
+        "\
+Examples:
+  coflash convert app.elf --board stm32f407g-disc1
+  coflash convert app.hex app.blk --vid 0x3F --pid 1234 --ver 0x00000001",
+    ),
+    (
+        "inspect",
+        "\
+Examples:
+  coflash inspect app.blk
+  coflash inspect app.elf --board stm32f407g-disc1",
+    ),
+    (
+        "scan",
+        "\
+Examples:
+  coflash scan
+  coflash scan --nodes 1-10 --json
+  coflash scan --listen-only",
+    ),
+    (
+        "read",
+        "\
+Examples:
+  coflash read 100A
+  coflash read 1000 1008 1018/1..4 --node 5
+  coflash read \"Program control/1\" --eds device.eds
+  coflash read --file objects.txt --json
+  coflash read 1F50/1 --output backup.bin",
+    ),
+    (
+        "write",
+        "\
+Examples:
+  coflash write 1017 500 --type u16 --node 5
+  coflash write \"Producer heartbeat time\" 500 --eds device.eds
+  coflash write 2000/1 -7 --type i16
+  coflash write 2010 parameters.bin --type domain-from-file",
+    ),
+    (
+        "nmt",
+        "\
+Examples:
+  coflash nmt start --node 5
+  coflash nmt pre-operational --node all
+  coflash nmt reset --node 5",
+    ),
+    (
+        "lss",
+        "\
+Examples:
+  coflash lss fastscan --assign 5 --store
+  coflash lss assign --node 7 --store",
+    ),
+    (
+        "reset",
+        "\
+Examples:
+  coflash reset --node 5
+  coflash reset --all",
+    ),
+    (
+        "monitor",
+        "\
+Examples:
+  coflash monitor
+  coflash monitor --replay bus.log",
+    ),
+    (
+        "info",
+        "\
+Examples:
+  coflash info --node 5
+  coflash info --node 5 --json",
+    ),
+    (
+        "shell",
+        "\
+Examples:
+  coflash shell --bus socketcan:can0
+  coflash shell --log-file session.log",
+    ),
+];
+
+/// The examples of a command.
+pub(super) fn examples(name: &str) -> Option<&'static str> {
+    EXAMPLES.iter().find(|(of, _)| *of == name).map(|(_, text)| *text)
+}
+
+/// The commands with their help in order.
+pub(super) fn in_order(command: Command) -> Command {
+    let root = examples("").unwrap_or_default();
+    let command = command.after_help(root).after_long_help(format!("{root}\n\n{EXIT_CODES}"));
+    below(command.mut_args(placed))
+}
+
+fn below(command: Command) -> Command {
+    let names: Vec<String> = command.get_subcommands().map(|below| below.get_name().to_string()).collect();
+    names.into_iter().fold(command, |command, name| {
+        let text = examples(&name);
+        command.mut_subcommand(name, |command| {
+            let command = below(command.mut_args(placed));
+            match text {
+                Some(text) => command.after_help(text),
+                None => command,
+            }
+        })
+    })
+}
+
+fn placed(argument: Arg) -> Arg {
+    let id = argument.get_id().as_str().to_string();
+    let rare =
+        RARE.contains(&id.as_str()) || LEGACY.contains(&id.as_str()) && argument.get_help_heading().is_some();
+    let group = GROUPS.iter().find(|(_, ids)| ids.contains(&id.as_str()));
+    let argument = argument.hide_short_help(rare).hide_env_values(true);
+    match group {
+        Some((group, _)) if argument.get_help_heading().is_none() && !argument.is_positional() => {
+            argument.help_heading(*group)
+        }
+        _ => argument,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_example_is_understood() {
+        let mut count = 0;
+        for (name, text) in EXAMPLES {
+            for line in text.lines().filter_map(|line| line.strip_prefix("  coflash ")) {
+                // None of them has a blank inside quotes but for names.
+                let mut words = vec!["coflash".to_string()];
+                for (number, part) in line.split('"').enumerate() {
+                    match number % 2 {
+                        0 => words.extend(part.split_whitespace().map(String::from)),
+                        _ => words.push(part.to_string()),
+                    }
+                }
+                let read = super::super::commands().try_get_matches_from(&words);
+                if let Err(error) = read {
+                    panic!("{line}: {error}");
+                }
+                assert!(name.is_empty() || words[1] == name, "{line}");
+                count += 1;
+            }
+        }
+        assert!(count > 30, "{count}");
+    }
+
+    /// What is placed here is there; and every option of `flash` that `-h` shows has a line that fits.
+    #[test]
+    fn the_groups_name_options_that_there_are() {
+        let command = super::super::commands();
+        let has = |id: &str| {
+            let own = |command: &Command| command.get_arguments().any(|argument| argument.get_id() == id);
+            own(&command) || command.get_subcommands().any(own)
+        };
+        for id in GROUPS.iter().flat_map(|(_, ids)| ids.iter()).chain(&RARE).chain(&LEGACY) {
+            assert!(has(id), "{id}");
+        }
+    }
+}

@@ -1,0 +1,54 @@
+//! A command line without its passwords, for records that are handed on.
+
+use std::ffi::OsString;
+
+use coflash::bus::redact::is_password;
+
+use super::values::address;
+
+/// The options whose value is a secret.
+const SECRET: [&str; 2] = ["--unlock", "--key"];
+
+/// What stands in place of a password.
+const HIDDEN: &str = "***";
+
+/// The words, with each password hidden: the value of `--unlock` and `--key`, and what `write` puts
+/// into an object of a password.
+pub(super) fn without(words: &[OsString]) -> Vec<String> {
+    let mut hide = false;
+    let writes = words.iter().any(|word| word == "write");
+    let shown = |word: &OsString| {
+        let word = word.to_string_lossy().into_owned();
+        if std::mem::take(&mut hide) {
+            return HIDDEN.to_string();
+        }
+        if let Some(option) = SECRET.iter().find(|option| word.starts_with(&format!("{option}="))) {
+            return format!("{option}={HIDDEN}");
+        }
+        let into_password = writes && address(&word).is_some_and(is_password);
+        hide = SECRET.contains(&word.as_str()) || into_password;
+        word
+    };
+    words.iter().map(shown).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn passwords_are_hidden() {
+        for (words, shown) in [
+            ("coflash flash a --unlock sesame -N 5", "coflash flash a --unlock *** -N 5"),
+            ("coflash flash a --unlock=sesame", "coflash flash a --unlock=***"),
+            ("coflash convert a --key 1234 --add 1", "coflash convert a --key *** --add 1"),
+            ("coflash write 6005/1 sesame --type string", "coflash write 6005/1 *** --type string"),
+            ("coflash write 0x7F50/1 0x494E4954", "coflash write 0x7F50/1 ***"),
+            ("coflash read 6005/1 100A", "coflash read 6005/1 100A"),
+            ("coflash flash a --unlock", "coflash flash a --unlock"),
+        ] {
+            let words: Vec<OsString> = words.split(' ').map(OsString::from).collect();
+            assert_eq!(without(&words).join(" "), shown);
+        }
+    }
+}

@@ -1,0 +1,69 @@
+//! A sign of life while something takes its time: what is waited for, on a terminal alone.
+
+use std::time::Duration;
+
+use coflash::update::event::{Event, Phase};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
+
+use super::output::Output;
+
+const STYLE: &str = "{spinner} {msg} ({waited})";
+
+/// How often it turns.
+const TURN: Duration = Duration::from_millis(120);
+
+/// Turns for as long as it lives.
+#[derive(Debug)]
+pub(super) struct Waiting(Option<ProgressBar>);
+
+impl Waiting {
+    /// Waits for `what`, as in "node 5 answers".
+    pub(super) fn new(out: Output, what: impl Into<String>) -> Self {
+        Self(out.shows_waiting().then(|| {
+            let spinner = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
+            // The template is a constant; should it ever be wrong, another style does.
+            if let Ok(style) = ProgressStyle::with_template(STYLE) {
+                spinner.set_style(style.with_key(
+                    "waited",
+                    |state: &ProgressState, text: &mut dyn std::fmt::Write| {
+                        // What cannot be drawn is no reason to stop.
+                        let _ = write!(text, "{} s", state.elapsed().as_secs());
+                    },
+                ));
+            }
+            spinner.set_message(format!("waiting until {}", what.into()));
+            spinner.enable_steady_tick(TURN);
+            spinner
+        }))
+    }
+}
+
+impl Drop for Waiting {
+    fn drop(&mut self) {
+        if let Some(spinner) = &self.0 {
+            spinner.finish_and_clear();
+        }
+    }
+}
+
+/// What is waited for once this has happened in an update.
+pub(super) fn waits_until(event: &Event) -> &'static str {
+    match event {
+        Event::Phase(Phase::Searching { .. }) => "the bootloader is there (Ctrl-C ends it)",
+        Event::Phase(Phase::CallingBack) => "the bootloader answers",
+        Event::Phase(Phase::Erasing) => "the old program is erased",
+        Event::Phase(Phase::TrialStarting | Phase::Starting) => "the program answers",
+        Event::Progress { .. } => "the program is checked",
+        _ => "the device answers",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn it_has_its_style() {
+        assert!(ProgressStyle::with_template(STYLE).is_ok());
+    }
+}

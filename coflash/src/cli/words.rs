@@ -1,0 +1,160 @@
+//! The words of the command line, before they are read: an option of a command may stand in front of
+//! it, too.
+
+use std::ffi::OsString;
+
+use clap::{Arg, Command};
+
+/// Puts options that stand in front of their command behind it: `coflash --node 5 info` is `coflash
+/// info --node 5`. What cannot be understood stays as it is, for the reader to object to.
+pub(super) fn ordered(words: Vec<OsString>, root: &Command) -> Vec<OsString> {
+    let mut kept: Vec<OsString> = Vec::new();
+    let mut moved: Vec<(String, Vec<OsString>)> = Vec::new();
+    let mut rest = words.iter();
+    // The program's name.
+    kept.extend(rest.next().cloned());
+    let command = loop {
+        let Some(word) = rest.next() else { return words };
+        let Some(text) = word.to_str() else { return words };
+        let Some(name) = Name::of(text) else {
+            match root.find_subcommand(text) {
+                Some(command) => {
+                    kept.push(word.clone());
+                    break command;
+                }
+                None => return words,
+            }
+        };
+        let own = root.get_arguments().find(|argument| name.is_of(argument));
+        let known = own.is_some() || ["help", "version", "h", "V"].contains(&name.bare);
+        let Some(takes) = own.or_else(|| within(root, &name)).map(|argument| name.takes_next(argument))
+        else {
+            if known {
+                kept.push(word.clone());
+                continue;
+            }
+            return words;
+        };
+        let mut all = vec![word.clone()];
+        if takes {
+            all.extend(rest.next().cloned());
+        }
+        if known {
+            kept.extend(all);
+        } else {
+            moved.push((text.to_string(), all));
+        }
+    };
+    // A command of a command, as `lss assign`.
+    let mut levels = vec![(command, kept.len())];
+    let mut rest: Vec<OsString> = rest.cloned().collect();
+    while let Some(next) = rest.first().and_then(|word| levels.last()?.0.find_subcommand(word)) {
+        kept.push(rest.remove(0));
+        levels.push((next, kept.len()));
+    }
+    // Behind the last command that has it: from the end on, so that the places stay.
+    let place = |text: &str| {
+        let has = |(command, _): &&(&Command, usize)| {
+            Name::of(text).is_some_and(|name| command.get_arguments().any(|argument| name.is_of(argument)))
+        };
+        levels.iter().rev().find(has).or(levels.last()).map_or(kept.len(), |(_, place)| *place)
+    };
+    let mut moved: Vec<(usize, Vec<OsString>)> =
+        moved.into_iter().map(|(text, words)| (place(&text), words)).collect();
+    moved.sort_by_key(|(place, _)| *place);
+    for (place, words) in moved.into_iter().rev() {
+        kept.splice(place..place, words);
+    }
+    kept.extend(rest);
+    kept
+}
+
+/// The first command, or command of a command, that has this option.
+fn within<'c>(command: &'c Command, name: &Name<'_>) -> Option<&'c Arg> {
+    let own = command.get_arguments().find(|argument| name.is_of(argument));
+    own.or_else(|| command.get_subcommands().find_map(|below| within(below, name)))
+}
+
+/// An option as it is written.
+struct Name<'w> {
+    /// Without dashes and value.
+    bare: &'w str,
+    long: bool,
+    /// Whether its value is in the same word.
+    valued: bool,
+}
+
+impl<'w> Name<'w> {
+    /// `None` for a word that is no option.
+    fn of(word: &'w str) -> Option<Self> {
+        match word.strip_prefix("--") {
+            Some("") => None,
+            Some(long) => {
+                let (bare, value) =
+                    long.split_once('=').map_or((long, None), |(bare, value)| (bare, Some(value)));
+                Some(Self { bare, long: true, valued: value.is_some() })
+            }
+            None => {
+                let short = word.strip_prefix('-').filter(|short| !short.is_empty())?;
+                let first = short.chars().next().map_or(0, char::len_utf8);
+                Some(Self { bare: &short[..first], long: false, valued: short.len() > first })
+            }
+        }
+    }
+
+    fn is_of(&self, argument: &Arg) -> bool {
+        if self.long {
+            let aliases = argument.get_all_aliases().unwrap_or_default();
+            argument.get_long() == Some(self.bare) || aliases.contains(&self.bare)
+        } else {
+            argument.get_short().is_some_and(|short| self.bare.starts_with(short))
+        }
+    }
+
+    /// Whether the next word is its value.
+    fn takes_next(&self, argument: &Arg) -> bool {
+        !self.valued && argument.get_action().takes_values() && !argument.is_require_equals_set()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn line(words: &str) -> String {
+        let words = std::iter::once("coflash").chain(words.split_whitespace()).map(OsString::from).collect();
+        let words = ordered(words, &super::super::commands());
+        let words: Vec<&str> = words.iter().skip(1).filter_map(|word| word.to_str()).collect();
+        words.join(" ")
+    }
+
+    #[test]
+    fn an_option_in_front_of_its_command_goes_behind_it() {
+        for (words, ordered) in [
+            ("--node 5 info", "info --node 5"),
+            ("-N 5 --json flash a.elf --verify", "--json flash -N 5 a.elf --verify"),
+            ("-N5 info", "info -N5"),
+            ("--node=5 --bus x info", "--bus x info --node=5"),
+            ("--node 5 --verify --bus x flash a.elf", "--bus x flash --node 5 --verify a.elf"),
+            ("--sdo_timeout 70 info", "info --sdo_timeout 70"),
+            ("--node 5 lss assign --store", "lss assign --node 5 --store"),
+            ("--node 5 debug read 0x20000000", "debug --node 5 read 0x20000000"),
+            ("-q -N 1,5-7 flash a", "-q flash -N 1,5-7 a"),
+        ] {
+            assert_eq!(line(words), ordered, "{words}");
+        }
+        // What is in order, and what nobody understands.
+        for words in [
+            "info --node 5",
+            "--json info",
+            "--speed 5 info",
+            "--node 5",
+            "--node 5 fly",
+            "--help",
+            "-- info",
+            "",
+        ] {
+            assert_eq!(line(words), words);
+        }
+    }
+}

@@ -1,0 +1,325 @@
+//! Electronic data sheets (CiA 306-1): names, types and access of a device's objects.
+//!
+//! A sheet comes from somewhere: one that is too large, no INI file or without objects is an error,
+//! and what is odd about a single object costs that object's type or limits, not the sheet.
+
+use std::collections::{BTreeMap, HashMap};
+
+use canopen::Address;
+use configparser::ini::Ini;
+
+use super::value::{integer, DataType};
+
+/// The most bytes that a sheet may have. Those of drives with hundreds of objects have some 300 KiB.
+pub const MAX: usize = 8 * 1024 * 1024;
+
+/// A data sheet's objects.
+#[derive(Clone, Debug, Default)]
+pub struct Eds {
+    objects: BTreeMap<(u16, u8), Entry>,
+}
+
+/// One object, or one sub-index of it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Entry {
+    /// Where it is.
+    pub at: Address,
+    /// Its name, printable.
+    pub name: String,
+    /// The name of the record or array that it is in.
+    pub within: Option<String>,
+    /// Its data type; `None` for one that has no notation here.
+    pub kind: Option<DataType>,
+    /// Whether it may be written.
+    pub writable: bool,
+    /// The least value that it takes, where the sheet tells.
+    pub low: Option<i128>,
+    /// The greatest value that it takes, where the sheet tells.
+    pub high: Option<i128>,
+}
+
+/// What is wrong with a data sheet.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum EdsError {
+    /// It has more than [`MAX`] bytes.
+    #[error("it is larger than {} MiB: that is no data sheet", MAX / (1024 * 1024))]
+    TooLarge,
+    /// It is no INI file.
+    #[error("it is no EDS: {0}")]
+    Syntax(String),
+    /// There is no object in it.
+    #[error("it is no EDS: no section of it is an object, like [1018] or [1018sub1]")]
+    NoObjects,
+}
+
+/// Why a name leads to no object.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum NoObject {
+    /// Nothing has this name.
+    #[error("the EDS has no object '{name}'{}", like(.near))]
+    Unknown {
+        /// What was asked for.
+        name: String,
+        /// Names that have it in them.
+        near: Vec<String>,
+    },
+    /// Several have it.
+    #[error("several objects are called '{name}': {}", .all.join(", "))]
+    Ambiguous {
+        /// What was asked for.
+        name: String,
+        /// Where they are.
+        all: Vec<String>,
+    },
+}
+
+fn like(near: &[String]) -> String {
+    match near {
+        [] => String::new(),
+        near => format!("; there is {}", near.join(", ")),
+    }
+}
+
+/// How many names are told that are like the one asked for.
+const NEAR: usize = 6;
+
+impl Entry {
+    /// The name that leads to it and to nothing else: `Identity object/Serial number`.
+    #[must_use]
+    pub fn path(&self) -> String {
+        match &self.within {
+            Some(record) => format!("{record}/{}", self.name),
+            None => self.name.clone(),
+        }
+    }
+}
+
+impl Eds {
+    /// Takes a data sheet apart. What is not UTF-8 is taken for a character of its own.
+    ///
+    /// # Errors
+    /// [`EdsError`].
+    pub fn parse(bytes: &[u8]) -> Result<Self, EdsError> {
+        if bytes.len() > MAX {
+            return Err(EdsError::TooLarge);
+        }
+        let mut ini = Ini::new();
+        let mut form = ini.defaults();
+        form.delimiters = vec!['='];
+        form.comment_symbols = vec![';'];
+        // "Motor 1; speed" is a name.
+        form.inline_comment_symbols = Some(Vec::new());
+        ini.load_defaults(form);
+        let sections = ini.read(String::from_utf8_lossy(bytes).into_owned()).map_err(EdsError::Syntax)?;
+        let mut eds = Self::default();
+        for (name, keys) in &sections {
+            let Some((head, rest)) = name.split_at_checked(4) else { continue };
+            let Some(index) = hex16(head) else { continue };
+            if rest.is_empty() {
+                eds.object(index, keys, &sections);
+                continue;
+            }
+            let sub = rest.strip_prefix("sub").and_then(hex16).and_then(|sub| u8::try_from(sub).ok());
+            if let Some(sub) = sub {
+                let within = sections.get(head).map(parameter_name);
+                eds.objects.insert((index, sub), entry(Address::new(index, sub), within, keys));
+            }
+        }
+        if eds.objects.is_empty() {
+            return Err(EdsError::NoObjects);
+        }
+        Ok(eds)
+    }
+
+    /// A section that is an object as a whole: a variable, an array in short form, or the head of
+    /// what has sections of its own.
+    fn object(&mut self, index: u16, keys: &Keys, sections: &HashMap<String, Keys>) {
+        let variable =
+            !matches!(number(keys, "objecttype"), Some(0x8 | 0x9)) && number(keys, "subnumber").is_none();
+        if variable {
+            self.objects.insert((index, 0), entry(Address::new(index, 0), None, keys));
+            return;
+        }
+        let Some(count) = number(keys, "compactsubobj").and_then(|count| u8::try_from(count).ok()) else {
+            return;
+        };
+        let names = sections.get(&format!("{index:04x}name"));
+        for sub in 1..=count {
+            let given = names.and_then(|names| names.get(&sub.to_string())?.clone());
+            let record = parameter_name(keys);
+            let name = given.map_or_else(|| format!("{record}{sub}"), |name| printable(&name));
+            let mut entry = entry(Address::new(index, sub), Some(record), keys);
+            entry.name = name;
+            // A section of its own wins.
+            if !sections.contains_key(&format!("{index:04x}sub{sub:x}")) {
+                self.objects.insert((index, sub), entry);
+            }
+        }
+    }
+
+    /// The object at this address.
+    #[must_use]
+    pub fn at(&self, at: Address) -> Option<&Entry> {
+        self.objects.get(&(at.index, at.sub))
+    }
+
+    /// The object of this name, capital or small: that of a variable, `RECORD/SUB` with the number or
+    /// the name of the sub-index, or the name of a sub-index that only one object has.
+    ///
+    /// # Errors
+    /// [`NoObject`].
+    pub fn find(&self, name: &str) -> Result<&Entry, NoObject> {
+        let wanted = name.trim().to_lowercase();
+        let exact = |entry: &&Entry| {
+            let by_number = entry.within.as_ref().map(|record| format!("{record}/{}", entry.at.sub));
+            entry.path().to_lowercase() == wanted
+                || by_number.is_some_and(|path| path.to_lowercase() == wanted)
+        };
+        let mut found: Vec<&Entry> = self.objects.values().filter(exact).collect();
+        if found.is_empty() {
+            found = self.objects.values().filter(|entry| entry.name.to_lowercase() == wanted).collect();
+        }
+        match found.as_slice() {
+            [entry] => Ok(entry),
+            [] => {
+                let near = self.objects.values().map(Entry::path);
+                let near = near.filter(|path| !wanted.is_empty() && path.to_lowercase().contains(&wanted));
+                let near = near.take(NEAR).map(|path| format!("'{path}'")).collect();
+                Err(NoObject::Unknown { name: name.to_string(), near })
+            }
+            several => {
+                let all = several.iter().take(NEAR).map(|entry| format!("{} ('{}')", entry.at, entry.path()));
+                Err(NoObject::Ambiguous { name: name.to_string(), all: all.collect() })
+            }
+        }
+    }
+}
+
+/// A section's keys, in small letters.
+type Keys = HashMap<String, Option<String>>;
+
+fn entry(at: Address, within: Option<String>, keys: &Keys) -> Entry {
+    let access = keys.get("accesstype").cloned().flatten().unwrap_or_default().to_lowercase();
+    Entry {
+        at,
+        name: parameter_name(keys),
+        within,
+        kind: number(keys, "datatype")
+            .and_then(|index| u32::try_from(index).ok())
+            .and_then(DataType::from_index),
+        writable: !matches!(access.as_str(), "ro" | "const"),
+        low: number(keys, "lowlimit"),
+        high: number(keys, "highlimit"),
+    }
+}
+
+fn parameter_name(keys: &Keys) -> String {
+    printable(keys.get("parametername").and_then(Option::as_deref).unwrap_or_default())
+}
+
+/// Names are shown on terminals: what would move the cursor is replaced.
+fn printable(text: &str) -> String {
+    text.trim().chars().map(|c| if c.is_control() { '?' } else { c }).collect()
+}
+
+/// `None` for what is no number, as `$NODEID+0x600`.
+fn number(keys: &Keys, key: &str) -> Option<i128> {
+    integer(keys.get(key)?.as_deref()?.trim())
+}
+
+fn hex16(digits: &str) -> Option<u16> {
+    let all = !digits.is_empty() && digits.bytes().all(|digit| digit.is_ascii_hexdigit());
+    all.then(|| u16::from_str_radix(digits, 16).ok()).flatten()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// As CiA 306-1 has them, with what sheets of the field have beside: capitals anywhere, blanks, a
+    /// name with a number sign, an array in short form.
+    const SHEET: &[u8] = b"; a comment\n[FileInfo]\nFileName=x.eds\n\n[1000]\nParameterName=Device type\n\
+        ObjectType=0x7\nDataType=0x0007\nAccessType=ro\n\
+        [1017]\nPARAMETERNAME = Producer heartbeat time\nobjecttype=7\nDataType=6\nAccessType=rw\n\
+        LowLimit=10\nHighLimit=0x7FFF\n\
+        [1018]\nParameterName=Identity object\nObjectType=0x9\nSubNumber=3\n\
+        [1018sub0]\nParameterName=Highest sub-index\nObjectType=0x7\nDataType=0x0005\nAccessType=const\n\
+        [1018Sub1]\nParameterName=Vendor-ID\nObjectType=0x7\nDataType=0x0007\nAccessType=ro\n\
+        [1018sub4]\nParameterName=Serial number\nObjectType=0x7\nDataType=0x0007\nAccessType=ro\n\
+        [2000]\nParameterName=Motor #1; speed = max\nObjectType=0x7\nDataType=0x0003\nAccessType=rww\nLowLimit=$NODEID+1\n\
+        [2001]\nParameterName=Gain\nObjectType=0x8\nDataType=0x0008\nAccessType=rw\nCompactSubObj=3\n\
+        [2001Name]\nNrOfEntries=1\n2=Gain of the middle\n\
+        [2002]\nParameterName=Other\nObjectType=0x9\nSubNumber=1\n\
+        [2002subA]\nParameterName=Serial number\nDataType=0x0009\n";
+
+    fn address(index: u16, sub: u8) -> Address {
+        Address::new(index, sub)
+    }
+
+    #[test]
+    fn objects_are_found_by_name() {
+        let eds = Eds::parse(SHEET).unwrap();
+        for (name, at) in [
+            ("Device type", address(0x1000, 0)),
+            ("producer HEARTBEAT time", address(0x1017, 0)),
+            ("Identity object/1", address(0x1018, 1)),
+            ("Identity object/Serial number", address(0x1018, 4)),
+            ("Vendor-ID", address(0x1018, 1)),
+            ("Motor #1; speed = max", address(0x2000, 0)),
+            ("Gain/3", address(0x2001, 3)),
+            ("Gain/Gain of the middle", address(0x2001, 2)),
+            ("Other/10", address(0x2002, 10)),
+        ] {
+            assert_eq!(eds.find(name).map(|entry| entry.at), Ok(at), "{name}");
+        }
+        let error = eds.find("Serial number").unwrap_err().to_string();
+        assert!(error.contains("1018h/4 ('Identity object/Serial number'), 2002h/10"), "{error}");
+        let error = eds.find("identity").unwrap_err().to_string();
+        assert!(
+            error.contains("no object 'identity'; there is 'Identity object/Highest sub-index'"),
+            "{error}"
+        );
+        assert!(eds.find("").is_err() && eds.find("Gain/4").is_err());
+    }
+
+    #[test]
+    fn types_access_and_limits_are_the_sheets() {
+        let eds = Eds::parse(SHEET).unwrap();
+        let heartbeat = eds.at(address(0x1017, 0)).unwrap();
+        assert_eq!((heartbeat.kind, heartbeat.writable), (Some(DataType::Unsigned(2)), true));
+        assert_eq!((heartbeat.low, heartbeat.high), (Some(10), Some(0x7FFF)));
+        let vendor = eds.at(address(0x1018, 1)).unwrap();
+        assert_eq!((vendor.kind, vendor.writable), (Some(DataType::Unsigned(4)), false));
+        let speed = eds.at(address(0x2000, 0)).unwrap();
+        assert_eq!((speed.kind, speed.low), (Some(DataType::Integer(2)), None));
+        assert_eq!(eds.at(address(0x2001, 1)).unwrap().kind, Some(DataType::Real32));
+        assert_eq!(eds.at(address(0x1018, 9)), None);
+    }
+
+    #[test]
+    fn a_sheet_that_is_none_is_an_error() {
+        for bytes in
+            [&b""[..], b"hello", b"[1000", b"<html>\n</html>", &[0xFF; 64], b"\0\0\0\0", b"[FileInfo]\na=b\n"]
+        {
+            assert!(Eds::parse(bytes).is_err(), "{:?}", String::from_utf8_lossy(bytes));
+        }
+        assert_eq!(Eds::parse(&vec![b'a'; MAX + 1]).unwrap_err(), EdsError::TooLarge);
+        // Odd objects cost themselves.
+        let odd = b"[1000]\nParameterName=A\x1B[2J\nDataType=0xFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFF\n[1018sub100]\n\
+                    ParameterName=B\n[10sub]\n[1018subx]\n[\xC3\xA4\xC3\xB6\xC3\xBC]\n[2001]\nObjectType=8\nCompactSubObj=900\n";
+        let eds = Eds::parse(odd).unwrap();
+        assert_eq!(
+            eds.at(address(0x1000, 0)).map(|entry| (entry.name.as_str(), entry.kind)),
+            Some(("A?[2J", None))
+        );
+        assert_eq!(eds.objects.len(), 1);
+    }
+
+    #[test]
+    fn our_own_sheets_are_understood() {
+        let eds = Eds::parse(include_bytes!("../../../docs/eds/coboot-bootloader.eds")).unwrap();
+        let control = eds.find("Program control/1").unwrap();
+        assert_eq!((control.at, control.kind), (address(0x1F51, 1), Some(DataType::Unsigned(1))));
+    }
+}

@@ -1,0 +1,185 @@
+//! A board's memory map from a file, for boards that the tool was not built with.
+//!
+//! `cargo xtask layout --toml` writes such a file. It is held to the rules that the layouts of this
+//! repository are held to when they are compiled.
+
+use serde::Deserialize;
+use shared_abi::geometry::{self, Geometry, SectorRun};
+use shared_abi::layout::Layout;
+
+/// The most bytes that such a file may have.
+pub const MAX: usize = 64 * 1024;
+
+/// What is wrong with a memory map.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum BoardError {
+    /// It is no TOML, or has not what a memory map has, in this line.
+    #[error("line {0}: {1}")]
+    Syntax(usize, String),
+    /// It breaks this rule.
+    #[error("{0}")]
+    Rule(&'static str),
+}
+
+#[derive(Clone, Copy, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Region {
+    base: u32,
+    size: u32,
+}
+
+impl From<Region> for geometry::Region {
+    fn from(Region { base, size }: Region) -> Self {
+        Self::new(base, size)
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+struct File {
+    board: String,
+    bootloader: Region,
+    callgate_offset: u32,
+    parameters: [Region; 2],
+    programs: Vec<Region>,
+    ram: Region,
+    handoff: Region,
+    warm_start: Region,
+    chip: Chip,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+struct Chip {
+    name: String,
+    flash: Region,
+    sectors: Vec<Sectors>,
+    second_bank: Option<u8>,
+    sram: Region,
+    ccm: Region,
+    interrupts: u16,
+    ports: u8,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Sectors {
+    count: u8,
+    size: u32,
+}
+
+/// Takes a memory map apart and checks it. What it gives stays for as long as the program runs.
+///
+/// # Errors
+/// [`BoardError`]: the line that cannot be read, or the rule that is broken.
+pub fn parse(text: &str) -> Result<&'static Layout, BoardError> {
+    let file: File = toml::from_str(text).map_err(|error| {
+        let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
+        BoardError::Syntax(1 + before.matches('\n').count(), error.message().to_string())
+    })?;
+    let runs: Vec<SectorRun> =
+        file.chip.sectors.iter().map(|run| SectorRun { count: run.count, size: run.size }).collect();
+    let programs: Vec<geometry::Region> = file.programs.into_iter().map(Into::into).collect();
+    // A layout refers to what is there for ever; a command has one board, of some hundred bytes.
+    let chip: &'static Geometry = Box::leak(Box::new(Geometry {
+        chip: name(file.chip.name)?,
+        flash: file.chip.flash.into(),
+        sectors: runs.leak(),
+        second_bank: file.chip.second_bank,
+        sram: file.chip.sram.into(),
+        ccm: file.chip.ccm.into(),
+        interrupts: file.chip.interrupts,
+        ports: file.chip.ports,
+    }));
+    let layout = Layout {
+        board: name(file.board)?,
+        chip,
+        bootloader: file.bootloader.into(),
+        callgate_offset: file.callgate_offset,
+        parameters: file.parameters.map(Into::into),
+        programs: programs.leak(),
+        ram: file.ram.into(),
+        handoff: file.handoff.into(),
+        warm_start: file.warm_start.into(),
+    };
+    chip.check().and_then(|()| layout.check()).map_err(BoardError::Rule)?;
+    Ok(Box::leak(Box::new(layout)))
+}
+
+/// A name that can be shown.
+fn name(text: String) -> Result<&'static str, BoardError> {
+    let good = (1..=64).contains(&text.len()) && text.bytes().all(|byte| byte.is_ascii_graphic());
+    if good {
+        Ok(text.leak())
+    } else {
+        Err(BoardError::Rule("a name has 1 to 64 printable ASCII characters and no blanks"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shared_abi::layout::toml::Toml;
+    use shared_abi::layout::{stm32f429i_disc1, BOARDS};
+
+    use super::*;
+
+    #[test]
+    fn every_board_comes_back_as_it_was_written() {
+        for board in BOARDS {
+            assert_eq!(parse(&Toml(board).to_string()), Ok(*board), "{}", board.board);
+        }
+    }
+
+    #[test]
+    fn a_map_that_breaks_a_rule_is_refused_with_its_words() {
+        let good = Toml(&stm32f429i_disc1::LAYOUT).to_string();
+        for (from, to, words) in [
+            (
+                "programs = [\n  { base = 0x08010000",
+                "programs = [\n  { base = 0x0800c000",
+                "a program must start and end at sector borders",
+            ),
+            (
+                "programs = [\n  { base = 0x08010000, size = 0x1f0000 },",
+                "programs = [",
+                "there must be 1 to 254 programs",
+            ),
+            (
+                "bootloader = { base = 0x08000000",
+                "bootloader = { base = 0xffffff00",
+                "over the end of the address space",
+            ),
+            (
+                "bootloader = { base = 0x08000000",
+                "bootloader = { base = 0x08004000",
+                "must start at the base of the flash",
+            ),
+            (
+                "callgate-offset = 0x40",
+                "callgate-offset = 0xfffffff0",
+                "the callgate lies outside the bootloader",
+            ),
+            ("callgate-offset = 0x40", "callgate-offset = 0x3c", "overlaps the bootloader's vector table"),
+            (
+                "handoff = { base = 0x2002ffc0",
+                "handoff = { base = 0x2002ff00",
+                "inside the RAM of the images",
+            ),
+            ("count = 7", "count = 8", "no STM32F4 has more than 24 sectors"),
+            ("size = 0x20000 }", "size = 0x20001 }", "16, 64 or 128 KiB"),
+            ("second-bank = 12", "second-bank = 11", "begins with sector 12"),
+            ("interrupts = 91", "interrupts = 65535", "112 interrupt lines"),
+            ("sram = { base = 0x20000000", "sram = { base = 0x20000004", "whole pages of 4 KiB"),
+            ("board = \"stm32f429i-disc1\"", "board = \"a\\u001bb\"", "printable ASCII"),
+            ("callgate-offset = 0x40", "callgate-offset = -1", "line 4: "),
+            ("ports = 11", "ports = 11\nspeed = 5", "speed"),
+            ("[chip]", "[chap]", "chap"),
+        ] {
+            let text = good.replacen(from, to, 1);
+            assert_ne!(text, good, "{from}");
+            let error = parse(&text).unwrap_err().to_string();
+            assert!(error.contains(words), "{to}: {error}");
+        }
+        assert!(parse("").is_err() && parse("board = [").is_err());
+    }
+}

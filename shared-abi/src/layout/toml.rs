@@ -1,0 +1,69 @@
+//! A layout as a text for the host tool (`coflash --layout FILE`), for boards that a tool was not
+//! built with.
+
+use core::fmt;
+
+use super::Layout;
+use crate::geometry::Region;
+
+/// Prints a layout, with its chip, as TOML.
+#[derive(Clone, Copy, Debug)]
+pub struct Toml<'a>(pub &'a Layout);
+
+struct Table(Region);
+
+impl fmt::Display for Table {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{{ base = {:#010x}, size = {:#x} }}", self.0.base, self.0.size)
+    }
+}
+
+struct List<'a>(&'a [Region]);
+
+impl fmt::Display for List<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "[")?;
+        for region in self.0 {
+            writeln!(f, "  {},", Table(*region))?;
+        }
+        f.write_str("]")
+    }
+}
+
+impl fmt::Display for Toml<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Layout {
+            board,
+            chip,
+            bootloader,
+            callgate_offset,
+            parameters,
+            programs,
+            ram,
+            handoff,
+            warm_start,
+        } = self.0;
+        writeln!(f, "# The memory map of a board, for coflash --layout. Addresses and sizes are in bytes.")?;
+        writeln!(f, "board = \"{board}\"")?;
+        writeln!(f, "bootloader = {}", Table(*bootloader))?;
+        writeln!(f, "callgate-offset = {callgate_offset:#x}")?;
+        writeln!(f, "parameters = {}", List(parameters))?;
+        writeln!(f, "programs = {}", List(programs))?;
+        writeln!(f, "ram = {}", Table(*ram))?;
+        writeln!(f, "handoff = {}", Table(*handoff))?;
+        writeln!(f, "warm-start = {}", Table(*warm_start))?;
+        writeln!(f, "\n[chip]\nname = \"{}\"", chip.chip)?;
+        writeln!(f, "flash = {}", Table(chip.flash))?;
+        writeln!(f, "sectors = [")?;
+        for run in chip.sectors {
+            writeln!(f, "  {{ count = {}, size = {:#x} }},", run.count, run.size)?;
+        }
+        writeln!(f, "]")?;
+        if let Some(first) = chip.second_bank {
+            writeln!(f, "second-bank = {first}")?;
+        }
+        writeln!(f, "sram = {}", Table(chip.sram))?;
+        writeln!(f, "ccm = {}", Table(chip.ccm))?;
+        writeln!(f, "interrupts = {}\nports = {}", chip.interrupts, chip.ports)
+    }
+}
