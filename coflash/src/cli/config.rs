@@ -193,6 +193,7 @@ mod tests {
                 let value = match argument.get_possible_values().first() {
                     Some(value) => value.get_name().to_string(),
                     None if key == "board" => "nucleo-f446re".to_string(),
+                    None if key == "search" => "serial".to_string(),
                     None if key.starts_with("sdo-re") => "0x640".to_string(),
                     None => "7".to_string(),
                 };

@@ -27,21 +27,41 @@ const GROUPS: [(&str, &[&str]); 5] = [
             "pid",
             "ver",
             "date",
+            "no_label",
+            "force",
         ],
     ),
     (
         "Update",
-        &["check_target", "trial_run", "wait", "no_mastership", "no_start", "verify", "block_repeats"],
+        &[
+            "check_target",
+            "no_trial",
+            "no_start",
+            "verify",
+            "wait",
+            "not_alone",
+            "no_mastership",
+            "block_repeats",
+        ],
     ),
     (
         "Time and transfer",
-        &["sdo_timeout", "sdo_attempts", "command_timeout", "boot_timeout", "delay", "repeats", "segmented"],
+        &[
+            "sdo_timeout",
+            "sdo_attempts",
+            "command_timeout",
+            "silence_timeout",
+            "boot_timeout",
+            "delay",
+            "repeats",
+            "segmented",
+        ],
     ),
     ("Devices of other makers", &["dialect", "unlock"]),
 ];
 
 /// Options for special cases: `--help` has them, `-h` does not.
-const RARE: [&str; 33] = [
+const RARE: [&str; 37] = [
     "trace",
     "log_file",
     "report_dir",
@@ -59,10 +79,14 @@ const RARE: [&str; 33] = [
     "last_block_2008",
     "ver",
     "date",
+    "no_label",
+    "not_alone",
     "no_mastership",
     "block_repeats",
+    "search",
     "sdo_attempts",
     "command_timeout",
+    "silence_timeout",
     "boot_timeout",
     "delay",
     "repeats",
@@ -81,7 +105,7 @@ const RARE: [&str; 33] = [
 const LEGACY: [&str; 4] = ["serial", "revision", "product", "vendor"];
 
 /// What people type, by command; the empty name is the program.
-const EXAMPLES: [(&str, &str); 13] = [
+const EXAMPLES: [(&str, &str); 25] = [
     (
         "",
         "\
@@ -99,7 +123,7 @@ coflash COMMAND -h has a command's options in short, --help all of them.",
         "\
 Examples:
   coflash flash app.elf --board stm32f407g-disc1 --node 5
-  coflash flash app.blk --node 5-9 --check-target --trial-run
+  coflash flash app.blk --node 5-9 --check-target --verify
   coflash flash app.hex --layout my-board.toml
   coflash flash --job line.toml --report result.json",
     ),
@@ -187,6 +211,86 @@ Examples:
   coflash shell --bus socketcan:can0
   coflash shell --log-file session.log",
     ),
+    (
+        "adapters",
+        "\
+Examples:
+  coflash adapters
+  coflash adapters --search serial,socketcan
+  coflash adapters --json",
+    ),
+    (
+        "status",
+        "\
+Examples:
+  coflash status --node 5
+  coflash status --node 5 --program 2 --json",
+    ),
+    (
+        "start",
+        "\
+Examples:
+  coflash start --node 5",
+    ),
+    (
+        "enter",
+        "\
+Examples:
+  coflash enter --node 5
+  coflash enter --node 5 --wait",
+    ),
+    (
+        "catch",
+        "\
+Examples:
+  coflash catch --node 5
+  coflash catch --any --within 60000",
+    ),
+    (
+        "erase",
+        "\
+Examples:
+  coflash erase --node 5",
+    ),
+    (
+        "release",
+        "\
+Examples:
+  coflash release --node 5",
+    ),
+    (
+        "withdraw",
+        "\
+Examples:
+  coflash withdraw --node 5",
+    ),
+    (
+        "debug",
+        "\
+Examples:
+  coflash debug read 0x20000000 64 --node 5
+  coflash debug break 0x08010204 --node 5",
+    ),
+    (
+        "ui",
+        "\
+Examples:
+  coflash ui
+  coflash ui --bus socketcan:can0 --port 8080 --no-open",
+    ),
+    (
+        "completions",
+        "\
+Examples:
+  coflash completions bash",
+    ),
+    (
+        "man",
+        "\
+Examples:
+  coflash man
+  coflash man --out man1",
+    ),
 ];
 
 /// The examples of a command.
@@ -237,6 +341,9 @@ mod tests {
     fn every_example_is_understood() {
         let mut count = 0;
         for (name, text) in EXAMPLES {
+            if name == "ui" && !cfg!(feature = "ui") {
+                continue;
+            }
             for line in text.lines().filter_map(|line| line.strip_prefix("  coflash ")) {
                 // None of them has a blank inside quotes but for names.
                 let mut words = vec!["coflash".to_string()];
@@ -255,6 +362,15 @@ mod tests {
             }
         }
         assert!(count > 30, "{count}");
+    }
+
+    #[test]
+    fn every_command_has_examples() {
+        let command = super::super::commands();
+        let names = command.get_subcommands().filter(|below| !below.is_hide_set()).map(Command::get_name);
+        for name in names.filter(|name| *name != "help") {
+            assert!(examples(name).is_some(), "{name}");
+        }
     }
 
     /// What is placed here is there; and every option of `flash` that `-h` shows has a line that fits.
