@@ -14,7 +14,7 @@ use canopen::od::{put, Address, Entry, Objects};
 use canopen::program::UNLOCK;
 use canopen::program::{
     region_value, FlashStatus, ProgramControl, ProgramState, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID,
-    PROGRAM_REGION, UNLOCK_ENTRIES,
+    PROGRAM_REGION, PROGRAM_VERSION, UNLOCK_ENTRIES,
 };
 use canopen::slave::SlaveDevice;
 #[cfg(feature = "lift")]
@@ -213,6 +213,10 @@ impl Objects for Application {
             PROGRAM_REGION => {
                 let region = LAYOUT.program(at.sub).ok_or(AbortCode::NO_DATA)?;
                 put(buf, &region_value(region.base, region.size))
+            }
+            PROGRAM_VERSION => {
+                let version = coboot::program_info(at.sub).map_or(0, |info| info.version);
+                put(buf, &version.to_le_bytes())
             }
             REENTRY_PATH => put(buf, &[self.path as u8]),
             CONFIRMATION => {

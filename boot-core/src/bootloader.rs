@@ -10,7 +10,7 @@ use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
     control_count, FlashError, ProgramControl, ENABLE_FLASH, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL,
-    PROGRAM_DATA, PROGRAM_ID, PROGRAM_REGION, SOFTWARE_VERSION, UNLOCK, UNLOCK_ENTRIES,
+    PROGRAM_DATA, PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION, SOFTWARE_VERSION, UNLOCK, UNLOCK_ENTRIES,
 };
 use canopen::slave::SlaveDevice;
 use canopen::{password::Lock, Instant};
@@ -276,6 +276,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
             PROGRAM_ID => put(buf, &self.download.identification(at.sub).to_le_bytes()),
             FLASH_STATUS => put(buf, &self.download.status(at.sub).to_word().to_le_bytes()),
             PROGRAM_REGION => put(buf, &self.download.region(at.sub)),
+            PROGRAM_VERSION => put(buf, &self.download.version(at.sub).to_le_bytes()),
             _ => Err(AbortCode::NO_DATA),
         }
     }

@@ -34,10 +34,10 @@ pub const PROGRAM_ID: u16 = 0x1F56;
 /// Flash status identification: gives a [`FlashStatus`].
 pub const FLASH_STATUS: u16 = 0x1F57;
 
-/// What 1F51h, 1F56h, 1F57h and 2004h are called, and what each of their elements is. Bootloader and
+/// What 1F51h, 1F56h, 1F57h, 2004h and 2005h are called, and what each of their elements is. Bootloader and
 /// application both have them, with an element for each program of the device, whichever runs (SYS
 /// TEC manual L-1112d_10, table 1 and 3.4.1).
-pub const CONTROL_ARRAYS: [(&str, Entry); 4] = [
+pub const CONTROL_ARRAYS: [(&str, Entry); 5] = [
     (
         "Program control",
         // Without a default value, which a configuration tool might write: what is read is a state,
@@ -55,6 +55,10 @@ pub const CONTROL_ARRAYS: [(&str, Entry); 4] = [
     (
         "Program region",
         Entry::sub(PROGRAM_REGION, 1, "Address and size of a program", DataType::Unsigned64, Access::Const),
+    ),
+    (
+        "Program version",
+        Entry::sub(PROGRAM_VERSION, 1, "Version of a program", DataType::Unsigned32, Access::Ro),
     ),
 ];
 
@@ -84,6 +88,11 @@ impl<const LEN: usize> Table<LEN> {
 /// Where the programs lie, an object of coboot: the sub-index is the program's number. The lower 32
 /// bits are the first address of its flash, the upper 32 bits how many bytes it has.
 pub const PROGRAM_REGION: u16 = 0x2004;
+
+/// The versions of the stored programs, an object of coboot: the sub-index is the program's number.
+/// As in a control block: major in bits 0-7, minor in bits 8-15, release in bits 16-31 (SYS TEC manual
+/// L-1112d_10, figure 13); 0 for a program that came without one, or none.
+pub const PROGRAM_VERSION: u16 = 0x2005;
 
 /// The value of [`PROGRAM_REGION`] for a program whose flash begins at `base` and has `size` bytes.
 #[must_use]

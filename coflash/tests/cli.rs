@@ -230,7 +230,7 @@ fn the_label_is_shown_and_goes_into_block_0() {
 
     let done = coflash(&[&["inspect", &file][..], &raw].concat());
     assert!(
-        done.out.contains("  label        vendor-ID 00000319h, product code 4007D151h, version 00010203h\n")
+        done.out.contains("  label        vendor-ID 00000319h, product code 4007D151h, version V3.2r1\n")
             && done.out.contains("  judged       can be a program"),
         "{}",
         done.out

@@ -10,7 +10,7 @@ use boot_core::canopen::lss::{LssAddress, LssDevice, StoreError};
 use boot_core::canopen::od::{put, Address, Entry, Objects};
 use boot_core::canopen::program::{
     region_value, FlashStatus, ProgramControl, ProgramState, CONTROL_ARRAYS, FLASH_STATUS, PROGRAM_CONTROL,
-    PROGRAM_ID, PROGRAM_REGION,
+    PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION,
 };
 use boot_core::canopen::slave::SlaveDevice;
 use boot_core::canopen::{AbortCode, BitRate, NodeId};
@@ -168,6 +168,10 @@ impl Objects for StandIn {
             PROGRAM_REGION => {
                 let Region { base, size } = self.layout.program(at.sub).ok_or(AbortCode::NO_DATA)?;
                 put(buf, &region_value(base, size))
+            }
+            PROGRAM_VERSION => {
+                let version = self.record(at.sub).map_or(0, |record| record.version);
+                put(buf, &version.to_le_bytes())
             }
             _ => Err(AbortCode::NO_DATA),
         }

@@ -74,7 +74,8 @@ fn a_stand_in_answers_for_the_program_and_lets_itself_be_called_back() {
     let folder = folder("stand-in");
     let nodes = Nodes::start(&folder, &["--node", "7", "--flash", "instant", "--stand-in"]);
     let coflash = Coflash::new(&folder, &nodes);
-    let said = coflash.done(&[FLASH, &["-N", "7", "--verify"]].concat());
+    let release = ["-N", "7", "--verify", "--vid", "0", "--pid", "0", "--ver", "0x00640A01"];
+    let said = coflash.done(&[FLASH, &release].concat());
     assert!(said.contains("running: an application"), "{said}");
     nodes.await_line("serial 1, node 7: would start program 1, on trial");
     nodes.await_line("serial 1, node 7: bootloader (Requested)");
@@ -82,8 +83,12 @@ fn a_stand_in_answers_for_the_program_and_lets_itself_be_called_back() {
     // CiA 302-3: it runs, and 1F56h is what it was in the bootloader.
     assert_eq!(coflash.json(&["read", "1F51/1", "-N", "7"])["number"], 1);
     assert_eq!(coflash.json(&["read", "1F56/1", "-N", "7"])["hex"], "818FFBA6");
+    // Running or stopped, the program's version is told; written as in the manual's figure 13.
+    let scan = || coflash.done(&["scan", "-N", "7"]);
+    assert!(scan().contains("running, CRC A6FB8F81h, V1.10r100"), "{}", scan());
     let said = coflash.done(&["enter", "-N", "7"]);
     assert!(said.contains("the bootloader is running"), "{said}");
+    assert!(scan().contains("stopped, CRC A6FB8F81h, V1.10r100"), "{}", scan());
     // The old program is no obstacle to the next one.
     coflash.done(&[FLASH, &["-N", "7", "--no-start"]].concat());
     coflash.done(&["reset", "-N", "7"]);

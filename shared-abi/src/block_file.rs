@@ -12,6 +12,8 @@
 //! manual gives its start value once as 0 and once as FFFFFFFFh, which is one function called in
 //! two ways. It is computed by whoever uses this module, so that this crate needs none of its own.
 
+use core::fmt;
+
 /// Bytes in front of a block's data.
 pub const HEADER_SIZE: usize = 12;
 /// Bytes of the CRC behind a block's data.
@@ -180,8 +182,23 @@ fn put_words(bytes: &mut [u8], words: &[u32]) {
     }
 }
 
+/// The version of a program as control blocks and labels have it: major in bits 0-7, minor in bits
+/// 8-15, release in bits 16-31 (SYS TEC manual L-1112d_10, figure 13). `Display` writes it as the
+/// manual does: `V1.10r100`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ProgramVersion(pub u32);
+
+impl fmt::Display for ProgramVersion {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [major, minor, ..] = self.0.to_le_bytes();
+        write!(f, "V{major}.{minor}r{}", self.0 >> 16)
+    }
+}
+
 #[cfg(test)]
 mod tests {
+    extern crate std;
+
     use super::*;
 
     /// The offsets of the tables of chapter 5.1, filled with telling bytes.
@@ -223,5 +240,11 @@ mod tests {
         }
         assert_eq!(Last::parse(&[0; 7]), None);
         assert_eq!(Last::parse(&[0; 9]), None);
+    }
+
+    /// The manual's own example: 0x00640A01 is V1.10r100.
+    #[test]
+    fn a_version_reads_as_in_the_manual() {
+        assert_eq!(std::format!("{}", ProgramVersion(0x0064_0A01)), "V1.10r100");
     }
 }

@@ -46,7 +46,7 @@ const COFLASH: &[Rule] = &[
     Rule { room: "json", may_use: &["canopen"] },
     Rule { room: "bus", may_use: &["canopen"] },
     Rule { room: "file", may_use: &["setters", "shared_abi"] },
-    Rule { room: "device", may_use: &["bus", "canopen", "json", "setters"] },
+    Rule { room: "device", may_use: &["bus", "canopen", "json", "setters", "shared_abi"] },
     Rule { room: "update", may_use: &["bus", "canopen", "device", "file", "json", "setters", "shared_abi"] },
     Rule { room: "cli", may_use: &["bus", "canopen", "device", "file", "shared_abi", "ui", "update"] },
     Rule { room: "ui", may_use: &["bus", "canopen", "device", "file", "shared_abi", "update"] },

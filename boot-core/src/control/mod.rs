@@ -154,6 +154,12 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         self.program(program).map_or(0, |state| state.identification)
     }
 
+    /// 2005h: the version that the program in flash came with, 0 for none.
+    #[must_use]
+    pub fn version(&self, program: u8) -> u32 {
+        self.program(program).and_then(|state| state.record).map_or(0, |record| record.version)
+    }
+
     /// 2004h: address and size of the program's flash, little-endian.
     #[must_use]
     pub fn region(&self, program: u8) -> [u8; 8] {

@@ -8,7 +8,7 @@ use coflash::file::block_file::FRAMING;
 use coflash::file::convert::{Converted, Label};
 use coflash::file::read::Firmware;
 use serde_json::json;
-use shared_abi::block_file::{Control, Identity};
+use shared_abi::block_file::{Control, Identity, ProgramVersion};
 
 use super::context::Context;
 use super::file::{warn_left_out, Input, Source};
@@ -130,8 +130,9 @@ impl Convert {
             let Identity { vendor_id, product_code, .. } = identity;
             let output = output.display();
             context.out.say(format_args!(
-                "{output}: for vendor-ID {vendor_id:08X}h, product code {product_code:08X}h, version {version:08X}h, \
-                 as its label says"
+                "{output}: for vendor-ID {vendor_id:08X}h, product code {product_code:08X}h, version {}, \
+                 as its label says",
+                ProgramVersion(*version)
             ));
         }
         self.tell(context, &output, &done);

@@ -116,8 +116,7 @@ fn row((node, found): (&NodeId, &Found)) -> [String; 7] {
     [node, runs.to_string(), text(&info.name), text(&info.software_version), serial, program, state]
 }
 
-/// What is there of a program: the state that 1F51h tells, and the CRC of 1F56h. Its version is the
-/// software version of a device that runs it.
+/// What is there of a program: the state that 1F51h tells, the CRC of 1F56h, and its version.
 fn cell(program: &ProgramInfo) -> String {
     if program.status.is_some_and(|status| status.busy) {
         return "busy".to_string();
@@ -128,10 +127,9 @@ fn cell(program: &ProgramInfo) -> String {
         Some(ProgramState::Stopped) => "stopped",
         None => "-",
     };
-    match program.crc.filter(|crc| *crc != 0) {
-        None => state.to_string(),
-        Some(crc) => format!("{state}, CRC {crc:08X}h"),
-    }
+    let crc = program.crc.filter(|crc| *crc != 0).map(|crc| format!(", CRC {crc:08X}h"));
+    let version = program.release().map(|version| format!(", {version}"));
+    format!("{state}{}{}", crc.unwrap_or_default(), version.unwrap_or_default())
 }
 
 fn values(found: &BTreeMap<NodeId, Found>) -> Vec<Value> {

@@ -6,6 +6,7 @@ use canopen::program::{self, FlashStatus, ProgramState};
 use canopen::Address;
 use serde::ser::SerializeStruct as _;
 use serde::{Serialize, Serializer};
+use shared_abi::block_file::ProgramVersion;
 
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
@@ -81,6 +82,8 @@ pub struct ProgramInfo {
     pub control: Option<u32>,
     /// 1F56h: CRC of the program.
     pub crc: Option<u32>,
+    /// 2005h of coboot: version of the program that is stored, 0 for none told.
+    pub version: Option<u32>,
     /// 1F57h.
     #[serde(serialize_with = "json::status")]
     pub status: Option<FlashStatus>,
@@ -100,6 +103,12 @@ impl ProgramInfo {
             (Some(STOPPED), _) => Some(ProgramState::Stopped),
             _ => None,
         }
+    }
+
+    /// The version that the stored program came with, where the device tells one.
+    #[must_use]
+    pub fn release(&self) -> Option<ProgramVersion> {
+        self.version.filter(|version| *version != 0).map(ProgramVersion)
     }
 }
 
@@ -168,7 +177,8 @@ pub fn program_info(session: &mut Session<'_>, program: u8) -> Result<ProgramInf
     let control = number(program::PROGRAM_CONTROL)?;
     let crc = number(program::PROGRAM_ID)?;
     let status = number(program::FLASH_STATUS)?.map(FlashStatus::from_word);
-    Ok(ProgramInfo { number: program, control, crc, status })
+    let version = number(program::PROGRAM_VERSION)?;
+    Ok(ProgramInfo { number: program, control, crc, version, status })
 }
 
 impl fmt::Display for DeviceInfo {
@@ -233,6 +243,9 @@ impl fmt::Display for ProgramInfo {
         }
         if let Some(crc) = self.crc {
             writeln!(f, "    CRC             {crc:08X}h")?;
+        }
+        if let Some(version) = self.release() {
+            writeln!(f, "    version         {version}")?;
         }
         if let Some(status) = self.status {
             write!(f, "    status          ")?;

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use shared_abi::block_file::{Control, Identity, NUMBER_CONTROL, NUMBER_LAST};
+use shared_abi::block_file::{Control, Identity, ProgramVersion, NUMBER_CONTROL, NUMBER_LAST};
 use shared_abi::label::Label;
 
 use super::block_file::{Block, BlockFile, Checksum};
@@ -131,23 +131,11 @@ impl Blocks {
 
     /// Version and date (seconds since 1970 UTC), if block 0 says them.
     #[must_use]
-    pub fn release(&self) -> Option<(Version, u64)> {
+    pub fn release(&self) -> Option<(ProgramVersion, u64)> {
         match self.control {
-            Control::Dated { version, date, .. } => Some((Version(version), date)),
+            Control::Dated { version, date, .. } => Some((ProgramVersion(version), date)),
             Control::Plain | Control::Identity(_) => None,
         }
-    }
-}
-
-/// The version in block 0: major in bits 0–7, minor in bits 8–15, release in bits 16–31 (manual,
-/// figure 13). `Display` writes it as the manual does: `V1.10r100`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Version(pub u32);
-
-impl fmt::Display for Version {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let [major, minor, ..] = self.0.to_le_bytes();
-        write!(f, "V{major}.{minor}r{}", self.0 >> 16)
     }
 }
 
@@ -263,11 +251,5 @@ mod tests {
             assert_eq!(Date(seconds).to_string(), words);
         }
         assert_eq!(Date(u64::MAX).to_string(), "18446744073709551615 s after 1970");
-    }
-
-    /// The manual's own example: 0x00640A01 is V1.10r100.
-    #[test]
-    fn a_version_reads_as_in_the_manual() {
-        assert_eq!(Version(0x0064_0A01).to_string(), "V1.10r100");
     }
 }

@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use shared_abi::block_file::ProgramVersion;
 use shared_abi::label::{Label, OFFSET, SIZE};
 
 use super::image::Image;
@@ -19,6 +20,10 @@ pub struct Words<'l>(pub &'l Label);
 impl fmt::Display for Words<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Label { vendor_id, product_code, version, .. } = self.0;
-        write!(f, "vendor-ID {vendor_id:08X}h, product code {product_code:08X}h, version {version:08X}h")
+        write!(
+            f,
+            "vendor-ID {vendor_id:08X}h, product code {product_code:08X}h, version {}",
+            ProgramVersion(*version)
+        )
     }
 }

@@ -2,11 +2,12 @@
 
 use std::sync::Arc;
 
+use shared_abi::block_file::ProgramVersion;
 use shared_abi::layout;
 
 use super::state::{Firmware, Notice, Settings};
 use crate::file::convert::{blocks_of, ConvertError, Options, Region};
-use crate::file::inspect::{Inspection, Version};
+use crate::file::inspect::Inspection;
 use crate::file::{self, label, AddressRange, BlockFile, Format};
 
 /// The most bytes of a file: an ELF of the largest program with all that a debugger wants to know.
@@ -80,11 +81,11 @@ fn label_of(file: &BlockFile) -> Option<(u32, u32, Option<String>)> {
     match *file.control() {
         Control::Identity(identity) => Some((identity.vendor_id, identity.product_code, None)),
         Control::Dated { identity, version, .. } => {
-            Some((identity.vendor_id, identity.product_code, Some(Version(version).to_string())))
+            Some((identity.vendor_id, identity.product_code, Some(ProgramVersion(version).to_string())))
         }
         Control::Plain => {
             let label = label::label_of(&file.image(), file.program_start())?;
-            Some((label.vendor_id, label.product_code, Some(format!("{:08X}h", label.version))))
+            Some((label.vendor_id, label.product_code, Some(ProgramVersion(label.version).to_string())))
         }
     }
 }

@@ -340,6 +340,9 @@ impl Program {
             }
             None => {}
         }
+        if let Some(version) = info.release() {
+            words += &format!(", {version}");
+        }
         Self { number: info.number, crc: info.crc, words }
     }
 }
