@@ -166,7 +166,10 @@ fn events_are_one_object_a_line() {
     let progress: Vec<&Value> = all.iter().filter(|line| line["event"] == "progress").collect();
     assert!((2..=101).contains(&progress.len()), "{}", progress.len());
     for line in &progress {
-        assert!(line["bytes_per_second"].is_u64() && line["seconds_left"].is_number(), "{line}");
+        assert!(
+            line["bytes_per_second"].is_u64() && line["seconds_left"].is_number() == (line["done"] != 0),
+            "{line}"
+        );
     }
     let last = progress.last().unwrap();
     assert_eq!((&last["done"], last["seconds_left"].as_f64()), (&last["total"], Some(0.0)), "{last}");

@@ -3,15 +3,13 @@
 use std::time::Duration;
 
 use clap::Args;
-use coflash::device::Session;
 use coflash::update::event::{Event, Phase};
 use coflash::update::{catch, CatchOptions, Caught};
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::json;
 
 use super::context::Context;
 use super::device::Device;
-use super::output::{Failure, Output};
+use super::output::Failure;
 use super::values::milliseconds;
 
 /// Waits for a device that is switched on, and holds it in its bootloader.
@@ -72,13 +70,18 @@ pub(super) fn run(
     }
     let began = session.now();
     let options = CatchOptions::default().any(any).within(limit.within);
-    let waiting = Waiting::new(context.out, &session, any);
+    let whom = if any { "any device".to_string() } else { format!("node {}", session.node()) };
+    let words = format!("{whom} comes up: switch the device off and on (Ctrl-C ends it)");
+    if !context.out.shows_waiting() {
+        context.out.say(format_args!("waiting until {words}"));
+    }
+    let waiting = context.waiting(words);
     let caught = catch(&mut session, &options, &mut |event| match event {
         // The line on the screen says it.
         Event::Phase(Phase::Searching { .. }) => {}
-        event => waiting.say(&event),
+        event => waiting.beside(|| context.out.say(format_args!("  {event}"))),
     });
-    waiting.finish();
+    drop(waiting);
     let Caught { node, running, .. } = caught.map_err(|error| Failure::diagnosed(error, &mut session))?;
     let seconds = session.now().saturating_sub(began).as_secs_f64();
     let words = match node {
@@ -96,54 +99,4 @@ pub(super) fn run(
         })
     });
     Ok(())
-}
-
-/// What is waited for: a line with a spinner and the time on a terminal, and elsewhere one line.
-struct Waiting {
-    out: Output,
-    spinner: Option<ProgressBar>,
-}
-
-impl Waiting {
-    fn new(out: Output, session: &Session<'_>, any: bool) -> Self {
-        let whom = if any { "any device".to_string() } else { format!("node {}", session.node()) };
-        let words = format!("waiting for {whom}: switch the device off and on (Ctrl-C ends it)");
-        if !out.on_terminal() {
-            out.say(&words);
-            return Self { out, spinner: None };
-        }
-        let spinner = ProgressBar::with_draw_target(None, ProgressDrawTarget::stdout());
-        // The template is a constant; should it ever be wrong, a spinner in another style does.
-        if let Ok(style) = ProgressStyle::with_template(STYLE) {
-            spinner.set_style(style);
-        }
-        spinner.set_message(words);
-        spinner.enable_steady_tick(Duration::from_millis(100));
-        Self { out, spinner: Some(spinner) }
-    }
-
-    fn say(&self, event: &Event) {
-        match &self.spinner {
-            Some(spinner) => spinner.println(format!("  {event}")),
-            None => self.out.say(format_args!("  {event}")),
-        }
-    }
-
-    fn finish(&self) {
-        if let Some(spinner) = &self.spinner {
-            spinner.finish_and_clear();
-        }
-    }
-}
-
-const STYLE: &str = "{spinner} {elapsed}  {msg}";
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_spinner_has_its_style() {
-        assert!(ProgressStyle::with_template(STYLE).is_ok());
-    }
 }

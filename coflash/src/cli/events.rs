@@ -42,7 +42,9 @@ impl Lines {
             }
             self.percent = Some(pace.percent());
             line["bytes_per_second"] = (pace.rate.round() as u64).into();
-            line["seconds_left"] = ((pace.left * 10.0).round() / 10.0).into();
+            // Before the first byte nothing is known of the rate.
+            let left = (done > 0).then(|| (pace.left * 10.0).round() / 10.0);
+            line["seconds_left"] = left.into();
         }
         self.out.event(&line);
     }

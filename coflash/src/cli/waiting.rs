@@ -36,6 +36,14 @@ impl Waiting {
             spinner
         }))
     }
+
+    /// Does what writes to the terminal meanwhile.
+    pub(super) fn beside(&self, write: impl FnOnce()) {
+        match &self.0 {
+            Some(spinner) => spinner.suspend(write),
+            None => write(),
+        }
+    }
 }
 
 impl Drop for Waiting {
