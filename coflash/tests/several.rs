@@ -224,7 +224,7 @@ fn a_silent_device_is_diagnosed_by_what_the_bus_says() {
         (&[(0x705, &[5][..])], "node 5 is heard (heartbeat, operational) but does not answer"),
         (&[(0x705, &[4])], "has been stopped, so that it serves no SDO: coflash reset --node 5"),
         (&[(0x185, &[1])], "node 5 is heard but does not answer"),
-        (&[(0x703, &[5]), (0x187, &[])], "the bus works, and node 3, 7 is heard"),
+        (&[(0x703, &[5]), (0x187, &[])], "the bus works, and nodes 3, 7 are heard"),
         (&[(0x7FF, &[])], "no CANopen node is heard"),
     ] {
         let said = advice(frames);

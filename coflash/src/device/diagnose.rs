@@ -97,11 +97,14 @@ impl fmt::Display for Diagnosis {
             ),
             None => {
                 let nodes: Vec<String> = heard.keys().map(NodeId::to_string).collect();
+                let are = if nodes.len() == 1 { ("node", "is") } else { ("nodes", "are") };
                 write!(
                     f,
-                    "the bus works, and node {} is heard: check that node {node} is the right one and that it has \
+                    "the bus works, and {} {} {} heard: check that node {node} is the right one and that it has \
                      power; coflash scan asks all of them, coflash lss fastscan finds devices without node-ID",
-                    nodes.join(", ")
+                    are.0,
+                    nodes.join(", "),
+                    are.1
                 )
             }
         }
