@@ -217,8 +217,8 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         self.download.command(program, command)
     }
 
-    /// The program has brought the device back to the bootloader: from now on it starts without a
-    /// rescue window.
+    /// The program (0 for none) has brought the device back to the bootloader: from now on it starts
+    /// without a rescue window.
     pub fn confirm(&mut self, program: u8) {
         self.download.confirm(program);
     }
