@@ -146,7 +146,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
             serial_number,
             reason,
             node,
-            id: None,
+            id: config.node_id.or(node.id),
             flash,
             download,
             emcy: Emcy::new(),
@@ -157,7 +157,6 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         if StayReason::is_trouble(reason) {
             bootloader.emcy.raise(emcy::code::SOFTWARE, 0, [reason, 0, 0, 0, 0]);
         }
-        bootloader.node_id_changed(config.node_id.or(node.id));
         bootloader
     }
 
