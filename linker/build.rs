@@ -39,6 +39,11 @@ fn main() {
     println!("cargo:rustc-link-arg-bins=--nmagic");
     // Functions that compile to the same code are one.
     println!("cargo:rustc-link-arg-bins=--icf=all");
+    if image == Image::Bootloader {
+        // Functions that are alike stand near each other, so that copies come from near. (The image
+        // is packed, and copies from the resident part.)
+        println!("cargo:rustc-link-arg-bins=--bp-compression-sort=function");
+    }
     if template == "bootloader.x" && has("LOG_DEFMT") {
         // The words of `defmt`, which are in the ELF file and not on the chip.
         println!("cargo:rustc-link-arg-bins=-Tdefmt.x");

@@ -146,7 +146,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
             serial_number,
             reason,
             node,
-            id: None,
+            id: config.node_id.or(node.id),
             flash,
             download,
             emcy: Emcy::new(),
@@ -157,7 +157,6 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         if StayReason::is_trouble(reason) {
             bootloader.emcy.raise(emcy::code::SOFTWARE, 0, [reason, 0, 0, 0, 0]);
         }
-        bootloader.node_id_changed(config.node_id.or(node.id));
         bootloader
     }
 
@@ -217,8 +216,8 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         self.download.command(program, command)
     }
 
-    /// The program has brought the device back to the bootloader: from now on it starts without a
-    /// rescue window.
+    /// The program (0 for none) has brought the device back to the bootloader: from now on it starts
+    /// without a rescue window.
     pub fn confirm(&mut self, program: u8) {
         self.download.confirm(program);
     }

@@ -183,9 +183,7 @@ mod app {
             flash,
             cx.local.blocks,
         );
-        if report.returned > 0 {
-            bootloader.confirm(report.returned);
-        }
+        bootloader.confirm(report.returned);
         let slave = Slave::new(bootloader.lss_address(), bootloader.node_id(), node.bit_rate, slave_config);
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();

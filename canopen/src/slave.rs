@@ -26,7 +26,8 @@ pub trait SlaveDevice: Objects + LssDevice {
         let _ = event;
     }
 
-    /// The device has this node-ID from now on, or none; its node starts anew.
+    /// The device has this node-ID from now on, or none; its node starts (anew). So it is told before
+    /// the first output, too.
     fn node_id_changed(&mut self, id: Option<NodeId>) {
         let _ = id;
     }
@@ -69,8 +70,9 @@ pub enum Output {
 #[derive(Debug)]
 pub struct Slave {
     config: Config,
-    /// `None` while the device has no node-ID.
+    /// `None` while the device has no node-ID, and until its first node was started.
     node: Option<Node>,
+    started: bool,
     lss: Lss,
     line: Line,
     losses: Losses,
@@ -95,15 +97,16 @@ impl Slave {
     pub fn new(address: LssAddress, id: Option<NodeId>, rate: BitRate, config: Config) -> Self {
         Self {
             config,
-            node: id.map(|id| Node::new(id, config.node)),
+            node: None,
+            started: false,
             lss: Lss::new(address, id, config.lss.unwrap_or_default()),
             line: Line::Down(rate),
             losses: Losses::default(),
-            accept: true,
+            accept: false,
         }
     }
 
-    /// Its node, unless it has no node-ID.
+    /// Its node, from the first output on, unless it has no node-ID.
     #[must_use]
     pub const fn node(&self) -> Option<&Node> {
         self.node.as_ref()
@@ -185,6 +188,9 @@ impl Slave {
     /// What to do next, until there is nothing. Frames are given only while there is `room` for one
     /// in the mailboxes.
     pub fn poll(&mut self, now: Instant, room: bool, device: &mut impl SlaveDevice) -> Option<Output> {
+        if !core::mem::replace(&mut self.started, true) {
+            self.restart(self.lss.node_id(), device);
+        }
         loop {
             if core::mem::take(&mut self.accept) {
                 return Some(Output::Accept(self.identifiers()));
@@ -238,7 +244,7 @@ impl Slave {
         }
     }
 
-    /// Starts the node anew under this node-ID: a transfer ends, the boot-up is sent (again).
+    /// Starts the node (anew) under this node-ID: a transfer ends, the boot-up is sent (again).
     fn restart(&mut self, id: Option<NodeId>, device: &mut impl SlaveDevice) {
         if let Some(node) = &mut self.node {
             node.end_transfer(device);

@@ -168,7 +168,7 @@ fn a_device_without_node_id_lets_lss_in_alone_and_boots_when_it_gets_one() {
     assert_eq!(bench.ask(0x7E5, &[0x11, 9, 0, 0, 0, 0, 0, 0]), [send(0x7E4, &[0x11, 0, 0, 0, 0, 0, 0, 0])]);
     let outputs = bench.ask(0x7E5, &[0x04, 0, 0, 0, 0, 0, 0, 0]);
     assert_eq!(outputs, [accept([0x000, 0x7E5, 0x609]), send(0x709, &[0])]);
-    assert_eq!(bench.device.ids, [Some(9)]);
+    assert_eq!(bench.device.ids, [None, Some(9)]);
 }
 
 /// A product may turn layer setting services off.
@@ -199,7 +199,7 @@ fn reset_communication_takes_over_what_lss_configured() {
     bench.ask(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
     bench.ask(0x7E5, &[0x11, 0xFF, 0, 0, 0, 0, 0, 0]);
     assert_eq!(bench.ask(0x000, &[0x82, 0]), [accept([0x7E5; 3])], "and falls silent without one");
-    assert_eq!(bench.device.ids, [Some(9), None]);
+    assert_eq!(bench.device.ids, [Some(5), Some(9), None]);
 }
 
 /// CiA 305: the state machine is entered anew, in LSS waiting, when communication was reset; the

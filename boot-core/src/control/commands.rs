@@ -87,7 +87,10 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// The program has brought the device back to the bootloader, so it can do that: it needs no
     /// rescue window any more.
     pub fn confirm(&mut self, program: u8) {
-        let Some(record) = self.program(program).and_then(|state| state.record) else { return };
+        // Not by `program`: this is called before the bootloader is at its place, and what is called
+        // there alone is shorter by that.
+        let state = self.programs.get(usize::from(program).wrapping_sub(1));
+        let Some(record) = state.and_then(|state| state.record) else { return };
         if !record.confirmed && !self.busy() {
             let record = ProgramRecord { confirmed: true, ..record };
             self.programmer.record(&mut self.parameters, program, record, true);

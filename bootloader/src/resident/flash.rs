@@ -56,25 +56,23 @@ impl Flash for ResidentFlash {
     }
 
     fn is_blank(&self, region: Region) -> bool {
-        let blank = |address| self.controller.read_byte(address) == u8::MAX;
         let (mut address, end) = (region.base, region.end());
-        while address < end && !address.is_multiple_of(4) {
-            if !blank(address) {
+        let is_flash = FLASH.contains(address, region.size);
+        while address < end {
+            // By words where it can be: a journal is looked through on the way of every start.
+            let is_word = is_flash && end - address >= 4 && address.is_multiple_of(4);
+            let is_blank = if is_word {
+                // SAFETY: inside the memory-mapped flash, which is always readable, and aligned.
+                unsafe { (address as *const u32).read_volatile() == u32::MAX }
+            } else {
+                self.controller.read_byte(address) == u8::MAX
+            };
+            if !is_blank {
                 return false;
             }
-            address += 1;
+            address += if is_word { 4 } else { 1 };
         }
-        if FLASH.contains(address, end - address) {
-            // By words, in a short loop: a journal is looked through on the way of every start.
-            while end - address >= 4 {
-                // SAFETY: inside the memory-mapped flash, which is always readable, and aligned.
-                if unsafe { (address as *const u32).read_volatile() } != u32::MAX {
-                    return false;
-                }
-                address += 4;
-            }
-        }
-        (address..end).all(blank)
+        true
     }
 
     /// Whole words by the unit, the rest without. The unit has the polynomial, but takes words with
