@@ -270,14 +270,15 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
         if let Some(read) = self.config.device.read(at, buf) {
             return read;
         }
-        match at.index {
-            PROGRAM_CONTROL => put(buf, &[self.download.control(at.sub) as u8]),
-            PROGRAM_ID => put(buf, &self.download.identification(at.sub).to_le_bytes()),
-            FLASH_STATUS => put(buf, &self.download.status(at.sub).to_word().to_le_bytes()),
-            PROGRAM_REGION => put(buf, &self.download.region(at.sub)),
-            PROGRAM_VERSION => put(buf, &self.download.version(at.sub).to_le_bytes()),
-            _ => Err(AbortCode::NO_DATA),
-        }
+        let word = match at.index {
+            PROGRAM_CONTROL => return put(buf, &[self.download.control(at.sub) as u8]),
+            PROGRAM_REGION => return put(buf, &self.download.region(at.sub)),
+            PROGRAM_ID => self.download.identification(at.sub),
+            FLASH_STATUS => self.download.status(at.sub).to_word(),
+            PROGRAM_VERSION => self.download.version(at.sub),
+            _ => return Err(AbortCode::NO_DATA),
+        };
+        put(buf, &word.to_le_bytes())
     }
 
     fn write(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
