@@ -57,22 +57,17 @@ impl Flash for ResidentFlash {
 
     fn is_blank(&self, region: Region) -> bool {
         let (mut address, end) = (region.base, region.end());
-        let is_flash = FLASH.contains(address, region.size);
-        while address < end {
-            // By words where it can be: a journal is looked through on the way of every start.
-            let is_word = is_flash && end - address >= 4 && address.is_multiple_of(4);
-            let is_blank = if is_word {
+        if address.is_multiple_of(4) && FLASH.contains(address, region.size) {
+            // By words, in a short loop: a journal is looked through on the way of every start.
+            while end - address >= 4 {
                 // SAFETY: inside the memory-mapped flash, which is always readable, and aligned.
-                unsafe { (address as *const u32).read_volatile() == u32::MAX }
-            } else {
-                self.controller.read_byte(address) == u8::MAX
-            };
-            if !is_blank {
-                return false;
+                if unsafe { (address as *const u32).read_volatile() } != u32::MAX {
+                    return false;
+                }
+                address += 4;
             }
-            address += if is_word { 4 } else { 1 };
         }
-        true
+        (address..end).all(|address| self.controller.read_byte(address) == u8::MAX)
     }
 
     /// Whole words by the unit, the rest without. The unit has the polynomial, but takes words with
