@@ -81,7 +81,7 @@ pub const fn entry_count(programs: u8, extras: Extras) -> usize {
 }
 
 /// 1018h/4.
-const SERIAL_NUMBER: Address = Address::new(IDENTITY, 4);
+const SERIAL_NUMBER: u8 = 4;
 
 /// What can be chosen about a bootloader.
 #[derive(Clone, Copy, Debug)]
@@ -259,16 +259,10 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
         if let Some(read) = self.id.and_then(|id| self.emcy.read(id, at, buf)) {
             return read;
         }
-        if at == SERIAL_NUMBER {
-            return put(buf, &self.serial_number.to_le_bytes());
-        }
         if at == Address::new(SOFTWARE_VERSION, 0) {
             if let Some(version) = self.stored_version.text() {
                 return put(buf, version);
             }
-        }
-        if let Some(read) = self.config.device.read(at, buf) {
-            return read;
         }
         let word = match at.index {
             PROGRAM_CONTROL => return put(buf, &[self.download.control(at.sub) as u8]),
@@ -276,7 +270,8 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
             PROGRAM_ID => self.download.identification(at.sub),
             FLASH_STATUS => self.download.status(at.sub).to_word(),
             PROGRAM_VERSION => self.download.version(at.sub),
-            _ => return Err(AbortCode::NO_DATA),
+            IDENTITY if at.sub == SERIAL_NUMBER => self.serial_number,
+            _ => return self.config.device.read(at, buf).unwrap_or(Err(AbortCode::NO_DATA)),
         };
         put(buf, &word.to_le_bytes())
     }
@@ -287,13 +282,12 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
         }
         match (at.index, data) {
             (PROGRAM_CONTROL, &[value]) => self.command(at.sub, ProgramControl::try_from(value)?),
-            (ENABLE_FLASH, password) => {
+            (ENABLE_FLASH | UNLOCK, password) => {
                 self.lock.open(password, self.now)?;
-                self.download.unlock(at.sub, true)
-            }
-            (UNLOCK, password) => {
-                self.lock.open(password, self.now)?;
-                (1..=PROGRAMS as u8).try_for_each(|program| self.download.unlock(program, false))
+                match at.index {
+                    ENABLE_FLASH => self.download.unlock(at.sub, true),
+                    _ => (1..=PROGRAMS as u8).try_for_each(|program| self.download.unlock(program, false)),
+                }
             }
             _ => Err(AbortCode::UNSUPPORTED_ACCESS),
         }

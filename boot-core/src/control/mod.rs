@@ -163,8 +163,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// 2004h: address and size of the program's flash, little-endian.
     #[must_use]
     pub fn region(&self, program: u8) -> [u8; 8] {
-        let Region { base, size } = self.program(program).map_or(Region::new(0, 0), |state| state.region);
-        region_value(base, size)
+        self.program(program).map_or([0; 8], |state| region_value(state.region.base, state.region.size))
     }
 
     /// Whether there is work for [`Downloader::step`].
