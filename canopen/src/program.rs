@@ -34,9 +34,9 @@ pub const PROGRAM_ID: u16 = 0x1F56;
 /// Flash status identification: gives a [`FlashStatus`].
 pub const FLASH_STATUS: u16 = 0x1F57;
 
-/// What 1F51h, 1F56h, 1F57h, 2004h and 2005h are called, and what each of their elements is. Bootloader and
-/// application both have them, with an element for each program of the device, whichever runs (SYS
-/// TEC manual L-1112d_10, table 1 and 3.4.1).
+/// What 1F51h, 1F56h, 1F57h, 2004h and 2005h are called, and what each of their elements is.
+/// Bootloader and application both have them, with an element for each program of the device,
+/// whichever runs (SYS TEC manual L-1112d_10, table 1 and 3.4.1).
 pub const CONTROL_ARRAYS: [(&str, Entry); 5] = [
     (
         "Program control",
@@ -90,8 +90,8 @@ impl<const LEN: usize> Table<LEN> {
 pub const PROGRAM_REGION: u16 = 0x2004;
 
 /// The versions of the stored programs, an object of coboot: the sub-index is the program's number.
-/// As in a control block: major in bits 0-7, minor in bits 8-15, release in bits 16-31 (SYS TEC manual
-/// L-1112d_10, figure 13); 0 for a program that came without one, or none.
+/// As in a control block: major in bits 0-7, minor in bits 8-15, release in bits 16-31 (SYS TEC
+/// manual L-1112d_10, figure 13); 0 for a program that came without one, or none.
 pub const PROGRAM_VERSION: u16 = 0x2005;
 
 /// The value of [`PROGRAM_REGION`] for a program whose flash begins at `base` and has `size` bytes.

@@ -8,13 +8,11 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::Duration;
 
-use bus::{node, Coflash, Folder, Nodes};
+use bus::{node, Coflash, Folder, Nodes, FLASH, VECTORS};
 
-/// A program as far as a bootloader looks at one: initial stack pointer in RAM, reset vector
-/// inside, Thumb bit set.
 fn program() -> Vec<u8> {
     let mut bytes: Vec<u8> = (0..300 * 1024_u32).map(|i| (i * 7 + (i >> 8) * 13) as u8).collect();
-    bytes[..8].copy_from_slice(&[0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x01, 0x08]);
+    bytes[..8].copy_from_slice(&VECTORS);
     bytes
 }
 
@@ -28,12 +26,8 @@ fn flashed() -> Vec<u8> {
     bytes
 }
 
-const FLASH: &[&str] = &["flash", "program.bin", "-I", "binary", "--board", "stm32f407g-disc1"];
-
 fn folder(test: &str) -> Folder {
-    let folder = Folder::new(test);
-    folder.write("program.bin", &program());
-    folder
+    Folder::with_program(test, &program())
 }
 
 #[test]

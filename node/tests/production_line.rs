@@ -13,7 +13,7 @@ use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 fn program() -> String {
     let mut bytes = vec![0xA5; 20 * 1024];
     // Initial stack pointer in RAM, reset vector inside, Thumb bit set.
-    bytes[..8].copy_from_slice(&[0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x01, 0x08]);
+    bytes[..8].copy_from_slice(&bus::VECTORS);
     let Ok(Firmware::Image(image)) = read(&bytes, Some(Format::Raw), Some(LAYOUT.programs[0].base)) else {
         panic!("a raw image");
     };

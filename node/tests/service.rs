@@ -6,23 +6,17 @@ mod bus;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use bus::{Coflash, Folder, Nodes};
+use bus::{Coflash, Folder, Nodes, FLASH, VECTORS};
 use serde_json::Value;
 
-/// A program as far as a bootloader looks at one: initial stack pointer in RAM, reset vector
-/// inside, Thumb bit set.
 fn program() -> Vec<u8> {
     let mut bytes = vec![0xA5; 20 * 1024];
-    bytes[..8].copy_from_slice(&[0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x01, 0x08]);
+    bytes[..8].copy_from_slice(&VECTORS);
     bytes
 }
 
-const FLASH: &[&str] = &["flash", "program.bin", "-I", "binary", "--board", "stm32f407g-disc1"];
-
 fn folder(test: &str) -> Folder {
-    let folder = Folder::new(test);
-    folder.write("program.bin", &program());
-    folder
+    Folder::with_program(test, &program())
 }
 
 fn eds() -> String {

@@ -18,6 +18,13 @@ use serde_json::Value;
 /// How long a program may take before it counts as hanging.
 const PATIENCE: Duration = Duration::from_secs(120);
 
+/// How the program of [`Folder::with_program`] is flashed.
+pub const FLASH: &[&str] = &["flash", "program.bin", "-I", "binary", "--board", "stm32f407g-disc1"];
+
+/// What a bootloader looks at in a program: initial stack pointer in RAM, reset vector inside, Thumb
+/// bit set.
+pub const VECTORS: [u8; 8] = [0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x01, 0x08];
+
 /// A folder of one test, away at the end.
 pub struct Folder(PathBuf);
 
@@ -27,6 +34,13 @@ impl Folder {
         let _ = fs::remove_dir_all(&path);
         fs::create_dir_all(&path).unwrap();
         Self(path)
+    }
+
+    /// With `program.bin` in it.
+    pub fn with_program(test: &str, program: &[u8]) -> Self {
+        let folder = Self::new(test);
+        folder.write("program.bin", program);
+        folder
     }
 
     pub fn path(&self, name: &str) -> PathBuf {
