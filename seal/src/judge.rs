@@ -1,0 +1,137 @@
+//! Whether a device may take an image, by everything but the signatures: those cost the device a
+//! tenth of a second, and this costs nothing.
+//!
+//! The order is that of the questions that a person would ask: is it a sealed image, is it for this
+//! device, is it recent enough, does the device have the keys?
+
+use crate::key_block::{self, FOR_TESTS, KEKS, KEK_COUNT, ROOTS, ROOT_COUNT};
+use crate::wire::{
+    flag, role, tag, word, Fault, Head, CERTIFICATE, ED25519, FIXED, FORMAT, MAX_CHUNK, MIN_CHUNK, RECIPIENT,
+};
+
+/// The device that an image came to.
+#[derive(Clone, Copy, Debug)]
+pub struct Device<'a> {
+    /// 1018h/1.
+    pub vendor_id: u32,
+    /// 1018h/2.
+    pub product_code: u32,
+    /// 1018h/3.
+    pub revision: u32,
+    /// The 96-bit unique ID of the chip.
+    pub unique_id: [u8; 12],
+    /// The program that is written: the sub-index of 1F50h.
+    pub program: u8,
+    /// Whether that is data of the application.
+    pub is_data: bool,
+    /// Bytes of the program's flash.
+    pub room: u32,
+    /// The lowest security counter that the device takes.
+    pub counter: u32,
+    /// The lowest epoch of a certificate.
+    pub epoch: u32,
+    /// Its [`key_block`].
+    pub keys: &'a [u8],
+}
+
+/// What an image needs that passed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Needs {
+    /// The root that has to have signed the certificate, or the image where there is none: where it
+    /// stands in the key block.
+    pub root: usize,
+    /// The epoch of the device when the image is installed.
+    pub epoch: u32,
+    /// Of an encrypted image the key-encryption key, where it stands in the key block, and the
+    /// recipient's record, where it stands in the manifest.
+    pub recipient: Option<(usize, usize)>,
+}
+
+/// Judges the head of an image.
+///
+/// # Errors
+/// Why the device refuses it.
+pub fn judge(head: Head<'_>, device: &Device<'_>) -> Result<Needs, Fault> {
+    let flags = head.flags();
+    let chunk = head.chunk();
+    let size = head.size();
+    let has = |which: u8| flags & which != 0;
+    let possible = flags & !flag::KNOWN == 0
+        && (MIN_CHUNK..=MAX_CHUNK).contains(&chunk)
+        && head.format() <= FORMAT
+        && size > 0
+        && head.payload() > 0
+        && (has(flag::COMPRESSED) || head.payload() == size)
+        && (has(flag::COMPRESSED) || !has(flag::DICTIONARY));
+    if !possible {
+        return Err(Fault::Format);
+    }
+    let mut recipient = None;
+    let mut at = FIXED;
+    for (tag, record) in head.records() {
+        at += 4;
+        if tag == tag::RECIPIENT && record.len() == RECIPIENT {
+            let key = key_block::find(device.keys, KEKS, KEK_COUNT, word(record, 0));
+            recipient = recipient.or(key.map(|key| (key, at)));
+        } else if tag & tag::CRITICAL != 0 {
+            return Err(Fault::Format);
+        }
+        at += record.len();
+    }
+    if head.vendor_id() != device.vendor_id {
+        return Err(Fault::WrongVendor);
+    }
+    let unique_id = head.unique_id();
+    let hardware = head.hardware();
+    let fits = head.product_code() == device.product_code
+        && head.program() == device.program
+        && has(flag::DATA) == device.is_data
+        && (unique_id == [0; 12] || unique_id == device.unique_id)
+        && (hardware == 0 || hardware >> (device.revision & 31) & 1 == 1);
+    if !fits {
+        return Err(Fault::WrongProduct);
+    }
+    if size > device.room {
+        return Err(Fault::Address);
+    }
+    let counter = head.counter();
+    if counter < device.counter {
+        return Err(Fault::Rollback);
+    }
+    let for_tests = word(device.keys, key_block::FLAGS) & FOR_TESTS != 0;
+    let mut epoch = device.epoch;
+    let mut test = has(flag::TEST);
+    let mut root_id = 0;
+    if let Some(certificate) = head.certificate() {
+        test |= certificate.role() == role::TEST;
+        let own = certificate.product_code();
+        let holds = usize::from(certificate.len()) == CERTIFICATE
+            && u16::from(certificate.algorithm()) == ED25519
+            && (certificate.role() == role::RELEASE || certificate.role() == role::TEST)
+            && certificate.vendor_id() == device.vendor_id
+            && (own == 0 || own == device.product_code)
+            && (certificate.lowest()..=certificate.highest()).contains(&counter);
+        if !holds {
+            return Err(Fault::Signature);
+        }
+        if certificate.epoch() < epoch {
+            return Err(Fault::Rollback);
+        }
+        epoch = certificate.epoch();
+        root_id = certificate.root_id();
+    }
+    let mut root = key_block::find(device.keys, ROOTS, ROOT_COUNT, root_id);
+    if head.certificate().is_none() {
+        // A root may sign a program itself.
+        root = (ROOTS..KEKS).step_by(key_block::KEY).find(|at| {
+            let id = word(device.keys, *at);
+            id != 0 && head.signature(id).is_some()
+        });
+    }
+    let Some(root) = root else { return Err(Fault::Key) };
+    if test && !for_tests || has(flag::ENCRYPTED) && recipient.is_none() {
+        return Err(Fault::Key);
+    }
+    let recipient = recipient.filter(|_| has(flag::ENCRYPTED));
+    Ok(Needs { root, epoch, recipient })
+}

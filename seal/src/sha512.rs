@@ -1,0 +1,229 @@
+//! SHA-512, SHA-512/256 (FIPS 180-4) and HMAC-SHA-512 (RFC 2104), small before fast.
+//!
+//! The block that is being filled is the message schedule, too: sixteen words, of which each round
+//! replaces one. So a hash needs 200 bytes of RAM whatever it is given.
+
+use core::sync::atomic::{AtomicU32, Ordering};
+
+/// The state that SHA-512 starts with (FIPS 180-4, 5.3.5) and the constants of the rounds (4.2.3),
+/// the lower half of each first: the first 64 bits of the fractional parts of the square roots of
+/// the first eight primes and of the cube roots of the first eighty. As bytes of a program they
+/// would be 704, which nothing packs. So they are worked out ([`prepare`]), which takes some 10 ms
+/// at 168 MHz.
+static CONSTANTS: [[AtomicU32; 2]; STATE + 80] = [const { [const { AtomicU32::new(0) }; 2] }; STATE + 80];
+
+/// Words of the state.
+const STATE: usize = 8;
+
+/// Constants that are there.
+fn constants() -> &'static [[AtomicU32; 2]; STATE + 80] {
+    while !prepare() {}
+    &CONSTANTS
+}
+
+/// Works out the next constant, in about 0.1 ms at 168 MHz; whether all are there. A device calls it
+/// when it has nothing else to do, so that nobody waits for all of them.
+pub fn prepare() -> bool {
+    // No constant's upper half is zero. Two that do this at once write the same.
+    let missing = |halves: &[AtomicU32; 2]| halves[1].load(Ordering::Acquire) == 0;
+    let Some((n, constant)) = CONSTANTS.iter().enumerate().find(|(_, halves)| missing(halves)) else {
+        return true;
+    };
+    let square = n < STATE;
+    let is_prime = |number: &u32| (2..*number).all(|divisor| !number.is_multiple_of(divisor));
+    let prime = (2..).filter(is_prime).nth(if square { n } else { n - STATE });
+    let root = root(prime.unwrap_or(0), square);
+    constant[0].store(root as u32, Ordering::Release);
+    constant[1].store((root >> 32) as u32, Ordering::Release);
+    false
+}
+
+/// The first 64 bits of the fractional part of a square or cube root below 8, bit by bit.
+///
+/// r is the root so far and b the next bit. Of the cube root `rest` is (number - r^3) / b, of which
+/// `q` + `h` + `b` = 3r^2 + 3rb + b^2 have to be taken for that bit; of the square root it is
+/// (number - r^2) / b, and `q` + `h` = 2r + b. All are in units of 2^-118: what is lost when they
+/// are halved does not reach the bits of the root.
+#[inline(never)]
+fn root(number: u32, square: bool) -> u64 {
+    let mut rest = u128::from(number) << 116;
+    let [mut q, mut h, mut b] = [0_u128, 0, 16 << 118];
+    if square {
+        [h, b] = [4 << 118, 0];
+    }
+    let mut root = 0;
+    // Three bits are in front of the point, and go out at the upper end.
+    for _ in 0..3 + 64 {
+        root <<= 1;
+        let taken = q + h + b;
+        if rest >= taken {
+            rest -= taken;
+            q = taken + h + b + b;
+            h += b + b + b;
+            root |= 1;
+        }
+        rest <<= 1;
+        h >>= 1;
+        b >>= 2;
+    }
+    root
+}
+
+#[inline(always)]
+fn constant(halves: &[AtomicU32; 2]) -> u64 {
+    let [low, high] = halves;
+    u64::from(high.load(Ordering::Relaxed)) << 32 | u64::from(low.load(Ordering::Relaxed))
+}
+
+/// A hash in the making.
+#[derive(Clone, Debug)]
+pub struct Sha512 {
+    state: [u64; STATE],
+    block: [u64; 16],
+    /// Bytes so far.
+    length: u32,
+}
+
+impl Default for Sha512 {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Sha512 {
+    /// Room for a hash; [`new`](Self::new) begins one. All zeros, so that it costs no flash.
+    pub const IDLE: Self = Self { state: [0; 8], block: [0; 16], length: 0 };
+
+    /// SHA-512 of nothing yet.
+    #[must_use]
+    pub fn new() -> Self {
+        let mut state = [0; STATE];
+        for (word, start) in state.iter_mut().zip(constants()) {
+            *word = constant(start);
+        }
+        Self { state, block: [0; 16], length: 0 }
+    }
+
+    /// SHA-512/256 of nothing yet. Its hash is the first 32 bytes that
+    /// [`finish`](Self::finish) gives.
+    #[must_use]
+    pub fn new_256() -> Self {
+        // FIPS 180-4, 5.3.6: how the state that a truncated hash starts with is found.
+        let mut hash = Self::new();
+        hash.state.iter_mut().for_each(|word| *word ^= 0xa5a5_a5a5_a5a5_a5a5);
+        hash.update(b"SHA-512/256");
+        hash.pad();
+        hash.length = 0;
+        hash
+    }
+
+    /// Takes more of the message, which may have 2^32 - 1 bytes in sum.
+    pub fn update(&mut self, data: &[u8]) {
+        for byte in data {
+            self.push(*byte);
+        }
+    }
+
+    /// The hash. Of SHA-512/256 it is the first 32 bytes. Nothing useful can be done with `self`
+    /// afterwards.
+    pub fn finish(&mut self) -> [u8; 64] {
+        self.pad();
+        let mut hash = [0; 64];
+        for (bytes, word) in hash.chunks_exact_mut(8).zip(&self.state) {
+            bytes.copy_from_slice(&word.to_be_bytes());
+        }
+        hash
+    }
+
+    #[inline(never)]
+    fn push(&mut self, byte: u8) {
+        let word = &mut self.block[self.length as usize / 8 % 16];
+        *word = *word << 8 | u64::from(byte);
+        self.length = self.length.wrapping_add(1);
+        if self.length.is_multiple_of(128) {
+            self.compress();
+        }
+    }
+
+    /// The end of the message: a bit, zeros, and the length in bits.
+    fn pad(&mut self) {
+        let bits = u64::from(self.length) * 8;
+        self.push(0x80);
+        while self.length % 128 != 112 {
+            self.push(0);
+        }
+        self.block[14] = 0;
+        self.block[15] = bits;
+        self.compress();
+    }
+
+    /// Takes the block into the state (FIPS 180-4, 6.4.2).
+    #[inline(never)]
+    fn compress(&mut self) {
+        // The eight working variables, a first, move one place down in each round: nothing is
+        // copied but what changes, until sixteen rounds are over.
+        let mut moving = [0; 16 + 8];
+        moving[..8].copy_from_slice(&self.state);
+        for round in CONSTANTS[STATE..].chunks_exact(16) {
+            moving.copy_within(..8, 16);
+            for (t, halves) in round.iter().enumerate() {
+                let Some([next, a, b, c, d, e, f, g, h]) = moving[15 - t % 16..].first_chunk_mut() else {
+                    break;
+                };
+                let w = self.block[t % 16];
+                let sum = h
+                    .wrapping_add(turns(*e, 14, 18, e.rotate_right(41)))
+                    .wrapping_add(*g ^ (*e & (*f ^ *g)))
+                    .wrapping_add(constant(halves))
+                    .wrapping_add(w);
+                *d = d.wrapping_add(sum);
+                *next = sum
+                    .wrapping_add(turns(*a, 28, 34, a.rotate_right(39)))
+                    .wrapping_add((*a & *b) | (*c & (*a | *b)));
+                let early = self.block[(t + 1) % 16];
+                let late = self.block[(t + 14) % 16];
+                // What this place of the block has sixteen rounds later.
+                self.block[t % 16] = w
+                    .wrapping_add(turns(early, 1, 8, early >> 7))
+                    .wrapping_add(self.block[(t + 9) % 16])
+                    .wrapping_add(turns(late, 19, 61, late >> 6));
+            }
+        }
+        for (state, word) in self.state.iter_mut().zip(&moving) {
+            *state = state.wrapping_add(*word);
+        }
+    }
+}
+
+/// The word turned to the right by two numbers of bits and a third word, added bit by bit.
+#[inline(always)]
+fn turns(word: u64, one: u32, two: u32, third: u64) -> u64 {
+    word.rotate_right(one) ^ word.rotate_right(two) ^ third
+}
+
+/// SHA-512/256 of these parts, one behind the other.
+#[must_use]
+pub fn hash_256(parts: &[&[u8]]) -> [u8; 32] {
+    let mut hash = Sha512::new_256();
+    parts.iter().for_each(|part| hash.update(part));
+    let mut first = [0; 32];
+    first.copy_from_slice(&hash.finish()[..32]);
+    first
+}
+
+/// HMAC-SHA-512 of these parts, one behind the other.
+#[must_use]
+pub fn hmac(key: &[u8; 32], parts: &[&[u8]]) -> [u8; 64] {
+    let keyed = |pad: u8| {
+        let mut hash = Sha512::new();
+        for at in 0..128 {
+            hash.push(key.get(at).unwrap_or(&0) ^ pad);
+        }
+        hash
+    };
+    let mut inner = keyed(0x36);
+    parts.iter().for_each(|part| inner.update(part));
+    let mut outer = keyed(0x5c);
+    outer.update(&inner.finish());
+    outer.finish()
+}
