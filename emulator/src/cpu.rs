@@ -11,7 +11,8 @@
 //!
 //! **What is missing.** Unaligned LDM, STM, LDRD and STRD work instead of faulting; the MPU is off;
 //! SEV is not seen (WFE ends by itself); an FPU instruction that a false IT condition skips faults
-//! all the same while the FPU is off.
+//! all the same while the FPU is off; CCR.BFHFNMIGN is for stores that a register refuses, and an
+//! access to where nothing is locks the core up all the same at priority -1.
 
 mod accesses;
 
@@ -22,7 +23,7 @@ use crate::cortex::debug::{DFSR_BKPT, DFSR_HALTED};
 use crate::cortex::exceptions::{
     Masks, BUS_FAULT, DEBUG_MONITOR, HARD_FAULT, MEM_MANAGE, NMI, SV_CALL, USAGE_FAULT,
 };
-use crate::cortex::scs::{cfsr, hfsr};
+use crate::cortex::scs::{cfsr, hfsr, RefusedStore};
 use crate::machine::chip::{
     Chip, BOOT_ALIAS, OPTION_PAGE, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS, PRIVATE, SRAM_ALIAS,
     SYSTEM_PAGE,
@@ -221,6 +222,7 @@ impl Cpu {
                     }),
                     Some(move |uc: &mut Unicorn<'_, State>, offset: u64, size: usize, value: u64| {
                         uc.get_data_mut().chip.store(base + offset as u32, size as u8, value as u32);
+                        settle_bus_error(uc);
                         locate_reports(uc);
                     }),
                 )
@@ -948,12 +950,6 @@ impl Cpu {
             self.take_fault(Fault::Hard(hfsr::FORCED))
         }
     }
-
-    /// The fault of a write that the bus refused after the CPU had gone on.
-    #[must_use]
-    pub fn late_bus_fault() -> Fault {
-        Fault::bus(cfsr::IMPRECISERR, None)
-    }
 }
 
 fn read(uc: &Unicorn<'_, State>, register: RegisterARM) -> u32 {
@@ -969,8 +965,26 @@ fn masks(uc: &Unicorn<'_, State>) -> Masks {
 }
 
 // The hooks of loads and stores never stop the engine themselves: it would put the PC back to the
-// instruction, which then runs twice. They set `Chip::leave`, and the next block does not start.
+// instruction, which then runs twice. They set `Chip::leave`, and the next block does not start. The
+// exception is a store with a precise fault, to which the PC has to point.
 //
+/// After a store to a peripheral: a bus error becomes a fault, or is ignored.
+fn settle_bus_error(uc: &mut Unicorn<'_, State>) {
+    let Some(address) = uc.get_data_mut().chip.bus_error.take() else { return };
+    let masks = uc.get_data().notes.masks.unwrap_or_else(|| masks(uc));
+    let State { chip, notes } = uc.get_data_mut();
+    chip.leave = true;
+    match chip.scs.refuse_store(address, masks) {
+        RefusedStore::Pended => chip.check_exceptions = true,
+        // A program that has the fault ignored means the store as it is: nothing to report.
+        RefusedStore::Ignored => drop(chip.unlocated.pop()),
+        RefusedStore::Taken => {
+            notes.fault = Some(Fault::bus(cfsr::PRECISERR, Some(address)));
+            let _ = uc.emu_stop();
+        }
+    }
+}
+
 /// Finds the instructions of accesses to peripherals that are to be reported.
 fn locate_reports(uc: &mut Unicorn<'_, State>) {
     while let Some(mut report) = uc.get_data_mut().chip.unlocated.pop() {

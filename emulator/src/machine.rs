@@ -356,9 +356,6 @@ impl Machine {
     }
 
     fn execute(&mut self) -> Entry {
-        if std::mem::take(&mut self.cpu.chip_mut().bus_error) {
-            return self.cpu.take_fault(Cpu::late_bus_fault());
-        }
         if let Some(exception) = self.cpu.deliverable() {
             if self.flash_holds(self.cpu.vector_address(exception)) {
                 return Entry::Taken;

@@ -3,8 +3,8 @@
 
 use super::debug::Debug;
 use super::exceptions::{
-    Exceptions, LineSet, BUS_FAULT, DEBUG_MONITOR, FIRST_LINE, MEM_MANAGE, NMI, PEND_SV, SV_CALL, SYS_TICK,
-    USAGE_FAULT,
+    Exceptions, LineSet, Masks, BUS_FAULT, DEBUG_MONITOR, FIRST_LINE, HARD_FAULT, MEM_MANAGE, NMI, PEND_SV,
+    SV_CALL, SYS_TICK, USAGE_FAULT,
 };
 use super::systick::SysTick;
 use crate::peripheral::Unmodelled;
@@ -57,6 +57,12 @@ const SCR_MASK: u32 = 0b1_0110;
 const CCR_MASK: u32 = 0x31B;
 /// UNALIGN_TRP, DIV_0_TRP.
 const CCR_TRAPS: u32 = 0b11 << 3;
+/// BFHFNMIGN.
+const CCR_IGNORES: u32 = 1 << 8;
+/// ACTLR: DISMCYCINT, DISDEFWBUF, DISFOLD, DISFPCA, DISOOFP (PM0214 section 4.4.1).
+const ACTLR_MASK: u32 = 0x307;
+/// DISDEFWBUF: no write buffer, so that every bus fault of a store is precise.
+const ACTLR_UNBUFFERED: u32 = 1 << 1;
 /// STKALIGN is set by reset on the r0p1 core of the STM32F4.
 const CCR_RESET: u32 = 1 << 9;
 const CPACR_MASK: u32 = 0xF << 20;
@@ -73,6 +79,18 @@ pub enum Effect {
     FpuAccess,
     /// Whether code runs step by step may have changed.
     Stepping,
+}
+
+/// What the core makes of a store that the bus refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RefusedStore {
+    /// The store went through the write buffer and the CPU has gone on: the fault is imprecise and
+    /// pending.
+    Pended,
+    /// The fault is precise, and nobody hears of it but BFSR and BFAR.
+    Ignored,
+    /// The fault is precise, and taken at the store.
+    Taken,
 }
 
 /// The registers from E000_E000 to E000_EFFF.
@@ -92,6 +110,7 @@ pub struct Scs {
     pub bfar: u32,
     /// Breakpoints and the debug monitor.
     pub debug: Debug,
+    actlr: u32,
     scr: u32,
     ccr: u32,
     cpacr: u32,
@@ -118,6 +137,7 @@ impl Scs {
             hfsr: 0,
             bfar: 0,
             debug: Debug::default(),
+            actlr: 0,
             scr: 0,
             ccr: CCR_RESET,
             cpacr: 0,
@@ -150,8 +170,35 @@ impl Scs {
         self.ccr & CCR_RESET != 0
     }
 
-    /// CCR.BFHFNMIGN and the like are kept, not acted upon; SLEEPDEEP is for the caller to see at
-    /// WFI.
+    /// A store to `address` came back with a bus error.
+    ///
+    /// As a rule it went through the write buffer (the peripherals are Device memory, whose stores
+    /// are buffered), so that the fault is imprecise: asynchronous, pending until the priority of
+    /// the code that runs lets it in, as BusFault if that is enabled and as HardFault if not. It
+    /// does not lock the core up, and BFHFNMIGN does not stop it: that bit is about precise faults
+    /// (DDI 0403E B3.2.8; PM0214 section 4.4.7 is silent about which). With ACTLR.DISDEFWBUF the
+    /// fault is precise, and code at priority -1 (FAULTMASK) or -2 goes on behind the store if
+    /// BFHFNMIGN is set.
+    pub fn refuse_store(&mut self, address: u32, masks: Masks) -> RefusedStore {
+        if self.actlr & ACTLR_UNBUFFERED == 0 {
+            self.cfsr |= cfsr::IMPRECISERR;
+            if self.exceptions.is_enabled(BUS_FAULT) {
+                self.exceptions.pend(BUS_FAULT);
+            } else {
+                self.hfsr |= hfsr::FORCED;
+                self.exceptions.pend(HARD_FAULT);
+            }
+            return RefusedStore::Pended;
+        }
+        if self.ccr & CCR_IGNORES == 0 || self.exceptions.execution_priority(masks) >= 0 {
+            return RefusedStore::Taken;
+        }
+        self.cfsr |= cfsr::PRECISERR | cfsr::BFARVALID;
+        self.bfar = address;
+        RefusedStore::Ignored
+    }
+
+    /// SCR.SLEEPDEEP, for the caller to see at WFI.
     #[must_use]
     pub fn sleeps_deeply(&self) -> bool {
         self.scr & SCR_SLEEPDEEP != 0
@@ -163,7 +210,7 @@ impl Scs {
         Ok(match offset {
             // Number of lines in groups of 32, less one.
             0x004 => u32::from((self.exceptions.count() - FIRST_LINE).div_ceil(32)) - 1,
-            0x008 => 0,
+            0x008 => self.actlr,
             0x010 => self.systick.read_csr(),
             0x014 => self.systick.read_reload(),
             0x018 => self.systick.read_value(now),
@@ -218,7 +265,7 @@ impl Scs {
     pub fn write(&mut self, offset: u32, value: u32, now: Time) -> Result<Effect, Unmodelled> {
         let row = offset & 0x7F;
         match offset {
-            0x008 => {}
+            0x008 => self.actlr = value & ACTLR_MASK,
             0x010 => self.systick.write_csr(value, now),
             0x014 => self.systick.write_reload(value, now),
             0x018 => self.systick.write_value(now),

@@ -242,8 +242,8 @@ pub struct Chip {
     pub reset_request: Option<ResetCause>,
     /// The CPU stands still until then: the bus to the flash is held.
     pub hold_until: Option<Time>,
-    /// An imprecise bus error came back for a write.
-    pub bus_error: bool,
+    /// A bus error came back for the last store, to this address.
+    pub bus_error: Option<u32>,
     /// Translations hold code that has changed since: (address, length).
     pub stale: Vec<(u32, u32)>,
     /// The translator's memory of what may be read must go: an operation started, and loads from
@@ -318,7 +318,7 @@ impl Chip {
             attention: false,
             reset_request: None,
             hold_until: None,
-            bus_error: false,
+            bus_error: None,
             stale: Vec::new(),
             flush_tlb: false,
             guarded: false,
@@ -367,7 +367,7 @@ impl Chip {
         self.check_exceptions = false;
         self.reset_request = None;
         self.hold_until = None;
-        self.bus_error = false;
+        self.bus_error = None;
         if self.flash.hardware_watchdog() {
             let now = self.now();
             // The key that starts it cannot be refused.
@@ -586,6 +586,9 @@ impl Chip {
         if let Err(unmodelled) = result {
             self.complain(Access::Write, address, size, value, unmodelled);
         }
+        if self.flash.take_bus_error() {
+            self.bus_error = Some(address);
+        }
         self.after_write();
     }
 
@@ -745,10 +748,6 @@ impl Chip {
             }
             Block::Iwdg if self.iwdg.is_running() => self.rcc.force_lsi(now),
             Block::Flash => {
-                if self.flash.take_bus_error() {
-                    self.bus_error = true;
-                    self.leave = true;
-                }
                 self.settle_flash();
             }
             Block::Gpio(_) => self.wire_usarts(),

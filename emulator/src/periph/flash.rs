@@ -4,19 +4,21 @@
 //! target is erased. While an operation runs (BSY) the array answers neither fetches nor data
 //! reads; the machine stalls the CPU then.
 
+mod lock;
+mod options;
+
 use shared_abi::geometry::{Geometry, Sector};
 
 use crate::machine::memory::HostMemory;
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::{Span, Time};
+use lock::Lock;
+use options::{OptionBytes, Request};
 
 /// Interrupt line of the flash (RM0090 table 61).
 const LINE: u16 = 4;
 
-const KEY1: u32 = 0x4567_0123;
-const KEY2: u32 = 0xCDEF_89AB;
-const OPTKEY1: u32 = 0x0819_2A3B;
-const OPTKEY2: u32 = 0x4C5D_6E7F;
+const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
 
 const SR_EOP: u32 = 1 << 0;
 const SR_OPERR: u32 = 1 << 1;
@@ -41,10 +43,6 @@ const CR_ERRIE: u32 = 1 << 25;
 const CR_LOCK: u32 = 1 << 31;
 const CR_KEPT: u32 = CR_PG | CR_SER | CR_MER | CR_SNB | CR_PSIZE | CR_EOPIE | CR_ERRIE;
 
-const OPTCR_OPTLOCK: u32 = 1 << 0;
-const OPTCR_OPTSTRT: u32 = 1 << 1;
-/// Factory option bytes: no protection, BOR off, software watchdog (section 3.10.5).
-const OPTCR_FACTORY: u32 = 0x0FFF_AAED;
 /// OPTCR1 from the factory: no sector of the second bank is protected (section 3.9.11).
 const OPTCR1_FACTORY: u32 = 0x0FFF_0000;
 
@@ -134,17 +132,6 @@ struct Running {
     ends: Time,
 }
 
-/// State of an unlock sequence.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Lock {
-    Locked,
-    /// The first key was right.
-    HalfOpen,
-    Open,
-    /// A key was wrong: closed until the next reset.
-    Barred,
-}
-
 /// What a store by the CPU to the array came to.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Store {
@@ -164,10 +151,7 @@ pub struct Flash {
     sr: u32,
     cr: u32,
     lock: Lock,
-    option_lock: Lock,
-    /// OPTCR as programmed, and as written but not yet programmed.
-    options: u32,
-    options_written: u32,
+    options: OptionBytes,
     running: Option<Running>,
     /// Ranges of the array that changed since the machine last asked, as (offset, length).
     changed: Vec<(u32, u32)>,
@@ -192,10 +176,8 @@ impl Flash {
             acr: 0,
             sr: 0,
             cr: 0,
-            lock: Lock::Locked,
-            option_lock: Lock::Locked,
-            options: OPTCR_FACTORY & !(OPTCR_OPTLOCK | OPTCR_OPTSTRT),
-            options_written: OPTCR_FACTORY & !(OPTCR_OPTLOCK | OPTCR_OPTSTRT),
+            lock: Lock::default(),
+            options: OptionBytes::default(),
             running: None,
             changed: Vec::new(),
             bus_error: false,
@@ -255,9 +237,7 @@ impl Flash {
     /// Sets the option byte RDP as a debug probe does: AAh no read-out protection, CCh level 2,
     /// anything else level 1.
     pub fn preset_read_protection(&mut self, rdp: u8) {
-        for options in [&mut self.options, &mut self.options_written] {
-            *options = *options & !0xFF00 | u32::from(rdp) << 8;
-        }
+        self.options.preset_read_protection(rdp);
     }
 
     /// The power fails now: what runs is torn. `seed` chooses how.
@@ -295,7 +275,7 @@ impl Flash {
     fn is_protected(&self, sector: Sector) -> bool {
         // The sectors of a second bank have theirs in OPTCR1, which stays as from the factory.
         let second = self.geometry.second_bank.is_some_and(|first| sector.number >= first);
-        !second && self.options >> 16 & 1 << sector.number == 0
+        !second && self.options.protects(sector.number)
     }
 
     /// Sets the option bytes as a debug probe does: in no time, and whoever runs does not notice.
@@ -304,10 +284,7 @@ impl Flash {
     /// For a sector of a second bank, whose option bytes are not modelled.
     pub fn protect_sector(&mut self, number: u8, protected: bool) {
         assert!(number < 12, "the write protection of a second bank is not modelled");
-        let bit = 1 << (16 + number);
-        for options in [&mut self.options, &mut self.options_written] {
-            *options = if protected { *options & !bit } else { *options | bit };
-        }
+        self.options.preset_protection(number, protected);
     }
 
     fn refuse(&mut self, flag: u32, why: &'static str) -> Store {
@@ -323,7 +300,7 @@ impl Flash {
     pub fn store(&mut self, offset: u32, bytes: &[u8], now: Time) -> Store {
         let start = self.wait_until_idle(now);
         let len = u32::try_from(bytes.len()).unwrap_or(u32::MAX);
-        if self.lock != Lock::Open {
+        if !self.lock.is_open() {
             return self.refuse(SR_PGSERR, "the flash is locked");
         }
         if self.cr & CR_PG == 0 {
@@ -453,7 +430,12 @@ impl Flash {
                     self.changed.push((sector.region.base - self.geometry.flash.base, sector.region.size));
                 }
             }
-            Operation::Options { optcr } => self.options = *optcr,
+            Operation::Options { optcr } => {
+                if self.options.program(*optcr) {
+                    self.array.bytes_mut().fill(0xFF);
+                    self.changed.push((0, self.geometry.flash.size));
+                }
+            }
         }
     }
 
@@ -484,24 +466,13 @@ impl Flash {
                     self.changed.push((sector.region.base - self.geometry.flash.base, sector.region.size));
                 }
             }
-            // The option bytes are double-checked by their complements; a torn set loads as the
-            // factory one.
-            Operation::Options { .. } => self.options = OPTCR_FACTORY & !(OPTCR_OPTLOCK | OPTCR_OPTSTRT),
-        }
-    }
-
-    fn turn(lock: Lock, value: u32, first: u32, second: u32) -> Lock {
-        match (lock, value) {
-            (Lock::Locked, key) if key == first => Lock::HalfOpen,
-            (Lock::HalfOpen, key) if key == second => Lock::Open,
-            _ => Lock::Barred,
+            Operation::Options { .. } => self.options.tear(),
         }
     }
 
     fn write_key(&mut self, value: u32) -> Result<(), Unmodelled> {
-        self.lock = Self::turn(self.lock, value, KEY1, KEY2);
+        self.lock = self.lock.turn(value, KEYS);
         if self.lock == Lock::Barred {
-            self.bus_error = true;
             return Err(Unmodelled(
                 "wrong key sequence at FLASH_KEYR: FLASH_CR is locked until the next reset, and the chip answers \
                  with a bus error"
@@ -512,14 +483,14 @@ impl Flash {
     }
 
     fn write_cr(&mut self, value: u32, now: Time) -> Result<(), Unmodelled> {
-        if self.lock != Lock::Open {
+        if !self.lock.is_open() {
             return Err(Unmodelled("FLASH_CR is written while it is locked: the chip ignores it".into()));
         }
         let start = self.wait_until_idle(now);
         let second_bank = if self.geometry.second_bank.is_some() { CR_MER1 } else { 0 };
         self.cr = value & (CR_KEPT | second_bank);
         if value & CR_LOCK != 0 {
-            self.lock = Lock::Locked;
+            self.lock = self.lock.close();
             return Ok(());
         }
         if value & CR_STRT != 0 {
@@ -529,40 +500,26 @@ impl Flash {
     }
 
     fn write_optcr(&mut self, value: u32, now: Time) -> Result<(), Unmodelled> {
-        if self.option_lock != Lock::Open {
-            return Err(Unmodelled("FLASH_OPTCR is written while it is locked: the chip ignores it".into()));
-        }
         let start = self.wait_until_idle(now);
-        self.options_written = value & 0x0FFF_FFEC;
-        if value & OPTCR_OPTLOCK != 0 {
-            self.option_lock = Lock::Locked;
-        } else if value & OPTCR_OPTSTRT != 0 {
+        if let Request::Program(optcr) = self.options.write(value)? {
             // Option bytes lie in a sector of their own; the datasheet gives no time: that of a 16
             // KiB sector.
             let takes = Span::from_millis(self.pick(ERASE_16_KIB[2]));
-            self.start(Operation::Options { optcr: self.options_written }, takes, start);
+            self.start(Operation::Options { optcr }, takes, start);
         }
         Ok(())
     }
 
-    /// The sixteen option bytes as they read at 1FFF_C000 (section 3.6.1): each value with its
-    /// complement.
+    /// The sixteen option bytes as they read at 1FFF_C000 (section 3.6.1).
     #[must_use]
     pub fn option_bytes(&self) -> [u8; 16] {
-        let mut bytes = [0xFF; 16];
-        let low = self.options as u16;
-        let high = (self.options >> 16 & 0x0FFF) as u16;
-        bytes[0..2].copy_from_slice(&low.to_le_bytes());
-        bytes[2..4].copy_from_slice(&(!low).to_le_bytes());
-        bytes[8..10].copy_from_slice(&high.to_le_bytes());
-        bytes[10..12].copy_from_slice(&(!high).to_le_bytes());
-        bytes
+        self.options.bytes()
     }
 
     /// Option bit WDG_SW clear: the watchdog starts by itself after reset (section 3.6.2).
     #[must_use]
     pub fn hardware_watchdog(&self) -> bool {
-        self.options & 1 << 5 == 0
+        self.options.hardware_watchdog()
     }
 }
 
@@ -579,12 +536,16 @@ impl Peripheral for Flash {
             0x04 | 0x08 => 0,
             0x0C => self.sr | if self.running.is_some() { SR_BSY } else { 0 },
             0x10 => {
-                let locked = if self.lock == Lock::Open { 0 } else { CR_LOCK };
+                let locked = if self.lock.is_open() { 0 } else { CR_LOCK };
                 let erasing =
                     matches!(&self.running, Some(Running { operation: Operation::Erase { .. }, .. }));
                 self.cr | locked | if erasing { CR_STRT } else { 0 }
             }
-            0x14 => self.options_written | if self.option_lock == Lock::Open { 0 } else { OPTCR_OPTLOCK },
+            0x14 => {
+                let programming =
+                    matches!(&self.running, Some(Running { operation: Operation::Options { .. }, .. }));
+                self.options.read(programming)
+            }
             0x18 if self.geometry.second_bank.is_some() => OPTCR1_FACTORY,
             _ => return Err(Unmodelled("the flash interface has no such register".into())),
         })
@@ -598,17 +559,11 @@ impl Peripheral for Flash {
                 self.acr = value & ACR_MASK;
                 Ok(())
             }
-            0x04 => self.write_key(value),
-            0x08 => {
-                self.option_lock = Self::turn(self.option_lock, value, OPTKEY1, OPTKEY2);
-                if self.option_lock == Lock::Barred {
-                    self.bus_error = true;
-                    return Err(Unmodelled(
-                        "wrong key sequence at FLASH_OPTKEYR: FLASH_OPTCR is locked until the next reset"
-                            .into(),
-                    ));
-                }
-                Ok(())
+            0x04 | 0x08 => {
+                let result =
+                    if offset == 0x04 { self.write_key(value) } else { self.options.write_key(value) };
+                self.bus_error = result.is_err();
+                result
             }
             0x0C => {
                 self.sr &= !(value & SR_CLEARABLE);
@@ -657,9 +612,8 @@ impl Peripheral for Flash {
         self.acr = 0;
         self.sr = 0;
         self.cr = 0;
-        self.lock = Lock::Locked;
-        self.option_lock = Lock::Locked;
-        self.options_written = self.options;
+        self.lock = Lock::default();
+        self.options.reset();
         self.bus_error = false;
         self.waited_until = None;
     }
@@ -830,7 +784,7 @@ mod tests {
         flash.store(14, &word, Time(0));
         assert_eq!(status(&mut flash, Time(0)), 0x20, "PGAERR: crosses a row");
         flash.write(SR, 0x20, Time(0)).unwrap();
-        flash.options &= !(1 << 16);
+        flash.protect_sector(0, true);
         flash.write(CR, CR_PG | X32 | CR_ERRIE, Time(0)).unwrap();
         flash.store(0, &word, Time(0));
         assert_eq!(status(&mut flash, Time(0)), 0x12, "WRPERR, and OPERR because of ERRIE");
@@ -871,12 +825,61 @@ mod tests {
         assert_eq!(flash.read(CR, Time(0)), Ok(CR_LOCK));
     }
 
-    /// RM0090 section 3.10.5 and 3.6.1.
+    const OPTCR: u32 = 0x14;
+
+    fn with_open_options() -> Flash {
+        let mut flash = unlocked();
+        flash.write(0x08, 0x0819_2A3B, Time(0)).unwrap();
+        flash.write(0x08, 0x4C5D_6E7F, Time(0)).unwrap();
+        flash
+    }
+
+    /// RM0090 section 3.6.2: the register, then OPTSTRT, then BSY.
     #[test]
-    fn option_bytes_read_as_from_the_factory() {
-        let mut flash = Flash::new(&STM32F407VG, FlashTimes::Typical);
-        assert_eq!(flash.read(0x14, Time(0)), Ok(0x0FFF_AAED));
-        assert_eq!(flash.option_bytes()[..4], [0xEC, 0xAA, 0x13, 0x55]);
+    fn option_bytes_take_their_time_and_protect_then() {
+        let mut flash = with_open_options();
+        flash.write(OPTCR, 0x0FFC_AAEC, Time(0)).unwrap();
+        flash.write(OPTCR, 0x0FFC_AAEE, Time(0)).unwrap();
+        assert_eq!(flash.read(OPTCR, Time(0)), Ok(0x0FFC_AAEE), "OPTSTRT is set until the end");
+        assert_eq!(status(&mut flash, Time(0)), 0x0001_0000);
+        let end = Time(250_000_000_000);
+        assert_eq!(flash.read(OPTCR, end), Ok(0x0FFC_AAEC));
+        flash.write(CR, CR_SER | 1 << 3 | X32 | CR_STRT, end).unwrap();
+        assert_eq!(status(&mut flash, end), 0x10, "WRPERR: sector 1");
+        flash.write(SR, 0x10, end).unwrap();
+        flash.write(CR, CR_SER | 2 << 3 | X32 | CR_STRT, end).unwrap();
+        assert_eq!(status(&mut flash, end), 0x0001_0000, "sector 2 is erased");
+        flash.reset();
+        assert_eq!(flash.read(OPTCR, end), Ok(0x0FFC_AAED), "kept over a reset, and locked");
+    }
+
+    #[test]
+    fn leaving_read_out_protection_erases_the_array() {
+        let mut flash = with_open_options();
+        flash.preset_read_protection(0x55);
+        flash.array.bytes_mut().fill(0);
+        flash.write(OPTCR, 0x0FFF_AAEE, Time(0)).unwrap();
+        flash.advance(Time(u64::MAX));
+        assert!(flash.array.bytes().iter().all(|&byte| byte == 0xFF));
+    }
+
+    #[test]
+    fn a_cut_while_option_bytes_are_programmed_leaves_level_1() {
+        for (when, wanted) in
+            [(Cut::Before, 0x0FFF_AAED), (Cut::After, 0x0FFC_AAED), (Cut::Torn { seed: 1 }, 0x0FFF_FFED)]
+        {
+            let mut flash = with_open_options();
+            flash.cut_power_at(Some(FlashCut { operation: 0, when }));
+            flash.write(OPTCR, 0x0FFC_AAEE, Time(0)).unwrap();
+            assert!(flash.power_has_failed());
+            flash.lose_power(0);
+            flash.reset();
+            assert_eq!(flash.read(OPTCR, Time(0)), Ok(wanted), "{when:?}");
+        }
+        let mut flash = with_open_options();
+        flash.write(OPTCR, 0x0FFC_AAEE, Time(0)).unwrap();
+        flash.reset();
+        assert_eq!(flash.read(OPTCR, Time(0)), Ok(0x0FFF_FFED), "a reset breaks it off as well");
     }
 
     #[test]

@@ -521,6 +521,155 @@ fn a_wrong_key_is_a_fault() {
     assert!(machine.reports()[0].what.contains("FLASH_KEYR"));
 }
 
+const KEYR: u32 = 0x4002_3C04;
+const OPTKEYR: u32 = 0x4002_3C08;
+const UNLOCK: [(u32, u32); 2] = [(KEYR, 0x4567_0123), (KEYR, 0xCDEF_89AB)];
+const UNLOCK_OPTIONS: [(u32, u32); 2] = [(OPTKEYR, 0x0819_2A3B), (OPTKEYR, 0x4C5D_6E7F)];
+/// Wrong keys for both.
+const LOCK: [(u32, u32); 2] = [(KEYR, 0), (OPTKEYR, 0)];
+const LOCKED: [u32; 2] = [0x8000_0000, 0x0FFF_AAED];
+const OPEN: [u32; 2] = [0, 0x0FFF_AAEC];
+const CPSID_F: (u32, u32) = (1, 1);
+const CPSIE_F: (u32, u32) = (1, 0);
+/// ACTLR.DISDEFWBUF.
+const NO_WRITE_BUFFER: (u32, u32) = (0xE000_E008, 1 << 1);
+/// CCR.BFHFNMIGN, beside STKALIGN.
+const IGNORE_BUS_FAULTS: (u32, u32) = (0xE000_ED14, 1 << 8 | 1 << 9);
+/// SHCSR.BUSFAULTENA.
+const ENABLE_BUS_FAULT: (u32, u32) = (0xE000_ED24, 1 << 17);
+
+/// What a script of stores leaves behind.
+#[derive(Debug, PartialEq, Eq)]
+struct Stored {
+    faults: u32,
+    /// FLASH_CR, FLASH_OPTCR.
+    locks: [u32; 2],
+    cfsr: u32,
+    hfsr: u32,
+    bfar: u32,
+}
+
+/// Runs a script of stores on a machine that has come out of a reset.
+fn store(machine: &mut Machine, script: &[&[(u32, u32)]]) -> Stored {
+    let script = script.concat();
+    for (n, (address, value)) in (0..).zip(script.iter().chain(&[(0, 0)])) {
+        put(machine, ARGUMENT + 8 * n, *address);
+        put(machine, ARGUMENT + 8 * n + 4, *value);
+    }
+    let until = Time(machine.now().0 + MS);
+    assert_eq!(machine.run_until(until), Stop::Deadline);
+    let log = words(machine, 6);
+    Stored { faults: log[0], locks: [log[1], log[2]], cfsr: log[3], hfsr: log[4], bfar: log[5] }
+}
+
+#[test]
+fn the_right_keys_open_flash_and_option_bytes() {
+    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
+    let stored = store(&mut machine, &[&UNLOCK, &UNLOCK_OPTIONS]);
+    assert_eq!(stored, Stored { faults: 0, locks: OPEN, cfsr: 0, hfsr: 0, bfar: 0 });
+    assert_eq!(machine.reports(), []);
+}
+
+/// RM0090 sections 3.5.1 and 3.6.2. The right keys are wrong ones then, and each is a bus error.
+#[test]
+fn after_a_wrong_key_the_right_ones_are_bus_errors_until_the_next_reset() {
+    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
+    let stored = store(&mut machine, &[&LOCK, &UNLOCK, &UNLOCK_OPTIONS]);
+    assert_eq!(stored, Stored { faults: 6, locks: LOCKED, cfsr: 0x400, hfsr: FORCED, bfar: 0 });
+    assert_eq!(word(&machine, OUT + 24), 3, "HardFault");
+    machine.reset_pin();
+    let stored = store(&mut machine, &[&UNLOCK, &UNLOCK_OPTIONS]);
+    assert_eq!((stored.faults, stored.locks), (0, OPEN));
+}
+
+/// One register's wrong key says nothing of the other.
+#[test]
+fn each_key_register_has_a_lock_of_its_own() {
+    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
+    let stored = store(&mut machine, &[&LOCK[..1], &UNLOCK_OPTIONS]);
+    assert_eq!((stored.faults, stored.locks), (1, [LOCKED[0], OPEN[1]]));
+    machine.reset_pin();
+    let stored = store(&mut machine, &[&LOCK[1..], &UNLOCK]);
+    assert_eq!((stored.faults, stored.locks), (1, [OPEN[0], LOCKED[1]]));
+}
+
+#[test]
+fn a_bus_error_is_a_bus_fault_where_that_is_enabled() {
+    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
+    let stored = store(&mut machine, &[&[ENABLE_BUS_FAULT], &LOCK]);
+    assert_eq!(stored, Stored { faults: 2, locks: LOCKED, cfsr: 0x400, hfsr: 0, bfar: 0 });
+    assert_eq!(word(&machine, OUT + 24), 5, "BusFault");
+}
+
+/// PM0214 section 4.4.10, IMPRECISERR: the fault becomes pending, and active only when the priority
+/// lets it.
+#[test]
+fn an_imprecise_fault_waits_for_faultmask_to_end() {
+    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
+    for ignore in [&[][..], &[IGNORE_BUS_FAULTS]] {
+        let stored = store(&mut machine, &[ignore, &[CPSID_F], &LOCK]);
+        assert_eq!((stored.faults, stored.locks, stored.cfsr), (0, LOCKED, 0x400));
+        machine.reset_pin();
+        let stored = store(&mut machine, &[ignore, &[CPSID_F], &LOCK, &[CPSIE_F]]);
+        assert_eq!((stored.faults, stored.locks, stored.hfsr), (1, LOCKED, FORCED));
+        machine.reset_pin();
+    }
+}
+
+/// ACTLR.DISDEFWBUF makes bus faults of stores precise (PM0214 section 4.4.1).
+#[test]
+fn without_the_write_buffer_the_fault_names_its_store() {
+    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
+    let stored = store(&mut machine, &[&[NO_WRITE_BUFFER], &LOCK[..1]]);
+    assert_eq!(stored.faults, 1);
+    assert_eq!((stored.cfsr, stored.hfsr, stored.bfar), (0x8200, FORCED, KEYR));
+    assert_eq!(word(&machine, OUT + 28), 0x0800_0216, "str r0, [r1]");
+    assert_eq!(stored.locks, [LOCKED[0], 0x0FFF_AAED]);
+}
+
+/// PM0214 section 4.4.7, BFHFNMIGN: code at priority -1 goes on behind the store. The status tells.
+#[test]
+fn a_precise_fault_is_ignored_under_faultmask_if_the_program_says_so() {
+    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
+    let quiet = [NO_WRITE_BUFFER, IGNORE_BUS_FAULTS, CPSID_F];
+    let stored = store(&mut machine, &[&quiet, &LOCK, &[CPSIE_F]]);
+    assert_eq!(stored, Stored { faults: 0, locks: LOCKED, cfsr: 0x8200, hfsr: 0, bfar: OPTKEYR });
+    assert_eq!(machine.reports(), [], "the program means it");
+    machine.reset_pin();
+    let stored = store(&mut machine, &[&quiet, &LOCK, &[CPSIE_F], &UNLOCK]);
+    assert_eq!((stored.faults, stored.locks), (2, LOCKED), "what tries the keys later gets its fault");
+    machine.reset_pin();
+    let without_mask = [NO_WRITE_BUFFER, IGNORE_BUS_FAULTS];
+    let stored = store(&mut machine, &[&without_mask, &LOCK]);
+    assert_eq!(stored.faults, 2, "the bit is for priorities below 0 alone");
+}
+
+#[test]
+fn a_precise_fault_under_faultmask_locks_up_otherwise() {
+    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
+    for (n, (address, value)) in (0..).zip([NO_WRITE_BUFFER, CPSID_F, LOCK[0], (0, 0)]) {
+        put(&mut machine, ARGUMENT + 8 * n, address);
+        put(&mut machine, ARGUMENT + 8 * n + 4, value);
+    }
+    assert_eq!(machine.run_until(ms(1)), Stop::Lockup);
+}
+
+/// RM0090 section 3.6.2: what is programmed is loaded at the next reset, and protects sectors 0 and 1.
+#[test]
+fn a_program_protects_sectors_by_its_option_bytes() {
+    const OPTCR: u32 = 0x4002_3C14;
+    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
+    store(&mut machine, &[&UNLOCK_OPTIONS, &[(OPTCR, 0x0FFC_AAEC), (OPTCR, 0x0FFC_AAEE)]]);
+    machine.run_until(ms(1_000));
+    machine.power_off();
+    machine.power_on(ms(2_000));
+    let stored = store(&mut machine, &[]);
+    assert_eq!(stored.locks[1], 0x0FFC_AAED);
+    let mut bytes = [0; 4];
+    machine.read_memory(0x1FFF_C008, &mut bytes).unwrap();
+    assert_eq!(bytes, [0xFC, 0x0F, 0x03, 0xF0], "nWRP and its complement");
+}
+
 // --- clocks
 // ----------------------------------------------------------------------------------------------------------
 

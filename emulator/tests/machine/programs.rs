@@ -824,6 +824,66 @@ pub const WRONG_KEY: Program = Program {
     ],
 };
 
+/// Follows a script at 2000_0100h, of pairs of words: address and value of a store; 1 or 2 and a
+/// value for FAULTMASK; 0 for the end. Logs then from 2000_0004h on: FLASH_CR, FLASH_OPTCR, CFSR,
+/// HFSR, BFAR. The handler of BusFault and HardFault counts at 2000_0000h, logs IPSR and the stacked
+/// PC at 2000_0018h, and goes on behind the store if that is what the PC points to.
+pub const STORES_OF_A_SCRIPT: Program = Program {
+    base: 0x0800_0200,
+    vectors: &[(3, 0x0800_0249), (5, 0x0800_0249)],
+    code: &[
+        0xF04F, 0x5600,      // 200 start:  mov.w r6, #536870912
+        0x2000,              // 204  movs r0, #0
+        0x6030,              // 206  str r0, [r6, #0]
+        0x4D17,              // 208  ldr r5, [pc, #92]
+        0x6829,              // 20A next:  ldr r1, [r5, #0]
+        0x6868,              // 20C  ldr r0, [r5, #4]
+        0x3508,              // 20E  adds r5, #8
+        0xB161,              // 210  cbz r1, 800022c
+        0x2902,              // 212  cmp r1, #2
+        0xD905,              // 214  bls.n 8000222
+        0x6008,              // 216  str r0, [r1, #0]
+        0xF3BF, 0x8F4F,      // 218 behind:  dsb sy
+        0xF3BF, 0x8F6F,      // 21C  isb sy
+        0xE7F3,              // 220  b.n 800020a
+        0xF380, 0x8813,      // 222 mask:  msr FAULTMASK, r0
+        0xF3BF, 0x8F6F,      // 226  isb sy
+        0xE7EE,              // 22A  b.n 800020a
+        0x490F,              // 22C done:  ldr r1, [pc, #60]
+        0x6908,              // 22E  ldr r0, [r1, #16]
+        0x6070,              // 230  str r0, [r6, #4]
+        0x6948,              // 232  ldr r0, [r1, #20]
+        0x60B0,              // 234  str r0, [r6, #8]
+        0x490E,              // 236  ldr r1, [pc, #56]
+        0x6808,              // 238  ldr r0, [r1, #0]
+        0x60F0,              // 23A  str r0, [r6, #12]
+        0x6848,              // 23C  ldr r0, [r1, #4]
+        0x6130,              // 23E  str r0, [r6, #16]
+        0x6908,              // 240  ldr r0, [r1, #16]
+        0x6170,              // 242  str r0, [r6, #20]
+        0xBF30,              // 244  wfi
+        0xE7FD,              // 246  b.n 8000244
+        0x6830,              // 248 fault:  ldr r0, [r6, #0]
+        0x3001,              // 24A  adds r0, #1
+        0x6030,              // 24C  str r0, [r6, #0]
+        0xF3EF, 0x8005,      // 24E  mrs r0, IPSR
+        0x61B0,              // 252  str r0, [r6, #24]
+        0x9806,              // 254  ldr r0, [sp, #24]
+        0x61F0,              // 256  str r0, [r6, #28]
+        0x4905,              // 258  ldr r1, [pc, #20]
+        0x680A,              // 25A  ldr r2, [r1, #0]
+        0x0592,              // 25C  lsls r2, r2, #22
+        0xD501,              // 25E  bpl.n 8000264
+        0x3002,              // 260  adds r0, #2
+        0x9006,              // 262  str r0, [sp, #24]
+        0x4770,              // 264 back:  bx lr
+        0xBF00,              // 266  nop
+        0x0100, 0x2000,      // 268  .word 0x20000100
+        0x3C00, 0x4002,      // 26C  .word 0x40023c00
+        0xED28, 0xE000,      // 270  .word 0xe000ed28
+    ],
+};
+
 /// Runs at 2000_1000h: SysTick every millisecond with its handler in RAM and the vector table where
 /// 2000_0100h says (its SysTick vector is written there if that is RAM); erases sector 1 with
 /// EOPIE; the flash's handler logs the number of ticks until then at 2000_0004h and SR at

@@ -1,0 +1,269 @@
+//! The option bytes and FLASH_OPTCR (RM0090 sections 3.6 and 3.9.9), as far as bank 1 goes.
+//!
+//! The chip loads the register from the option bytes at reset. A program changes the register, and
+//! OPTSTRT erases the option bytes and programs them from it. They are not part of the array: a
+//! reset, the loss of power and a mass erase leave them.
+//!
+//! **Read-out protection.** Level 2 is for good: the option bytes can no longer be changed. Going
+//! from level 1 to level 0 erases the whole array (section 3.6.3). What the levels deny a debugger
+//! and code in RAM is not modelled: there is no debugger here but the emulator's own, and the
+//! programs boot from flash.
+
+use super::lock::Lock;
+use crate::peripheral::Unmodelled;
+
+const KEYS: [u32; 2] = [0x0819_2A3B, 0x4C5D_6E7F];
+
+const OPTLOCK: u32 = 1 << 0;
+const OPTSTRT: u32 = 1 << 1;
+/// What is kept of a value: nWRP, RDP, the user options, BOR_LEV.
+const KEPT: u32 = 0x0FFF_FFEC;
+/// From the factory: no protection, BOR off, software watchdog (section 3.9.9).
+const FACTORY: u32 = 0x0FFF_AAEC;
+/// What is left when the power fails while they are programmed: an erased cell reads as 1. That is
+/// read-out protection level 1 with no sector protected. Of an STM32F429 it was told in ST's forum
+/// ("STM32F429ZIT6 reset values for flash option bytes when power down", 2018); there the same ones
+/// are SPRMOD, too, so that no sector can be read and the part never starts again.
+const ERASED: u32 = KEPT;
+
+/// RDP of level 0.
+const LEVEL_0: u8 = 0xAA;
+/// RDP of level 2.
+const LEVEL_2: u8 = 0xCC;
+
+/// What a write to FLASH_OPTCR asks of the flash interface.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Request {
+    /// Nothing more.
+    Done,
+    /// The option bytes shall be programmed with this value.
+    Program(u32),
+}
+
+/// The option bytes, the register, and its lock.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct OptionBytes {
+    /// What is programmed, as OPTCR shows it.
+    programmed: u32,
+    /// OPTCR as written.
+    register: u32,
+    lock: Lock,
+}
+
+impl Default for OptionBytes {
+    fn default() -> Self {
+        Self { programmed: FACTORY, register: FACTORY, lock: Lock::default() }
+    }
+}
+
+impl OptionBytes {
+    /// Takes a write to OPTKEYR.
+    ///
+    /// # Errors
+    /// A wrong key, which the chip answers with a bus error.
+    pub fn write_key(&mut self, value: u32) -> Result<(), Unmodelled> {
+        self.lock = self.lock.turn(value, KEYS);
+        if self.lock == Lock::Barred {
+            return Err(Unmodelled(
+                "wrong key sequence at FLASH_OPTKEYR: FLASH_OPTCR is locked until the next reset, and the chip \
+                 answers with a bus error"
+                    .into(),
+            ));
+        }
+        Ok(())
+    }
+
+    /// OPTCR as it reads; `programming` while OPTSTRT's work is being done.
+    #[must_use]
+    pub fn read(&self, programming: bool) -> u32 {
+        let lock = if self.lock.is_open() { 0 } else { OPTLOCK };
+        self.register | lock | if programming { OPTSTRT } else { 0 }
+    }
+
+    /// Takes a write to OPTCR.
+    ///
+    /// # Errors
+    /// What the chip does not do, because of the lock or of read-out protection level 2.
+    pub fn write(&mut self, value: u32) -> Result<Request, Unmodelled> {
+        if !self.lock.is_open() {
+            return Err(Unmodelled("FLASH_OPTCR is written while it is locked: the chip ignores it".into()));
+        }
+        self.register = value & KEPT;
+        if value & OPTLOCK != 0 {
+            self.lock = self.lock.close();
+        } else if value & OPTSTRT != 0 {
+            if self.level() == 2 {
+                return Err(Unmodelled(
+                    "FLASH_OPTCR.OPTSTRT with read-out protection level 2: the option bytes cannot be changed any \
+                     more"
+                        .into(),
+                ));
+            }
+            return Ok(Request::Program(self.register));
+        }
+        Ok(Request::Done)
+    }
+
+    /// The option bytes are programmed. Returns whether that erases the array: read-out protection
+    /// went from level 1 to level 0.
+    pub fn program(&mut self, value: u32) -> bool {
+        let before = self.level();
+        self.programmed = value & KEPT;
+        before == 1 && self.level() == 0
+    }
+
+    /// The power fails, or a reset comes, while they are programmed.
+    pub fn tear(&mut self) {
+        self.programmed = ERASED;
+    }
+
+    /// A reset: the register is loaded, and locked.
+    pub fn reset(&mut self) {
+        self.register = self.programmed;
+        self.lock = Lock::default();
+    }
+
+    /// The level of read-out protection, 0 to 2 (section 3.6.3).
+    #[must_use]
+    pub fn level(&self) -> u8 {
+        match (self.programmed >> 8) as u8 {
+            LEVEL_0 => 0,
+            LEVEL_2 => 2,
+            _ => 1,
+        }
+    }
+
+    /// nWRP: a zero protects the sector (section 3.6.5). For sectors 0 to 11.
+    #[must_use]
+    pub fn protects(&self, sector: u8) -> bool {
+        self.programmed >> 16 & 1 << sector == 0
+    }
+
+    /// Sets nWRP of a sector as a debug probe does: at once, and whoever runs does not notice.
+    pub fn preset_protection(&mut self, sector: u8, protected: bool) {
+        let bit = 1 << (16 + sector);
+        self.preset(bit, if protected { 0 } else { bit });
+    }
+
+    /// Sets RDP as a debug probe does.
+    pub fn preset_read_protection(&mut self, rdp: u8) {
+        self.preset(0xFF00, u32::from(rdp) << 8);
+    }
+
+    fn preset(&mut self, mask: u32, value: u32) {
+        for options in [&mut self.programmed, &mut self.register] {
+            *options = *options & !mask | value;
+        }
+    }
+
+    /// The sixteen bytes as they read at 1FFF_C000 (section 3.6.1): each value with its complement.
+    #[must_use]
+    pub fn bytes(&self) -> [u8; 16] {
+        let mut bytes = [0xFF; 16];
+        let low = self.programmed as u16;
+        let high = (self.programmed >> 16 & 0x0FFF) as u16;
+        bytes[0..2].copy_from_slice(&low.to_le_bytes());
+        bytes[2..4].copy_from_slice(&(!low).to_le_bytes());
+        bytes[8..10].copy_from_slice(&high.to_le_bytes());
+        bytes[10..12].copy_from_slice(&(!high).to_le_bytes());
+        bytes
+    }
+
+    /// Option bit WDG_SW clear: the watchdog starts by itself after reset (section 3.6.2).
+    #[must_use]
+    pub fn hardware_watchdog(&self) -> bool {
+        self.programmed & 1 << 5 == 0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn open() -> OptionBytes {
+        let mut options = OptionBytes::default();
+        for key in [0x0819_2A3B, 0x4C5D_6E7F] {
+            options.write_key(key).unwrap();
+        }
+        options
+    }
+
+    /// RM0090 sections 3.9.9 (reset value 0FFF AAEDh) and 3.6.1.
+    #[test]
+    fn from_the_factory_nothing_is_protected() {
+        let options = OptionBytes::default();
+        assert_eq!(options.read(false), 0x0FFF_AAED);
+        assert_eq!(options.bytes()[..4], [0xEC, 0xAA, 0x13, 0x55]);
+        assert_eq!(options.level(), 0);
+        assert!((0..12).all(|sector| !options.protects(sector)));
+        assert!(!options.hardware_watchdog());
+    }
+
+    #[test]
+    fn the_register_is_only_a_wish_until_it_is_programmed() {
+        let mut options = open();
+        assert_eq!(options.write(0x0FFE_AAEC), Ok(Request::Done));
+        assert_eq!(options.read(false), 0x0FFE_AAEC);
+        assert!(!options.protects(0));
+        options.reset();
+        assert_eq!(options.read(false), 0x0FFF_AAED, "loaded again, and locked");
+    }
+
+    #[test]
+    fn what_is_programmed_outlives_a_reset() {
+        let mut options = open();
+        assert_eq!(options.write(0x0FFC_AAEC | OPTSTRT), Ok(Request::Program(0x0FFC_AAEC)));
+        assert_eq!(options.read(true), 0x0FFC_AAEE);
+        assert!(!options.program(0x0FFC_AAEC));
+        options.reset();
+        assert_eq!(options.read(false), 0x0FFC_AAED);
+        let protected: Vec<u8> = (0..12).filter(|sector| options.protects(*sector)).collect();
+        assert_eq!(protected, [0, 1]);
+    }
+
+    #[test]
+    fn a_locked_register_does_not_change() {
+        let mut options = OptionBytes::default();
+        assert!(options.write(0x0FFE_AAEC | OPTSTRT).is_err());
+        assert_eq!(options.read(false), 0x0FFF_AAED);
+        let mut options = open();
+        assert_eq!(options.write(0x0FFF_AAEC | OPTLOCK), Ok(Request::Done));
+        assert!(options.write(0x0FFE_AAEC).is_err());
+    }
+
+    #[test]
+    fn a_wrong_key_shuts_the_register_until_the_next_reset() {
+        let mut options = open();
+        assert!(options.write_key(0).is_err());
+        assert!(options.write_key(0x0819_2A3B).is_err());
+        assert!(options.write_key(0x4C5D_6E7F).is_err());
+        assert_eq!(options.read(false), 0x0FFF_AAED);
+        options.reset();
+        options.write_key(0x0819_2A3B).unwrap();
+        options.write_key(0x4C5D_6E7F).unwrap();
+        assert_eq!(options.read(false), 0x0FFF_AAEC);
+    }
+
+    /// Section 3.6.3, figure 5: 0 to 1 and back with a mass erase; 2 is the end.
+    #[test]
+    fn levels_of_read_out_protection() {
+        let mut options = open();
+        assert!(!options.program(0x0FFF_55EC));
+        assert_eq!(options.level(), 1);
+        assert!(!options.program(0x0FFE_55EC), "level 1 stays: nothing is erased");
+        assert!(options.program(0x0FFF_AAEC), "back to level 0");
+        assert!(!options.program(0x0FFF_CCEC));
+        assert_eq!(options.level(), 2);
+        assert!(options.write(0x0FFF_AAEC | OPTSTRT).is_err(), "never again");
+    }
+
+    #[test]
+    fn torn_ones_load_as_erased() {
+        let mut options = open();
+        options.program(0x0FFC_AAEC);
+        options.tear();
+        options.reset();
+        assert_eq!(options.read(false), 0x0FFF_FFED);
+        assert_eq!(options.level(), 1);
+    }
+}
