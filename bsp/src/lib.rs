@@ -167,11 +167,33 @@ pub struct Identity {
     pub hardware_version: &'static str,
 }
 
-/// Serial number of the device (1018h/4): a fold of the chip's 96-bit unique identifier (RM0090
-/// section 39.1).
-#[must_use]
-pub fn serial_number() -> u32 {
+/// The chip's 96-bit unique identifier (RM0090 section 39.1).
+#[inline(always)]
+fn unique_words() -> [u32; 3] {
     const UNIQUE_ID: *const [u32; 3] = 0x1FFF_7A10 as *const _;
     // SAFETY: the unique identifier is a read-only word-aligned part of every STM32F4.
-    shared_abi::check_word(&unsafe { UNIQUE_ID.read_volatile() })
+    unsafe { UNIQUE_ID.read_volatile() }
+}
+
+/// The chip's 96-bit unique identifier (RM0090 section 39.1), as its bytes lie in memory.
+#[must_use]
+pub fn unique_id() -> [u8; 12] {
+    let mut bytes = [0; 12];
+    for (bytes, word) in bytes.chunks_exact_mut(4).zip(unique_words()) {
+        bytes.copy_from_slice(&word.to_le_bytes());
+    }
+    bytes
+}
+
+/// The count of the system timer, which runs with the clock of the core.
+#[cfg(target_arch = "arm")]
+#[must_use]
+pub fn cycles() -> u32 {
+    cortex_m::peripheral::SYST::get_current()
+}
+
+/// Serial number of the device (1018h/4): a fold of the chip's unique identifier.
+#[must_use]
+pub fn serial_number() -> u32 {
+    shared_abi::check_word(&unique_words())
 }

@@ -58,9 +58,20 @@ impl Lock {
             self.failures = 0;
             return Ok(());
         }
+        self.fail(now);
+        Err(AbortCode::INVALID_VALUE)
+    }
+
+    /// Somebody has failed by another way than a wrong password: the next wait is longer.
+    pub fn fail(&mut self, now: Instant) {
         self.closed_until = Some(now + (FIRST_DELAY_MS << self.failures.min(MOST_FAILURES)));
         self.failures = self.failures.saturating_add(1);
-        Err(AbortCode::INVALID_VALUE)
+    }
+
+    /// Somebody has succeeded by another way than the password: the next wait is the first one
+    /// again.
+    pub fn succeed(&mut self) {
+        self.failures = 0;
     }
 }
 

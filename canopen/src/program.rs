@@ -117,6 +117,26 @@ pub const UNLOCK_ENTRIES: [Entry; 2] = [
     Entry::record(UNLOCK, "Lock/unlock parameters", UNLOCK_FIRMWARE),
     Entry::sub(UNLOCK, UNLOCK_FIRMWARE, "Firmware update", DataType::VisibleString, Access::Wo),
 ];
+/// Access to a sealed device, an object of coboot (docs/security.md).
+pub const ACCESS: u16 = 0x2002;
+/// What a sealed device has recorded, an object of coboot: the last eight events.
+pub const EVENTS: u16 = 0x2003;
+/// What a sealed device has of the two.
+pub const SEALED_ENTRIES: [Entry; 12] = [
+    Entry::record(ACCESS, "Access", 2),
+    Entry::sub(ACCESS, 1, "Unique ID, nonce, rights", DataType::OctetString, Access::Ro),
+    Entry::sub(ACCESS, 2, "Request and signature", DataType::OctetString, Access::Wo),
+    Entry::array(EVENTS, "Events", 8),
+    Entry::sub(EVENTS, 1, "Event 1", DataType::OctetString, Access::Ro),
+    Entry::sub(EVENTS, 2, "Event 2", DataType::OctetString, Access::Ro),
+    Entry::sub(EVENTS, 3, "Event 3", DataType::OctetString, Access::Ro),
+    Entry::sub(EVENTS, 4, "Event 4", DataType::OctetString, Access::Ro),
+    Entry::sub(EVENTS, 5, "Event 5", DataType::OctetString, Access::Ro),
+    Entry::sub(EVENTS, 6, "Event 6", DataType::OctetString, Access::Ro),
+    Entry::sub(EVENTS, 7, "Event 7", DataType::OctetString, Access::Ro),
+    Entry::sub(EVENTS, 8, "Event 8", DataType::OctetString, Access::Ro),
+];
+
 /// Enable flash programming (ESAcademy): the password of a program; the sub-index is the program's
 /// number.
 pub const ENABLE_FLASH: u16 = 0x7F50;
@@ -252,7 +272,7 @@ impl FlashError {
 /// Names and words of the manual's codes, from one list.
 macro_rules! flash_errors {
     ($($name:ident = $code:literal, $doc:literal, $words:literal;)*) => {
-        /// The codes of the manual, table 3.
+        /// The codes of the manual, table 3; from 8Ah on those of sealed images.
         #[allow(non_upper_case_globals, reason = "they are used as the variants of an open enum")]
         impl FlashError {
             $(#[doc = $doc] pub const $name: Self = Self(NonZeroU8::new($code).unwrap());)*
@@ -307,6 +327,12 @@ flash_errors! {
         "a command is still being carried out";
     Sequence = 0x88, "The blocks came in a wrong order.",
         "the blocks came in a wrong order";
+    Signature = 0x8A, "A sealed image whose signature, certificate, chain or hash is wrong.",
+        "the program's signature is wrong";
+    Rollback = 0x8C, "A sealed image whose security counter or epoch is lower than the device's.",
+        "the program is older than the device allows";
+    Key = 0x8E, "A sealed image for which the device has no key.",
+        "the device has no key for this program";
 }
 
 impl core::error::Error for FlashError {}

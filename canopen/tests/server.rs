@@ -181,7 +181,7 @@ fn refuses_what_the_table_does_not_allow() {
         ([0x21, 0x17, 0x10, 0, 3, 0, 0, 0], [0x80, 0x17, 0x10, 0, 0x12, 0x00, 0x07, 0x06]),
         ([0x21, 0x03, 0x20, 0, 7, 0, 0, 0], [0x80, 0x03, 0x20, 0, 0x13, 0x00, 0x07, 0x06]),
         ([0x22, 0x03, 0x20, 0, 1, 2, 3, 4], [0x80, 0x03, 0x20, 0, 0x13, 0x00, 0x07, 0x06]),
-        ([0x21, 0x01, 0x20, 0, 65, 0, 0, 0], [0x80, 0x01, 0x20, 0, 0x12, 0x00, 0x07, 0x06]),
+        ([0x21, 0x01, 0x20, 0, TOO_LONG, 0, 0, 0], [0x80, 0x01, 0x20, 0, 0x12, 0x00, 0x07, 0x06]),
         // A value that the device refuses: 06090030h.
         ([0x2F, 0x51, 0x1F, 1, 0x7F, 0, 0, 0], [0x80, 0x51, 0x1F, 1, 0x30, 0x00, 0x09, 0x06]),
     ];
@@ -202,6 +202,9 @@ fn breaks(dialogue: &[([u8; 8], [u8; 8])], events: &[Event]) {
     assert_eq!(bench.device.events, events);
     still_serves(&mut bench);
 }
+
+/// Bytes of a string that is too long (the feature `sealed` makes the longest one longer).
+const TOO_LONG: u8 = canopen::sdo::server::VALUE_MAX as u8 + 1;
 
 const START_9: ([u8; 8], [u8; 8]) = ([0x21, 0x50, 0x1F, 1, 9, 0, 0, 0], [0x60, 0x50, 0x1F, 1, 0, 0, 0, 0]);
 const FIRST: ([u8; 8], [u8; 8]) = ([0x00, 1, 2, 3, 4, 5, 6, 7], [0x20, 0, 0, 0, 0, 0, 0, 0]);
@@ -237,11 +240,12 @@ fn sizes_that_do_not_match_abort() {
     // A string that is never announced and grows past every bound.
     let start = ([0x20, 0x01, 0x20, 0, 0, 0, 0, 0], [0x60, 0x01, 0x20, 0, 0, 0, 0, 0]);
     let mut dialogue = vec![start];
-    for i in 0..9 {
+    let fits = TOO_LONG / 7;
+    for i in 0..fits {
         let toggle = (i % 2) << 4;
         dialogue.push(([toggle, 1, 2, 3, 4, 5, 6, 7], [0x20 | toggle, 0, 0, 0, 0, 0, 0, 0]));
     }
-    dialogue.push(([0x10, 1, 2, 3, 4, 5, 6, 7], [0x80, 0x01, 0x20, 0, 0x12, 0x00, 0x07, 0x06]));
+    dialogue.push(([(fits % 2) << 4, 1, 2, 3, 4, 5, 6, 7], [0x80, 0x01, 0x20, 0, 0x12, 0x00, 0x07, 0x06]));
     breaks(&dialogue, &[]);
 }
 

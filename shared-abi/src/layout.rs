@@ -17,6 +17,9 @@ pub mod stm32f407g_disc1_two;
 pub mod stm32f429i_disc1;
 pub mod toml;
 
+/// Bytes of [`Layout::key_block`].
+pub const KEY_BLOCK_SIZE: u32 = 256;
+
 /// Every board that coboot knows, for tools that take a board by name.
 pub const BOARDS: &[&Layout] = &[
     &stm32f407g_disc1::LAYOUT,
@@ -103,6 +106,9 @@ impl Layout {
         if !chip.is_whole_sectors(&self.bootloader) {
             return Err("the bootloader must end at a sector border");
         }
+        if self.bootloader.size <= KEY_BLOCK_SIZE {
+            return Err("the bootloader has no room behind its key block");
+        }
         if self.callgate_offset < CORE_VECTORS_SIZE {
             return Err("the callgate overlaps the bootloader's vector table");
         }
@@ -188,6 +194,19 @@ impl Layout {
         self.bootloader.base + self.callgate_offset
     }
 
+    /// The keys of a sealed device: the last [`KEY_BLOCK_SIZE`] bytes of the bootloader's flash,
+    /// written in production and never by the bootloader.
+    #[must_use]
+    pub const fn key_block(&self) -> Region {
+        Region::new(self.bootloader.end() - KEY_BLOCK_SIZE, KEY_BLOCK_SIZE)
+    }
+
+    /// What the bootloader itself may fill of its flash: all but the key block.
+    #[must_use]
+    pub const fn bootloader_image(&self) -> Region {
+        Region::new(self.bootloader.base, self.bootloader.size - KEY_BLOCK_SIZE)
+    }
+
     /// Flash of program `number` (1 is the first, as in the sub-index).
     #[must_use]
     pub fn program(&self, number: u8) -> Option<Region> {
@@ -222,7 +241,7 @@ impl fmt::Display for LinkerScript<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let layout = self.layout;
         let (flash, name) = match self.image {
-            Image::Bootloader => (layout.bootloader, "bootloader"),
+            Image::Bootloader => (layout.bootloader_image(), "bootloader"),
             Image::Program(number) => (layout.program(number).ok_or(fmt::Error)?, "program"),
         };
         writeln!(f, "/* {name} of {}, made from shared-abi/src/layout: change it there. */", layout.board)?;

@@ -27,8 +27,9 @@ use block_upload::Sender;
 use incoming::Incoming;
 use outgoing::Outgoing;
 
-/// The longest variable or string, in bytes. A longer value has to be a domain.
-pub const VALUE_MAX: usize = 64;
+/// The longest variable or string, in bytes. A longer value has to be a domain. (A signature with
+/// what it signs, 2002h, has 76.)
+pub const VALUE_MAX: usize = if cfg!(feature = "sealed") { 80 } else { 64 };
 
 /// How long an answer is held back for want of room before the device is asked for room in its
 /// reserve, in milliseconds.
