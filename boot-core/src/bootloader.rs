@@ -10,19 +10,23 @@ use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
     control_count, FlashError, ProgramControl, ENABLE_FLASH, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL,
-    PROGRAM_DATA, PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION, SOFTWARE_VERSION, UNLOCK, UNLOCK_ENTRIES,
+    PROGRAM_DATA, PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION, SEALED_ENTRIES, SOFTWARE_VERSION, UNLOCK,
+    UNLOCK_ENTRIES,
 };
 use canopen::slave::SlaveDevice;
 use canopen::{password::Lock, Instant};
 use canopen::{AbortCode, NodeId};
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
+#[cfg(feature = "sealed")]
+use {canopen::program::ACCESS, seal::access::right};
 
 use crate::control::{Downloader, Policy, Step};
 use crate::decision::StayReason;
 use crate::flash::Flash;
 use crate::store::{NodeParameters, Parameters};
 use crate::stored_version::StoredVersion;
+use crate::unseal::Unsealer;
 
 /// What dialects add to the object dictionary.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -31,11 +35,13 @@ pub struct Extras {
     pub password: PasswordObject,
     /// Whether 1F50h can be read.
     pub read_back: bool,
+    /// Whether there are 2002h and 2003h, of a device that takes sealed images.
+    pub sealed: bool,
 }
 
 impl Extras {
     /// Nothing.
-    pub const NONE: Self = Self { password: PasswordObject::None, read_back: false };
+    pub const NONE: Self = Self { password: PasswordObject::None, read_back: false, sealed: false };
 }
 
 /// Where a password is written.
@@ -57,6 +63,7 @@ pub const fn entries<const LEN: usize>(programs: u8, extras: Extras) -> Table<LE
     let data = Entry::sub(PROGRAM_DATA, 1, "Program data of a program", DataType::Domain, data_access);
     let table = Table::<LEN>::EMPTY.with(&device::ENTRIES).with(&emcy::ENTRIES);
     let table = table.with_array("Program data", data, programs).with_program_control(programs);
+    let table = if extras.sealed { table.with(&SEALED_ENTRIES) } else { table };
     match extras.password {
         PasswordObject::None => table,
         PasswordObject::Unlock => table.with(&UNLOCK_ENTRIES),
@@ -77,7 +84,8 @@ pub const fn entry_count(programs: u8, extras: Extras) -> usize {
         PasswordObject::Unlock => UNLOCK_ENTRIES.len(),
         PasswordObject::EnableFlash => array,
     };
-    device::ENTRIES.len() + emcy::ENTRIES.len() + array + control_count(programs) + password
+    let sealed = if extras.sealed { SEALED_ENTRIES.len() } else { 0 };
+    device::ENTRIES.len() + emcy::ENTRIES.len() + array + control_count(programs) + password + sealed
 }
 
 /// 1018h/4.
@@ -131,6 +139,7 @@ pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize> {
 impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PROGRAMS> {
     /// Starts from what the parameters tell, for a device that stayed in the bootloader for this
     /// reason. The larger `buffer`, the further the flash may lag behind the bus.
+    #[allow(clippy::too_many_arguments, reason = "each is a part of the device")]
     pub fn new(
         config: &'static Config,
         serial_number: u32,
@@ -139,8 +148,9 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         parameters: P,
         flash: F,
         buffer: &'b mut [u8],
+        unsealer: Unsealer<'b>,
     ) -> Self {
-        let download = Downloader::new(config.layout, &config.download, parameters, &flash, buffer);
+        let download = Downloader::new(config.layout, &config.download, parameters, &flash, buffer, unsealer);
         let mut bootloader = Self {
             config,
             serial_number,
@@ -191,8 +201,17 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
     fn report_outcome(&mut self) {
         match self.download.take_outcome() {
             None => {}
-            Some((_, Ok(()))) => self.emcy.clear(emcy::register::MANUFACTURER),
+            Some((_, Ok(()))) => {
+                #[cfg(feature = "sealed")]
+                self.lock.succeed();
+                self.emcy.clear(emcy::register::MANUFACTURER);
+            }
             Some((program, Err(error))) => {
+                // A signature costs the device a tenth of a second.
+                #[cfg(feature = "sealed")]
+                if error == FlashError::Signature {
+                    self.lock.fail(self.now);
+                }
                 let code = match error {
                     FlashError::Write | FlashError::Secured | FlashError::NvData => emcy::code::HARDWARE,
                     _ => emcy::code::DATA_SET,
@@ -264,6 +283,10 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
                 return put(buf, version);
             }
         }
+        #[cfg(feature = "sealed")]
+        if let Some(read) = self.download.unsealer_mut().read(at, buf) {
+            return read;
+        }
         let word = match at.index {
             PROGRAM_CONTROL => return put(buf, &[self.download.control(at.sub) as u8]),
             PROGRAM_REGION => return put(buf, &self.download.region(at.sub)),
@@ -281,6 +304,15 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
             return written;
         }
         match (at.index, data) {
+            #[cfg(feature = "sealed")]
+            (ACCESS, request) => {
+                // One signature at a time is looked at, and that of an image comes first.
+                let is_active = self.download.unsealer_mut().is_active();
+                if self.lock.is_waiting(self.now) || self.download.busy() || is_active {
+                    return Err(AbortCode::DEVICE_STATE);
+                }
+                self.download.unsealer_mut().ask(&self.flash, request)
+            }
             (PROGRAM_CONTROL, &[value]) => self.command(at.sub, ProgramControl::try_from(value)?),
             (ENABLE_FLASH | UNLOCK, password) => {
                 self.lock.open(password, self.now)?;
@@ -294,6 +326,10 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
     }
 
     fn download_start(&mut self, at: Address, size: Option<u32>) -> Result<(), AbortCode> {
+        #[cfg(feature = "sealed")]
+        if self.download.unsealer_mut().takes_no_other() && self.lock.is_waiting(self.now) {
+            return Err(AbortCode::DEVICE_STATE);
+        }
         self.download.download_start(at.sub, size)
     }
 
@@ -338,6 +374,10 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> LssDevice for Bootloader<'_
     }
 
     fn store(&mut self, id: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {
+        #[cfg(feature = "sealed")]
+        if !self.download.unsealer_mut().permits(right::STORE) {
+            return Poll::Ready(Err(StoreError::Failed));
+        }
         if !self.config.lss_store {
             return Poll::Ready(Err(StoreError::Unsupported));
         }

@@ -5,6 +5,7 @@
 //! | [`decision`] | bootloader or program, after every reset | records, no flash |
 //! | `intake` | what arrives in 1F50h: bytes in, judged and placed pieces out | formats, no flash |
 //! | `queue` | the pieces between the two | |
+//! | `unseal` | sealed images: authentic, deciphered, unpacked (feature `sealed`) | the format, no object |
 //! | `programmer` | erase, write, read back, verify | pieces and flash, no format, no object |
 //! | [`store`] | everything non-volatile | the journal |
 //! | [`control`] | 1F51h, 1F57h, sessions: the rules that tie the three together | all of them |
@@ -21,6 +22,7 @@ pub mod crc;
 pub mod decision;
 pub mod flash;
 mod intake;
+mod keys;
 pub mod policy;
 pub mod profile;
 pub mod program;
@@ -31,6 +33,7 @@ mod sequence;
 mod session;
 pub mod store;
 mod stored_version;
+pub mod unseal;
 
 /// Frames, node and transfers, in which the core speaks: a firmware that uses this crate needs no
 /// other for them.

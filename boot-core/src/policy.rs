@@ -65,6 +65,48 @@ pub struct Policy {
     /// Bytes of flash that one step of a CRC covers: the longest that other work of the same
     /// priority is kept waiting.
     pub crc_step: u32,
+    /// What a sealed image is judged by.
+    #[cfg(feature = "sealed")]
+    pub seal: SealPolicy,
+}
+
+/// What a sealed image is judged by, beside the keys in the device.
+#[cfg(feature = "sealed")]
+#[derive(Clone, Copy, Debug)]
+pub struct SealPolicy {
+    /// Vendor-ID of the device (1018h/1).
+    pub vendor_id: u32,
+    /// Its product code (1018h/2).
+    pub product_code: u32,
+    /// Its revision number (1018h/3); the five lowest bits are the hardware revision.
+    pub revision: u32,
+    /// The number of the program that is data of the application.
+    pub data: Option<u8>,
+    /// The 96-bit unique ID of the chip.
+    pub unique_id: fn() -> [u8; 12],
+    /// A number that nobody can foresee to the last bit, such as that of the clock cycles when it is
+    /// asked for.
+    pub cycles: fn() -> u32,
+    /// The lowest security counter, whatever is stored.
+    pub counter: u32,
+    /// Whether the counter is raised when a program is confirmed, and not when it is installed: until
+    /// then the device takes older ones.
+    pub counter_with_confirmation: bool,
+}
+
+#[cfg(feature = "sealed")]
+impl SealPolicy {
+    /// For no device.
+    pub const NONE: Self = Self {
+        vendor_id: 0,
+        product_code: 0,
+        revision: 0,
+        data: None,
+        unique_id: || [0; 12],
+        cycles: || 0,
+        counter: 0,
+        counter_with_confirmation: false,
+    };
 }
 
 impl Policy {
@@ -84,5 +126,7 @@ impl Policy {
         replaces: false,
         crc: CrcKind::Crc32,
         crc_step: 1024,
+        #[cfg(feature = "sealed")]
+        seal: SealPolicy::NONE,
     };
 }

@@ -68,7 +68,7 @@ impl Profile {
     pub const LIFT: Self = Self {
         device_type: LIFT_DEVICE_TYPE,
         node_id: NodeId::new(LIFT_NODE_ID),
-        extras: Extras { password: PasswordObject::Unlock, read_back: true },
+        extras: Extras { password: PasswordObject::Unlock, read_back: true, ..Extras::NONE },
         password: LIFT_PASSWORD,
         download: Policy {
             locked: true,

@@ -6,6 +6,7 @@ use shared_abi::vectors::{VectorFault, VectorTable};
 
 use crate::crc::CrcKind;
 use crate::flash::{fold, Flash};
+use crate::keys::has_key_block;
 use crate::store::{Parameters, ProgramRecord};
 
 /// A CRC over flash, computed in steps that the caller bounds.
@@ -93,6 +94,13 @@ impl VerifiedProgram {
         self.record.confirmed
     }
 
+    /// Whether the flash is locked in front of it until the next reset.
+    #[cfg(feature = "sealed")]
+    #[must_use]
+    pub fn locks_flash(&self) -> bool {
+        self.record.seal == Some(crate::store::record::Seal::Locked)
+    }
+
     /// What to jump to.
     #[must_use]
     pub const fn vectors(&self) -> VectorTable {
@@ -126,6 +134,9 @@ pub fn verify<F: Flash>(
 ) -> Result<VerifiedProgram, Invalid> {
     let region = layout.program(number).ok_or(Invalid::NoSuchProgram)?;
     let record = ProgramRecord::load(parameters, flash, number).ok_or(Invalid::Absent)?;
+    if !record.is_sealed() && has_key_block(flash, layout) {
+        return Err(Invalid::Absent);
+    }
     if record.size > region.size {
         return Err(Invalid::Size);
     }

@@ -72,6 +72,33 @@ impl<'b> Queue<'b> {
         true
     }
 
+    /// Adds bytes that are no piece, of a sealed image ([`take`](Self::take)). All or nothing; tells
+    /// whether there was room.
+    #[cfg(feature = "sealed")]
+    pub(crate) fn push_bytes(&mut self, data: &[u8]) -> bool {
+        if data.len() > self.free() {
+            return false;
+        }
+        for byte in data {
+            let at = self.place(self.queued);
+            self.buffer[at] = *byte;
+            self.queued += 1;
+        }
+        true
+    }
+
+    /// Takes bytes out that are no piece, as many as there are and have room; how many.
+    #[cfg(feature = "sealed")]
+    pub(crate) fn take(&mut self, bytes: &mut [u8]) -> usize {
+        let len = bytes.len().min(self.queued);
+        for (i, byte) in bytes.iter_mut().take(len).enumerate() {
+            *byte = self.byte(i);
+        }
+        self.front = self.place(len);
+        self.queued -= len;
+        len
+    }
+
     /// Copies bytes of the open piece; whether there are as many.
     pub(crate) fn read_open(&self, offset: usize, bytes: &mut [u8]) -> bool {
         if self.open_size() < offset + bytes.len() {

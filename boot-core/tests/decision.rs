@@ -34,6 +34,8 @@ fn check(signed: bool, damage: impl FnOnce(&mut ModelFlash)) -> Result<VerifiedP
     flash.poke(0x0801_0000, &bytes);
     let mut journal = Journal::open(&flash, LAYOUT.parameters);
     let record = ProgramRecord {
+        #[cfg(feature = "sealed")]
+        seal: None,
         size: 64,
         crc: boot_core::crc32(&bytes),
         signed,

@@ -9,6 +9,7 @@ use boot_core::crc::CrcKind;
 use boot_core::flash::{Flash, FlashFault, Next};
 use boot_core::program::{verify, Invalid};
 use boot_core::store::{Journal, Key, Parameters, StoreError, Value};
+use boot_core::unseal::{Room, Unsealer};
 use canopen::od::{Address, Objects};
 use canopen::program::{FlashError, ProgramControl};
 use canopen::AbortCode;
@@ -681,12 +682,13 @@ fn parameters_may_be_kept_in_an_eeprom() {
         }
     }
 
+    let unsealer = || -> Unsealer<'static> { Box::leak(Box::<Room>::default()).unsealer() };
     let image = program(200, 0x5E);
     let mut flash = ModelFlash::new(&CHIP);
     let mut eeprom = Eeprom::default();
     let mut buffer = [0; 256];
     let mut device: Downloader<'_, _, 1> =
-        Downloader::new(&LAYOUT, &Policy::DEFAULT, &mut eeprom, &flash, &mut buffer);
+        Downloader::new(&LAYOUT, &Policy::DEFAULT, &mut eeprom, &flash, &mut buffer, unsealer());
     let settle = |device: &mut Downloader<'_, &mut Eeprom, 1>, flash: &mut ModelFlash| {
         for _ in 0..1_000_000 {
             if device.step(flash) == Step::Idle {
@@ -713,7 +715,7 @@ fn parameters_may_be_kept_in_an_eeprom() {
 
     eeprom.fails = true;
     let mut device: Downloader<'_, _, 1> =
-        Downloader::new(&LAYOUT, &Policy::DEFAULT, &mut eeprom, &flash, &mut buffer);
+        Downloader::new(&LAYOUT, &Policy::DEFAULT, &mut eeprom, &flash, &mut buffer, unsealer());
     device.command(1, ProgramControl::ClrSignature).unwrap();
     assert_eq!(settle(&mut device, &mut flash), 0x10, "NVDATA");
     assert!(

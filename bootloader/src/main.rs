@@ -46,7 +46,7 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
 
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]
 mod app {
-    use boot_core::bootloader::{self, entries, entry_count, Bootloader};
+    use boot_core::bootloader::{self, entries, entry_count, Bootloader, Extras};
     use boot_core::canopen::bit_rate::Heard;
     use boot_core::canopen::device::Device;
     use boot_core::canopen::line::{Confinement, Status, CONTROLLER_OVERRUN, QUEUE_OVERRUN};
@@ -58,6 +58,7 @@ mod app {
     use boot_core::canopen::{BitRate, CobId, Frame, Instant, NodeId};
     use boot_core::control::Step;
     use boot_core::store::NodeParameters;
+    use boot_core::unseal::Room;
     use bsp::can::{Errors, Mode};
     use bsp::clock::Source;
     use bsp::hal::rcc::RccExt;
@@ -84,9 +85,9 @@ mod app {
     const TICK_MS: u32 = 2;
     /// Programs of the layout, each a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
     const PROGRAMS: usize = LAYOUT.programs.len();
-    const ENTRY_COUNT: usize = entry_count(PROGRAMS as u8, PRODUCT.profile.extras) + debugger::ENTRIES.len();
-    static ENTRIES: [Entry; ENTRY_COUNT] =
-        entries(PROGRAMS as u8, PRODUCT.profile.extras).with(&debugger::ENTRIES).entries();
+    const EXTRAS: Extras = Extras { sealed: cfg!(feature = "sealed"), ..PRODUCT.profile.extras };
+    const ENTRY_COUNT: usize = entry_count(PROGRAMS as u8, EXTRAS) + debugger::ENTRIES.len();
+    static ENTRIES: [Entry; ENTRY_COUNT] = entries(PROGRAMS as u8, EXTRAS).with(&debugger::ENTRIES).entries();
 
     static CONFIG: bootloader::Config = bootloader::Config {
         entries: &ENTRIES,
@@ -139,7 +140,7 @@ mod app {
         at: Option<Instant>,
     }
 
-    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer], store: StoreState = StoreState([0; STORE_STATE_WORDS])])]
+    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer], room: Room = Room::new(), store: StoreState = StoreState([0; STORE_STATE_WORDS])])]
     fn init(cx: init::Context) -> (Shared, Local) {
         CLOCK_TREE.speed_up(&cx.device.RCC, Source::Crystal);
         // SAFETY: the device's own are not used beside it.
@@ -182,6 +183,7 @@ mod app {
             parameters,
             flash,
             cx.local.blocks,
+            cx.local.room.unsealer(),
         );
         bootloader.confirm(report.returned);
         let slave = Slave::new(bootloader.lss_address(), bootloader.node_id(), node.bit_rate, slave_config);

@@ -12,6 +12,8 @@ use boot_core::control::{Erase, Policy, Verdict};
 use boot_core::crc::CrcKind;
 use boot_core::decision;
 use boot_core::flash::Flash;
+#[cfg(feature = "sealed")]
+use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
 use boot_core::store::{Journal, NodeParameters};
 use bsp::can::BitTiming;
@@ -100,6 +102,11 @@ pub struct Product {
     /// How long the device stays after the answer to its leaving is on the bus, in ms, at least 10:
     /// clients want to see the answer before anything else happens.
     pub answer_to_reset_ms: u32,
+    /// The lowest security counter of a sealed image, whatever is stored (feature `sealed`).
+    pub security_counter: u32,
+    /// Whether the security counter is raised when a program is confirmed, and not when it is
+    /// installed (feature `sealed`).
+    pub counter_with_confirmation: bool,
 }
 
 impl Product {
@@ -131,10 +138,12 @@ impl Product {
         start_allowed: |_| true,
         crc: CrcKind::Crc32,
         crc_step: 1024,
-        block_buffer: 80 * 1024,
+        block_buffer: if cfg!(feature = "sealed") { 48 } else { 80 } * 1024,
         watchdog_ms: Some(1000),
         program_watchdog_ms: None,
         answer_to_reset_ms: 20,
+        security_counter: 0,
+        counter_with_confirmation: false,
     };
 
     /// Gives the product back if its choices go together; fails the build with the rule's name if
@@ -147,6 +156,10 @@ impl Product {
                 "product: autostart names a program that the layout has not"
             );
         }
+        assert!(
+            !cfg!(feature = "sealed") || matches!(self.crc, CrcKind::Crc32),
+            "product: a sealed image carries a CRC-32"
+        );
         assert!(self.max_crash_resets >= 1, "product: max_crash_resets must be 1 or more");
         let window = if self.rescue_window_ms > self.rescue_window_confirmed_ms {
             self.rescue_window_ms
@@ -235,6 +248,17 @@ impl Product {
             },
             crc: self.crc,
             crc_step: self.crc_step,
+            #[cfg(feature = "sealed")]
+            seal: SealPolicy {
+                vendor_id: IDENTITY.vendor_id,
+                product_code: IDENTITY.product_code,
+                revision: IDENTITY.revision,
+                data: self.profile.download.data,
+                unique_id: bsp::unique_id,
+                cycles: bsp::cycles,
+                counter: self.security_counter,
+                counter_with_confirmation: self.counter_with_confirmation,
+            },
             ..self.profile.download
         }
     }

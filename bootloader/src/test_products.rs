@@ -69,7 +69,7 @@ const SWITCHES: NodeSource = NodeSource::Function(|| {
 /// the rows and has the same fields in the same order; a digit that stands for no value fails the
 /// build.
 const fn of_choices(this: Product, row: &[u8]) -> Product {
-    assert!(row.len() == 31, "COBOOT_PRODUCT: a row has a colon and 30 digits");
+    assert!(row.len() == 33, "COBOOT_PRODUCT: a row has a colon and 32 digits");
     Product {
         profile: match row[1] {
             b'0' => Profile::STANDARD,
@@ -112,6 +112,9 @@ const fn of_choices(this: Product, row: &[u8]) -> Product {
         program_watchdog_ms: if second(row, 28) { Some(1000) } else { None },
         answer_to_reset_ms: if second(row, 29) { 50 } else { 20 },
         max_crash_resets: if second(row, 30) { 1 } else { 3 },
+        // Without the feature `sealed` they change nothing.
+        security_counter: if second(row, 31) { 5 } else { 0 },
+        counter_with_confirmation: second(row, 32),
     }
 }
 

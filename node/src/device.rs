@@ -18,6 +18,7 @@ use boot_core::decision::{decide, BootDecision, Circumstances, Policy, StayReaso
 use boot_core::program::verify;
 use boot_core::store::Journal;
 use boot_core::store::NodeParameters;
+use boot_core::unseal::Room;
 use shared_abi::warm_start::{BootRequest, Owed};
 
 use crate::file_flash::FileFlash;
@@ -217,8 +218,17 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
             BootDecision::Stay(_) | BootDecision::Hold { .. } => {
                 let reason =
                     if let BootDecision::Stay(reason) = decision { reason } else { StayReason::Rescue };
-                let device =
-                    Bootloader::new(config, serial_number, node, reason.code(), journal, flash, buffer);
+                let (reason_code, unsealer) = (reason.code(), Box::leak(Box::<Room>::default()).unsealer());
+                let device = Bootloader::new(
+                    config,
+                    serial_number,
+                    node,
+                    reason_code,
+                    journal,
+                    flash,
+                    buffer,
+                    unsealer,
+                );
                 let address = device.lss_address();
                 let node = NodeParameters { id: device.node_id(), ..node };
                 let slave = slave(address, node, config.device.heartbeat_ms, NmtPolicy::StayPreOperational);

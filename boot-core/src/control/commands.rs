@@ -3,6 +3,8 @@
 
 use canopen::program::{FlashError, ProgramControl};
 use canopen::AbortCode;
+#[cfg(feature = "sealed")]
+use seal::access::right;
 use shared_abi::warm_start::BootRequest;
 
 use super::{find, Downloader};
@@ -42,13 +44,28 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let own = self.programmer.program().is_none_or(|of| of == program);
         let restarts = command == Clear && own && self.programmer.is_abortable();
         let busy = match command {
-            SetSignature | ClrSignature => self.programmer.is_busy(),
+            // Nor while a sealed image comes: the record is its business then.
+            SetSignature | ClrSignature => {
+                self.programmer.is_busy() || self.programmer.unsealer().is_active()
+            }
             _ => self.programmer.has_work(),
         };
         if self.boot_request.is_some() || (busy && !restarts) {
             return Err(state.refuse(Refusal::untimely(FlashError::Busy)));
         }
         let changes = matches!(command, Clear | SetSignature | ClrSignature);
+        #[cfg(feature = "sealed")]
+        {
+            let again = matches!(state.session, Session::Cleared { just: true });
+            let needed = match command {
+                Clear if again || (self.policy.erase)(program) == Erase::AtOnce => right::ERASE,
+                ClrSignature => right::CLEAR_SIGNATURE,
+                _ => 0,
+            };
+            if needed != 0 && !self.programmer.unsealer().permits(needed) {
+                return Err(state.refuse(Refusal::untimely(FlashError::NoAccess)));
+            }
+        }
         if changes && (state.locked || !(self.policy.allowed)()) {
             return Err(state.refuse(Refusal::untimely(FlashError::NoAccess)));
         }
@@ -116,6 +133,9 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             state.streamed = false;
             state.session = Session::Cleared { just: false };
         }
+        // A password crosses the bus as it is: in a sealed device it costs no program.
+        #[cfg(feature = "sealed")]
+        let at_once = at_once && self.programmer.unsealer().permits(right::ERASE);
         if at_once {
             self.programmer.void(program);
         }

@@ -18,6 +18,8 @@ use core::task::Poll;
 
 use canopen::program::{region_value, FlashError, FlashStatus, ProgramState};
 use canopen::AbortCode;
+#[cfg(feature = "sealed")]
+use seal::access::right;
 use shared_abi::geometry::Region;
 use shared_abi::label;
 use shared_abi::layout::Layout;
@@ -30,6 +32,7 @@ use crate::programmer::{Event, Programmer};
 use crate::refusal::Refusal;
 use crate::session::Session;
 use crate::store::{NodeParameters, Parameters, ProgramRecord};
+use crate::unseal::Unsealer;
 
 pub use crate::policy::{Erase, Policy, Verdict};
 pub use crate::programmer::Step;
@@ -89,11 +92,13 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         parameters: P,
         flash: &F,
         buffer: &'b mut [u8],
+        mut unsealer: Unsealer<'b>,
     ) -> Self {
+        unsealer.attach(flash, &parameters, layout, policy);
         let mut number = 0;
         let programs = [(); PROGRAMS].map(|()| {
             number += 1;
-            let record = ProgramRecord::load(&parameters, flash, number);
+            let record = load(&parameters, flash, number, &unsealer);
             Program {
                 region: layout.program(number).unwrap_or(Region::new(0, 0)),
                 record,
@@ -111,7 +116,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             policy,
             parameters,
             programs,
-            programmer: Programmer::new(buffer, policy.crc, policy.crc_step),
+            programmer: Programmer::new(buffer, policy.crc, policy.crc_step, unsealer),
             transfer: None,
             fault: AbortCode::DEVICE_STATE,
             boot_request: None,
@@ -123,6 +128,12 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// Ends here, whatever is being done; gives the buffer back.
     pub fn into_buffer(self) -> &'b mut [u8] {
         self.programmer.into_buffer()
+    }
+
+    /// What there is of sealed images.
+    #[cfg(feature = "sealed")]
+    pub(crate) fn unsealer_mut(&mut self) -> &mut Unsealer<'b> {
+        self.programmer.unsealer_mut()
     }
 
     /// Whether sub-index `program` of 1F50h, 1F51h, 1F56h and 1F57h exists.
@@ -221,6 +232,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         if !self.policy.read_back {
             return Err(AbortCode::WRITE_ONLY);
         }
+        #[cfg(feature = "sealed")]
+        if !self.programmer.unsealer().permits(right::READ_BACK) {
+            return Err(AbortCode::DEVICE_STATE);
+        }
         // While it works the flash cannot be read.
         if state.locked || self.busy() {
             return Err(AbortCode::DEVICE_STATE);
@@ -248,11 +263,15 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             None => {}
             Some(Event::NodeStored(outcome)) => self.node_stored = outcome,
             Some(Event::Stored { program, ends }) => {
-                let record = ProgramRecord::load(&self.parameters, flash, program);
+                let record = load(&self.parameters, flash, program, self.programmer.unsealer());
                 if let Some(state) = find(&mut self.programs, program) {
                     state.record = record;
                     if record.is_none() {
                         state.identification = 0;
+                    }
+                    let open = matches!(state.session, Session::Open { .. });
+                    if ends && open && self.programmer.unsealer().is_same() {
+                        state.session = Session::Idle;
                     }
                 }
                 if ends {
@@ -266,18 +285,35 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 }
                 match self.check_stored(flash, program, &expected, crc) {
                     Ok(version) => {
-                        let signed = expected.crc.is_none() && self.policy.valid_without_signature;
+                        let whole = expected.crc.is_none() || self.programmer.unsealer().is_active();
+                        let signed = whole && self.policy.valid_without_signature;
                         let size = expected.size;
                         let half_erased = self.programmer.is_half_erased();
-                        let record =
-                            ProgramRecord { size, crc, signed, confirmed: false, version, half_erased };
+                        let confirmed = false;
+                        let record = ProgramRecord {
+                            size,
+                            crc,
+                            signed,
+                            confirmed,
+                            version,
+                            half_erased,
+                            #[cfg(feature = "sealed")]
+                            seal: None,
+                        };
+                        let record = self.programmer.unsealer().mark(record);
                         self.programmer.record(&mut self.parameters, program, record, false);
                     }
                     Err(error) => self.end(program, Err(error)),
                 }
             }
             Some(Event::Failed { program, error, erasing }) => {
-                self.fault = if erasing { AbortCode::GENERAL } else { AbortCode::HARDWARE };
+                self.fault = match error {
+                    _ if erasing => AbortCode::GENERAL,
+                    // What a sealed image is refused for.
+                    #[cfg(feature = "sealed")]
+                    error if !matches!(error, FlashError::Write | FlashError::NvData) => AbortCode::STORE,
+                    _ => AbortCode::HARDWARE,
+                };
                 self.end(program, Err(error));
             }
         }
@@ -313,6 +349,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             region,
             session: state.session,
             installed: false,
+            #[cfg(feature = "sealed")]
+            sealed_only: false,
         };
         // A control block's version comes first. (In one expression: it is 190 bytes shorter.)
         let told = state.version;
@@ -327,6 +365,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             self.transfer = None;
             self.programmer.queue_mut().clear();
         }
+        self.outcome = Some((program, outcome));
         let Some(state) = find(&mut self.programs, program) else { return };
         let start = core::mem::take(&mut state.start_when_verified);
         state.error = outcome.err();
@@ -338,7 +377,6 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         } else if start && state.record.is_some() {
             self.boot_request = Some(BootRequest::Fresh(program));
         }
-        self.outcome = Some((program, outcome));
     }
 
     /// Whether the queue takes another transfer.
@@ -354,6 +392,17 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             one_of_many(&self.programs, program)
         }
     }
+}
+
+/// The record of a program, where the device may start it.
+fn load<F: Flash>(
+    parameters: &impl Parameters,
+    flash: &F,
+    number: u8,
+    unsealer: &Unsealer<'_>,
+) -> Option<ProgramRecord> {
+    let record = ProgramRecord::load(parameters, flash, number)?;
+    (record.is_sealed() || !unsealer.takes_no_other()).then_some(record)
 }
 
 /// A program, if there is one of this number.

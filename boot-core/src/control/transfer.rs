@@ -106,6 +106,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             region: state.region,
             session: state.session,
             installed: state.record.is_some(),
+            #[cfg(feature = "sealed")]
+            sealed_only: self.programmer.unsealer().takes_no_other(),
         };
         let mut to = Destination { judge, queue: self.programmer.queue_mut(), progress: Progress::default() };
         let outcome = match data {
@@ -143,6 +145,10 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             // A sequence of blocks that begins anew goes on over what is there.
             if !matches!(state.session, Session::Open { .. }) {
                 self.programmer.open(program, state.region, state.session.erases(self.policy), begin.size);
+                #[cfg(feature = "sealed")]
+                if progress.sealed {
+                    self.programmer.unseal();
+                }
             }
             state.session = Session::Open { next: 1 };
         }

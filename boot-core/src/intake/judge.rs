@@ -26,6 +26,9 @@ pub(crate) struct Judge<'a> {
     pub session: Session,
     /// Whether there is a program.
     pub installed: bool,
+    /// Whether the device takes sealed images alone.
+    #[cfg(feature = "sealed")]
+    pub sealed_only: bool,
 }
 
 impl Judge<'_> {

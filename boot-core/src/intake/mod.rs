@@ -4,6 +4,7 @@
 //! |---|---|
 //! | [`block_file`] | the number of a block |
 //! | [`ihex`] | `:` |
+//! | `sealed` | `CBS1` (feature `sealed`) |
 //! | [`raw`] | an initial stack pointer; any bytes where the program is data |
 //!
 //! A format sees its bytes, the rules that it is judged by ([`Judge`]) and the queue of the pieces.
@@ -14,6 +15,8 @@ mod block_file;
 mod ihex;
 mod judge;
 mod raw;
+#[cfg(feature = "sealed")]
+mod sealed;
 mod stream;
 
 use canopen::program::FlashError;
@@ -23,7 +26,15 @@ use crate::queue::Queue;
 use crate::refusal::Refusal;
 pub(crate) use judge::Judge;
 
+#[cfg(not(feature = "sealed"))]
 formats! {
+    BlockFile(block_file::BlockFile),
+    IntelHex(ihex::IntelHex),
+    Raw(raw::Raw),
+}
+#[cfg(feature = "sealed")]
+formats! {
+    Sealed(sealed::Sealed),
     BlockFile(block_file::BlockFile),
     IntelHex(ihex::IntelHex),
     Raw(raw::Raw),
@@ -83,6 +94,9 @@ pub(crate) struct Progress {
     pub block: bool,
     /// The program is complete.
     pub complete: Option<crate::program::Expected>,
+    /// What begins is a sealed image.
+    #[cfg(feature = "sealed")]
+    pub sealed: bool,
 }
 
 /// What is known of a program when its download begins.
@@ -125,6 +139,10 @@ impl Intake {
             bytes = &bytes[more..];
             let (first, len) = (*first, *len);
             let Some(mut known) = Known::recognise(&first[..len], &to.judge)? else { return Ok(()) };
+            #[cfg(feature = "sealed")]
+            if to.judge.sealed_only && !matches!(known, Known::Sealed(_)) {
+                return Err(Refusal::unfit(FlashError::NoAccess));
+            }
             known.begin(self.size, &to.judge, to.queue)?;
             known.data(&first[..len], to)?;
             self.state = State::Known(known);

@@ -24,6 +24,7 @@ use crate::flash::{Flash, FlashFault, Next, Operation};
 use crate::program::{Expected, FlashCrc};
 use crate::queue::Queue;
 use crate::store::{Key, NodeParameters, Parameters, ProgramRecord, Value};
+use crate::unseal::Unsealer;
 use write::WritePiece;
 
 /// What came of a step.
@@ -84,6 +85,9 @@ enum Job {
     Erase { sector: Option<Sector>, until: u32 },
     /// The piece at the front of the queue.
     Write(WritePiece),
+    /// The sealed image goes on.
+    #[cfg(feature = "sealed")]
+    Unseal,
     /// Is the flash what the host meant?
     Verify { expected: Expected, crc: FlashCrc },
 }
@@ -99,16 +103,26 @@ enum Change {
     Confirm,
     /// Node-ID and bit rate.
     Node,
+    /// The security counter of a sealed image.
+    #[cfg(feature = "sealed")]
+    Counter,
+    /// An event, or how often rights were granted; nobody waits for it.
+    #[cfg(feature = "sealed")]
+    Note,
 }
 
 /// The flash half. It starts operations and polls them, and never waits for one.
 pub(crate) struct Programmer<'b> {
     queue: Queue<'b>,
+    unsealer: Unsealer<'b>,
     crc_kind: CrcKind,
     crc_step: u32,
     target: Option<Target>,
-    /// Bit n: the record of program n + 1 has to go before anything is erased or written.
+    /// Bit n: the record of program n has to go before anything is erased or written.
     voids: u32,
+    /// What the next one of them has proved is stored as its counter.
+    #[cfg(feature = "sealed")]
+    kept: bool,
     job: Option<Job>,
     /// What the flash is doing. Without a job nobody wants its outcome any more.
     running: Option<Step>,
@@ -117,13 +131,21 @@ pub(crate) struct Programmer<'b> {
 impl<'b> Programmer<'b> {
     /// The larger `buffer`, the further the flash may lag behind the bus. One step of a CRC covers
     /// `crc_step` bytes.
-    pub(crate) fn new(buffer: &'b mut [u8], crc_kind: CrcKind, crc_step: u32) -> Self {
+    pub(crate) fn new(
+        buffer: &'b mut [u8],
+        crc_kind: CrcKind,
+        crc_step: u32,
+        unsealer: Unsealer<'b>,
+    ) -> Self {
         Self {
             queue: Queue::new(buffer),
+            unsealer,
             crc_kind,
             crc_step,
             target: None,
             voids: 0,
+            #[cfg(feature = "sealed")]
+            kept: false,
             job: None,
             running: None,
         }
@@ -154,8 +176,28 @@ impl<'b> Programmer<'b> {
         };
         let (untouched, clearing, half_erased, expected) = (Some(ahead), false, false, None);
         let ahead = erased;
+        self.unsealer.rest();
         self.target =
             Some(Target { program, region, erased, ahead, untouched, clearing, half_erased, expected });
+    }
+
+    /// What was [opened](Self::open) comes as a sealed image.
+    #[cfg(feature = "sealed")]
+    pub(crate) fn unseal(&mut self) {
+        if let Some(Target { program, region, .. }) = self.target {
+            self.unsealer.begin(program, region);
+        }
+    }
+
+    /// The sealed image, if the program came as one.
+    pub(crate) fn unsealer(&self) -> &Unsealer<'b> {
+        &self.unsealer
+    }
+
+    /// See [`unsealer`](Self::unsealer).
+    #[cfg(feature = "sealed")]
+    pub(crate) fn unsealer_mut(&mut self) -> &mut Unsealer<'b> {
+        &mut self.unsealer
     }
 
     /// The record of a program goes, then all its sectors are erased that are not.
@@ -169,7 +211,7 @@ impl<'b> Programmer<'b> {
     /// The record of a program goes. That of the target says that it is half erased, until the work on
     /// it has come to its end.
     pub(crate) fn void(&mut self, program: u8) {
-        self.voids |= 1 << program.saturating_sub(1);
+        self.voids |= bit(program);
     }
 
     /// The program was sent completely.
@@ -204,6 +246,7 @@ impl<'b> Programmer<'b> {
     /// What was received is not wanted any more. What is on its way into the store goes on.
     pub(crate) fn abort(&mut self) {
         self.queue.clear();
+        self.unsealer.rest();
         self.target = None;
         if !self.is_storing() {
             self.job = None;
@@ -233,9 +276,12 @@ impl<'b> Programmer<'b> {
     /// Whether there is work that a command has to wait for.
     pub(crate) fn has_work(&self) -> bool {
         let confirming = matches!(self.job, Some(Job::Store(Change::Confirm, _)));
+        #[cfg(feature = "sealed")]
+        let confirming = confirming || matches!(self.job, Some(Job::Store(Change::Note, _)));
         (self.job.is_some() || self.running.is_some()) && !confirming
             || self.voids != 0
             || !self.queue.is_empty()
+            || !self.unsealer.waits()
             || self.target.as_ref().is_some_and(|target| {
                 target.clearing || target.expected.is_some() || target.erased < target.ahead
             })
@@ -299,7 +345,8 @@ impl<'b> Programmer<'b> {
             }
             if self.job.is_none() {
                 return match self.choose(parameters, flash) {
-                    Ok(None) => (Step::Idle, None),
+                    Ok(None) if self.unsealer.prepare() => (Step::Idle, None),
+                    Ok(None) => (Step::Again, None),
                     Ok(job) => {
                         self.job = job;
                         (Step::Again, None)
@@ -340,7 +387,18 @@ impl<'b> Programmer<'b> {
             }
             (_, Err(fault)) => Err(fault),
             (Some(Job::Erase { sector, .. }), _) => Ok(sector.take().map(Operation::Erase)),
-            (Some(Job::Write(write)), _) => write.next(flash, &self.queue),
+            #[cfg(feature = "sealed")]
+            (Some(Job::Unseal), _) => {
+                return Next::Done(self.unsealer.step(flash, parameters, &mut self.queue));
+            }
+            (Some(Job::Write(write)), _) => {
+                let (queue, unsealer) = (&self.queue, &self.unsealer);
+                if unsealer.is_active() {
+                    write.next(flash, move |at| unsealer.data(at))
+                } else {
+                    write.next(flash, move |at| queue.data(at))
+                }
+            }
             (Some(Job::Verify { crc, .. }), _) => {
                 return match crc.step(flash, self.crc_kind, self.crc_step) {
                     true => Next::Done(Ok(())),
@@ -361,9 +419,19 @@ impl<'b> Programmer<'b> {
     fn done(&mut self, result: Result<(), FlashError>) -> Option<Event> {
         match (self.job.take()?, result) {
             (Job::Store(Change::Node, _), result) => Some(Event::NodeStored(result)),
+            #[cfg(feature = "sealed")]
+            (Job::Store(Change::Counter | Change::Note, _) | Job::Unseal, Ok(())) => None,
             (Job::Store(change, program), result) => {
                 if change == Change::Void {
-                    self.voids &= !(1 << program.saturating_sub(1));
+                    self.voids &= !bit(program);
+                    #[cfg(feature = "sealed")]
+                    {
+                        self.kept = false;
+                    }
+                }
+                #[cfg(feature = "sealed")]
+                if change == Change::Record && self.unsealer.is_installed() {
+                    self.unsealer.end(result);
                 }
                 match result {
                     Ok(()) => Some(Event::Stored { program, ends: change == Change::Record }),
@@ -384,7 +452,11 @@ impl<'b> Programmer<'b> {
                 None
             }
             (Job::Write(_), Ok(())) => {
-                self.queue.pop();
+                if self.unsealer.is_active() {
+                    self.unsealer.written();
+                } else {
+                    self.queue.pop();
+                }
                 None
             }
             (Job::Verify { expected, crc }, Ok(())) => {
@@ -396,6 +468,11 @@ impl<'b> Programmer<'b> {
     // A call is shorter: three ways lead here.
     #[inline(never)]
     fn fail(&mut self, error: FlashError, erasing: bool) -> Option<Event> {
+        #[cfg(feature = "sealed")]
+        self.unsealer.end(Err(error));
+        #[cfg(feature = "sealed")]
+        let program = self.program().unwrap_or(0);
+        #[cfg(not(feature = "sealed"))]
         let program = self.program()?;
         self.abort();
         Some(Event::Failed { program, error, erasing })
@@ -407,18 +484,43 @@ impl<'b> Programmer<'b> {
         parameters: &mut impl Parameters,
         flash: &F,
     ) -> Result<Option<Job>, FlashError> {
-        let piece = self.queue.first();
+        #[cfg(feature = "sealed")]
+        {
+            if let Some((key, value)) = self.unsealer.take_store() {
+                parameters.store(key, value);
+                return Ok(Some(Job::Store(Change::Note, 0)));
+            }
+            if self.unsealer.is_asked() {
+                return Ok(Some(Job::Unseal));
+            }
+        }
+        let piece = if self.unsealer.is_active() { self.unsealer.piece() } else { self.queue.first() };
         if let Some(target) = &mut self.target {
-            if piece.is_some() || target.clearing || target.expected.is_some() {
+            // Of a sealed image nothing is known before there is an authentic piece of it.
+            if piece.is_some() || target.clearing || (target.expected.is_some() && !self.unsealer.is_active())
+            {
                 if let Some(ahead) = target.untouched.take() {
                     target.ahead = target.ahead.max(ahead);
+                    // All of an authentic image may be erased ahead of its data.
+                    #[cfg(feature = "sealed")]
+                    if self.unsealer.is_active() && target.erased < target.region.end() {
+                        target.ahead = target.region.base + self.unsealer.expected().size;
+                    }
                     let program = target.program;
                     self.void(program);
                 }
             }
         }
         if self.voids != 0 {
-            let program = self.voids.trailing_zeros() as u8 + 1;
+            let program = self.voids.trailing_zeros() as u8;
+            // What a program has proved outlives its record.
+            #[cfg(feature = "sealed")]
+            if !core::mem::replace(&mut self.kept, true) {
+                if let Some(counter) = crate::unseal::proved(flash, parameters, program) {
+                    parameters.store(Key::Counter(program), counter);
+                    return Ok(Some(Job::Store(Change::Counter, program)));
+                }
+            }
             let mut half_erased = ProgramRecord::load_half_erased(parameters, flash, program);
             if let Some(target) = self.target.as_mut().filter(|target| target.program == program) {
                 target.half_erased = core::mem::replace(&mut half_erased, true);
@@ -442,11 +544,40 @@ impl<'b> Programmer<'b> {
             let write = WritePiece::new(flash, piece).ok_or(FlashError::NotCleared)?;
             return Ok(Some(Job::Write(write)));
         }
+        #[cfg(feature = "sealed")]
+        if self.unsealer.is_active() {
+            let ended = target.expected.is_some();
+            match (self.unsealer.is_installed(), self.queue.is_empty()) {
+                (false, true) if self.unsealer.waits() => {
+                    return if ended { Err(FlashError::Format) } else { Ok(None) };
+                }
+                (false, _) => return Ok(Some(Job::Unseal)),
+                (true, false) => return Err(FlashError::Format),
+                (true, true) if !ended => return Ok(None),
+                (true, true) => target.expected = Some(self.unsealer.expected()),
+            }
+            let program = target.program;
+            // Of the same image, too: its certificate may be of a higher epoch.
+            if let Some(counter) = self.unsealer.take_counter() {
+                parameters.store(Key::Counter(program), counter);
+                return Ok(Some(Job::Store(Change::Counter, program)));
+            }
+            if self.unsealer.is_same() {
+                target.expected = None;
+                let value = self.unsealer.same_record();
+                return Ok(Some(store(parameters, Change::Record, program, value)));
+            }
+        }
         Ok(target.expected.take().map(|expected| {
             let crc = FlashCrc::new(Region::new(target.region.base, expected.size));
             Job::Verify { expected, crc }
         }))
     }
+}
+
+/// The bit of a program.
+fn bit(program: u8) -> u32 {
+    1_u32.wrapping_shl(program.into())
 }
 
 /// A value of a program is on its way into the store from now on.

@@ -3,7 +3,7 @@
 use shared_abi::geometry::Region;
 
 use crate::flash::{Flash, FlashFault, Operation};
-use crate::queue::{Piece, Queue};
+use crate::queue::Piece;
 use crate::sequence::ProgramWords;
 
 /// The words of a piece being programmed. Flash is programmed by words: the first and the last one
@@ -31,7 +31,7 @@ impl WritePiece {
     pub(super) fn next<F: Flash>(
         &mut self,
         flash: &F,
-        queue: &Queue<'_>,
+        data: impl Fn(usize) -> u8,
     ) -> Result<Option<Operation>, FlashFault> {
         let (piece, edges) = (self.piece, self.edges);
         let before = piece.address as usize % 4;
@@ -43,7 +43,7 @@ impl WritePiece {
             for (i, byte) in bytes.iter_mut().enumerate() {
                 let offset = (4 * word + i).wrapping_sub(before);
                 if offset < size {
-                    *byte = queue.data(offset);
+                    *byte = data(offset);
                 }
             }
             u32::from_le_bytes(bytes)

@@ -125,14 +125,14 @@ impl Journal {
         Self { valid, other, header, newer, sequence, free, storing: Storing::default() }
     }
 
-    /// The latest sound record of a tag, and where it is.
-    fn latest<F: Flash>(&self, flash: &F, tag: u32) -> Option<(u32, Slot)> {
+    /// The latest sound record of a tag.
+    fn latest<F: Flash>(&self, flash: &F, tag: u32) -> Option<Slot> {
         let first = first_slot(&self.valid);
         let mut at = self.free;
         while at > first {
             at -= SLOT_SIZE;
             if let Some(slot) = sound_slot(flash, at, tag) {
-                return Some((at, slot));
+                return Some(slot);
             }
         }
         None
@@ -141,7 +141,7 @@ impl Journal {
 
 impl Parameters for Journal {
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value> {
-        let (_, [_, a, b, c, d, _]) = self.latest(flash, key.tag())?;
+        let [_, a, b, c, d, _] = self.latest(flash, key.tag())?;
         Some([a, b, c, d])
     }
 
@@ -233,14 +233,23 @@ impl Journal {
     }
 
     /// Copies the next living record; behind the last one the other region gets its header.
+    ///
+    /// Whether a tag has its copy is asked of the copies, which were just written and read back. A slot
+    /// that a power cut left between 0 and 1 may be the latest of its tag when it is looked at once,
+    /// and none when it is looked at again: by comparing places, neither it nor the one before it would
+    /// be copied.
     fn collect<F: Flash>(&mut self, flash: &F) {
         while self.storing.from < self.free {
-            let from = self.storing.from;
+            let tag = flash.read_word(self.storing.from);
             self.storing.from += SLOT_SIZE;
-            let tag = flash.read_word(from);
-            match self.latest(flash, tag) {
-                Some((at, slot)) if at == from => return self.write(Step::Copy, self.storing.to, slot),
-                _ => {}
+            let mut copy = first_slot(&self.other);
+            while copy < self.storing.to && flash.read_word(copy) != tag {
+                copy += SLOT_SIZE;
+            }
+            if copy == self.storing.to {
+                if let Some(slot) = self.latest(flash, tag) {
+                    return self.write(Step::Copy, self.storing.to, slot);
+                }
             }
         }
         let header = header_slot(self.sequence.wrapping_add(1));

@@ -30,6 +30,16 @@ pub enum Key {
     CrashCount,
     /// Node-ID and bit rate, see [`NodeParameters`].
     Node,
+    /// Of a program (1 to 254) the lowest security counter and the lowest epoch that the device
+    /// takes, and the counter of what is installed. It outlives the program's record.
+    #[cfg(feature = "sealed")]
+    Counter(u8),
+    /// An event (0 to 7), see `seal::access`.
+    #[cfg(feature = "sealed")]
+    Event(u8),
+    /// How often rights were granted.
+    #[cfg(feature = "sealed")]
+    Grants,
 }
 
 impl Key {
@@ -40,6 +50,12 @@ impl Key {
             Self::Program(number) => 0x0001_0000 | number as u32,
             Self::CrashCount => 0x0002_0000,
             Self::Node => 0x0003_0000,
+            #[cfg(feature = "sealed")]
+            Self::Counter(number) => 0x0004_0000 | number as u32,
+            #[cfg(feature = "sealed")]
+            Self::Event(place) => 0x0005_0000 | place as u32,
+            #[cfg(feature = "sealed")]
+            Self::Grants => 0x0006_0000,
         }
     }
 }

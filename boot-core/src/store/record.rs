@@ -20,6 +20,19 @@ pub struct ProgramRecord {
     /// Since all of the program's flash was last erased, work on it was begun that did not come to its
     /// end: a sector that reads as erased may be so badly.
     pub half_erased: bool,
+    /// How it came where it came as a sealed image; `None` where it did not.
+    #[cfg(feature = "sealed")]
+    pub seal: Option<Seal>,
+}
+
+/// What a sealed program may do to the flash.
+#[cfg(feature = "sealed")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Seal {
+    /// Nothing: the flash is locked in front of it until the next reset.
+    Locked,
+    /// It writes the flash itself, and its manifest says so.
+    WritesFlash,
 }
 
 /// The words of the two flags: signed or not, confirmed or not. Magic numbers, so that few wrong
@@ -30,6 +43,16 @@ const SIGNED_CONFIRMED: u32 = u32::from_le_bytes(*b"RUN1");
 
 /// In the first word of the stored form, above the size: [`half_erased`](ProgramRecord::half_erased).
 const HALF_ERASED: u32 = 1 << 31;
+/// There, too: the two kinds of [`Seal`].
+#[cfg(feature = "sealed")]
+const SEALED: u32 = 1 << 30;
+#[cfg(feature = "sealed")]
+const WRITES_FLASH: u32 = 1 << 29;
+/// Where the size stands in the first word.
+#[cfg(feature = "sealed")]
+const SIZE: u32 = !(HALF_ERASED | SEALED | WRITES_FLASH);
+#[cfg(not(feature = "sealed"))]
+const SIZE: u32 = !HALF_ERASED;
 
 impl ProgramRecord {
     /// The stored form of "no program".
@@ -43,6 +66,15 @@ impl ProgramRecord {
         parameters.get(flash, Key::Program(number)).is_some_and(|[first, ..]| first & HALF_ERASED != 0)
     }
 
+    /// Whether it came as a sealed image.
+    #[must_use]
+    pub const fn is_sealed(&self) -> bool {
+        #[cfg(feature = "sealed")]
+        return self.seal.is_some();
+        #[cfg(not(feature = "sealed"))]
+        false
+    }
+
     /// From the store; `None` where there is no program.
     pub fn load<F: Flash>(parameters: &impl Parameters, flash: &F, number: u8) -> Option<Self> {
         Self::from_value(parameters.get(flash, Key::Program(number))?)
@@ -52,13 +84,26 @@ impl ProgramRecord {
     #[must_use]
     pub const fn from_value([first, crc, flags, version]: Value) -> Option<Self> {
         let half_erased = first & HALF_ERASED != 0;
-        let size = first & !HALF_ERASED;
+        let size = first & SIZE;
         if size == 0 {
             return None;
         }
         let signed = flags == SIGNED || flags == SIGNED_CONFIRMED;
         let confirmed = flags == CONFIRMED || flags == SIGNED_CONFIRMED;
-        Some(Self { size, crc, signed, confirmed, version, half_erased })
+        Some(Self {
+            size,
+            crc,
+            signed,
+            confirmed,
+            version,
+            half_erased,
+            #[cfg(feature = "sealed")]
+            seal: match first & (SEALED | WRITES_FLASH) {
+                SEALED => Some(Seal::Locked),
+                0 | WRITES_FLASH => None,
+                _ => Some(Seal::WritesFlash),
+            },
+        })
     }
 
     /// The stored form.
@@ -70,6 +115,14 @@ impl ProgramRecord {
             (false, true) => CONFIRMED,
             (true, true) => SIGNED_CONFIRMED,
         };
-        [self.size | Self::none(self.half_erased)[0], self.crc, flags, self.version]
+        #[cfg(not(feature = "sealed"))]
+        let seal = 0;
+        #[cfg(feature = "sealed")]
+        let seal = match self.seal {
+            None => 0,
+            Some(Seal::Locked) => SEALED,
+            Some(Seal::WritesFlash) => SEALED | WRITES_FLASH,
+        };
+        [self.size | Self::none(self.half_erased)[0] | seal, self.crc, flags, self.version]
     }
 }

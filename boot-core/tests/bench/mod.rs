@@ -7,6 +7,7 @@ use boot_core::crc::CrcKind;
 use boot_core::program::{verify, Invalid};
 use boot_core::store::Journal;
 use boot_core::store::NodeParameters;
+use boot_core::unseal::Room;
 use canopen::device::Device;
 use canopen::od::{Address, Entry, Objects};
 use canopen::{AbortCode, BitRate, NodeId};
@@ -80,7 +81,8 @@ impl<'f> Bench<'f> {
         let buffer = Box::leak(vec![0; size].into_boxed_slice());
         let config = Box::leak(Box::new(config));
         let parameters = Journal::open(flash, LAYOUT.parameters);
-        Self { node: Bootloader::new(config, 0, node(), 0, parameters, flash, buffer) }
+        let unsealer = Box::leak(Box::<Room>::default()).unsealer();
+        Self { node: Bootloader::new(config, 0, node(), 0, parameters, flash, buffer, unsealer) }
     }
 
     pub fn settle(&mut self) {

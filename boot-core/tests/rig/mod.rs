@@ -216,9 +216,28 @@ impl Rig {
         let buffer = Box::leak(vec![0; buffer].into_boxed_slice());
         let parameters = Journal::open(&flash, setup.layout.parameters);
         let node = NodeParameters::load(&parameters, &flash, BOARD_NODE, |_| true);
+        let unsealer = Box::leak(Box::<boot_core::unseal::Room>::default()).unsealer();
         match setup.programs() {
-            1 => Box::new(Bootloader::<_, _, 1>::new(&setup.config, 0, node, 0, parameters, flash, buffer)),
-            2 => Box::new(Bootloader::<_, _, 2>::new(&setup.config, 0, node, 0, parameters, flash, buffer)),
+            1 => Box::new(Bootloader::<_, _, 1>::new(
+                &setup.config,
+                0,
+                node,
+                0,
+                parameters,
+                flash,
+                buffer,
+                unsealer,
+            )),
+            2 => Box::new(Bootloader::<_, _, 2>::new(
+                &setup.config,
+                0,
+                node,
+                0,
+                parameters,
+                flash,
+                buffer,
+                unsealer,
+            )),
             _ => unreachable!(),
         }
     }

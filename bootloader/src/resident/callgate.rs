@@ -2,17 +2,24 @@
 //!
 //! The flash controller may be the application's otherwise, and so may the CRC unit and the caches
 //! of the flash: they are taken when they are free, and left as they were found.
+//!
+//! In front of a sealed program the flash is locked (`flash_lock.rs`): nothing can be stored then
+//! before the next reset, and a key that is written would be a bus error in the application.
 
 use core::ffi::c_void;
 
 use boot_core::canopen::{BitRate, NodeId};
 use boot_core::flash::Flash;
-use boot_core::store::{Key, NodeParameters, ProgramRecord};
+#[cfg(feature = "sealed")]
+use boot_core::store::record::Seal;
+use boot_core::store::{Key, NodeParameters, ProgramRecord, Value};
 use bsp::{pac, LAYOUT};
 use shared_abi::callgate::{
     Crc32Args, NodeArgs, ProgramArgs, Selector, Status, PROGRAM_INSTALLED, PROGRAM_SIGNED,
 };
 use shared_abi::geometry::Region;
+#[cfg(feature = "sealed")]
+use shared_abi::handoff::Handoff;
 
 use crate::flash::ResidentFlash;
 use crate::flash_controller::FlashController;
@@ -69,6 +76,33 @@ fn is_in_ram(address: u32, size: u32) -> bool {
     address.is_multiple_of(4) && (chip.sram.contains(address, size) || chip.ccm.contains(address, size))
 }
 
+/// Stores a value, unless the flash is locked.
+fn keep(
+    parameters: &mut product::Parameters,
+    flash: &mut ResidentFlash,
+    key: Key,
+    value: Value,
+) -> Result<(), Status> {
+    if is_locked(parameters, flash) {
+        return Err(Status::Failed);
+    }
+    store(parameters, flash, key, value).map_err(|_| Status::Failed)
+}
+
+/// Whether the boot stage has locked the flash in front of the program that runs.
+#[cfg(feature = "sealed")]
+fn is_locked(parameters: &product::Parameters, flash: &ResidentFlash) -> bool {
+    // SAFETY: the layout's handoff region, checked to be RAM of that size in no image.
+    let program = unsafe { Handoff::read_program(LAYOUT.handoff.base as *const Handoff) };
+    let record = ProgramRecord::load(parameters, flash, program);
+    record.is_some_and(|record| record.seal == Some(Seal::Locked))
+}
+
+#[cfg(not(feature = "sealed"))]
+fn is_locked(_: &product::Parameters, _: &ResidentFlash) -> bool {
+    false
+}
+
 fn crc32(flash: &ResidentFlash, args: &mut Crc32Args) -> Result<(), Status> {
     if args.len == 0 || !LAYOUT.chip.flash.contains(args.address, args.len) {
         return Err(Status::BadRange);
@@ -94,7 +128,7 @@ fn node(selector: Selector, flash: &mut ResidentFlash, args: &mut NodeArgs) -> R
     };
     let bit_rate = BitRate::from_bits_per_second(args.bit_rate).filter(|rate| product::supports(*rate));
     let node = NodeParameters { id, bit_rate: bit_rate.ok_or(Status::BadArgument)? };
-    store(&mut parameters, flash, Key::Node, node.value()).map_err(|_| Status::Failed)
+    keep(&mut parameters, flash, Key::Node, node.value())
 }
 
 /// Tells of a program; confirms it, which releases it for autostart, or takes both away. A confirmed
@@ -118,10 +152,10 @@ fn program(selector: Selector, flash: &mut ResidentFlash, args: &mut ProgramArgs
     let confirmed = selector == Selector::Confirm;
     if record.signed != confirmed || record.confirmed != confirmed {
         let told = ProgramRecord { signed: confirmed, confirmed, ..record };
-        store(&mut parameters, flash, Key::Program(number), told.value()).map_err(|_| Status::Failed)?;
+        keep(&mut parameters, flash, Key::Program(number), told.value())?;
     }
     if confirmed && crash_count(&parameters, flash) > 0 {
-        store(&mut parameters, flash, Key::CrashCount, [0; 4]).map_err(|_| Status::Failed)?;
+        keep(&mut parameters, flash, Key::CrashCount, [0; 4])?;
     }
     Ok(())
 }

@@ -8,6 +8,7 @@
 //! | `callgate.rs` | services for the application | its ABI |
 //! | `service_table.rs` | services for the RAM part: the one owner of what is non-volatile | their ABI |
 //! | `flash.rs` | the flash with sectors and CRC unit | registers |
+//! | `flash_lock.rs` | shuts the flash in front of a sealed program (feature `sealed`) | assembly |
 //! | `storing.rs` | a value stored while nothing else runs | no |
 //! | `ram_image.rs` | the rest of the bootloader, checked and unpacked to RAM | memory |
 //! | `unpack.rs` | the unpacker of ZX0 | assembly |
@@ -26,6 +27,8 @@ mod callgate;
 mod flash;
 #[path = "../flash_controller.rs"]
 mod flash_controller;
+#[cfg(feature = "sealed")]
+mod flash_lock;
 #[path = "../memory.rs"]
 mod memory;
 #[path = "../product.rs"]

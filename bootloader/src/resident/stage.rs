@@ -40,6 +40,13 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
     let reset_cause = ResetCause::from_rcc_csr(rcc.csr().read().bits());
     rcc.csr().modify(|_, w| w.rmvf().set_bit());
 
+    // No reset: an application has jumped here, and the flash may be locked. A reset opens it; the
+    // request stays in the cell.
+    #[cfg(feature = "sealed")]
+    if reset_cause == ResetCause::Unknown {
+        SCB::sys_reset();
+    }
+
     let mut cell = product::warm_start_cell();
     let request = cell.take();
     let strap = bsp::entry_strap();
@@ -80,6 +87,11 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
                 bootloader_version: product::VERSION,
                 serial_number: bsp::serial_number(),
             });
+            #[cfg(feature = "sealed")]
+            if program.locks_flash() {
+                // SAFETY: nothing runs yet but this, and nothing is written any more.
+                unsafe { crate::flash_lock::lock_flash() };
+            }
             if let Some(ms) = PRODUCT.program_watchdog_ms {
                 bsp::watchdog::start(&iwdg, ms);
             }

@@ -1,0 +1,47 @@
+//! A sealed image: its bytes go through the queue as they come. They are judged in the flash half
+//! (`unseal`), because a signature takes longer than a client waits for an answer.
+
+use canopen::program::FlashError;
+use canopen::AbortCode;
+use seal::wire::MAGIC;
+
+use super::{Begin, Destination, Format, Judge, Recognition};
+use crate::program::Expected;
+use crate::queue::Queue;
+use crate::refusal::Refusal;
+
+pub(super) struct Sealed;
+
+impl Format for Sealed {
+    const IS_STREAM: bool = true;
+
+    fn recognise(first: &[u8], _judge: &Judge<'_>) -> Recognition<Self> {
+        match (MAGIC.starts_with(first), first.len() == MAGIC.len()) {
+            (true, true) => Recognition::Yes(Self),
+            (true, false) => Recognition::More,
+            _ => Recognition::No,
+        }
+    }
+
+    fn begin(&mut self, _size: Option<u32>, judge: &Judge<'_>, _queue: &Queue<'_>) -> Result<(), Refusal> {
+        judge.may_begin()
+    }
+
+    fn data(&mut self, bytes: &[u8], to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
+        if !to.queue.push_bytes(bytes) {
+            // A client that waits for the answers does not get here.
+            return Err(Refusal(FlashError::Busy, AbortCode::OUT_OF_MEMORY));
+        }
+        if !to.judge.has_begun() {
+            to.progress.begins = Some(Begin { size: 0, version: 0 });
+            to.progress.sealed = true;
+        }
+        Ok(())
+    }
+
+    fn end(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
+        // What it has to be stands in its manifest.
+        to.progress.complete = Some(Expected { size: 0, crc: None });
+        Ok(())
+    }
+}

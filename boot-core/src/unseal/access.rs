@@ -1,0 +1,146 @@
+//! What a sealed device does for the holder of a root key alone (2002h), and what it records (2003h).
+
+use canopen::od::{put, Address};
+use canopen::program::{FlashError, ACCESS, EVENTS};
+use canopen::AbortCode;
+use seal::access::{event, right, CHALLENGE, DOMAIN, REQUEST, SIGNED_CHALLENGE, SIGNED_REQUEST};
+use seal::key_block::{KEKS, KEY, ROOTS};
+use seal::sha512::hash_256;
+use seal::wire::{array, word, Fault, Head};
+
+use super::image::{start, Room, Stage, Unsealer};
+use crate::flash::Flash;
+use crate::store::{Key, Value};
+
+/// Events that are remembered.
+const LAST: usize = seal::access::EVENTS;
+
+// What `seal`, `canopen` and `shared-abi` each have to say of the same thing.
+const _: () = {
+    assert!(canopen::program::SEALED_ENTRIES.len() == 4 + LAST);
+    assert!(REQUEST <= canopen::sdo::server::VALUE_MAX);
+    assert!(shared_abi::layout::KEY_BLOCK_SIZE as usize == seal::key_block::SIZE);
+    assert!(FlashError::Signature.code() == Fault::Signature as u8);
+    assert!(FlashError::Rollback.code() == Fault::Rollback as u8);
+    assert!(FlashError::Key.code() == Fault::Key as u8);
+};
+
+impl Unsealer<'_> {
+    /// Whether something is allowed that needs a right in a sealed device.
+    pub(crate) fn permits(&self, right: u32) -> bool {
+        !self.0.takes_no_other || self.0.granted & right != 0
+    }
+
+    /// Reads 2002h or 2003h; `None` for other objects.
+    pub(crate) fn read(&mut self, at: Address, buf: &mut [u8]) -> Option<Result<usize, AbortCode>> {
+        let room = &mut *self.0;
+        match at.index {
+            ACCESS => Some(put(buf, &room.challenge())),
+            EVENTS => {
+                // The last one first.
+                let event = room.events[room.event.wrapping_sub(u32::from(at.sub) - 1) as usize % LAST];
+                let mut bytes = [0; 16];
+                for (bytes, word) in bytes.chunks_exact_mut(4).zip(event) {
+                    bytes.copy_from_slice(&word.to_le_bytes());
+                }
+                Some(put(buf, &bytes))
+            }
+            _ => None,
+        }
+    }
+
+    /// Somebody asks for rights (2002h/2). The signature is looked at in steps.
+    ///
+    /// # Errors
+    /// A request that is none, or one for a key that is no root of the device.
+    pub(crate) fn ask<F: Flash>(&mut self, flash: &F, request: &[u8]) -> Result<(), AbortCode> {
+        let room = &mut *self.0;
+        if request.len() != REQUEST {
+            return Err(AbortCode::LENGTH);
+        }
+        let mut roots = (room.key_block + ROOTS as u32..room.key_block + KEKS as u32).step_by(KEY);
+        let id = word(request, 8);
+        let root = roots.find(|at| room.takes_no_other && id != 0 && flash.read_word(*at) == id);
+        let root = root.ok_or(AbortCode::INVALID_VALUE)?;
+        let mut key = [0; 32];
+        flash.read(root + 4, &mut key);
+        let challenge = room.challenge();
+        let (asked, signature) = request.split_at(SIGNED_REQUEST);
+        let message = [&DOMAIN[..], &challenge[..SIGNED_CHALLENGE], asked];
+        start(&mut room.verification, &key, &array(signature, 0), &message);
+        room.asked = (word(asked, 0), word(asked, 4));
+        room.stage = Stage::Access;
+        Ok(())
+    }
+
+    /// What is to be stored, once.
+    pub(crate) fn take_store(&mut self) -> Option<(Key, Value)> {
+        let room = &mut *self.0;
+        if core::mem::take(&mut room.stores.1) {
+            return Some((Key::Grants, [room.grants, 0, 0, 0]));
+        }
+        let place = room.event as usize % LAST;
+        core::mem::take(&mut room.stores.0).then(|| (Key::Event(place as u8), room.events[place]))
+    }
+
+    /// Whether a signature is looked at that asks for rights.
+    pub(crate) fn is_asked(&self) -> bool {
+        self.0.stage == Stage::Access
+    }
+
+    /// The sealed image is installed, or it is not: that is recorded.
+    pub(crate) fn end(&mut self, outcome: Result<(), FlashError>) {
+        if self.0.active {
+            let program = u32::from(self.0.program);
+            self.0.record(match outcome {
+                Ok(()) => event::INSTALLED | program,
+                Err(error) => event::REFUSED | u32::from(error.code()),
+            });
+        }
+        self.rest();
+    }
+}
+
+impl Room {
+    /// 2002h/1. Its nonce lasts until rights are granted for it, or to the next reset.
+    fn challenge(&mut self) -> [u8; CHALLENGE] {
+        let Some(policy) = self.policy else { return [0; CHALLENGE] };
+        let unique_id = (policy.unique_id)();
+        if self.nonce == [0; 32] {
+            let parts = [&unique_id[..], &self.grants.to_le_bytes(), &(policy.cycles)().to_le_bytes()];
+            self.nonce = hash_256(&parts);
+        }
+        let mut challenge = [0; CHALLENGE];
+        challenge[..12].copy_from_slice(&unique_id);
+        challenge[12..SIGNED_CHALLENGE].copy_from_slice(&self.nonce);
+        challenge[SIGNED_CHALLENGE..].copy_from_slice(&self.granted.to_le_bytes());
+        challenge
+    }
+
+    /// The signature is good.
+    pub(super) fn grant(&mut self) {
+        let (rights, argument) = self.asked;
+        self.granted |= rights;
+        if rights & right::LOWER_COUNTER != 0 {
+            self.argument = argument;
+        }
+        self.nonce = [0; 32];
+        self.grants = self.grants.wrapping_add(1);
+        self.stores.1 = true;
+        self.stage = Stage::Head;
+        self.record(event::UNLOCKED | rights & 0xFFFF);
+    }
+
+    /// An event.
+    fn record(&mut self, what: u32) {
+        let head = Head(&self.head);
+        let last = self.events[self.event as usize % LAST];
+        // Somebody who is refused again and again does not wear the flash out.
+        if what >> 16 == event::REFUSED >> 16 && last[1] == what {
+            return;
+        }
+        self.event += 1;
+        self.events[self.event as usize % LAST] = [self.event, what, head.counter(), head.version()];
+        self.stores.0 = true;
+    }
+}

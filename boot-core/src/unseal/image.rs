@@ -1,0 +1,615 @@
+//! Sealed images on their way from the queue to the flash: judged, authenticated, deciphered,
+//! unpacked (`seal::wire` has the format, docs/security.md what it is good for).
+//!
+//! The order is the point: nothing is deciphered, unpacked or written before it is authentic. The
+//! head is held until its signatures are good; each chunk is held until its hash is the one that
+//! the authentic chunk before it told.
+
+use canopen::program::FlashError;
+use seal::access::{right, EVENTS};
+use seal::chacha20;
+use seal::ed25519::Verification;
+use seal::judge::{judge, Device, Needs};
+use seal::key_block::{self, KEKS, KEK_COUNT, KEY};
+use seal::lzma::Decoder;
+use seal::sha512::{hmac, prepare, Sha512};
+use seal::wire::{
+    array, flag, head_size, Fault, Head, Recipient, DOMAIN, HASH, MAX_CHUNK, MAX_HEAD, WRAP_DOMAIN,
+};
+use shared_abi::geometry::Region;
+use shared_abi::layout::Layout;
+
+use crate::flash::{fold, Flash};
+use crate::keys::{has_key_block, is_sound};
+use crate::policy::{Policy, SealPolicy};
+use crate::program::Expected;
+use crate::queue::{Piece, Queue};
+use crate::store::record::Seal;
+use crate::store::{Key, Parameters, ProgramRecord, Value};
+
+/// Bytes that are hashed in one step.
+const STEP: usize = 1024;
+/// Bytes that the decoder may leave for the next chunk.
+const CARRY: usize = 24;
+/// Where the payload of a chunk begins in the buffer: behind what the chunk before has left, and
+/// behind the hash of the next one.
+const PAYLOAD: usize = CARRY + HASH;
+/// Where unpacked bytes wait for the flash, behind the largest chunk.
+const UNPACKED: usize = PAYLOAD + (1 << MAX_CHUNK);
+/// Bytes that are unpacked at a time.
+const UNPACK: usize = 512;
+
+/// How far an image is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Stage {
+    /// Its head comes.
+    Head,
+    /// The signature of a root over the certificate is looked at.
+    Certificate,
+    /// The signature over the manifest is.
+    Manifest,
+    /// The signature of somebody who asks for rights is looked at; there is no image.
+    Access,
+    /// The other program is hashed, which is the dictionary.
+    Dictionary,
+    /// A chunk comes.
+    Chunk,
+    /// It is authentic and on its way into the flash.
+    Payload,
+    /// All is written, and hashed once more where it stands.
+    Image,
+    /// The flash holds the image.
+    Installed,
+}
+
+/// The sealed image that comes.
+pub struct Unsealer<'b>(pub(super) &'b mut Room);
+
+/// What there is of it. It is large, and stands outside the structure of the bootloader.
+pub struct Room {
+    pub(super) policy: Option<&'static SealPolicy>,
+    layout: Option<&'static Layout>,
+    /// Address of the key block.
+    pub(super) key_block: u32,
+    pub(super) takes_no_other: bool,
+    /// Rights that were granted since the reset, and the argument of the last ones.
+    pub(super) granted: u32,
+    pub(super) argument: u32,
+    /// How often rights were granted in the device's life.
+    pub(super) grants: u32,
+    /// What is signed with a request; zeros until somebody asks for it.
+    pub(super) nonce: [u8; HASH],
+    /// Rights that a signature is looked at for, and their argument.
+    pub(super) asked: (u32, u32),
+    /// The last event's number, and the events.
+    pub(super) event: u32,
+    pub(super) events: [Value; EVENTS],
+    /// What is to be stored as soon as the flash is idle: the last event, how often rights were
+    /// granted.
+    pub(super) stores: (bool, bool),
+    pub(super) active: bool,
+    pub(super) stage: Stage,
+    pub(super) program: u8,
+    /// The same image is installed: it is looked at and thrown away.
+    same: bool,
+    /// The record that says so.
+    record: Value,
+    /// What the counter becomes is not stored yet.
+    raises: bool,
+    /// The program's flash.
+    region: Region,
+    /// The other program, if it is the dictionary; else no bytes.
+    dictionary: Region,
+    /// Bytes of the head or of the chunk that are here, and that there have to be.
+    have: usize,
+    want: usize,
+    /// Payload that is still to come, this chunk's not counted.
+    left: u32,
+    /// Bytes of the image that are in flash, or of the flash that are hashed.
+    done: u32,
+    /// Where in the buffer the next bytes are that go into the flash, and how many.
+    out: (usize, usize),
+    /// Up to where in the buffer the payload is deciphered.
+    clear: usize,
+    /// Where in the buffer the bytes stand that are not unpacked yet.
+    packed: usize,
+    /// What the counter becomes.
+    counter: Value,
+    needs: Needs,
+    /// What the hash of the next chunk has to be.
+    next: [u8; HASH],
+    key: [u8; 32],
+    hash: Sha512,
+    pub(super) verification: Verification,
+    lzma: Decoder,
+    pub(super) head: [u8; MAX_HEAD],
+    bytes: [u8; UNPACKED + UNPACK],
+}
+
+impl Default for Room {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Room {
+    /// Room for one image at a time.
+    #[must_use]
+    pub const fn new() -> Self {
+        Self {
+            policy: None,
+            layout: None,
+            key_block: 0,
+            takes_no_other: false,
+            granted: 0,
+            argument: 0,
+            grants: 0,
+            nonce: [0; HASH],
+            asked: (0, 0),
+            event: 0,
+            events: [[0; 4]; EVENTS],
+            stores: (false, false),
+            active: false,
+            stage: Stage::Head,
+            program: 0,
+            same: false,
+            record: [0; 4],
+            raises: false,
+            region: Region::new(0, 0),
+            dictionary: Region::new(0, 0),
+            have: 0,
+            want: 0,
+            left: 0,
+            done: 0,
+            out: (0, 0),
+            clear: 0,
+            packed: 0,
+            counter: [0; 4],
+            needs: Needs { root: 0, epoch: 0, recipient: None },
+            next: [0; HASH],
+            key: [0; 32],
+            hash: Sha512::IDLE,
+            verification: Verification::IDLE,
+            lzma: Decoder::new(),
+            head: [0; MAX_HEAD],
+            bytes: [0; UNPACKED + UNPACK],
+        }
+    }
+
+    /// What works in it.
+    pub fn unsealer(&mut self) -> Unsealer<'_> {
+        Unsealer(self)
+    }
+}
+
+impl Unsealer<'_> {
+    /// Whether the download is that of a sealed image.
+    pub(crate) fn is_active(&self) -> bool {
+        self.0.active
+    }
+
+    /// It is not, or not any more.
+    pub(crate) fn rest(&mut self) {
+        self.0.active = false;
+        self.0.stage = Stage::Head;
+    }
+
+    /// What the device is.
+    pub(crate) fn attach<F: Flash>(
+        &mut self,
+        flash: &F,
+        parameters: &impl Parameters,
+        layout: &'static Layout,
+        policy: &'static Policy,
+    ) {
+        let room = &mut self.0;
+        for (place, event) in (0..).zip(&mut room.events) {
+            *event = parameters.get(flash, Key::Event(place)).unwrap_or([0; 4]);
+            room.event = room.event.max(event[0]);
+        }
+        [room.grants, ..] = parameters.get(flash, Key::Grants).unwrap_or([0; 4]);
+        self.0.layout = Some(layout);
+        self.0.key_block = layout.key_block().base;
+        self.0.policy = Some(&policy.seal);
+        self.0.takes_no_other = has_key_block(flash, layout);
+    }
+
+    /// Works ahead while there is nothing else to do; whether there is nothing left.
+    pub(crate) fn prepare(&mut self) -> bool {
+        prepare()
+    }
+
+    /// Whether the device has keys: then it takes and starts sealed programs alone.
+    pub(crate) fn takes_no_other(&self) -> bool {
+        self.0.takes_no_other
+    }
+
+    /// An image for this program comes.
+    pub(crate) fn begin(&mut self, program: u8, region: Region) {
+        self.0.active = true;
+        self.0.stage = Stage::Head;
+        self.0.program = program;
+        self.0.region = region;
+        self.0.have = 0;
+        self.0.want = 8;
+        self.0.out.1 = 0;
+        self.0.raises = true;
+        self.0.same = false;
+    }
+
+    /// Whether there is nothing to do before more bytes come.
+    pub(crate) fn waits(&self) -> bool {
+        matches!(self.0.stage, Stage::Head | Stage::Chunk | Stage::Installed)
+    }
+
+    /// Whether the flash holds the image.
+    pub(crate) fn is_installed(&self) -> bool {
+        self.0.stage == Stage::Installed
+    }
+
+    /// Whether it was there before.
+    pub(crate) fn is_same(&self) -> bool {
+        self.0.same
+    }
+
+    /// The record of it, as it was read then: after a power cut it may read so once and otherwise later.
+    pub(crate) fn same_record(&self) -> Value {
+        self.0.record
+    }
+
+    /// What goes into the flash next.
+    pub(crate) fn piece(&self) -> Option<Piece> {
+        let size = self.0.out.1 as u32;
+        (size > 0).then(|| Piece { address: self.0.region.base + self.0.done, size })
+    }
+
+    /// A byte of it.
+    pub(crate) fn data(&self, offset: usize) -> u8 {
+        self.0.bytes.get(self.0.out.0 + offset).copied().unwrap_or(0)
+    }
+
+    /// It is in the flash.
+    pub(crate) fn written(&mut self) {
+        self.0.done += self.0.out.1 as u32;
+        self.0.out.1 = 0;
+    }
+
+    /// What the program has to be.
+    pub(crate) fn expected(&self) -> Expected {
+        let head = Head(&self.0.head);
+        Expected { size: head.size(), crc: Some(head.crc()) }
+    }
+
+    /// What the counter becomes, once.
+    pub(crate) fn take_counter(&mut self) -> Option<Value> {
+        core::mem::take(&mut self.0.raises).then_some(self.0.counter)
+    }
+
+    /// The record of a program that came as a sealed image.
+    pub(crate) fn mark(&self, record: ProgramRecord) -> ProgramRecord {
+        if !self.0.active {
+            return record;
+        }
+        let head = Head(&self.0.head);
+        let writes = head.flags() & flag::WRITES_FLASH != 0;
+        let seal = if writes { Seal::WritesFlash } else { Seal::Locked };
+        ProgramRecord { version: head.version(), seal: Some(seal), ..record }
+    }
+
+    /// Carries it on by a bounded piece of work.
+    pub(crate) fn step<F: Flash>(
+        &mut self,
+        flash: &F,
+        parameters: &impl Parameters,
+        queue: &mut Queue<'_>,
+    ) -> Result<(), FlashError> {
+        self.0
+            .advance(flash, parameters, queue)
+            .map_err(|fault| FlashError::from_code(fault as u8).unwrap_or(FlashError::Unspecified))
+    }
+}
+
+impl Room {
+    fn advance<F: Flash>(
+        &mut self,
+        flash: &F,
+        parameters: &impl Parameters,
+        queue: &mut Queue<'_>,
+    ) -> Result<(), Fault> {
+        match self.stage {
+            Stage::Head => {
+                let room = self.head.get_mut(self.have..self.want).ok_or(Fault::Format)?;
+                self.have += queue.take(room);
+                if self.have < self.want {
+                    return Ok(());
+                }
+                self.want = head_size(&self.head[..self.have])?;
+                if self.have == self.want {
+                    self.judge(flash, parameters)?;
+                }
+            }
+            Stage::Certificate | Stage::Manifest | Stage::Access => match self.verification.step() {
+                None => {}
+                Some(false) => return Err(Fault::Signature),
+                Some(true) if self.stage == Stage::Certificate => self.check_manifest(None)?,
+                Some(true) if self.stage == Stage::Manifest => self.open(flash, parameters)?,
+                Some(true) => self.grant(),
+            },
+            Stage::Chunk => {
+                let end = self.want.min(self.have + STEP);
+                let room = &mut self.bytes[self.have..end];
+                let taken = queue.take(room);
+                self.hash.update(&room[..taken]);
+                self.have += taken;
+                if self.have == self.want {
+                    self.check_chunk()?;
+                }
+            }
+            Stage::Payload => self.unpack(flash)?,
+            Stage::Dictionary | Stage::Image => {
+                let head = Head(&self.head);
+                let (place, told) = if self.stage == Stage::Image {
+                    (Region::new(self.region.base, head.size()), head.image_hash())
+                } else {
+                    (self.dictionary, head.dictionary())
+                };
+                let size = (place.size - self.done).min(STEP as u32);
+                let place = Region::new(place.base + self.done, size);
+                let hash = core::mem::replace(&mut self.hash, Sha512::IDLE);
+                self.hash = fold(flash, hash, place, |mut hash, bytes| {
+                    hash.update(bytes);
+                    hash
+                });
+                self.done += size;
+                if size == 0 {
+                    let differs = self.hash.finish()[..HASH] != told;
+                    match self.stage {
+                        Stage::Image if differs => return Err(Fault::Signature),
+                        Stage::Image => self.stage = Stage::Installed,
+                        _ if differs => return Err(Fault::WrongProduct),
+                        _ => self.begin_chunks(),
+                    }
+                }
+            }
+            Stage::Installed => {}
+        }
+        Ok(())
+    }
+
+    /// The head is complete.
+    fn judge<F: Flash>(&mut self, flash: &F, parameters: &impl Parameters) -> Result<(), Fault> {
+        let block = self.key_block;
+        let policy = self.policy.ok_or(Fault::Key)?;
+        // All of the key block but the secret keys, of which the ids.
+        let mut keys = [0; KEKS + KEK_COUNT * KEY];
+        if is_sound(flash, block) {
+            flash.read(block, &mut keys[..KEKS]);
+            for at in (KEKS..).step_by(KEY).take(KEK_COUNT) {
+                flash.read(block + at as u32, &mut keys[at..at + 4]);
+            }
+        }
+        let word = |at| seal::wire::word(&keys, at);
+        let record = ProgramRecord::load(parameters, flash, self.program);
+        let [mut counter, mut epoch, installed, _] =
+            parameters.get(flash, Key::Counter(self.program)).unwrap_or([0; 4]);
+        // A program that has proved itself has raised the counter, wherever that is due then.
+        if record.is_some_and(|record| record.confirmed) {
+            counter = counter.max(installed);
+        }
+        counter = counter.max(word(key_block::COUNTER)).max(policy.counter);
+        if self.granted & right::LOWER_COUNTER != 0 {
+            counter = counter.min(self.argument);
+        }
+        epoch = epoch.max(word(key_block::EPOCH));
+        let head = Head(&self.head);
+        self.needs = judge(
+            head,
+            &Device {
+                vendor_id: policy.vendor_id,
+                product_code: policy.product_code,
+                revision: policy.revision,
+                unique_id: (policy.unique_id)(),
+                program: self.program,
+                is_data: policy.data == Some(self.program),
+                room: self.region.size,
+                counter,
+                epoch,
+                keys: &keys,
+            },
+        )?;
+        self.same = record.is_some_and(|record| {
+            record.seal.is_some()
+                && (record.size, record.crc, record.version) == (head.size(), head.crc(), head.version())
+        }) && installed == head.counter();
+        self.record = record.map_or([0; 4], |record| record.value());
+        let floor = if policy.counter_with_confirmation { counter } else { head.counter() };
+        self.counter = [floor, self.needs.epoch, head.counter(), 0];
+        let root = &keys[self.needs.root + 4..][..32];
+        let root = root.try_into().map_err(|_| Fault::Key)?;
+        match head.certificate() {
+            Some(certificate) => {
+                self.stage = Stage::Certificate;
+                let signature = certificate.signature();
+                start(&mut self.verification, root, &signature, &[certificate.signed()]);
+                Ok(())
+            }
+            None => self.check_manifest(Some(root)),
+        }
+    }
+
+    /// The key is good that has to have signed the manifest: this root, or that of the certificate.
+    fn check_manifest(&mut self, root: Option<&[u8; 32]>) -> Result<(), Fault> {
+        let head = Head(&self.head);
+        let certified = head.certificate().map(|certificate| certificate.key());
+        let key = certified.as_ref().or(root).ok_or(Fault::Key)?;
+        let signature = head.signature(key_id(key)).ok_or(Fault::Signature)?;
+        self.stage = Stage::Manifest;
+        start(&mut self.verification, key, &signature, &[DOMAIN, head.manifest()]);
+        Ok(())
+    }
+
+    /// The manifest is authentic.
+    fn open<F: Flash>(&mut self, flash: &F, parameters: &impl Parameters) -> Result<(), Fault> {
+        let head = Head(&self.head);
+        if let Some((at, recipient)) = &self.needs.recipient {
+            let recipient = array(head.0, *recipient);
+            let recipient = Recipient(&recipient);
+            let mut secret = [0; 32];
+            flash.read(self.key_block + *at as u32 + 4, &mut secret);
+            let stream = hmac(&secret, &[WRAP_DOMAIN, &head.nonce()]);
+            // It lies nowhere in RAM from here on.
+            secret = [0; 32];
+            core::hint::black_box(&secret);
+            if stream[32..40] != recipient.check() {
+                return Err(Fault::Key);
+            }
+            for ((key, wrapped), stream) in self.key.iter_mut().zip(recipient.wrapped()).zip(stream) {
+                *key = wrapped ^ stream;
+            }
+        }
+        // Once.
+        self.granted &= !right::LOWER_COUNTER;
+        self.dictionary = Region::new(0, 0);
+        if head.flags() & flag::DICTIONARY == 0 {
+            self.begin_chunks();
+            return Ok(());
+        }
+        // Of two programs the other one.
+        let other = 3_u8.wrapping_sub(self.program);
+        let place = self.layout.and_then(|layout| layout.program(other));
+        let record = ProgramRecord::load(parameters, flash, other);
+        let (Some(place), Some(record)) = (place, record) else { return Err(Fault::WrongProduct) };
+        self.dictionary = Region::new(place.base, record.size.min(place.size));
+        self.hash = Sha512::new_256();
+        self.done = 0;
+        self.stage = Stage::Dictionary;
+        Ok(())
+    }
+
+    /// All is known of the image but its chunks.
+    fn begin_chunks(&mut self) {
+        let head = Head(&self.head);
+        self.next = head.chain();
+        self.left = head.payload();
+        self.done = 0;
+        self.packed = CARRY;
+        self.lzma.reset();
+        self.next_chunk();
+    }
+
+    fn next_chunk(&mut self) {
+        let payload = self.left.min(1 << Head(&self.head).chunk());
+        self.left -= payload;
+        self.have = CARRY;
+        self.want = PAYLOAD + payload as usize;
+        self.hash = Sha512::new_256();
+        self.stage = if payload > 0 { Stage::Chunk } else { Stage::Image };
+        if payload == 0 {
+            self.done = 0;
+        }
+    }
+
+    /// A chunk is here.
+    fn check_chunk(&mut self) -> Result<(), Fault> {
+        if self.hash.finish()[..HASH] != self.next {
+            return Err(Fault::Signature);
+        }
+        self.next.copy_from_slice(&self.bytes[CARRY..PAYLOAD]);
+        if self.same {
+            self.next_chunk();
+            return Ok(());
+        }
+        self.stage = Stage::Payload;
+        self.clear = PAYLOAD;
+        // What the chunk before has left of compressed bytes stands in front of it.
+        let left = CARRY - self.packed;
+        self.bytes.copy_within(self.packed..CARRY, PAYLOAD - left);
+        self.packed = PAYLOAD - left;
+        Ok(())
+    }
+
+    /// The payload goes into the flash.
+    fn unpack<F: Flash>(&mut self, flash: &F) -> Result<(), Fault> {
+        let head = Head(&self.head);
+        let size = head.size();
+        if head.flags() & flag::ENCRYPTED != 0 && self.clear < self.want {
+            let before = head.payload() - self.left - (self.want - self.clear) as u32;
+            let end = self.want.min(self.clear + STEP);
+            let [nonce @ .., _, _, _, _] = head.nonce();
+            chacha20::apply(&self.key, &nonce, before / 64, &mut self.bytes[self.clear..end]);
+            self.clear = end;
+            return Ok(());
+        }
+        if head.flags() & flag::COMPRESSED == 0 && self.packed < self.want {
+            self.out = (self.packed, self.want - self.packed);
+            self.packed = self.want;
+            return Ok(());
+        }
+        let (input, out) = self.bytes.split_at_mut(UNPACKED);
+        let last = self.left == 0;
+        let done = self.done;
+        let room = (size - done).min(UNPACK as u32) as usize;
+        // The last symbol may lead to more bytes than are unpacked at a time, with no input left.
+        if (self.packed < self.want || last) && room > 0 {
+            let (base, dictionary) = (self.region.base, self.dictionary);
+            let before = |distance: u32| {
+                let mut byte = [0];
+                // Behind the dictionary the image begins. (Of one of odd length the first byte is left
+                // out, so that positions are odd where those of the image are.)
+                let from = if distance > done { dictionary.end() } else { base };
+                flash.read(from.wrapping_add(done).wrapping_sub(distance), &mut byte);
+                byte[0]
+            };
+            let input = &input[self.packed..self.want];
+            let (consumed, produced) = self
+                .lzma
+                .decode(input, last, done + (dictionary.size & !1), &before, &mut out[..room])
+                .map_err(|_| Fault::Format)?;
+            self.packed += consumed;
+            self.out = (UNPACKED, produced);
+            if produced > 0 {
+                return Ok(());
+            }
+        }
+        // No more comes out of this chunk.
+        let rest = self.want - self.packed;
+        if last && done < size || rest > CARRY {
+            return Err(Fault::Format);
+        }
+        self.bytes.copy_within(self.packed..self.want, CARRY - rest);
+        self.packed = CARRY - rest;
+        self.next_chunk();
+        Ok(())
+    }
+}
+
+/// What the counter of a program becomes before its record goes: that of a program which has proved
+/// itself. Also where it reads so already: after a power cut it may read so now and otherwise later.
+pub(crate) fn proved<F: Flash>(flash: &F, parameters: &impl Parameters, program: u8) -> Option<Value> {
+    let record = ProgramRecord::load(parameters, flash, program)?;
+    let [counter, epoch, installed, _] = parameters.get(flash, Key::Counter(program))?;
+    (record.confirmed && installed >= counter).then_some([installed, epoch, installed, 0])
+}
+
+/// A signature is about to be looked at.
+pub(super) fn start(
+    verification: &mut Verification,
+    key: &[u8; 32],
+    signature: &[u8; 64],
+    message: &[&[u8]],
+) {
+    let mut hash = Sha512::new();
+    hash.update(&signature[..32]);
+    hash.update(key);
+    for part in message {
+        hash.update(part);
+    }
+    *verification = Verification::new(key, signature, &hash.finish());
+}
+
+/// The id of a key: the first four bytes of its hash.
+fn key_id(key: &[u8; 32]) -> u32 {
+    let mut hash = Sha512::new();
+    hash.update(key);
+    seal::wire::word(&hash.finish(), 0)
+}
