@@ -95,7 +95,9 @@ struct Encryption {
 impl Convert {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         if self.encryption.key.is_some() || self.encryption.add.is_some() {
-            let advice = "leave --key and --add out: this bootloader takes programs that are not encrypted";
+            let advice =
+                "seal the program in place of it, which encrypts and signs: coflash key new --role kek \
+                          --of-value KEY makes a key of this value, coflash seal --encrypt kek.pem takes it";
             return Err(Failure::usage("encrypted block files cannot be made", advice));
         }
         let input = self.input.path();

@@ -7,7 +7,7 @@ use clap::{Args, ValueEnum};
 use coflash::file::block_file::{Checksum, LastBlock};
 use coflash::file::convert::{blocks_of, Converted, GapFill, Label, Options, Region, DEFAULT_BLOCK_SIZE};
 use coflash::file::read::{self, Firmware, Format};
-use coflash::file::{self, AddressRange};
+use coflash::file::{self, limit, AddressRange};
 use shared_abi::layout;
 
 use super::context::Context;
@@ -15,9 +15,9 @@ use super::objects::bytes_of;
 use super::output::Failure;
 use super::values::number;
 
-/// How to read a firmware file and cut it into blocks.
+/// Where a program lies, and how its file is read.
 #[derive(Clone, Debug, Args)]
-pub(super) struct Source {
+pub(super) struct Place {
     /// The board: takes the program's region from its memory map, and refuses data outside.
     #[arg(long, value_name = "BOARD", value_parser = board)]
     board: Option<&'static layout::Layout>,
@@ -39,6 +39,26 @@ pub(super) struct Source {
     #[arg(long, alias = "end_address", value_name = "ADDRESS", value_parser = number, conflicts_with_all = ["board", "layout"])]
     end_address: Option<u32>,
 
+    /// What is added to every address of the file (0xF8000000 takes 0x08000000 away).
+    #[arg(long, alias = "adjust_start", value_name = "OFFSET", value_parser = number, default_value = "0")]
+    adjust_start: u32,
+
+    /// Where a raw binary goes that nothing is said about: for devices that take an image as it is,
+    /// and have no addresses in it.
+    #[arg(skip)]
+    image_at: Option<u32>,
+
+    /// The file's format, if the first bytes do not tell it.
+    #[arg(short = 'I', long = "input-format", value_name = "FORMAT", ignore_case = true)]
+    format: Option<FormatName>,
+}
+
+/// How to read a firmware file and cut it into blocks.
+#[derive(Clone, Debug, Args)]
+pub(super) struct Source {
+    #[command(flatten)]
+    place: Place,
+
     /// Bytes of a block, its 16 bytes of framing included: at most the bootloader's buffer.
     #[arg(long, alias = "block_size", value_name = "BYTES", value_parser = number, default_value = "0x400")]
     block_size: u32,
@@ -52,10 +72,6 @@ pub(super) struct Source {
     #[arg(long, alias = "block_max_gap", value_name = "BYTES", value_parser = number)]
     block_max_gap: Option<u32>,
 
-    /// What is added to every address of the file (0xF8000000 takes 0x08000000 away).
-    #[arg(long, alias = "adjust_start", value_name = "OFFSET", value_parser = number, default_value = "0")]
-    adjust_start: u32,
-
     /// Check blocks and program with the 16-bit CRC (polynomial 1021h): for a bootloader that was
     /// built for it.
     #[arg(long)]
@@ -65,15 +81,6 @@ pub(super) struct Source {
     /// bootloader of 2008 (manual L-1112e_5).
     #[arg(long)]
     last_block_2008: bool,
-
-    /// Where a raw binary goes that nothing is said about: for devices that take an image as it is,
-    /// and have no addresses in it.
-    #[arg(skip)]
-    image_at: Option<u32>,
-
-    /// The file's format, if the first bytes do not tell it.
-    #[arg(short = 'I', long = "input-format", value_name = "FORMAT", ignore_case = true)]
-    format: Option<FormatName>,
 }
 
 const _: () = assert!(DEFAULT_BLOCK_SIZE == 0x400, "the help text says so");
@@ -107,7 +114,7 @@ impl From<FormatName> for Format {
     }
 }
 
-fn board(name: &str) -> Result<&'static layout::Layout, String> {
+pub(super) fn board(name: &str) -> Result<&'static layout::Layout, String> {
     layout::by_name(name).ok_or_else(|| {
         let known: Vec<&str> = layout::BOARDS.iter().map(|layout| layout.board).collect();
         format!("known boards: {}", known.join(", "))
@@ -124,14 +131,7 @@ impl Source {
 
     /// Reads `file`; tells its format, too.
     pub(super) fn load(&self, file: &Path, program: u8) -> Result<(Firmware, Format), Failure> {
-        // A raw file starts where the region does; conversion will adjust that like any other
-        // address.
-        let raw_address = match self.region(program)? {
-            Region::Unknown | Region::CutBehind(_) => self.image_at,
-            Region::Strict(range) => Some(range.first.wrapping_sub(self.adjust_start)),
-            Region::Cut(range) => Some(range.first),
-        };
-        Ok(read::load_telling(file, self.format.map(Format::from), raw_address)?)
+        self.place.load(file, program)
     }
 
     /// Makes the blocks of a file that was read.
@@ -142,12 +142,12 @@ impl Source {
         program: u8,
         label: Label,
     ) -> Result<Converted, Failure> {
-        let options = Options::default()
-            .region(self.region(program)?)
+        let options = self
+            .place
+            .options(program)?
             .block_size(self.block_size as usize)
             .gap_fill(GapFill::new(self.gap_fill))
             .label(label)
-            .adjust_start(self.adjust_start)
             .checksum(if self.crc16 { Checksum::Crc16 } else { Checksum::Crc32 })
             .max_gap(self.block_max_gap)
             .last_block(if self.last_block_2008 { LastBlock::Of2008 } else { LastBlock::Of2015 });
@@ -158,12 +158,14 @@ impl Source {
     pub(super) fn for_board(&self, name: &str) -> Result<Self, Failure> {
         let layout =
             board(name).map_err(|known| Failure::usage(format!("there is no board '{name}'"), known))?;
-        Ok(Self { board: Some(layout), layout: None, ..self.clone() })
+        let place = Place { board: Some(layout), layout: None, ..self.place.clone() };
+        Ok(Self { place, ..self.clone() })
     }
 
     /// The same for a device that takes images without addresses.
     pub(super) fn for_images(&self) -> Self {
-        Self { image_at: Some(0), ..self.clone() }
+        let place = Place { image_at: Some(0), ..self.place.clone() };
+        Self { place, ..self.clone() }
     }
 
     /// Whether another CRC was asked for than the one that a file has.
@@ -173,10 +175,27 @@ impl Source {
 
     /// Whether it was said where the program may lie.
     pub(super) fn has_region(&self) -> bool {
-        self.board.is_some()
-            || self.layout.is_some()
-            || self.start_address.is_some()
-            || self.end_address.is_some()
+        let Place { board, layout, start_address, end_address, .. } = &self.place;
+        board.is_some() || layout.is_some() || start_address.is_some() || end_address.is_some()
+    }
+}
+
+impl Place {
+    /// Reads `file` for program `number`; tells its format, too.
+    pub(super) fn load(&self, file: &Path, program: u8) -> Result<(Firmware, Format), Failure> {
+        // A raw file starts where the region does; conversion will adjust that like any other
+        // address.
+        let raw_address = match self.region(program)? {
+            Region::Unknown | Region::CutBehind(_) => self.image_at,
+            Region::Strict(range) => Some(range.first.wrapping_sub(self.adjust_start)),
+            Region::Cut(range) => Some(range.first),
+        };
+        Ok(read::load_telling(file, self.format.map(Format::from), raw_address)?)
+    }
+
+    /// How to convert for this place.
+    pub(super) fn options(&self, program: u8) -> Result<Options, Failure> {
+        Ok(Options::default().region(self.region(program)?).adjust_start(self.adjust_start))
     }
 
     /// The board, by its name or by its file.
@@ -185,9 +204,7 @@ impl Source {
         if let Some(layout) = self.loaded.get() {
             return Ok(Some(layout));
         }
-        let bytes = bytes_of(path, file::board::MAX as u64)?;
-        let text = String::from_utf8_lossy(&bytes);
-        let layout = file::board::parse(&text).map_err(|error| Failure::file(path, &error.to_string()))?;
+        let layout = board_of_file(path)?;
         Ok(Some(self.loaded.get_or_init(|| layout)))
     }
 
@@ -209,6 +226,27 @@ impl Source {
             }
         }
     }
+}
+
+/// The memory map in a file.
+pub(super) fn board_of_file(path: &Path) -> Result<&'static layout::Layout, Failure> {
+    let bytes = bytes_of(path, file::board::MAX as u64)?;
+    let text = String::from_utf8_lossy(&bytes);
+    file::board::parse(&text).map_err(|error| Failure::file(path, &error.to_string()))
+}
+
+/// The other program of a device, as in flash: a firmware file, or the bytes of the flash.
+pub(super) fn base(path: &Path) -> Result<Vec<u8>, Failure> {
+    let bytes = limit::read(path).map_err(|cause| Failure::file(path, &cause.to_string()))?;
+    if bytes.is_empty() {
+        return Err(Failure::file(path, "is empty"));
+    }
+    if Format::detect(&bytes).is_none() {
+        return Ok(bytes);
+    }
+    let firmware = read::read(&bytes, None, None).map_err(|error| error.of(path.display()))?;
+    let done = blocks_of(firmware, &Options::default()).map_err(|error| Failure::convert(error, path))?;
+    Ok(done.file.flash_image())
 }
 
 /// A firmware file as a positional argument.

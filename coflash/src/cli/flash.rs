@@ -13,11 +13,14 @@ use coflash::file::block_file::BlockFile;
 use coflash::file::convert::Label;
 use coflash::file::judge::judge;
 use coflash::file::limit::read_text;
+use coflash::file::sealed::show::flags;
+use coflash::file::sealed::{Refusal, Sealed, SealedFile};
 use coflash::update::dialect::is_data;
 use coflash::update::job::{self, Entry, Settings};
 use coflash::update::many::{flash_in_turn, flash_many, Job, ManyOptions};
-use coflash::update::{flash, Event, FlashOptions, Target};
+use coflash::update::{flash_program, Event, FlashOptions, Program, Target};
 use serde_json::json;
+use shared_abi::block_file::ProgramVersion;
 
 use super::context::Context;
 use super::convert::Labels;
@@ -29,10 +32,11 @@ use super::many::{diagnose_silence, document, summary, write_report, Board, Outc
 use super::output::Failure;
 use super::progress::Progress;
 use super::values::{nodes, number, program_number};
+use super::verify::{self, is_sealed};
 
 /// Puts a program into a device, or into many, and starts it.
 ///
-/// Takes a block file, or any other firmware file and converts it on the fly. The file is read and
+/// Takes a block file or a sealed image, or any other firmware file and converts it on the fly. The file is read and
 /// checked completely before a device is touched. An update that was interrupted can be started
 /// again at once.
 ///
@@ -45,7 +49,7 @@ use super::values::{nodes, number, program_number};
 /// (-F, --node_id, --prog_no, --chk_tgt, --chk_run, --sdo_timeout, --timeout and so on).
 #[derive(Debug, Args)]
 pub(super) struct Flash {
-    /// The firmware: Intel HEX, Motorola S-record, ELF, raw binary or block file.
+    /// The firmware: Intel HEX, Motorola S-record, ELF, raw binary, block file or sealed image.
     #[arg(value_name = "FILE", required_unless_present_any = ["legacy_file", "job", "vxd_type", "index"])]
     file: Option<PathBuf>,
 
@@ -141,7 +145,7 @@ struct Assignment {
     node: Option<NodeId>,
     address: Option<LssAddress>,
     image: PathBuf,
-    file: Arc<BlockFile>,
+    file: Program,
     options: FlashOptions,
 }
 
@@ -176,13 +180,15 @@ impl Flash {
     fn devices(&self, context: &Context) -> Result<Vec<Assignment>, Failure> {
         let unnamed = || Failure::usage("no file is named", "name the firmware: coflash flash FILE");
         let image = self.file.as_deref().or(self.legacy_file.as_deref()).ok_or_else(unnamed)?;
-        let done = self.source().blocks(image, self.program, self.labels.label()?)?;
-        warn_left_out(context, image, &done);
-        self.judge(image, &done.file, self.program)?;
-        let options = self.options(&done.file, &Settings::default())?;
-        let (size, crc) = (done.file.program_size(), done.file.program_crc());
-        context.out.say(format_args!("{}: program of {size} bytes, CRC {crc:08X}h", image.display()));
-        let file = Arc::new(done.file);
+        let file = self.program(context, image, self.program, &self.source(), self.labels.label()?)?;
+        let options = self.options(&file, &Settings::default())?;
+        match &file {
+            Program::Blocks(file) => {
+                let (size, crc) = (file.program_size(), file.program_crc());
+                context.out.say(format_args!("{}: program of {size} bytes, CRC {crc:08X}h", image.display()));
+            }
+            Program::Sealed(file) => context.out.say(format_args!("{}: {}", image.display(), brief(file))),
+        }
         let address = self.legacy.address();
         let mut nodes: Vec<NodeId> = Vec::new();
         for node in self.node.iter().flatten() {
@@ -207,7 +213,7 @@ impl Flash {
     /// The devices of a job file. Every image is read and checked before any device is touched.
     fn devices_of_job(&self, context: &Context, job: &Path) -> Result<Vec<Assignment>, Failure> {
         // Devices that get the same share it.
-        let mut known: Vec<(PathBuf, Option<String>, u8, Arc<BlockFile>)> = Vec::new();
+        let mut known: Vec<(PathBuf, Option<String>, u8, Program)> = Vec::new();
         let mut devices = Vec::new();
         let text = read_text(job).map_err(|error| Failure::unreadable(job, &error))?;
         let entries = job::parse(&text, job.parent().unwrap_or(Path::new("")));
@@ -225,10 +231,7 @@ impl Flash {
                         Some(board) => self.source().for_board(board)?,
                         None => self.source(),
                     };
-                    let done = source.blocks(&image, program, Label::default())?;
-                    warn_left_out(context, &image, &done);
-                    self.judge(&image, &done.file, program)?;
-                    let file = Arc::new(done.file);
+                    let file = self.program(context, &image, program, &source, Label::default())?;
                     known.push((image.clone(), settings.board.clone(), program, file.clone()));
                     file
                 }
@@ -237,6 +240,30 @@ impl Flash {
             devices.push(Assignment { node, address, image, file, options });
         }
         Ok(devices)
+    }
+
+    /// Reads what is to go into a device, and judges it.
+    fn program(
+        &self,
+        context: &Context,
+        path: &Path,
+        program: u8,
+        source: &Source,
+        label: Label,
+    ) -> Result<Program, Failure> {
+        if is_sealed(path) {
+            let file = SealedFile::parse(verify::read(path)?);
+            let file = file.map_err(|refusal| Failure::sealed(path, &refusal))?;
+            let image = file.head().program();
+            if image != program && !self.force {
+                return Err(Failure::sealed(path, &Refusal::Program { image, device: program }));
+            }
+            return Ok(Arc::new(file).into());
+        }
+        let done = source.blocks(path, program, label)?;
+        warn_left_out(context, path, &done);
+        self.judge(path, &done.file, program)?;
+        Ok(Arc::new(done.file).into())
     }
 
     /// Refuses what can be no program, before a device is asked anything. Whether another number than
@@ -250,11 +277,15 @@ impl Flash {
     }
 
     /// What the command line says, unless a device's own settings say otherwise.
-    fn options(&self, file: &BlockFile, settings: &Settings) -> Result<FlashOptions, Failure> {
+    fn options(&self, file: &Program, settings: &Settings) -> Result<FlashOptions, Failure> {
         let check = settings.check_target.unwrap_or(self.check_target || self.legacy.check_target());
         let advice = "convert it with --vid and --pid, or give them here";
         let unnamed = || Failure::usage("the file does not say for which device it is", advice);
-        let check_target = if check { Some(Target::of(file).ok_or_else(unnamed)?) } else { None };
+        let target = match file {
+            Program::Blocks(file) => Target::of(file),
+            Program::Sealed(file) => Some(Target::of_sealed(file)),
+        };
+        let check_target = if check { Some(target.ok_or_else(unnamed)?) } else { None };
         Ok(FlashOptions::default()
             .program(self.program)
             .repeats(self.block_repeats)
@@ -303,7 +334,7 @@ impl Flash {
         let mut session = self.patience.session(link, node)?;
         let mut progress = Progress::new(context.out, node);
         let mut left = None;
-        let result = flash(&mut session, &device.file, &device.options, &mut |event| match event {
+        let result = flash_program(&mut session, &device.file, &device.options, &mut |event| match event {
             Event::Done(done) => {
                 left = Some(done.left);
                 progress.show(Event::Done(done));
@@ -394,6 +425,24 @@ impl Flash {
         let outcomes: Vec<Outcome> = outcomes.into_iter().flatten().collect();
         summary(context.out, &outcomes, self.report.as_deref())
     }
+}
+
+/// What is to be known of a sealed image before it is sent.
+fn brief(file: &SealedFile) -> String {
+    let head = file.head();
+    let names: Vec<&str> = flags(head.flags()).collect();
+    let kind = if names.is_empty() { String::new() } else { format!(" ({})", names.join(", ")) };
+    let keys: Vec<String> = Sealed::parse(file.bytes())
+        .map(|sealed| sealed.signers().into_iter().map(|id| format!("{id:08X}h")).collect())
+        .unwrap_or_default();
+    format!(
+        "sealed program of {} bytes{kind}, CRC {:08X}h, version {}, counter {}, signed by {}",
+        head.size(),
+        head.crc(),
+        ProgramVersion(head.version()),
+        head.counter(),
+        keys.join(", ")
+    )
 }
 
 impl Assignment {

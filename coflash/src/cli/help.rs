@@ -105,7 +105,7 @@ const RARE: [&str; 37] = [
 const LEGACY: [&str; 4] = ["serial", "revision", "product", "vendor"];
 
 /// What people type, by command; the empty name is the program.
-const EXAMPLES: [(&str, &str); 25] = [
+const EXAMPLES: [(&str, &str); 32] = [
     (
         "",
         "\
@@ -140,6 +140,42 @@ Examples:
 Examples:
   coflash inspect app.blk
   coflash inspect app.elf --board stm32f407g-disc1",
+    ),
+    (
+        "key",
+        "\
+Examples:
+  coflash key new --role root
+  coflash key new --role release
+  coflash key certify --root root.pem --key release.pub --epoch 1 --vendor 0x3F
+  coflash key show release.cert",
+    ),
+    (
+        "seal",
+        "\
+Examples:
+  coflash seal app.elf --board stm32f407g-disc1 --key release.pem --cert release.cert --counter 1
+  coflash seal app.elf --key release.pem --cert release.cert --counter 1 --compress --encrypt kek.pem",
+    ),
+    (
+        "verify",
+        "\
+Examples:
+  coflash verify app.cbs --root root.pub
+  coflash verify app.cbs --root root.pub --kek kek.pem --product 1234 --counter 7",
+    ),
+    (
+        "show",
+        "\
+Examples:
+  coflash show app.cbs
+  coflash show app.cbs --json",
+    ),
+    (
+        "provision",
+        "\
+Examples:
+  coflash provision bootloader.elf --board stm32f407g-disc1 --root root.pub -o production.hex",
     ),
     (
         "scan",
@@ -265,6 +301,19 @@ Examples:
   coflash withdraw --node 5",
     ),
     (
+        "unlock",
+        "\
+Examples:
+  coflash unlock erase --root root.pem --node 5
+  coflash unlock lower-counter --counter 3 --root root.pem --node 5",
+    ),
+    (
+        "events",
+        "\
+Examples:
+  coflash events --node 5",
+    ),
+    (
         "debug",
         "\
 Examples:
@@ -302,15 +351,16 @@ pub(super) fn examples(name: &str) -> Option<&'static str> {
 pub(super) fn in_order(command: Command) -> Command {
     let root = examples("").unwrap_or_default();
     let command = command.after_help(root).after_long_help(format!("{root}\n\n{EXIT_CODES}"));
-    below(command.mut_args(placed))
+    below(command.mut_args(placed), &|name| examples(name))
 }
 
-fn below(command: Command) -> Command {
+/// The commands below this one; those below them have no examples of their own.
+fn below(command: Command, examples: &dyn Fn(&str) -> Option<&'static str>) -> Command {
     let names: Vec<String> = command.get_subcommands().map(|below| below.get_name().to_string()).collect();
     names.into_iter().fold(command, |command, name| {
         let text = examples(&name);
         command.mut_subcommand(name, |command| {
-            let command = below(command.mut_args(placed));
+            let command = below(command.mut_args(placed), &|_| None);
             match text {
                 Some(text) => command.after_help(text),
                 None => command,

@@ -9,10 +9,12 @@ use super::context::Context;
 use super::file::{Input, Source};
 use super::output::Failure;
 use super::values::program_number;
+use super::verify::{is_sealed, show};
 
 /// Shows what a firmware file holds, and checks all of it.
 ///
-/// That is every record, size and CRC, of a block file, too.
+/// That is every record, size and CRC, of a block file, too. Of a sealed image it is the form alone;
+/// verify checks it.
 ///
 /// With --board it also checks that the program lies where the board has room for it. No device is
 /// needed.
@@ -32,6 +34,9 @@ pub(super) struct Inspect {
 impl Inspect {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = self.input.path();
+        if is_sealed(path) {
+            return show(context, "inspect", path);
+        }
         let (firmware, format) = self.source.load(path, self.program)?;
         // What conversion would refuse is worth knowing now; an image without a board has no region
         // to leave.

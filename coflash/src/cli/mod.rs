@@ -11,6 +11,7 @@ use self::output::{Failure, Output, GLOBAL};
 use self::search::Kinds;
 use self::values::base_id;
 
+mod access;
 mod adapters;
 mod catch;
 mod config;
@@ -26,6 +27,7 @@ mod generate;
 mod help;
 mod info;
 mod inspect;
+mod keys;
 mod legacy;
 mod lss;
 mod many;
@@ -35,10 +37,12 @@ mod objects;
 mod output;
 mod program;
 mod progress;
+mod provision;
 mod read;
 mod record;
 mod reset;
 mod scan;
+mod seal;
 mod search;
 mod secrets;
 mod shell;
@@ -46,6 +50,7 @@ mod shell;
 mod ui;
 mod units;
 mod values;
+mod verify;
 mod waiting;
 mod words;
 mod write;
@@ -106,6 +111,11 @@ struct Cli {
 enum Command {
     Convert(convert::Convert),
     Inspect(inspect::Inspect),
+    Key(keys::Key),
+    Seal(Box<seal::Seal>),
+    Verify(Box<verify::Verify>),
+    Show(verify::Show),
+    Provision(provision::Provision),
     Flash(Box<flash::Flash>),
     Adapters(adapters::Adapters),
     Scan(scan::Scan),
@@ -117,6 +127,8 @@ enum Command {
     Erase(program::Erase),
     Release(program::Release),
     Withdraw(program::Withdraw),
+    Unlock(access::Unlock),
+    Events(access::Events),
     Reset(reset::Reset),
     Read(read::Read),
     Write(write::Write),
@@ -136,7 +148,16 @@ impl Command {
     fn takes_a_bus(&self) -> bool {
         !matches!(
             self,
-            Self::Convert(_) | Self::Inspect(_) | Self::Adapters(_) | Self::Completions(_) | Self::Man(_)
+            Self::Convert(_)
+                | Self::Inspect(_)
+                | Self::Key(_)
+                | Self::Seal(_)
+                | Self::Verify(_)
+                | Self::Show(_)
+                | Self::Provision(_)
+                | Self::Adapters(_)
+                | Self::Completions(_)
+                | Self::Man(_)
         )
     }
 
@@ -147,6 +168,11 @@ impl Command {
         match self {
             Self::Convert(convert) => convert.run(context),
             Self::Inspect(inspect) => inspect.run(context),
+            Self::Key(key) => key.run(context),
+            Self::Seal(seal) => seal.run(context),
+            Self::Verify(verify) => verify.run(context),
+            Self::Show(show) => show.run(context),
+            Self::Provision(provision) => provision.run(context),
             Self::Flash(flash) => flash.run(context),
             Self::Adapters(adapters) => adapters.run(context),
             Self::Scan(scan) => scan.run(context),
@@ -158,6 +184,8 @@ impl Command {
             Self::Erase(erase) => erase.run(context),
             Self::Release(release) => release.run(context),
             Self::Withdraw(withdraw) => withdraw.run(context),
+            Self::Unlock(unlock) => unlock.run(context),
+            Self::Events(events) => events.run(context),
             Self::Reset(reset) => reset.run(context),
             Self::Read(read) => read.run(context),
             Self::Write(write) => write.run(context),

@@ -4,14 +4,16 @@ use std::fmt;
 use std::io::{self, IsTerminal, Write as _};
 use std::path::Path;
 
+use canopen::program::FlashError;
 use canopen::NodeId;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::Args;
 use coflash::bus::AdapterError;
 use coflash::device::diagnose::{diagnose, Diagnosis};
-use coflash::device::error::LssFailure;
+use coflash::device::error::{flash_error_number, LssFailure};
 use coflash::device::{legacy, Session};
 use coflash::file::convert::ConvertError;
+use coflash::file::sealed::Refusal;
 use coflash::file::{judge, Cause, FileError};
 use coflash::update::job::Fault;
 use coflash::update::{Left, Look};
@@ -390,6 +392,18 @@ impl Failure {
     pub(super) fn no_program(path: &Path, fault: judge::Fault) -> Self {
         let (what, advice) = (format!("{}: {fault}", path.display()), fault.advice().to_string());
         Self::new(Exit::File, Some(judge::Fault::NUMBER), what, Some(advice))
+    }
+
+    /// A sealed image that breaks a rule.
+    pub(super) fn sealed(path: &Path, refusal: &Refusal) -> Self {
+        let number = match refusal {
+            Refusal::NotSealed => Some(judge::Fault::NUMBER),
+            refusal => FlashError::from_code(refusal.fault() as u8).map(flash_error_number),
+        };
+        let (what, advice) = (format!("{}: {refusal}", path.display()), refusal.advice().to_string());
+        // The manual's tools know no such files.
+        let legacy = Exit::File.legacy();
+        Self { legacy, ..Self::new(Exit::File, number, what, Some(advice)) }
     }
 
     /// A conversion of `file` that failed.

@@ -7,12 +7,12 @@ use coflash::bus::redact::is_password;
 use super::values::address;
 
 /// The options whose value is a secret.
-const SECRET: [&str; 2] = ["--unlock", "--key"];
+const SECRET: [&str; 3] = ["--unlock", "--key", "--of-value"];
 
 /// What stands in place of a password.
 const HIDDEN: &str = "***";
 
-/// The words, with each password hidden: the value of `--unlock` and `--key`, and what `write` puts
+/// The words, with each password hidden: the value of `--unlock`, `--key` and `--of-value`, and what `write` puts
 /// into an object of a password.
 pub(super) fn without(words: &[OsString]) -> Vec<String> {
     let mut hide = false;
@@ -42,6 +42,7 @@ mod tests {
             ("coflash flash a --unlock sesame -N 5", "coflash flash a --unlock *** -N 5"),
             ("coflash flash a --unlock=sesame", "coflash flash a --unlock=***"),
             ("coflash convert a --key 1234 --add 1", "coflash convert a --key *** --add 1"),
+            ("coflash key new --role kek --of-value 12", "coflash key new --role kek --of-value ***"),
             ("coflash write 6005/1 sesame --type string", "coflash write 6005/1 *** --type string"),
             ("coflash write 0x7F50/1 0x494E4954", "coflash write 0x7F50/1 ***"),
             ("coflash read 6005/1 100A", "coflash read 6005/1 100A"),

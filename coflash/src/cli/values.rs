@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use canopen::{Address, NodeId};
 use coflash::device::value::integer;
+use coflash::file::sealed::key::hexadecimal;
 
 /// A number of up to 32 bits in C notation: `4096`, `0x1000`, `010000` (octal), with an `u` or `l`
 /// behind it if need be.
@@ -80,6 +81,15 @@ pub(super) fn address(words: &str) -> Option<Address> {
     Some(Address::new(index, sub))
 }
 
+/// The unique ID of a chip, in hexadecimal digits.
+pub(super) fn unique_id(text: &str) -> Result<[u8; 12], String> {
+    let id = hexadecimal(text).and_then(|bytes| bytes.try_into().ok());
+    match id {
+        Some(id) if id != [0; 12] => Ok(id),
+        _ => Err("it must have 24 hexadecimal digits, and not be 0".to_string()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -127,6 +137,16 @@ mod tests {
             "0xUL",
         ] {
             assert!(number(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_unique_id_has_twelve_bytes() {
+        assert_eq!(unique_id("00112233445566778899aAbB").map(|id| id[11]), Ok(0xBB));
+        for text in
+            ["", "00", "000000000000000000000000", "00112233445566778899aabbc", "0x112233445566778899aabb"]
+        {
+            assert!(unique_id(text).is_err(), "{text}");
         }
     }
 

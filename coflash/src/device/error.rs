@@ -316,7 +316,8 @@ impl Error {
 }
 
 /// The manual's number for an error of 1F57h.
-const fn flash_error_number(error: FlashError) -> u32 {
+#[must_use]
+pub const fn flash_error_number(error: FlashError) -> u32 {
     match error {
         FlashError::NoValidProgram => 0x6000_0001,
         FlashError::Format => 0x6000_0002,
@@ -331,7 +332,10 @@ const fn flash_error_number(error: FlashError) -> u32 {
         | FlashError::WrongProductId
         | FlashError::NoAccess
         | FlashError::Busy
-        | FlashError::Sequence => 0x6000_0100 + error.code() as u32,
+        | FlashError::Sequence
+        | FlashError::Signature
+        | FlashError::Rollback
+        | FlashError::Key => 0x6000_0100 + error.code() as u32,
         // "An error that is unknown to the tool", or unspecified.
         _ => 0x6000_0008,
     }

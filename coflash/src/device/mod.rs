@@ -1,6 +1,7 @@
 //! One device on the bus, or whoever is there: conversations by SDO, what devices say about
 //! themselves, node-ID and bit rate by LSS, and what can go wrong.
 
+pub mod access;
 pub mod debugger;
 mod device_type;
 pub mod diagnose;

@@ -107,6 +107,9 @@ pub enum Cause {
     /// None of the known formats.
     #[error("is no firmware file (neither Intel HEX, S-record, ELF nor block file; for a raw binary give -I binary and --start-address)")]
     NotFirmware,
+    /// A sealed image where the program itself is needed.
+    #[error("is a sealed image, which is taken as it is: `coflash flash` sends it, `coflash show` and `coflash verify` tell what it is")]
+    Sealed,
     /// A raw file, and nobody said where it goes.
     #[error("a raw binary does not say where it belongs: give --start-address or --board")]
     NoAddress,
@@ -269,6 +272,7 @@ impl Cause {
             | Self::NoRegularFile(_)
             | Self::TooLarge { .. }
             | Self::NotFirmware
+            | Self::Sealed
             | Self::NoAddress
             | Self::WrongElf(_)
             | Self::WrongMachine(_)

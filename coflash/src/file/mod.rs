@@ -14,6 +14,7 @@ pub mod limit;
 mod range;
 pub mod raw;
 pub mod read;
+pub mod sealed;
 pub mod srec;
 mod text;
 

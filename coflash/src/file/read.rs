@@ -7,6 +7,7 @@ use std::path::Path;
 use super::block_file::BlockFile;
 use super::fault::{Cause, FileError, Place, ReadError};
 use super::image::Image;
+use super::sealed::Sealed;
 use super::{elf, ihex, limit, raw, srec};
 
 /// What a firmware file can be.
@@ -20,6 +21,8 @@ pub enum Format {
     Elf,
     /// Block file, ready for 1F50h.
     BlockFile,
+    /// Sealed image: goes to the device as it is, and only the device's keys open it.
+    Sealed,
     /// The bytes of the flash and nothing else; where they go must be told.
     Raw,
 }
@@ -32,6 +35,7 @@ impl Format {
         let text = bytes.trim_ascii_start();
         match bytes {
             [0x7F, b'E', b'L', b'F', ..] => Some(Self::Elf),
+            _ if Sealed::looks_like(bytes) => Some(Self::Sealed),
             _ if BlockFile::looks_like(bytes) => Some(Self::BlockFile),
             _ if text.starts_with(b":") => Some(Self::IntelHex),
             _ if text.first() == Some(&b'S') && text.get(1).is_some_and(u8::is_ascii_digit) => {
@@ -49,6 +53,7 @@ impl fmt::Display for Format {
             Self::SRecord => "Motorola S-record",
             Self::Elf => "ELF",
             Self::BlockFile => "block file",
+            Self::Sealed => "sealed image",
             Self::Raw => "raw binary",
         })
     }
@@ -111,6 +116,7 @@ fn read_telling(
         Format::Elf => elf::read(bytes).map(Firmware::Image),
         Format::Raw => raw::read(bytes, raw_address).map(Firmware::Image),
         Format::BlockFile => BlockFile::parse(bytes).map(Firmware::Blocks),
+        Format::Sealed => Err(Place::File.fault(Cause::Sealed)),
     };
     Ok((firmware?, format))
 }

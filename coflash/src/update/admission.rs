@@ -4,6 +4,7 @@
 use canopen::program::IDENTITY;
 use canopen::Address;
 
+use super::content::Content;
 use super::dialect::is_data;
 use super::options::{FlashOptions, Target};
 use crate::device::error::{optional, Error, Mismatch};
@@ -11,6 +12,7 @@ use crate::device::region::program_region;
 use crate::device::{Dialect, Session};
 use crate::file::image::Image;
 use crate::file::judge::{judge, judge_place, Fault};
+use crate::file::sealed::{Refusal, SealedFile};
 use crate::file::{AddressRange, BlockFile};
 
 /// Judges what is to go into a device that speaks this dialect. Tells whether there is nothing left
@@ -21,13 +23,17 @@ use crate::file::{AddressRange, BlockFile};
 /// [read](Session::read) has.
 pub(super) fn admit(
     session: &mut Session<'_>,
-    file: &BlockFile,
+    file: Content<'_>,
     dialect: Dialect,
     options: &FlashOptions,
 ) -> Result<bool, Error> {
     if options.force {
         return Ok(true);
     }
+    let file = match file {
+        Content::Blocks(file) => file,
+        Content::Sealed(file) => return admit_sealed(session, file, options.program),
+    };
     let image = file.image();
     if !is_data(dialect, options.program) {
         judge(&image, file.program_start()).map_err(no_program)?;
@@ -44,11 +50,45 @@ pub(super) fn admit(
 /// As [`admit`].
 pub(super) fn admit_to_bootloader(
     session: &mut Session<'_>,
-    file: &BlockFile,
+    file: Content<'_>,
     dialect: Dialect,
     options: &FlashOptions,
 ) -> Result<bool, Error> {
-    admit_place(session, file, &file.image(), dialect, options.program)
+    match file {
+        _ if options.force => Ok(true),
+        Content::Blocks(file) => admit_place(session, file, &file.image(), dialect, options.program),
+        Content::Sealed(file) => admit_room(session, file.head().size(), options.program),
+    }
+}
+
+/// Judges a sealed image: its program, its device, and its size.
+fn admit_sealed(session: &mut Session<'_>, file: &SealedFile, program: u8) -> Result<bool, Error> {
+    let head = file.head();
+    if head.program() != program {
+        return Err(refused(&Refusal::Program { image: head.program(), device: program }));
+    }
+    for (sub, image, what) in
+        [(1, head.vendor_id(), Mismatch::VendorId), (2, head.product_code(), Mismatch::ProductCode)]
+    {
+        // 0 is no device's here, but that of one whose identity is 0.
+        compare_identity(session, sub, image, what)?;
+    }
+    admit_room(session, head.size(), program)
+}
+
+/// Judges the size of a sealed image; tells whether the device has told its room.
+fn admit_room(session: &mut Session<'_>, size: u32, program: u8) -> Result<bool, Error> {
+    match program_region(session, program)? {
+        None => Ok(false),
+        Some(region) if size > region.size => {
+            Err(refused(&Refusal::Room { image: size, device: region.size }))
+        }
+        Some(_) => Ok(true),
+    }
+}
+
+fn refused(refusal: &Refusal) -> Error {
+    Error::NoProgram { why: format!("does not fit: {refusal}"), advice: refusal.advice() }
 }
 
 fn admit_place(
@@ -94,14 +134,18 @@ fn check_identity(session: &mut Session<'_>, target: Option<Target>) -> Result<(
         if file == 0 {
             continue;
         }
-        match optional(session.read_number(Address::new(IDENTITY, sub)))? {
-            Some(device) if device != file => {
-                return Err(Error::WrongTarget { node: session.node(), what, device, file });
-            }
-            _ => {}
-        }
+        compare_identity(session, sub, file, what)?;
     }
     Ok(())
+}
+
+fn compare_identity(session: &mut Session<'_>, sub: u8, file: u32, what: Mismatch) -> Result<(), Error> {
+    match optional(session.read_number(Address::new(IDENTITY, sub)))? {
+        Some(device) if device != file => {
+            Err(Error::WrongTarget { node: session.node(), what, device, file })
+        }
+        _ => Ok(()),
+    }
 }
 
 fn no_program(fault: Fault) -> Error {

@@ -7,6 +7,7 @@
 use std::cell::RefCell;
 
 use super::aftermath::look;
+use super::content::{Content, Program};
 use super::course::Course;
 use super::dialect::{self, Downloaded};
 use super::event::{Done, Event, Note, Phase, Report, Warning};
@@ -16,6 +17,7 @@ use super::reach::reach;
 use super::steps::compare_crc;
 use crate::device::session::Silence;
 use crate::device::{flying_master, Error, Session};
+use crate::file::sealed::SealedFile;
 use crate::file::BlockFile;
 
 /// Puts a program into a device: finds out what runs there, calls the bootloader, erases, sends the
@@ -31,6 +33,42 @@ use crate::file::BlockFile;
 pub fn flash(
     session: &mut Session<'_>,
     file: &BlockFile,
+    options: &FlashOptions,
+    tell: &mut dyn FnMut(Event),
+) -> Result<Report, Error> {
+    flash_content(session, Content::Blocks(file), options, tell)
+}
+
+/// [`flash`] with a sealed image, which is sent as it is, with one download. Whether the device takes
+/// it is the device's to say; what can be judged without its keys is judged before it is sent.
+///
+/// # Errors
+/// Those of [`flash`].
+pub fn flash_sealed(
+    session: &mut Session<'_>,
+    file: &SealedFile,
+    options: &FlashOptions,
+    tell: &mut dyn FnMut(Event),
+) -> Result<Report, Error> {
+    flash_content(session, Content::Sealed(file), options, tell)
+}
+
+/// [`flash`] or [`flash_sealed`].
+///
+/// # Errors
+/// Those of [`flash`].
+pub fn flash_program(
+    session: &mut Session<'_>,
+    program: &Program,
+    options: &FlashOptions,
+    tell: &mut dyn FnMut(Event),
+) -> Result<Report, Error> {
+    flash_content(session, program.content(), options, tell)
+}
+
+fn flash_content(
+    session: &mut Session<'_>,
+    file: Content<'_>,
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Report, Error> {
@@ -68,7 +106,7 @@ pub fn flash(
 /// [`flash`], but for what has to be done however it ends.
 fn procedure(
     session: &mut Session<'_>,
-    file: &BlockFile,
+    file: Content<'_>,
     options: &FlashOptions,
     course: &mut Course<'_>,
 ) -> Result<Report, Error> {

@@ -5,13 +5,13 @@ use std::sync::Arc;
 
 use canopen::NodeId;
 
+use super::content::Program;
 use super::event::{Event, Report};
-use super::flash::flash;
+use super::flash::flash_program;
 use super::left::{DeviceState, Left, Look};
 use super::options::FlashOptions;
 use crate::bus::{hub, Adapter, Gateway};
 use crate::device::{Error, Session, Timing, Transfers};
-use crate::file::BlockFile;
 
 /// What one device is to get.
 #[derive(Clone, Debug)]
@@ -20,7 +20,7 @@ pub struct Job {
     /// Which device.
     pub node: NodeId,
     /// The program.
-    pub file: Arc<BlockFile>,
+    pub file: Program,
     /// How.
     pub options: FlashOptions,
 }
@@ -28,8 +28,8 @@ pub struct Job {
 impl Job {
     /// This program for this device.
     #[must_use]
-    pub fn new(node: NodeId, file: Arc<BlockFile>, options: FlashOptions) -> Self {
-        Self { node, file, options }
+    pub fn new(node: NodeId, file: impl Into<Program>, options: FlashOptions) -> Self {
+        Self { node, file: file.into(), options }
     }
 }
 
@@ -126,7 +126,7 @@ fn update(
     session.cancel_by(all.cancelled.clone());
     session.transfer_by(all.transfers);
     let mut left = Left { state: DeviceState::Untouched, look: Look::NotAsked };
-    let result = flash(session, &job.file, one, &mut |event| {
+    let result = flash_program(session, &job.file, one, &mut |event| {
         left = event.left().unwrap_or(left);
         tell(event);
     });

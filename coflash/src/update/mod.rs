@@ -5,6 +5,7 @@ mod admission;
 mod aftermath;
 mod catch;
 pub mod config;
+mod content;
 mod course;
 pub mod dialect;
 pub mod event;
@@ -24,8 +25,9 @@ mod toml_line;
 mod trial;
 
 pub use self::catch::{catch, CatchOptions, Caught};
+pub use self::content::Program;
 pub use self::event::{Event, Report};
-pub use self::flash::flash;
+pub use self::flash::{flash, flash_program, flash_sealed};
 pub use self::left::{DeviceState, Left, Look, Seen};
 pub use self::many::{flash_in_turn, flash_many, ManyOptions};
 pub use self::options::{FlashOptions, Target};

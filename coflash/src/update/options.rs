@@ -8,6 +8,7 @@ use super::password::Password;
 use crate::device::Dialect;
 use crate::file::image::Image;
 use crate::file::label::label_of;
+use crate::file::sealed::SealedFile;
 use crate::file::BlockFile;
 
 /// What to do beyond the download itself.
@@ -81,6 +82,13 @@ impl Target {
     #[must_use]
     pub fn of(file: &BlockFile) -> Option<Self> {
         Self::of_control(file).or_else(|| Self::of_label(&file.image(), file.program_start()))
+    }
+
+    /// The device that a sealed image names.
+    #[must_use]
+    pub fn of_sealed(file: &SealedFile) -> Self {
+        let head = file.head();
+        Self { vendor_id: head.vendor_id(), product_code: head.product_code() }
     }
 
     /// The device that the label of a program names which starts at `start`.

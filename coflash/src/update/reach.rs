@@ -2,19 +2,19 @@
 
 use super::admission::{admit, admit_to_bootloader};
 use super::catch::knock;
+use super::content::Content;
 use super::course::Course;
 use super::dialect;
 use super::event::{Event, Note, Phase};
 use super::options::FlashOptions;
 use super::steps::{check_target, CALL_BACK};
 use crate::device::{recognise, Dialect, Error, Session};
-use crate::file::BlockFile;
 
 /// Steps 2 and 3: finds the device, and brings it into its bootloader; again and again until it
 /// works or the user gives up, if that is asked for. Gives what the bootloader speaks.
 pub(super) fn reach(
     session: &mut Session<'_>,
-    file: &BlockFile,
+    file: Content<'_>,
     options: &FlashOptions,
     course: &mut Course<'_>,
 ) -> Result<Dialect, Error> {
@@ -46,7 +46,7 @@ pub(super) fn reach(
 /// Steps 2 and 3, once.
 fn attempt(
     session: &mut Session<'_>,
-    file: &BlockFile,
+    file: Content<'_>,
     options: &FlashOptions,
     course: &mut Course<'_>,
 ) -> Result<Dialect, Error> {

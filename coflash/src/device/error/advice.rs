@@ -127,6 +127,18 @@ fn failure_advice(error: FlashError) -> &'static str {
         FlashError::Busy => {
             "wait a moment and run the command again; another tool may be at work on the device"
         }
+        FlashError::Signature => {
+            "check the file with coflash verify and the root's public key; seal the program again with a key \
+             that the device's root has certified"
+        }
+        FlashError::Rollback => {
+            "seal the program with a higher --counter, and sign with a key that is valid now: the device \
+             has seen a newer one"
+        }
+        FlashError::Key => {
+            "compare the key ids that coflash show tells with those that the device was provisioned with; \
+             programs that are signed for tests run on devices for tests alone"
+        }
         FlashError::Sequence => "run the command again; another tool may be at work on the device",
         _ => "run the command again, or switch the device off and on first",
     }

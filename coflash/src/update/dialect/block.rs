@@ -3,9 +3,11 @@
 use canopen::program::{self, FlashError};
 use canopen::Address;
 
+use super::cia302;
 use super::procedure::{enter_by_call, Downloaded, Procedure};
 use crate::device::{DeviceType, Dialect, Doing, Error, Session, Transfers};
 use crate::file::block_file::{Block as FileBlock, BlockFile};
+use crate::update::content::Content;
 use crate::update::course::Course;
 use crate::update::event::{Event, Phase, RepeatReason, Retry};
 use crate::update::judge::{judge, Judgement};
@@ -28,14 +30,21 @@ impl Procedure for Block {
     }
 
     /// Erases, sends the blocks, compares, tries the program and releases it for autostart. One that
-    /// is not to be started is neither tried nor released.
+    /// is not to be started is neither tried nor released. A sealed image goes with one download, and
+    /// needs no release: its signature is one.
     fn download(
         &self,
         session: &mut Session<'_>,
-        file: &BlockFile,
+        file: Content<'_>,
         options: &FlashOptions,
         course: &mut Course<'_>,
     ) -> Result<Downloaded, Error> {
+        let file = match file {
+            Content::Blocks(file) => file,
+            Content::Sealed(sealed) => {
+                return cia302::download(session, sealed.bytes(), file.program_crc(), options, course);
+            }
+        };
         let number = options.program;
         let before = steps::told_before(session, number)?;
         course.erases(before);

@@ -10,7 +10,8 @@ use super::restart::{arrived, reset_program};
 use super::whole::{self, idle, Said, Whole};
 use crate::device::error::{absent, optional};
 use crate::device::{DeviceType, Dialect, Doing, Error, Session};
-use crate::file::{ihex, BlockFile};
+use crate::file::ihex;
+use crate::update::content::Content;
 use crate::update::course::Course;
 use crate::update::event::Note;
 use crate::update::options::FlashOptions;
@@ -40,11 +41,11 @@ impl Procedure for EsAcademy {
     fn download(
         &self,
         session: &mut Session<'_>,
-        file: &BlockFile,
+        file: Content<'_>,
         options: &FlashOptions,
         course: &mut Course<'_>,
     ) -> Result<Downloaded, Error> {
-        let content = ihex::emit(&file.image()).into_bytes();
+        let content = file.stream(|blocks| ihex::emit(&blocks.image()).into_bytes());
         let prepare = |session: &mut Session<'_>, course: &mut Course<'_>| unlock(session, options, course);
         let crc = file.program_crc();
         let whole = Whole { content: &content, crc, prepare: &prepare, status };

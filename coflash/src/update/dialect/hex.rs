@@ -4,7 +4,7 @@ use super::cia302;
 use super::procedure::{Downloaded, Procedure};
 use crate::device::{DeviceType, Dialect, Error, Session};
 use crate::file::ihex;
-use crate::file::BlockFile;
+use crate::update::content::Content;
 use crate::update::course::Course;
 use crate::update::options::FlashOptions;
 
@@ -25,11 +25,11 @@ impl Procedure for Hex {
     fn download(
         &self,
         session: &mut Session<'_>,
-        file: &BlockFile,
+        file: Content<'_>,
         options: &FlashOptions,
         course: &mut Course<'_>,
     ) -> Result<Downloaded, Error> {
-        let content = ihex::emit(&file.image()).into_bytes();
+        let content = file.stream(|blocks| ihex::emit(&blocks.image()).into_bytes());
         cia302::download(session, &content, file.program_crc(), options, course)
     }
 }

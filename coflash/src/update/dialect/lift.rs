@@ -14,6 +14,7 @@ use crate::device::info::nameplate;
 use crate::device::recognise::UNLOCK;
 use crate::device::{recognise, DeviceType, Dialect, Doing, Error, Session, Timing};
 use crate::file::BlockFile;
+use crate::update::content::Content;
 use crate::update::course::Course;
 use crate::update::event::{Event, Note, Phase, Warning};
 use crate::update::left::DeviceState;
@@ -66,11 +67,11 @@ impl Procedure for Lift {
     fn download(
         &self,
         session: &mut Session<'_>,
-        file: &BlockFile,
+        file: Content<'_>,
         options: &FlashOptions,
         course: &mut Course<'_>,
     ) -> Result<Downloaded, Error> {
-        let (content, crc) = (file.flash_image(), file.program_crc());
+        let (content, crc) = (file.stream(BlockFile::flash_image), file.program_crc());
         // Unlocked already; what is there is overwritten.
         let prepare = |_: &mut Session<'_>, _: &mut Course<'_>| Ok(());
         let whole = Whole { content: &content, crc, prepare: &prepare, status: whole::status };

@@ -5,7 +5,7 @@ use std::time::Duration;
 use canopen::NodeId;
 
 use crate::device::{DeviceType, Dialect, Error, Session};
-use crate::file::BlockFile;
+use crate::update::content::Content;
 use crate::update::course::Course;
 use crate::update::event::{Note, Phase};
 use crate::update::left::DeviceState;
@@ -34,7 +34,7 @@ pub(in crate::update) trait Procedure {
     fn download(
         &self,
         session: &mut Session<'_>,
-        file: &BlockFile,
+        file: Content<'_>,
         options: &FlashOptions,
         course: &mut Course<'_>,
     ) -> Result<Downloaded, Error>;

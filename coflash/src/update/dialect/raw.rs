@@ -4,6 +4,7 @@ use super::cia302;
 use super::procedure::{Downloaded, Procedure};
 use crate::device::{DeviceType, Dialect, Error, Session};
 use crate::file::BlockFile;
+use crate::update::content::Content;
 use crate::update::course::Course;
 use crate::update::options::FlashOptions;
 
@@ -24,11 +25,11 @@ impl Procedure for Raw {
     fn download(
         &self,
         session: &mut Session<'_>,
-        file: &BlockFile,
+        file: Content<'_>,
         options: &FlashOptions,
         course: &mut Course<'_>,
     ) -> Result<Downloaded, Error> {
-        let content = file.flash_image();
+        let content = file.stream(BlockFile::flash_image);
         cia302::download(session, &content, file.program_crc(), options, course)
     }
 }

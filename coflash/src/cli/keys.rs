@@ -1,0 +1,339 @@
+//! `coflash key`: keys of sealed images, and certificates of those that sign.
+
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+
+use clap::{Args, Subcommand, ValueEnum};
+use coflash::file::sealed::key::hexadecimal;
+use coflash::file::sealed::show::{digits, role_name, CertificateWords};
+use coflash::file::sealed::{Certificate, Kek, KeyFault, PublicKey, Role, SigningKey};
+use seal::wire::{self, CERTIFICATE, CERTIFICATE_MAGIC};
+use serde_json::json;
+
+use super::context::Context;
+use super::objects::bytes_of;
+use super::output::Failure;
+use super::values::number;
+
+/// The most bytes that a file with a key may have.
+const MAX: u64 = 16 * 1024;
+
+/// Makes keys for sealed images, certifies them, and shows them.
+///
+/// A root key certifies the keys that sign programs; devices know the root's public key. A
+/// key-encryption key (kek) opens encrypted programs; devices have it, so it is as secret as the
+/// private keys.
+#[derive(Debug, Args)]
+pub(super) struct Key {
+    #[command(subcommand)]
+    job: Job,
+}
+
+#[derive(Debug, Subcommand)]
+enum Job {
+    /// Make a key. The private part is readable for its owner alone.
+    New(New),
+    /// Certify a key that signs programs, with a root.
+    Certify(Certify),
+    /// Show a key or a certificate. Secrets are not shown.
+    Show(Show),
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum KeyRole {
+    /// Certifies the keys that sign. Keep it offline.
+    Root,
+    /// Signs programs.
+    Release,
+    /// Opens encrypted programs.
+    Kek,
+}
+
+#[derive(Debug, Args)]
+struct New {
+    /// What the key is for. Root and release are Ed25519 keys in PKCS#8 PEM, as OpenSSL makes them.
+    #[arg(long, value_name = "ROLE")]
+    role: KeyRole,
+
+    /// The file for the private key; otherwise the role's name with .pem. The public key goes beside
+    /// it, with .pub.
+    #[arg(long, short, value_name = "FILE")]
+    output: Option<PathBuf>,
+
+    /// Make the key-encryption key of this value of 128 bits, in 32 hexadecimal digits, as the
+    /// manual's tools take one for encryption.
+    #[arg(long, value_name = "HEX128", value_parser = value_of_128_bits)]
+    of_value: Option<[u8; 16]>,
+
+    /// Replace files that are there already. What was sealed or certified with the old key stays with
+    /// it.
+    #[arg(long = "force")]
+    overwrite: bool,
+}
+
+#[derive(Debug, Args)]
+struct Certify {
+    /// The root's private key.
+    #[arg(long, value_name = "FILE")]
+    root: PathBuf,
+
+    /// The public key to certify.
+    #[arg(long, value_name = "FILE")]
+    key: PathBuf,
+
+    /// The epoch: devices that have taken a program of a higher one refuse this key.
+    #[arg(long, value_name = "NUMBER", value_parser = number)]
+    epoch: u32,
+
+    /// Vendor-ID of the devices (1018h/1).
+    #[arg(long, alias = "vid", value_name = "NUMBER", value_parser = number)]
+    vendor: u32,
+
+    /// Their product code (1018h/2); otherwise all products of the vendor.
+    #[arg(long, alias = "pid", value_name = "NUMBER", value_parser = number, default_value = "0")]
+    product: u32,
+
+    /// The lowest security counter that the key may sign.
+    #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0")]
+    lowest: u32,
+
+    /// The highest one.
+    #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0xFFFFFFFF")]
+    highest: u32,
+
+    /// The key signs programs for devices that are marked for tests, and for no others.
+    #[arg(long)]
+    test: bool,
+
+    /// The file for the certificate; otherwise the key's name with .cert.
+    #[arg(long, short, value_name = "FILE")]
+    output: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+struct Show {
+    /// A private key, a public key, a key-encryption key or a certificate.
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+}
+
+/// 16 bytes in hexadecimal digits. The words of a fault do not repeat the value, which is secret.
+fn value_of_128_bits(text: &str) -> Result<[u8; 16], String> {
+    let digits = text.strip_prefix("0x").unwrap_or(text);
+    let bytes = hexadecimal(digits).and_then(|bytes| bytes.try_into().ok());
+    bytes.ok_or_else(|| "it must have 32 hexadecimal digits".to_string())
+}
+
+impl Key {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        match &self.job {
+            Job::New(new) => new.run(context),
+            Job::Certify(certify) => certify.run(context),
+            Job::Show(show) => show.run(context),
+        }
+    }
+}
+
+impl New {
+    fn run(&self, context: &Context) -> Result<(), Failure> {
+        let (name, is_kek) = match self.role {
+            KeyRole::Root => ("root", false),
+            KeyRole::Release => ("release", false),
+            KeyRole::Kek => ("kek", true),
+        };
+        if self.of_value.is_some() && !is_kek {
+            let advice = "leave --of-value out, or make a key-encryption key: --role kek";
+            return Err(Failure::usage("a value makes a key-encryption key alone", advice));
+        }
+        let output = self.output.clone().unwrap_or_else(|| PathBuf::from(format!("{name}.pem")));
+        let fault = |fault: KeyFault| Failure::system(fault.to_string());
+        let (id, public) = if is_kek {
+            let kek = self.of_value.map_or_else(Kek::generate, Kek::of_value).map_err(fault)?;
+            write_secret(&output, kek.to_pem(), self.overwrite)?;
+            (kek.id(), None)
+        } else {
+            let public = output.with_extension("pub");
+            if public == output {
+                let what = format!("{} is the name of the public key's file", output.display());
+                return Err(Failure::usage(what, "name the private key's file with .pem"));
+            }
+            if !self.overwrite && public.exists() {
+                return Err(exists(&public));
+            }
+            let key = SigningKey::generate().map_err(fault)?;
+            write_secret(&output, key.to_pem(), self.overwrite)?;
+            write(&public, key.public().to_pem().as_bytes())?;
+            (key.public().id(), Some(public))
+        };
+        let beside = public
+            .as_ref()
+            .map_or_else(String::new, |public| format!(", its public key in {}", public.display()));
+        let kind = if is_kek { "key-encryption" } else { name };
+        let words = format!("{}: {kind} key {id:08X}h{beside}; keep it secret", output.display());
+        context.out.result(words, || {
+            json!({
+                "command": "key new",
+                "role": name,
+                "id": id,
+                "output": output.display().to_string(),
+                "public": public.as_ref().map(|public| public.display().to_string()),
+            })
+        });
+        Ok(())
+    }
+}
+
+impl Certify {
+    fn run(&self, context: &Context) -> Result<(), Failure> {
+        if self.lowest > self.highest {
+            let advice = "give --highest a number that is not below --lowest";
+            return Err(Failure::usage("the certificate would allow no security counter", advice));
+        }
+        let root = signing_key(&self.root)?;
+        let certificate = Certificate {
+            role: if self.test { Role::Test } else { Role::Release },
+            epoch: self.epoch,
+            vendor_id: self.vendor,
+            product_code: self.product,
+            lowest: self.lowest,
+            highest: self.highest,
+            key: public_key(&self.key)?,
+        };
+        let bytes = certificate.signed_by(&root);
+        let output = self.output.clone().unwrap_or_else(|| self.key.with_extension("cert"));
+        write(&output, &bytes)?;
+        let words = format!("{}: {}", output.display(), CertificateWords(wire::Certificate(&bytes)));
+        context.out.result(words, || {
+            let mut value = certificate_value(wire::Certificate(&bytes));
+            value["command"] = "key certify".into();
+            value["output"] = output.display().to_string().into();
+            value
+        });
+        Ok(())
+    }
+}
+
+impl Show {
+    fn run(&self, context: &Context) -> Result<(), Failure> {
+        let path = &self.file;
+        let bytes = bytes_of(path, MAX)?;
+        if bytes.starts_with(&CERTIFICATE_MAGIC) {
+            let bytes = certificate(path)?;
+            let words = CertificateWords(wire::Certificate(&bytes));
+            let words = format!("{}: certificate: {words} (its signature is not checked)", path.display());
+            context.out.result(words, || {
+                let mut value = certificate_value(wire::Certificate(&bytes));
+                value["command"] = "key show".into();
+                value["kind"] = "certificate".into();
+                value
+            });
+            return Ok(());
+        }
+        let text = String::from_utf8_lossy(&bytes);
+        let (kind, id, public) = if let Ok(key) = SigningKey::from_pem(&text) {
+            ("private key", key.public().id(), Some(key.public()))
+        } else if let Ok(key) = PublicKey::from_pem(&text) {
+            ("public key", key.id(), Some(key))
+        } else if let Ok(kek) = Kek::from_pem(&text) {
+            ("key-encryption key", kek.id(), None)
+        } else {
+            let why =
+                "is no key and no certificate; one with a password must be decrypted first (openssl pkey)";
+            return Err(Failure::file(path, why));
+        };
+        let public = public.map(|key| digits(&key.bytes()));
+        let behind = public.as_ref().map_or_else(String::new, |public| format!(", public key {public}"));
+        context.out.result(
+            format!("{}: {kind} {id:08X}h{behind}", path.display()),
+            || json!({ "command": "key show", "kind": kind, "id": id, "public_key": public }),
+        );
+        Ok(())
+    }
+}
+
+/// A certificate for programs.
+pub(super) fn certificate_value(certificate: wire::Certificate<'_>) -> serde_json::Value {
+    json!({
+        "role": role_name(certificate.role()),
+        "epoch": certificate.epoch(),
+        "vendor_id": certificate.vendor_id(),
+        "product_code": certificate.product_code(),
+        "lowest": certificate.lowest(),
+        "highest": certificate.highest(),
+        "key": digits(&certificate.key()),
+        "key_id": PublicKey::new(certificate.key()).ok().map(|key| key.id()),
+        "root_id": certificate.root_id(),
+    })
+}
+
+fn text(path: &Path) -> Result<String, Failure> {
+    Ok(String::from_utf8_lossy(&bytes_of(path, MAX)?).into_owned())
+}
+
+/// The private key in a file.
+pub(super) fn signing_key(path: &Path) -> Result<SigningKey, Failure> {
+    SigningKey::from_pem(&text(path)?).map_err(|fault| Failure::file(path, &fault.to_string()))
+}
+
+/// The public key in a file; that of a private key does, too.
+pub(super) fn public_key(path: &Path) -> Result<PublicKey, Failure> {
+    let text = text(path)?;
+    match SigningKey::from_pem(&text) {
+        Ok(key) => Ok(key.public()),
+        Err(_) => PublicKey::from_pem(&text).map_err(|fault| Failure::file(path, &fault.to_string())),
+    }
+}
+
+/// The public keys in files.
+pub(super) fn public_keys(paths: &[PathBuf]) -> Result<Vec<PublicKey>, Failure> {
+    paths.iter().map(|path| public_key(path)).collect()
+}
+
+/// The key-encryption keys in files.
+pub(super) fn keks(paths: &[PathBuf]) -> Result<Vec<Kek>, Failure> {
+    let kek =
+        |path: &PathBuf| Kek::from_pem(&text(path)?).map_err(|fault| Failure::file(path, &fault.to_string()));
+    paths.iter().map(kek).collect()
+}
+
+/// The certificate in a file. What it says is judged where it is used.
+pub(super) fn certificate(path: &Path) -> Result<[u8; CERTIFICATE], Failure> {
+    let bytes = bytes_of(path, MAX)?;
+    let bytes = Some(bytes).filter(|bytes| bytes.starts_with(&CERTIFICATE_MAGIC));
+    let why = "is no certificate: coflash key certify makes one";
+    bytes.and_then(|bytes| bytes.try_into().ok()).ok_or_else(|| Failure::file(path, why))
+}
+
+/// Writes what everybody may read.
+pub(super) fn write(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
+    std::fs::write(path, bytes).map_err(|error| unwritable(path, &error))
+}
+
+/// Writes what its owner alone may read. A file that is there is replaced only if that is wanted.
+pub(super) fn write_secret(path: &Path, text: impl AsRef<[u8]>, overwrite: bool) -> Result<(), Failure> {
+    if overwrite {
+        // A new file has the right mode; one that is there would keep its own.
+        match std::fs::remove_file(path) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(unwritable(path, &error)),
+            _ => {}
+        }
+    }
+    let mut options = std::fs::OpenOptions::new();
+    options.write(true).create_new(true);
+    #[cfg(unix)]
+    std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
+    let written = options.open(path).and_then(|mut file| file.write_all(text.as_ref()));
+    written.map_err(|error| match error.kind() {
+        io::ErrorKind::AlreadyExists => exists(path),
+        _ => unwritable(path, &error),
+    })
+}
+
+fn exists(path: &Path) -> Failure {
+    let what = format!("{} is there already", path.display());
+    Failure::usage(what, "name another file; --force replaces it, and the old key is gone then")
+}
+
+fn unwritable(path: &Path, error: &io::Error) -> Failure {
+    Failure::system(format!("{}: cannot be written: {error}", path.display()))
+}

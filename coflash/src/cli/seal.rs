@@ -1,0 +1,265 @@
+//! `coflash seal`: a program into a sealed image.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use coflash::file::block_file::BlockFile;
+use coflash::file::convert::blocks_of;
+use coflash::file::judge::judge;
+use coflash::file::label::label_of;
+use coflash::file::limit;
+use coflash::file::sealed::sealer::CHUNK;
+use coflash::file::sealed::{hash, Sealed, Sealer, Unsigned};
+use seal::wire::{MAX_CHUNK, MIN_CHUNK};
+use shared_abi::block_file::ProgramVersion;
+
+use super::context::Context;
+use super::file::{base, Input, Place};
+use super::keys::{self, write};
+use super::objects::bytes_of;
+use super::output::Failure;
+use super::values::{number, program_number, unique_id};
+use super::verify::value;
+
+/// Seals a program: signed, and encrypted or compressed if wanted, ready for devices with keys.
+///
+/// The same input gives the same output, byte for byte.
+///
+/// For a key in a hardware security module in two steps: with --tbs and the public key, and, when the
+/// module has signed what is in that file, with --attach.
+#[derive(Debug, Args)]
+pub(super) struct Seal {
+    #[command(flatten)]
+    input: Input,
+
+    /// The sealed image to write; otherwise the firmware's name with .cbs.
+    #[arg(long, short, value_name = "OUT")]
+    output: Option<PathBuf>,
+
+    /// The private key that signs; with --tbs and --attach the public key does.
+    #[arg(long, value_name = "FILE")]
+    key: PathBuf,
+
+    /// The key's certificate. Without one the key must be a root of the devices.
+    #[arg(long, value_name = "FILE")]
+    cert: Option<PathBuf>,
+
+    /// The security counter: devices refuse programs with a lower one than they have seen.
+    #[arg(long, value_name = "NUMBER", value_parser = number, required_unless_present = "attach")]
+    counter: Option<u32>,
+
+    /// Vendor-ID of the devices (1018h/1); otherwise that of the label in the image.
+    #[arg(long, alias = "vid", value_name = "NUMBER", value_parser = number)]
+    vendor: Option<u32>,
+
+    /// Their product code (1018h/2); otherwise that of the label in the image.
+    #[arg(long, alias = "pid", value_name = "NUMBER", value_parser = number)]
+    product: Option<u32>,
+
+    /// The program's version: major in bits 0-7, minor in bits 8-15, release in bits 16-31; otherwise
+    /// that of the label in the image.
+    #[arg(long, value_name = "NUMBER", value_parser = number)]
+    ver: Option<u32>,
+
+    /// The date to tell, in seconds since 1970; otherwise SOURCE_DATE_EPOCH, otherwise none.
+    #[arg(long, value_name = "SECONDS", env = "SOURCE_DATE_EPOCH")]
+    date: Option<u64>,
+
+    /// The program number on the board.
+    #[arg(long, short = 'P', alias = "prog_no", value_name = "1..254", value_parser = program_number, default_value = "1")]
+    program: u8,
+
+    #[command(flatten)]
+    place: Place,
+
+    /// Encrypt for the devices with this key-encryption key; once for each key.
+    #[arg(long, value_name = "FILE")]
+    encrypt: Vec<PathBuf>,
+
+    /// Compress the program.
+    #[arg(long)]
+    compress: bool,
+
+    /// Compress against this firmware, which is the other program of the device.
+    #[arg(long, value_name = "FILE")]
+    base: Option<PathBuf>,
+
+    /// For the device with this unique ID alone: 24 hexadecimal digits, as it reads.
+    #[arg(long, value_name = "UID", value_parser = unique_id)]
+    device: Option<[u8; 12]>,
+
+    /// For devices of this hardware revision alone (low 5 bits of 1018h/3); once for each.
+    #[arg(long, value_name = "REVISION", value_parser = number)]
+    hardware: Vec<u32>,
+
+    /// Payload of a chunk: a power of two from 512 to 8192. A device has to have room for one.
+    #[arg(long, value_name = "BYTES", value_parser = chunk, default_value = "4096")]
+    chunk: u8,
+
+    /// A text for people.
+    #[arg(long, value_name = "TEXT")]
+    text: Option<String>,
+
+    /// The software bill of materials, whose hash the image tells.
+    #[arg(long, value_name = "FILE")]
+    sbom: Option<PathBuf>,
+
+    /// The file is data of the application, and no program.
+    #[arg(long)]
+    data: bool,
+
+    /// The application writes to flash itself: the device does not lock it.
+    #[arg(long)]
+    writes_flash: bool,
+
+    /// For devices that are marked for tests, and for no others.
+    #[arg(long)]
+    test: bool,
+
+    /// Write to this file what the key has to sign (pure Ed25519), and leave the signature out.
+    #[arg(long, value_name = "FILE", conflicts_with = "attach")]
+    tbs: Option<PathBuf>,
+
+    /// Complete a sealed image that was made with --tbs: the file with the signature, of 64 bytes.
+    #[arg(long, value_name = "FILE")]
+    attach: Option<PathBuf>,
+
+    /// Seal the file although it can be no program of an STM32F4.
+    #[arg(long)]
+    force: bool,
+}
+
+const _: () = assert!(CHUNK == 12, "the help text says so");
+
+/// A power of two, as its logarithm.
+fn chunk(text: &str) -> Result<u8, String> {
+    let bytes = number(text)?;
+    match (MIN_CHUNK..=MAX_CHUNK).find(|chunk| 1_u32 << chunk == bytes) {
+        Some(chunk) => Ok(chunk),
+        None => Err(format!("it must be a power of two from {} to {}", 1 << MIN_CHUNK, 1 << MAX_CHUNK)),
+    }
+}
+
+/// A program as it lies in flash.
+struct Flash {
+    bytes: Vec<u8>,
+    blocks: BlockFile,
+}
+
+impl Seal {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        let path = self.input.path();
+        if let Some(signature) = &self.attach {
+            return self.complete(context, path, signature);
+        }
+        let output = self.output.clone().unwrap_or_else(|| path.with_extension("cbs"));
+        if output == path || self.tbs.as_ref() == Some(&output) {
+            let what = format!("{} would be overwritten", output.display());
+            return Err(Failure::usage(what, "name another file for the result: --output"));
+        }
+        let flash = self.flash(context, path)?;
+        let label = label_of(&flash.blocks.image(), flash.blocks.program_start());
+        let unnamed = |what: &str, option: &str| {
+            let what = format!("{}: the program does not say for which {what} it is", path.display());
+            Failure::usage(what, format!("give {option}"))
+        };
+        let vendor_id = self.vendor.or(label.map(|label| label.vendor_id));
+        let product_code = self.product.or(label.map(|label| label.product_code));
+        let encrypt_for = keys::keks(&self.encrypt)?;
+        let base = self.base.as_deref().map(base).transpose()?;
+        let sbom = self.sbom.as_deref().map(limit::read).transpose();
+        let sbom =
+            sbom.map_err(|cause| Failure::file(self.sbom.as_deref().unwrap_or(path), &cause.to_string()))?;
+        let sealer = Sealer {
+            certificate: self.cert.as_deref().map(keys::certificate).transpose()?,
+            vendor_id: vendor_id.ok_or_else(|| unnamed("vendor-ID", "--vendor"))?,
+            product_code: product_code.ok_or_else(|| unnamed("product code", "--product"))?,
+            version: self.ver.or(label.map(|label| label.version)).unwrap_or(0),
+            // clap wants it wherever it comes to this.
+            counter: self.counter.unwrap_or(0),
+            program: self.program,
+            chunk: self.chunk,
+            encrypt_for: &encrypt_for,
+            compress: self.compress,
+            base: base.as_deref(),
+            unique_id: self.device.unwrap_or_default(),
+            hardware: self.hardware.iter().fold(0, |mask, revision| mask | 1 << (revision & 31)),
+            created: self.date.unwrap_or(0),
+            data: self.data,
+            writes_flash: self.writes_flash,
+            test: self.test,
+            text: self.text.as_deref(),
+            sbom: sbom.as_deref().map(hash),
+            source: None,
+        };
+        let failed = |fault: coflash::file::sealed::SealFault| Failure::file(path, &fault.to_string());
+        let file = match &self.tbs {
+            None => sealer.seal(&flash.bytes, &keys::signing_key(&self.key)?).map_err(failed)?,
+            Some(tbs) => {
+                let key = keys::public_key(&self.key)?;
+                let unsigned = sealer.for_module(&flash.bytes, key).map_err(failed)?;
+                write(tbs, &unsigned.tbs())?;
+                unsigned.file().to_vec()
+            }
+        };
+        write(&output, &file)?;
+        self.tell(context, &output, &file)
+    }
+
+    /// The second of two steps.
+    fn complete(&self, context: &Context, path: &Path, signature: &Path) -> Result<(), Failure> {
+        let output = self.output.clone().unwrap_or_else(|| path.to_path_buf());
+        let file = limit::read(path).map_err(|cause| Failure::file(path, &cause.to_string()))?;
+        let key = keys::public_key(&self.key)?;
+        let why = "is no signature: it must have 64 bytes, as openssl pkeyutl -sign -rawin writes them";
+        let bytes: Option<[u8; 64]> = bytes_of(signature, 1024)?.try_into().ok();
+        let bytes = bytes.ok_or_else(|| Failure::file(signature, why))?;
+        let file = Unsigned::of_file(file, key).and_then(|unsigned| unsigned.attach(&bytes));
+        let file = file.map_err(|fault| Failure::file(path, &fault.to_string()))?;
+        write(&output, &file)?;
+        self.tell(context, &output, &file)
+    }
+
+    /// The program, judged as `flash` judges one.
+    fn flash(&self, context: &Context, path: &Path) -> Result<Flash, Failure> {
+        let (firmware, _) = self.place.load(path, self.program)?;
+        let done = blocks_of(firmware, &self.place.options(self.program)?);
+        let done = done.map_err(|error| Failure::convert(error, path))?;
+        super::file::warn_left_out(context, path, &done);
+        let blocks = done.file;
+        if !self.data && !self.force {
+            judge(&blocks.image(), blocks.program_start())
+                .map_err(|fault| Failure::no_program(path, fault))?;
+        }
+        Ok(Flash { bytes: blocks.flash_image(), blocks })
+    }
+
+    fn tell(&self, context: &Context, output: &Path, file: &[u8]) -> Result<(), Failure> {
+        let sealed = Sealed::parse(file).map_err(|refusal| Failure::sealed(output, &refusal))?;
+        let head = sealed.head;
+        let (size, payload) = (head.size(), head.payload());
+        let mut words = format!(
+            "{}: program {} {}, counter {}, {size} bytes, CRC {:08X}h",
+            output.display(),
+            head.program(),
+            ProgramVersion(head.version()),
+            head.counter(),
+            head.crc()
+        );
+        if self.compress || self.base.is_some() {
+            let percent = u64::from(payload) * 100 / u64::from(size.max(1));
+            words += &format!(", compressed to {payload} bytes ({percent} %)");
+        }
+        if self.tbs.is_some() {
+            words += "; its signature is missing: --attach completes it";
+        }
+        context.out.result(words, || {
+            let mut value = value(&sealed);
+            value["command"] = "seal".into();
+            value["output"] = output.display().to_string().into();
+            value["signed"] = self.tbs.is_none().into();
+            value
+        });
+        Ok(())
+    }
+}

@@ -1,0 +1,213 @@
+//! `coflash verify` and `coflash show`: what a sealed image is, and whether a device takes it.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use coflash::file::limit;
+use coflash::file::sealed::open::Closed;
+use coflash::file::sealed::show::{digits, flags, text};
+use coflash::file::sealed::{verify, Device, Sealed};
+use seal::wire::tag;
+use serde_json::{json, Value};
+use shared_abi::block_file::ProgramVersion;
+
+use super::context::Context;
+use super::file::base;
+use super::keys;
+use super::output::Failure;
+use super::values::{number, program_number, unique_id};
+
+/// Checks a sealed image as a device does, and says which rule it breaks.
+///
+/// That is all of it: the form, the device that it is for, counter and epoch, the certificate, the
+/// signature, every chunk, and the program itself, which takes a key if it is encrypted. What is not
+/// told about the device is taken as the image wants it.
+#[derive(Debug, Args)]
+pub(super) struct Verify {
+    /// The sealed image.
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+
+    /// A root's public key, as the device knows it; once for each.
+    #[arg(long, value_name = "FILE", required = true)]
+    root: Vec<PathBuf>,
+
+    /// A key-encryption key of the device; without one the program in an encrypted image is not
+    /// looked at.
+    #[arg(long, value_name = "FILE")]
+    kek: Vec<PathBuf>,
+
+    /// The other program of the device, for an image that was compressed against it.
+    #[arg(long, value_name = "FILE")]
+    base: Option<PathBuf>,
+
+    /// The device's vendor-ID (1018h/1).
+    #[arg(long, alias = "vid", value_name = "NUMBER", value_parser = number)]
+    vendor: Option<u32>,
+
+    /// Its product code (1018h/2).
+    #[arg(long, alias = "pid", value_name = "NUMBER", value_parser = number)]
+    product: Option<u32>,
+
+    /// Its hardware revision (1018h/3).
+    #[arg(long, value_name = "REVISION", value_parser = number)]
+    hardware: Option<u32>,
+
+    /// Its unique ID, in 24 hexadecimal digits.
+    #[arg(long, value_name = "UID", value_parser = unique_id)]
+    device: Option<[u8; 12]>,
+
+    /// The program number that is to be written.
+    #[arg(long, short = 'P', value_name = "1..254", value_parser = program_number)]
+    program: Option<u8>,
+
+    /// Bytes of the program's flash.
+    #[arg(long, value_name = "BYTES", value_parser = number)]
+    room: Option<u32>,
+
+    /// The lowest security counter that the device takes.
+    #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0")]
+    counter: u32,
+
+    /// The lowest epoch that it takes.
+    #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0")]
+    epoch: u32,
+
+    /// The device is marked for tests.
+    #[arg(long)]
+    for_tests: bool,
+}
+
+/// Shows what a sealed image says of itself. Nothing is checked but its form.
+#[derive(Debug, Args)]
+pub(super) struct Show {
+    /// The sealed image.
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+}
+
+impl Verify {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        let path = &self.file;
+        let bytes = read(path)?;
+        let (roots, keks) = (keys::public_keys(&self.root)?, keys::keks(&self.kek)?);
+        let base = self.base.as_deref().map(base).transpose()?;
+        let device = Device {
+            roots: &roots,
+            keks: &keks,
+            base: base.as_deref(),
+            vendor_id: self.vendor,
+            product_code: self.product,
+            revision: self.hardware,
+            unique_id: self.device,
+            program: self.program,
+            room: self.room,
+            counter: self.counter,
+            epoch: self.epoch,
+            for_tests: self.for_tests,
+        };
+        let opened = verify(&bytes, &device).map_err(|refusal| Failure::sealed(path, &refusal))?;
+        let sealed = Sealed::parse(&bytes).map_err(|refusal| Failure::sealed(path, &refusal))?;
+        let head = sealed.head;
+        let (key, root) = (opened.signed_by.id(), opened.root.id());
+        let image = match opened.closed {
+            None => format!("the program is whole, {} bytes, CRC {:08X}h", head.size(), head.crc()),
+            Some(Closed::Encrypted) => {
+                "the program was not looked at: it is encrypted, give --kek".to_string()
+            }
+            Some(Closed::Dictionary) => {
+                "the program was not looked at: it was compressed against another one, give --base"
+                    .to_string()
+            }
+        };
+        let whose = match key == root {
+            true => "a root itself".to_string(),
+            false => format!("which root {root:08X}h has certified"),
+        };
+        let words = format!(
+            "{}: good\n  signed by    key {key:08X}h, {whose}\n  \
+             program      {} {}, counter {}, epoch {}\n  image        {image}",
+            path.display(),
+            head.program(),
+            ProgramVersion(head.version()),
+            head.counter(),
+            opened.epoch,
+        );
+        context.out.result(words, || {
+            let mut value = value(&sealed);
+            value["command"] = "verify".into();
+            value["signed_by"] = key.into();
+            value["root"] = root.into();
+            value["epoch"] = opened.epoch.into();
+            value["image_checked"] = opened.closed.is_none().into();
+            value
+        });
+        Ok(())
+    }
+}
+
+impl Show {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        show(context, "show", &self.file)
+    }
+}
+
+/// Shows a sealed image, for the command of this name.
+pub(super) fn show(context: &Context, command: &str, path: &Path) -> Result<(), Failure> {
+    let bytes = read(path)?;
+    let sealed = Sealed::parse(&bytes).map_err(|refusal| Failure::sealed(path, &refusal))?;
+    context.out.result(format_args!("{}: {sealed}", path.display()), || {
+        let mut value = value(&sealed);
+        value["command"] = command.into();
+        value
+    });
+    Ok(())
+}
+
+/// Whether the file begins as a sealed image; what cannot be read does not.
+pub(super) fn is_sealed(path: &Path) -> bool {
+    use std::io::Read as _;
+    let is_file = std::fs::metadata(path).is_ok_and(|told| told.is_file());
+    let mut start = [0; 4];
+    is_file
+        && std::fs::File::open(path).is_ok_and(|mut file| file.read_exact(&mut start).is_ok())
+        && Sealed::looks_like(&start)
+}
+
+/// Reads a sealed image.
+pub(super) fn read(path: &Path) -> Result<Vec<u8>, Failure> {
+    Ok(limit::read(path).map_err(|cause| coflash::file::Place::File.fault(cause).of(path.display()))?)
+}
+
+/// A sealed image for programs.
+pub(super) fn value(sealed: &Sealed<'_>) -> Value {
+    let head = sealed.head;
+    let record = |wanted: u16| head.records().find(|(tag, _)| *tag == wanted).map(|(_, bytes)| bytes);
+    json!({
+        "format": "sealed image",
+        "vendor_id": head.vendor_id(),
+        "product_code": head.product_code(),
+        "program": head.program(),
+        "version": head.version(),
+        "version_text": ProgramVersion(head.version()).to_string(),
+        "counter": head.counter(),
+        "created": head.created(),
+        "size": head.size(),
+        "crc": head.crc(),
+        "payload": head.payload(),
+        "chunk": 1_u32 << (head.chunk() & 31),
+        "flags": flags(head.flags()).collect::<Vec<_>>(),
+        "unique_id": Some(head.unique_id()).filter(|id| *id != [0; 12]).map(|id| digits(&id)),
+        "hardware": head.hardware(),
+        "hash": digits(&head.image_hash()),
+        "chain": digits(&head.chain()),
+        "nonce": digits(&head.nonce()),
+        "dictionary": Some(head.dictionary()).filter(|hash| *hash != [0; 32]).map(|hash| digits(&hash)),
+        "recipients": sealed.recipients().map(|recipient| recipient.key_id()).collect::<Vec<_>>(),
+        "text": record(tag::TEXT).map(text),
+        "source": record(tag::SOURCE).map(text),
+        "sbom": record(tag::SBOM).map(digits),
+        "certificate": head.certificate().map(keys::certificate_value),
+        "signatures": sealed.signers(),
+    })
+}

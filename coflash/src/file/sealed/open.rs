@@ -1,0 +1,588 @@
+//! Takes a sealed image apart and checks it as a device does: head, identity, counter, keys,
+//! signatures, chain, and then the image itself.
+//!
+//! What a device answers with one number is told apart here: each rule has its own words.
+
+use seal::judge::judge;
+use seal::wire::{
+    array, flag, head_size, role, tag, word, Certificate, Fault, Head, Recipient, CERTIFICATE, DOMAIN,
+    ED25519, FORMAT, HASH, MAGIC, MAX_CHUNK, MIN_CHUNK, RECIPIENT,
+};
+
+use super::cipher::{chacha20, hash, wrap};
+use super::key::{Kek, PublicKey};
+use super::{key_block, lzma};
+use crate::file::block_file::{CRC, MAX_PROGRAM_SIZE};
+
+/// A sealed image that has as many bytes as it says; nothing else is known of it.
+#[derive(Clone, Copy, Debug)]
+pub struct Sealed<'a> {
+    /// Manifest, certificate and signatures.
+    pub head: Head<'a>,
+    /// The chunks with their hashes.
+    pub chunks: &'a [u8],
+}
+
+/// A sealed image as a file has it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SealedFile(Vec<u8>);
+
+impl SealedFile {
+    /// Takes a file that [`Sealed::parse`] understands.
+    ///
+    /// # Errors
+    /// Those of [`Sealed::parse`].
+    pub fn parse(bytes: Vec<u8>) -> Result<Self, Refusal> {
+        Sealed::parse(&bytes)?;
+        Ok(Self(bytes))
+    }
+
+    /// All of its bytes: what a device gets.
+    #[must_use]
+    pub fn bytes(&self) -> &[u8] {
+        &self.0
+    }
+
+    /// Manifest, certificate and signatures.
+    #[must_use]
+    pub fn head(&self) -> Head<'_> {
+        // `parse` has found all of it.
+        Head(&self.0)
+    }
+}
+
+/// The device that an image is checked for. What is not told is as the image wants it.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Device<'a> {
+    /// The roots that it knows.
+    pub roots: &'a [PublicKey],
+    /// Its key-encryption keys; without any the payload of an encrypted image is not looked into.
+    pub keks: &'a [Kek],
+    /// The other program in it, as in flash: the dictionary of images that have one.
+    pub base: Option<&'a [u8]>,
+    /// 1018h/1.
+    pub vendor_id: Option<u32>,
+    /// 1018h/2.
+    pub product_code: Option<u32>,
+    /// 1018h/3.
+    pub revision: Option<u32>,
+    /// The 96-bit unique ID of the chip.
+    pub unique_id: Option<[u8; 12]>,
+    /// The number of the program that is written.
+    pub program: Option<u8>,
+    /// Bytes of its flash.
+    pub room: Option<u32>,
+    /// The lowest security counter that it takes.
+    pub counter: u32,
+    /// The lowest epoch of a certificate.
+    pub epoch: u32,
+    /// Whether it takes programs that are signed with a test key.
+    pub for_tests: bool,
+}
+
+/// An image that a device would take.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Opened {
+    /// The image as in flash, if it could be looked at.
+    pub image: Option<Vec<u8>>,
+    /// Why not, otherwise.
+    pub closed: Option<Closed>,
+    /// The key that signed the image.
+    pub signed_by: PublicKey,
+    /// The root that it comes from.
+    pub root: PublicKey,
+    /// The epoch of the device when the image is installed.
+    pub epoch: u32,
+}
+
+/// Why the image behind a good chain was not looked at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Closed {
+    /// It is encrypted, and no key-encryption key was given.
+    Encrypted,
+    /// Its dictionary is the other program, which was not given.
+    Dictionary,
+}
+
+/// Which rule an image breaks.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Refusal {
+    /// Another file.
+    #[error("it is no sealed image: its first bytes are not CBS1")]
+    NotSealed,
+    /// The head has an impossible size.
+    #[error("the head is damaged: the size of its manifest or the number of its signatures is impossible")]
+    Head,
+    /// The file ends too early.
+    #[error("it is cut off: it must have {needed} bytes and has {found}")]
+    CutOff {
+        /// Bytes that it announces.
+        needed: u64,
+        /// Bytes that are there.
+        found: u64,
+    },
+    /// The file is longer than it says.
+    #[error("it has {found} bytes and announces {needed}: something was appended to it")]
+    TooLong {
+        /// Bytes that it announces.
+        needed: u64,
+        /// Bytes that are there.
+        found: u64,
+    },
+    /// A field with a value that it cannot have.
+    #[error("the manifest is not possible: {0}")]
+    Field(&'static str),
+    /// For devices of another vendor.
+    #[error("it is for vendor-ID {image:08X}h, and the device has {device:08X}h")]
+    Vendor {
+        /// What the image says.
+        image: u32,
+        /// What the device has.
+        device: u32,
+    },
+    /// For another product.
+    #[error("it is for product code {image:08X}h, and the device has {device:08X}h")]
+    Product {
+        /// What the image says.
+        image: u32,
+        /// What the device has.
+        device: u32,
+    },
+    /// For another program.
+    #[error("it is program {image}, and program {device} is written")]
+    Program {
+        /// What the image says.
+        image: u8,
+        /// What is written.
+        device: u8,
+    },
+    /// For one device alone.
+    #[error("it is for the device with another unique ID alone")]
+    UniqueId,
+    /// For other hardware.
+    #[error("it is not for hardware revision {device:08X}h (its revisions have the mask {mask:08X}h)")]
+    Hardware {
+        /// What the image says.
+        mask: u32,
+        /// What the device has.
+        device: u32,
+    },
+    /// Too large.
+    #[error("the program has {image} bytes, and the device has room for {device}")]
+    Room {
+        /// Bytes of the image.
+        image: u32,
+        /// Bytes of the flash.
+        device: u32,
+    },
+    /// An old program.
+    #[error("its security counter is {image}, and the device takes none below {device}")]
+    Counter {
+        /// What the image says.
+        image: u32,
+        /// The lowest.
+        device: u32,
+    },
+    /// An old certificate.
+    #[error("its certificate is of epoch {image}, and the device takes none below {device}")]
+    Epoch {
+        /// What the certificate says.
+        image: u32,
+        /// The lowest.
+        device: u32,
+    },
+    /// A certificate that does not allow this image.
+    #[error("its certificate does not hold: {0}")]
+    Certificate(&'static str),
+    /// No such root.
+    #[error("its root {0:08X}h is none of the roots given")]
+    Root(u32),
+    /// No root has signed it, and there is no certificate.
+    #[error("it has no certificate, and none of the roots given has signed it")]
+    NoCertificate,
+    /// A test key.
+    #[error("it is signed for tests, and the device is not marked for tests")]
+    Test,
+    /// No key for the encryption.
+    #[error("it is encrypted for other keys than those given")]
+    Kek,
+    /// The root has not signed the certificate.
+    #[error("the signature of its certificate is wrong: the root {0:08X}h has not signed these bytes")]
+    CertificateSignature(u32),
+    /// The certified key has not signed the image.
+    #[error("it has no signature of the key {0:08X}h, whose certificate it carries")]
+    NoSignature(u32),
+    /// Another manifest was signed.
+    #[error("its signature is wrong: the key {0:08X}h has not signed this manifest")]
+    Signature(u32),
+    /// A chunk is another one.
+    #[error("chunk {number} of {of} is not the one that was signed")]
+    Chain {
+        /// Its number, from 1 on.
+        number: usize,
+        /// How many there are.
+        of: usize,
+    },
+    /// The key has the right id and does not fit.
+    #[error("the key-encryption key {0:08X}h does not open it: its check is wrong")]
+    WrongKek(u32),
+    /// The other program is another one.
+    #[error("its dictionary is another program than the one given")]
+    Dictionary,
+    /// The payload is no compressed image.
+    #[error("its payload cannot be decompressed")]
+    Compression,
+    /// The image is another one.
+    #[error("the image is not the one that was signed: its hash is another")]
+    Hash,
+    /// The CRC in the manifest is that of another image.
+    #[error("the CRC of the image is {found:08X}h, and its manifest says {said:08X}h")]
+    Crc {
+        /// What it is.
+        found: u32,
+        /// What the manifest says.
+        said: u32,
+    },
+}
+
+impl Refusal {
+    /// What a device with the same keys would answer (1F57h).
+    #[must_use]
+    pub fn fault(&self) -> Fault {
+        match self {
+            Self::NotSealed | Self::Head | Self::CutOff { .. } | Self::TooLong { .. } | Self::Field(_) => {
+                Fault::Format
+            }
+            Self::Vendor { .. } => Fault::WrongVendor,
+            Self::Product { .. } | Self::Program { .. } | Self::UniqueId | Self::Hardware { .. } => {
+                Fault::WrongProduct
+            }
+            Self::Room { .. } => Fault::Address,
+            Self::Counter { .. } | Self::Epoch { .. } => Fault::Rollback,
+            Self::Root(_) | Self::NoCertificate | Self::Test | Self::Kek | Self::WrongKek(_) => Fault::Key,
+            Self::Certificate(_)
+            | Self::CertificateSignature(_)
+            | Self::NoSignature(_)
+            | Self::Signature(_)
+            | Self::Chain { .. }
+            | Self::Dictionary
+            | Self::Compression
+            | Self::Hash
+            | Self::Crc { .. } => Fault::Signature,
+        }
+    }
+
+    /// What to do next.
+    #[must_use]
+    pub fn advice(&self) -> &'static str {
+        match self {
+            Self::NotSealed => "give a file that `coflash seal` made",
+            Self::Head | Self::CutOff { .. } | Self::TooLong { .. } | Self::Chain { .. } => {
+                "copy the file again from where it was sealed, or seal the program again"
+            }
+            Self::Field(_) => "seal the program again, with the coflash that belongs to the bootloader",
+            Self::Vendor { .. } | Self::Product { .. } | Self::Program { .. } => {
+                "give the file of this device and program, or seal the program for it"
+            }
+            Self::UniqueId => "seal the program for this device (--device), or for all of the product",
+            Self::Hardware { .. } => "seal the program for this revision (--hardware), if it fits",
+            Self::Room { .. } => {
+                "make the program smaller: --compress makes the file smaller, not the program"
+            }
+            Self::Counter { .. } => {
+                "seal the program with a higher --counter, if it is to replace the newer one"
+            }
+            Self::Epoch { .. } => {
+                "the key was revoked by a higher epoch: sign with the key that is valid now"
+            }
+            Self::Certificate(_) => "have the key certified for this program: `coflash key certify`",
+            Self::Root(_) | Self::NoCertificate => {
+                "give the public key of the root that certified it (--root); `coflash show` tells its id"
+            }
+            Self::Test => "sign it with a release key, or check it for a device for tests (--for-tests)",
+            Self::Kek | Self::WrongKek(_) => {
+                "give one of the keys that it is encrypted for (--kek); `coflash show` tells their ids"
+            }
+            Self::CertificateSignature(_) => "do not use this file: nobody knows who made its certificate",
+            Self::NoSignature(_) | Self::Signature(_) => {
+                "do not use this file: nobody knows who made it; seal the program again"
+            }
+            Self::Dictionary => "give the program that it was sealed with as --base",
+            Self::Compression | Self::Hash | Self::Crc { .. } => {
+                "seal the program again: what made this file does not work as it should"
+            }
+        }
+    }
+}
+
+impl<'a> Sealed<'a> {
+    /// Whether these bytes begin as a sealed image does.
+    #[must_use]
+    pub fn looks_like(bytes: &[u8]) -> bool {
+        bytes.starts_with(&MAGIC)
+    }
+
+    /// Takes a file apart.
+    ///
+    /// # Errors
+    /// [`Refusal::NotSealed`], [`Refusal::Head`], [`Refusal::Field`], [`Refusal::CutOff`] or
+    /// [`Refusal::TooLong`].
+    pub fn parse(bytes: &'a [u8]) -> Result<Self, Refusal> {
+        if !Self::looks_like(bytes) {
+            return Err(Refusal::NotSealed);
+        }
+        let found = bytes.len() as u64;
+        let size = head_size(bytes).map_err(|_| Refusal::Head)?;
+        let (Some(head), Some(chunks)) = (bytes.get(..size), bytes.get(size..)) else {
+            return Err(Refusal::CutOff { needed: size as u64, found });
+        };
+        let head = Head(head);
+        if !(MIN_CHUNK..=MAX_CHUNK).contains(&head.chunk()) {
+            return Err(Refusal::Field("no device takes chunks of this size"));
+        }
+        let payload = u64::from(head.payload());
+        let needed = size as u64 + payload + HASH as u64 * payload.div_ceil(1 << head.chunk());
+        match () {
+            () if found < needed => Err(Refusal::CutOff { needed, found }),
+            () if found > needed => Err(Refusal::TooLong { needed, found }),
+            () => Ok(Self { head, chunks }),
+        }
+    }
+
+    /// For whom it is encrypted: the ids of the keys.
+    pub fn recipients(&self) -> impl Iterator<Item = Recipient<'a>> + 'a {
+        let records = self.head.records().filter(|(tag, _)| *tag == tag::RECIPIENT);
+        records.filter_map(|(_, record)| <&[u8; RECIPIENT]>::try_from(record).ok().map(Recipient))
+    }
+
+    /// The ids of the keys that have signed it.
+    #[must_use]
+    pub fn signers(&self) -> Vec<u32> {
+        let mut at = self.head.manifest().len() + self.head.certificate().map_or(0, |_| CERTIFICATE);
+        let mut ids = Vec::new();
+        for _ in 0..self.head.signatures() {
+            ids.push(word(self.head.0, at));
+            at += seal::wire::SIGNATURE_HEADER + usize::from(seal::wire::half(self.head.0, at + 6));
+        }
+        ids
+    }
+
+    /// Chunks, each with the hash of the next.
+    fn pieces(&self) -> std::slice::Chunks<'a, u8> {
+        self.chunks.chunks(HASH + (1 << self.head.chunk()))
+    }
+
+    /// Checks it as this device would.
+    ///
+    /// # Errors
+    /// The rule that it breaks.
+    pub fn verify(&self, device: &Device<'_>) -> Result<Opened, Refusal> {
+        let head = self.head;
+        let (root, recipient, epoch) = self.judge(device)?;
+        let certificate = head.certificate();
+        let signed_by = match certificate {
+            None => root,
+            Some(certificate) => {
+                if !root.verifies(certificate.signed(), &certificate.signature()) {
+                    return Err(Refusal::CertificateSignature(root.id()));
+                }
+                let bad = Refusal::Certificate("its key is none");
+                PublicKey::new(certificate.key()).map_err(|_| bad)?
+            }
+        };
+        let id = signed_by.id();
+        let signature = head.signature(id).ok_or(Refusal::NoSignature(id))?;
+        if !signed_by.verifies(&[&DOMAIN[..], head.manifest()].concat(), &signature) {
+            return Err(Refusal::Signature(id));
+        }
+        let mut payload = self.payload()?;
+        let mut opened = Opened { image: None, closed: None, signed_by, root, epoch };
+        if head.flags() & flag::ENCRYPTED != 0 {
+            let Some((kek, recipient)) = recipient else {
+                return Ok(Opened { closed: Some(Closed::Encrypted), ..opened });
+            };
+            let recipient = Recipient(&recipient);
+            let (check, key) = wrap(kek.secret(), &head.nonce(), &recipient.wrapped());
+            if check != recipient.check() {
+                return Err(Refusal::WrongKek(kek.id()));
+            }
+            chacha20(&mut payload, &key, &head.nonce());
+        }
+        if head.flags() & flag::COMPRESSED != 0 {
+            let base = match (head.flags() & flag::DICTIONARY != 0, device.base) {
+                (false, _) => &[][..],
+                (true, None) => return Ok(Opened { closed: Some(Closed::Dictionary), ..opened }),
+                (true, Some(base)) if hash(base) != head.dictionary() => return Err(Refusal::Dictionary),
+                (true, Some(base)) => base,
+            };
+            if head.size() > MAX_PROGRAM_SIZE {
+                return Err(Refusal::Field("the image is larger than any flash"));
+            }
+            let image = lzma::decompress(&payload, head.size() as usize, base);
+            payload = image.ok_or(Refusal::Compression)?;
+        }
+        if hash(&payload) != head.image_hash() {
+            return Err(Refusal::Hash);
+        }
+        let (found, said) = (CRC.checksum(&payload), head.crc());
+        if found != said {
+            return Err(Refusal::Crc { found, said });
+        }
+        opened.image = Some(payload);
+        Ok(opened)
+    }
+
+    /// The payload, if the chain holds.
+    fn payload(&self) -> Result<Vec<u8>, Refusal> {
+        let of = self.pieces().len();
+        let mut next = self.head.chain();
+        let mut payload = Vec::with_capacity(self.chunks.len());
+        for (number, piece) in (1..).zip(self.pieces()) {
+            if hash(piece) != next {
+                return Err(Refusal::Chain { number, of });
+            }
+            next = array(piece, 0);
+            payload.extend_from_slice(&piece[HASH..]);
+        }
+        // The last one has nothing behind it, and says so.
+        if next != [0; HASH] {
+            return Err(Refusal::Chain { number: of, of });
+        }
+        Ok(payload)
+    }
+
+    /// What the device judges before a signature: by its own code. Gives the root, the
+    /// key-encryption key with the recipient's record, and the epoch.
+    #[allow(clippy::type_complexity)]
+    fn judge(
+        &self,
+        device: &Device<'_>,
+    ) -> Result<(PublicKey, Option<(Kek, [u8; RECIPIENT])>, u32), Refusal> {
+        let head = self.head;
+        // A device has room for a few keys only: those are in it that count.
+        let wanted = |id: u32| match head.certificate() {
+            Some(certificate) => certificate.root_id() == id,
+            None => head.signature(id).is_some(),
+        };
+        let roots: Vec<PublicKey> = device.roots.iter().copied().filter(|root| wanted(root.id())).collect();
+        let ids: Vec<u32> = self.recipients().map(|recipient| recipient.key_id()).collect();
+        let keks: Vec<&Kek> = device.keks.iter().filter(|kek| ids.contains(&kek.id())).collect();
+        let closed = device.keks.is_empty();
+        let in_block: Vec<(u32, [u8; 32])> = if closed {
+            // Without a key nothing is decrypted; the id of a recipient is all that is judged.
+            ids.iter().map(|id| (*id, [0; 32])).collect()
+        } else {
+            keks.iter().map(|kek| (kek.id(), [0; 32])).collect()
+        };
+        let root_ids: Vec<_> = roots.iter().map(|root| (root.id(), root.bytes())).collect();
+        let keys = key_block::of_ids(&root_ids, &in_block, 0, 0, device.for_tests);
+        let as_wanted = head.hardware().trailing_zeros() & 31;
+        let device = seal::judge::Device {
+            vendor_id: device.vendor_id.unwrap_or(head.vendor_id()),
+            product_code: device.product_code.unwrap_or(head.product_code()),
+            revision: device.revision.unwrap_or(as_wanted),
+            unique_id: device.unique_id.unwrap_or(head.unique_id()),
+            program: device.program.unwrap_or(head.program()),
+            is_data: head.flags() & flag::DATA != 0,
+            room: device.room.unwrap_or(u32::MAX),
+            counter: device.counter,
+            epoch: device.epoch,
+            keys: &keys,
+        };
+        let needs = judge(head, &device).map_err(|fault| self.why(fault, &device))?;
+        let id = word(&keys, needs.root);
+        let root = roots.into_iter().find(|root| root.id() == id).ok_or(Refusal::Root(id))?;
+        let recipient = needs.recipient.filter(|_| !closed).and_then(|(_, at)| {
+            let record = array(head.0, at);
+            let id = Recipient(&record).key_id();
+            keks.into_iter().find(|kek| kek.id() == id).map(|kek| (kek.clone(), record))
+        });
+        Ok((root, recipient, needs.epoch))
+    }
+
+    /// Which rule is behind a fault.
+    fn why(&self, fault: Fault, device: &seal::judge::Device<'_>) -> Refusal {
+        let head = self.head;
+        match fault {
+            Fault::Format => Refusal::Field(self.field()),
+            Fault::WrongVendor => Refusal::Vendor { image: head.vendor_id(), device: device.vendor_id },
+            Fault::WrongProduct if head.product_code() != device.product_code => {
+                Refusal::Product { image: head.product_code(), device: device.product_code }
+            }
+            Fault::WrongProduct if head.program() != device.program => {
+                Refusal::Program { image: head.program(), device: device.program }
+            }
+            Fault::WrongProduct if ![[0; 12], device.unique_id].contains(&head.unique_id()) => {
+                Refusal::UniqueId
+            }
+            Fault::WrongProduct => Refusal::Hardware { mask: head.hardware(), device: device.revision },
+            Fault::Address => Refusal::Room { image: head.size(), device: device.room },
+            Fault::Rollback if head.counter() < device.counter => {
+                Refusal::Counter { image: head.counter(), device: device.counter }
+            }
+            Fault::Rollback => {
+                let image = head.certificate().map_or(0, Certificate::epoch);
+                Refusal::Epoch { image, device: device.epoch }
+            }
+            Fault::Signature => Refusal::Certificate(self.certificate_field(device)),
+            Fault::Key => self.key(device),
+        }
+    }
+
+    fn field(&self) -> &'static str {
+        let head = self.head;
+        let has = |which: u8| head.flags() & which != 0;
+        match () {
+            () if head.flags() & !flag::KNOWN != 0 => "it has an unknown flag",
+            () if head.format() > FORMAT => "it wants a newer bootloader",
+            () if head.size() == 0 || head.payload() == 0 => "it is empty",
+            () if !has(flag::COMPRESSED) && head.payload() != head.size() => {
+                "payload and image have different sizes, and it is not compressed"
+            }
+            () if !has(flag::COMPRESSED) && has(flag::DICTIONARY) => {
+                "it has a dictionary, and is not compressed"
+            }
+            () => "it has a record that must be understood and is not known",
+        }
+    }
+
+    fn certificate_field(&self, device: &seal::judge::Device<'_>) -> &'static str {
+        let Some(certificate) = self.head.certificate() else { return "there is none" };
+        match () {
+            () if usize::from(certificate.len()) != CERTIFICATE => "its size is impossible",
+            () if u16::from(certificate.algorithm()) != ED25519 => "its key is for another algorithm",
+            () if ![role::RELEASE, role::TEST].contains(&certificate.role()) => {
+                "its key does not sign programs"
+            }
+            () if certificate.vendor_id() != device.vendor_id => "it is for another vendor",
+            () if ![0, device.product_code].contains(&certificate.product_code()) => {
+                "it is for another product"
+            }
+            () => "it does not allow this security counter",
+        }
+    }
+
+    fn key(&self, device: &seal::judge::Device<'_>) -> Refusal {
+        use seal::key_block::{find, KEKS, KEK_COUNT, ROOTS, ROOT_COUNT};
+        let certificate = self.head.certificate();
+        match certificate.map(Certificate::root_id) {
+            Some(id) if find(device.keys, ROOTS, ROOT_COUNT, id).is_none() => return Refusal::Root(id),
+            None if word(device.keys, ROOTS) == 0 => return Refusal::NoCertificate,
+            _ => {}
+        }
+        let known = |id| find(device.keys, KEKS, KEK_COUNT, id).is_some();
+        let encrypted = self.head.flags() & flag::ENCRYPTED != 0;
+        if encrypted && !self.recipients().any(|recipient| known(recipient.key_id())) {
+            return Refusal::Kek;
+        }
+        Refusal::Test
+    }
+}
+
+/// Checks a file as this device would.
+///
+/// # Errors
+/// The first rule that it breaks.
+pub fn verify(bytes: &[u8], device: &Device<'_>) -> Result<Opened, Refusal> {
+    Sealed::parse(bytes)?.verify(device)
+}

@@ -1,0 +1,98 @@
+//! The bootloader of a sealed device: its image with the key block in its place.
+
+use seal::key_block::SIZE;
+use shared_abi::layout::Layout;
+
+use crate::file::fault::Place;
+use crate::file::image::{Image, Pieces};
+use crate::file::range::AddressRange;
+
+/// Why a bootloader cannot get its key block.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum ProvisionFault {
+    /// Another image than a bootloader.
+    #[error(
+        "it lies at {found}, and the bootloader of this board at {region}: give the bootloader of this board"
+    )]
+    Elsewhere {
+        /// Where it lies.
+        found: AddressRange,
+        /// Where it must.
+        region: AddressRange,
+    },
+    /// It does not begin where the CPU starts.
+    #[error(
+        "it begins at {found:#010x} and not at {start:#010x}, where a reset starts: it is no bootloader"
+    )]
+    Start {
+        /// Its first address.
+        found: u32,
+        /// Where it must begin.
+        start: u32,
+    },
+    /// Something is where the keys go.
+    #[error("it has data of its own at {0}, where the keys go: give a bootloader without keys")]
+    Occupied(AddressRange),
+}
+
+/// Puts a key block into its place behind a bootloader.
+///
+/// # Errors
+/// See [`ProvisionFault`].
+pub fn provision(bootloader: &Image, layout: &Layout, block: &[u8; SIZE]) -> Result<Image, ProvisionFault> {
+    let region = AddressRange::from(layout.bootloader);
+    let found = bootloader.span();
+    if !region.contains(&found) {
+        return Err(ProvisionFault::Elsewhere { found, region });
+    }
+    if found.first != region.first {
+        return Err(ProvisionFault::Start { found: found.first, start: region.first });
+    }
+    let place = AddressRange::from(layout.key_block());
+    // A raw image of the whole region has erased flash there.
+    if bootloader.part(place).is_some_and(|there| there.only_byte() != Some(0xFF)) {
+        return Err(ProvisionFault::Occupied(place));
+    }
+    let own = AddressRange { first: region.first, last: place.first - 1 };
+    let mut pieces = Pieces::default();
+    for (address, data) in bootloader.part(own).iter().flat_map(Image::segments) {
+        pieces.add(address, data, Place::File);
+    }
+    pieces.add(place.first, block.to_vec(), Place::File);
+    Ok(pieces.in_order())
+}
+
+#[cfg(test)]
+mod tests {
+    use shared_abi::layout::stm32f407g_disc1::LAYOUT;
+
+    use super::*;
+    use crate::file::raw;
+
+    fn image(address: u32, bytes: &[u8]) -> Image {
+        raw::read(bytes, Some(address)).unwrap()
+    }
+
+    #[test]
+    fn the_keys_lie_at_the_end_of_the_bootloaders_flash() {
+        let (base, size) = (LAYOUT.bootloader.base, LAYOUT.bootloader.size);
+        let whole = [vec![0x5A; 0x400], vec![0xFF; size as usize - 0x400]].concat();
+        for bytes in [&whole[..], &whole[..0x400], &whole[..0x401]] {
+            let made = provision(&image(base, bytes), &LAYOUT, &[7; SIZE]).unwrap();
+            assert_eq!(made.span(), AddressRange { first: base, last: base + size - 1 });
+            assert_eq!(made.bytes(base + size - 256), Some([7; 256]));
+            assert_eq!(made.bytes(base), Some([0x5A; 0x400]));
+        }
+        let place = AddressRange::from(LAYOUT.key_block());
+        let mut taken = whole.clone();
+        taken[size as usize - 1] = 0;
+        let provision = |image| super::provision(&image, &LAYOUT, &[7; SIZE]).unwrap_err();
+        assert_eq!(provision(image(base, &taken)), ProvisionFault::Occupied(place));
+        let start = ProvisionFault::Start { found: base + 4, start: base };
+        assert_eq!(provision(image(base + 4, &[0; 8])), start);
+        let program = image(LAYOUT.programs[0].base, &[0; 8]);
+        assert!(matches!(provision(program), ProvisionFault::Elsewhere { .. }));
+        let long = vec![0; size as usize + 1];
+        assert!(matches!(provision(image(base, &long)), ProvisionFault::Elsewhere { .. }));
+    }
+}

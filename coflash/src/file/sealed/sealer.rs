@@ -1,0 +1,408 @@
+//! Makes a sealed image of a program.
+//!
+//! The image is compressed (if wanted), then encrypted (if wanted), then cut into chunks. The same
+//! image, options and key give the same file, byte for byte.
+
+use seal::wire::{
+    flag, tag, CERTIFICATE, CERTIFICATE_MAGIC, DOMAIN, ED25519, FIXED, FORMAT, HASH, MAGIC, MAX_CHUNK,
+    MAX_HEAD, MAX_MANIFEST, MIN_CHUNK, RECIPIENT, SIGNATURE, SIGNATURE_HEADER,
+};
+use seal::wire::{role, Certificate as Wire};
+
+use super::cipher::{chacha20, hash, hmac, wrap};
+use super::key::{Kek, PublicKey, SigningKey};
+use super::lzma;
+use crate::file::block_file::{CRC, MAX_PROGRAM_SIZE};
+
+/// What stands in front when an image's key and nonce are made.
+const KEY_DOMAIN: &[u8] = b"coboot image key 1\0";
+/// The usual chunk: 4096 bytes of payload.
+pub const CHUNK: u8 = 12;
+
+/// Why an image cannot be sealed.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum SealFault {
+    /// No image.
+    #[error("there is nothing to seal: the image is empty")]
+    Empty,
+    /// An image larger than any flash.
+    #[error("the image has {0} bytes, more than any flash")]
+    TooLarge(usize),
+    /// A chunk that no device takes.
+    #[error("a chunk of {} bytes is impossible: it must be a power of two from {} to {}", 1_u64 << (.0 & 31), 1 << MIN_CHUNK, 1 << MAX_CHUNK)]
+    Chunk(u8),
+    /// A program that has no sub-index in 1F50h.
+    #[error("there is no program {0}: programs are 1 to 254")]
+    Program(u8),
+    /// The manifest has no room for the records.
+    #[error("the manifest would have {0} bytes, and has room for {MAX_MANIFEST}: shorten the text, or encrypt for fewer keys")]
+    Manifest(usize),
+    /// The head is more than a device can hold.
+    #[error("the head would have {0} bytes, and a device holds {MAX_HEAD}: shorten the text, or encrypt for fewer keys")]
+    Head(usize),
+    /// Two recipients with one key id.
+    #[error("the image would be encrypted twice for the key {0:08X}h: give each key once")]
+    Twice(u32),
+    /// No certificate.
+    #[error("the certificate is none: give a file that `coflash key certify` made")]
+    NoCertificate,
+    /// A certificate of another key.
+    #[error("the certificate is of another key: give the certificate of the key {0:08X}h, which signs")]
+    OtherKey(u32),
+    /// What the certificate does not allow.
+    #[error("the certificate allows {what} {allowed}, and this is {wanted}: change it, or have the key certified for it")]
+    NotAllowed {
+        /// Which field.
+        what: &'static str,
+        /// What the certificate says.
+        allowed: String,
+        /// What was asked for.
+        wanted: String,
+    },
+    /// A signature that does not fit.
+    #[error("this is no signature of the key {0:08X}h over this image: sign the file that --tbs wrote (pure Ed25519), with this key")]
+    Signature(u32),
+    /// Nothing to complete.
+    #[error("it is no sealed image without a signature: give the file that was written with --tbs")]
+    NotUnsigned,
+}
+
+/// How to seal an image. The default is a program for product 0 of vendor 0 that is neither
+/// compressed nor encrypted.
+#[derive(Clone, Debug)]
+pub struct Sealer<'a> {
+    /// The certificate of the key that signs; `None` for a root that signs itself.
+    pub certificate: Option<[u8; CERTIFICATE]>,
+    /// Vendor-ID of the devices that it is for (1018h/1).
+    pub vendor_id: u32,
+    /// Their product code (1018h/2).
+    pub product_code: u32,
+    /// The program's version: major in bits 0–7, minor in bits 8–15, release in bits 16–31.
+    pub version: u32,
+    /// The security counter: a device takes none that is lower than its own.
+    pub counter: u32,
+    /// The program's number, 1 to 254: the sub-index of 1F50h.
+    pub program: u8,
+    /// Binary logarithm of a chunk's payload, 9 to 13.
+    pub chunk: u8,
+    /// For whom it is encrypted; for nobody: not at all.
+    pub encrypt_for: &'a [Kek],
+    /// Whether it is compressed. One with a [`Self::base`] always is.
+    pub compress: bool,
+    /// The other program of the device, as in flash, which becomes the dictionary of the compression.
+    pub base: Option<&'a [u8]>,
+    /// The 96-bit unique ID of the only device that it is for, or zeros.
+    pub unique_id: [u8; 12],
+    /// Hardware revisions that it is for: bit n for those whose revision number (1018h/3) has n in its
+    /// five lowest bits; 0 for all.
+    pub hardware: u32,
+    /// When it was made, in seconds since 1970; 0 where that is not told.
+    pub created: u64,
+    /// Data of the application, no program.
+    pub data: bool,
+    /// The application writes the flash itself, so that the flash is not locked in front of it.
+    pub writes_flash: bool,
+    /// For devices that are marked for tests. A certificate of a test key makes it so, too.
+    pub test: bool,
+    /// Text for people.
+    pub text: Option<&'a str>,
+    /// SHA-512/256 of the software bill of materials.
+    pub sbom: Option<[u8; HASH]>,
+    /// Revision of the source.
+    pub source: Option<&'a str>,
+}
+
+impl Default for Sealer<'_> {
+    fn default() -> Self {
+        Self {
+            certificate: None,
+            vendor_id: 0,
+            product_code: 0,
+            version: 0,
+            counter: 0,
+            program: 1,
+            chunk: CHUNK,
+            encrypt_for: &[],
+            compress: false,
+            base: None,
+            unique_id: [0; 12],
+            hardware: 0,
+            created: 0,
+            data: false,
+            writes_flash: false,
+            test: false,
+            text: None,
+            sbom: None,
+            source: None,
+        }
+    }
+}
+
+/// A sealed image whose signature is still missing.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Unsigned {
+    /// The file, with zeros for the signature.
+    file: Vec<u8>,
+    /// Where the signature goes.
+    at: usize,
+    key: PublicKey,
+}
+
+impl Sealer<'_> {
+    /// Seals an image, given as it lies in flash: gaps are FFh.
+    ///
+    /// # Errors
+    /// See [`SealFault`].
+    pub fn seal(&self, image: &[u8], key: &SigningKey) -> Result<Vec<u8>, SealFault> {
+        let unsigned = self.unsigned(image, key.public(), &key.seed())?;
+        unsigned.attach(&key.sign(&unsigned.tbs()))
+    }
+
+    /// The same for a key that is in a hardware security module: what is to be signed is
+    /// [`Unsigned::tbs`], and [`Unsigned::attach`] completes the file.
+    ///
+    /// Key and nonce of an encrypted image come from the image and from the keys that it is encrypted
+    /// for, as the module's own key cannot be used for that.
+    ///
+    /// # Errors
+    /// See [`SealFault`].
+    pub fn for_module(&self, image: &[u8], key: PublicKey) -> Result<Unsigned, SealFault> {
+        let secret = self.encrypt_for.iter().flat_map(|kek| *kek.secret());
+        self.unsigned(image, key, &secret.collect::<Vec<u8>>())
+    }
+
+    fn unsigned(&self, image: &[u8], key: PublicKey, secret: &[u8]) -> Result<Unsigned, SealFault> {
+        self.check(image, key)?;
+        let compressed = self.compress || self.base.is_some();
+        let mut payload = if compressed {
+            lzma::compress(image, self.base.unwrap_or_default()).ok_or(SealFault::TooLarge(image.len()))?
+        } else {
+            image.to_vec()
+        };
+        let mut manifest = self.manifest(image, payload.len());
+        let size = manifest.len() + self.records_size();
+        if size > MAX_MANIFEST {
+            return Err(SealFault::Manifest(size));
+        }
+        manifest[4..6].copy_from_slice(&(size as u16).to_le_bytes());
+        // No two payloads have one key and nonce, and what goes into them is all that there is: a key
+        // stream that is used twice would show both.
+        let made = hmac(secret, &[KEY_DOMAIN, &manifest, &payload]);
+        let image_key: [u8; 32] = seal::wire::array(&made, 0);
+        let nonce: [u8; 16] = seal::wire::array(&made, 32);
+        manifest[104..120].copy_from_slice(&nonce);
+        if !self.encrypt_for.is_empty() {
+            chacha20(&mut payload, &image_key, &nonce);
+        }
+        let (chain, chunks) = chain(&payload, 1 << self.chunk);
+        manifest[72..104].copy_from_slice(&chain);
+        self.add_records(&mut manifest, &image_key, &nonce);
+
+        let mut file = manifest;
+        if let Some(certificate) = &self.certificate {
+            file.extend_from_slice(certificate);
+        }
+        file.extend_from_slice(&key.id().to_le_bytes());
+        file.extend_from_slice(&ED25519.to_le_bytes());
+        file.extend_from_slice(&(SIGNATURE as u16).to_le_bytes());
+        let at = file.len();
+        if at + SIGNATURE > MAX_HEAD {
+            return Err(SealFault::Head(at + SIGNATURE));
+        }
+        file.extend_from_slice(&[0; SIGNATURE]);
+        file.extend_from_slice(&chunks);
+        Ok(Unsigned { file, at, key })
+    }
+
+    fn check(&self, image: &[u8], key: PublicKey) -> Result<(), SealFault> {
+        if image.is_empty() {
+            return Err(SealFault::Empty);
+        }
+        let longest = image.len().max(self.base.unwrap_or_default().len());
+        if longest > MAX_PROGRAM_SIZE as usize {
+            return Err(SealFault::TooLarge(longest));
+        }
+        if !(MIN_CHUNK..=MAX_CHUNK).contains(&self.chunk) {
+            return Err(SealFault::Chunk(self.chunk));
+        }
+        if !(1..=254).contains(&self.program) {
+            return Err(SealFault::Program(self.program));
+        }
+        let ids: Vec<u32> = self.encrypt_for.iter().map(Kek::id).collect();
+        if let Some((_, id)) = ids.iter().enumerate().find(|(at, id)| ids[..*at].contains(id)) {
+            return Err(SealFault::Twice(*id));
+        }
+        match &self.certificate {
+            Some(certificate) => self.check_certificate(certificate, key),
+            None => Ok(()),
+        }
+    }
+
+    /// Better no file than one that no device takes.
+    fn check_certificate(&self, bytes: &[u8; CERTIFICATE], key: PublicKey) -> Result<(), SealFault> {
+        let certificate = Wire(bytes);
+        let known = bytes.starts_with(&CERTIFICATE_MAGIC)
+            && usize::from(certificate.len()) == CERTIFICATE
+            && u16::from(certificate.algorithm()) == ED25519
+            && [role::RELEASE, role::TEST].contains(&certificate.role());
+        if !known {
+            return Err(SealFault::NoCertificate);
+        }
+        if certificate.key() != key.bytes() {
+            return Err(SealFault::OtherKey(key.id()));
+        }
+        let not_allowed =
+            |what, allowed: String, wanted: String| Err(SealFault::NotAllowed { what, allowed, wanted });
+        if certificate.vendor_id() != self.vendor_id {
+            let (allowed, wanted) = (certificate.vendor_id(), self.vendor_id);
+            return not_allowed("the vendor-ID", format!("{allowed:08X}h"), format!("{wanted:08X}h"));
+        }
+        if ![0, self.product_code].contains(&certificate.product_code()) {
+            let (allowed, wanted) = (certificate.product_code(), self.product_code);
+            return not_allowed("the product code", format!("{allowed:08X}h"), format!("{wanted:08X}h"));
+        }
+        let (lowest, highest) = (certificate.lowest(), certificate.highest());
+        if !(lowest..=highest).contains(&self.counter) {
+            let allowed = format!("from {lowest} to {highest}");
+            return not_allowed("security counters", allowed, self.counter.to_string());
+        }
+        Ok(())
+    }
+
+    /// The fixed fields, without nonce, chain and size.
+    fn manifest(&self, image: &[u8], payload: usize) -> Vec<u8> {
+        let certified_test = self.certificate.as_ref().is_some_and(|bytes| Wire(bytes).role() == role::TEST);
+        let flags = [
+            (!self.encrypt_for.is_empty(), flag::ENCRYPTED),
+            (self.compress || self.base.is_some(), flag::COMPRESSED),
+            (self.base.is_some(), flag::DICTIONARY),
+            (self.data, flag::DATA),
+            (self.writes_flash, flag::WRITES_FLASH),
+            (self.test || certified_test, flag::TEST),
+        ];
+        let flags = flags.iter().filter(|(set, _)| *set).fold(0, |flags, (_, flag)| flags | flag);
+        let mut bytes = vec![0; FIXED];
+        let mut put = |at: usize, field: &[u8]| bytes[at..at + field.len()].copy_from_slice(field);
+        put(0, &MAGIC);
+        put(6, &[1, flags]);
+        put(8, &self.vendor_id.to_le_bytes());
+        put(12, &self.product_code.to_le_bytes());
+        put(16, &self.version.to_le_bytes());
+        put(20, &self.counter.to_le_bytes());
+        put(24, &[self.program, self.chunk]);
+        put(26, &FORMAT.to_le_bytes());
+        // `check` keeps the image, and LZMA with it, far below 4 GiB.
+        put(28, &(image.len() as u32).to_le_bytes());
+        put(32, &CRC.checksum(image).to_le_bytes());
+        put(36, &(payload as u32).to_le_bytes());
+        put(40, &hash(image));
+        put(120, &self.unique_id);
+        put(132, &self.hardware.to_le_bytes());
+        put(136, &self.created.to_le_bytes());
+        if let Some(base) = self.base {
+            put(144, &hash(base));
+        }
+        bytes
+    }
+
+    /// The records that are for people. Zeros behind a text make whole words of it: a manifest has
+    /// nothing between its records.
+    fn notes(&self) -> impl Iterator<Item = (u16, Vec<u8>)> {
+        let words = |tag, text: &str| {
+            let mut bytes = text.as_bytes().to_vec();
+            bytes.resize(bytes.len().next_multiple_of(4), 0);
+            (tag, bytes)
+        };
+        let text = self.text.map(|text| words(tag::TEXT, text));
+        let sbom = self.sbom.map(|sbom| (tag::SBOM, sbom.to_vec()));
+        let source = self.source.map(|source| words(tag::SOURCE, source));
+        [text, sbom, source].into_iter().flatten()
+    }
+
+    fn records_size(&self) -> usize {
+        let notes: usize = self.notes().map(|(_, bytes)| 4 + bytes.len()).sum();
+        notes + self.encrypt_for.len() * (4 + RECIPIENT)
+    }
+
+    fn add_records(&self, manifest: &mut Vec<u8>, image_key: &[u8; 32], nonce: &[u8; 16]) {
+        let mut add = |tag: u16, parts: &[&[u8]]| {
+            let size: usize = parts.iter().map(|part| part.len()).sum();
+            manifest.extend_from_slice(&tag.to_le_bytes());
+            // The manifest's own size was checked, which is far less.
+            manifest.extend_from_slice(&(size as u16).to_le_bytes());
+            parts.iter().for_each(|part| manifest.extend_from_slice(part));
+        };
+        for kek in self.encrypt_for {
+            let (check, wrapped) = wrap(kek.secret(), nonce, image_key);
+            add(tag::RECIPIENT, &[&kek.id().to_le_bytes(), &check, &wrapped]);
+        }
+        for (tag, bytes) in self.notes() {
+            add(tag, &[&bytes]);
+        }
+    }
+}
+
+impl Unsigned {
+    /// What is to be signed by pure Ed25519: the domain and the manifest.
+    #[must_use]
+    pub fn tbs(&self) -> Vec<u8> {
+        let manifest = seal::wire::Head(&self.file).manifest();
+        [&DOMAIN[..], manifest].concat()
+    }
+
+    /// The file with zeros for the signature.
+    #[must_use]
+    pub fn file(&self) -> &[u8] {
+        &self.file
+    }
+
+    /// Takes up a file that was kept, of an image which this key signs.
+    ///
+    /// # Errors
+    /// [`SealFault::NotUnsigned`], [`SealFault::OtherKey`].
+    pub fn of_file(file: Vec<u8>, key: PublicKey) -> Result<Self, SealFault> {
+        let head = match seal::wire::head_size(&file) {
+            Ok(size) if size <= file.len() => size,
+            _ => return Err(SealFault::NotUnsigned),
+        };
+        let certificate = seal::wire::Head(&file[..head]).certificate();
+        let of_another = certificate.is_some_and(|certificate| certificate.key() != key.bytes());
+        let at = head.checked_sub(SIGNATURE).ok_or(SealFault::NotUnsigned)?;
+        let header = at.checked_sub(SIGNATURE_HEADER).ok_or(SealFault::NotUnsigned)?;
+        let id = seal::wire::word(&file, header);
+        match seal::wire::Head(&file[..head]).signature(id) {
+            Some(zeros) if zeros == [0; SIGNATURE] && seal::wire::Head(&file).signatures() == 1 => {}
+            _ => return Err(SealFault::NotUnsigned),
+        }
+        if of_another || id != key.id() {
+            return Err(SealFault::OtherKey(id));
+        }
+        Ok(Self { file, at, key })
+    }
+
+    /// The sealed image with its signature.
+    ///
+    /// # Errors
+    /// [`SealFault::Signature`] for one that does not fit.
+    pub fn attach(&self, signature: &[u8; SIGNATURE]) -> Result<Vec<u8>, SealFault> {
+        if !self.key.verifies(&self.tbs(), signature) {
+            return Err(SealFault::Signature(self.key.id()));
+        }
+        let mut file = self.file.clone();
+        file[self.at..self.at + SIGNATURE].copy_from_slice(signature);
+        Ok(file)
+    }
+}
+
+/// Cuts payload into chunks: the hash of the first, and all of them.
+fn chain(payload: &[u8], chunk: usize) -> ([u8; HASH], Vec<u8>) {
+    let mut next = [0; HASH];
+    let mut chunks: Vec<Vec<u8>> = Vec::new();
+    for data in payload.chunks(chunk).rev() {
+        let bytes = [&next[..], data].concat();
+        next = hash(&bytes);
+        chunks.push(bytes);
+    }
+    chunks.reverse();
+    (next, chunks.concat())
+}
