@@ -160,6 +160,23 @@ impl Bench {
         }
     }
 
+    /// Switches the power on; gives how long it takes to the program counter in program 1, in steps
+    /// of 10 us.
+    ///
+    /// # Panics
+    /// If the program does not start within a second.
+    pub fn power_on_to_first_instruction(&mut self) -> Span {
+        let from: Time = self.time();
+        self.power_on();
+        loop {
+            self.world.run_for(Span::from_micros(10));
+            if firmware::board().programs[0].contains(self.machine().pc(), 2) {
+                return self.time() - from;
+            }
+            assert!(self.time() - from < Span::from_millis(1000), "the program does not start");
+        }
+    }
+
     /// Cuts the power of all boards.
     pub fn power_off(&mut self) {
         for board in self.boards() {

@@ -30,6 +30,10 @@ static ESACADEMY: [Entry; len(Profile::ESACADEMY.extras)] =
     entries(PROGRAMS, Profile::ESACADEMY.extras).entries();
 static LIFT: [Entry; len(Profile::LIFT.extras)] = entries(PROGRAMS, Profile::LIFT.extras).entries();
 
+/// With sealed images.
+const SEALED: Extras = Extras { sealed: true, ..Extras::NONE };
+static SEALED_ENTRIES: [Entry; len(SEALED)] = entries(PROGRAMS, SEALED).entries();
+
 const fn len(extras: Extras) -> usize {
     entry_count(PROGRAMS, extras)
 }
@@ -52,9 +56,9 @@ pub struct Image {
     pub lss: bool,
 }
 
-/// All images: the bootloader in each profile, and the application template.
+/// All images: the bootloader in each profile and for sealed images, and the application template.
 #[must_use]
-pub fn images() -> [Image; 5] {
+pub fn images() -> [Image; 6] {
     [
         bootloader(),
         bootloader_of(
@@ -62,6 +66,12 @@ pub fn images() -> [Image; 5] {
             "coboot, the CANopen bootloader, as port's Paulus",
             Profile::PAULUS,
             &STANDARD,
+        ),
+        bootloader_of(
+            "coboot-bootloader-sealed.eds",
+            "coboot, the CANopen bootloader, for sealed images",
+            Profile::STANDARD,
+            &SEALED_ENTRIES,
         ),
         bootloader_of(
             "coboot-bootloader-esacademy.eds",

@@ -33,6 +33,8 @@ pub const BOOTLOADER_LOG_RTT: &str = "bootloader-log-rtt.elf";
 pub const BOOTLOADER_LOG_DEFMT: &str = "bootloader-log-defmt.elf";
 /// The same as text, out of the board's UART.
 pub const BOOTLOADER_LOG_UART: &str = "bootloader-log-uart.elf";
+/// The one that takes sealed images, and no others once it has keys.
+pub const BOOTLOADER_SEALED: &str = "bootloader-sealed.elf";
 /// One with the debugger interface, which no product has.
 pub const BOOTLOADER_DEBUGGER: &str = "bootloader-debugger.elf";
 /// The one that speaks CAN over the board's UART.

@@ -13,7 +13,8 @@
 pub mod board;
 mod device;
 #[path = "../../boot-core/tests/model/mod.rs"]
-mod model;
+#[allow(missing_docs, reason = "it is the tests' own")]
+pub mod model;
 mod points;
 mod scenario;
 

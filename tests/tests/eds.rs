@@ -12,7 +12,7 @@ use coboot_tests::firmware;
 use coflash::file::read::Firmware;
 use coflash::update::{flash, FlashOptions};
 
-fn images() -> [Image; 5] {
+fn images() -> [Image; 6] {
     eds::images()
 }
 

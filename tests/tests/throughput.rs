@@ -2,7 +2,7 @@
 //! programming and verifying included.
 
 use canopen::BitRate;
-use coboot_tests::throughput::{load, measure};
+use coboot_tests::throughput::{load, measure, measure_form, Form};
 
 #[test]
 fn a_download_at_1_mbit_comes_to_95_percent_of_the_wire() {
@@ -22,4 +22,15 @@ fn the_host_tool_saturates_the_bus_at_1_mbit() {
     assert!((95..=100).contains(&load.percent()), "{load:?}");
     // 256 KiB by 7 in a frame, and what goes with it.
     assert!((37_450..42_000).contains(&load.frames), "{load:?}");
+}
+
+/// At 500 kbit/s a program that is sealed and compressed is in the device, verified, before the raw one
+/// could be on the wire.
+#[test]
+fn a_compressed_program_is_faster_than_the_wire_of_the_raw_one() {
+    let measured = measure_form(BitRate::K500, 256, Form::Compressed);
+    assert!(measured.took < measured.wire, "{measured:?}");
+    // No faster than the wire and the flash allow.
+    assert!(measured.took >= measured.flash, "{measured:?}");
+    assert!(measured.percent() >= measured.file as u64 * 100 / (256 * 1024), "{measured:?}");
 }

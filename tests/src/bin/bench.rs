@@ -4,7 +4,7 @@
 use std::process::ExitCode;
 
 use canopen::BitRate;
-use coboot_tests::throughput::{load, measure, Load, Measurement};
+use coboot_tests::throughput::{load, measure, measure_form, Form, Load, Measurement, OfForm};
 
 const RATES: [BitRate; 4] = [BitRate::K125, BitRate::K250, BitRate::K500, BitRate::K1000];
 const SIZES: [u32; 3] = [64, 256, 900];
@@ -50,9 +50,25 @@ fn main() -> ExitCode {
             }
         }
     }
+    if !json {
+        println!("\nA program of 256 KiB as one file, from CLEAR to verified; the wire limit is that of the raw program.\n");
+        println!("   kbit/s        form   bytes sent     measured   wire limit   of the limit   flash limit");
+    }
+    let mut forms = Vec::new();
+    for rate in RATES {
+        for form in [Form::Raw, Form::Sealed, Form::Compressed] {
+            let row = measure_form(rate, 256, form);
+            if json {
+                forms.push(form_as_json(&row));
+            } else {
+                println!("{}", form_as_text(&row));
+            }
+        }
+    }
     if json {
+        let forms = forms.join(",\n");
         let (rows, loads) = (rows.join(",\n"), loads.join(",\n"));
-        println!("{{\"downloads\": [\n{rows}\n],\n\"bus\": [\n{loads}\n]}}");
+        println!("{{\"downloads\": [\n{rows}\n],\n\"bus\": [\n{loads}\n],\n\"forms\": [\n{forms}\n]}}");
     }
     ExitCode::SUCCESS
 }
@@ -78,6 +94,42 @@ fn load_as_json(row: &Load) -> String {
         row.took,
         row.busy,
         row.frames,
+        row.percent()
+    )
+}
+
+fn name(form: Form) -> &'static str {
+    match form {
+        Form::Raw => "raw",
+        Form::Sealed => "sealed",
+        Form::Compressed => "compressed",
+    }
+}
+
+fn form_as_text(row: &OfForm) -> String {
+    let seconds = |us: u64| format!("{:.3} s", us as f64 / 1e6);
+    format!(
+        "{:>9} {:>11} {:>12} {:>12} {:>12} {:>12} % {:>13}",
+        row.bit_rate / 1000,
+        name(row.form),
+        row.file,
+        seconds(row.took),
+        seconds(row.wire),
+        row.percent(),
+        seconds(row.flash)
+    )
+}
+
+fn form_as_json(row: &OfForm) -> String {
+    format!(
+        "  {{\"bit_rate\": {}, \"kib\": {}, \"form\": \"{}\", \"bytes_sent\": {}, \"measured_us\": {}, \"wire_limit_us\": {}, \"flash_limit_us\": {}, \"percent\": {}}}",
+        row.bit_rate,
+        row.kib,
+        name(row.form),
+        row.file,
+        row.took,
+        row.wire,
+        row.flash,
         row.percent()
     )
 }

@@ -1,7 +1,10 @@
-//! The main job for people to watch: `cargo xtask demo`.
+//! The main job for people to watch: `cargo xtask demo`, and with `--sealed` the sealed device.
 //!
 //! Host tool, bus and chip run in this process, in virtual time; the firmware is the one that goes
 //! onto the board.
+
+#[path = "demo/sealed.rs"]
+mod sealed;
 
 use std::fs::File;
 use std::io::BufWriter;
@@ -11,6 +14,7 @@ use canopen::program::{ProgramControl, DEVICE_NAME, PROGRAM_ID, SOFTWARE_VERSION
 use canopen::Address;
 use coboot_tests::bench::{Bench, BIT_RATE, NODE};
 use coboot_tests::firmware;
+use coboot_tests::sealed_board::open_board;
 use coflash::file::block_file::BlockFile;
 use coflash::update::{flash, Event, FlashOptions};
 use emulator::candump;
@@ -20,10 +24,14 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 type Outcome<T> = Result<T, Box<dyn std::error::Error>>;
 
 const USAGE: &str =
-    "usage: demo [--trace FILE]    (run it as `cargo xtask demo`, which builds everything first)";
+    "usage: demo [--sealed] [--trace FILE]    (run it as `cargo xtask demo`, which builds everything first)";
 
 fn main() -> ExitCode {
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let mut arguments: Vec<String> = std::env::args().skip(1).collect();
+    let is_sealed = arguments.first().is_some_and(|first| first == "--sealed");
+    if is_sealed {
+        arguments.remove(0);
+    }
     let trace = match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
         [] => None,
         ["--trace", file] => Some(file.to_owned()),
@@ -32,7 +40,7 @@ fn main() -> ExitCode {
             return ExitCode::from(2);
         }
     };
-    match demo(trace.as_deref()) {
+    match demo(trace.as_deref(), is_sealed) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("the demonstration failed: {error}");
@@ -41,10 +49,10 @@ fn main() -> ExitCode {
     }
 }
 
-fn demo(trace: Option<&str>) -> Outcome<()> {
+fn demo(trace: Option<&str>, is_sealed: bool) -> Outcome<()> {
     let board = firmware::board();
     println!("An emulated {} on a CAN bus at {} kbit/s. Times are virtual.\n", board.board, BIT_RATE / 1000);
-    let mut bench = Bench::new();
+    let mut bench = if is_sealed { open_board() } else { Bench::new() };
     let log = match trace {
         Some(path) => {
             let file = File::create(path).map_err(|error| format!("{path}: {error}"))?;
@@ -55,30 +63,47 @@ fn demo(trace: Option<&str>) -> Outcome<()> {
         None => None,
     };
 
+    if is_sealed {
+        sealed::tell(&mut bench)?;
+    } else {
+        main_job(&mut bench)?;
+    }
+
+    let counters = bench.machine().counters();
+    println!("\nDone: {} million instructions ran on the chip.", counters.instructions / 1_000_000);
+    if let Some((path, log)) = log {
+        log.flush()?;
+        println!("The bus is in {path}, as candump logs it.");
+    }
+    Ok(())
+}
+
+/// Two versions, one after the other, and a power failure.
+fn main_job(bench: &mut Bench) -> Outcome<()> {
     chapter("Power on: an empty board comes up in its bootloader");
     bench.power_on();
     print_line(bench.time(), "power on");
     let up = bench.await_boot_up(1000);
     print_line(up, &format!("boot-up of node {NODE}"));
-    introduce(&mut bench)?;
+    introduce(bench)?;
 
     chapter("Version 1 goes into the board");
     let v1 = convert(firmware::APP_V1);
-    install(&mut bench, &v1)?;
-    introduce(&mut bench)?;
-    heartbeat(&mut bench)?;
+    install(bench, &v1)?;
+    introduce(bench)?;
+    heartbeat(bench)?;
 
     chapter("The master calls the application back: 1F51h = 80h");
     bench.session().command(1, ProgramControl::StartBootloader)?;
     print_line(bench.time(), "the application acknowledged, and leaves");
     let up = bench.await_boot_up(1000);
     print_line(up, "boot-up: the bootloader is back");
-    introduce(&mut bench)?;
+    introduce(bench)?;
 
     chapter("Version 2 goes into the board");
     let v2 = convert(firmware::APP_V2);
-    install(&mut bench, &v2)?;
-    introduce(&mut bench)?;
+    install(bench, &v2)?;
+    introduce(bench)?;
 
     chapter("The power fails, and comes back");
     bench.power_off();
@@ -88,16 +113,9 @@ fn demo(trace: Option<&str>) -> Outcome<()> {
     print_line(bench.time(), "power on");
     let up = bench.await_boot_up(1000);
     print_line(up, "boot-up: the program started by itself, at once: it has passed its trial");
-    introduce(&mut bench)?;
-    heartbeat(&mut bench)?;
+    introduce(bench)?;
+    heartbeat(bench)?;
     bench.assert_nothing_unmodelled();
-
-    let counters = bench.machine().counters();
-    println!("\nDone: {} million instructions ran on the chip.", counters.instructions / 1_000_000);
-    if let Some((path, log)) = log {
-        log.flush()?;
-        println!("The bus is in {path}, as candump logs it.");
-    }
     Ok(())
 }
 

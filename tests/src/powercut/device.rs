@@ -16,6 +16,7 @@ use boot_core::flash::{run, Flash, FlashFault, Next, Operation};
 use boot_core::profile::Profile;
 use boot_core::program::verify;
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord, StoreError, Value};
+use boot_core::unseal::Room;
 use shared_abi::geometry::{Region, Sector};
 use shared_abi::layout::Layout;
 
@@ -261,8 +262,11 @@ impl Device {
     fn host_of<R>(&mut self, config: &'static Config, talk: impl FnOnce(&mut Host<'_, '_>) -> R) -> R {
         let (parameters, node) = (self.parameters(), self.node());
         let flash = Chip { flash: &mut self.flash, bug: self.bug };
-        let mut buffer = [0; 256];
-        talk(&mut Host { node: Bootloader::new(config, 0, node, 0, parameters, flash, &mut buffer) })
+        let (mut buffer, mut room) = ([0; 256], Room::new());
+        let unsealer = room.unsealer();
+        talk(&mut Host {
+            node: Bootloader::new(config, 0, node, 0, parameters, flash, &mut buffer, unsealer),
+        })
     }
 }
 
@@ -458,6 +462,7 @@ impl Store {
                     confirmed: false,
                     version: 0,
                     half_erased: false,
+                    seal: None,
                 };
                 Self::Instead(journal, Some(record.value()))
             }
@@ -474,6 +479,9 @@ fn naive_key(key: Key) -> u32 {
         Key::Program(number) => 0x100 + u32::from(number),
         Key::CrashCount => 0x200,
         Key::Node => 0x300,
+        Key::Counter(number) => 0x400 + u32::from(number),
+        Key::Event(place) => 0x500 + u32::from(place),
+        Key::Grants => 0x600,
     }
 }
 

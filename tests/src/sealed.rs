@@ -1,0 +1,766 @@
+//! A device that takes sealed images alone, on the flash model: the keys that it trusts, the files
+//! that come to it, and what may be found in its flash.
+
+use std::cell::{RefCell, RefMut};
+use std::rc::Rc;
+use std::sync::OnceLock;
+use std::task::Poll;
+
+use boot_core::bootloader::{entries, entry_count, Bootloader, Config, PasswordObject};
+use boot_core::canopen::device::Device as Identity;
+use boot_core::canopen::lss::LssDevice;
+use boot_core::canopen::od::{Address, Entry, Objects};
+use boot_core::canopen::{AbortCode, BitRate, Instant, NodeId};
+use boot_core::control::{Policy, Step};
+use boot_core::crc::CrcKind;
+use boot_core::decision::{self, decide, BootDecision, Circumstances};
+use boot_core::flash::{Flash, FlashFault, Operation};
+use boot_core::policy::SealPolicy;
+use boot_core::profile::Profile;
+use boot_core::program::{verify, Invalid, VerifiedProgram};
+use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord};
+use boot_core::unseal::Room;
+use coflash::file::sealed::{hash, key_block, Certificate, Kek, Role, Sealer, SigningKey};
+use seal::access::{right, CHALLENGE, DOMAIN as ACCESS_DOMAIN, SIGNED_CHALLENGE};
+use seal::wire::{head_size, CERTIFICATE, DOMAIN, ED25519};
+use shared_abi::geometry::{Region, Sector};
+use shared_abi::label::{self, Label};
+use shared_abi::layout::Layout;
+use shared_abi::warm_start::BootRequest;
+
+use crate::powercut::model::{ModelFlash, CHIP, ONE_PROGRAM, TWO_PROGRAMS};
+
+// --- setups
+
+/// What a device is made for.
+pub struct Setup {
+    /// Its name, for who is told of a failure.
+    pub name: &'static str,
+    /// Who owns which address.
+    pub layout: &'static Layout,
+    /// Who writes which password where.
+    pub profile: Profile,
+    config: Config,
+}
+
+/// 1018h/1.
+pub const VENDOR_ID: u32 = 0x0000_0319;
+/// 1018h/2.
+pub const PRODUCT_CODE: u32 = 0x0004_0001;
+/// 1018h/3: hardware revision 2.
+pub const REVISION: u32 = 0x0001_0002;
+/// Of the chip.
+pub const UNIQUE_ID: [u8; 12] = *b"unique id 96";
+
+static ONE: Layout = ONE_PROGRAM;
+static TWO: Layout = TWO_PROGRAMS;
+
+const SEAL: SealPolicy = SealPolicy {
+    vendor_id: VENDOR_ID,
+    product_code: PRODUCT_CODE,
+    revision: REVISION,
+    unique_id: || UNIQUE_ID,
+    ..SealPolicy::NONE
+};
+
+const fn config(
+    profile: &Profile,
+    layout: &'static Layout,
+    entries: &'static [Entry],
+    seal: SealPolicy,
+) -> Config {
+    Config {
+        entries,
+        device: Identity {
+            device_type: profile.device_type,
+            name: "sealed",
+            hardware_version: "0",
+            software_version: "0",
+            heartbeat_ms: 0,
+            vendor_id: VENDOR_ID,
+            product_code: PRODUCT_CODE,
+            revision: REVISION,
+            serial_number: 0,
+        },
+        node_id: profile.node_id,
+        layout,
+        supports: |_| true,
+        boot_up_emergency: false,
+        lss_store: true,
+        download: Policy {
+            identity: Some((VENDOR_ID, PRODUCT_CODE)),
+            seal: SealPolicy { data: profile.download.data, ..seal },
+            ..profile.download
+        },
+        password: profile.password,
+    }
+}
+
+/// The setup of a profile, with an object dictionary of its own.
+macro_rules! setup {
+    ($name:literal, $programs:literal, $layout:ident, $profile:expr, $seal:expr) => {{
+        const PROFILE: Profile = $profile;
+        static ENTRIES: [Entry; entry_count($programs, PROFILE.extras)] =
+            entries($programs, PROFILE.extras).entries();
+        Setup {
+            name: $name,
+            layout: &$layout,
+            profile: PROFILE,
+            config: config(&PROFILE, &$layout, &ENTRIES, $seal),
+        }
+    }};
+}
+
+/// The standard profile, one program.
+pub static STANDARD_1: Setup = setup!("STANDARD_1", 1, ONE, Profile::STANDARD, SEAL);
+/// The standard profile, two programs.
+pub static STANDARD_2: Setup = setup!("STANDARD_2", 2, TWO, Profile::STANDARD, SEAL);
+/// A product whose bootloader takes no counter below 6.
+pub static CONSTANT_1: Setup =
+    setup!("CONSTANT_1", 1, ONE, Profile::STANDARD, SealPolicy { counter: 6, ..SEAL });
+/// A product that raises the counter when a program is confirmed.
+pub static CONFIRMED_1: Setup =
+    setup!("CONFIRMED_1", 1, ONE, Profile::STANDARD, SealPolicy { counter_with_confirmation: true, ..SEAL });
+/// The same with two programs.
+pub static CONFIRMED_2: Setup =
+    setup!("CONFIRMED_2", 2, TWO, Profile::STANDARD, SealPolicy { counter_with_confirmation: true, ..SEAL });
+/// A password for each program, which voids it; and the program starts by itself.
+pub static ESACADEMY_2: Setup = setup!("ESACADEMY_2", 2, TWO, Profile::ESACADEMY, SEAL);
+/// A password, and program 2 is data.
+pub static LIFT_2: Setup = setup!("LIFT_2", 2, TWO, Profile::LIFT, SEAL);
+
+impl Setup {
+    /// How many programs there are.
+    #[must_use]
+    pub fn programs(&self) -> u8 {
+        self.layout.programs.len() as u8
+    }
+
+    /// The flash of a program.
+    #[must_use]
+    pub fn region(&self, program: u8) -> Region {
+        self.layout.programs[usize::from(program) - 1]
+    }
+
+    /// Whether a program is data of the application.
+    #[must_use]
+    pub fn is_data(&self, program: u8) -> bool {
+        self.profile.download.data == Some(program)
+    }
+}
+
+// --- keys and files
+
+/// The keys of this world.
+pub struct Keys {
+    /// In every key block.
+    pub root: SigningKey,
+    /// The second root of every key block.
+    pub second_root: SigningKey,
+    /// What the root certifies.
+    pub release: SigningKey,
+    /// What nobody certifies.
+    pub stranger: SigningKey,
+    /// The key-encryption key that devices have.
+    pub keks: [Kek; 1],
+    /// One that they have not.
+    pub other_keks: [Kek; 1],
+}
+
+/// See [`Keys`].
+pub fn keys() -> &'static Keys {
+    static KEYS: OnceLock<Keys> = OnceLock::new();
+    let signing = |seed| SigningKey::from_seed([seed; 32]).expect("its id is not 0");
+    let kek = |byte| Kek::new([byte; 32]).expect("its id is not 0");
+    KEYS.get_or_init(|| Keys {
+        root: signing(1),
+        second_root: signing(2),
+        release: signing(3),
+        stranger: signing(4),
+        keks: [kek(5)],
+        other_keks: [kek(6)],
+    })
+}
+
+/// The epoch of [`certificate`].
+pub const EPOCH: u32 = 4;
+/// The highest counter of [`certificate`].
+pub const HIGHEST: u32 = 1000;
+
+/// What the root says of the release key: any product, counters to [`HIGHEST`].
+#[must_use]
+pub fn certificate() -> Certificate {
+    Certificate {
+        role: Role::Release,
+        epoch: EPOCH,
+        vendor_id: VENDOR_ID,
+        product_code: 0,
+        lowest: 0,
+        highest: HIGHEST,
+        key: keys().release.public(),
+    }
+}
+
+/// The key block of every sealed device here, unless told otherwise.
+#[must_use]
+pub fn default_keys() -> [u8; 256] {
+    let Keys { root, second_root, keks, .. } = keys();
+    key_block(&[root.public(), second_root.public()], keks, 0, 0, false).expect("it has room for them")
+}
+
+/// Whether an image is encrypted, and whether it is compressed.
+pub const FORMS: [(bool, bool); 4] = [(false, false), (true, false), (false, true), (true, true)];
+
+/// For an image of program 1 with counter 5 and version 1, of the release key.
+#[must_use]
+pub fn sealer((encrypted, compress): (bool, bool)) -> Sealer<'static> {
+    static CERTIFICATE_BYTES: OnceLock<[u8; CERTIFICATE]> = OnceLock::new();
+    Sealer {
+        certificate: Some(*CERTIFICATE_BYTES.get_or_init(|| certificate().signed_by(&keys().root))),
+        vendor_id: VENDOR_ID,
+        product_code: PRODUCT_CODE,
+        version: 1,
+        counter: 5,
+        encrypt_for: if encrypted { &keys().keks } else { &[] },
+        compress,
+        ..Sealer::default()
+    }
+}
+
+/// Seals for the release key.
+#[must_use]
+pub fn seal(sealer: &Sealer<'_>, image: &[u8]) -> Vec<u8> {
+    sealer.seal(image, &keys().release).expect("it can be sealed")
+}
+
+/// A program for this place: vectors, a label, and bytes that tell it from any other.
+#[must_use]
+pub fn image(region: Region, len: usize, seed: u8) -> Vec<u8> {
+    let mut bytes: Vec<u8> = (0..len).map(|i| (i as u8).wrapping_mul(31) ^ (i >> 8) as u8 ^ seed).collect();
+    bytes[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
+    bytes[4..8].copy_from_slice(&(region.base + 0x101).to_le_bytes());
+    let at = label::OFFSET as usize;
+    if len >= at + label::SIZE {
+        let Label { magic, vendor_id, product_code, version, reserved: [a, b, c], check } =
+            Label::new(VENDOR_ID, PRODUCT_CODE, seed.into());
+        let words = [magic, vendor_id, product_code, version, a, b, c, check];
+        for (place, word) in bytes[at..].chunks_mut(4).zip(words) {
+            place.copy_from_slice(&word.to_le_bytes());
+        }
+    }
+    bytes
+}
+
+/// CRC-32 of the catalogue (CRC-32/ISO-HDLC).
+#[must_use]
+pub fn crc32(bytes: &[u8]) -> u32 {
+    crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(bytes)
+}
+
+/// A sealed image in its parts, to be made wrong.
+#[derive(Clone)]
+pub struct Parts {
+    /// With its own size in it.
+    pub manifest: Vec<u8>,
+    /// Empty for none.
+    pub certificate: Vec<u8>,
+    /// With their headers.
+    pub signatures: Vec<u8>,
+    /// All of them.
+    pub chunks: Vec<u8>,
+}
+
+impl Parts {
+    /// Of a file with one signature.
+    #[must_use]
+    pub fn of(file: &[u8]) -> Self {
+        let mut have = 8;
+        let head = loop {
+            match head_size(&file[..have]).expect("it is a sealed image") {
+                size if size == have => break have,
+                size => have = size,
+            }
+        };
+        let manifest = usize::from(u16::from_le_bytes([file[4], file[5]]));
+        Self {
+            manifest: file[..manifest].to_vec(),
+            certificate: file[manifest..head - 72].to_vec(),
+            signatures: file[head - 72..head].to_vec(),
+            chunks: file[head..].to_vec(),
+        }
+    }
+
+    /// Bytes in the manifest become these.
+    #[must_use]
+    pub fn with(mut self, at: usize, bytes: &[u8]) -> Self {
+        self.manifest[at..at + bytes.len()].copy_from_slice(bytes);
+        self
+    }
+
+    /// One more record at the end of the manifest; `size` is what it says of itself.
+    #[must_use]
+    pub fn with_record(mut self, tag: u16, size: u16, bytes: &[u8]) -> Self {
+        self.manifest.extend(tag.to_le_bytes());
+        self.manifest.extend(size.to_le_bytes());
+        self.manifest.extend(bytes);
+        let size = self.manifest.len() as u16;
+        self.with(4, &size.to_le_bytes())
+    }
+
+    /// With another certificate, signed as it should be.
+    #[must_use]
+    pub fn certified(mut self, certificate: &[u8]) -> Self {
+        self.certificate = certificate.to_vec();
+        self
+    }
+
+    /// With this payload, in chunks of the size that the manifest says.
+    #[must_use]
+    pub fn with_payload(self, payload: &[u8]) -> Self {
+        let mut next = [0; 32];
+        let mut chunks: Vec<Vec<u8>> = Vec::new();
+        for data in payload.chunks(1 << self.manifest[25]).rev() {
+            let chunk = [&next[..], data].concat();
+            next = hash(&chunk);
+            chunks.push(chunk);
+        }
+        chunks.reverse();
+        let size = payload.len() as u32;
+        Self { chunks: chunks.concat(), ..self }.with(36, &size.to_le_bytes()).with(72, &next)
+    }
+
+    /// Its payload, where it is not encrypted.
+    #[must_use]
+    pub fn payload(&self) -> Vec<u8> {
+        self.chunks.chunks(32 + (1 << self.manifest[25])).flat_map(|chunk| &chunk[32..]).copied().collect()
+    }
+
+    /// Signed by this key alone.
+    #[must_use]
+    pub fn signed_by(mut self, key: &SigningKey) -> Self {
+        self.signatures = Self::signature(key, &self.manifest);
+        self
+    }
+
+    /// A signature with its header.
+    #[must_use]
+    pub fn signature(key: &SigningKey, manifest: &[u8]) -> Vec<u8> {
+        let signature = key.sign(&[&DOMAIN[..], manifest].concat());
+        [&key.public().id().to_le_bytes()[..], &ED25519.to_le_bytes(), &64_u16.to_le_bytes(), &signature]
+            .concat()
+    }
+
+    /// Signed by the release key.
+    #[must_use]
+    pub fn signed(self) -> Vec<u8> {
+        self.signed_by(&keys().release).bytes()
+    }
+
+    /// The file.
+    #[must_use]
+    pub fn bytes(&self) -> Vec<u8> {
+        [&self.manifest[..], &self.certificate, &self.signatures, &self.chunks].concat()
+    }
+
+    /// Bytes in front of the chunks.
+    #[must_use]
+    pub fn head(&self) -> usize {
+        self.manifest.len() + self.certificate.len() + self.signatures.len()
+    }
+}
+
+// --- the device
+
+/// The flash, which outlives the bootloader that works on it.
+#[derive(Clone)]
+pub struct Chip(Rc<RefCell<ModelFlash>>);
+
+impl Chip {
+    /// As a debug probe sees it.
+    #[must_use]
+    pub fn model(&self) -> RefMut<'_, ModelFlash> {
+        self.0.borrow_mut()
+    }
+}
+
+impl Flash for Chip {
+    fn read(&self, address: u32, buffer: &mut [u8]) {
+        self.0.borrow().read(address, buffer);
+    }
+
+    fn start(&mut self, operation: Operation) -> Result<(), FlashFault> {
+        self.model().start(operation)
+    }
+
+    fn sector_at(&self, address: u32) -> Option<Sector> {
+        self.0.borrow().sector_at(address)
+    }
+
+    fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
+        self.model().poll()
+    }
+}
+
+/// What the rest of a device uses of its bootloader.
+pub trait Node: Objects + LssDevice {
+    /// A bounded piece of work; whether there was none.
+    fn is_idle_after_step(&mut self) -> bool;
+    /// [`Bootloader::take_boot_request`].
+    fn take_boot_request(&mut self) -> Option<BootRequest>;
+    /// [`Bootloader::confirm`].
+    fn confirm(&mut self, program: u8);
+    /// [`Bootloader::set_time`].
+    fn set_time(&mut self, now: Instant);
+}
+
+impl<F: Flash, P: Parameters, const PROGRAMS: usize> Node for Bootloader<'_, F, P, PROGRAMS> {
+    fn is_idle_after_step(&mut self) -> bool {
+        self.step() == Step::Idle
+    }
+
+    fn take_boot_request(&mut self) -> Option<BootRequest> {
+        Bootloader::take_boot_request(self)
+    }
+
+    fn confirm(&mut self, program: u8) {
+        Bootloader::confirm(self, program);
+    }
+
+    fn set_time(&mut self, now: Instant) {
+        Bootloader::set_time(self, now);
+    }
+}
+
+const DECISION: decision::Policy = decision::Policy {
+    autostart: Some(1),
+    max_crash_resets: 3,
+    node_ids: 1..=127,
+    rescue_window_ms: 0,
+    rescue_window_confirmed_ms: 0,
+    start_allowed: |_| true,
+};
+
+const BOARD_NODE: NodeParameters = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
+
+/// A device without power, or with it in [`run`](Self::run).
+pub struct Device {
+    /// What it is made for.
+    pub setup: &'static Setup,
+    /// Its flash.
+    pub chip: Chip,
+    /// Bytes of buffer between bus and flash.
+    pub buffer: usize,
+}
+
+impl Device {
+    /// With this flash.
+    #[must_use]
+    pub fn on(setup: &'static Setup, flash: ModelFlash) -> Self {
+        Self { setup, chip: Chip(Rc::new(RefCell::new(flash))), buffer: 2048 }
+    }
+
+    /// With an empty flash but for this key block.
+    #[must_use]
+    pub fn with_keys(setup: &'static Setup, block: &[u8; 256]) -> Self {
+        let mut flash = ModelFlash::new(&CHIP);
+        flash.poke(setup.layout.key_block().base, block);
+        Self::on(setup, flash)
+    }
+
+    /// With an empty flash but for [`default_keys`].
+    #[must_use]
+    pub fn sealed(setup: &'static Setup) -> Self {
+        Self::with_keys(setup, &default_keys())
+    }
+
+    /// With an empty flash.
+    #[must_use]
+    pub fn open(setup: &'static Setup) -> Self {
+        Self::on(setup, ModelFlash::new(&CHIP))
+    }
+
+    /// Another device with the same in its flash.
+    #[must_use]
+    pub fn copy(&self) -> Self {
+        let mut flash = self.chip.model().clone();
+        flash.power_on();
+        flash.touched.clear();
+        Self { buffer: self.buffer, ..Self::on(self.setup, flash) }
+    }
+
+    /// Power on, bootloader mode, and somebody who talks to it; then power off.
+    pub fn run<R>(&self, talk: impl FnOnce(&mut Host<'_>) -> R) -> R {
+        let flash = self.chip.clone();
+        let parameters = Journal::open(&flash, self.setup.layout.parameters);
+        let node = NodeParameters::load(&parameters, &flash, BOARD_NODE, |_| true);
+        let mut buffer = vec![0; self.buffer];
+        let mut room = Box::<Room>::default();
+        let (config, buffer, unsealer) = (&self.setup.config, &mut buffer[..], room.unsealer());
+        let node: Box<dyn Node + '_> = match self.setup.programs() {
+            1 => {
+                Box::new(Bootloader::<_, _, 1>::new(config, 0, node, 0, parameters, flash, buffer, unsealer))
+            }
+            _ => {
+                Box::new(Bootloader::<_, _, 2>::new(config, 0, node, 0, parameters, flash, buffer, unsealer))
+            }
+        };
+        let result = talk(&mut Host { device: self, node, now: 0 });
+        self.chip.model().power_on();
+        result
+    }
+
+    fn parameters(&self) -> Journal {
+        Journal::open(&self.chip, self.setup.layout.parameters)
+    }
+
+    /// What the boot stage makes of a program.
+    ///
+    /// # Errors
+    /// Why it would not start it.
+    pub fn verified(&self, program: u8) -> Result<VerifiedProgram, Invalid> {
+        verify(&self.chip, &self.parameters(), self.setup.layout, CrcKind::Crc32, program)
+    }
+
+    /// What is known of a program.
+    #[must_use]
+    pub fn record(&self, program: u8) -> Option<ProgramRecord> {
+        ProgramRecord::load(&self.parameters(), &self.chip, program)
+    }
+
+    /// The lowest counter that is stored for a program.
+    #[must_use]
+    pub fn counter(&self, program: u8) -> u32 {
+        self.parameters().get(&self.chip, Key::Counter(program)).map_or(0, |[counter, ..]| counter)
+    }
+
+    /// Which program the boot stage starts.
+    #[must_use]
+    pub fn starts(&self, request: Option<BootRequest>) -> Option<u8> {
+        let circumstances = Circumstances { request, strap: false, crash_resets: 0, node_id: 5 };
+        match decide(&circumstances, &DECISION, |program| self.verified(program)) {
+            BootDecision::Start { program, .. } => Some(program.number()),
+            BootDecision::Stay(_) | BootDecision::Hold { .. } => None,
+        }
+    }
+
+    /// The first bytes of a program's flash.
+    #[must_use]
+    pub fn cells(&self, program: u8, len: usize) -> Vec<u8> {
+        let base = self.setup.region(program).base;
+        self.chip.model().cells(Region::new(base, len as u32)).to_vec()
+    }
+
+    /// Whether the boot stage takes the program, it is this image, and the bits of it are sound.
+    #[must_use]
+    pub fn holds(&self, program: u8, image: &[u8]) -> bool {
+        let place = Region::new(self.setup.region(program).base, image.len() as u32);
+        self.verified(program).is_ok()
+            && self.cells(program, image.len()) == image
+            && self.chip.model().is_stable(place)
+    }
+
+    /// What was erased or written since somebody looked last, but for the journal, where events are
+    /// recorded.
+    #[allow(clippy::must_use_candidate, reason = "it forgets, too")]
+    pub fn take_touched(&self) -> Vec<Region> {
+        let mut touched = std::mem::take(&mut self.chip.model().touched);
+        let journal = self.setup.layout.parameters;
+        touched.retain(|region| !journal.iter().any(|place| place.contains(region.base, region.size)));
+        touched
+    }
+
+    /// Whether the flash of a program was touched since somebody looked last.
+    #[must_use]
+    pub fn was_touched(&self, program: u8) -> bool {
+        let region = self.setup.region(program);
+        self.take_touched().iter().any(|touched| region.contains(touched.base, touched.size))
+    }
+}
+
+/// CLEAR of 1F51h.
+pub const CLEAR: u8 = 0x03;
+/// START of 1F51h.
+pub const START: u8 = 0x01;
+/// SET_SIGNATURE of 1F51h.
+pub const SET_SIGNATURE: u8 = 0x83;
+/// CLR_SIGNATURE of 1F51h.
+pub const CLR_SIGNATURE: u8 = 0x84;
+
+/// Somebody who talks to the bootloader.
+pub struct Host<'a> {
+    /// The device.
+    pub device: &'a Device,
+    /// Its bootloader.
+    pub node: Box<dyn Node + 'a>,
+    /// The time in ms.
+    pub now: u32,
+}
+
+impl Host<'_> {
+    /// Steps until there is no work.
+    pub fn settle(&mut self) {
+        assert!((0..400_000).any(|_| self.node.is_idle_after_step()), "the work does not end");
+    }
+
+    /// So many steps.
+    pub fn steps(&mut self, steps: usize) {
+        for _ in 0..steps {
+            self.node.is_idle_after_step();
+        }
+    }
+
+    fn word(&mut self, index: u16, program: u8) -> u32 {
+        let mut bytes = [0; 4];
+        self.node.read(Address::new(index, program), &mut bytes).expect("the object can be read");
+        u32::from_le_bytes(bytes)
+    }
+
+    /// 1F51h: 0 stopped, 3 there is none.
+    pub fn state(&mut self, program: u8) -> u32 {
+        self.word(0x1F51, program)
+    }
+
+    /// 1F56h.
+    pub fn identification(&mut self, program: u8) -> u32 {
+        self.word(0x1F56, program)
+    }
+
+    /// 1F57h.
+    pub fn status(&mut self, program: u8) -> u32 {
+        self.word(0x1F57, program)
+    }
+
+    /// 1F51h; what it leads to is not waited for.
+    ///
+    /// # Errors
+    /// The abort.
+    pub fn command(&mut self, program: u8, command: u8) -> Result<(), AbortCode> {
+        self.node.write(Address::new(0x1F51, program), &[command])
+    }
+
+    /// A command, carried out; gives the status.
+    pub fn commanded(&mut self, program: u8, command: u8) -> u32 {
+        self.command(program, command).expect("the command is taken");
+        self.settle();
+        self.status(program)
+    }
+
+    /// Password or CLEAR: a download may begin.
+    pub fn clear(&mut self, program: u8) {
+        let password = self.device.setup.profile.password;
+        match self.device.setup.profile.extras.password {
+            PasswordObject::None => drop(self.commanded(program, CLEAR)),
+            PasswordObject::EnableFlash => {
+                self.node.write(Address::new(0x7F50, program), password).expect("it is right");
+            }
+            PasswordObject::Unlock => {
+                self.node.write(Address::new(0x6005, 1), password).expect("it is right");
+            }
+        }
+        self.settle();
+    }
+
+    /// Begins a download and sends these bytes of it, so many at a time.
+    ///
+    /// # Errors
+    /// The abort.
+    pub fn begin(&mut self, program: u8, data: &[u8], piece: usize) -> Result<(), AbortCode> {
+        let at = Address::new(0x1F50, program);
+        self.node.download_start(at, None)?;
+        self.go_on(program, data, piece)
+    }
+
+    /// Sends more bytes.
+    ///
+    /// # Errors
+    /// The abort.
+    pub fn go_on(&mut self, program: u8, data: &[u8], piece: usize) -> Result<(), AbortCode> {
+        let at = Address::new(0x1F50, program);
+        for bytes in data.chunks(piece) {
+            while self.node.download_space(at, false) < bytes.len() {
+                assert!(!self.node.is_idle_after_step(), "there is never room");
+            }
+            if let Err(abort) = self.node.download_data(at, bytes) {
+                self.node.download_cancel(at);
+                return Err(abort);
+            }
+        }
+        Ok(())
+    }
+
+    /// The end of a download; what it leads to is not waited for.
+    ///
+    /// # Errors
+    /// The abort.
+    pub fn end(&mut self, program: u8) -> Result<(), AbortCode> {
+        self.node.download_end(Address::new(0x1F50, program))
+    }
+
+    /// The end of the transfer, as an SDO abort makes it.
+    pub fn cancel(&mut self, program: u8) {
+        self.node.download_cancel(Address::new(0x1F50, program));
+    }
+
+    /// A download, carried out; gives the abort, if any, and the status.
+    pub fn send(&mut self, program: u8, data: &[u8], piece: usize) -> (Result<(), AbortCode>, u32) {
+        let outcome = self.begin(program, data, piece).and_then(|()| self.end(program));
+        self.settle();
+        (outcome, self.status(program))
+    }
+
+    /// The holder of a root asks for rights (2002h); whether they are granted.
+    pub fn grant(&mut self, root: &SigningKey, rights: u32, argument: u32) -> bool {
+        let mut challenge = [0; CHALLENGE];
+        self.node.read(Address::new(0x2002, 1), &mut challenge).expect("it can be read");
+        let mut request = Vec::new();
+        for word in [rights, argument, root.public().id()] {
+            request.extend(word.to_le_bytes());
+        }
+        let message = [&ACCESS_DOMAIN[..], &challenge[..SIGNED_CHALLENGE], &request].concat();
+        request.extend(root.sign(&message));
+        let asked = self.node.write(Address::new(0x2002, 2), &request);
+        self.settle();
+        self.node.read(Address::new(0x2002, 1), &mut challenge).expect("it can be read");
+        asked.is_ok() && u32::from_le_bytes([44, 45, 46, 47].map(|at| challenge[at])) & rights == rights
+    }
+
+    /// The program is erased by who has the right to it.
+    pub fn erase(&mut self, program: u8) {
+        assert!(self.grant(&keys().root, right::ERASE, 0));
+        for _ in 0..2 {
+            assert_eq!(self.commanded(program, CLEAR), 0);
+        }
+    }
+
+    /// So long that no earlier failure slows anybody down.
+    pub fn wait(&mut self) {
+        self.now += 100_000;
+        self.node.set_time(Instant::from_millis(self.now));
+    }
+
+    /// The same behind password or CLEAR.
+    pub fn update(&mut self, program: u8, data: &[u8], piece: usize) -> (Result<(), AbortCode>, u32) {
+        self.wait();
+        self.clear(program);
+        self.send(program, data, piece)
+    }
+
+    /// A good image.
+    pub fn install(&mut self, program: u8, data: &[u8]) {
+        assert_eq!(self.update(program, data, 7), (Ok(()), 0), "a good image is taken");
+        self.node.take_boot_request();
+    }
+
+    /// The program has brought the device back.
+    pub fn confirm(&mut self, program: u8) {
+        self.node.confirm(program);
+        self.settle();
+    }
+
+    /// START; gives the program that the boot stage starts then.
+    pub fn start(&mut self, program: u8) -> Option<u8> {
+        self.command(program, START).ok()?;
+        let request = self.node.take_boot_request()?;
+        self.device.starts(Some(request))
+    }
+}

@@ -1,0 +1,118 @@
+//! Sealed devices and sealed images. The keys are made of fixed seeds, so that each run is the same.
+
+use std::sync::LazyLock;
+
+use canopen::program::ProgramControl;
+use canopen::Address;
+use coflash::device::{Doing, Transfers};
+use coflash::file::sealed::{key_block, Certificate, Kek, Role, Sealer, SigningKey};
+use coflash::Error;
+
+use crate::bench::Bench;
+use crate::firmware;
+
+/// 1F50h/1 and 1F57h/1.
+const DATA: Address = Address::new(0x1F50, 1);
+const STATUS: Address = Address::new(0x1F57, 1);
+
+/// The lowest security counter that a new device takes, and the counter of [`sealer`].
+pub const COUNTER: u32 = 7;
+
+/// The key-encryption key that the devices have.
+pub static KEKS: LazyLock<[Kek; 1]> = LazyLock::new(|| [Kek::new(KEK).expect("its id is not 0")]);
+
+/// The bytes of [`KEKS`]: no two of them are equal, and no four stand in any code.
+pub const KEK: [u8; 32] = {
+    let mut bytes = [0; 32];
+    let mut at = 0;
+    while at < 32 {
+        bytes[at] = 0x9D ^ (at as u8).wrapping_mul(73);
+        at += 1;
+    }
+    bytes
+};
+
+/// A signing key of a seed.
+///
+/// # Panics
+/// Never for the seeds of these tests: no id is 0.
+#[must_use]
+pub fn key(seed: u8) -> SigningKey {
+    SigningKey::from_seed([seed; 32]).expect("its id is not 0")
+}
+
+/// The root that the devices know.
+#[must_use]
+pub fn root() -> SigningKey {
+    key(1)
+}
+
+/// The key that signs programs, certified by [`root`].
+#[must_use]
+pub fn release() -> SigningKey {
+    key(2)
+}
+
+/// A program of the board's product with this security counter, neither compressed nor encrypted,
+/// to be signed by [`release`].
+#[must_use]
+pub fn sealer(counter: u32) -> Sealer<'static> {
+    let bsp::Identity { vendor_id, product_code, .. } = bsp::IDENTITY;
+    let certificate = Certificate {
+        role: Role::Release,
+        epoch: 1,
+        vendor_id,
+        product_code: 0,
+        lowest: 0,
+        highest: u32::MAX,
+        key: release().public(),
+    };
+    let certificate = Some(certificate.signed_by(&root()));
+    Sealer { certificate, vendor_id, product_code, counter, ..Sealer::default() }
+}
+
+/// A board with the bootloader for sealed images and the keys for it, and no power yet.
+///
+/// # Panics
+/// If the firmware was not built.
+#[must_use]
+pub fn board() -> Bench {
+    let mut bench = open_board();
+    provision(&mut bench);
+    bench
+}
+
+/// Writes the keys into a board, as in production: it is a sealed one from its next reset on.
+///
+/// # Panics
+/// Never: the place of the keys is in flash.
+pub fn provision(bench: &mut Bench) {
+    let block = key_block(&[root().public()], &*KEKS, COUNTER, 0, false).expect("one root and one key");
+    let place = firmware::board().key_block();
+    bench.machine().load_bin(place.base, &block).expect("it is in flash");
+}
+
+/// The same without keys: an open device.
+#[must_use]
+pub fn open_board() -> Bench {
+    Bench::of_image(firmware::BOOTLOADER_SEALED)
+}
+
+/// Sends CLEAR and writes a file to 1F50h as a whole, as any master does; gives the abort code, if
+/// there was one, and the word of 1F57h when the device is not busy any more.
+///
+/// # Panics
+/// If the device does not answer.
+pub fn write(bench: &mut Bench, file: &[u8], transfers: Transfers) -> (Option<u32>, u32) {
+    let mut session = bench.session();
+    session.transfer_by(transfers);
+    session.command(1, ProgramControl::Clear).expect("CLEAR is answered");
+    session.await_idle(1, Doing::Command(ProgramControl::Clear)).expect("1F57h is answered");
+    let abort = match session.write(DATA, file, Doing::Program, &mut |_| {}) {
+        Ok(()) => None,
+        Err(Error::Refused { code, .. }) => Some(code.0),
+        Err(error) => panic!("{error}"),
+    };
+    let status = session.await_idle(1, Doing::Read(STATUS)).expect("1F57h is answered");
+    (abort, status.to_word())
+}

@@ -1,0 +1,303 @@
+//! The sealed device: the built bootloader with keys in its flash, on the emulated bus. What it
+//! takes, what it refuses, and that the old program starts whatever was refused.
+
+#[path = "sealed/limits.rs"]
+mod limits;
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::{env, fs};
+
+use canopen::program::ProgramControl;
+use canopen::Address;
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::endpoint::Endpoint;
+use coboot_tests::firmware;
+use coboot_tests::sealed_board::{board, key, open_board, release, root, sealer, write, COUNTER, KEKS};
+use coflash::device::access::{ask, challenge, events};
+use coflash::device::{Doing, Transfers};
+use coflash::file::sealed::{Kek, Sealer, SigningKey};
+use seal::access::{event, right};
+
+const VERSION: Address = Address::new(0x100A, 0);
+const CRC_OF_PROGRAM: Address = Address::new(0x1F56, 1);
+
+/// The words of 1F57h: the error code from bit 1 on (SYS TEC manual, table 3; from 8Ah on those of
+/// sealed images).
+mod status {
+    pub const OK: u32 = 0;
+    pub const FORMAT: u32 = 0x04;
+    pub const NO_ACCESS: u32 = 0x84;
+    pub const SIGNATURE: u32 = 0x8A;
+    pub const ROLLBACK: u32 = 0x8C;
+    pub const KEY: u32 = 0x8E;
+}
+
+fn crc32(bytes: &[u8]) -> u32 {
+    crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(bytes)
+}
+
+/// The four kinds of payload.
+fn kinds(counter: u32) -> [(&'static str, Sealer<'static>); 4] {
+    let plain = sealer(counter);
+    let encrypted = Sealer { encrypt_for: &*KEKS, ..plain.clone() };
+    [
+        ("plain", plain.clone()),
+        ("encrypted", encrypted.clone()),
+        ("compressed", Sealer { compress: true, ..plain }),
+        ("encrypted and compressed", Sealer { compress: true, ..encrypted }),
+    ]
+}
+
+fn seal(sealer: &Sealer<'_>, image: &str) -> Vec<u8> {
+    sealer.seal(&firmware::raw(image), &release()).expect("it can be sealed")
+}
+
+/// Starts what was downloaded, and looks whether it is that.
+fn start(bench: &mut Bench, image: &str, version: &str) {
+    let crc = bench.session().read_number(CRC_OF_PROGRAM).unwrap();
+    assert_eq!(crc, crc32(&firmware::raw(image)));
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    bench.await_boot_up(1000);
+    assert!(!bench.is_bootloader(NODE), "{image} was not started");
+    assert_eq!(bench.session().read_text(VERSION).unwrap(), version);
+    assert_eq!(bench.session().read_number(CRC_OF_PROGRAM).unwrap(), crc);
+}
+
+/// Stops the program: the device comes back to the bootloader, which confirms the program. (The first
+/// 80h to a program that was just downloaded as a whole would mean "confirm".)
+fn call_back(bench: &mut Bench) {
+    bench.session().command(1, ProgramControl::Stop).unwrap();
+    bench.run_ms(100);
+    assert!(bench.is_bootloader(NODE));
+}
+
+/// A sealed device, in its bootloader, with version 1 installed, started once and confirmed.
+fn board_with_a_program() -> Bench {
+    let mut bench = board();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let file = seal(&sealer(COUNTER), firmware::APP_V1);
+    assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
+    start(&mut bench, firmware::APP_V1, "1.0.0");
+    call_back(&mut bench);
+    bench
+}
+
+/// The power goes and comes back: the old program, version 1, starts by itself. It is called back.
+fn assert_old_program_starts(bench: &mut Bench, what: &str) {
+    bench.power_off();
+    bench.run_ms(100);
+    bench.power_on();
+    bench.await_program(1000);
+    assert!(!bench.is_bootloader(NODE), "{what}: the old program does not start");
+    assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0", "{what}");
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up(1000);
+    bench.run_ms(50);
+    assert!(bench.is_bootloader(NODE), "{what}");
+}
+
+/// Every kind, written blindly by either transfer; each one over the one before.
+#[test]
+fn sealed_programs_are_taken_and_started() {
+    let mut bench = board();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let versions = [(firmware::APP_V1, "1.0.0"), (firmware::APP_V2, "2.0.0")];
+    for transfers in [Transfers::Segments, Transfers::Blocks] {
+        for ((what, sealer), (image, version)) in kinds(COUNTER)
+            .iter()
+            .zip(versions.into_iter().cycle().skip(usize::from(transfers == Transfers::Blocks)))
+        {
+            let file = seal(sealer, image);
+            assert_eq!(write(&mut bench, &file, transfers), (None, status::OK), "{what}, {transfers:?}");
+            start(&mut bench, image, version);
+            call_back(&mut bench);
+        }
+    }
+    bench.assert_nothing_unmodelled();
+}
+
+/// What is not genuine is refused, by the code that tells why, and costs nothing: the flash of the program
+/// stays as it was, and the program starts.
+#[test]
+fn what_is_not_genuine_is_refused_and_the_old_program_starts() {
+    let mut bench = board_with_a_program();
+    let genuine = seal(&sealer(COUNTER), firmware::APP_V2);
+    let manifest = usize::from(u16::from_le_bytes([genuine[4], genuine[5]]));
+    let flipped = |at: usize| {
+        let mut file = genuine.clone();
+        file[at] ^= 0x10;
+        file
+    };
+    let (certificate, signature, first_chunk) = (manifest, manifest + 152, manifest + 152 + 72);
+    let foreign_root = Sealer { certificate: None, ..sealer(COUNTER) };
+    let image = firmware::raw(firmware::APP_V2);
+    let foreign_kek = [Kek::new([0x77; 32]).unwrap()];
+    let [_, (_, encrypted), ..] = kinds(COUNTER);
+    for (what, file, expected) in [
+        ("a bit of the hash of the image", flipped(50), status::SIGNATURE),
+        ("a bit of the root's signature", flipped(certificate + 90), status::SIGNATURE),
+        ("a bit of the signature", flipped(signature + 20), status::SIGNATURE),
+        ("a bit of the first chunk", flipped(first_chunk + 40), status::SIGNATURE),
+        ("a lower counter", seal(&sealer(COUNTER - 1), firmware::APP_V2), status::ROLLBACK),
+        ("a foreign root", foreign_root.seal(&image, &key(9)).unwrap(), status::KEY),
+        (
+            "encrypted for others",
+            seal(&Sealer { encrypt_for: &foreign_kek, ..encrypted }, firmware::APP_V2),
+            status::KEY,
+        ),
+        ("cut off behind the head", genuine[..first_chunk].to_vec(), status::FORMAT),
+        ("a raw image", image.clone(), status::NO_ACCESS),
+        ("blocks", firmware::blocks(firmware::APP_V2).emit(), status::NO_ACCESS),
+    ] {
+        for transfers in [Transfers::Segments, Transfers::Blocks] {
+            let before = bench.machine().flash().to_vec();
+            let (abort, word) = write(&mut bench, &file, transfers);
+            assert_eq!(word, expected, "{what}, {transfers:?}: {abort:X?}");
+            let program = (firmware::board().programs[0].base - firmware::board().chip.flash.base) as usize;
+            assert!(bench.machine().flash()[program..] == before[program..], "{what}: the flash is another");
+            // A power cycle, too, because bad signatures slow the device down.
+            assert_old_program_starts(&mut bench, what);
+        }
+    }
+    // And the genuine one is taken after all that.
+    assert_eq!(write(&mut bench, &genuine, Transfers::Segments), (None, status::OK));
+    start(&mut bench, firmware::APP_V2, "2.0.0");
+    bench.assert_nothing_unmodelled();
+}
+
+/// A program that was installed with a higher counter leaves no way back to a lower one.
+#[test]
+fn the_counter_goes_up_and_never_back() {
+    let mut bench = board_with_a_program();
+    let newer = seal(&sealer(COUNTER + 2), firmware::APP_V1);
+    assert_eq!(write(&mut bench, &newer, Transfers::Blocks), (None, status::OK));
+    start(&mut bench, firmware::APP_V1, "1.0.0");
+    call_back(&mut bench);
+    for counter in [COUNTER, COUNTER + 1] {
+        let (_, word) = write(&mut bench, &seal(&sealer(counter), firmware::APP_V2), Transfers::Blocks);
+        assert_eq!(word, status::ROLLBACK, "{counter}");
+        assert_old_program_starts(&mut bench, "a lower counter");
+    }
+    let same = seal(&sealer(COUNTER + 2), firmware::APP_V2);
+    assert_eq!(write(&mut bench, &same, Transfers::Blocks), (None, status::OK));
+    start(&mut bench, firmware::APP_V2, "2.0.0");
+}
+
+/// Without keys the same bootloader is as open as any, and takes no sealed program: it knows no root.
+#[test]
+fn without_keys_the_device_is_open() {
+    let mut bench = open_board();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let sealed = seal(&sealer(COUNTER), firmware::APP_V1);
+    assert_eq!(write(&mut bench, &sealed, Transfers::Blocks).1, status::KEY);
+    assert_eq!(write(&mut bench, &firmware::raw(firmware::APP_V1), Transfers::Segments), (None, status::OK));
+    start(&mut bench, firmware::APP_V1, "1.0.0");
+    call_back(&mut bench);
+    let file = firmware::blocks(firmware::APP_V2);
+    coflash::update::flash(&mut bench.session(), &file, &Default::default(), &mut |_| {}).unwrap();
+    assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
+    bench.assert_nothing_unmodelled();
+}
+
+/// By either transfer; a flipped bit is refused.
+#[test]
+fn an_unmodified_python_canopen_writes_a_sealed_image() {
+    let python = env::var_os("COBOOT_PYTHON")
+        .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
+    let mut bench = board();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let mut endpoint = Endpoint::new(bench);
+    let genuine = seal(&Sealer { compress: true, ..sealer(COUNTER) }, firmware::APP_V1);
+    let mut flipped = genuine.clone();
+    flipped[50] ^= 1;
+    for (way, file, said) in [
+        (None, &flipped, "1F57h = 0000008Ah"),
+        (Some("--block"), &genuine, "started"),
+        (None, &genuine, "started"),
+    ] {
+        let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("app.cbs");
+        fs::write(&path, file).unwrap();
+        let mut client = Command::new(&python);
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/sealed_client.py");
+        client.arg(script).arg(endpoint.address()).arg(path).args(way);
+        let output = endpoint.run(&mut client);
+        // A bad signature slows the device down for half a second.
+        endpoint.bench.run_ms(1000);
+        let text = [output.stdout, output.stderr].concat();
+        let text = String::from_utf8_lossy(&text);
+        assert!(text.contains(said), "{way:?}: {text}");
+        if said == "started" {
+            assert!(output.status.success(), "{text}");
+            assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), "1.0.0");
+            call_back(&mut endpoint.bench);
+        }
+    }
+    endpoint.bench.assert_nothing_unmodelled();
+}
+
+/// The demonstration for people tells its story to the end, which it does not if the device takes or
+/// refuses what it should not.
+#[test]
+fn the_demonstration_succeeds() {
+    let output = Command::new(env!("CARGO_BIN_EXE_demo")).arg("--sealed").output().unwrap();
+    let told = [output.stdout, output.stderr].concat();
+    let told = String::from_utf8_lossy(&told);
+    assert!(output.status.success(), "{told}");
+    for line in ["1F57h = 8Ah", "1F57h = 8Ch", "1F57h = 8Eh", "1F57h = 84h"] {
+        assert!(told.contains(line), "no {line:?} in:\n{told}");
+    }
+    assert_eq!(told.matches("the old program starts").count(), 5, "{told}");
+}
+
+/// What destroys is for the holder of the root key: asked for by 2002h, granted until the next reset,
+/// and recorded in 2003h over power-off.
+#[test]
+fn the_holder_of_the_root_key_gets_rights_and_the_device_remembers() {
+    let mut bench = board_with_a_program();
+    let clear_twice = |bench: &mut Bench| {
+        let first = bench.session().command(1, ProgramControl::Clear);
+        first.and_then(|()| bench.session().command(1, ProgramControl::Clear))
+    };
+    assert!(clear_twice(&mut bench).is_err(), "nobody has the right yet");
+    assert!(bench.session().read_number(CRC_OF_PROGRAM).unwrap() != 0, "and the program is there");
+
+    let before = challenge(&mut bench.session()).unwrap();
+    assert_eq!(before.granted(), 0);
+    let ask_by = |bench: &mut Bench, signer: &SigningKey, claimed: &SigningKey| {
+        let asked = (right::ERASE, 0, claimed.public().id());
+        let challenge = challenge(&mut bench.session()).unwrap();
+        ask(&mut bench.session(), asked, &signer.sign(&challenge.tbs(asked.0, asked.1, asked.2)))
+    };
+    let stranger = key(99);
+    assert!(ask_by(&mut bench, &stranger, &stranger).is_err(), "not a root of the device");
+    // Each wrong signature makes the next wait twice as long; each try here takes two seconds.
+    for _ in 0..3 {
+        let granted = ask_by(&mut bench, &stranger, &root()).unwrap();
+        assert!(!granted, "a root's id, and another one's signature");
+    }
+    assert!(ask_by(&mut bench, &root(), &root()).is_err(), "it waits after wrong signatures");
+    bench.run_ms(3000);
+    assert!(ask_by(&mut bench, &root(), &root()).unwrap());
+    assert_ne!(
+        challenge(&mut bench.session()).unwrap().tbs(0, 0, 0),
+        before.tbs(0, 0, 0),
+        "a nonce is used once"
+    );
+    // The second one since the first block, so it erases at once.
+    bench.session().command(1, ProgramControl::Clear).unwrap();
+    bench.session().await_idle(1, Doing::Command(ProgramControl::Clear)).unwrap();
+    assert_eq!(bench.session().read_number(CRC_OF_PROGRAM).unwrap(), 0, "erased");
+
+    bench.power_off();
+    bench.run_ms(100);
+    bench.power_on();
+    bench.await_boot_up(100);
+    assert_eq!(challenge(&mut bench.session()).unwrap().granted(), 0, "until the reset");
+    let told: Vec<u32> = events(&mut bench.session()).unwrap().iter().map(|event| event.what).collect();
+    assert_eq!(told, [event::UNLOCKED | right::ERASE, event::INSTALLED | 1]);
+}

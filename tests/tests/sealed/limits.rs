@@ -1,0 +1,274 @@
+//! What signatures and ciphers may cost: time on the bus, time before the start, stack, and no trace
+//! of a secret. All times are virtual.
+
+use canopen::program::ProgramControl;
+use canopen::BitRate;
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::firmware;
+use coboot_tests::sealed_board::{board, open_board, provision, release, sealer, write, COUNTER, KEK};
+use coboot_tests::throughput::{change_over, code};
+use coflash::device::Transfers;
+use coflash::file::sealed::Sealer;
+use emulator::bus::Outcome;
+use emulator::time::{Span, Time};
+use object::read::elf::ElfFile32;
+use object::{Endianness, Object, ObjectSection, SectionFlags};
+
+use super::{call_back, kinds, start, status};
+
+const REQUEST: u16 = 0x600 + NODE as u16;
+const RESPONSE: u32 = 0x580 + NODE as u32;
+const READ_1000: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
+const READ_STATUS: [u8; 8] = [0x40, 0x57, 0x1F, 1, 0, 0, 0, 0];
+
+fn micros(span: Span) -> u64 {
+    span.0 / 1_000_000
+}
+
+/// A sealed board in its bootloader, at this bit rate.
+fn board_at(rate: BitRate) -> Bench {
+    let mut bench = open_board();
+    change_over(&mut bench, rate);
+    provision(&mut bench);
+    bench.power_on();
+    bench.await_boot_up(100);
+    bench.run_ms(50);
+    bench
+}
+
+/// Sends a file in segments as fast as they are answered, and then asks for 1000h and 1F57h by turns
+/// until the device is idle; `look` sees the board between the requests of the latter. Gives the word of
+/// 1F57h.
+fn send_and_ask(bench: &mut Bench, file: &[u8], look: &mut dyn FnMut(&Bench)) -> u32 {
+    let request = |bench: &mut Bench, data: [u8; 8]| {
+        bench.ask(REQUEST, &data, RESPONSE).unwrap_or_else(|| panic!("no answer to {data:02X?}"))
+    };
+    let idle = |word: &[u8]| u32::from_le_bytes(word[4..].try_into().expect("four bytes"));
+    assert_eq!(request(bench, [0x2F, 0x51, 0x1F, 1, 3, 0, 0, 0])[0], 0x60);
+    while idle(&request(bench, READ_STATUS)) & 1 != 0 {}
+    let [a, b, c, d] = (file.len() as u32).to_le_bytes();
+    assert_eq!(request(bench, [0x21, 0x50, 0x1F, 1, a, b, c, d])[0], 0x60);
+    let last = file.chunks(7).count() - 1;
+    for (number, segment) in file.chunks(7).enumerate() {
+        let mut data = [0; 8];
+        data[0] = (number as u8 & 1) << 4 | (7 - segment.len() as u8) << 1 | u8::from(number == last);
+        data[1..=segment.len()].copy_from_slice(segment);
+        let answer = request(bench, data);
+        if answer[0] == 0x80 {
+            break;
+        }
+        assert_eq!(answer[0], 0x20 | (number as u8 & 1) << 4);
+    }
+    loop {
+        look(bench);
+        assert_eq!(request(bench, READ_1000)[4..], [0, 0, 0, 0x10]);
+        let word = idle(&request(bench, READ_STATUS));
+        if word & 1 == 0 {
+            return word;
+        }
+    }
+}
+
+/// The four kinds of payload, each with a counter of its own: the same image once more would be
+/// thrown away.
+fn kinds_one_by_one() -> impl Iterator<Item = (&'static str, Sealer<'static>)> {
+    let kinds = (COUNTER..).zip(kinds(COUNTER));
+    kinds.map(|(counter, (what, sealer))| (what, Sealer { counter, ..sealer }))
+}
+
+/// How long each request on the SDO channel waited for its answer, from the end of the one frame to the
+/// end of the other.
+fn answers(bench: &Bench, from: Time) -> Vec<Span> {
+    let mut asked = None;
+    let mut all = Vec::new();
+    for record in bench.records().into_iter().filter(|r| r.start >= from && r.outcome == Outcome::Good) {
+        match record.frame.raw_id() {
+            id if id == u32::from(REQUEST) => asked = Some(record.end),
+            RESPONSE => all.extend(asked.take().map(|asked| record.end - asked)),
+            _ => {}
+        }
+    }
+    all
+}
+
+/// While signatures are looked at, chunks hashed, deciphered and unpacked, sectors erased and words
+/// written: no SDO request waits longer than 5 ms for its answer.
+#[test]
+fn no_answer_takes_longer_than_5_ms() {
+    let image = code(24);
+    // The largest chunk: 8 KiB.
+    let chunk = 13;
+    for rate in [BitRate::K125, BitRate::K1000] {
+        let mut bench = board_at(rate);
+        bench.soil_programs();
+        for (what, sealer) in kinds_one_by_one() {
+            let file = Sealer { chunk, ..sealer }.seal(&image, &release()).expect("it can be sealed");
+            let from = bench.time();
+            let mut busy = 0;
+            assert_eq!(send_and_ask(&mut bench, &file, &mut |_| busy += 1), status::OK, "{what}");
+            let answers = answers(&bench, from);
+            let slowest = answers.iter().copied().max().expect("answers");
+            println!(
+                "{rate:?}, {what}: {} answers, the slowest after {} us; {busy} looks behind the last segment",
+                answers.len(),
+                micros(slowest)
+            );
+            // Every segment was answered.
+            assert!(answers.len() > file.len() / 7, "{what}");
+            assert!(slowest <= Span::from_millis(5), "{rate:?}, {what}: {} us", micros(slowest));
+        }
+        bench.assert_nothing_unmodelled();
+    }
+}
+
+/// How long the device is busy with a head alone.
+fn busy_with(bench: &mut Bench, head: &[u8], expected: u32) -> Span {
+    let mut from = None;
+    let word = send_and_ask(bench, head, &mut |bench| {
+        from.get_or_insert(bench.time());
+    });
+    assert_eq!(word, expected);
+    bench.time() - from.expect("it was looked at")
+}
+
+/// One signature is the difference between a head with one and a head with two, both of which are cut
+/// off there.
+#[test]
+fn a_signature_takes_less_than_a_second() {
+    let image = code(20);
+    let certified = sealer(COUNTER).seal(&image, &release()).expect("it can be sealed");
+    let by_the_root = Sealer { certificate: None, ..sealer(COUNTER) };
+    let by_the_root =
+        by_the_root.seal(&image, &coboot_tests::sealed_board::root()).expect("it can be sealed");
+    let mut took = Vec::new();
+    for (file, head) in [(&by_the_root, 176 + 72), (&certified, 176 + 152 + 72)] {
+        let mut bench = board_at(BitRate::K1000);
+        // What it works out while it is idle is ready.
+        bench.run_ms(1000);
+        took.push(busy_with(&mut bench, &file[..head], status::FORMAT));
+    }
+    let one = Span(took[1].0 - took[0].0);
+    println!(
+        "one signature takes {} ms; a head with one {} ms, with two {} ms",
+        micros(one) / 1000,
+        micros(took[0]) / 1000,
+        micros(took[1]) / 1000
+    );
+    assert!(one <= Span::from_millis(1000), "{} us", micros(one));
+    assert!(one >= Span::from_millis(20), "nothing was looked at: {} us", micros(one));
+}
+
+/// The budget of the design: 5 ms, with a CRC over all of a program of 400 KiB. The signature was looked
+/// at when it was installed.
+#[test]
+fn a_sealed_program_of_400_kib_is_started_within_5_ms() {
+    let mut bench = board_at(BitRate::K1000);
+    let file = sealer(COUNTER).seal(&code(400), &release()).expect("it can be sealed");
+    assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    bench.await_boot_up(1000);
+    call_back(&mut bench);
+    bench.power_off();
+    bench.run_ms(10);
+    let took = bench.power_on_to_first_instruction();
+    println!("reset to the first instruction of a sealed program of 400 KiB: {} us", micros(took));
+    assert!(took <= Span::from_millis(5), "{} us", micros(took));
+    assert!(took >= Span::from_millis(1), "its CRC takes a part of it: {} us", micros(took));
+}
+
+/// As soon as without the feature: 15 ms after power-on, 30 ms after the answer to 80h.
+#[test]
+fn the_bootloader_is_there_as_soon_as_an_open_one() {
+    let mut bench = board();
+    bench.power_on();
+    let power_on = bench.await_boot_up(100) - Time(0);
+    let file = sealer(COUNTER).seal(&firmware::raw(firmware::APP_V1), &release()).expect("it can be sealed");
+    assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
+    start(&mut bench, firmware::APP_V1, "1.0.0");
+    super::call_back(&mut bench);
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    bench.await_boot_up(1000);
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    let answered = bench.time();
+    let call_back = bench.await_boot_up(1000) - answered;
+    println!(
+        "boot-up: {} us after power-on, {} us after the answer to 80h",
+        micros(power_on),
+        micros(call_back)
+    );
+    assert!(power_on <= Span::from_millis(15), "{} us", micros(power_on));
+    assert!(call_back <= Span::from_millis(30), "{} us", micros(call_back));
+}
+
+/// Bytes of RAM behind the statics of an image: its stack.
+fn stack(image: &str) -> u32 {
+    let elf = firmware::elf(image);
+    let file = ElfFile32::<Endianness>::parse(&*elf).expect("an ELF file");
+    let ram = firmware::board().ram;
+    let allocated = |section: &object::read::elf::ElfSection32<'_, '_, Endianness>| matches!(section.flags(), SectionFlags::Elf { sh_flags } if sh_flags & 2 != 0);
+    let ends = file.sections().filter(allocated).map(|section| (section.address() + section.size()) as u32);
+    ram.end() - ends.filter(|end| ram.contains(end - 1, 1)).max().expect("statics in RAM")
+}
+
+/// No update of any kind takes more than 4 KiB of the stack: a pattern is laid below them, and all of it
+/// is there when all is done.
+#[test]
+fn updates_take_4_kib_of_the_stack_at_most() {
+    const MOST: u32 = 4096;
+    let size = stack(firmware::BOOTLOADER_SEALED);
+    let end = firmware::board().ram.end();
+    assert!(size >= 4 * MOST, "the stack has {size} bytes");
+    let mut bench = board_at(BitRate::K1000);
+    let pattern = vec![0xA5; (size - MOST) as usize];
+    bench.machine().write_ram(end - size, &pattern).expect("it is in RAM");
+    for (what, sealer) in kinds_one_by_one() {
+        let file = sealer.seal(&code(20), &release()).expect("it can be sealed");
+        assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK), "{what}");
+    }
+    let mut found = vec![0; pattern.len()];
+    bench.machine().read_memory(end - size, &mut found).expect("it is in RAM");
+    let unused = found.iter().take_while(|byte| **byte == 0xA5).count();
+    println!("the stack has {size} bytes, of which at most {MOST} are used");
+    assert_eq!(unused, pattern.len(), "more than {MOST} bytes of the stack are used");
+}
+
+/// Eight bytes of the key as they are, or as HMAC takes them (RFC 2104: exclusive-or 36h and 5Ch),
+/// in the order of memory or of SHA-512's words (FIPS 180-4: most significant byte first).
+fn traces_of_the_key() -> Vec<[u8; 8]> {
+    let mut traces = Vec::new();
+    for mask in [0, 0x36, 0x5C] {
+        for part in KEK.windows(8) {
+            let mut trace: [u8; 8] = part.try_into().expect("eight bytes");
+            trace.iter_mut().for_each(|byte| *byte ^= mask);
+            traces.push(trace);
+            trace.reverse();
+            traces.push(trace);
+        }
+    }
+    traces
+}
+
+fn holds_a_trace(memory: &[u8], traces: &[[u8; 8]]) -> bool {
+    memory.windows(8).any(|window| traces.iter().any(|trace| trace == window))
+}
+
+/// The key-encryption key stands in the flash alone: RAM can be read out of a chip whose flash cannot.
+#[test]
+fn the_key_encryption_key_leaves_no_trace_in_ram() {
+    let traces = traces_of_the_key();
+    let [_, (_, encrypted), ..] = kinds(COUNTER);
+    let file = encrypted.seal(&code(20), &release()).expect("it can be sealed");
+    let mut bench = board_at(BitRate::K1000);
+    assert!(holds_a_trace(bench.machine().flash(), &traces), "it is found where it is");
+    let mut looks = 0;
+    let sram = firmware::board().chip.sram;
+    let mut ram = vec![0; sram.size as usize];
+    let mut look = |bench: &Bench| {
+        bench.world.machine(bench.device).read_memory(sram.base, &mut ram).expect("it is RAM");
+        assert!(!holds_a_trace(&ram, &traces), "look {looks}");
+        looks += 1;
+    };
+    assert_eq!(send_and_ask(&mut bench, &file, &mut look), status::OK);
+    look(&bench);
+    assert!(looks >= 2);
+}

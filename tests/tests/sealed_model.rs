@@ -1,0 +1,595 @@
+//! Sealed images on the flash model: what is installed, what a sealed device refuses and an open one
+//! takes, and the security counter.
+
+use boot_core::canopen::{AbortCode, BitRate, NodeId};
+use boot_core::program::Invalid;
+use coboot_tests::ihex::intel_hex;
+use coboot_tests::sealed::{
+    certificate, crc32, default_keys, image, keys, seal, sealer, Device, Host, Setup, CLR_SIGNATURE,
+    CONFIRMED_1, CONSTANT_1, EPOCH, ESACADEMY_2, FORMS, LIFT_2, SET_SIGNATURE, STANDARD_1, STANDARD_2, START,
+};
+use coflash::file::sealed::{key_block, Certificate, Sealer};
+
+/// Statuses in 1F57h.
+const NOT_CLEARED: u32 = 0x08;
+const NO_PROGRAM: u32 = 0x02;
+const WRONG_PRODUCT: u32 = 0x82;
+const NO_ACCESS: u32 = 0x84;
+const SIGNATURE: u32 = 0x8A;
+const ROLLBACK: u32 = 0x8C;
+const KEY: u32 = 0x8E;
+
+fn program(len: usize, seed: u8) -> Vec<u8> {
+    image(STANDARD_1.region(1), len, seed)
+}
+
+/// Counter and version of an image of program 1.
+fn of_counter(counter: u32, version: u32, image: &[u8]) -> Vec<u8> {
+    seal(&Sealer { counter, version, ..sealer((false, false)) }, image)
+}
+
+/// What holds of an image that was just installed.
+fn is_installed(host: &mut Host<'_>, number: u8, image: &[u8]) {
+    let device = host.device;
+    assert_eq!(host.state(number), 0, "stopped");
+    assert_eq!(host.identification(number), crc32(image));
+    assert!(device.holds(number, image));
+    assert_eq!(host.start(number), Some(number), "START");
+}
+
+// --- good images
+
+#[test]
+fn a_good_image_of_every_form_is_installed() {
+    // Around the borders of chunks and of sectors, and the whole flash.
+    let sizes =
+        [8, 9, 511, 512, 513, 1000, 1023, 1024, 1025, 2047, 2048, 2049, 4096, 4097, 8191, 8192, 8193, 15_360];
+    let pieces = [1, 2, 3, 4, 5, 6, 7, 889];
+    let mut number = 0;
+    for form in FORMS {
+        for chunk in 9..=13 {
+            for size in sizes {
+                let image = program(size, number as u8);
+                let file = seal(&Sealer { chunk, ..sealer(form) }, &image);
+                let piece = pieces[number % pieces.len()];
+                number += 1;
+                let told = format!("{form:?}, chunks of 2^{chunk}, {size} bytes, {piece} at a time");
+                let device = Device::sealed(&STANDARD_1);
+                device.run(|host| {
+                    assert_eq!(host.update(1, &file, piece), (Ok(()), 0), "{told}");
+                    // What the manifest says.
+                    assert_eq!(host.identification(1).to_le_bytes(), file[32..36], "{told}");
+                    is_installed(host, 1, &image);
+                });
+                assert_eq!(device.starts(None), Some(1), "{told}");
+                assert_eq!(device.counter(1), 5, "{told}");
+            }
+        }
+    }
+}
+
+/// The end of such an image is one symbol, which leads to more than is unpacked at a time.
+#[test]
+fn an_image_that_ends_in_a_long_run_is_installed() {
+    for run in [0, 1, 200, 273, 274, 511, 512, 513, 600, 3000] {
+        for before in [501, 512, 1023, 1024, 1025, 1300] {
+            for fill in [0, 0xFF] {
+                let mut image = program(before, 7);
+                image.resize(before + run, fill);
+                for form in [(false, true), (true, true)] {
+                    let device = Device::sealed(&STANDARD_1);
+                    device.run(|host| host.install(1, &seal(&Sealer { chunk: 9, ..sealer(form) }, &image)));
+                    assert!(device.holds(1, &image), "{form:?} {before} and {run} of {fill:02X}h");
+                }
+            }
+        }
+    }
+}
+
+/// Over another program, by every number of bytes at a time, with the smallest buffer and a large one.
+#[test]
+fn however_it_is_cut_into_segments() {
+    let (old, new) = (program(3000, 1), program(2600, 2));
+    let before = Device::sealed(&STANDARD_1);
+    before.run(|host| host.install(1, &of_counter(5, 1, &old)));
+    for form in FORMS {
+        let file = seal(&Sealer { chunk: 9, ..sealer(form) }, &new);
+        for buffer in [64, 256, 16 * 1024] {
+            for piece in [1, 2, 3, 4, 5, 6, 7, 889] {
+                if piece > buffer / 4 {
+                    continue;
+                }
+                let mut device = before.copy();
+                device.buffer = buffer;
+                device.run(|host| {
+                    assert_eq!(host.update(1, &file, piece), (Ok(()), 0), "{form:?} {buffer} {piece}");
+                    is_installed(host, 1, &new);
+                });
+            }
+        }
+    }
+}
+
+/// Without a certificate; by the second root; by a certificate for this product alone.
+#[test]
+fn each_way_to_be_signed_is_taken() {
+    let image = program(700, 3);
+    let plain = sealer((false, false));
+    let root = Sealer { certificate: None, ..plain.clone() };
+    let of = |certificate: Certificate, root| Sealer {
+        certificate: Some(certificate.signed_by(root)),
+        ..plain.clone()
+    };
+    let product = Certificate { product_code: coboot_tests::sealed::PRODUCT_CODE, ..certificate() };
+    let narrow = Certificate { lowest: 5, highest: 5, ..certificate() };
+    let files = [
+        root.seal(&image, &keys().root),
+        root.seal(&image, &keys().second_root),
+        of(certificate(), &keys().second_root).seal(&image, &keys().release),
+        of(product, &keys().root).seal(&image, &keys().release),
+        of(narrow, &keys().root).seal(&image, &keys().release),
+    ];
+    for file in files {
+        let device = Device::sealed(&STANDARD_1);
+        device.run(|host| {
+            host.install(1, &file.expect("it can be sealed"));
+            is_installed(host, 1, &image);
+        });
+    }
+}
+
+/// What a manifest may say of the device that it is for.
+#[test]
+fn an_image_for_this_very_device_is_taken() {
+    let image = program(700, 3);
+    let device = Device::sealed(&STANDARD_1);
+    let file = seal(
+        &Sealer {
+            unique_id: coboot_tests::sealed::UNIQUE_ID,
+            hardware: 1 << 2,
+            text: Some("for one"),
+            source: Some("revision"),
+            sbom: Some([7; 32]),
+            writes_flash: true,
+            ..sealer((true, true))
+        },
+        &image,
+    );
+    device.run(|host| {
+        host.install(1, &file);
+        is_installed(host, 1, &image);
+    });
+}
+
+#[test]
+fn a_test_key_signs_for_devices_that_are_marked_for_tests() {
+    let image = program(700, 3);
+    let file = seal(&Sealer { test: true, ..sealer((false, false)) }, &image);
+    let marked = key_block(&[keys().root.public()], &[], 0, 0, true).unwrap();
+    Device::with_keys(&STANDARD_1, &marked).run(|host| host.install(1, &file));
+    Device::sealed(&STANDARD_1).run(|host| assert_eq!(host.update(1, &file, 7).1, KEY));
+}
+
+// --- the same again
+
+#[test]
+fn the_same_image_again_costs_nothing() {
+    for form in FORMS {
+        let image = program(2500, 9);
+        let file = seal(&Sealer { chunk: 10, ..sealer(form) }, &image);
+        let device = Device::sealed(&STANDARD_1);
+        device.run(|host| host.install(1, &file));
+        let record = device.record(1);
+        device.take_touched();
+        for _ in 0..2 {
+            device.run(|host| {
+                host.install(1, &file);
+                is_installed(host, 1, &image);
+                assert!(!device.was_touched(1), "{form:?}");
+            });
+        }
+        assert_eq!((device.record(1), device.counter(1)), (record, 5));
+        // It is looked at all the same.
+        let mut damaged = file.clone();
+        *damaged.last_mut().unwrap() ^= 1;
+        device.run(|host| {
+            assert_eq!(host.update(1, &damaged, 7).1, SIGNATURE);
+            assert!(device.holds(1, &image) && !device.was_touched(1));
+        });
+        // Another version with the same counter is another image, though every byte is the same.
+        let other = seal(&Sealer { version: 2, chunk: 10, ..sealer(form) }, &image);
+        device.run(|host| {
+            host.install(1, &other);
+            assert!(device.was_touched(1));
+            is_installed(host, 1, &image);
+        });
+        assert_eq!(device.record(1).unwrap().version, 2);
+    }
+}
+
+// --- sealed devices and open ones
+
+/// The same program in every unsealed form.
+fn unsealed(setup: &Setup, number: u8, image: &[u8]) -> [Vec<u8>; 3] {
+    let base = setup.region(number).base;
+    let words = |words: &[u32]| words.iter().flat_map(|word| word.to_le_bytes()).collect::<Vec<_>>();
+    let mut block = words(&[0, 0, 8]);
+    block.extend(words(&[image.len() as u32, 0]));
+    block.extend(crc32(&block).to_le_bytes());
+    [image.to_vec(), intel_hex(base, image).into_bytes(), block]
+}
+
+#[test]
+fn a_sealed_device_takes_nothing_unsealed() {
+    for setup in [&STANDARD_1, &STANDARD_2, &ESACADEMY_2, &LIFT_2] {
+        for installed in [false, true] {
+            for number in 1..=setup.programs() {
+                let old = image(setup.region(number), 900, 1);
+                let sealed =
+                    Sealer { program: number, data: setup.is_data(number), ..sealer((false, false)) };
+                let device = Device::sealed(setup);
+                // The password of ESAcademy voids what is there.
+                let stays = installed && !std::ptr::eq(setup, &ESACADEMY_2);
+                if installed {
+                    device.run(|host| host.install(number, &seal(&sealed, &old)));
+                }
+                device.take_touched();
+                for data in unsealed(setup, number, &image(setup.region(number), 900, 2)) {
+                    for piece in [7, 889] {
+                        device.run(|host| {
+                            let (abort, status) = host.update(number, &data, piece);
+                            assert_eq!((abort, status), (Err(AbortCode::STORE), NO_ACCESS), "{}", setup.name);
+                            assert!(!device.was_touched(number));
+                            if !stays {
+                                host.node.take_boot_request();
+                                assert_eq!(host.commanded(number, SET_SIGNATURE), NO_PROGRAM);
+                            }
+                        });
+                        assert_eq!(
+                            device.record(number).is_some(),
+                            stays,
+                            "{} {number} {installed}",
+                            setup.name
+                        );
+                        if !setup.is_data(number) {
+                            assert_eq!(device.holds(number, &old), stays);
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// A device that was open when its program came.
+#[test]
+fn a_program_from_before_the_keys_has_no_rights() {
+    let image = program(900, 1);
+    let device = Device::open(&STANDARD_1);
+    device.run(|host| host.install(1, &image));
+    assert_eq!(device.starts(None), Some(1));
+    let block = STANDARD_1.layout.key_block();
+    device.chip.model().poke(block.base, &default_keys());
+    device.take_touched();
+    assert_eq!(device.verified(1), Err(Invalid::Absent));
+    assert_eq!(device.starts(None), None);
+    device.run(|host| {
+        assert_eq!(host.state(1), 3, "there is none");
+        assert_eq!(host.commanded(1, SET_SIGNATURE), NO_PROGRAM);
+        assert_eq!(host.commanded(1, START), NO_PROGRAM);
+        assert_eq!(host.node.take_boot_request(), None);
+        assert_eq!(device.take_touched(), []);
+        let sealed = seal(&sealer((true, true)), &image);
+        host.install(1, &sealed);
+        is_installed(host, 1, &image);
+    });
+    assert_eq!(device.starts(None), Some(1));
+}
+
+/// An unsealed program that was signed, and one that was not, and the request of a trial.
+#[test]
+fn an_open_device_is_as_before_and_takes_no_sealed_image() {
+    let image = program(900, 1);
+    let raw = program(600, 2);
+    for form in FORMS {
+        let device = Device::open(&STANDARD_1);
+        let file = seal(&sealer(form), &image);
+        device.run(|host| {
+            assert_eq!(host.send(1, &file, 7).1, KEY);
+            assert_eq!(device.take_touched(), []);
+            host.install(1, &raw);
+            assert_eq!(host.start(1), Some(1));
+            let hex = intel_hex(STANDARD_1.region(1).base, &image).into_bytes();
+            host.install(1, &hex);
+            is_installed(host, 1, &image);
+            device.take_touched();
+            assert_eq!(host.update(1, &file, 7).1, KEY);
+            assert_eq!(device.take_touched(), []);
+        });
+        assert!(device.holds(1, &image));
+        assert_eq!(device.starts(None), Some(1));
+    }
+}
+
+/// Without CLEAR, as every other format.
+#[test]
+fn an_installed_program_stays_without_clear() {
+    let device = Device::sealed(&STANDARD_1);
+    let image = program(900, 1);
+    device.run(|host| host.install(1, &of_counter(5, 1, &image)));
+    device.run(|host| {
+        device.take_touched();
+        let (abort, status) = host.send(1, &of_counter(6, 1, &program(900, 2)), 7);
+        assert_eq!((abort, status), (Err(AbortCode::DEVICE_STATE), NOT_CLEARED));
+        assert_eq!(device.take_touched(), []);
+        is_installed(host, 1, &image);
+    });
+}
+
+// --- the counter
+
+fn refused(device: &Device, counter: u32, code: u32) {
+    device.take_touched();
+    device.run(|host| {
+        assert_eq!(host.update(1, &of_counter(counter, 9, &program(900, 99)), 7).1, code, "{counter}");
+        assert_eq!(device.take_touched(), []);
+    });
+}
+
+#[test]
+fn the_counter_never_goes_back() {
+    let device = Device::sealed(&STANDARD_1);
+    for (counter, version) in [(5, 1), (5, 2), (7, 1), (1000, 1)] {
+        let image = program(900, version as u8 + counter as u8);
+        device.run(|host| host.install(1, &of_counter(counter, version, &image)));
+        assert_eq!(device.counter(1), counter);
+        for lower in [0, 1, counter - 1] {
+            refused(&device, lower, ROLLBACK);
+        }
+        assert!(device.holds(1, &image));
+        // Not by taking the program away either.
+        let emptied = device.copy();
+        emptied.run(|host| host.erase(1));
+        assert!(emptied.record(1).is_none());
+        refused(&emptied, counter - 1, ROLLBACK);
+        assert_eq!(emptied.counter(1), counter);
+        emptied.run(|host| host.install(1, &of_counter(counter, 1, &image)));
+    }
+    // What no certificate allows any more.
+    let root = Sealer { certificate: None, counter: u32::MAX, ..sealer((false, false)) };
+    let image = program(900, 1);
+    let file = root.seal(&image, &keys().root).unwrap();
+    device.run(|host| host.install(1, &file));
+    assert_eq!(device.counter(1), u32::MAX);
+    refused(&device, 1000, ROLLBACK);
+    device.run(|host| host.install(1, &file));
+}
+
+#[test]
+fn constants_of_the_bootloader_and_of_production_count_too() {
+    let of_block = |counter, epoch| key_block(&[keys().root.public()], &[], counter, epoch, false).unwrap();
+    for (setup, counter, lowest) in [(&STANDARD_1, 8, 8), (&CONSTANT_1, 0, 6), (&CONSTANT_1, 9, 9)] {
+        let device = Device::with_keys(setup, &of_block(counter, EPOCH));
+        refused(&device, lowest - 1, ROLLBACK);
+        device.run(|host| host.install(1, &of_counter(lowest, 1, &program(900, 1))));
+        assert_eq!(device.counter(1), lowest);
+    }
+    let device = Device::with_keys(&STANDARD_1, &of_block(0, EPOCH + 1));
+    refused(&device, 5, ROLLBACK);
+}
+
+/// A certificate of a higher epoch revokes those before.
+#[test]
+fn the_epoch_never_goes_back() {
+    let device = Device::sealed(&STANDARD_1);
+    let of_epoch = |epoch, image: &[u8]| {
+        let certificate = Certificate { epoch, ..certificate() };
+        let certificate = Some(certificate.signed_by(&keys().root));
+        seal(&Sealer { certificate, ..sealer((false, false)) }, image)
+    };
+    let (one, two) = (program(900, 1), program(900, 2));
+    device.run(|host| {
+        host.install(1, &of_epoch(4, &one));
+        host.install(1, &of_epoch(6, &two));
+        device.take_touched();
+        assert_eq!(host.update(1, &of_epoch(5, &one), 7).1, ROLLBACK);
+        assert_eq!(device.take_touched(), []);
+        host.install(1, &of_epoch(6, &one));
+    });
+    // The same image with a certificate of a higher epoch revokes as well.
+    device.run(|host| {
+        host.install(1, &of_epoch(7, &one));
+        assert_eq!(host.update(1, &of_epoch(6, &two), 7).1, ROLLBACK);
+    });
+}
+
+/// Raised when the program has brought the device back, and not before.
+#[test]
+fn with_confirmation_the_counter_waits_for_it() {
+    let device = Device::sealed(&CONFIRMED_1);
+    let (one, two) = (program(900, 1), program(900, 2));
+    device.run(|host| host.install(1, &of_counter(5, 1, &one)));
+    // One that does not come up can be replaced by the one before.
+    device.run(|host| {
+        host.install(1, &of_counter(9, 2, &two));
+        host.install(1, &of_counter(5, 1, &one));
+        host.confirm(1);
+    });
+    refused(&device, 4, ROLLBACK);
+    device.run(|host| {
+        host.install(1, &of_counter(9, 2, &two));
+        host.confirm(1);
+        assert!(device.record(1).unwrap().confirmed);
+    });
+    refused(&device, 8, ROLLBACK);
+    // Whatever becomes of the program that has proved itself.
+    let voided = device.copy();
+    voided.run(|host| host.erase(1));
+    refused(&voided, 8, ROLLBACK);
+    let broken_off = device.copy();
+    broken_off.run(|host| {
+        host.clear(1);
+        let file = of_counter(9, 3, &program(5000, 3));
+        host.begin(1, &file[..5000], 7).unwrap();
+        host.settle();
+    });
+    assert!(broken_off.record(1).is_none());
+    refused(&broken_off, 8, ROLLBACK);
+    let replaced = device.copy();
+    replaced.run(|host| host.install(1, &of_counter(10, 3, &one)));
+    refused(&replaced, 8, ROLLBACK);
+    replaced.run(|host| host.install(1, &of_counter(9, 4, &two)));
+}
+
+// --- two programs
+
+#[test]
+fn each_program_has_its_own_images_and_its_own_counter() {
+    let device = Device::sealed(&STANDARD_2);
+    let places = [STANDARD_2.region(1), STANDARD_2.region(2)];
+    let images = places.map(|place| image(place, 900, 1));
+    let of =
+        |program, counter, image: &[u8]| seal(&Sealer { program, counter, ..sealer((true, true)) }, image);
+    device.run(|host| {
+        for number in [1, 2] {
+            let other = 3 - number;
+            let file = of(other, 5, &images[usize::from(other) - 1]);
+            device.take_touched();
+            assert_eq!(host.update(number, &file, 7).1, WRONG_PRODUCT);
+            assert_eq!(device.take_touched(), []);
+        }
+        host.install(1, &of(1, 9, &images[0]));
+        assert_eq!((device.counter(1), device.counter(2)), (9, 0));
+        host.install(2, &of(2, 5, &images[1]));
+        assert_eq!((device.counter(1), device.counter(2)), (9, 5));
+        assert_eq!(host.update(1, &of(1, 8, &images[0]), 7).1, ROLLBACK);
+        host.install(2, &of(2, 8, &images[1]));
+        is_installed(host, 1, &images[0]);
+        is_installed(host, 2, &images[1]);
+    });
+}
+
+/// A lift: any bytes, and the program's images are none of them.
+#[test]
+fn data_of_the_application_are_sealed_as_data() {
+    let device = Device::sealed(&LIFT_2);
+    let bytes: Vec<u8> = (0..3000_u32).map(|i| (i * i / 8) as u8).collect();
+    let data = Sealer { program: 2, data: true, ..sealer((true, true)) };
+    device.run(|host| {
+        assert_eq!(
+            host.update(2, &seal(&Sealer { data: false, ..data.clone() }, &bytes), 7).1,
+            WRONG_PRODUCT
+        );
+        for piece in [4, 5, 6, 7, 889] {
+            assert_eq!(host.update(2, &seal(&data, &bytes), piece), (Ok(()), 0));
+        }
+        assert_eq!(device.cells(2, bytes.len()), bytes);
+        assert_eq!(host.start(2), None);
+        let program = image(LIFT_2.region(1), 900, 1);
+        assert_eq!(
+            host.update(1, &seal(&Sealer { data: true, ..sealer((false, false)) }, &program), 7).1,
+            0x82
+        );
+        host.install(1, &seal(&sealer((false, false)), &program));
+    });
+}
+
+// --- in between
+
+/// Commands, passwords, LSS, rights and another transfer at every stage of an update: it ends as it
+/// would have, or it is refused; and nothing but authentic bytes gets into the flash of the program.
+#[test]
+fn nothing_that_comes_in_between_gets_past_the_signature() {
+    let places = [STANDARD_2.region(1), STANDARD_2.region(2)];
+    let (old, new) = (image(places[0], 600, 1), image(places[0], 1500, 2));
+    let other = image(places[1], 600, 3);
+    let device = Device::sealed(&STANDARD_2);
+    let of = |program, image: &[u8]| {
+        seal(&Sealer { program, version: image.len() as u32, chunk: 9, ..sealer((true, true)) }, image)
+    };
+    device.run(|host| {
+        host.install(1, &of(1, &old));
+        host.install(2, &of(2, &other));
+    });
+    let file = of(1, &new);
+    type Action<'a> = &'a dyn Fn(&mut Host<'_>);
+    let strange = of(2, &other);
+    let actions: [(&str, Action<'_>); 14] = [
+        ("CLEAR of 1", &|host| {
+            let _ = host.command(1, 0x03);
+        }),
+        ("CLEAR of 2", &|host| {
+            let _ = host.command(2, 0x03);
+        }),
+        ("START of 1", &|host| {
+            let _ = host.command(1, START);
+        }),
+        ("START of 2", &|host| {
+            let _ = host.command(2, START);
+        }),
+        ("83h of 1", &|host| {
+            let _ = host.command(1, SET_SIGNATURE);
+        }),
+        ("83h of 2", &|host| {
+            let _ = host.command(2, SET_SIGNATURE);
+        }),
+        ("84h of 1", &|host| {
+            let _ = host.command(1, CLR_SIGNATURE);
+        }),
+        ("84h of 2", &|host| {
+            let _ = host.command(2, CLR_SIGNATURE);
+        }),
+        ("LSS store", &|host| {
+            let _ = host.node.store(NodeId::new(9), Some(BitRate::K125));
+        }),
+        ("rights", &|host| {
+            let _ = host.grant(&keys().root, 0xFF, 0);
+        }),
+        ("confirmation", &|host| host.node.confirm(1)),
+        ("a transfer to 2", &|host| {
+            let _ = host.begin(2, &strange[..300], 7);
+        }),
+        ("a transfer to 1", &|host| {
+            let _ = host.begin(1, &file[..300], 7);
+        }),
+        ("an abort", &|host| host.cancel(1)),
+    ];
+    for right in [false, true] {
+        for (what, action) in actions {
+            for at in (0..=file.len()).step_by(60) {
+                for steps in [0, 3, 40, usize::MAX] {
+                    let told = format!("{what} behind {at} bytes and {steps} steps, rights: {right}");
+                    let device = device.copy();
+                    device.run(|host| {
+                        if right {
+                            assert!(host.grant(&keys().root, 0x1B, 0), "{told}");
+                        }
+                        host.clear(1);
+                        let mut sent = host.begin(1, &file[..at], 7);
+                        match steps {
+                            usize::MAX => host.settle(),
+                            steps => host.steps(steps),
+                        }
+                        action(host);
+                        host.steps(steps.min(40));
+                        if sent.is_ok() {
+                            sent = host.go_on(1, &file[at..], 7).and_then(|()| host.end(1));
+                        }
+                        host.settle();
+                        host.node.take_boot_request();
+                        let whole = device.holds(1, &new);
+                        assert!(whole || device.holds(1, &old) || device.record(1).is_none(), "{told}");
+                        assert!(sent.is_err() || whole || host.status(1) != 0, "{told}");
+                        assert!(device.holds(2, &other), "{told}");
+                        let region = STANDARD_2.region(1);
+                        for touched in device.take_touched() {
+                            assert!(region.contains(touched.base, touched.size), "{told}: {touched:?}");
+                        }
+                    });
+                    device.run(|host| assert_eq!(host.update(1, &file, 7), (Ok(()), 0), "{told}"));
+                    assert!(device.holds(1, &new), "{told}");
+                }
+            }
+        }
+    }
+}

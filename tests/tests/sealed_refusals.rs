@@ -1,0 +1,653 @@
+//! Sealed images that are wrong: every bit of the head, many of the chunks, every length, every field.
+//! Each is refused with the code that says why, and nothing is erased or written before the
+//! signatures are good.
+
+#[path = "../src/random.rs"]
+#[allow(dead_code, reason = "the tests need some of it")]
+mod random;
+
+use boot_core::canopen::{AbortCode, Instant};
+use coboot_tests::sealed::{
+    certificate, image, keys, seal, sealer, Device, Parts, EPOCH, FORMS, HIGHEST, PRODUCT_CODE, REVISION,
+    STANDARD_1, UNIQUE_ID, VENDOR_ID,
+};
+use coflash::file::sealed::{key_block, Certificate, Kek, Role, Sealer};
+use random::Random;
+
+/// Statuses in 1F57h.
+const FORMAT: u32 = 0x04;
+const ADDRESS: u32 = 0x0C;
+const VENDOR: u32 = 0x80;
+const PRODUCT: u32 = 0x82;
+const NO_ACCESS: u32 = 0x84;
+const SIGNATURE: u32 = 0x8A;
+const ROLLBACK: u32 = 0x8C;
+const KEY: u32 = 0x8E;
+
+/// What is installed before: counter 5, epoch 4.
+fn installed() -> (Device, Vec<u8>) {
+    let device = Device::sealed(&STANDARD_1);
+    let old = image(STANDARD_1.region(1), 700, 0xA3);
+    device.run(|host| host.install(1, &seal(&sealer((false, false)), &old)));
+    device.take_touched();
+    (device, old)
+}
+
+/// The image that comes: counter 7.
+fn next(form: (bool, bool), len: usize) -> (Vec<u8>, Vec<u8>) {
+    let image = image(STANDARD_1.region(1), len, 0xB7);
+    let sealer = Sealer { counter: 7, version: 2, chunk: 9, text: Some("a text to be read"), ..sealer(form) };
+    let file = seal(&sealer, &image);
+    (file, image)
+}
+
+/// Refused with one of these codes, and nothing is lost.
+fn costs_nothing(device: &Device, old: &[u8], file: &[u8], codes: &[u32], told: &str) {
+    device.run(|host| {
+        let (abort, status) = host.update(1, file, 7);
+        assert!(codes.contains(&status), "{told}: {status:02X}h, and not {codes:02X?}");
+        assert!(abort.is_ok() || abort == Err(AbortCode::STORE), "{told}: {abort:?}");
+        assert_eq!(device.take_touched(), [], "{told}");
+        assert_eq!(host.start(1), Some(1), "{told}: the old program can be started");
+    });
+    assert!(device.holds(1, old), "{told}");
+}
+
+/// Refused behind good signatures: there is no program, nothing but `authentic` bytes of it are in
+/// the flash, and a good one can be installed.
+fn costs_the_program(device: &Device, file: &[u8], codes: &[u32], authentic: &[u8], told: &str) {
+    let device = device.copy();
+    device.run(|host| {
+        let (abort, status) = host.update(1, file, 7);
+        assert!(codes.contains(&status), "{told}: {status:02X}h, and not {codes:02X?}");
+        assert!(abort.is_ok() || abort == Err(AbortCode::STORE), "{told}: {abort:?}");
+        assert_eq!(host.state(1), 3, "{told}: there is none");
+        assert_eq!(host.start(1), None, "{told}");
+    });
+    assert!(device.record(1).is_none() && device.starts(None).is_none(), "{told}");
+    let written = device.cells(1, authentic.len());
+    assert_eq!(written, authentic, "{told}");
+    let size = STANDARD_1.region(1).size as usize;
+    let sector = authentic.len().next_multiple_of(0x400).min(size);
+    assert!(device.cells(1, sector)[authentic.len()..].iter().all(|byte| *byte == 0xFF), "{told}");
+    let (good, image) = next((true, true), 700);
+    device.run(|host| host.install(1, &good));
+    assert!(device.holds(1, &image), "{told}");
+}
+
+// --- bits
+
+fn word(bytes: &[u8], at: usize) -> u32 {
+    u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap())
+}
+
+/// The codes for a flipped bit in the head of [`next`], from the tables of the format.
+fn code_of_flip(good: &[u8], at: usize, bit: u8) -> Vec<u32> {
+    let mut flipped = good.to_vec();
+    flipped[at] ^= 1 << bit;
+    let parts = Parts::of(good);
+    let manifest = parts.manifest.len();
+    let flags = good[7];
+    let compressed = flags & 2 != 0;
+    let encrypted = flags & 1 != 0;
+    let in_certificate = at.wrapping_sub(manifest);
+    let in_signature = at.wrapping_sub(manifest + 152);
+    let code = match at {
+        0..4 => return vec![NO_ACCESS, FORMAT],
+        // Something else is taken for the certificate and the signatures.
+        4..6 => return vec![FORMAT, SIGNATURE, KEY],
+        6 => return vec![FORMAT, SIGNATURE],
+        7 => match bit {
+            0 if encrypted => SIGNATURE,
+            0 => KEY,
+            1 if compressed => FORMAT,
+            3 if !compressed => FORMAT,
+            // The device has no program that could be the dictionary.
+            3 => return vec![FORMAT, SIGNATURE],
+            2 | 7 => FORMAT,
+            4 => PRODUCT,
+            6 => KEY,
+            _ => SIGNATURE,
+        },
+        8..12 => VENDOR,
+        12..16 => PRODUCT,
+        20..24 if word(&flipped, 20) < 5 => ROLLBACK,
+        24 => PRODUCT,
+        25 if !(9..=13).contains(&flipped[25]) => FORMAT,
+        26..28 if word(&flipped, 24) >> 16 > 1 => FORMAT,
+        28..32 if !compressed => FORMAT,
+        28..32 if word(&flipped, 28) > STANDARD_1.region(1).size => ADDRESS,
+        36..40 if !compressed => FORMAT,
+        120..132 => PRODUCT,
+        132..136 if word(&flipped, 132) != 1 << (REVISION & 31) => PRODUCT,
+        176.. if at < manifest => {
+            let recipient = encrypted.then_some(176..224);
+            match recipient.filter(|record| record.contains(&at)) {
+                Some(_) if at < 178 && (at, bit) != (177, 7) => FORMAT,
+                Some(_) if at < 178 => KEY,
+                Some(_) if at < 180 => FORMAT,
+                Some(_) if at < 184 => KEY,
+                Some(_) => SIGNATURE,
+                None => {
+                    let text = if encrypted { 224 } else { 176 };
+                    match at - text {
+                        1 if bit == 7 => FORMAT,
+                        // What is left behind it, or in front of it, may be a record or none.
+                        2 | 3 => return vec![FORMAT, SIGNATURE],
+                        _ => SIGNATURE,
+                    }
+                }
+            }
+        }
+        // It is none then, and the first half of it is no signature.
+        _ if in_certificate < 4 => return vec![FORMAT, KEY],
+        _ if (8..12).contains(&in_certificate) && word(&flipped, manifest + 8) < EPOCH => ROLLBACK,
+        _ if (60..64).contains(&in_certificate) => KEY,
+        // It is longer: chunks are taken for a part of it.
+        _ if (6..8).contains(&in_signature) => return vec![FORMAT, SIGNATURE],
+        _ => SIGNATURE,
+    };
+    vec![code]
+}
+
+#[test]
+fn every_bit_of_the_head_counts() {
+    for form in [(false, false), (true, true)] {
+        let (device, old) = installed();
+        let (good, image) = next(form, 600);
+        for at in 0..Parts::of(&good).head() {
+            for bit in 0..8 {
+                let mut file = good.clone();
+                file[at] ^= 1 << bit;
+                let told = format!("{form:?} bit {bit} of byte {at}");
+                costs_nothing(&device, &old, &file, &code_of_flip(&good, at, bit), &told);
+            }
+        }
+        device.run(|host| host.install(1, &good));
+        assert!(device.holds(1, &image));
+    }
+}
+
+#[test]
+fn every_byte_of_the_chunks_counts() {
+    let mut random = Random(7);
+    for form in FORMS {
+        let (device, old) = installed();
+        let (good, image) = next(form, 1700);
+        let head = Parts::of(&good).head();
+        for at in head..good.len() {
+            // All bytes of the hashes, and others now and then.
+            let (chunk, within) = ((at - head) / 544, (at - head) % 544);
+            if within >= 32 && !random.chance(4) {
+                continue;
+            }
+            let mut file = good.clone();
+            file[at] ^= 1 << random.below(8);
+            let told = format!("{form:?} byte {within} of chunk {chunk}");
+            if chunk == 0 {
+                costs_nothing(&device, &old, &file, &[SIGNATURE], &told);
+            } else if form.1 {
+                // How much a chunk unpacks to, the decoder of another tells.
+                let device = device.copy();
+                device.run(|host| assert_eq!(host.update(1, &file, 7).1, SIGNATURE, "{told}"));
+                assert!(device.record(1).is_none(), "{told}");
+                let size = STANDARD_1.region(1).size as usize;
+                let written = device.cells(1, image.len());
+                let same = written.iter().zip(&image).take_while(|(a, b)| a == b).count();
+                assert!(written[same..].iter().all(|byte| *byte == 0xFF), "{told}");
+                assert!(same < size);
+            } else {
+                costs_the_program(&device, &file, &[SIGNATURE], &image[..chunk * 512], &told);
+            }
+        }
+    }
+}
+
+// --- lengths
+
+#[test]
+fn every_prefix_is_refused() {
+    for form in [(false, false), (true, true)] {
+        let (device, old) = installed();
+        let (good, image) = next(form, 1100);
+        let first_chunk = Parts::of(&good).head() + 544;
+        // Ended, aborted, and left for a reset.
+        for len in 0..good.len() {
+            if len < first_chunk {
+                if len >= 8 {
+                    costs_nothing(&device, &old, &good[..len], &[FORMAT], &format!("{form:?} {len} bytes"));
+                }
+                device.run(|host| {
+                    host.clear(1);
+                    host.begin(1, &good[..len], 7).unwrap();
+                    host.settle();
+                    if len % 2 == 0 {
+                        host.cancel(1);
+                        host.settle();
+                        let begun = len >= 4;
+                        assert_eq!(host.status(1), if begun { FORMAT } else { 0 }, "{len}");
+                        assert_eq!(host.start(1), Some(1), "{len}");
+                    }
+                });
+                assert_eq!(device.take_touched(), [], "{form:?} {len}");
+                assert!(device.holds(1, &old));
+            } else if len % 5 == 0 || len > good.len() - 40 {
+                let device = device.copy();
+                device.run(|host| {
+                    host.clear(1);
+                    host.begin(1, &good[..len], 7).unwrap();
+                    if len % 2 == 0 {
+                        host.cancel(1);
+                        host.settle();
+                        assert_eq!(host.status(1), FORMAT, "{len}");
+                    } else {
+                        assert_eq!(host.end(1), Ok(()));
+                        host.settle();
+                        assert_eq!(host.status(1), FORMAT, "{len}");
+                        assert_eq!(host.state(1), 3);
+                    }
+                    if host.state(1) == 3 {
+                        assert_eq!(host.start(1), None);
+                    }
+                });
+                // What was in the queue still when it was broken off has cost nothing.
+                assert!(device.record(1).is_none() || device.holds(1, &old), "{len}");
+                device.run(|host| host.install(1, &good));
+                assert!(device.holds(1, &image));
+            }
+        }
+    }
+}
+
+#[test]
+fn bytes_behind_the_end_are_refused() {
+    for form in FORMS {
+        let (device, _) = installed();
+        for (len, more) in [(600, 1), (600, 7), (1024, 1), (1024, 544), (1100, 5000)] {
+            let (good, image) = next(form, len);
+            let file = [good, vec![0x5A; more]].concat();
+            costs_the_program(&device, &file, &[FORMAT], &image, &format!("{form:?} {len} + {more}"));
+        }
+    }
+}
+
+// --- fields
+
+/// Who makes a certificate, for what.
+fn certified(certificate: Certificate, root: &coflash::file::sealed::SigningKey) -> Parts {
+    Parts::of(&next((false, false), 600).0).certified(&certificate.signed_by(root))
+}
+
+/// Files that are signed as they should be, and are not for this device, or not possible.
+fn signed_and_wrong() -> Vec<(String, u32, Vec<u8>)> {
+    let plain = Parts::of(&next((false, false), 600).0);
+    let packed = Parts::of(&next((false, true), 600).0);
+    let secret = Parts::of(&next((true, false), 600).0);
+    let own = certificate();
+    let Keys { root, second_root, release, stranger, .. } = keys();
+    let mut files = Vec::new();
+    let mut add = |what: &str, code: u32, file: Vec<u8>| files.push((what.to_string(), code, file));
+
+    // The fields of the manifest.
+    for (what, at, value, code) in [
+        ("vendor 0", 8, 0, VENDOR),
+        ("another vendor", 8, VENDOR_ID + 1, VENDOR),
+        ("product 0", 12, 0, PRODUCT),
+        ("another product", 12, PRODUCT_CODE ^ 0x100, PRODUCT),
+        ("a lower counter", 20, 4, ROLLBACK),
+        ("the counter 0", 20, 0, ROLLBACK),
+        ("a counter that the key may not sign", 20, HIGHEST + 1, SIGNATURE),
+        ("the highest counter", 20, u32::MAX, SIGNATURE),
+        ("no image", 28, 0, FORMAT),
+        ("an image larger than its payload", 28, 601, FORMAT),
+        ("an image smaller than its payload", 28, 599, FORMAT),
+        ("no payload", 36, 0, FORMAT),
+        ("all payload", 36, u32::MAX, FORMAT),
+        ("the unique ID of nobody", 128, 1, PRODUCT),
+        ("hardware revision 1", 132, 1 << 1, PRODUCT),
+        ("all hardware revisions but ours", 132, !(1 << (REVISION & 31)), PRODUCT),
+    ] {
+        add(what, code, plain.clone().with(at, &u32::to_le_bytes(value)).signed());
+    }
+    let mut almost = UNIQUE_ID;
+    almost[11] ^= 1;
+    for (what, at, bytes, code) in [
+        ("another unique ID", 120, &almost[..], PRODUCT),
+        ("program 0", 24, &[0], PRODUCT),
+        ("program 2", 24, &[2], PRODUCT),
+        ("program 255", 24, &[255], PRODUCT),
+        ("chunks of 2^0", 25, &[0], FORMAT),
+        ("chunks of 2^8", 25, &[8], FORMAT),
+        ("chunks of 2^14", 25, &[14], FORMAT),
+        ("chunks of 2^41", 25, &[41], FORMAT),
+        ("chunks of 2^255", 25, &[255], FORMAT),
+        ("format 2", 26, &[2, 0], FORMAT),
+        ("format FFFFh", 26, &[255, 255], FORMAT),
+        ("flag 2", 7, &[1 << 2], FORMAT),
+        ("flag 7", 7, &[1 << 7], FORMAT),
+        ("all flags", 7, &[0xFF], FORMAT),
+        ("data", 7, &[1 << 4], PRODUCT),
+        ("a dictionary without compression", 7, &[1 << 3], FORMAT),
+        ("signed for tests", 7, &[1 << 6], KEY),
+        ("encrypted for nobody", 7, &[1 << 0], KEY),
+        ("no signature", 6, &[0], FORMAT),
+        ("four signatures", 6, &[4], FORMAT),
+        ("255 signatures", 6, &[255], FORMAT),
+        ("a manifest of 0 bytes", 4, &[0, 0], FORMAT),
+        ("a manifest of 172 bytes", 4, &[172, 0], FORMAT),
+        ("a manifest of 177 bytes", 4, &[177, 0], FORMAT),
+        ("a manifest of 1028 bytes", 4, &1028_u16.to_le_bytes(), FORMAT),
+        ("a manifest of 65535 bytes", 4, &[255, 255], FORMAT),
+    ] {
+        add(what, code, plain.clone().with(at, bytes).signed());
+    }
+    let size = STANDARD_1.region(1).size;
+    for large in [size + 1, 1 << 24, u32::MAX] {
+        let file = packed.clone().with(28, &large.to_le_bytes()).signed();
+        add(&format!("an image of {large} bytes"), ADDRESS, file);
+        let file = plain.clone().with(28, &large.to_le_bytes()).with(36, &large.to_le_bytes()).signed();
+        add(&format!("an image of {large} bytes, unpacked"), ADDRESS, file);
+    }
+    for (what, at) in [("size", 28), ("payload", 36)] {
+        add(&format!("{what} 0, compressed"), FORMAT, packed.clone().with(at, &[0; 4]).signed());
+    }
+
+    // Records.
+    let record = |tag, size, bytes: &[u8]| plain.clone().with_record(tag, size, bytes).signed();
+    add("an unknown critical record", FORMAT, record(0x8002, 4, &[1; 4]));
+    add("an unknown critical record without bytes", FORMAT, record(0xFFFE, 0, &[]));
+    add("a record over the end of the manifest", FORMAT, record(0x0002, 8, &[1; 4]));
+    add("a huge record", FORMAT, record(0x0002, 65535, &[1; 4]));
+    add("a recipient that is too short", FORMAT, record(0x8001, 40, &[1; 40]));
+    add("a recipient that is too long", FORMAT, record(0x8001, 48, &[1; 48]));
+    add("a recipient without bytes", FORMAT, record(0x8001, 0, &[]));
+    let unknown = secret.clone().with(180, &[1, 2, 3, 4]).signed();
+    add("encrypted for a key that is not here", KEY, unknown);
+    let zero = secret.clone().with(180, &[0; 4]).signed();
+    add("encrypted for the key 0", KEY, zero);
+    for at in [184, 191] {
+        let mut file = secret.clone();
+        file.manifest[at] ^= 1;
+        add("a wrong check of the key", KEY, file.signed());
+    }
+    let other = Sealer { encrypt_for: &keys().other_keks, counter: 7, ..sealer((true, false)) };
+    let image = image(STANDARD_1.region(1), 600, 1);
+    add("encrypted for others", KEY, seal(&other, &image));
+
+    // The certificate.
+    let with = |certificate| certified(certificate, root).signed();
+    add("certified for another vendor", SIGNATURE, with(Certificate { vendor_id: 1, ..own }));
+    add("certified for vendor 0", SIGNATURE, with(Certificate { vendor_id: 0, ..own }));
+    add("certified for another product", SIGNATURE, with(Certificate { product_code: 1, ..own }));
+    add("certified for higher counters", SIGNATURE, with(Certificate { lowest: 8, ..own }));
+    add("certified for lower counters", SIGNATURE, with(Certificate { highest: 6, ..own }));
+    add("certified for none", SIGNATURE, with(Certificate { lowest: 9, highest: 1, ..own }));
+    add("of an old epoch", ROLLBACK, with(Certificate { epoch: EPOCH - 1, ..own }));
+    add("of epoch 0", ROLLBACK, with(Certificate { epoch: 0, ..own }));
+    add("certified for tests", KEY, with(Certificate { role: Role::Test, ..own }));
+    add("certified by nobody", KEY, certified(own, stranger).signed());
+    let certified_stranger = Certificate { key: stranger.public(), ..own };
+    add(
+        "another key's certificate",
+        SIGNATURE,
+        certified(certified_stranger, root).signed_by(release).bytes(),
+    );
+    let claims = |certificate: Certificate, change: &dyn Fn(&mut [u8; 152])| {
+        let mut bytes = certificate.signed_by(root);
+        change(&mut bytes);
+        // Signed once more, as the root would sign what is wrong.
+        let signature = root.sign(&bytes[..88]);
+        bytes[88..].copy_from_slice(&signature);
+        plain.clone().certified(&bytes).signed()
+    };
+    for role in [0, 3, 255] {
+        add(&format!("role {role}"), SIGNATURE, claims(own, &|bytes| bytes[6] = role));
+    }
+    for algorithm in [0, 2, 3, 255] {
+        let file = claims(own, &|bytes| bytes[7] = algorithm);
+        add(&format!("algorithm {algorithm}"), SIGNATURE, file);
+    }
+    for len in [0_u16, 151, 153, 65535] {
+        let file = claims(own, &|bytes| bytes[4..6].copy_from_slice(&len.to_le_bytes()));
+        add(&format!("a certificate of {len} bytes"), SIGNATURE, file);
+    }
+    add("of the root 0", KEY, claims(own, &|bytes| bytes[60..64].fill(0)));
+    let second = second_root.public().id().to_le_bytes();
+    add("of the other root", SIGNATURE, claims(own, &|bytes| bytes[60..64].copy_from_slice(&second)));
+    let forged = own.signed_by(stranger);
+    let claimed = |mut bytes: [u8; 152]| {
+        bytes[60..64].copy_from_slice(&root.public().id().to_le_bytes());
+        plain.clone().certified(&bytes).signed()
+    };
+    add("a stranger's certificate in the root's name", SIGNATURE, claimed(forged));
+
+    // Signatures.
+    add("signed by nobody", SIGNATURE, plain.clone().signed_by(stranger).bytes());
+    add("signed by the root for the release key", SIGNATURE, plain.clone().signed_by(root).bytes());
+    let bare = plain.clone().certified(&[]);
+    add("signed by the release key without certificate", KEY, bare.clone().signed_by(release).bytes());
+    let in_the_name = |signature: &[u8], of: u32| {
+        let mut parts = bare.clone();
+        parts.signatures = signature.to_vec();
+        parts.signatures[..4].copy_from_slice(&of.to_le_bytes());
+        parts.bytes()
+    };
+    let strange = Parts::signature(stranger, &bare.manifest);
+    add("a stranger in the root's name", SIGNATURE, in_the_name(&strange, root.public().id()));
+    add("in the name of the key 0", KEY, in_the_name(&strange, 0));
+    for algorithm in [0_u8, 2, 3, 255] {
+        let mut parts = plain.clone().signed_by(release);
+        parts.signatures[4] = algorithm;
+        add(&format!("signature algorithm {algorithm}"), SIGNATURE, parts.bytes());
+    }
+    for bytes in [0, 63] {
+        let mut parts = plain.clone().signed_by(release);
+        parts.signatures[6] = bytes;
+        parts.signatures.truncate(8 + usize::from(bytes));
+        add(&format!("a signature of {bytes} bytes"), SIGNATURE, parts.bytes());
+    }
+    for bytes in [8000_u16, 65535] {
+        let mut parts = plain.clone().signed_by(release);
+        parts.signatures[6..8].copy_from_slice(&bytes.to_le_bytes());
+        parts.signatures.resize(8 + usize::from(bytes), 0x5A);
+        add(&format!("a signature of {bytes} bytes"), FORMAT, parts.bytes());
+    }
+    // Two signatures with the id of the key: the first counts, and it is bad.
+    let mut two = plain.clone().with(6, &[2]).signed_by(release);
+    let mut bad = two.signatures.clone();
+    bad[20] ^= 1;
+    two.signatures = [bad, two.signatures].concat();
+    add("a bad signature in front of a good one", SIGNATURE, two.bytes());
+    // S + L in place of S (RFC 8032 section 5.1.7 takes no S of L or more).
+    let mut malleable = plain.clone().signed_by(release);
+    let order = [
+        0xed, 0xd3, 0xf5, 0x5c, 0x1a, 0x63, 0x12, 0x58, 0xd6, 0x9c, 0xf7, 0xa2, 0xde, 0xf9, 0xde, 0x14, 0, 0,
+        0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0x10,
+    ];
+    let mut carry = 0_u16;
+    for (byte, order) in malleable.signatures[40..72].iter_mut().zip(order) {
+        carry += u16::from(*byte) + order;
+        *byte = carry as u8;
+        carry >>= 8;
+    }
+    add("a signature with S + L", SIGNATURE, malleable.bytes());
+
+    // The first chunk.
+    let mut parts = plain.clone();
+    parts.chunks.rotate_left(1);
+    add("a chunk that is shifted", SIGNATURE, parts.bytes());
+    add("the chunks of another image", SIGNATURE, {
+        let others = Parts::of(&next((false, true), 600).0).chunks;
+        Parts { chunks: others, ..plain.clone() }.bytes()
+    });
+    files
+}
+
+use coboot_tests::sealed::Keys;
+
+#[test]
+fn a_good_signature_does_not_make_a_wrong_field_right() {
+    let (device, old) = installed();
+    let files = signed_and_wrong();
+    assert!(files.len() > 90, "{}", files.len());
+    for (what, code, file) in files {
+        costs_nothing(&device, &old, &file, &[code], &what);
+    }
+    // Beside signatures that this device knows nothing of, the good one is found.
+    let (good, image) = next((true, true), 600);
+    let mut parts = Parts::of(&good).with(6, &[3]).signed_by(&keys().release);
+    let strange = Parts::signature(&keys().stranger, &parts.manifest);
+    let lms = [&[1, 2, 3, 4, 2, 0, 100, 0][..], &[0x5A; 100]].concat();
+    parts.signatures = [lms, strange, parts.signatures].concat();
+    device.run(|host| host.install(1, &parts.bytes()));
+    assert!(device.holds(1, &image));
+}
+
+/// Another key-encryption key with the id of ours.
+#[test]
+fn a_wrong_key_is_told_before_anything_is_lost() {
+    let Keys { root, second_root, keks, .. } = keys();
+    let mut block = key_block(&[root.public(), second_root.public()], keks, 0, 0, false).unwrap();
+    block[88 + 4] ^= 1;
+    let check = coboot_tests::sealed::crc32(&block[..252]);
+    block[252..].copy_from_slice(&check.to_le_bytes());
+    let device = Device::with_keys(&STANDARD_1, &block);
+    let old = image(STANDARD_1.region(1), 700, 0xA3);
+    device.run(|host| host.install(1, &seal(&sealer((false, false)), &old)));
+    device.take_touched();
+    costs_nothing(&device, &old, &next((true, false), 600).0, &[KEY], "another key with our id");
+    // And for three keys, of which the second is ours.
+    let (first, third) = (Kek::new([7; 32]).unwrap(), Kek::new([8; 32]).unwrap());
+    let for_three = [first, keks[0].clone(), third];
+    let (device, _) = installed();
+    let image = image(STANDARD_1.region(1), 900, 1);
+    let file = seal(&Sealer { encrypt_for: &for_three, counter: 7, ..sealer((true, true)) }, &image);
+    device.run(|host| host.install(1, &file));
+    assert!(device.holds(1, &image));
+}
+
+/// No root, or a key block that is damaged.
+#[test]
+fn a_device_without_the_root_takes_nothing() {
+    let (good, _) = next((false, false), 600);
+    let block = key_block(&[keys().stranger.public()], &keys().keks, 0, 0, false).unwrap();
+    let device = Device::with_keys(&STANDARD_1, &block);
+    device.run(|host| assert_eq!(host.update(1, &good, 7).1, KEY));
+    assert_eq!(device.take_touched(), []);
+}
+
+// --- what is compressed
+
+/// Authentic, and unpacked to something else than the manifest says: there is no program then, and
+/// nothing outside of its flash is touched.
+#[test]
+fn a_stream_that_is_wrong_ends_without_a_program() {
+    let (device, old) = installed();
+    let (good, image) = next((false, true), 3000);
+    let parts = Parts::of(&good);
+    let payload = parts.payload();
+    let cut = |len: usize| parts.clone().with_payload(&payload[..len]);
+    let mut files = vec![
+        ("half a stream".to_string(), cut(payload.len() / 2)),
+        ("a byte alone".to_string(), cut(1)),
+        ("five bytes".to_string(), cut(5)),
+        ("all zeros".to_string(), parts.clone().with_payload(&[0; 3000])),
+        ("all FFh".to_string(), parts.clone().with_payload(&[0xFF; 3000])),
+        ("a first byte that is not 0".to_string(), {
+            let mut wrong = payload.clone();
+            wrong[0] = 1;
+            parts.clone().with_payload(&wrong)
+        }),
+        ("much behind its end".to_string(), parts.clone().with_payload(&[&payload[..], &[0; 600]].concat())),
+        ("an image larger than the stream".to_string(), parts.clone().with(28, &9000_u32.to_le_bytes())),
+        ("an image smaller than the stream".to_string(), parts.clone().with(28, &1000_u32.to_le_bytes())),
+        ("another CRC".to_string(), parts.clone().with(32, &[1, 2, 3, 4])),
+        ("another hash".to_string(), parts.clone().with(40, &[1, 2, 3, 4])),
+    ];
+    // A match in front of the first byte: what LZMA has behind 0, and then bits that are 1.
+    files.push((
+        "a match with nothing".to_string(),
+        parts.clone().with_payload(&[&[0][..], &[0xFE; 90]].concat()),
+    ));
+    let mut random = Random(11);
+    for number in 0..150 {
+        let mut wrong = payload.clone();
+        for _ in 0..1 + random.below(4) {
+            let at = random.below(wrong.len());
+            wrong[at] ^= 1 << random.below(8);
+        }
+        files.push((format!("stream {number} of seed 11"), parts.clone().with_payload(&wrong)));
+    }
+    let region = STANDARD_1.region(1);
+    let journal = STANDARD_1.layout.parameters;
+    let mut refused = 0;
+    for (what, parts) in files {
+        let device = device.copy();
+        device.run(|host| {
+            let (_, status) = host.update(1, &parts.signed(), 7);
+            // Bits at the end of a stream may say nothing.
+            let sound = status == 0 && device.holds(1, &image);
+            assert!(sound || [FORMAT, SIGNATURE, 0x02].contains(&status), "{what}: {status:02X}h");
+            refused += u32::from(!sound);
+        });
+        // Where not a byte came out of it, nothing was lost.
+        let whole = device.holds(1, &old) || device.holds(1, &image);
+        assert!(device.record(1).is_none() || whole, "{what}");
+        for touched in device.take_touched() {
+            let place = |region: &shared_abi::geometry::Region| region.contains(touched.base, touched.size);
+            assert!(place(&region) || journal.iter().any(place), "{what}: {touched:?}");
+        }
+        device.run(|host| host.install(1, &good));
+        assert!(device.holds(1, &image), "{what}");
+    }
+    assert!(refused > 140, "{refused}");
+}
+
+/// An image that was packed with the other program as its dictionary, for a device that has none: it
+/// must not cost the program.
+#[test]
+fn a_dictionary_that_is_not_here_costs_nothing() {
+    let (device, old) = installed();
+    let other = image(STANDARD_1.region(1), 2000, 0x11);
+    let new = image(STANDARD_1.region(1), 2000, 0x12);
+    let sealer = Sealer { base: Some(&other), counter: 7, ..sealer((false, false)) };
+    costs_nothing(&device, &old, &seal(&sealer, &new), &[FORMAT, SIGNATURE, KEY, PRODUCT], "a dictionary");
+}
+
+/// Who cannot sign tries again and again: the device stays reachable, the next try waits longer each
+/// time, up to half a minute, and the flash does not wear out.
+#[test]
+fn ten_thousand_bad_signatures_in_a_row_slow_down_and_cost_nothing() {
+    let (device, old) = installed();
+    let (good, new) = next((false, false), 600);
+    let mut bad = good.clone();
+    let signature = Parts::of(&good).head() - 1;
+    bad[signature] ^= 1;
+    device.run(|host| {
+        for tries in 0..10_000 {
+            // At first; then no longer than the longest wait.
+            host.now += 64_000;
+            host.node.set_time(Instant::from_millis(host.now));
+            host.clear(1);
+            assert_eq!(host.send(1, &bad, 889).1, SIGNATURE, "{tries}");
+            let longest = 32_000;
+            let wait = if tries < 6 { 500 << tries } else { longest };
+            for later in [0, wait - 1] {
+                host.node.set_time(Instant::from_millis(host.now + later));
+                assert!(host.begin(1, &good, 889).is_err(), "{tries}: {later} ms later");
+            }
+            assert_eq!(host.state(1), 0, "it answers");
+        }
+        assert_eq!(host.start(1), Some(1));
+    });
+    let touched = device.chip.model().touched.clone();
+    let journal = device.setup.layout.parameters;
+    assert!(touched
+        .iter()
+        .all(|region| journal.iter().any(|place| place.contains(region.base, region.size))));
+    // The header once more, and one event.
+    assert!(touched.len() <= 12, "{} operations for 10000 refusals", touched.len());
+    assert!(device.holds(1, &old));
+    device.run(|host| host.install(1, &good));
+    assert!(device.holds(1, &new));
+}
