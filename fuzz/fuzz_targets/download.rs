@@ -8,6 +8,7 @@
 
 use boot_core::control::{Downloader, Policy, Step};
 use boot_core::store::Journal;
+use boot_core::unseal::Room;
 use canopen::program::{FlashError, FlashStatus, ProgramControl};
 use coboot_fuzz::model::{ModelFlash, CHIP, ONE_PROGRAM};
 use coboot_fuzz::Input;
@@ -25,8 +26,9 @@ fuzz_target!(|bytes: &[u8]| {
     let mut flash = ModelFlash::new(&CHIP);
     let mut buffer = [0; BUFFER];
     let journal = Journal::open(&flash, LAYOUT.parameters);
+    let mut room = Room::new();
     let mut device: Downloader<'_, _, 1> =
-        Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer);
+        Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer, room.unsealer());
     let mut input = Input::new(bytes);
     let mut next = 0_u32;
     // Whether the SDO server has a transfer open: it calls nothing else then.
@@ -109,8 +111,9 @@ fuzz_target!(|bytes: &[u8]| {
 
     let mut buffer = [0; BUFFER];
     let journal = Journal::open(&flash, LAYOUT.parameters);
+    let mut room = Room::new();
     let mut device: Downloader<'_, _, 1> =
-        Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer);
+        Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer, room.unsealer());
     device.command(1, ProgramControl::Clear).expect("CLEAR");
     settle(&mut device, &mut flash);
     assert_eq!(device.status(1), FlashStatus::OK);

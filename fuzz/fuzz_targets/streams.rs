@@ -12,6 +12,7 @@ use boot_core::control::{Policy, Step};
 use boot_core::store::NodeParameters;
 use boot_core::store::Journal;
 use boot_core::profile::Profile;
+use boot_core::unseal::Room;
 use canopen::device::Device;
 use canopen::od::{Entry, Objects};
 use canopen::program::{ENABLE_FLASH, PROGRAM_CONTROL, PROGRAM_DATA, UNLOCK, UNLOCK_FIRMWARE};
@@ -98,7 +99,8 @@ type Model<'b, 'f> = Bootloader<'b, &'f mut ModelFlash, Journal, PROGRAMS>;
 fn device<'b, 'f>(config: &'static Config, flash: &'f mut ModelFlash, buffer: &'b mut [u8]) -> Model<'b, 'f> {
     let parameters = Journal::open(flash, LAYOUT.parameters);
     let node = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
-    Bootloader::new(config, 0, node, 0, parameters, flash, buffer)
+    let unsealer = Box::leak(Box::<Room>::default()).unsealer();
+    Bootloader::new(config, 0, node, 0, parameters, flash, buffer, unsealer)
 }
 
 fn session(config: &'static Config, flash: &mut ModelFlash, input: &mut Input<'_>) {

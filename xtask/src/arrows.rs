@@ -35,24 +35,25 @@ struct Rule {
 const RULES: &[Rule] = &[
     Rule { name: "shared-abi", may_use: &[] },
     Rule { name: "canopen", may_use: &[] },
-    Rule { name: "boot-core", may_use: &["canopen", "shared-abi"] },
+    Rule { name: "seal", may_use: &[] },
+    Rule { name: "boot-core", may_use: &["canopen", "seal", "shared-abi"] },
     Rule { name: "bsp", may_use: &["shared-abi"] },
-    Rule { name: "bootloader", may_use: &["boot-core", "bsp", "shared-abi"] },
+    Rule { name: "bootloader", may_use: &["boot-core", "bsp", "seal", "shared-abi"] },
     Rule { name: "app-template", may_use: &["canopen", "bsp", "shared-abi"] },
     Rule { name: "vendor-can", may_use: &[] },
-    Rule { name: "coflash", may_use: &["canopen", "shared-abi", "vendor-can"] },
+    Rule { name: "coflash", may_use: &["canopen", "seal", "shared-abi", "vendor-can"] },
     Rule { name: "coflash-python", may_use: &["canopen", "coflash", "shared-abi"] },
     Rule { name: "coboot-node", may_use: &["boot-core", "canopen", "coflash", "shared-abi"] },
     Rule { name: "emulator", may_use: &["shared-abi"] },
     Rule {
         name: "coboot-tests",
-        may_use: &["boot-core", "bsp", "canopen", "coboot-node", "coflash", "emulator", "shared-abi"],
+        may_use: &["boot-core", "bsp", "canopen", "coboot-node", "coflash", "emulator", "seal", "shared-abi"],
     },
     Rule { name: "xtask", may_use: &["shared-abi"] },
 ];
 
 /// The crates that need no `unsafe` and say so to the compiler.
-const PURE: &[&str] = &["canopen", "boot-core", "coflash", "coboot-node", "xtask"];
+const PURE: &[&str] = &["canopen", "seal", "boot-core", "coflash", "coboot-node", "xtask"];
 /// How they say it.
 const FORBID: &str = "#![forbid(unsafe_code)]";
 

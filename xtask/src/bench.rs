@@ -8,11 +8,12 @@ pub const HELP: &str = "\
 usage: cargo xtask bench [--json] [--board BOARD] [--yes]
 
 Downloads programs of 64, 256 and 900 KiB at 125 to 1000 kbit/s into an emulated board, in virtual
-time, and prints how long that took beside what the wire and the flash allow at best; and how busy the
-bus is while `coflash flash` sends a program. Then, in real time: what a frame costs the host, in an
-update over socketcand into a node whose flash is a file.
+time, and prints how long that took beside what the wire and the flash allow at best; how busy the
+bus is while `coflash flash` sends a program; and what it costs or gains to seal and to compress one.
+Then, in real time: what a frame costs the host, in an update over socketcand into a node whose flash
+is a file.
 
-  --json          prints the tables as JSON: downloads, bus, host
+  --json          prints the tables as JSON: downloads, bus, forms, host
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
 ";
@@ -23,7 +24,7 @@ pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     args.none_left()?;
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
-    let images = build::images(board, &["bootloader", "app-v1"])?;
+    let images = build::images(board, &["bootloader", "bootloader-sealed", "app-v1"])?;
     let mut bench = process::cargo("run");
     bench.args(build::tests_args(board)).args(["--bin", "bench"]);
     bench.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", images);

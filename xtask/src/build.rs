@@ -69,6 +69,8 @@ pub const VARIANTS: &[Variant] = table![
     bootloader("bootloader-log-defmt", "log-defmt"),
     bootloader("bootloader-log-uart", "log-uart"),
     bootloader("bootloader-virtual-can", "virtual-can"),
+    // It takes programs from the holder of a key alone.
+    bootloader("bootloader-sealed", "sealed"),
     // With the debugger interface, for the tests alone: never ship it.
     bootloader("bootloader-debugger", "debugger"),
     application("app-debugger", "debugger"),
@@ -130,7 +132,7 @@ impl Variant {
 
     /// The flash that it is for.
     fn region(&self, board: &Layout) -> Region {
-        board.program(self.program).unwrap_or(board.bootloader)
+        board.program(self.program).unwrap_or(board.bootloader_image())
     }
 }
 
@@ -379,6 +381,9 @@ mod tests {
         );
         let second = Variant::by_name(two, "app-program-2").ok().unwrap();
         assert_eq!(second.region(two), two.programs[1]);
-        assert_eq!(Variant::by_name(two, "bootloader-lift").ok().unwrap().region(two), two.bootloader);
+        assert_eq!(
+            Variant::by_name(two, "bootloader-lift").ok().unwrap().region(two),
+            two.bootloader_image()
+        );
     }
 }

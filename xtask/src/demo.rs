@@ -5,11 +5,14 @@ use crate::setup::{Part, Setup};
 use crate::{build, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask demo [--trace FILE] [--board BOARD] [--yes]
+usage: cargo xtask demo [--sealed] [--trace FILE] [--board BOARD] [--yes]
 
 Sets the machine up, builds bootloader and application and plays the main job on an emulated board: power on, flash
 version 1 over CANopen, start it, call it back, flash version 2, cut the power, see version 2 start.
 
+  --sealed        shows the sealed device instead: keys go into the board, which then takes signed programs
+                  alone; a flipped bit, an old counter and a foreign key are refused, and the old program
+                  starts each time
   --trace FILE    writes the bus to FILE, as candump logs it
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -18,13 +21,18 @@ version 1 over CANopen, start it, call it back, flash version 2, cut the power, 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let trace = args.value("--trace")?;
+    let is_sealed = args.flag("--sealed");
     let setup = Setup::from(&mut args);
     args.none_left()?;
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
-    let images = build::images(board, &build::MAIN)?;
+    let bootloader = if is_sealed { "bootloader-sealed" } else { "bootloader" };
+    let images = build::images(board, &[bootloader, "app-v1", "app-v2"])?;
 
     let mut demo = process::cargo("run");
     demo.args(build::tests_args(board)).args(["--bin", "demo", "--"]);
+    if is_sealed {
+        demo.arg("--sealed");
+    }
     if let Some(trace) = trace {
         demo.args(["--trace", &trace]);
     }

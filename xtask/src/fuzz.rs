@@ -5,7 +5,7 @@ use std::process::{Command, Stdio};
 use std::{env, fs};
 
 use crate::args::Args;
-use crate::{process, workspace, Outcome};
+use crate::{process, setup, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask fuzz [--seconds N] [--target NAME]
@@ -13,7 +13,7 @@ usage: cargo xtask fuzz [--seconds N] [--target NAME]
 Runs the fuzz targets of fuzz/: SDO server, SDO client, the wire between them, LSS, debugger interface,
 program download by blocks and in one piece,
 parameter journal, firmware files, candump logs, the text of SLCAN and socketcand, job and
-configuration files. What they find in this run is built upon in the next one.
+configuration files, sealed images with their signatures and their compression. What they find in this run is built upon in the next one.
 
   --seconds N     how long each target runs (default: 30)
   --target NAME   this one alone
@@ -40,7 +40,7 @@ pub fn run(mut args: Args) -> Outcome {
         targets = vec![name];
     }
     toolchain()?;
-    let path = cargo_fuzz()?;
+    let path = setup::tool("cargo-fuzz", CARGO_FUZZ)?;
 
     let fuzz = |words: &[&str]| {
         let mut command = Command::new("rustup");
@@ -135,24 +135,6 @@ fn toolchain() -> Outcome {
             .into());
     }
     Ok(())
-}
-
-/// Sees to it that there is a cargo-fuzz; gives the PATH with it.
-fn cargo_fuzz() -> Outcome<std::ffi::OsString> {
-    let tools = workspace::target_dir().join("tools");
-    let mut folders = vec![tools.join("bin")];
-    folders.extend(env::split_paths(&env::var_os("PATH").unwrap_or_default()));
-    let there =
-        |folder: &PathBuf| folder.join("cargo-fuzz").with_extension(env::consts::EXE_EXTENSION).is_file();
-    if !folders.iter().any(there) {
-        println!("Installing cargo-fuzz into {} ...", workspace::shown(&tools));
-        let mut install = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-        install.args(["install", "--quiet", "--locked", "cargo-fuzz", "--version", CARGO_FUZZ, "--root"]);
-        install.arg(&tools).env("CARGO_TARGET_DIR", tools.join("build"));
-        process::run(&mut install)
-            .map_err(|problem| format!("{problem} It needs a connection to crates.io, once."))?;
-    }
-    env::join_paths(folders).map_err(|error| format!("the PATH cannot be extended: {error}."))
 }
 
 /// How many inputs the fuzzer says it has run.

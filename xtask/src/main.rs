@@ -34,6 +34,7 @@ mod portable;
 mod powercut;
 mod process;
 mod rooms;
+mod sbom;
 mod setup;
 mod size;
 mod test;
@@ -144,6 +145,12 @@ const JOBS: &[Job] = &[
         about: "formatting, clippy and documentation, warnings denied",
         help: lint::HELP,
         run: lint::run,
+    },
+    Job {
+        name: "sbom",
+        about: "the software bills of materials of bootloader and host tool",
+        help: sbom::HELP,
+        run: sbom::run,
     },
     Job {
         name: "portable",

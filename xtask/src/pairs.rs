@@ -21,7 +21,7 @@ build or does not fit its flash. It prints the choices and the size of each.
 
 /// The fields of a product that are varied, and how many values each has. The values themselves stand
 /// in `bootloader/src/test_products.rs`, in the same order.
-const FIELDS: [(&str, u8); 30] = [
+const FIELDS: [(&str, u8); 32] = [
     ("profile", 4),
     ("autostart", 2),
     ("rescue_window_ms", 2),
@@ -52,6 +52,8 @@ const FIELDS: [(&str, u8); 30] = [
     ("program_watchdog_ms", 2),
     ("answer_to_reset_ms", 2),
     ("max_crash_resets", 2),
+    ("security_counter", 2),
+    ("counter_with_confirmation", 2),
 ];
 
 /// The values of a product, by the order of [`FIELDS`]; 0 is the default.
@@ -172,12 +174,12 @@ fn pairs() -> Vec<(Choice, Choice)> {
 mod tests {
     use super::*;
 
-    /// Counted by hand: 28 fields of two values, one of three, one of four.
+    /// Counted by hand: 30 fields of two values, one of three, one of four.
     #[test]
     fn every_pair_stands_in_a_row_and_no_row_contradicts_itself() {
         let rows = covering();
-        // 4 for each pair of the 28, 6 and 8 with the larger ones, 12 between these; two contradict.
-        assert_eq!(pairs().len(), 28 * 27 / 2 * 4 + 28 * 6 + 28 * 8 + 12 - 2);
+        // 4 for each pair of the 30, 6 and 8 with the larger ones, 12 between these; two contradict.
+        assert_eq!(pairs().len(), 30 * 29 / 2 * 4 + 30 * 6 + 30 * 8 + 12 - 2);
         for ((a, value_a), (b, value_b)) in pairs() {
             assert!(rows.iter().any(|row| row[a] == value_a && row[b] == value_b), "{a} {b}");
         }

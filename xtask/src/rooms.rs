@@ -20,22 +20,41 @@ const BOOT_CORE: &[Rule] = &[
     Rule { room: "flash", may_use: &["crc"] },
     Rule { room: "sequence", may_use: &["flash"] },
     Rule { room: "store", may_use: &["crc", "flash", "sequence"] },
-    Rule { room: "program", may_use: &["crc", "flash", "store"] },
+    Rule { room: "program", may_use: &["crc", "flash", "keys", "store"] },
     Rule { room: "decision", may_use: &["program"] },
+    Rule { room: "keys", may_use: &["flash"] },
     Rule { room: "queue", may_use: &[] },
     Rule { room: "refusal", may_use: &[] },
     Rule { room: "policy", may_use: &["crc"] },
     Rule { room: "session", may_use: &["policy", "refusal"] },
     // Bytes in, judged and placed pieces out: no flash, no store, no command.
     Rule { room: "intake", may_use: &["policy", "program", "queue", "refusal", "session"] },
+    // From the queue to the flash: no session, no object.
+    Rule { room: "unseal", may_use: &["flash", "keys", "policy", "program", "queue", "store"] },
     // Pieces and addresses: no format, no object.
-    Rule { room: "programmer", may_use: &["crc", "flash", "program", "queue", "sequence", "store"] },
+    Rule {
+        room: "programmer",
+        may_use: &["crc", "flash", "program", "queue", "sequence", "store", "unseal"],
+    },
     Rule {
         room: "control",
-        may_use: &["flash", "intake", "policy", "program", "programmer", "refusal", "session", "store"],
+        may_use: &[
+            "flash",
+            "intake",
+            "policy",
+            "program",
+            "programmer",
+            "refusal",
+            "session",
+            "store",
+            "unseal",
+        ],
     },
     Rule { room: "stored_version", may_use: &["flash", "programmer"] },
-    Rule { room: "bootloader", may_use: &["control", "decision", "flash", "store", "stored_version"] },
+    Rule {
+        room: "bootloader",
+        may_use: &["control", "decision", "flash", "store", "stored_version", "unseal"],
+    },
     Rule { room: "profile", may_use: &["bootloader", "policy"] },
 ];
 

@@ -4,6 +4,7 @@
 //! When nothing is missing this takes a fraction of a second.
 
 use std::collections::BTreeSet;
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, fs};
@@ -292,6 +293,27 @@ pub fn rust_target(target: &str) -> Outcome {
         "the Rust target {target} is missing and could not be added. With rustup (https://rustup.rs) and a \
          connection, this line does it:\n\n    rustup target add {target}"
     ))
+}
+
+/// Sees to it that there is a program that cargo installs, in the PATH or in `target/tools`; gives
+/// the PATH with it.
+///
+/// # Errors
+/// When it is missing and cannot be installed.
+pub fn tool(name: &str, version: &str) -> Outcome<OsString> {
+    let tools = workspace::target_dir().join("tools");
+    let mut folders = vec![tools.join("bin")];
+    folders.extend(env::split_paths(&env::var_os("PATH").unwrap_or_default()));
+    let there = |folder: &PathBuf| folder.join(name).with_extension(env::consts::EXE_EXTENSION).is_file();
+    if !folders.iter().any(there) {
+        println!("Installing {name} into {} ...", workspace::shown(&tools));
+        let mut install = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+        install.args(["install", "--quiet", "--locked", name, "--version", version, "--root"]);
+        install.arg(&tools).env("CARGO_TARGET_DIR", tools.join("build"));
+        process::run(&mut install)
+            .map_err(|problem| format!("{problem} It needs a connection to crates.io, once."))?;
+    }
+    env::join_paths(folders).map_err(|error| format!("the PATH cannot be extended: {error}."))
 }
 
 fn rust_components() -> Outcome {

@@ -17,8 +17,9 @@ pub const HELP: &str = "\
 usage: cargo xtask size [--board BOARD] [--yes]
 
 Builds the bootloader, prints its flash by section, by part, by variant and by board, and fails when
-it is over the budget on any board. What runs from RAM lies in flash packed: sizes are told as they are unpacked (raw)
-and as the flash has them (packed). A share of what is packed is an estimate: as much of it as of the raw.
+it is over the budget on any board, or with sealed images over what the key block leaves of the
+region. What runs from RAM lies in flash packed: sizes are told as they are unpacked (raw) and as the
+flash has them (packed). A share of what is packed is an estimate: as much of it as of the raw.
 
   --board BOARD   the board of the tables (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -55,6 +56,14 @@ pub fn run(mut args: Args) -> Outcome {
         let flash = Flash::of(&read(&path)?, board.bootloader)?;
         println!("{:<31} {:>6}", board.board, flash.used);
         within = within.and(flash.within(BUDGET).map_err(|problem| format!("{}: {problem}", board.board)));
+    }
+    println!("\nwith sealed images               bytes     of");
+    for board in BOARDS {
+        let room = board.bootloader_image();
+        let path = build::images(board, &["bootloader-sealed"])?.join("bootloader-sealed.elf");
+        let flash = Flash::of(&read(&path)?, room)?;
+        println!("{:<31} {:>6}  {}", board.board, flash.used, room.size);
+        within = within.and(flash.within(room.size).map_err(|problem| format!("{}: {problem}", board.board)));
     }
     within
 }

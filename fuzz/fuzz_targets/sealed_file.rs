@@ -1,0 +1,52 @@
+//! A sealed image from anybody, in front of every signature.
+//!
+//! Must hold: no bytes make the parser or the judge panic; a head that is complete is no longer than
+//! the bytes; each record lies inside the manifest; what the judge lets pass is for this device and
+//! names keys that it has.
+#![no_main]
+
+use libfuzzer_sys::fuzz_target;
+use seal::judge::{judge, Device};
+use seal::key_block::{KEK_COUNT, KEKS, KEY, ROOTS, SIZE};
+use seal::wire::{head_size, word, Head, RECIPIENT};
+
+const DEVICE: Device<'_> = Device {
+    vendor_id: 0x319,
+    product_code: 1,
+    revision: 2,
+    unique_id: *b"unique id 96",
+    program: 1,
+    is_data: false,
+    room: 0xF_0000,
+    counter: 5,
+    epoch: 1,
+    keys: &[0; SIZE],
+};
+
+fuzz_target!(|bytes: &[u8]| {
+    // The first byte is the id of the root, so that the fuzzer can meet it.
+    let Some((id, bytes)) = bytes.split_first() else { return };
+    let mut keys = [0; SIZE];
+    keys[ROOTS] = *id;
+    keys[KEKS] = *id;
+    let Ok(size) = head_size(bytes) else { return };
+    assert!(size >= 8);
+    if size > bytes.len() {
+        return;
+    }
+    let head = Head(&bytes[..size]);
+    assert!(head.manifest().len() <= size);
+    let records: usize = head.records().map(|(_, record)| 4 + record.len()).sum();
+    assert!(records <= head.manifest().len());
+    let device = Device { keys: &keys, ..DEVICE };
+    if let Ok(needs) = judge(head, &device) {
+        assert_eq!((head.vendor_id(), head.product_code()), (device.vendor_id, device.product_code));
+        assert!(head.counter() >= device.counter && needs.epoch >= device.epoch);
+        assert!(head.size() <= device.room);
+        assert!(word(&keys, needs.root) != 0);
+        if let Some((key, at)) = needs.recipient {
+            assert!((KEKS..KEKS + KEK_COUNT * KEY).contains(&key));
+            assert!(at + RECIPIENT <= head.manifest().len());
+        }
+    }
+});

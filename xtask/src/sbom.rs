@@ -1,0 +1,282 @@
+//! `cargo xtask sbom`: the software bills of materials of what is released.
+//!
+//! cargo-cyclonedx makes them. It writes a file beside the manifest of every crate of the workspace
+//! and puts the time, a random number and this machine's folders into it. This job takes the file
+//! that was asked for, takes those three out, so that the same sources give the same bytes, and
+//! holds the rest against what CycloneDX demands and against cargo.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+use std::process::Command;
+use std::{env, fs, process as std_process};
+
+use sha2::{Digest, Sha512_256};
+
+use crate::args::Args;
+use crate::json::Value;
+use crate::{process, setup, workspace, Outcome};
+
+pub const HELP: &str = "\
+usage: cargo xtask sbom [--board BOARD]
+
+Writes the software bills of materials of bootloader and host tool (CycloneDX 1.5, JSON) into
+target/sbom, and prints each with its SHA-512/256: the hash that the manifest of a sealed image has
+room for. The same sources give the same bytes. The host tool's one is that of all systems together.
+
+  --board BOARD   the board of the bootloader (default: stm32f407g-disc1)
+
+cargo-cyclonedx is installed into target/tools where it is missing, which takes some minutes once.
+";
+
+/// The version that is installed where there is none.
+const VERSION: &str = "0.5.7";
+
+/// What is released, and how cargo is told of it.
+struct Released {
+    package: &'static str,
+    /// The target, or `all`.
+    target: &'static str,
+    features: Vec<String>,
+}
+
+pub fn run(mut args: Args) -> Outcome {
+    let board = workspace::board(&mut args)?;
+    args.none_left()?;
+    setup::rust_target(workspace::TARGET)?;
+    let path = setup::tool("cargo-cyclonedx", VERSION)?;
+    let folder = workspace::target_dir().join("sbom");
+    fs::create_dir_all(&folder).map_err(|error| unwritable(&folder, &error))?;
+    let board_feature = format!("board-{}", board.board);
+    let all = [
+        Released {
+            package: "bootloader",
+            target: workspace::TARGET,
+            features: ["--no-default-features", "--features", &board_feature].map(str::to_owned).into(),
+        },
+        Released { package: "coflash", target: "all", features: Vec::new() },
+    ];
+    for released in &all {
+        let text = tidy(&generate(released, &path)?, &workspace::root().display().to_string());
+        let faults = faults(&Value::parse(&text)?, &closure(released)?);
+        if !faults.is_empty() {
+            return Err(format!(
+                "the bill of materials of {} is not as it has to be:\n    {}",
+                released.package,
+                faults.join("\n    ")
+            ));
+        }
+        let name = if released.target == "all" { "all-systems" } else { board.board };
+        let file = folder.join(format!("{}-{name}.cdx.json", released.package));
+        fs::write(&file, &text).map_err(|error| unwritable(&file, &error))?;
+        let hash: String = Sha512_256::digest(&text).iter().map(|byte| format!("{byte:02x}")).collect();
+        println!("{}\n  SHA-512/256 {hash}", workspace::shown(&file));
+    }
+    Ok(())
+}
+
+fn unwritable(path: &std::path::Path, error: &std::io::Error) -> String {
+    format!("{} cannot be written: {error}.", workspace::shown(path))
+}
+
+/// What cargo-cyclonedx makes of a package.
+fn generate(released: &Released, path: &std::ffi::OsStr) -> Outcome<String> {
+    // Beside each manifest; the number keeps two runs apart.
+    let name = format!("sbom-{}", std_process::id());
+    let mut command = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    command.args(["cyclonedx", "--quiet", "--format", "json", "--spec-version", "1.5"]);
+    command.args(["--override-filename", &name, "--target", released.target]).args(&released.features);
+    command.arg("--manifest-path").arg(manifest(released)).env("PATH", path);
+    let made = process::run(&mut command);
+    let mut text = Err(format!("cargo-cyclonedx wrote nothing for {}.", released.package));
+    for (package, folder) in members()? {
+        let file = folder.join(&name).with_extension("json");
+        if package == released.package {
+            text = fs::read_to_string(&file)
+                .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&file)));
+        }
+        // Where there is none, there is nothing to take away.
+        let _ = fs::remove_file(&file);
+    }
+    made.and(text)
+}
+
+fn manifest(released: &Released) -> PathBuf {
+    workspace::root().join(released.package).join("Cargo.toml")
+}
+
+/// The crates of the workspace with their folders.
+fn members() -> Outcome<Vec<(String, PathBuf)>> {
+    let said = process::output(process::cargo("metadata").args(["--no-deps", "--format-version", "1"]))?;
+    let member = |package: &Value| {
+        let manifest = PathBuf::from(package.get("manifest_path").text()?);
+        Some((package.get("name").text()?.to_owned(), manifest.parent()?.to_owned()))
+    };
+    Ok(Value::parse(&said)?.get("packages").items().iter().filter_map(member).collect())
+}
+
+/// Takes out of a bill of materials what differs from run to run and from machine to machine: the
+/// time, the serial number (both are optional in CycloneDX 1.5) and the folder of the repository.
+fn tidy(text: &str, root: &str) -> String {
+    let varies = |line: &&str| {
+        let line = line.trim_start();
+        line.starts_with("\"serialNumber\": ") || line.starts_with("\"timestamp\": ")
+    };
+    let lines: Vec<&str> = text.lines().filter(|line| !varies(line)).collect();
+    lines.join("\n").replace(&format!("file://{root}/"), "file:///coboot/") + "\n"
+}
+
+/// Name and version.
+type Crate = (String, String);
+
+/// What a package is built from, by cargo: itself and everything that it depends on, build
+/// dependencies too.
+fn closure(released: &Released) -> Outcome<BTreeSet<Crate>> {
+    let mut command = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    command.args(["tree", "--locked", "--prefix", "none", "--edges", "normal,build", "--no-dedupe"]);
+    command.args(["--format", "{p}", "--target", released.target]).args(&released.features);
+    command.arg("--manifest-path").arg(manifest(released));
+    Ok(crates(&process::output(&mut command)?))
+}
+
+/// The crates in what `cargo tree` prints with the format `{p}`: `name v1.2.3`, and more.
+fn crates(tree: &str) -> BTreeSet<Crate> {
+    let line = |line: &str| {
+        let mut words = line.split(' ');
+        Some((words.next()?.to_owned(), words.next()?.strip_prefix('v')?.to_owned()))
+    };
+    tree.lines().filter_map(line).collect()
+}
+
+/// What of a bill of materials is not as CycloneDX 1.5 demands it, or misses a crate.
+fn faults(sbom: &Value, crates: &BTreeSet<Crate>) -> Vec<String> {
+    let mut faults = Vec::new();
+    for (name, wanted) in [("bomFormat", "CycloneDX"), ("specVersion", "1.5")] {
+        if sbom.get(name).text() != Some(wanted) {
+            faults.push(format!("{name} is not \"{wanted}\""));
+        }
+    }
+    let main = sbom.get("metadata").get("component");
+    let mut listed = BTreeSet::new();
+    let mut refs = BTreeMap::new();
+    for component in [main].into_iter().chain(sbom.get("components").items()) {
+        let text = |name: &str| component.get(name).text().unwrap_or_default().to_owned();
+        let (name, version) = (text("name"), text("version"));
+        // `version` is optional there; a bill without is of no use.
+        for needed in ["type", "name", "version", "bom-ref", "purl"] {
+            if text(needed).is_empty() {
+                faults.push(format!("the component \"{name}\" has no {needed}"));
+            }
+        }
+        *refs.entry(text("bom-ref")).or_insert(0) += 1;
+        listed.insert((name, version));
+    }
+    faults.extend(
+        refs.iter().filter(|(_, count)| **count > 1).map(|(name, _)| format!("{name} is there twice")),
+    );
+    for dependency in sbom.get("dependencies").items() {
+        let all = [dependency.get("ref")].into_iter().chain(dependency.get("dependsOn").items());
+        let unknown = all.filter_map(Value::text).filter(|name| !refs.contains_key(*name));
+        faults.extend(unknown.map(|name| format!("a dependency on {name}, which is not listed")));
+    }
+    let missing = crates.difference(&listed);
+    faults.extend(missing.map(|(name, version)| format!("{name} {version} is not listed")));
+    faults
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// As cargo-cyclonedx 0.5.7 writes it, shortened.
+    const MADE: &str = r#"{
+  "bomFormat": "CycloneDX",
+  "specVersion": "1.5",
+  "version": 1,
+  "serialNumber": "urn:uuid:855bf0d1-408e-4889-8c6f-9b56e1ec443b",
+  "metadata": {
+    "timestamp": "2026-11-22T13:26:08.454115787Z",
+    "component": {
+      "type": "application",
+      "bom-ref": "path+file:///home/me/coboot/bootloader#0.1.0",
+      "name": "bootloader",
+      "version": "0.1.0",
+      "purl": "pkg:cargo/bootloader@0.1.0?download_url=file://."
+    }
+  },
+  "components": [
+    {
+      "type": "library",
+      "bom-ref": "registry+https://github.com/rust-lang/crates.io-index#crc@3.4.0",
+      "name": "crc",
+      "version": "3.4.0",
+      "purl": "pkg:cargo/crc@3.4.0"
+    }
+  ],
+  "dependencies": [
+    {
+      "ref": "path+file:///home/me/coboot/bootloader#0.1.0",
+      "dependsOn": ["registry+https://github.com/rust-lang/crates.io-index#crc@3.4.0"]
+    }
+  ]
+}"#;
+
+    /// As `cargo tree` prints it.
+    const TREE: &str = "bootloader v0.1.0 (/home/me/coboot/bootloader)\ncrc v3.4.0\ncrc v3.4.0\n\n";
+
+    fn faults_of(text: &str, tree: &str) -> Vec<String> {
+        faults(&Value::parse(&tidy(text, "/home/me/coboot")).unwrap(), &crates(tree))
+    }
+
+    #[test]
+    fn time_serial_number_and_folder_are_taken_out_and_nothing_else() {
+        let tidied = tidy(MADE, "/home/me/coboot");
+        assert!(!tidied.contains("uuid") && !tidied.contains("2026") && !tidied.contains("/home/me"));
+        assert!(tidied.contains("\"path+file:///coboot/bootloader#0.1.0\""));
+        assert_eq!(tidied.lines().count(), MADE.lines().count() - 2);
+        let other = MADE.replace("/home/me/coboot", "/src").replace("855bf0d1", "00000000");
+        assert_eq!(tidy(&other, "/src"), tidied);
+    }
+
+    #[test]
+    fn a_whole_one_has_no_faults() {
+        assert_eq!(faults_of(MADE, TREE), Vec::<String>::new());
+    }
+
+    #[test]
+    fn what_is_missing_is_named() {
+        for (text, tree, fault) in [
+            (MADE.replace("\"1.5\"", "\"1.4\""), TREE, "specVersion is not \"1.5\""),
+            (MADE.replace("\"CycloneDX\"", "1"), TREE, "bomFormat is not \"CycloneDX\""),
+            (MADE.replace("\"type\": \"library\"", "\"kind\": \"library\""), TREE, "has no type"),
+            (MADE.replace("\"purl\": \"pkg:cargo/crc@3.4.0\"", "\"x\": 0"), TREE, "\"crc\" has no purl"),
+            (MADE.replacen("crc@3.4.0\"", "crc@3.4.1\"", 1), TREE, "which is not listed"),
+            (MADE.to_owned(), "crc v3.4.1", "crc 3.4.1 is not listed"),
+            (MADE.to_owned(), "heapless v0.9.3 (proc-macro)", "heapless 0.9.3 is not listed"),
+        ] {
+            let faults = faults_of(&text, tree);
+            assert!(faults.iter().any(|told| told.contains(fault)), "{fault}: {faults:?}");
+        }
+        let twice = MADE.replace("registry+https://github.com/rust-lang/crates.io-index#crc@3.4.0", "x");
+        let twice = twice.replace("path+file:///home/me/coboot/bootloader#0.1.0", "x");
+        assert_eq!(faults_of(&twice, TREE), ["x is there twice"]);
+    }
+
+    /// What cargo says of our own bootloader: what it is linked from and what builds it, and neither
+    /// what its tests use nor what the emulator links.
+    #[test]
+    fn cargo_tells_what_the_bootloader_is_built_from() {
+        let features = ["--no-default-features", "--features", "board-stm32f407g-disc1"];
+        let released = Released {
+            package: "bootloader",
+            target: workspace::TARGET,
+            features: features.map(str::to_owned).into(),
+        };
+        let names: BTreeSet<String> = closure(&released).unwrap().into_iter().map(|(name, _)| name).collect();
+        for name in ["bootloader", "boot-core", "canopen", "cortex-m-rt", "rtic", "bxcan", "syn"] {
+            assert!(names.contains(name), "{name}: {names:?}");
+        }
+        for name in ["unicorn-engine", "coflash", "proptest"] {
+            assert!(!names.contains(name), "{name}");
+        }
+    }
+}
