@@ -5,10 +5,12 @@
 
 use core::sync::atomic::{AtomicU32, Ordering};
 
+use crate::words::add_product;
+
 /// The state that SHA-512 starts with (FIPS 180-4, 5.3.5) and the constants of the rounds (4.2.3),
 /// the lower half of each first: the first 64 bits of the fractional parts of the square roots of
 /// the first eight primes and of the cube roots of the first eighty. As bytes of a program they
-/// would be 704, which nothing packs. So they are worked out ([`prepare`]), which takes some 10 ms
+/// would be 704, which nothing packs. So they are worked out ([`prepare`]), which takes some 30 ms
 /// at 168 MHz.
 static CONSTANTS: [[AtomicU32; 2]; STATE + 80] = [const { [const { AtomicU32::new(0) }; 2] }; STATE + 80];
 
@@ -21,7 +23,7 @@ fn constants() -> &'static [[AtomicU32; 2]; STATE + 80] {
     &CONSTANTS
 }
 
-/// Works out the next constant, in about 0.1 ms at 168 MHz; whether all are there. A device calls it
+/// Works out the next constant, in about 0.4 ms at 168 MHz; whether all are there. A device calls it
 /// when it has nothing else to do, so that nobody waits for all of them.
 pub fn prepare() -> bool {
     // No constant's upper half is zero. Two that do this at once write the same.
@@ -32,41 +34,36 @@ pub fn prepare() -> bool {
     let square = n < STATE;
     let is_prime = |number: &u32| (2..*number).all(|divisor| !number.is_multiple_of(divisor));
     let prime = (2..).filter(is_prime).nth(if square { n } else { n - STATE });
-    let root = root(prime.unwrap_or(0), square);
+    let root = root(prime.unwrap_or(0), if square { 2 } else { 3 });
     constant[0].store(root as u32, Ordering::Release);
     constant[1].store((root >> 32) as u32, Ordering::Release);
     false
 }
 
-/// The first 64 bits of the fractional part of a square or cube root below 8, bit by bit.
-///
-/// r is the root so far and b the next bit. Of the cube root `rest` is (number - r^3) / b, of which
-/// `q` + `h` + `b` = 3r^2 + 3rb + b^2 have to be taken for that bit; of the square root it is
-/// (number - r^2) / b, and `q` + `h` = 2r + b. All are in units of 2^-118: what is lost when they
-/// are halved does not reach the bits of the root.
+/// The first 64 bits of the fractional part of a square or cube root below 8, bit by bit: each is
+/// tried, and taken back where the power is not below the number any more. No root is a whole
+/// number, so none is hit.
 #[inline(never)]
-fn root(number: u32, square: bool) -> u64 {
-    let mut rest = u128::from(number) << 116;
-    let [mut q, mut h, mut b] = [0_u128, 0, 16 << 118];
-    if square {
-        [h, b] = [4 << 118, 0];
-    }
-    let mut root = 0;
-    // Three bits are in front of the point, and go out at the upper end.
-    for _ in 0..3 + 64 {
-        root <<= 1;
-        let taken = q + h + b;
-        if rest >= taken {
-            rest -= taken;
-            q = taken + h + b + b;
-            h += b + b + b;
-            root |= 1;
+fn root(number: u32, exponent: usize) -> u64 {
+    // Times 2^64.
+    let mut root = [0; 3];
+    // Three bits are in front of the point.
+    for bit in (0..3 + 64).rev() {
+        root[bit / 32] ^= 1 << (bit % 32);
+        // Its powers, each times 2^64 once more.
+        let mut power = [1, 0, 0, 0, 0, 0, 0, 0];
+        for _ in 0..exponent {
+            let mut product = [0; 8 + 3];
+            for (at, factor) in root.iter().enumerate() {
+                add_product(&mut product[at..], *factor, &power);
+            }
+            power.copy_from_slice(&product[..8]);
         }
-        rest <<= 1;
-        h >>= 1;
-        b >>= 2;
+        if power[2 * exponent % 8] >= number {
+            root[bit / 32] ^= 1 << (bit % 32);
+        }
     }
-    root
+    u64::from(root[1]) << 32 | u64::from(root[0])
 }
 
 #[inline(always)]
