@@ -149,7 +149,9 @@ pub fn decide(
     let (number, trial) = match circumstances.request {
         // A request is new: whoever makes it knows of the crashes before.
         Some(BootRequest::Trial(number) | BootRequest::Fresh(number)) => (number, true),
-        Some(BootRequest::Start(number) | BootRequest::Resume(number)) => (number, false),
+        Some(BootRequest::Start(number) | BootRequest::Resume(number) | BootRequest::Confirm(number)) => {
+            (number, false)
+        }
         _ => {
             if circumstances.crash_resets >= policy.max_crash_resets {
                 return Stay(StayReason::CrashLoop);

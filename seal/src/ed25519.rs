@@ -134,14 +134,15 @@ pub struct Verification {
 }
 
 impl Verification {
-    /// Room for a verification; [`new`](Self::new) begins one. All zeros, so that it costs no flash.
+    /// Room for a verification; [`new`](Self::new) begins one. This one is over, with a bad signature.
+    /// All zeros, so that it costs no flash.
     pub const IDLE: Self = Self {
         registers: [[0; 8]; 16],
         points: [[[0; 8]; 3]; 2],
         factors: [[0; 8]; 2],
         public: [0; 8],
         r: [0; 8],
-        phase: Phase::Fraction,
+        phase: Phase::Done(false),
         power: 0,
         zeros: 0,
         bits: 0,

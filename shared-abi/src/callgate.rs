@@ -98,6 +98,10 @@ pub enum Status {
     BadArgument = -6,
     /// Nothing is installed under this number.
     NoProgram = -7,
+    /// Nothing can be stored before the next reset, because the flash is locked in front of a sealed
+    /// program: the same is to be asked through the warm-start cell
+    /// ([`BootRequest::Confirm`](crate::warm_start::BootRequest::Confirm) and the two behind it).
+    Locked = -8,
 }
 
 /// Arguments of [`Selector::Crc32`].

@@ -210,6 +210,15 @@ impl Handoff {
         }
     }
 
+    /// Takes it away: no program was started.
+    ///
+    /// # Safety
+    /// As for [`write`](Self::write).
+    pub unsafe fn erase(address: *mut Self) {
+        // SAFETY: the caller vouches for the address. Without its magic no record is sound.
+        unsafe { address.cast::<u32>().write_volatile(0) };
+    }
+
     /// Leaves the handoff for the application.
     ///
     /// # Safety

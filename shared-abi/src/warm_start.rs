@@ -41,6 +41,40 @@ pub enum BootRequest {
     /// as a [`Trial`](Self::Trial), and the handoff tells the program that it is fresh. The
     /// bootloader asks this of itself.
     Fresh(u8) = 9,
+    /// Confirm program `n`, then start it. This and the next two are what the callgate could not
+    /// store, because the flash is locked in front of a sealed program
+    /// ([`Status::Locked`](crate::callgate::Status::Locked)). A bootloader without sealed images
+    /// stores nothing.
+    Confirm(u8) = 10,
+    /// Take the signature of program `n` away, then start as after a power-on.
+    Invalidate(u8) = 11,
+    /// Store node parameters, then start as after a power-on.
+    StoreNode(StoredNode) = 12,
+}
+
+/// Node parameters in the cell.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(C)]
+pub struct StoredNode {
+    /// 1 to 127; 255 for none.
+    pub node_id: u8,
+    /// In units of 5 kbit/s, which all of CANopen's are multiples of; 0 for a bit rate that is found
+    /// out by listening.
+    pub bit_rate: u8,
+}
+
+impl StoredNode {
+    /// Node-ID, and bit rate in bit/s, up to 1 275 000; what is in between is rounded down.
+    #[must_use]
+    pub const fn new(node_id: u8, bit_rate: u32) -> Self {
+        Self { node_id, bit_rate: (bit_rate / 5000) as u8 }
+    }
+
+    /// The bit rate in bit/s.
+    #[must_use]
+    pub const fn bits_per_second(self) -> u32 {
+        self.bit_rate as u32 * 5000
+    }
 }
 
 /// A write of 1F51h whose SDO answer is owed.
@@ -68,11 +102,12 @@ pub struct WarmStart {
     /// [`MAGIC`].
     pub magic: u32,
     /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume, 7 owed, 8 damaged,
-    /// 9 fresh.
+    /// 9 fresh, 10 confirm, 11 invalidate, 12 store node parameters.
     pub request: u32,
-    /// The program number (1 to 254) of a trial, start, resume or fresh start; the number of a
-    /// [`Damage`]; of an owed answer the program number in bits 0 to 7, the value in bits 8 to 15 and
-    /// the node-ID in bits 16 to 22; 0 otherwise.
+    /// The program number (1 to 254) of a trial, start, resume or fresh start, and of what is
+    /// confirmed or invalidated; the number of a [`Damage`]; of an owed answer the program number in
+    /// bits 0 to 7, the value in bits 8 to 15 and the node-ID in bits 16 to 22; of node parameters the
+    /// node-ID in bits 0 to 7 and the bit rate in bits 8 to 15; 0 otherwise.
     pub argument: u32,
     /// [`check_word`] over the three words before.
     pub check: u32,
@@ -97,6 +132,11 @@ impl WarmStart {
             }
             BootRequest::Damaged(damage) => (8, damage as u32),
             BootRequest::Fresh(program) => (9, program as u32),
+            BootRequest::Confirm(program) => (10, program as u32),
+            BootRequest::Invalidate(program) => (11, program as u32),
+            BootRequest::StoreNode(StoredNode { node_id, bit_rate }) => {
+                (12, u32::from_le_bytes([node_id, bit_rate, 0, 0]))
+            }
         };
         Self::encode(request, argument)
     }
@@ -112,21 +152,27 @@ impl WarmStart {
     /// request or an argument out of its range.
     #[must_use]
     pub fn request(&self) -> Option<BootRequest> {
+        if *self != Self::encode(self.request, self.argument) {
+            return None;
+        }
         let [program, value, node_id, _] = self.argument.to_le_bytes();
-        let request = match (self.request, program) {
-            (1, _) => BootRequest::Stay,
+        Some(match (self.request, self.argument) {
+            (1, 0) => BootRequest::Stay,
             (2, 1..=254) => BootRequest::Trial(program),
             (3, 1..=254) => BootRequest::Start(program),
-            (4, _) => BootRequest::Fault,
-            (5, _) => BootRequest::PowerOn,
+            (4, 0) => BootRequest::Fault,
+            (5, 0) => BootRequest::PowerOn,
             (6, 1..=254) => BootRequest::Resume(program),
-            (7, 1..=254) => BootRequest::Owed(Owed { program, value, node_id }),
-            (8, damage) => BootRequest::Damaged(Damage::from_number(damage)?),
+            (7, ..=0x00FF_FFFF) if (1..=254).contains(&program) => {
+                BootRequest::Owed(Owed { program, value, node_id })
+            }
+            (8, ..=0xFF) => BootRequest::Damaged(Damage::from_number(program)?),
             (9, 1..=254) => BootRequest::Fresh(program),
+            (10, 1..=254) => BootRequest::Confirm(program),
+            (11, 1..=254) => BootRequest::Invalidate(program),
+            (12, ..=0xFFFF) => BootRequest::StoreNode(StoredNode { node_id: program, bit_rate: value }),
             _ => return None,
-        };
-        // One encoder decides what is well-formed: all four words must be exactly its.
-        (*self == Self::new(request)).then_some(request)
+        })
     }
 }
 
@@ -191,6 +237,10 @@ mod tests {
             BootRequest::Fresh(1),
             BootRequest::Owed(Owed { program: 3, value: 3, node_id: 1 }),
             BootRequest::Owed(Owed { program: 254, value: 0, node_id: 127 }),
+            BootRequest::Confirm(1),
+            BootRequest::Invalidate(254),
+            BootRequest::StoreNode(StoredNode::new(127, 1_000_000)),
+            BootRequest::StoreNode(StoredNode::new(255, 0)),
         ];
         for request in requests {
             let mut ram = WarmStart::EMPTY;
@@ -244,7 +294,11 @@ mod tests {
             (8, 5),
             (9, 0),
             (9, 0x0101),
-            (10, 1),
+            (10, 0),
+            (10, 255),
+            (11, 0x0101),
+            (12, 0x0001_0001),
+            (13, 1),
         ] {
             let check = check_word(&[MAGIC, request, argument]);
             let cell = WarmStart { magic: MAGIC, request, argument, check };

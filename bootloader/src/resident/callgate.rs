@@ -4,7 +4,8 @@
 //! of the flash: they are taken when they are free, and left as they were found.
 //!
 //! In front of a sealed program the flash is locked (`flash_lock.rs`): nothing can be stored then
-//! before the next reset, and a key that is written would be a bus error in the application.
+//! before the next reset, and a key that is written would be a bus error in the application. The
+//! application leaves what it wants in the warm-start cell, and the boot stage stores it.
 
 use core::ffi::c_void;
 
@@ -20,6 +21,8 @@ use shared_abi::callgate::{
 use shared_abi::geometry::Region;
 #[cfg(feature = "sealed")]
 use shared_abi::handoff::Handoff;
+#[cfg(feature = "sealed")]
+use shared_abi::warm_start::BootRequest;
 
 use crate::flash::ResidentFlash;
 use crate::flash_controller::FlashController;
@@ -84,7 +87,7 @@ fn keep(
     value: Value,
 ) -> Result<(), Status> {
     if is_locked(parameters, flash) {
-        return Err(Status::Failed);
+        return Err(Status::Locked);
     }
     store(parameters, flash, key, value).map_err(|_| Status::Failed)
 }
@@ -96,6 +99,29 @@ fn is_locked(parameters: &product::Parameters, flash: &ResidentFlash) -> bool {
     let program = unsafe { Handoff::read_program(LAYOUT.handoff.base as *const Handoff) };
     let record = ProgramRecord::load(parameters, flash, program);
     record.is_some_and(|record| record.seal == Some(Seal::Locked))
+}
+
+/// Stores what an application has asked for through a reset. What is refused stays as it was; the
+/// application sees that when it looks.
+#[cfg(feature = "sealed")]
+pub fn store_after_reset(flash: &mut ResidentFlash, request: Option<BootRequest>) {
+    // The program that the lock was for does not run any more.
+    // SAFETY: the layout's handoff region, checked to be RAM of that size in no image.
+    let unlock = || unsafe { Handoff::erase(LAYOUT.handoff.base as *mut Handoff) };
+    let (selector, number) = match request {
+        Some(BootRequest::Confirm(number)) => (Selector::Confirm, number),
+        Some(BootRequest::Invalidate(number)) => (Selector::Invalidate, number),
+        Some(BootRequest::StoreNode(node)) => {
+            unlock();
+            let node_id = node.node_id.into();
+            let mut args = NodeArgs { node_id, bit_rate: node.bits_per_second() };
+            let _ = self::node(Selector::StoreNode, flash, &mut args);
+            return;
+        }
+        _ => return,
+    };
+    unlock();
+    let _ = program(selector, flash, &mut ProgramArgs { number: number.into(), ..ProgramArgs::default() });
 }
 
 #[cfg(not(feature = "sealed"))]
