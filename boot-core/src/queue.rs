@@ -125,6 +125,18 @@ impl<'b> Queue<'b> {
         self.open = 0;
     }
 
+    /// The bytes of the open piece are good, and part of a sealed image: they join the queue, and are
+    /// no piece.
+    #[cfg(feature = "sealed")]
+    pub(crate) fn commit_bytes(&mut self) {
+        for _ in 0..self.open_size() {
+            let at = self.place(self.queued);
+            self.buffer[at] = self.byte(self.queued + PIECE_HEADER);
+            self.queued += 1;
+        }
+        self.open = 0;
+    }
+
     /// The open piece goes.
     pub(crate) fn discard(&mut self) {
         self.open = 0;

@@ -92,6 +92,8 @@ impl Store {
 }
 
 impl Parameters for Store {
+    // A call is shorter: many look something up.
+    #[inline(never)]
     fn get<F: Flash>(&self, _flash: &F, key: Key) -> Option<Value> {
         let mut value = [0; 4];
         // SAFETY: the state comes from `open`.

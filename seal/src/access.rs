@@ -15,6 +15,9 @@ pub mod right {
     pub const READ_BACK: u32 = 1 << 4;
 }
 
+/// Beside the granted rights in 2002h/1: the device has keys, so it takes sealed images alone.
+pub const SEALED: u32 = 1 << 31;
+
 /// What stands in front of the challenge in the signed message.
 pub const DOMAIN: &[u8; 16] = b"coboot access 1\0";
 /// Bytes of 2002h/1: the chip's unique ID (12), the nonce (32), the granted rights (u32).

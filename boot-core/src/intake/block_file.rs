@@ -98,6 +98,21 @@ impl Format for BlockFile {
                     Control::Identity(identity) => Begin { size: identity.app_size, version: 0 },
                     Control::Dated { identity, version, .. } => Begin { size: identity.app_size, version },
                 });
+                #[cfg(feature = "sealed")]
+                if to.judge.sealed_only {
+                    to.progress.begins = Some(Begin { size: 0, version: 0 });
+                    to.progress.sealed = true;
+                }
+            }
+            #[cfg(feature = "sealed")]
+            NUMBER_LAST if to.judge.sealed_only => {
+                // What the program has to be stands in its manifest.
+                to.progress.complete = Some(Expected { size: 0, crc: None });
+            }
+            #[cfg(feature = "sealed")]
+            _ if to.judge.sealed_only => {
+                to.queue.commit_bytes();
+                to.progress.block = true;
             }
             NUMBER_LAST => {
                 let last = fields.and_then(Last::parse).ok_or(malformed)?;
@@ -171,7 +186,12 @@ fn judge_header(header: Header, to: &Destination<'_, '_>) -> Result<(), Refusal>
         return Err(TOO_LONG);
     }
     match (header.number, to.judge.session) {
-        // The sequence begins anew, over what is there.
+        // The sequence begins anew, over what is there. (What is there of a sealed image has gone
+        // another way.)
+        #[cfg(feature = "sealed")]
+        (NUMBER_CONTROL, Session::Open { .. }) if to.judge.sealed_only => {
+            return Err(Refusal::untimely(FlashError::Sequence));
+        }
         (NUMBER_CONTROL, Session::Open { .. }) => return Ok(()),
         (NUMBER_CONTROL, _) => return to.judge.may_begin(),
         (NUMBER_LAST, Session::Open { next }) if next > 1 => return Ok(()),

@@ -140,7 +140,7 @@ impl Intake {
             let (first, len) = (*first, *len);
             let Some(mut known) = Known::recognise(&first[..len], &to.judge)? else { return Ok(()) };
             #[cfg(feature = "sealed")]
-            if to.judge.sealed_only && !matches!(known, Known::Sealed(_)) {
+            if to.judge.sealed_only && !matches!(known, Known::Sealed(_) | Known::BlockFile(_)) {
                 return Err(Refusal::unfit(FlashError::NoAccess));
             }
             known.begin(self.size, &to.judge, to.queue)?;

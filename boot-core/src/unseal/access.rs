@@ -3,7 +3,7 @@
 use canopen::od::{put, Address};
 use canopen::program::{FlashError, ACCESS, EVENTS};
 use canopen::AbortCode;
-use seal::access::{event, right, CHALLENGE, DOMAIN, REQUEST, SIGNED_CHALLENGE, SIGNED_REQUEST};
+use seal::access::{event, right, CHALLENGE, DOMAIN, REQUEST, SEALED, SIGNED_CHALLENGE, SIGNED_REQUEST};
 use seal::key_block::{KEKS, KEY, ROOTS};
 use seal::sha512::hash_256;
 use seal::wire::{array, word, Fault, Head};
@@ -113,7 +113,8 @@ impl Room {
         let mut challenge = [0; CHALLENGE];
         challenge[..12].copy_from_slice(&unique_id);
         challenge[12..SIGNED_CHALLENGE].copy_from_slice(&self.nonce);
-        challenge[SIGNED_CHALLENGE..].copy_from_slice(&self.granted.to_le_bytes());
+        let sealed = if self.takes_no_other { SEALED } else { 0 };
+        challenge[SIGNED_CHALLENGE..].copy_from_slice(&(self.granted | sealed).to_le_bytes());
         challenge
     }
 
