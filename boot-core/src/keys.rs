@@ -3,12 +3,17 @@
 use shared_abi::layout::Layout;
 
 use crate::flash::Flash;
-
-/// Whether anything stands in the key block's place (`seal::key_block`). A key block that is damaged
-/// does not open the device: then no image passes.
 #[cfg(feature = "sealed")]
-pub fn has_key_block<F: Flash>(flash: &F, layout: &Layout) -> bool {
-    !flash.is_blank(layout.key_block())
+use crate::store::Key;
+use crate::store::Parameters;
+
+/// Whether anything stands in the key block's place (`seal::key_block`), unless the holder of a root
+/// key has opened the device for good. A key block that is damaged does not open it: then no image
+/// passes.
+#[cfg(feature = "sealed")]
+pub fn is_sealed<F: Flash>(flash: &F, parameters: &impl Parameters, layout: &Layout) -> bool {
+    let [_, opened, ..] = parameters.get(flash, Key::Grants).unwrap_or([0; 4]);
+    opened == 0 && !flash.is_blank(layout.key_block())
 }
 
 /// Whether the key block there is sound.
@@ -23,6 +28,6 @@ pub fn is_sound<F: Flash>(flash: &F, key_block: u32) -> bool {
 
 /// No key means anything to a bootloader without sealed images.
 #[cfg(not(feature = "sealed"))]
-pub fn has_key_block<F: Flash>(_: &F, _: &Layout) -> bool {
+pub fn is_sealed<F: Flash>(_: &F, _: &impl Parameters, _: &Layout) -> bool {
     false
 }

@@ -6,7 +6,7 @@ use shared_abi::vectors::{VectorFault, VectorTable};
 
 use crate::crc::CrcKind;
 use crate::flash::{fold, Flash};
-use crate::keys::has_key_block;
+use crate::keys::is_sealed;
 use crate::store::{Parameters, ProgramRecord};
 
 /// A CRC over flash, computed in steps that the caller bounds.
@@ -134,7 +134,7 @@ pub fn verify<F: Flash>(
 ) -> Result<VerifiedProgram, Invalid> {
     let region = layout.program(number).ok_or(Invalid::NoSuchProgram)?;
     let record = ProgramRecord::load(parameters, flash, number).ok_or(Invalid::Absent)?;
-    if !record.is_sealed() && has_key_block(flash, layout) {
+    if !record.is_sealed() && is_sealed(flash, parameters, layout) {
         return Err(Invalid::Absent);
     }
     if record.size > region.size {

@@ -13,6 +13,9 @@ pub mod right {
     pub const STORE: u32 = 1 << 3;
     /// Read programs back (1F50h).
     pub const READ_BACK: u32 = 1 << 4;
+    /// Open the device for good: from the next reset on it takes and starts any program. Its keys
+    /// stay, so that sealed images work as before; only a debug probe seals it again.
+    pub const OPEN: u32 = 1 << 5;
 }
 
 /// Beside the granted rights in 2002h/1: the device has keys, so it takes sealed images alone.

@@ -247,8 +247,8 @@ impl<'a> Head<'a> {
 
     /// SHA-512/256 of the image.
     #[must_use]
-    pub fn image_hash(self) -> [u8; HASH] {
-        array(self.0, 40)
+    pub fn image_hash(self) -> &'a [u8] {
+        self.0.get(40..72).unwrap_or(&[])
     }
 
     /// Hash of the first chunk.
@@ -284,8 +284,8 @@ impl<'a> Head<'a> {
 
     /// Hash of the program that is the dictionary, or zeros.
     #[must_use]
-    pub fn dictionary(self) -> [u8; HASH] {
-        array(self.0, 144)
+    pub fn dictionary(self) -> &'a [u8] {
+        self.0.get(144..176).unwrap_or(&[])
     }
 
     /// The records of the manifest: tag and bytes. A record that reaches over the end of the
@@ -304,14 +304,14 @@ impl<'a> Head<'a> {
 
     /// The Ed25519 signature of the key with this id.
     #[must_use]
-    pub fn signature(self, key_id: u32) -> Option<[u8; SIGNATURE]> {
+    pub fn signature(self, key_id: u32) -> Option<&'a [u8; SIGNATURE]> {
         let certificate = if self.certificate().is_some() { CERTIFICATE } else { 0 };
         let mut at = self.manifest().len() + certificate;
         for _ in 0..self.signatures() {
             let length = half(self.0, at + 6);
             let fits = half(self.0, at + 4) == ED25519 && usize::from(length) == SIGNATURE;
             if fits && word(self.0, at) == key_id {
-                return Some(array(self.0, at + SIGNATURE_HEADER));
+                return self.0.get(at + SIGNATURE_HEADER..)?.first_chunk();
             }
             at += SIGNATURE_HEADER + usize::from(length);
         }

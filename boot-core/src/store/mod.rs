@@ -37,7 +37,7 @@ pub enum Key {
     /// An event (0 to 7), see `seal::access`.
     #[cfg(feature = "sealed")]
     Event(u8),
-    /// How often rights were granted.
+    /// How often rights were granted, and whether one of them has opened the device for good.
     #[cfg(feature = "sealed")]
     Grants,
 }

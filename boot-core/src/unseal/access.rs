@@ -77,7 +77,7 @@ impl Unsealer<'_> {
     pub(crate) fn take_store(&mut self) -> Option<(Key, Value)> {
         let room = &mut *self.0;
         if core::mem::take(&mut room.stores.1) {
-            return Some((Key::Grants, [room.grants, 0, 0, 0]));
+            return Some((Key::Grants, [room.grants, room.opened, 0, 0]));
         }
         let place = room.event as usize % LAST;
         core::mem::take(&mut room.stores.0).then(|| (Key::Event(place as u8), room.events[place]))
@@ -125,6 +125,7 @@ impl Room {
         if rights & right::LOWER_COUNTER != 0 {
             self.argument = argument;
         }
+        self.opened |= rights & right::OPEN;
         self.nonce = [0; 32];
         self.grants = self.grants.wrapping_add(1);
         self.stores.1 = true;

@@ -20,7 +20,7 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
 use crate::flash::{fold, Flash};
-use crate::keys::{has_key_block, is_sound};
+use crate::keys::{is_sealed, is_sound};
 use crate::policy::{Policy, SealPolicy};
 use crate::program::Expected;
 use crate::queue::{Piece, Queue};
@@ -77,6 +77,8 @@ pub struct Room {
     pub(super) argument: u32,
     /// How often rights were granted in the device's life.
     pub(super) grants: u32,
+    /// Not 0: the device is open from the next reset on.
+    pub(super) opened: u32,
     /// What is signed with a request; zeros until somebody asks for it.
     pub(super) nonce: [u8; HASH],
     /// Rights that a signature is looked at for, and their argument.
@@ -144,6 +146,7 @@ impl Room {
             granted: 0,
             argument: 0,
             grants: 0,
+            opened: 0,
             nonce: [0; HASH],
             asked: (0, 0),
             event: 0,
@@ -207,11 +210,11 @@ impl Unsealer<'_> {
             *event = parameters.get(flash, Key::Event(place)).unwrap_or([0; 4]);
             room.event = room.event.max(event[0]);
         }
-        [room.grants, ..] = parameters.get(flash, Key::Grants).unwrap_or([0; 4]);
+        [room.grants, room.opened, ..] = parameters.get(flash, Key::Grants).unwrap_or([0; 4]);
         self.0.layout = Some(layout);
         self.0.key_block = layout.key_block().base;
         self.0.policy = Some(&policy.seal);
-        self.0.takes_no_other = has_key_block(flash, layout);
+        self.0.takes_no_other = is_sealed(flash, parameters, layout);
     }
 
     /// Works ahead while there is nothing else to do; whether there is nothing left.
@@ -362,7 +365,7 @@ impl Room {
                 });
                 self.done += size;
                 if size == 0 {
-                    let differs = self.hash.finish()[..HASH] != told;
+                    let differs = self.hash.finish()[..HASH] != *told;
                     match self.stage {
                         Stage::Image if differs => return Err(Fault::Signature),
                         Stage::Image => self.stage = Stage::Installed,
@@ -444,7 +447,7 @@ impl Room {
         let key = certified.as_ref().or(root).ok_or(Fault::Key)?;
         let signature = head.signature(key_id(key)).ok_or(Fault::Signature)?;
         self.stage = Stage::Manifest;
-        start(&mut self.verification, key, &signature, &[DOMAIN, head.manifest()]);
+        start(&mut self.verification, key, signature, &[DOMAIN, head.manifest()]);
         Ok(())
     }
 
