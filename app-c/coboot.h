@@ -34,13 +34,17 @@ static inline uint32_t coboot_check_word(const void *record, size_t words)
 
 #define COBOOT_WARM_START_MAGIC UINT32_C(0x31574243)
 
-/* Requests. Those for a program take its number, 1 to 254, as argument, an owed answer what coboot_owed makes, and the
- * others 0. */
+/* Requests. Those for a program take its number, 1 to 254, as argument, an owed answer what coboot_owed makes, node
+ * parameters what coboot_stored_node makes, and the others 0. The last three are for what the callgate answers with
+ * COBOOT_STATUS_LOCKED. */
 #define COBOOT_REQUEST_STAY UINT32_C(0x1)
 #define COBOOT_REQUEST_TRIAL UINT32_C(0x2)
 #define COBOOT_REQUEST_START UINT32_C(0x3)
 #define COBOOT_REQUEST_POWER_ON UINT32_C(0x5)
 #define COBOOT_REQUEST_OWED UINT32_C(0x7)
+#define COBOOT_REQUEST_CONFIRM UINT32_C(0xA)
+#define COBOOT_REQUEST_INVALIDATE UINT32_C(0xB)
+#define COBOOT_REQUEST_STORE_NODE UINT32_C(0xC)
 
 struct coboot_warm_start {
     uint32_t magic;
@@ -60,6 +64,12 @@ _Static_assert(offsetof(struct coboot_warm_start, check) == 12, "coboot_warm_sta
 static inline uint32_t coboot_owed(uint8_t program, uint8_t value, uint8_t node_id)
 {
     return program | (uint32_t)value << 8 | (uint32_t)node_id << 16;
+}
+
+/* The argument of COBOOT_REQUEST_STORE_NODE: node-ID (255 for none) and bit rate in bit/s, as in coboot_store_node. */
+static inline uint32_t coboot_stored_node(uint8_t node_id, uint32_t bit_rate)
+{
+    return node_id | (bit_rate / 5000 & UINT32_C(0xFF)) << 8;
 }
 
 /* The cell that carries a request. */
@@ -221,6 +231,7 @@ _Static_assert(offsetof(struct coboot_program_args, flags) == 16, "coboot_progra
 #define COBOOT_STATUS_FAILED INT32_C(-5) /* the flash did not take the value */
 #define COBOOT_STATUS_BAD_ARGUMENT INT32_C(-6) /* a node-ID, bit rate or program number that does not exist here */
 #define COBOOT_STATUS_NO_PROGRAM INT32_C(-7) /* nothing is installed under this number */
+#define COBOOT_STATUS_LOCKED INT32_C(-8) /* the flash is locked: leave with COBOOT_REQUEST_CONFIRM or the like */
 
 /* Whether the application understands a callgate. */
 enum coboot_callgate_state {

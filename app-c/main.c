@@ -167,8 +167,7 @@ static enum abort_code find(uint16_t index, uint8_t sub, const struct object **f
 
 static enum abort_code depart(uint32_t request, uint32_t argument)
 {
-    reentry_begin(request, argument, now_ms);
-    return GOOD;
+    return reentry_begin(request, argument, now_ms) ? GOOD : ABORT_DEVICE_STATE;
 }
 
 /* The 1F51h callback. It runs before the answer is sent, so it only notes what is to be done. */
@@ -180,8 +179,13 @@ static enum abort_code program_control(uint8_t program, uint32_t command)
     case PROGRAM_START_BOOTLOADER:
         /* The first 80h right behind a download in one go means "confirm", to masters that do that. */
         if (own && fresh) {
+            const int32_t status = gate != NULL ? coboot_confirm(gate, program) : COBOOT_STATUS_FAILED;
+            if (status == COBOOT_STATUS_LOCKED) {
+                /* The bootloader stores it. Until then an 80h that comes again means the same. */
+                return depart(COBOOT_REQUEST_CONFIRM, program);
+            }
             fresh = false;
-            return gate != NULL && coboot_confirm(gate, program) == COBOOT_STATUS_OK ? GOOD : ABORT_HARDWARE;
+            return status == COBOOT_STATUS_OK ? GOOD : ABORT_HARDWARE;
         }
         return depart(COBOOT_REQUEST_STAY, 0);
     case PROGRAM_STOP:  /* The bootloader runs instead. */

@@ -28,10 +28,13 @@ static struct {
     uint32_t latest_ms;
 } reentry;
 
-void reentry_begin(uint32_t request, uint32_t argument, uint32_t now_ms)
+bool reentry_begin(uint32_t request, uint32_t argument, uint32_t now_ms)
 {
     const bool owed = request == COBOOT_REQUEST_OWED;
 
+    if (reentry.pending && reentry.request == COBOOT_REQUEST_CONFIRM && request != COBOOT_REQUEST_CONFIRM) {
+        return false;
+    }
     if (!reentry.pending) {
         reentry.pause_ms = owed ? 0 : ANSWER_TO_RESET_MS;
         reentry.latest_ms = now_ms + (owed ? OWED_MOST_MS : ANSWERED_MOST_MS);
@@ -46,6 +49,7 @@ void reentry_begin(uint32_t request, uint32_t argument, uint32_t now_ms)
     } else {
         reentry.counting = false;
     }
+    return true;
 }
 
 bool reentry_proceed(uint32_t now_ms)

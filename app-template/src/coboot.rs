@@ -8,7 +8,7 @@ use bsp::{BIT_RATE, CAN_CLOCK, LAYOUT, NODE_ID};
 use canopen::application::{self, Next};
 use canopen::slave::Slave;
 use canopen::{AbortCode, BitRate, Instant, NodeId};
-use shared_abi::callgate::{Callgate, CallgateError, NodeArgs, ProgramArgs};
+use shared_abi::callgate::{Callgate, CallgateError, NodeArgs, ProgramArgs, Status};
 use shared_abi::handoff::Handoff;
 use shared_abi::layout::Layout;
 use shared_abi::reentry;
@@ -94,7 +94,8 @@ pub fn program_crc(number: u8) -> u32 {
 /// layer setting services mean them.
 ///
 /// # Errors
-/// What the bootloader says.
+/// What the bootloader says. A sealed device stores them for the holder of a root key alone, in the
+/// bootloader.
 pub fn store_node(id: Option<NodeId>, rate: BitRate) -> Result<(), CallgateError> {
     const NO_NODE_ID: u8 = 255;
     let node_id = id.map_or(NO_NODE_ID, NodeId::get).into();
@@ -109,18 +110,36 @@ pub fn program_info(number: u8) -> Result<ProgramArgs, CallgateError> {
     Callgate::find(LAYOUT)?.program_info(number)
 }
 
-/// Confirms this program: a trial that is content with itself is one no more. Or takes its
-/// signature away.
+/// What came of a confirmation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Confirmed {
+    /// It is stored.
+    Now,
+    /// The flash is locked in front of a sealed program: the bootloader stores it when the device
+    /// leaves with [`BootRequest::Confirm`].
+    AtReset,
+}
+
+/// Confirms a program: a trial that is content with itself is one no more.
 ///
 /// # Errors
 /// What the bootloader says.
-pub fn confirm(number: u8, content: bool) -> Result<(), CallgateError> {
-    let callgate = Callgate::find(LAYOUT)?;
-    if content {
-        callgate.confirm(number)
-    } else {
-        callgate.invalidate(number)
+pub fn confirm(number: u8) -> Result<Confirmed, CallgateError> {
+    const LOCKED: i32 = Status::Locked as i32;
+    match Callgate::find(LAYOUT)?.confirm(number) {
+        Ok(()) => Ok(Confirmed::Now),
+        Err(CallgateError::Refused(LOCKED)) => Ok(Confirmed::AtReset),
+        Err(error) => Err(error),
     }
+}
+
+/// Takes a program's signature away.
+///
+/// # Errors
+/// What the bootloader says. In a sealed device the holder of a root key alone does that, in the
+/// bootloader.
+pub fn invalidate(number: u8) -> Result<(), CallgateError> {
+    Callgate::find(LAYOUT)?.invalidate(number)
 }
 
 /// How the device goes back into the bootloader (`shared_abi::reentry`).
@@ -162,7 +181,10 @@ pub type Departure = application::Departure<(ReentryPath, BootRequest)>;
 /// Begins with it, right behind the frame that asked for it.
 pub fn begin(departure: &mut Departure, path: ReentryPath, leave: Leave, slave: &mut Slave, now: Instant) {
     match leave {
-        Leave::Answered(request) => departure.begin((path, request), request == BootRequest::Stay, now),
+        Leave::Answered(request) => {
+            let promised = !matches!(request, BootRequest::PowerOn | BootRequest::Start(_));
+            departure.begin((path, request), promised, now);
+        }
         Leave::Owed(owed) if slave.withdraw_answer(&[0x60, 0x51, 0x1F, owed.program, 0, 0, 0, 0]) => {
             departure.begin_silent((path, BootRequest::Owed(owed)), now)
         }

@@ -24,7 +24,7 @@ use shared_abi::callgate::{PROGRAM_INSTALLED, PROGRAM_SIGNED};
 use shared_abi::label::Label;
 use shared_abi::warm_start::{BootRequest, Owed};
 
-use crate::coboot::{self, Leave, ReentryPath, Start};
+use crate::coboot::{self, Confirmed, Leave, ReentryPath, Start};
 use crate::debugger;
 use crate::entries::{entries, entry_count, CONFIRMATION, REENTRY_PATH};
 
@@ -77,6 +77,9 @@ pub struct Application {
     /// The re-entry path (2000h).
     path: ReentryPath,
     leave: Option<Leave>,
+    /// What a master was promised of the reset that is due: the bootloader, or that this program is
+    /// confirmed by it. Nobody else takes that away.
+    promised: Option<BootRequest>,
     /// The next 80h to this program confirms it.
     fresh: bool,
     /// The node-ID as which the bootloader can answer in this program's place.
@@ -115,6 +118,7 @@ impl Application {
             program: start.program,
             path: ReentryPath::default(),
             leave: None,
+            promised: None,
             fresh: start.fresh,
             bootloader_answers: start.bootloader_answers(),
             #[cfg(feature = "lift")]
@@ -163,11 +167,11 @@ impl Application {
         let standing = Standing { fresh, armed, can_hand_over: node_id.is_some() };
         self.leave = Some(match react(command, program == self.program, standing)? {
             Reaction::Nothing => return Ok(()),
-            Reaction::Confirm => {
-                self.fresh = false;
-                return coboot::confirm(program, true).map_err(|_| AbortCode::HARDWARE);
+            Reaction::Confirm => return self.confirm(),
+            Reaction::CallBack => return self.promise(BootRequest::Stay),
+            _ if matches!(self.promised, Some(BootRequest::Confirm(_))) => {
+                return Err(AbortCode::DEVICE_STATE);
             }
-            Reaction::CallBack => Leave::Answered(BootRequest::Stay),
             Reaction::Restart => Leave::Answered(BootRequest::Start(program)),
             Reaction::HandOver => {
                 let node_id = node_id.map_or(0, NodeId::get);
@@ -175,6 +179,28 @@ impl Application {
             }
         });
         Ok(())
+    }
+
+    /// The device leaves with this request, unless it was promised to leave with another one.
+    fn promise(&mut self, request: BootRequest) -> Result<(), AbortCode> {
+        if self.promised.is_some_and(|promised| promised != request) {
+            return Err(AbortCode::DEVICE_STATE);
+        }
+        self.promised = Some(request);
+        self.leave = Some(Leave::Answered(request));
+        Ok(())
+    }
+
+    /// This program is good.
+    fn confirm(&mut self) -> Result<(), AbortCode> {
+        let confirmed = coboot::confirm(self.program);
+        // Until it is stored, an 80h that comes again means the same.
+        self.fresh &= confirmed == Ok(Confirmed::AtReset);
+        match confirmed {
+            Ok(Confirmed::Now) => Ok(()),
+            Ok(Confirmed::AtReset) => self.promise(BootRequest::Confirm(self.program)),
+            Err(_) => Err(AbortCode::HARDWARE),
+        }
     }
 
     /// What 1F51h reads.
@@ -244,8 +270,10 @@ impl Objects for Application {
                 Ok(())
             }
             (CONFIRMATION, &[value @ 0..=3]) => {
-                let signed = u32::from(value) & PROGRAM_SIGNED != 0;
-                coboot::confirm(self.program, signed).map_err(|_| AbortCode::DEVICE_STATE)
+                if u32::from(value) & PROGRAM_SIGNED != 0 {
+                    return self.confirm().map_err(|_| AbortCode::DEVICE_STATE);
+                }
+                coboot::invalidate(self.program).map_err(|_| AbortCode::DEVICE_STATE)
             }
             (CONFIRMATION, _) => Err(AbortCode::INVALID_VALUE),
             _ => Err(AbortCode::UNSUPPORTED_ACCESS),

@@ -79,8 +79,8 @@ pub struct Departure<R>(Option<Pending<R>>);
 #[derive(Clone, Copy, Debug)]
 struct Pending<R> {
     request: R,
-    /// The request is one for the bootloader.
-    calls_back: bool,
+    /// A master was promised it, whatever another one asks.
+    promised: bool,
     /// How long the device stays behind the last answer, in ms.
     pause_ms: u32,
     /// When the pause is over; set when the answer is on the bus.
@@ -106,14 +106,14 @@ impl<R: Copy> Departure<R> {
     /// The device stays.
     pub const NONE: Self = Self(None);
 
-    /// A command was taken whose answer this program sends. `calls_back`: the device is to come up in
-    /// the bootloader. A master that was promised that is not let down by another one, whose command
-    /// starts the program anew.
-    pub fn begin(&mut self, request: R, calls_back: bool, now: Instant) {
+    /// A command was taken whose answer this program sends. `promised`: the device is to come up in
+    /// the bootloader, or something is to be stored. A master that was promised that is not let down
+    /// by another one, whose command starts the program anew.
+    pub fn begin(&mut self, request: R, promised: bool, now: Instant) {
         match &mut self.0 {
             Some(pending) => {
-                if calls_back || !pending.calls_back {
-                    (pending.request, pending.calls_back) = (request, calls_back);
+                if promised || !pending.promised {
+                    (pending.request, pending.promised) = (request, promised);
                 }
                 // This answer, too, is followed by the pause.
                 pending.at = None;
@@ -121,7 +121,7 @@ impl<R: Copy> Departure<R> {
             None => {
                 let latest = now + ANSWERED_MOST_MS;
                 let pause_ms = ANSWER_TO_RESET_MS;
-                self.0 = Some(Pending { request, calls_back, pause_ms, at: None, latest, silent: false });
+                self.0 = Some(Pending { request, promised, pause_ms, at: None, latest, silent: false });
             }
         }
     }
@@ -130,7 +130,7 @@ impl<R: Copy> Departure<R> {
     /// has its pause.
     pub fn begin_silent(&mut self, request: R, now: Instant) {
         let latest = now + SILENT_MOST_MS;
-        let new = Pending { request, calls_back: true, pause_ms: 0, at: None, latest, silent: true };
+        let new = Pending { request, promised: true, pause_ms: 0, at: None, latest, silent: true };
         self.0 = Some(match self.0 {
             Some(Pending { pause_ms, at, .. }) => Pending { pause_ms, at, ..new },
             None => new,

@@ -40,6 +40,12 @@ static inline uint32_t coboot_owed(uint8_t program, uint8_t value, uint8_t node_
     return program | (uint32_t)value << 8 | (uint32_t)node_id << 16;
 }
 
+/* The argument of COBOOT_REQUEST_STORE_NODE: node-ID (255 for none) and bit rate in bit/s, as in coboot_store_node. */
+static inline uint32_t coboot_stored_node(uint8_t node_id, uint32_t bit_rate)
+{
+    return node_id | (bit_rate / 5000 & UINT32_C(0xFF)) << 8;
+}
+
 /* The cell that carries a request. */
 static inline struct coboot_warm_start coboot_request(uint32_t request, uint32_t argument)
 {

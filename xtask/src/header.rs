@@ -8,7 +8,7 @@ use std::mem::{offset_of, size_of};
 
 use shared_abi::callgate::{self, Crc32Args, NodeArgs, ProgramArgs, Selector, Status, Table};
 use shared_abi::handoff::{self, Handoff, ResetCause};
-use shared_abi::warm_start::{self, BootRequest, Owed, WarmStart};
+use shared_abi::warm_start::{self, BootRequest, Owed, StoredNode, WarmStart};
 
 use crate::args::Args;
 use crate::Outcome;
@@ -119,14 +119,18 @@ const OWED: Owed = Owed { program: 1, value: 0, node_id: 1 };
 fn warm_start() -> String {
     let request = |request| WarmStart::new(request).request;
     defines([("WARM_START_MAGIC", warm_start::MAGIC)])
-        + "\n/* Requests. Those for a program take its number, 1 to 254, as argument, an owed answer what coboot_owed makes, and the\n \
-           * others 0. */\n"
+        + "\n/* Requests. Those for a program take its number, 1 to 254, as argument, an owed answer what coboot_owed makes, node\n \
+           * parameters what coboot_stored_node makes, and the others 0. The last three are for what the callgate answers with\n \
+           * COBOOT_STATUS_LOCKED. */\n"
         + &defines([
             ("REQUEST_STAY", request(BootRequest::Stay)),
             ("REQUEST_TRIAL", request(BootRequest::Trial(1))),
             ("REQUEST_START", request(BootRequest::Start(1))),
             ("REQUEST_POWER_ON", request(BootRequest::PowerOn)),
             ("REQUEST_OWED", request(BootRequest::Owed(OWED))),
+            ("REQUEST_CONFIRM", request(BootRequest::Confirm(1))),
+            ("REQUEST_INVALIDATE", request(BootRequest::Invalidate(1))),
+            ("REQUEST_STORE_NODE", request(BootRequest::StoreNode(StoredNode::new(1, 0)))),
         ])
         + "\n"
         + &structure!("coboot_warm_start", WarmStart, magic, request, argument, check)
@@ -221,6 +225,7 @@ fn status() -> String {
             "a node-ID, bit rate or program number that does not exist here",
         ),
         ("NO_PROGRAM", Status::NoProgram, "nothing is installed under this number"),
+        ("LOCKED", Status::Locked, "the flash is locked: leave with COBOOT_REQUEST_CONFIRM or the like"),
     ];
     let mut text = String::new();
     for (name, code, meaning) in codes {
