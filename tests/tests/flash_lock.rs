@@ -180,8 +180,8 @@ fn a_sealed_program_cannot_open_flash_and_option_bytes() {
         assert_eq!(log.masks, [0, 0], "{start}");
         assert_eq!(log.faults, 4, "{start}: a fault for each key");
         assert_eq!(log.locks, [0x8000_0000, 0x0FFF_AAED], "{start}");
-        // Failed: nothing can be stored before the next reset, and asking is no fault.
-        assert_eq!(log.callgate, -5, "{start}");
+        // Locked: nothing can be stored before the next reset, and asking is no fault.
+        assert_eq!(log.callgate, -8, "{start}");
         bench.machine().write_ram(OUT, &[0; 48]).unwrap();
         bench.power_off();
         bench.power_on();

@@ -199,7 +199,7 @@ pub(super) fn value(sealed: &Sealed<'_>) -> Value {
         "flags": flags(head.flags()).collect::<Vec<_>>(),
         "unique_id": Some(head.unique_id()).filter(|id| *id != [0; 12]).map(|id| digits(&id)),
         "hardware": head.hardware(),
-        "hash": digits(&head.image_hash()),
+        "hash": digits(head.image_hash()),
         "chain": digits(&head.chain()),
         "nonce": digits(&head.nonce()),
         "dictionary": Some(head.dictionary()).filter(|hash| *hash != [0; 32]).map(|hash| digits(&hash)),

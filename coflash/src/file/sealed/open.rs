@@ -392,7 +392,7 @@ impl<'a> Sealed<'a> {
         };
         let id = signed_by.id();
         let signature = head.signature(id).ok_or(Refusal::NoSignature(id))?;
-        if !signed_by.verifies(&[&DOMAIN[..], head.manifest()].concat(), &signature) {
+        if !signed_by.verifies(&[&DOMAIN[..], head.manifest()].concat(), signature) {
             return Err(Refusal::Signature(id));
         }
         let mut payload = self.payload()?;

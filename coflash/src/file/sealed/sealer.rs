@@ -371,7 +371,7 @@ impl Unsigned {
         let header = at.checked_sub(SIGNATURE_HEADER).ok_or(SealFault::NotUnsigned)?;
         let id = seal::wire::word(&file, header);
         match seal::wire::Head(&file[..head]).signature(id) {
-            Some(zeros) if zeros == [0; SIGNATURE] && seal::wire::Head(&file).signatures() == 1 => {}
+            Some(zeros) if *zeros == [0; SIGNATURE] && seal::wire::Head(&file).signatures() == 1 => {}
             _ => return Err(SealFault::NotUnsigned),
         }
         if of_another || id != key.id() {

@@ -123,9 +123,9 @@ impl fmt::Display for Sealed<'_> {
         for id in self.signers() {
             writeln!(f, "  signature    of the key {id:08X}h")?;
         }
-        writeln!(f, "  image hash   {}", digits(&head.image_hash()))?;
+        writeln!(f, "  image hash   {}", digits(head.image_hash()))?;
         if head.dictionary() != [0; 32] {
-            writeln!(f, "  dictionary   {}", digits(&head.dictionary()))?;
+            writeln!(f, "  dictionary   {}", digits(head.dictionary()))?;
         }
         writeln!(f, "  chain        {}", digits(&head.chain()))
     }

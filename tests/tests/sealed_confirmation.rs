@@ -1,0 +1,155 @@
+//! What a sealed program lets be stored: the flash is locked while it runs, so its confirmation goes
+//! through the warm-start cell and a reset (`shared_abi::warm_start::BootRequest::Confirm`).
+
+use canopen::program::ProgramControl;
+use canopen::Address;
+use coboot_tests::bench::{Bench, NODE, RESCUE_WINDOW_MS};
+use coboot_tests::firmware;
+use coboot_tests::sealed_board::{board, release, sealer, write, COUNTER};
+use coflash::device::Transfers;
+use shared_abi::warm_start::{BootRequest, StoredNode, WarmStart};
+
+const APPLICATIONS: [&str; 2] = [firmware::APP_V1, firmware::APP_C];
+const CRC: Address = Address::new(0x1F56, 1);
+
+const REQUEST: u16 = 0x600 + NODE as u16;
+const ANSWER: u32 = 0x580 + NODE as u32;
+const HEARTBEAT: u32 = 0x700 + NODE as u32;
+
+/// 1F51h/1 := value, its acknowledgement (CiA 301, 7.2.4.3.3), and its refusal because of the
+/// device's state (7.2.4.3.17).
+const fn command(value: u8) -> [u8; 8] {
+    [0x2F, 0x51, 0x1F, 1, value, 0, 0, 0]
+}
+const ACKNOWLEDGED: [u8; 8] = [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0];
+const REFUSED: [u8; 8] = [0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 0x08];
+
+/// A sealed board whose sealed program was downloaded in one go, and started.
+fn fresh_board(image: &str) -> Bench {
+    let mut bench = board();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let file = sealer(COUNTER).seal(&firmware::raw(image), &release()).unwrap();
+    assert_eq!(write(&mut bench, &file, Transfers::Segments), (None, 0), "{image}");
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    bench.await_boot_up(1000);
+    bench.run_ms(50);
+    bench
+}
+
+/// How often the device says boot-up when the power comes back: the bootloader of an unconfirmed
+/// program does for its rescue window, before the program does.
+fn boot_ups_after_power_off(bench: &mut Bench) -> usize {
+    bench.power_off();
+    bench.run_ms(100);
+    let from = bench.time();
+    bench.power_on();
+    bench.run_ms(RESCUE_WINDOW_MS + 200);
+    let frames = bench.frames_since(from);
+    frames.iter().filter(|(_, id, data)| *id == HEARTBEAT && data[..] == [0]).count()
+}
+
+fn ask(bench: &mut Bench, value: u8) -> Option<Vec<u8>> {
+    bench.ask(REQUEST, &command(value), ANSWER)
+}
+
+/// As on an open device, but for the reset: acknowledged, confirmed for good, and the next 80h calls
+/// the program back.
+#[test]
+fn the_first_80h_confirms_a_sealed_program_through_a_reset() {
+    for image in APPLICATIONS {
+        let mut bench = fresh_board(image);
+        let crc = bench.session().read_number(CRC).unwrap();
+        assert_eq!(ask(&mut bench, 0x80).as_deref(), Some(&ACKNOWLEDGED[..]), "{image}");
+        bench.await_boot_up(1000);
+        bench.run_ms(50);
+        assert!(!bench.is_bootloader(NODE), "{image}: the program is back");
+        assert_eq!(bench.session().read_number(CRC).unwrap(), crc, "{image}");
+        assert_eq!(boot_ups_after_power_off(&mut bench), 1, "{image}: confirmed for good");
+        assert_eq!(ask(&mut bench, 0x80).as_deref(), Some(&ACKNOWLEDGED[..]), "{image}");
+        bench.await_boot_up(1000);
+        bench.run_ms(50);
+        assert!(bench.is_bootloader(NODE), "{image}: the second is a call");
+        bench.assert_nothing_unmodelled();
+    }
+}
+
+/// Between the answer and the reset: who repeats the 80h gets the same answer, nobody takes the
+/// confirmation away, and the device leaves all the same.
+#[test]
+fn nothing_takes_the_confirmation_away() {
+    for image in APPLICATIONS {
+        for (what, value, answer) in [
+            ("80h again", 0x80, ACKNOWLEDGED),
+            ("STOP", 0x00, REFUSED),
+            ("CLEAR", 0x03, REFUSED),
+            ("reset program", 0x02, REFUSED),
+        ] {
+            let mut bench = fresh_board(image);
+            assert_eq!(ask(&mut bench, 0x80).as_deref(), Some(&ACKNOWLEDGED[..]));
+            assert_eq!(ask(&mut bench, value).as_deref(), Some(&answer[..]), "{image}, {what}");
+            bench.await_boot_up(1000);
+            bench.run_ms(50);
+            assert!(!bench.is_bootloader(NODE), "{image}, {what}");
+            assert_eq!(boot_ups_after_power_off(&mut bench), 1, "{image}, {what}");
+        }
+        let mut bench = fresh_board(image);
+        assert!(ask(&mut bench, 0x80).is_some());
+        // NMT reset node.
+        bench.post(0x000, &[0x81, NODE]);
+        bench.await_boot_up(1000);
+        assert_eq!(boot_ups_after_power_off(&mut bench), 1, "{image}, NMT");
+    }
+}
+
+/// A power cut before the reset costs the confirmation and nothing else.
+#[test]
+fn a_power_cut_before_the_reset_leaves_an_unconfirmed_program() {
+    for image in APPLICATIONS {
+        let mut bench = fresh_board(image);
+        assert!(ask(&mut bench, 0x80).is_some());
+        assert_eq!(boot_ups_after_power_off(&mut bench), 2, "{image}: a rescue window, and the program");
+        assert!(!bench.is_bootloader(NODE), "{image}");
+    }
+}
+
+/// The other two requests, as an application may leave them, and what makes no sense.
+#[test]
+fn the_boot_stage_stores_what_the_callgate_could_not() {
+    let leave = |bench: &mut Bench, request: BootRequest| {
+        let WarmStart { magic, request, argument, check } = WarmStart::new(request);
+        let bytes: Vec<u8> =
+            [magic, request, argument, check].iter().flat_map(|word| word.to_le_bytes()).collect();
+        bench.machine().write_ram(firmware::board().warm_start.base, &bytes).unwrap();
+        bench.machine().reset_pin();
+    };
+    let mut bench = fresh_board(firmware::APP_V1);
+    for nonsense in [
+        BootRequest::Confirm(200),
+        BootRequest::Invalidate(200),
+        BootRequest::StoreNode(StoredNode { node_id: 0, bit_rate: 100 }),
+        BootRequest::StoreNode(StoredNode { node_id: 200, bit_rate: 25 }),
+        BootRequest::StoreNode(StoredNode { node_id: 9, bit_rate: 7 }),
+    ] {
+        leave(&mut bench, nonsense);
+        bench.await_boot_up(1000);
+        bench.run_ms(RESCUE_WINDOW_MS + 100);
+        if nonsense == BootRequest::Confirm(200) {
+            // A start that was asked for, of a program that is not there.
+            assert!(bench.is_bootloader(NODE), "{nonsense:?}");
+        } else {
+            assert!(!bench.is_bootloader(NODE), "{nonsense:?}");
+        }
+    }
+    leave(&mut bench, BootRequest::StoreNode(StoredNode::new(9, 125_000)));
+    bench.await_program_of(9, 1000);
+    leave(&mut bench, BootRequest::Invalidate(1));
+    bench.await_boot_up_of(9, 1000);
+    bench.run_ms(RESCUE_WINDOW_MS + 100);
+    assert!(bench.is_bootloader(9), "it is not released any more");
+    leave(&mut bench, BootRequest::Confirm(1));
+    bench.await_boot_up_of(9, 1000);
+    bench.run_ms(100);
+    assert!(!bench.is_bootloader(9), "and now it is again");
+    bench.assert_nothing_unmodelled();
+}
