@@ -54,6 +54,7 @@ pub mod key_block;
 mod lzma;
 pub mod open;
 pub mod provision;
+mod ram_image;
 pub mod sealer;
 pub mod show;
 
