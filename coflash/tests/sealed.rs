@@ -4,10 +4,11 @@
 use std::io::Write as _;
 use std::process::{Command, Stdio};
 
+use coflash::file::sealed::blocks::{looks_like, FRONT};
 use coflash::file::sealed::open::Closed;
 use coflash::file::sealed::{
-    hash, verify, Certificate, Device, Kek, PublicKey, Refusal, Role, SealFault, Sealed, Sealer, SigningKey,
-    Unsigned,
+    carried, hash, verify, Carried, Certificate, Device, Kek, PublicKey, Refusal, Role, SealFault, Sealed,
+    Sealer, SigningKey, Unsigned,
 };
 use proptest::prelude::*;
 use seal::wire::Fault;
@@ -78,6 +79,34 @@ fn device<'a>(roots: &'a [PublicKey], keks: &'a [Kek]) -> Device<'a> {
 
 fn refusal(file: &[u8], device: &Device<'_>) -> Refusal {
     verify(file, device).unwrap_err()
+}
+
+/// A block as the manual's figure has it: number, address, size, data, CRC-32.
+fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
+    let words = [number, address, data.len() as u32];
+    let mut bytes: Vec<u8> = words.into_iter().flat_map(u32::to_le_bytes).collect();
+    bytes.extend_from_slice(data);
+    let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&bytes);
+    bytes.extend_from_slice(&crc.to_le_bytes());
+    bytes
+}
+
+/// The last block of what these bytes are.
+fn last(bytes: &[u8]) -> Vec<u8> {
+    let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(bytes);
+    block(u32::MAX, 0, &[(bytes.len() as u32).to_le_bytes(), crc.to_le_bytes()].concat())
+}
+
+const START: u32 = 0x0801_0000;
+
+/// A block file that carries these bytes, in pieces of 600.
+fn in_blocks(bytes: &[u8]) -> Vec<Vec<u8>> {
+    let mut blocks = vec![block(0, 0, &[0; 8])];
+    for (number, piece) in (0..).zip(bytes.chunks(600)) {
+        blocks.push(block(number + 1, START + 600 * number, piece));
+    }
+    blocks.push(last(bytes));
+    blocks
 }
 
 /// The manifest with a field changed, signed again by the release key; the rest as it is.
@@ -283,6 +312,74 @@ fn the_device_tells_which_rule_is_broken() {
 }
 
 #[test]
+fn a_block_file_carries_a_sealed_image() {
+    let image = sealer().seal(&image(900), &release()).unwrap();
+    for control in [8, 12, 24] {
+        let mut blocks = in_blocks(&image);
+        blocks[0] = block(0, 0, &vec![0; control]);
+        let file = blocks.concat();
+        assert!(looks_like(&file[..FRONT]));
+        let carried = carried(file.clone()).unwrap();
+        assert!(carried.image == image);
+        assert_eq!(carried.blocks.unwrap().emit(), file);
+        assert!(verify(&carried.image, &device(&[root().public()], &[])).is_ok());
+    }
+    // What carries none stays what it is.
+    for other in [b"".to_vec(), image.clone(), image[..3].to_vec(), b"CBS1".to_vec()] {
+        assert_eq!(carried(other.clone()).unwrap(), Carried { image: other, blocks: None });
+    }
+    let plain = in_blocks(&[&[0; 4], &image[..]].concat()).concat();
+    assert!(!looks_like(&plain));
+    assert_eq!(carried(plain.clone()).unwrap(), Carried { image: plain, blocks: None });
+}
+
+/// Numbers, addresses, sizes and CRCs are made wrong one by one; all CRCs but the one in question fit.
+#[test]
+fn blocks_that_carry_no_whole_image_are_refused() {
+    let image = sealer().seal(&image(900), &release()).unwrap();
+    let good = in_blocks(&image);
+    let count = good.len();
+    assert_eq!(count, 5);
+    let fault = |blocks: &[Vec<u8>]| carried(blocks.concat()).unwrap_err().to_string();
+    let of = |number: usize, address: u32, at: usize| {
+        block(number as u32, address, image.chunks(600).nth(at).unwrap())
+    };
+
+    // Cut off, at each byte behind what tells that it is one.
+    let whole = good.concat();
+    for end in FRONT..whole.len() {
+        assert!(carried(whole[..end].to_vec()).is_err(), "{end}");
+    }
+    assert!(fault(&good[..count - 1]).contains("ends without its last block"));
+    assert!(fault(&[&good[..], &[vec![0]]].concat()).contains("there is more behind the last block"));
+    // A block is missing: by number, by address, and with a last block of what is left.
+    let without = [&good[..2], &good[3..]].concat();
+    assert!(fault(&without).contains("block 3 follows where block 2 must"));
+    let renumbered = [&good[..2], &[of(2, START + 1200, 2)], &good[4..]].concat();
+    assert!(fault(&renumbered).contains("does not fit the blocks before it"));
+    let filled = [&image[..600], &[0xFF; 600], &image[1200..]].concat();
+    let gap = [&renumbered[..3], &[last(&filled)]].concat();
+    let words = fault(&gap);
+    assert!(words.contains("offset 0x280") && words.contains("a block is missing"), "{words}");
+    // Out of order.
+    let swapped = [&good[..2], &[good[3].clone(), good[2].clone()], &good[4..]].concat();
+    assert!(fault(&swapped).contains("block 3 follows where block 2 must"));
+    let swapped = [&good[..2], &[of(2, START + 1200, 2), of(3, START + 600, 1)], &good[4..]].concat();
+    assert!(fault(&swapped).contains("does not lie behind the one before it"));
+    // A wrong CRC, of a block and of all.
+    let mut wrong = good.clone();
+    wrong[2][30] ^= 1;
+    assert!(fault(&wrong).contains("CRC of block 2 is"));
+    let wrong = [&good[..count - 1], &[last(&image[1..])]].concat();
+    assert!(fault(&wrong).contains("does not fit the blocks before it"));
+    // Erased flash in front of it or behind it is no part of it.
+    let behind = [&good[..count - 1], &[last(&[&image[..], &[0xFF; 4]].concat())]].concat();
+    assert!(fault(&behind).contains("does not fit the blocks before it"));
+    let front = [&good[..count - 1], &[last(&[&[0xFF; 4], &image[..]].concat())]].concat();
+    assert!(fault(&front).contains("does not fit the blocks before it"));
+}
+
+#[test]
 fn a_record_that_must_be_understood_and_is_not_is_refused() {
     let text = Sealer { text: Some("1234"), ..sealer() };
     let file = text.seal(&image(10), &release()).unwrap();
@@ -474,6 +571,24 @@ proptest! {
             let number = (at - signature - 72) / 544 + 1;
             prop_assert_eq!(refusal, Refusal::Chain { number, of: 2 });
         }
+    }
+
+    /// Any bytes in place of a few in a block file: what comes out is the image, or nothing.
+    #[test]
+    fn hostile_blocks_are_refused(
+        noise in prop::collection::vec(any::<u8>(), 1..40),
+        place in any::<prop::sample::Index>(),
+    ) {
+        let image = sealer().seal(&image(900), &release()).unwrap();
+        let mut file = in_blocks(&image).concat();
+        let at = FRONT + place.index(file.len() - FRONT);
+        let end = (at + noise.len()).min(file.len());
+        file[at..end].copy_from_slice(&noise[..end - at]);
+        let is_as_before = file == in_blocks(&image).concat();
+        prop_assert_eq!(carried(file).is_ok(), is_as_before);
+        let mut file = in_blocks(&image)[0].clone();
+        file.extend(in_blocks(&image)[1][..16].iter().chain(&noise));
+        prop_assert!(carried(file).is_err());
     }
 
     /// Cut off anywhere: refused, and told as cut off where the head is whole.

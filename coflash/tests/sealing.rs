@@ -177,10 +177,175 @@ fn a_value_of_128_bits_makes_a_key() {
         assert_eq!(coflash(&["key", "new", "--role", role, "--of-value", value, "-o", &out]).exit, 2);
         assert!(!Path::new(&out).exists());
     }
-    // What the manual's converter takes for encryption leads here.
-    let done = coflash(&["convert", &room.path("app.hex"), "--board", "stm32f407g-disc1", "--key", value]);
-    assert_eq!(done.exit, 2);
-    assert!(done.err.contains("--of-value") && !done.err.contains(value), "{}", done.err);
+}
+
+/// `--key` of the manual's converter: the program comes out with the key of the same value, and with no
+/// other.
+#[test]
+fn the_converter_encrypts_with_a_value() {
+    let room = Room::new("convert");
+    let (value, app) = ("000102030405060708090a0b0c0d0e0f", room.path("app.hex"));
+    let (sign, cert) = (room.path("release.pem"), room.path("release.cert"));
+    let words = ["convert", &app, "--board", "stm32f407g-disc1", "--key", value];
+    for (more, missing) in [
+        (&[][..], "--sign and --counter is missing"),
+        (&["--counter", "7"], ", and --sign is missing"),
+        (&["--sign", &sign], ", and --counter is missing"),
+    ] {
+        let done = coflash(&[&words[..], more].concat());
+        assert_eq!(done.exit, 2);
+        assert!(done.err.contains(missing) && done.err.contains("what to do: give --sign"), "{}", done.err);
+        assert!(!done.err.contains(value), "the value is a secret");
+        assert!(!Path::new(&room.path("app.blk")).exists());
+    }
+    let signed = [&words[..], &["--sign", &sign, "--cert", &cert, "--counter", "7"]].concat();
+    let done = room.good(&[&signed[..], &["--add", "0xA5"]].concat());
+    assert!(done.out.contains("app.blk: program 1 V1.10r100, counter 7, 9001 bytes"), "{}", done.out);
+    assert!(done.err.contains("--add changes nothing"), "{}", done.err);
+    let kek = room.path("product.pem");
+    room.good(&["key", "new", "--role", "kek", "--of-value", value, "-o", &kek]);
+    assert!(room.verify("app.blk", &["--kek", &kek]).out.contains("the program is whole, 9001 bytes"));
+    assert!(room.verify("app.blk", &["--kek", &room.path("kek.pem")]).err.contains("for other keys"));
+    let shown = json(&["show", &room.path("app.blk")]);
+    assert_eq!(shown["flags"], serde_json::json!(["encrypted"]));
+    assert_eq!(shown["blocks"]["start"], START);
+    // Nothing of the program is to be seen.
+    let first = room.bytes("app.blk");
+    let has = |part: &[u8]| first.windows(part.len()).any(|bytes| bytes == part);
+    assert!(program()[0x300..].chunks_exact(32).all(|plain| !has(plain)));
+    room.good(&signed);
+    assert_eq!(room.bytes("app.blk"), first, "the same input, the same file");
+    // The image itself is what `seal` makes.
+    room.good(&[&["convert", &app, &room.path("own.cbs")], &signed[2..]].concat());
+    room.seal("sealed.cbs", &["--counter", "7", "--encrypt", &kek]);
+    assert_eq!(room.bytes("own.cbs"), room.bytes("sealed.cbs"));
+    // Another identity is that of the command line, and the certificate has its say.
+    let done = coflash(&[&signed[..], &["--vid", "1", "--pid", "2"]].concat());
+    assert!(done.err.contains("the certificate allows the vendor-ID 0000003Fh"), "{}", done.err);
+    for (more, words) in [
+        (&["--key", "12"][..], "32 hexadecimal digits"),
+        (&["--add", "1"], "--key"),
+        (&["--key", value, "--crc16"], "--crc16"),
+    ] {
+        let done = coflash(&[&["convert", &app], more].concat());
+        assert_eq!(done.exit, 2);
+        assert!(done.err.contains(words), "{}", done.err);
+    }
+    let junk = room.0.file("junk.bin", &[0x5A; 1000]);
+    let done = coflash(&[&["convert", &junk, "-I", "binary"], &signed[2..]].concat());
+    assert!(done.exit == 3 && done.err.contains("is no program"), "{}", done.err);
+    assert!(!Path::new(&room.path("junk.blk")).exists());
+}
+
+fn crc32(bytes: &[u8]) -> u32 {
+    crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(bytes)
+}
+
+fn word(bytes: &[u8], at: usize) -> u32 {
+    u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap())
+}
+
+/// Takes blocks apart by the manual's figure: each has its number, its CRC, and the address behind the
+/// one before it. Gives the data of block 0 and what the others carry.
+fn unwrapped(blocks: &[Vec<u8>]) -> (Vec<u8>, Vec<u8>) {
+    let data = |block: &[u8]| {
+        let end = block.len() - 4;
+        assert_eq!(word(block, end), crc32(&block[..end]));
+        assert_eq!(word(block, 8) as usize, end - 12);
+        block[12..end].to_vec()
+    };
+    let (last, rest) = blocks.split_last().unwrap();
+    let mut carried = Vec::new();
+    for (number, block) in rest.iter().enumerate() {
+        assert_eq!(word(block, 0), number as u32);
+        if number > 0 {
+            assert_eq!(word(block, 4), START + carried.len() as u32);
+            carried.extend(data(block));
+        }
+    }
+    assert_eq!(word(last, 0), u32::MAX);
+    assert_eq!(data(last), [(carried.len() as u32).to_le_bytes(), crc32(&carried).to_le_bytes()].concat());
+    (data(&blocks[0]), carried)
+}
+
+/// The blocks of a file.
+fn split(mut file: &[u8]) -> Vec<Vec<u8>> {
+    let mut blocks = Vec::new();
+    while !file.is_empty() {
+        let (block, rest) = file.split_at(16 + word(file, 8) as usize);
+        blocks.push(block.to_vec());
+        file = rest;
+    }
+    blocks
+}
+
+#[test]
+fn a_sealed_image_is_written_in_blocks_and_read_out_of_them() {
+    let room = Room::new("blocks");
+    let more = ["--counter", "7", "--date", "1420070400"];
+    room.seal("app.cbs", &more);
+    let image = room.bytes("app.cbs");
+    for (name, blocks, largest) in
+        [("usual.blk", &["--blocks"][..], 0x400), ("small.blk", &["--blocks", "0x110"], 0x110)]
+    {
+        let done = room.seal(name, &[&more[..], blocks].concat());
+        assert_eq!(done.exit, 0, "{}", done.err);
+        let blocks = split(&room.bytes(name));
+        let (control, carried) = unwrapped(&blocks);
+        assert!(carried == image);
+        assert!(blocks.iter().all(|block| block.len() <= largest) && blocks[1].len() == largest);
+        let size = image.len() as u32;
+        let words = [size, VENDOR, PRODUCT, 0x0064_0A01, 1_420_070_400, 0];
+        assert_eq!(control, words.into_iter().flat_map(u32::to_le_bytes).collect::<Vec<u8>>());
+        // It is taken for what it carries.
+        let verified = room.verify(name, &["--product", "1234"]);
+        assert!(verified.out.contains("the program is whole, 9001 bytes"), "{}", verified.err);
+        let shown = json(&["show", &room.path(name)]);
+        assert_eq!((&shown["format"], &shown["counter"]), (&"sealed image".into(), &7.into()));
+        assert_eq!(shown["blocks"]["count"], blocks.len());
+        assert_eq!(shown["blocks"]["crc"], crc32(&image));
+        for command in ["show", "inspect"] {
+            let words = room.good(&[command, &room.path(name)]).out;
+            let front =
+                format!("block file, {} blocks, from 0x08010000 on; in it: sealed image", blocks.len());
+            assert!(words.contains(&front) && words.contains("counter      7"), "{words}");
+        }
+        let converted = coflash(&["convert", &room.path(name), &room.path("x.blk")]);
+        assert!(converted.exit == 3 && converted.err.contains("is a sealed image"), "{}", converted.err);
+    }
+    assert_eq!(json(&["show", &room.path("app.cbs")])["blocks"], Value::Null);
+    // The name of the result, and what cannot be.
+    let (app, key) = (room.path("app.hex"), room.path("release.pem"));
+    let words = ["seal", &app, "--key", &key, "--cert", &room.path("release.cert"), "--counter", "7"];
+    room.good(&[&words[..], &["--blocks"]].concat());
+    assert!(room.bytes("app.blk").len() > image.len());
+    let done = coflash(&[&words[..], &["--blocks", "20"]].concat());
+    assert!(done.exit == 2 && done.err.contains("a block size of 20 is impossible"), "{}", done.err);
+    // Whatever is wrong with the blocks, every command says it.
+    let good = room.bytes("small.blk");
+    let mut wrong = good.clone();
+    wrong[0x300] ^= 1;
+    let mut blocks = split(&good);
+    blocks.remove(3);
+    for (name, bytes, words, number) in [
+        ("cut.blk", &good[..good.len() - 30], "a block is cut off", "[0x60000022]"),
+        ("wrong.blk", &wrong, "CRC of block 3 is", "[0x60000020]"),
+        ("missing.blk", &blocks.concat(), "block 4 follows where block 3 must", "[0x60000022]"),
+    ] {
+        let file = room.0.file(name, bytes);
+        let root = room.path("root.pub");
+        for command in [
+            &["show", &file][..],
+            &["inspect", &file],
+            &["verify", &file, "--root", &root],
+            &["verify-device", &file, "--root", &root],
+            &["flash", &file],
+        ] {
+            let done = coflash(command);
+            assert_eq!(done.exit, 3, "{command:?}: {}", done.err);
+            assert!(done.err.contains(words) && done.err.contains(number), "{}", done.err);
+        }
+    }
 }
 
 #[test]
@@ -356,8 +521,14 @@ fn a_module_signs_in_two_steps() {
         let key = coflash::file::sealed::SigningKey::from_pem(&key).unwrap();
         fs::write(&signature, key.sign(&room.bytes("app.tbs"))).unwrap();
     }
-    room.good(&["seal", &out, "--key", &key, "--attach", &signature]);
+    // In blocks, if it is known where they go.
+    let attach = ["seal", &out, "--key", &key, "--attach", &signature];
+    let done = coflash(&[&attach[..], &["--blocks"]].concat());
+    assert!(done.exit == 2 && done.err.contains("give --board"), "{}", done.err);
+    room.good(&[&attach[..], &["--blocks", "--board", "stm32f407g-disc1"]].concat());
+    room.good(&attach);
     assert!(room.verify("app.cbs", &[]).out.contains("is whole"));
+    assert!(unwrapped(&split(&room.bytes("app.blk"))).1 == room.bytes("app.cbs"));
     // What the tool itself has signed, OpenSSL finds right.
     room.seal("own.cbs", &["--counter", "1"]);
     let own = room.bytes("own.cbs");
@@ -374,10 +545,21 @@ fn a_module_signs_in_two_steps() {
     openssl(&[&words[..], &["-sigfile", &signature]].concat());
 }
 
+/// 1000 bytes of a bootloader: a stack pointer, and a RAM image that is not packed, with these words.
+fn bootloader(words: &[u8]) -> Vec<u8> {
+    let stored = [words, &vec![0x5A; 972 - words.len()]].concat();
+    let header = [0_u32, 3, 0, 972, 972].map(u32::to_le_bytes).concat();
+    [&0x2001_FFC0_u32.to_le_bytes()[..], b"CBI1", &header, &stored].concat()
+}
+
+fn words_of(root: &str) -> [&str; 4] {
+    ["--board", "stm32f407g-disc1", "--root", root]
+}
+
 #[test]
 fn a_bootloader_gets_its_keys() {
     let room = Room::new("provision");
-    let bootloader = [&0x2001_FFC0_u32.to_le_bytes()[..], &[0x5A; 996]].concat();
+    let bootloader = bootloader(b"coboot sealed image 1\0");
     let boot = room.0.file("boot.bin", &bootloader);
     let (root, kek) = (room.path("root.pub"), room.path("kek.pem"));
     let words = ["provision", &boot, "--board", "stm32f407g-disc1", "--root", &root, "--kek", &kek];
@@ -431,6 +613,17 @@ fn a_bootloader_gets_its_keys() {
     ]);
     assert_eq!(again.exit, 3);
     assert!(again.err.contains("where the keys go"), "{}", again.err);
+    // To one without sealed images keys would mean nothing; other files are no bootloader.
+    let plain = room.0.file("plain.bin", &self::bootloader(b"coboot"));
+    let junk = room.0.file("junk.bin", &[0x5A; 1000]);
+    for (file, words) in [(&plain, "knows no sealed images"), (&junk, "it is no bootloader of coboot")] {
+        let out = room.path("none.hex");
+        let done = coflash(&[&["provision", file][..], &words_of(&root), &["-o", &out]].concat());
+        assert!(done.exit == 3 && done.err.contains(words), "{}", done.err);
+        assert!(!Path::new(&out).exists());
+    }
+    let done = coflash(&["provision", &boot, "--root", &root]);
+    assert!(done.exit == 2 && done.err.contains("give --board or --layout"), "{}", done.err);
 }
 
 /// A device that takes sealed images: it keeps what it is sent.
@@ -538,6 +731,221 @@ fn a_sealed_image_goes_into_a_device_as_it_is() {
         server.join().unwrap();
         assert!(*kept.lock().unwrap() == bytes);
     }
+}
+
+/// A device with these objects: in its bootloader, and while an application runs.
+struct Told {
+    bootloader: Vec<((u16, u8), Vec<u8>)>,
+    application: Vec<((u16, u8), Vec<u8>)>,
+}
+
+const UID: [u8; 12] = *b"\x00\x11\x22\x33\x44\x55\x66\x77\x88\x99\xAA\xBB";
+
+/// 2002h/1 with this last word.
+fn challenge(word: u32) -> ((u16, u8), Vec<u8>) {
+    ((0x2002, 1), [&UID[..], &[0x5A; 32], &word.to_le_bytes()].concat())
+}
+
+/// An event in 2003h: number, what, counter, version.
+fn event(place: u8, words: [u32; 4]) -> ((u16, u8), Vec<u8>) {
+    ((0x2003, place), words.into_iter().flat_map(u32::to_le_bytes).collect())
+}
+
+/// Sealed, with the right for LSS granted.
+const SEALED: u32 = 1 << 31 | 8;
+
+impl Told {
+    /// A sealed device that has this program, and has refused something since it was installed.
+    fn sealed(program: &[u8]) -> Self {
+        let application = vec![
+            ((0x2004, 1), [START.to_le_bytes(), 0x10000_u32.to_le_bytes()].concat()),
+            ((0x2005, 1), 0x0064_0A01_u32.to_le_bytes().to_vec()),
+            ((0x1F56, 1), crc32(program).to_le_bytes().to_vec()),
+        ];
+        let mut bootloader = application.clone();
+        bootloader.push(challenge(SEALED));
+        bootloader.push(event(1, [9, 0x2_008C, 5, 0x0001_0000]));
+        bootloader.push(event(2, [8, 0x1_0001, 7, 0x0064_0A01]));
+        bootloader.push(event(3, [7, 0x1_0001, 6, 0x0000_0001]));
+        bootloader.extend((4..=8).map(|place| event(place, [0; 4])));
+        Self { bootloader, application }
+    }
+
+    /// The same with another value in the bootloader, or without one that is empty.
+    fn but(mut self, (at, value): ((u16, u8), Vec<u8>)) -> Self {
+        self.bootloader.retain(|(own, _)| *own != at);
+        if !value.is_empty() {
+            self.bootloader.push((at, value));
+        }
+        self
+    }
+}
+
+impl Maker for Told {
+    fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
+        let all = if running == BOOTLOADER { &self.bootloader } else { &self.application };
+        all.iter().find(|(own, _)| *own == at).map(|(_, value)| Ok(value.clone()))
+    }
+
+    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
+        None
+    }
+
+    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
+        None
+    }
+}
+
+/// Runs a command on such a device.
+fn on(running: u32, told: Told, words: &[&str]) -> (Done, Fake) {
+    let mut fake = Fake::new(running);
+    fake.erase_time = Duration::from_millis(30);
+    fake.restart_time = Duration::from_millis(20);
+    fake.maker = Some(Box::new(told));
+    let (bus, server) = serve(fake);
+    let done = coflash(&[words, &["--bus", &bus, "-N", "5"]].concat());
+    (done, server.join().unwrap())
+}
+
+#[test]
+fn a_sealed_image_goes_into_a_device_block_by_block() {
+    let room = Room::new("flash-blocks");
+    let program = &program()[..1024];
+    room.0.file("app.hex", ihex::emit(&raw::read(program, Some(START)).unwrap()).as_bytes());
+    room.seal("app.cbs", &["--counter", "7"]);
+    room.seal("app.blk", &["--counter", "7", "--blocks", "0x200"]);
+    let image = room.bytes("app.cbs");
+    for name in ["app.cbs", "app.blk"] {
+        let words = ["flash", &room.path(name), "--blocks", "--block-size", "0x110"];
+        let (done, fake) = on(APPLICATION, Told::sealed(program), &words);
+        assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+        let (control, carried) = unwrapped(&fake.blocks);
+        assert!(carried == image, "{name}");
+        assert_eq!(word(&control, 4), VENDOR);
+        assert_eq!(fake.blocks[1].len(), 0x110);
+        // No release: it has a signature.
+        let commands: Vec<&str> =
+            fake.writes().into_iter().filter(|write| write.starts_with("command")).collect();
+        assert_eq!(commands, ["command 80", "command 03", "command 01"]);
+    }
+    // Without the option the image goes as it is, whatever file it came in.
+    let (done, kept, _) = flashed(&room.path("app.blk"), 0x10000, 0, &[]);
+    assert_eq!(done.exit, 0, "{}", done.err);
+    assert!(kept == image);
+
+    let file = room.path("app.cbs");
+    let done = coflash(&["flash", &file, "--blocks", "--block-size", "20"]);
+    assert!(done.exit == 2 && done.err.contains("a block size of 20 is impossible"), "{}", done.err);
+    // A device that does not tell where its program starts, and one that takes no blocks.
+    let untold = Told::sealed(program).but(((0x2004, 1), Vec::new()));
+    let (done, fake) = on(BOOTLOADER, untold, &["flash", &file, "--blocks"]);
+    assert!(done.exit == 6 && done.err.contains("where its program starts (2004h)"), "{}", done.err);
+    assert!(fake.writes().is_empty(), "{:?}", fake.writes());
+    let words = ["flash", &file, "--blocks", "--dialect", "raw"];
+    let (done, fake) = on(BOOTLOADER, Told::sealed(program), &words);
+    assert!(done.exit == 2 && done.err.contains("and not in blocks"), "{}", done.err);
+    assert!(fake.writes().is_empty(), "{:?}", fake.writes());
+}
+
+#[test]
+fn a_device_without_keys_gets_no_sealed_image() {
+    let room = Room::new("unsealed");
+    room.seal("app.cbs", &["--counter", "7"]);
+    let file = room.path("app.cbs");
+    let open = || Told::sealed(&program()).but(challenge(SEALED & 0xFFFF));
+    let (done, fake) = on(BOOTLOADER, open(), &["flash", &file]);
+    assert_eq!(done.exit, 6);
+    assert!(
+        done.err.contains("the device is not sealed") && done.err.contains("coflash provision"),
+        "{}",
+        done.err
+    );
+    assert!(done.err.contains("nothing was changed in it"), "{}", done.err);
+    assert!(fake.writes().is_empty(), "{:?}", fake.writes());
+    // An application does not say it; the bootloader does, before anything is erased.
+    let (done, fake) = on(APPLICATION, open(), &["flash", &file]);
+    assert!(done.exit == 6 && done.err.contains("the device is not sealed"), "{}", done.err);
+    assert_eq!(fake.writes(), ["command 80"]);
+}
+
+#[test]
+fn a_device_is_compared_with_a_sealed_image() {
+    let room = Room::new("verify-device");
+    let program = program();
+    room.seal("app.cbs", &["--counter", "7", "--device", "00112233445566778899aabb", "--hardware", "1"]);
+    let (file, root) = (room.path("app.cbs"), room.path("root.pub"));
+    let words = ["verify-device", &file, "--root", &root];
+    let compared = |running: u32, told: Told, more: &[&str]| on(running, told, &[&words[..], more].concat());
+
+    let revision = ((0x1018, 3), 0x0001_0021_u32.to_le_bytes().to_vec());
+    let (done, fake) = compared(BOOTLOADER, Told::sealed(&program).but(revision.clone()), &[]);
+    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    assert!(done.out.contains("node 5: holds program 1 of"), "{}", done.out);
+    assert!(done.out.contains("and does not run it") && !done.out.contains("not told"), "{}", done.out);
+    assert!(fake.writes().is_empty());
+
+    // In an application some of it is not told, and that is said.
+    let (done, _) = compared(APPLICATION, Told::sealed(&program), &["--json"]);
+    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    let value: Value = serde_json::from_str(&done.out).unwrap();
+    assert_eq!((&value["same"], &value["runs"]), (&true.into(), &true.into()));
+    assert_eq!(value["untold"], serde_json::json!(["1018h/3", "2002h/1", "2003h/1"]));
+
+    // Each difference is named, and each alone is enough.
+    let number = |index: u16, sub: u8, value: u32| ((index, sub), value.to_le_bytes().to_vec());
+    let other_chip = ((0x2002, 1), [&[1; 12][..], &[0; 32], &SEALED.to_le_bytes()].concat());
+    for (told, words) in [
+        (number(0x1018, 1, 0x40), "vendor-ID (1018h/1): the file has 0000003Fh, the device 00000040h"),
+        (number(0x1018, 2, 1235), "product code (1018h/2): the file has 000004D2h, the device 000004D3h"),
+        (
+            number(0x1018, 3, 2),
+            "hardware revision (1018h/3): the file has the mask 00000002h, the device 00000002h",
+        ),
+        (number(0x1F56, 1, 0), "CRC of the program (1F56h): the file has"),
+        (number(0x1F56, 1, 0x1234_5678), ", the device 12345678h"),
+        (number(0x2005, 1, 0), "version of the program (2005h): the file has V1.10r100, the device V0.0r0"),
+        (other_chip, "unique ID (2002h/1): the file has 00112233445566778899aabb, the device 010101"),
+        (challenge(0x7FFF_FFFF), "the device is not sealed"),
+        (((0x2002, 1), Vec::new()), "knows no sealed images"),
+        (
+            event(2, [8, 0x1_0001, 6, 0x0064_0A01]),
+            "security counter of the last installation (2003h): the file has 7, the device 6",
+        ),
+        (
+            event(2, [8, 0x1_0001, 7, 1]),
+            "version of the last installation (2003h): the file has V1.10r100, the device V1.0r0",
+        ),
+    ] {
+        let (done, _) = compared(BOOTLOADER, Told::sealed(&program).but(revision.clone()).but(told), &[]);
+        assert_eq!(done.exit, 3, "{words}: {}", done.out);
+        assert!(done.out.contains(words), "{words}: {}", done.out);
+        assert_eq!(done.out.matches("  differs ").count(), 1, "{}", done.out);
+        assert!(done.err.contains("node 5 differs from the file in one thing"), "{}", done.err);
+    }
+    let two = Told::sealed(&program).but(number(0x1018, 3, 1)).but(number(0x1F56, 1, 1)).but(challenge(0));
+    let (done, _) = compared(BOOTLOADER, two, &["--json"]);
+    let value: Value = serde_json::from_str(&done.out).unwrap();
+    let what: Vec<&Value> =
+        value["differences"].as_array().unwrap().iter().map(|difference| &difference["what"]).collect();
+    assert_eq!((done.exit, what), (3, vec![&"crc".into(), &"keys".into()]));
+    assert_eq!(value["same"], false);
+
+    // A program of which no installation is among the last eight events, and one of another number.
+    let forgotten = Told::sealed(&program).but(revision.clone()).but(event(2, [0; 4]));
+    let forgotten = forgotten.but(event(3, [7, 0x1_0002, 1, 1]));
+    let (done, _) = compared(BOOTLOADER, forgotten, &[]);
+    assert!(done.exit == 0 && done.out.contains("not told     2003h/1"), "{}{}", done.out, done.err);
+
+    // A bad file is refused before a device is asked, a device that is not there has its own code.
+    let other = room.path("release.pub");
+    let done = coflash(&["verify-device", &file, "--root", &other, "--bus", "socketcand://127.0.0.1:1/can0"]);
+    assert!(done.exit == 3 && done.err.contains("is none of the roots given"), "{}", done.err);
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.running = None;
+    let (bus, server) = serve(fake);
+    let done = coflash(&[&words[..], &["--bus", &bus, "-N", "5", "--sdo-timeout", "20"]].concat());
+    assert_eq!(done.exit, 5, "{}", done.err);
+    server.join().unwrap();
 }
 
 /// The library's own check of what the commands have made.

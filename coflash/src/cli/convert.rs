@@ -3,16 +3,20 @@
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+use ::seal::wire::CERTIFICATE;
 use clap::Args;
-use coflash::file::block_file::FRAMING;
+use coflash::file::block_file::{BlockFile, FRAMING};
 use coflash::file::convert::{Converted, Label};
 use coflash::file::read::Firmware;
+use coflash::file::sealed::{Kek, Sealer, SigningKey};
 use serde_json::json;
 use shared_abi::block_file::{Control, Identity, ProgramVersion};
 
 use super::context::Context;
 use super::file::{warn_left_out, Input, Source};
+use super::keys::{self, value_of_128_bits};
 use super::output::Failure;
+use super::seal::{self, Form, Program};
 use super::values::{number, program_number};
 
 /// Converts a firmware file into a block file, ready for 1F50h.
@@ -81,25 +85,76 @@ pub(super) struct Labels {
     no_label: bool,
 }
 
-/// What the manual's converter could do and no bootloader of this house undoes: better no file than
-/// a wrong one.
+/// The manual's encryption. It names no algorithm, so that what is made here is a sealed image, for the
+/// sealed bootloader of this house.
 #[derive(Debug, Args)]
+#[command(next_help_heading = "Encryption")]
 struct Encryption {
-    #[arg(long, value_name = "KEY", hide = true)]
-    key: Option<String>,
+    /// Encrypt with this value of 128 bits, in 32 hexadecimal digits; needs --sign and --counter.
+    ///
+    /// The manual names no algorithm: encrypted files of its tool can be neither made nor read. The result
+    /// is a block file that carries a sealed image (one named .cbs is the image itself), encrypted for the
+    /// key that `coflash key new --role kek --of-value` makes of the same value.
+    #[arg(long, value_name = "HEX128", value_parser = value_of_128_bits, conflicts_with_all = ["crc16", "last_block_2008", "no_label"])]
+    key: Option<[u8; 16]>,
 
-    #[arg(long, value_name = "VALUE", hide = true)]
-    add: Option<String>,
+    /// The start value of the manual's encryption, which changes nothing here.
+    ///
+    /// Every sealed image has a nonce of its own.
+    #[arg(long, value_name = "VALUE", value_parser = number, requires = "key")]
+    add: Option<u32>,
+
+    /// The private key that signs what is encrypted, as --key of `coflash seal`.
+    #[arg(long, value_name = "FILE", requires = "key")]
+    sign: Option<PathBuf>,
+
+    /// That key's certificate. Without one the key must be a root of the devices.
+    #[arg(long, value_name = "FILE", requires = "key")]
+    cert: Option<PathBuf>,
+
+    /// The security counter: devices refuse programs with a lower one than they have seen.
+    #[arg(long, value_name = "NUMBER", value_parser = number, requires = "key")]
+    counter: Option<u32>,
+}
+
+impl Encryption {
+    /// The way of the result, if it is to be encrypted.
+    fn sealing(&self) -> Result<Option<Sealing>, Failure> {
+        let Some(value) = self.key else { return Ok(None) };
+        let (Some(sign), Some(counter)) = (&self.sign, self.counter) else {
+            let missing: Vec<&str> = [("--sign", self.sign.is_none()), ("--counter", self.counter.is_none())]
+                .into_iter()
+                .filter_map(|(option, is_missing)| is_missing.then_some(option))
+                .collect();
+            let what = format!(
+                "an encrypted program is a sealed one here, and {} is missing",
+                missing.join(" and ")
+            );
+            let advice =
+                "give --sign with the private key that signs (and --cert with its certificate, unless it \
+                          is a root), and --counter; or leave --key out: the file is not encrypted then";
+            return Err(Failure::usage(what, advice));
+        };
+        Ok(Some(Sealing {
+            kek: [Kek::of_value(value).map_err(|fault| Failure::system(fault.to_string()))?],
+            key: keys::signing_key(sign)?,
+            certificate: self.cert.as_deref().map(keys::certificate).transpose()?,
+            counter,
+        }))
+    }
+}
+
+/// What an encrypted program is sealed with.
+struct Sealing {
+    kek: [Kek; 1],
+    key: SigningKey,
+    certificate: Option<[u8; CERTIFICATE]>,
+    counter: u32,
 }
 
 impl Convert {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        if self.encryption.key.is_some() || self.encryption.add.is_some() {
-            let advice =
-                "seal the program in place of it, which encrypts and signs: coflash key new --role kek \
-                          --of-value KEY makes a key of this value, coflash seal --encrypt kek.pem takes it";
-            return Err(Failure::usage("encrypted block files cannot be made", advice));
-        }
+        let sealing = self.encryption.sealing()?;
         let input = self.input.path();
         let output = self.output.clone().unwrap_or_else(|| input.with_extension("blk"));
         if same_file(input, &output) {
@@ -121,12 +176,17 @@ impl Convert {
         }
         let done = self.source.convert(firmware, input, self.program, self.labels.label()?)?;
         warn_left_out(context, input, &done);
-        write(&output, &done.file.emit())?;
+        if sealing.is_none() {
+            write(&output, &done.file.emit())?;
+        }
         if self.temp {
             let name = output.with_extension("tmp");
             let flash = PathBuf::from(name.file_name().unwrap_or_default());
             write(&flash, &done.file.flash_image())?;
             context.out.say(format_args!("{}: the program as it lies in flash", flash.display()));
+        }
+        if let Some(sealing) = sealing {
+            return self.seal(context, &output, &done.file, &sealing);
         }
         if let (true, Control::Dated { identity, version, .. }) = (of_image, done.file.control()) {
             let Identity { vendor_id, product_code, .. } = identity;
@@ -138,6 +198,45 @@ impl Convert {
             ));
         }
         self.tell(context, &output, &done);
+        Ok(())
+    }
+
+    /// Writes the program sealed and encrypted.
+    fn seal(
+        &self,
+        context: &Context,
+        output: &Path,
+        blocks: &BlockFile,
+        sealing: &Sealing,
+    ) -> Result<(), Failure> {
+        let Labels { vid, pid, ver, date, .. } = self.labels;
+        let program = Program {
+            path: self.input.path(),
+            blocks,
+            identity: (vid, pid),
+            options: ("--vid and --pid", "--vid and --pid"),
+            version: ver,
+        };
+        program.judge()?;
+        let sealer = program.sealer(Sealer {
+            certificate: sealing.certificate,
+            counter: sealing.counter,
+            program: self.program,
+            encrypt_for: &sealing.kek,
+            created: date.unwrap_or(0),
+            ..Sealer::default()
+        })?;
+        let image = program.seal(&sealer, &sealing.key)?;
+        let is_plain = output.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("cbs"));
+        let form = match is_plain {
+            true => Form::Plain,
+            false => Form::Blocks { start: blocks.program_start(), size: self.source.block_size() },
+        };
+        if self.encryption.add.is_some_and(|add| add != 0) {
+            context.out.warn("--add changes nothing: every sealed image has a nonce of its own");
+        }
+        let file = seal::put(output, image, form)?;
+        seal::tell(context, "convert", output, &file, true);
         Ok(())
     }
 

@@ -15,10 +15,10 @@ use super::objects::bytes_of;
 use super::output::Failure;
 use super::values::number;
 
-/// Where a program lies, and how its file is read.
-#[derive(Clone, Debug, Args)]
-pub(super) struct Place {
-    /// The board: takes the program's region from its memory map, and refuses data outside.
+/// The board, by its name or by its file.
+#[derive(Clone, Debug, Default, Args)]
+pub(super) struct MemoryMap {
+    /// The board, whose memory map says what lies where; data outside is refused.
     #[arg(long, value_name = "BOARD", value_parser = board)]
     board: Option<&'static layout::Layout>,
 
@@ -30,6 +30,25 @@ pub(super) struct Place {
     /// What that file says, once it was read.
     #[arg(skip)]
     loaded: OnceLock<&'static layout::Layout>,
+}
+
+impl MemoryMap {
+    /// The memory map, if one was named.
+    pub(super) fn layout(&self) -> Result<Option<&'static layout::Layout>, Failure> {
+        let Some(path) = &self.layout else { return Ok(self.board) };
+        if let Some(layout) = self.loaded.get() {
+            return Ok(Some(layout));
+        }
+        let layout = board_of_file(path)?;
+        Ok(Some(self.loaded.get_or_init(|| layout)))
+    }
+}
+
+/// Where a program lies, and how its file is read.
+#[derive(Clone, Debug, Args)]
+pub(super) struct Place {
+    #[command(flatten)]
+    map: MemoryMap,
 
     /// The first address of the program's region; data before it is left out.
     #[arg(long, alias = "start_address", value_name = "ADDRESS", value_parser = number, conflicts_with_all = ["board", "layout"])]
@@ -114,7 +133,7 @@ impl From<FormatName> for Format {
     }
 }
 
-pub(super) fn board(name: &str) -> Result<&'static layout::Layout, String> {
+fn board(name: &str) -> Result<&'static layout::Layout, String> {
     layout::by_name(name).ok_or_else(|| {
         let known: Vec<&str> = layout::BOARDS.iter().map(|layout| layout.board).collect();
         format!("known boards: {}", known.join(", "))
@@ -145,7 +164,7 @@ impl Source {
         let options = self
             .place
             .options(program)?
-            .block_size(self.block_size as usize)
+            .block_size(self.block_size())
             .gap_fill(GapFill::new(self.gap_fill))
             .label(label)
             .checksum(if self.crc16 { Checksum::Crc16 } else { Checksum::Crc32 })
@@ -158,7 +177,8 @@ impl Source {
     pub(super) fn for_board(&self, name: &str) -> Result<Self, Failure> {
         let layout =
             board(name).map_err(|known| Failure::usage(format!("there is no board '{name}'"), known))?;
-        let place = Place { board: Some(layout), layout: None, ..self.place.clone() };
+        let map = MemoryMap { board: Some(layout), ..MemoryMap::default() };
+        let place = Place { map, ..self.place.clone() };
         Ok(Self { place, ..self.clone() })
     }
 
@@ -168,6 +188,11 @@ impl Source {
         Self { place, ..self.clone() }
     }
 
+    /// Bytes of a block, framing included.
+    pub(super) fn block_size(&self) -> usize {
+        self.block_size as usize
+    }
+
     /// Whether another CRC was asked for than the one that a file has.
     pub(super) fn wants(&self, kept: Checksum) -> bool {
         self.crc16 && kept != Checksum::Crc16
@@ -175,8 +200,9 @@ impl Source {
 
     /// Whether it was said where the program may lie.
     pub(super) fn has_region(&self) -> bool {
-        let Place { board, layout, start_address, end_address, .. } = &self.place;
-        board.is_some() || layout.is_some() || start_address.is_some() || end_address.is_some()
+        let Place { map, start_address, end_address, .. } = &self.place;
+        let has_map = map.board.is_some() || map.layout.is_some();
+        has_map || start_address.is_some() || end_address.is_some()
     }
 }
 
@@ -198,18 +224,17 @@ impl Place {
         Ok(Options::default().region(self.region(program)?).adjust_start(self.adjust_start))
     }
 
-    /// The board, by its name or by its file.
-    fn board(&self) -> Result<Option<&'static layout::Layout>, Failure> {
-        let Some(path) = &self.layout else { return Ok(self.board) };
-        if let Some(layout) = self.loaded.get() {
-            return Ok(Some(layout));
-        }
-        let layout = board_of_file(path)?;
-        Ok(Some(self.loaded.get_or_init(|| layout)))
+    /// Where the program starts, as far as that is said and the firmware is not looked at.
+    pub(super) fn start(&self, program: u8) -> Result<Option<u32>, Failure> {
+        Ok(match self.region(program)? {
+            Region::Unknown | Region::CutBehind(_) => None,
+            Region::Strict(range) => Some(range.first),
+            Region::Cut(range) => Some(range.first.wrapping_add(self.adjust_start)),
+        })
     }
 
     fn region(&self, program: u8) -> Result<Region, Failure> {
-        match (self.board()?, self.start_address, self.end_address) {
+        match (self.map.layout()?, self.start_address, self.end_address) {
             (Some(layout), ..) => match layout.program(program) {
                 Some(region) => Ok(Region::Strict(region.into())),
                 None => {
@@ -229,7 +254,7 @@ impl Place {
 }
 
 /// The memory map in a file.
-pub(super) fn board_of_file(path: &Path) -> Result<&'static layout::Layout, Failure> {
+fn board_of_file(path: &Path) -> Result<&'static layout::Layout, Failure> {
     let bytes = bytes_of(path, file::board::MAX as u64)?;
     let text = String::from_utf8_lossy(&bytes);
     file::board::parse(&text).map_err(|error| Failure::file(path, &error.to_string()))
@@ -261,6 +286,11 @@ impl Input {
     pub(super) fn path(&self) -> &Path {
         &self.file
     }
+}
+
+/// All of a firmware file.
+pub(super) fn bytes(path: &Path) -> Result<Vec<u8>, Failure> {
+    Ok(limit::read(path).map_err(|cause| file::Place::File.fault(cause).of(path.display()))?)
 }
 
 /// Says what was left out, if something was.

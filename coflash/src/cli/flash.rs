@@ -14,7 +14,7 @@ use coflash::file::convert::Label;
 use coflash::file::judge::judge;
 use coflash::file::limit::read_text;
 use coflash::file::sealed::show::flags;
-use coflash::file::sealed::{Refusal, Sealed, SealedFile};
+use coflash::file::sealed::{Refusal, SealedFile};
 use coflash::update::dialect::is_data;
 use coflash::update::job::{self, Entry, Settings};
 use coflash::update::many::{flash_in_turn, flash_many, Job, ManyOptions};
@@ -122,6 +122,10 @@ pub(super) struct Flash {
     /// Compare the program's CRC once more at the very end, as the running program tells it.
     #[arg(long)]
     verify: bool,
+
+    /// Send a sealed image block by block (--block-size), and not with one download.
+    #[arg(long = "blocks")]
+    in_blocks: bool,
 
     /// How often one block is sent again after a CRC error or a broken transfer.
     #[arg(long, value_name = "TIMES", value_parser = number, default_value = "3")]
@@ -252,8 +256,12 @@ impl Flash {
         label: Label,
     ) -> Result<Program, Failure> {
         if is_sealed(path) {
-            let file = SealedFile::parse(verify::read(path)?);
+            let file = SealedFile::parse(verify::read(path)?.image);
             let file = file.map_err(|refusal| Failure::sealed(path, &refusal))?;
+            if self.in_blocks {
+                // Where the program starts the device tells; whether such blocks can be is known now.
+                file.blocks(0, source.block_size()).map_err(|error| Failure::convert(error, path))?;
+            }
             let image = file.head().program();
             if image != program && !self.force {
                 return Err(Failure::sealed(path, &Refusal::Program { image, device: program }));
@@ -298,6 +306,7 @@ impl Flash {
             .wait(self.wait)
             .alone(!self.not_alone)
             .mastership(!self.no_mastership)
+            .blocks(self.in_blocks.then(|| self.source.block_size()))
             .force(self.force))
     }
 
@@ -432,9 +441,7 @@ fn brief(file: &SealedFile) -> String {
     let head = file.head();
     let names: Vec<&str> = flags(head.flags()).collect();
     let kind = if names.is_empty() { String::new() } else { format!(" ({})", names.join(", ")) };
-    let keys: Vec<String> = Sealed::parse(file.bytes())
-        .map(|sealed| sealed.signers().into_iter().map(|id| format!("{id:08X}h")).collect())
-        .unwrap_or_default();
+    let keys: Vec<String> = file.parts().signers().into_iter().map(|id| format!("{id:08X}h")).collect();
     format!(
         "sealed program of {} bytes{kind}, CRC {:08X}h, version {}, counter {}, signed by {}",
         head.size(),

@@ -41,6 +41,7 @@ const GROUPS: [(&str, &[&str]); 5] = [
             "wait",
             "not_alone",
             "no_mastership",
+            "in_blocks",
             "block_repeats",
         ],
     ),
@@ -61,7 +62,7 @@ const GROUPS: [(&str, &[&str]); 5] = [
 ];
 
 /// Options for special cases: `--help` has them, `-h` does not.
-const RARE: [&str; 37] = [
+const RARE: [&str; 38] = [
     "trace",
     "log_file",
     "report_dir",
@@ -82,6 +83,7 @@ const RARE: [&str; 37] = [
     "no_label",
     "not_alone",
     "no_mastership",
+    "in_blocks",
     "block_repeats",
     "search",
     "sdo_attempts",
@@ -105,7 +107,7 @@ const RARE: [&str; 37] = [
 const LEGACY: [&str; 4] = ["serial", "revision", "product", "vendor"];
 
 /// What people type, by command; the empty name is the program.
-const EXAMPLES: [(&str, &str); 32] = [
+const EXAMPLES: [(&str, &str); 33] = [
     (
         "",
         "\
@@ -132,7 +134,8 @@ Examples:
         "\
 Examples:
   coflash convert app.elf --board stm32f407g-disc1
-  coflash convert app.hex app.blk --vid 0x3F --pid 1234 --ver 0x00000001",
+  coflash convert app.hex app.blk --vid 0x3F --pid 1234 --ver 0x00000001
+  coflash convert app.elf --key cf7a7fe196f64c6b8f19e58361d2397e --sign release.pem --cert release.cert --counter 7",
     ),
     (
         "inspect",
@@ -155,7 +158,8 @@ Examples:
         "\
 Examples:
   coflash seal app.elf --board stm32f407g-disc1 --key release.pem --cert release.cert --counter 1
-  coflash seal app.elf --key release.pem --cert release.cert --counter 1 --compress --encrypt kek.pem",
+  coflash seal app.elf --key release.pem --cert release.cert --counter 1 --compress --encrypt kek.pem
+  coflash seal app.elf --board stm32f407g-disc1 --key release.pem --cert release.cert --counter 1 --blocks",
     ),
     (
         "verify",
@@ -163,6 +167,12 @@ Examples:
 Examples:
   coflash verify app.cbs --root root.pub
   coflash verify app.cbs --root root.pub --kek kek.pem --product 1234 --counter 7",
+    ),
+    (
+        "verify-device",
+        "\
+Examples:
+  coflash verify-device app.cbs --root root.pub --node 5",
     ),
     (
         "show",

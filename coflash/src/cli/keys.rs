@@ -117,8 +117,40 @@ struct Show {
     file: PathBuf,
 }
 
+/// What a sealed device has in its key block.
+#[derive(Debug, Args)]
+pub(super) struct KeyBlock {
+    /// The public key of a root that the device knows; once for each.
+    #[arg(long, value_name = "FILE", required = true)]
+    root: Vec<PathBuf>,
+
+    /// A key-encryption key of the device, which opens encrypted images; once for each.
+    #[arg(long, value_name = "FILE")]
+    kek: Vec<PathBuf>,
+
+    /// The lowest security counter that the device takes, of every program.
+    #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0")]
+    pub(super) counter: u32,
+
+    /// The lowest epoch of a certificate that it takes.
+    #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0")]
+    pub(super) epoch: u32,
+
+    /// The device is marked for tests: it takes programs that are signed with test keys, too.
+    #[arg(long)]
+    pub(super) for_tests: bool,
+}
+
+impl KeyBlock {
+    /// The keys in the files that are named: roots and key-encryption keys.
+    pub(super) fn keys(&self) -> Result<(Vec<PublicKey>, Vec<Kek>), Failure> {
+        let roots = self.root.iter().map(|path| public_key(path)).collect::<Result<_, Failure>>()?;
+        Ok((roots, keks(&self.kek)?))
+    }
+}
+
 /// 16 bytes in hexadecimal digits. The words of a fault do not repeat the value, which is secret.
-fn value_of_128_bits(text: &str) -> Result<[u8; 16], String> {
+pub(super) fn value_of_128_bits(text: &str) -> Result<[u8; 16], String> {
     let digits = text.strip_prefix("0x").unwrap_or(text);
     let bytes = hexadecimal(digits).and_then(|bytes| bytes.try_into().ok());
     bytes.ok_or_else(|| "it must have 32 hexadecimal digits".to_string())
@@ -282,11 +314,6 @@ pub(super) fn public_key(path: &Path) -> Result<PublicKey, Failure> {
         Ok(key) => Ok(key.public()),
         Err(_) => PublicKey::from_pem(&text).map_err(|fault| Failure::file(path, &fault.to_string())),
     }
-}
-
-/// The public keys in files.
-pub(super) fn public_keys(paths: &[PathBuf]) -> Result<Vec<PublicKey>, Failure> {
-    paths.iter().map(|path| public_key(path)).collect()
 }
 
 /// The key-encryption keys in files.

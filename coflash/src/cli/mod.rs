@@ -51,6 +51,7 @@ mod ui;
 mod units;
 mod values;
 mod verify;
+mod verify_device;
 mod waiting;
 mod words;
 mod write;
@@ -114,6 +115,7 @@ enum Command {
     Key(keys::Key),
     Seal(Box<seal::Seal>),
     Verify(Box<verify::Verify>),
+    VerifyDevice(verify_device::VerifyDevice),
     Show(verify::Show),
     Provision(provision::Provision),
     Flash(Box<flash::Flash>),
@@ -171,6 +173,7 @@ impl Command {
             Self::Key(key) => key.run(context),
             Self::Seal(seal) => seal.run(context),
             Self::Verify(verify) => verify.run(context),
+            Self::VerifyDevice(verify) => verify.run(context),
             Self::Show(show) => show.run(context),
             Self::Provision(provision) => provision.run(context),
             Self::Flash(flash) => flash.run(context),

@@ -227,7 +227,7 @@ Exit codes:
   0    done
   1    the result cannot be written, or the system refuses something else
   2    wrong usage
-  3    the firmware file is bad, or does not fit the board; no device was touched
+  3    the firmware file is bad, or does not fit the board or the device; nothing was changed
   4    the CAN adapter cannot be opened, or is gone
   5    the device does not answer
   6    the device refuses, or reports an error
@@ -313,6 +313,18 @@ impl Failure {
     pub(super) fn told(exit: Exit, legacy: u32, failed: usize, of: usize) -> Self {
         let what = format!("{failed} of {of} devices failed");
         Self { told: true, legacy, ..Self::new(exit, None, what, None) }
+    }
+
+    /// A device that differs from a file in so many things, each of which was told.
+    pub(super) fn differs(node: NodeId, count: usize) -> Self {
+        let what = match count {
+            1 => format!("node {node} differs from the file in one thing"),
+            count => format!("node {node} differs from the file in {count} things"),
+        };
+        let advice =
+            "flash the file, or look for the one that the device was made with; coflash events tells \
+                      what was installed";
+        Self { told: true, ..Self::new(Exit::File, None, what, Some(advice.to_string())) }
     }
 
     /// Objects of several that the device refused, each of which was told; it ends as the first of

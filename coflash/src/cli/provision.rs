@@ -8,18 +8,17 @@ use coflash::file::read::{self, Firmware, Format};
 use coflash::file::sealed::provision::provision;
 use coflash::file::sealed::{key_block, Kek, PublicKey};
 use serde_json::json;
-use shared_abi::layout::Layout;
 
 use super::context::Context;
-use super::file::{board, board_of_file, Input};
-use super::keys::{self, write_secret};
+use super::file::{Input, MemoryMap};
+use super::keys::{write_secret, KeyBlock};
 use super::output::Failure;
-use super::values::number;
 
 /// Puts keys into a bootloader, which makes devices that take sealed programs alone.
 ///
-/// The result is written in production, by a debug probe. Key-encryption keys in it make it as secret
-/// as they are; it is readable for its owner alone.
+/// There is room for two roots and three key-encryption keys. The result is written in production, by a
+/// debug probe. Key-encryption keys in it make it as secret as they are; it is readable for its owner
+/// alone.
 #[derive(Debug, Args)]
 pub(super) struct Provision {
     #[command(flatten)]
@@ -29,34 +28,11 @@ pub(super) struct Provision {
     #[arg(long, short, value_name = "OUT")]
     output: Option<PathBuf>,
 
-    /// The board, whose memory map says where the keys go.
-    #[arg(long, value_name = "BOARD", value_parser = board, required_unless_present = "layout")]
-    board: Option<&'static Layout>,
+    #[command(flatten)]
+    map: MemoryMap,
 
-    /// The same for a board that this tool was not built with: its memory map, as `cargo xtask
-    /// layout --toml` writes it.
-    #[arg(long, value_name = "FILE", conflicts_with = "board")]
-    layout: Option<PathBuf>,
-
-    /// The public key of a root; one or two of them.
-    #[arg(long, value_name = "FILE", required = true)]
-    root: Vec<PathBuf>,
-
-    /// A key-encryption key; up to three of them.
-    #[arg(long, value_name = "FILE")]
-    kek: Vec<PathBuf>,
-
-    /// The lowest security counter that the device takes, of every program.
-    #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0")]
-    counter: u32,
-
-    /// The lowest epoch of a certificate that it takes.
-    #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0")]
-    epoch: u32,
-
-    /// Mark the device for tests: it takes programs that are signed with test keys, too.
-    #[arg(long)]
-    for_tests: bool,
+    #[command(flatten)]
+    keys: KeyBlock,
 
     /// Replace a file that is there already.
     #[arg(long = "force")]
@@ -66,11 +42,8 @@ pub(super) struct Provision {
 impl Provision {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = self.input.path();
-        let layout = match (&self.layout, self.board) {
-            (Some(file), _) => board_of_file(file)?,
-            (None, Some(board)) => board,
-            (None, None) => return Err(Failure::usage("no board is named", "give --board or --layout")),
-        };
+        let unnamed = || Failure::usage("it is not said where the keys go", "give --board or --layout");
+        let layout = self.map.layout()?.ok_or_else(unnamed)?;
         let output = self.output.clone().unwrap_or_else(|| path.with_extension("hex"));
         let extension = output.extension().map(|extension| extension.to_ascii_lowercase());
         let binary = match extension.as_ref().and_then(|extension| extension.to_str()) {
@@ -85,14 +58,15 @@ impl Provision {
             let what = format!("{} would be overwritten", output.display());
             return Err(Failure::usage(what, "name another file for the result: --output"));
         }
-        let bytes = super::verify::read(path)?;
+        let bytes = super::file::bytes(path)?;
         let format = Format::detect(&bytes).or(Some(Format::Raw));
         let firmware = read::read(&bytes, format, Some(layout.bootloader.base));
         let Firmware::Image(image) = firmware.map_err(|error| error.of(path.display()))? else {
             return Err(Failure::file(path, "is a block file, and no bootloader: give the linker's output"));
         };
-        let (roots, keks) = (keys::public_keys(&self.root)?, keys::keks(&self.kek)?);
-        let block = key_block(&roots, &keks, self.counter, self.epoch, self.for_tests)
+        let (roots, keks) = self.keys.keys()?;
+        let KeyBlock { counter, epoch, for_tests, .. } = self.keys;
+        let block = key_block(&roots, &keks, counter, epoch, for_tests)
             .map_err(|fault| Failure::usage(fault.to_string(), "see coflash provision --help"))?;
         let made =
             provision(&image, layout, &block).map_err(|fault| Failure::file(path, &fault.to_string()))?;
@@ -119,15 +93,13 @@ impl Provision {
         };
         let words = format!(
             "{}: {} with keys at {:#010x}\n  roots                {}\n  key-encryption keys  {}\n  \
-             counter {}, epoch {}{}",
+             counter {counter}, epoch {epoch}{}",
             output.display(),
             layout.board,
             layout.key_block().base,
             ids(&root_ids),
             ids(&kek_ids),
-            self.counter,
-            self.epoch,
-            if self.for_tests { ", for tests" } else { "" },
+            if for_tests { ", for tests" } else { "" },
         );
         context.out.result(words, || {
             json!({
@@ -137,9 +109,9 @@ impl Provision {
                 "address": layout.key_block().base,
                 "roots": root_ids,
                 "keks": kek_ids,
-                "counter": self.counter,
-                "epoch": self.epoch,
-                "for_tests": self.for_tests,
+                "counter": counter,
+                "epoch": epoch,
+                "for_tests": for_tests,
             })
         });
         Ok(())

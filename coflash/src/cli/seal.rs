@@ -4,13 +4,13 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use coflash::file::block_file::BlockFile;
-use coflash::file::convert::blocks_of;
+use coflash::file::convert::{blocks_of, DEFAULT_BLOCK_SIZE};
 use coflash::file::judge::judge;
 use coflash::file::label::label_of;
 use coflash::file::limit;
 use coflash::file::sealed::sealer::CHUNK;
-use coflash::file::sealed::{hash, Sealed, Sealer, Unsigned};
-use seal::wire::{MAX_CHUNK, MIN_CHUNK};
+use coflash::file::sealed::{hash, SealFault, SealedFile, Sealer, SigningKey, Unsigned};
+use seal::wire::{flag, MAX_CHUNK, MIN_CHUNK};
 use shared_abi::block_file::ProgramVersion;
 
 use super::context::Context;
@@ -32,7 +32,7 @@ pub(super) struct Seal {
     #[command(flatten)]
     input: Input,
 
-    /// The sealed image to write; otherwise the firmware's name with .cbs.
+    /// The sealed image to write; otherwise the firmware's name with .cbs, or with .blk for --blocks.
     #[arg(long, short, value_name = "OUT")]
     output: Option<PathBuf>,
 
@@ -92,6 +92,11 @@ pub(super) struct Seal {
     #[arg(long, value_name = "REVISION", value_parser = number)]
     hardware: Vec<u32>,
 
+    /// Write a block file that carries the sealed image, for masters that know nothing else; its blocks
+    /// have at most so many bytes, framing included.
+    #[arg(long, value_name = "BYTES", value_parser = number, num_args = 0..=1, default_missing_value = "0x400", conflicts_with = "tbs")]
+    blocks: Option<u32>,
+
     /// Payload of a chunk: a power of two from 512 to 8192. A device has to have room for one.
     #[arg(long, value_name = "BYTES", value_parser = chunk, default_value = "4096")]
     chunk: u8,
@@ -129,7 +134,7 @@ pub(super) struct Seal {
     force: bool,
 }
 
-const _: () = assert!(CHUNK == 12, "the help text says so");
+const _: () = assert!(CHUNK == 12 && DEFAULT_BLOCK_SIZE == 0x400, "the help text says so");
 
 /// A power of two, as its logarithm.
 fn chunk(text: &str) -> Result<u8, String> {
@@ -140,10 +145,102 @@ fn chunk(text: &str) -> Result<u8, String> {
     }
 }
 
-/// A program as it lies in flash.
-struct Flash {
-    bytes: Vec<u8>,
-    blocks: BlockFile,
+/// A program that is to be sealed, and what the command line says of it.
+pub(super) struct Program<'p> {
+    /// Its file.
+    pub(super) path: &'p Path,
+    /// What is in it.
+    pub(super) blocks: &'p BlockFile,
+    /// Vendor-ID and product code; otherwise those of its label.
+    pub(super) identity: (Option<u32>, Option<u32>),
+    /// The options that give them.
+    pub(super) options: (&'static str, &'static str),
+    /// Its version; otherwise that of its label.
+    pub(super) version: Option<u32>,
+}
+
+impl Program<'_> {
+    /// Refuses what can be no program, as `flash` does.
+    pub(super) fn judge(&self) -> Result<(), Failure> {
+        let (image, start) = (self.blocks.image(), self.blocks.program_start());
+        judge(&image, start).map_err(|fault| Failure::no_program(self.path, fault))
+    }
+
+    /// Seals it with this identity and version, and with the rest as `sealer` has it.
+    pub(super) fn sealer<'s>(&self, sealer: Sealer<'s>) -> Result<Sealer<'s>, Failure> {
+        let label = label_of(&self.blocks.image(), self.blocks.program_start());
+        let unnamed = |what: &str, option: &str| {
+            let what = format!("{}: the program does not say for which {what} it is", self.path.display());
+            Failure::usage(what, format!("give {option}"))
+        };
+        let vendor_id = self.identity.0.or(label.map(|label| label.vendor_id));
+        let product_code = self.identity.1.or(label.map(|label| label.product_code));
+        Ok(Sealer {
+            vendor_id: vendor_id.ok_or_else(|| unnamed("vendor-ID", self.options.0))?,
+            product_code: product_code.ok_or_else(|| unnamed("product code", self.options.1))?,
+            version: self.version.or(label.map(|label| label.version)).unwrap_or(0),
+            ..sealer
+        })
+    }
+
+    /// The program as it lies in flash, sealed with this key.
+    pub(super) fn seal(&self, sealer: &Sealer<'_>, key: &SigningKey) -> Result<Vec<u8>, Failure> {
+        sealer.seal(&self.blocks.flash_image(), key).map_err(|fault| self.fault(&fault))
+    }
+
+    fn fault(&self, fault: &SealFault) -> Failure {
+        Failure::file(self.path, &fault.to_string())
+    }
+}
+
+/// What a sealed image is written as.
+#[derive(Clone, Copy)]
+pub(super) enum Form {
+    /// As it is.
+    Plain,
+    /// In blocks of at most `size` bytes, for a program that starts at `start`.
+    Blocks { start: u32, size: usize },
+}
+
+/// Writes a sealed image, and gives it back; its signature may be missing.
+pub(super) fn put(output: &Path, image: Vec<u8>, form: Form) -> Result<SealedFile, Failure> {
+    let file = SealedFile::parse(image).map_err(|refusal| Failure::sealed(output, &refusal))?;
+    match form {
+        Form::Plain => write(output, file.bytes())?,
+        Form::Blocks { start, size } => {
+            let blocks = file.blocks(start, size).map_err(|error| Failure::convert(error, output))?;
+            write(output, &blocks.emit())?;
+        }
+    }
+    Ok(file)
+}
+
+/// Tells what was written.
+pub(super) fn tell(context: &Context, command: &str, output: &Path, file: &SealedFile, signed: bool) {
+    let head = file.head();
+    let (size, payload) = (head.size(), head.payload());
+    let mut words = format!(
+        "{}: program {} {}, counter {}, {size} bytes, CRC {:08X}h",
+        output.display(),
+        head.program(),
+        ProgramVersion(head.version()),
+        head.counter(),
+        head.crc()
+    );
+    if head.flags() & flag::COMPRESSED != 0 {
+        let percent = u64::from(payload) * 100 / u64::from(size.max(1));
+        words += &format!(", compressed to {payload} bytes ({percent} %)");
+    }
+    if !signed {
+        words += "; its signature is missing: --attach completes it";
+    }
+    context.out.result(words, || {
+        let mut value = value(file);
+        value["command"] = command.into();
+        value["output"] = output.display().to_string().into();
+        value["signed"] = signed.into();
+        value
+    });
 }
 
 impl Seal {
@@ -152,29 +249,33 @@ impl Seal {
         if let Some(signature) = &self.attach {
             return self.complete(context, path, signature);
         }
-        let output = self.output.clone().unwrap_or_else(|| path.with_extension("cbs"));
+        let extension = if self.blocks.is_some() { "blk" } else { "cbs" };
+        let output = self.output.clone().unwrap_or_else(|| path.with_extension(extension));
         if output == path || self.tbs.as_ref() == Some(&output) {
             let what = format!("{} would be overwritten", output.display());
             return Err(Failure::usage(what, "name another file for the result: --output"));
         }
-        let flash = self.flash(context, path)?;
-        let label = label_of(&flash.blocks.image(), flash.blocks.program_start());
-        let unnamed = |what: &str, option: &str| {
-            let what = format!("{}: the program does not say for which {what} it is", path.display());
-            Failure::usage(what, format!("give {option}"))
+        let (firmware, _) = self.place.load(path, self.program)?;
+        let done = blocks_of(firmware, &self.place.options(self.program)?);
+        let done = done.map_err(|error| Failure::convert(error, path))?;
+        super::file::warn_left_out(context, path, &done);
+        let program = Program {
+            path,
+            blocks: &done.file,
+            identity: (self.vendor, self.product),
+            options: ("--vendor", "--product"),
+            version: self.ver,
         };
-        let vendor_id = self.vendor.or(label.map(|label| label.vendor_id));
-        let product_code = self.product.or(label.map(|label| label.product_code));
+        if !self.data && !self.force {
+            program.judge()?;
+        }
         let encrypt_for = keys::keks(&self.encrypt)?;
         let base = self.base.as_deref().map(base).transpose()?;
         let sbom = self.sbom.as_deref().map(limit::read).transpose();
         let sbom =
             sbom.map_err(|cause| Failure::file(self.sbom.as_deref().unwrap_or(path), &cause.to_string()))?;
-        let sealer = Sealer {
+        let sealer = program.sealer(Sealer {
             certificate: self.cert.as_deref().map(keys::certificate).transpose()?,
-            vendor_id: vendor_id.ok_or_else(|| unnamed("vendor-ID", "--vendor"))?,
-            product_code: product_code.ok_or_else(|| unnamed("product code", "--product"))?,
-            version: self.ver.or(label.map(|label| label.version)).unwrap_or(0),
             // clap wants it wherever it comes to this.
             counter: self.counter.unwrap_or(0),
             program: self.program,
@@ -190,76 +291,53 @@ impl Seal {
             test: self.test,
             text: self.text.as_deref(),
             sbom: sbom.as_deref().map(hash),
-            source: None,
-        };
-        let failed = |fault: coflash::file::sealed::SealFault| Failure::file(path, &fault.to_string());
-        let file = match &self.tbs {
-            None => sealer.seal(&flash.bytes, &keys::signing_key(&self.key)?).map_err(failed)?,
+            ..Sealer::default()
+        })?;
+        let image = match &self.tbs {
+            None => program.seal(&sealer, &keys::signing_key(&self.key)?)?,
             Some(tbs) => {
                 let key = keys::public_key(&self.key)?;
-                let unsigned = sealer.for_module(&flash.bytes, key).map_err(failed)?;
+                let unsigned = sealer.for_module(&program.blocks.flash_image(), key);
+                let unsigned = unsigned.map_err(|fault| program.fault(&fault))?;
                 write(tbs, &unsigned.tbs())?;
                 unsigned.file().to_vec()
             }
         };
-        write(&output, &file)?;
-        self.tell(context, &output, &file)
+        let file = put(&output, image, self.form(|| Ok(program.blocks.program_start()))?)?;
+        tell(context, "seal", &output, &file, self.tbs.is_none());
+        Ok(())
+    }
+
+    /// What the result is written as, if the program starts there.
+    fn form(&self, start: impl FnOnce() -> Result<u32, Failure>) -> Result<Form, Failure> {
+        Ok(match self.blocks {
+            None => Form::Plain,
+            Some(size) => Form::Blocks { start: start()?, size: size as usize },
+        })
     }
 
     /// The second of two steps.
     fn complete(&self, context: &Context, path: &Path, signature: &Path) -> Result<(), Failure> {
-        let output = self.output.clone().unwrap_or_else(|| path.to_path_buf());
+        let output = self.output.clone().unwrap_or_else(|| match self.blocks {
+            None => path.to_path_buf(),
+            Some(_) => path.with_extension("blk"),
+        });
+        let form = self.form(|| {
+            let unknown = || {
+                let what = "a sealed image does not say where its program starts, and blocks do";
+                Failure::usage(what, "give --board, --layout or --start-address")
+            };
+            self.place.start(self.program)?.ok_or_else(unknown)
+        })?;
         let file = limit::read(path).map_err(|cause| Failure::file(path, &cause.to_string()))?;
         let key = keys::public_key(&self.key)?;
         let why = "is no signature: it must have 64 bytes, as openssl pkeyutl -sign -rawin writes them";
         let bytes: Option<[u8; 64]> = bytes_of(signature, 1024)?.try_into().ok();
         let bytes = bytes.ok_or_else(|| Failure::file(signature, why))?;
-        let file = Unsigned::of_file(file, key).and_then(|unsigned| unsigned.attach(&bytes));
-        let file = file.map_err(|fault| Failure::file(path, &fault.to_string()))?;
-        write(&output, &file)?;
-        self.tell(context, &output, &file)
-    }
-
-    /// The program, judged as `flash` judges one.
-    fn flash(&self, context: &Context, path: &Path) -> Result<Flash, Failure> {
-        let (firmware, _) = self.place.load(path, self.program)?;
-        let done = blocks_of(firmware, &self.place.options(self.program)?);
-        let done = done.map_err(|error| Failure::convert(error, path))?;
-        super::file::warn_left_out(context, path, &done);
-        let blocks = done.file;
-        if !self.data && !self.force {
-            judge(&blocks.image(), blocks.program_start())
-                .map_err(|fault| Failure::no_program(path, fault))?;
-        }
-        Ok(Flash { bytes: blocks.flash_image(), blocks })
-    }
-
-    fn tell(&self, context: &Context, output: &Path, file: &[u8]) -> Result<(), Failure> {
-        let sealed = Sealed::parse(file).map_err(|refusal| Failure::sealed(output, &refusal))?;
-        let head = sealed.head;
-        let (size, payload) = (head.size(), head.payload());
-        let mut words = format!(
-            "{}: program {} {}, counter {}, {size} bytes, CRC {:08X}h",
-            output.display(),
-            head.program(),
-            ProgramVersion(head.version()),
-            head.counter(),
-            head.crc()
-        );
-        if self.compress || self.base.is_some() {
-            let percent = u64::from(payload) * 100 / u64::from(size.max(1));
-            words += &format!(", compressed to {payload} bytes ({percent} %)");
-        }
-        if self.tbs.is_some() {
-            words += "; its signature is missing: --attach completes it";
-        }
-        context.out.result(words, || {
-            let mut value = value(&sealed);
-            value["command"] = "seal".into();
-            value["output"] = output.display().to_string().into();
-            value["signed"] = self.tbs.is_none().into();
-            value
-        });
+        let image = Unsigned::of_file(file, key).and_then(|unsigned| unsigned.attach(&bytes));
+        let image = image.map_err(|fault| Failure::file(path, &fault.to_string()))?;
+        let file = put(&output, image, form)?;
+        tell(context, "seal", &output, &file, true);
         Ok(())
     }
 }

@@ -3,43 +3,28 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use coflash::file::limit;
 use coflash::file::sealed::open::Closed;
 use coflash::file::sealed::show::{digits, flags, text};
-use coflash::file::sealed::{verify, Device, Sealed};
+use coflash::file::sealed::{blocks, carried, verify, Carried, Device, Opened, SealedFile};
 use seal::wire::tag;
 use serde_json::{json, Value};
 use shared_abi::block_file::ProgramVersion;
 
 use super::context::Context;
-use super::file::base;
-use super::keys;
+use super::file::{base, bytes};
+use super::keys::{self, KeyBlock};
 use super::output::Failure;
 use super::values::{number, program_number, unique_id};
 
 /// Checks a sealed image as a device does, and says which rule it breaks.
 ///
 /// That is all of it: the form, the device that it is for, counter and epoch, the certificate, the
-/// signature, every chunk, and the program itself, which takes a key if it is encrypted. What is not
-/// told about the device is taken as the image wants it.
+/// signature, every chunk, and the program itself. What is not told about the device is taken as the
+/// image wants it. Without --kek the program in an encrypted image is not looked at.
 #[derive(Debug, Args)]
 pub(super) struct Verify {
-    /// The sealed image.
-    #[arg(value_name = "FILE")]
-    file: PathBuf,
-
-    /// A root's public key, as the device knows it; once for each.
-    #[arg(long, value_name = "FILE", required = true)]
-    root: Vec<PathBuf>,
-
-    /// A key-encryption key of the device; without one the program in an encrypted image is not
-    /// looked at.
-    #[arg(long, value_name = "FILE")]
-    kek: Vec<PathBuf>,
-
-    /// The other program of the device, for an image that was compressed against it.
-    #[arg(long, value_name = "FILE")]
-    base: Option<PathBuf>,
+    #[command(flatten)]
+    checked: Checked,
 
     /// The device's vendor-ID (1018h/1).
     #[arg(long, alias = "vid", value_name = "NUMBER", value_parser = number)]
@@ -64,51 +49,60 @@ pub(super) struct Verify {
     /// Bytes of the program's flash.
     #[arg(long, value_name = "BYTES", value_parser = number)]
     room: Option<u32>,
+}
 
-    /// The lowest security counter that the device takes.
-    #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0")]
-    counter: u32,
+/// A sealed image, and the keys to check it with.
+#[derive(Debug, Args)]
+pub(super) struct Checked {
+    /// The sealed image, or the block file that carries one.
+    #[arg(value_name = "FILE")]
+    pub(super) file: PathBuf,
 
-    /// The lowest epoch that it takes.
-    #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0")]
-    epoch: u32,
+    #[command(flatten)]
+    keys: KeyBlock,
 
-    /// The device is marked for tests.
-    #[arg(long)]
-    for_tests: bool,
+    /// The other program of the device, for an image that was compressed against it.
+    #[arg(long, value_name = "FILE")]
+    base: Option<PathBuf>,
 }
 
 /// Shows what a sealed image says of itself. Nothing is checked but its form.
 #[derive(Debug, Args)]
 pub(super) struct Show {
-    /// The sealed image.
+    /// The sealed image, or the block file that carries one.
     #[arg(value_name = "FILE")]
     file: PathBuf,
 }
 
+impl Checked {
+    /// Checks the image for a device with these keys, of which `device` tells the rest; gives the file
+    /// and what became of it.
+    pub(super) fn check(&self, device: &Device<'_>) -> Result<(SealedFile, Opened), Failure> {
+        let path = &self.file;
+        let refused = |refusal| Failure::sealed(path, &refusal);
+        let bytes = read(path)?.image;
+        let (roots, keks) = self.keys.keys()?;
+        let KeyBlock { counter, epoch, for_tests, .. } = self.keys;
+        let base = self.base.as_deref().map(base).transpose()?;
+        let keys = Device { roots: &roots, keks: &keks, base: base.as_deref(), ..*device };
+        let opened = verify(&bytes, &Device { counter, epoch, for_tests, ..keys }).map_err(refused)?;
+        Ok((SealedFile::parse(bytes).map_err(refused)?, opened))
+    }
+}
+
 impl Verify {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        let path = &self.file;
-        let bytes = read(path)?;
-        let (roots, keks) = (keys::public_keys(&self.root)?, keys::keks(&self.kek)?);
-        let base = self.base.as_deref().map(base).transpose()?;
-        let device = Device {
-            roots: &roots,
-            keks: &keks,
-            base: base.as_deref(),
+        let path = &self.checked.file;
+        let (file, opened) = self.checked.check(&Device {
             vendor_id: self.vendor,
             product_code: self.product,
             revision: self.hardware,
             unique_id: self.device,
             program: self.program,
             room: self.room,
-            counter: self.counter,
-            epoch: self.epoch,
-            for_tests: self.for_tests,
-        };
-        let opened = verify(&bytes, &device).map_err(|refusal| Failure::sealed(path, &refusal))?;
-        let sealed = Sealed::parse(&bytes).map_err(|refusal| Failure::sealed(path, &refusal))?;
-        let head = sealed.head;
+            ..Device::default()
+        })?;
+        let head = file.head();
         let (key, root) = (opened.signed_by.id(), opened.root.id());
         let image = match opened.closed {
             None => format!("the program is whole, {} bytes, CRC {:08X}h", head.size(), head.crc()),
@@ -134,7 +128,7 @@ impl Verify {
             opened.epoch,
         );
         context.out.result(words, || {
-            let mut value = value(&sealed);
+            let mut value = value(&file);
             value["command"] = "verify".into();
             value["signed_by"] = key.into();
             value["root"] = root.into();
@@ -154,33 +148,44 @@ impl Show {
 
 /// Shows a sealed image, for the command of this name.
 pub(super) fn show(context: &Context, command: &str, path: &Path) -> Result<(), Failure> {
-    let bytes = read(path)?;
-    let sealed = Sealed::parse(&bytes).map_err(|refusal| Failure::sealed(path, &refusal))?;
-    context.out.result(format_args!("{}: {sealed}", path.display()), || {
-        let mut value = value(&sealed);
+    let Carried { image, blocks } = read(path)?;
+    let file = SealedFile::parse(image).map_err(|refusal| Failure::sealed(path, &refusal))?;
+    let carrier = blocks.as_ref().map_or_else(String::new, |blocks| {
+        let (count, start) = (blocks.blocks().len(), blocks.program_start());
+        format!("block file, {count} blocks, from {start:#010x} on; in it: ")
+    });
+    context.out.result(format_args!("{}: {carrier}{}", path.display(), file.parts()), || {
+        let mut value = value(&file);
         value["command"] = command.into();
+        value["blocks"] = json!(blocks.as_ref().map(|blocks| json!({
+            "count": blocks.blocks().len(),
+            "start": blocks.program_start(),
+            "size": blocks.program_size(),
+            "crc": blocks.program_crc(),
+        })));
         value
     });
     Ok(())
 }
 
-/// Whether the file begins as a sealed image; what cannot be read does not.
+/// Whether the file begins as a sealed image, or as a block file that carries one; what cannot be read
+/// does not.
 pub(super) fn is_sealed(path: &Path) -> bool {
     use std::io::Read as _;
     let is_file = std::fs::metadata(path).is_ok_and(|told| told.is_file());
-    let mut start = [0; 4];
-    is_file
-        && std::fs::File::open(path).is_ok_and(|mut file| file.read_exact(&mut start).is_ok())
-        && Sealed::looks_like(&start)
+    let mut front = Vec::new();
+    let mut read = |file: std::fs::File| file.take(blocks::FRONT as u64).read_to_end(&mut front);
+    is_file && std::fs::File::open(path).and_then(&mut read).is_ok() && blocks::looks_like(&front)
 }
 
-/// Reads a sealed image.
-pub(super) fn read(path: &Path) -> Result<Vec<u8>, Failure> {
-    Ok(limit::read(path).map_err(|cause| coflash::file::Place::File.fault(cause).of(path.display()))?)
+/// Reads a sealed image, out of the blocks of a block file if it is in some.
+pub(super) fn read(path: &Path) -> Result<Carried, Failure> {
+    Ok(carried(bytes(path)?).map_err(|fault| fault.of(path.display()))?)
 }
 
 /// A sealed image for programs.
-pub(super) fn value(sealed: &Sealed<'_>) -> Value {
+pub(super) fn value(file: &SealedFile) -> Value {
+    let sealed = file.parts();
     let head = sealed.head;
     let record = |wanted: u16| head.records().find(|(tag, _)| *tag == wanted).map(|(_, bytes)| bytes);
     json!({

@@ -16,6 +16,11 @@ const VERDICT: Duration = Duration::from_secs(2);
 /// How often it is asked meanwhile.
 const PERIOD: Duration = Duration::from_millis(50);
 
+/// The rights in the last word of 2002h/1.
+const RIGHTS: u32 = 0xFFFF;
+/// In the same word: the device is sealed, it has a key block.
+const SEALED: u32 = 1 << 31;
+
 /// What a device wants to be signed together with a request (2002h/1).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Challenge([u8; CHALLENGE]);
@@ -30,7 +35,13 @@ impl Challenge {
     /// The rights that are granted until the next reset (`seal::access::right`).
     #[must_use]
     pub fn granted(&self) -> u32 {
-        word(&self.0, SIGNED_CHALLENGE)
+        word(&self.0, SIGNED_CHALLENGE) & RIGHTS
+    }
+
+    /// Whether the device is sealed: it has keys, and takes sealed images alone.
+    #[must_use]
+    pub fn is_sealed(&self) -> bool {
+        word(&self.0, SIGNED_CHALLENGE) & SEALED != 0
     }
 
     /// What the holder of the root key signs: rights, their argument and the id of the key.
@@ -53,6 +64,18 @@ fn request(rights: u32, argument: u32, key_id: u32) -> impl Iterator<Item = u8> 
 pub fn challenge(session: &mut Session<'_>) -> Result<Challenge, Error> {
     let bytes = session.read(Address::new(ACCESS, 1))?;
     Ok(Challenge(array(&bytes, 0)))
+}
+
+/// The same, of a device that may have no such object: `None` then, and where what it tells is none.
+///
+/// # Errors
+/// As [`challenge`], but for a refusal.
+pub fn told_challenge(session: &mut Session<'_>) -> Result<Option<Challenge>, Error> {
+    match session.read(Address::new(ACCESS, 1)) {
+        Ok(bytes) => Ok(bytes.try_into().ok().map(Challenge)),
+        Err(Error::Refused { .. }) => Ok(None),
+        Err(error) => Err(error),
+    }
 }
 
 /// Asks for rights with the signature of a root over [`Challenge::tbs`]; whether all are granted.

@@ -7,7 +7,7 @@ use std::path::Path;
 use super::block_file::BlockFile;
 use super::fault::{Cause, FileError, Place, ReadError};
 use super::image::Image;
-use super::sealed::Sealed;
+use super::sealed::{blocks, Sealed};
 use super::{elf, ihex, limit, raw, srec};
 
 /// What a firmware file can be.
@@ -115,8 +115,9 @@ fn read_telling(
         Format::SRecord => srec::read(bytes).map(Firmware::Image),
         Format::Elf => elf::read(bytes).map(Firmware::Image),
         Format::Raw => raw::read(bytes, raw_address).map(Firmware::Image),
-        Format::BlockFile => BlockFile::parse(bytes).map(Firmware::Blocks),
-        Format::Sealed => Err(Place::File.fault(Cause::Sealed)),
+        Format::BlockFile if !blocks::looks_like(bytes) => BlockFile::parse(bytes).map(Firmware::Blocks),
+        // What its blocks carry is no program for the flash.
+        Format::BlockFile | Format::Sealed => Err(Place::File.fault(Cause::Sealed)),
     };
     Ok((firmware?, format))
 }

@@ -7,6 +7,7 @@ use canopen::Address;
 use super::content::Content;
 use super::dialect::is_data;
 use super::options::{FlashOptions, Target};
+use crate::device::access::told_challenge;
 use crate::device::error::{optional, Error, Mismatch};
 use crate::device::region::program_region;
 use crate::device::{Dialect, Session};
@@ -57,7 +58,7 @@ pub(super) fn admit_to_bootloader(
     match file {
         _ if options.force => Ok(true),
         Content::Blocks(file) => admit_place(session, file, &file.image(), dialect, options.program),
-        Content::Sealed(file) => admit_room(session, file.head().size(), options.program),
+        Content::Sealed(file) => admit_capable(session, file, options.program),
     }
 }
 
@@ -73,7 +74,22 @@ fn admit_sealed(session: &mut Session<'_>, file: &SealedFile, program: u8) -> Re
         // 0 is no device's here, but that of one whose identity is 0.
         compare_identity(session, sub, image, what)?;
     }
-    admit_room(session, head.size(), program)
+    admit_capable(session, file, program)
+}
+
+/// Judges what a bootloader knows and an application may not: whether the device takes sealed images,
+/// and its room. Tells whether the device has told both.
+fn admit_capable(session: &mut Session<'_>, file: &SealedFile, program: u8) -> Result<bool, Error> {
+    let challenge = told_challenge(session)?;
+    if challenge.is_some_and(|challenge| !challenge.is_sealed()) {
+        let why = "cannot be taken: the device is not sealed, it has no keys to check it with";
+        let advice =
+            "write keys into the device by the probe (coflash provision makes the file), or flash the \
+                      program as it is, not sealed";
+        return Err(Error::NoProgram { why: why.to_string(), advice });
+    }
+    let room = admit_room(session, file.head().size(), program)?;
+    Ok(room && challenge.is_some())
 }
 
 /// Judges the size of a sealed image; tells whether the device has told its room.

@@ -45,6 +45,8 @@ pub struct FlashOptions {
     pub alone: bool,
     /// Ask for the NMT mastership around a lift's update, and give it back (CiA 814-1 clause 6.3).
     pub mastership: bool,
+    /// Send a sealed image in blocks of so many bytes, framing included, and not with one download.
+    pub blocks: Option<usize>,
     /// Leave it to the device to judge the image: without that, what can be no program, or is for
     /// another device or another place, is refused before anything is done.
     pub force: bool,
@@ -64,6 +66,7 @@ impl FlashOptions {
         wait: bool,
         alone: bool,
         mastership: bool,
+        blocks: Option<usize>,
         force: bool,
     }
 }
@@ -123,6 +126,7 @@ impl Default for FlashOptions {
             wait: false,
             alone: true,
             mastership: true,
+            blocks: None,
             force: false,
         }
     }

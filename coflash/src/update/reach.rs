@@ -60,6 +60,7 @@ fn attempt(
         Some(dialect) => dialect,
         None => recognise(session, running, CALL_BACK)?,
     };
+    check_way(file, found, options)?;
     let admitted = admit(session, file, found, options)?;
     match (options.alone, options.wait) {
         (false, _) => {}
@@ -67,8 +68,22 @@ fn attempt(
         (true, true) => session.ensure_alone()?,
     }
     let dialect = dialect::of(found).enter(session, running, options, course)?;
+    // The bootloader may have told more than the application did.
+    check_way(file, dialect, options)?;
     if !admitted && !running.is_bootloader() {
         admit_to_bootloader(session, file, dialect, options)?;
     }
     Ok(dialect)
+}
+
+/// Whether the dialect has the way in which the file is to be sent.
+fn check_way(file: Content<'_>, dialect: Dialect, options: &FlashOptions) -> Result<(), Error> {
+    match (file, dialect) {
+        (Content::Sealed(_), Dialect::Block) | (Content::Blocks(_), _) => Ok(()),
+        (Content::Sealed(_), _) if options.blocks.is_none() => Ok(()),
+        (Content::Sealed(_), dialect) => Err(Error::NotInDialect {
+            dialect,
+            what: "a sealed image goes with one download, and not in blocks",
+        }),
+    }
 }

@@ -9,6 +9,7 @@
 //! | [`certificate`] | what a root says of a release key |
 //! | [`sealer`] | makes a sealed image of a program |
 //! | [`open`] | takes a sealed image apart and checks it as a device does |
+//! | [`blocks`] | one in a block file |
 //! | [`show`] | what it says of itself, in words |
 //! | [`key_block`](mod@key_block) | the keys in a device |
 //! | [`provision`] | a bootloader with them |
@@ -45,6 +46,7 @@
 //! # }
 //! ```
 
+pub mod blocks;
 pub mod certificate;
 mod cipher;
 pub mod key;
@@ -52,9 +54,11 @@ pub mod key_block;
 mod lzma;
 pub mod open;
 pub mod provision;
+mod ram_image;
 pub mod sealer;
 pub mod show;
 
+pub use self::blocks::{carried, Carried};
 pub use self::certificate::{Certificate, Role};
 pub use self::cipher::hash;
 pub use self::key::{Kek, KeyFault, PublicKey, SigningKey};

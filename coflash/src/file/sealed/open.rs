@@ -46,8 +46,15 @@ impl SealedFile {
     /// Manifest, certificate and signatures.
     #[must_use]
     pub fn head(&self) -> Head<'_> {
-        // `parse` has found all of it.
-        Head(&self.0)
+        self.parts().head
+    }
+
+    /// Its parts.
+    #[must_use]
+    pub fn parts(&self) -> Sealed<'_> {
+        // `parse` has found the head to be there.
+        let (head, chunks) = self.0.split_at(head_size(&self.0).unwrap_or_default());
+        Sealed { head: Head(head), chunks }
     }
 }
 

@@ -1,12 +1,16 @@
 //! The dialect `block`, of SYS TEC and coboot: a block file, an SDO download for each block.
 
+use std::time::Duration;
+
 use canopen::program::{self, FlashError};
 use canopen::Address;
 
 use super::cia302;
 use super::procedure::{enter_by_call, Downloaded, Procedure};
+use crate::device::region::program_region;
 use crate::device::{DeviceType, Dialect, Doing, Error, Session, Transfers};
 use crate::file::block_file::{Block as FileBlock, BlockFile};
+use crate::file::sealed::SealedFile;
 use crate::update::content::Content;
 use crate::update::course::Course;
 use crate::update::event::{Event, Phase, RepeatReason, Retry};
@@ -30,8 +34,8 @@ impl Procedure for Block {
     }
 
     /// Erases, sends the blocks, compares, tries the program and releases it for autostart. One that
-    /// is not to be started is neither tried nor released. A sealed image goes with one download, and
-    /// needs no release: its signature is one.
+    /// is not to be started is neither tried nor released. A sealed image goes with one download unless
+    /// blocks were asked for, and needs no release: its signature is one.
     fn download(
         &self,
         session: &mut Session<'_>,
@@ -39,24 +43,22 @@ impl Procedure for Block {
         options: &FlashOptions,
         course: &mut Course<'_>,
     ) -> Result<Downloaded, Error> {
-        let file = match file {
-            Content::Blocks(file) => file,
-            Content::Sealed(sealed) => {
+        let file = match (file, options.blocks) {
+            (Content::Blocks(file), _) => file,
+            (Content::Sealed(sealed), None) => {
                 return cia302::download(session, sealed.bytes(), file.program_crc(), options, course);
+            }
+            (Content::Sealed(sealed), Some(block_size)) => {
+                let blocks = cut(session, sealed, block_size, options.program)?;
+                let (repeats, took) = send(session, &blocks, options, course)?;
+                course.state = DeviceState::Written;
+                let crc = file.program_crc();
+                steps::verify(session, options.program, crc, &mut |event| course.tell(event))?;
+                return Ok(Downloaded { repeats, took, released: None });
             }
         };
         let number = options.program;
-        let before = steps::told_before(session, number)?;
-        course.erases(before);
-        if let Err(error) = steps::erase(session, number, &mut |event| course.tell(event)) {
-            if error.is_refusal() {
-                course.erases_not();
-            }
-            return Err(error);
-        }
-        let began = session.now();
-        let repeats = send_blocks(session, file, options, course)?;
-        let took = session.now().saturating_sub(began);
+        let (repeats, took) = send(session, file, options, course)?;
         steps::verify(session, number, file.program_crc(), &mut |event| course.tell(event))?;
         course.state = DeviceState::Unreleased;
         if !options.start {
@@ -70,6 +72,44 @@ impl Procedure for Block {
         course.state = DeviceState::Released;
         Ok(Downloaded { repeats, took, released: Some(true) })
     }
+}
+
+/// The blocks that carry a sealed image to where this device has the program.
+fn cut(
+    session: &mut Session<'_>,
+    sealed: &SealedFile,
+    block_size: usize,
+    program: u8,
+) -> Result<BlockFile, Error> {
+    let not_cut = |why: &str| Error::NoProgram {
+        why: format!("cannot be sent in blocks: {why}"),
+        advice: "send it with one download: leave --blocks out",
+    };
+    let region = program_region(session, program)?;
+    let region =
+        region.ok_or_else(|| not_cut("the device does not tell where its program starts (2004h)"))?;
+    sealed.blocks(region.base, block_size).map_err(|error| not_cut(&error.to_string()))
+}
+
+/// Steps 4 to 9: erases and sends all blocks; gives how many had to be repeated, and how long they took.
+fn send(
+    session: &mut Session<'_>,
+    file: &BlockFile,
+    options: &FlashOptions,
+    course: &mut Course<'_>,
+) -> Result<(u32, Duration), Error> {
+    let number = options.program;
+    let before = steps::told_before(session, number)?;
+    course.erases(before);
+    if let Err(error) = steps::erase(session, number, &mut |event| course.tell(event)) {
+        if error.is_refusal() {
+            course.erases_not();
+        }
+        return Err(error);
+    }
+    let began = session.now();
+    let repeats = send_blocks(session, file, options, course)?;
+    Ok((repeats, session.now().saturating_sub(began)))
 }
 
 /// Steps 6 to 9: all blocks; gives how many had to be repeated.

@@ -1,0 +1,72 @@
+//! `coflash verify-device`: whether a device holds the program of a sealed image.
+
+use clap::Args;
+use coflash::file::sealed::Device as Its;
+use coflash::update::{held, Held};
+use serde_json::json;
+
+use super::context::Context;
+use super::device::Device;
+use super::output::Failure;
+use super::verify::Checked;
+
+/// Says whether a device holds exactly the program of a sealed image.
+///
+/// The file is checked as verify does. Then what the device tells is compared with it, in the
+/// bootloader or in the application: vendor-ID, product code, hardware revision, unique ID and keys of
+/// the device, CRC and version of the program, and what was installed last. Nothing is changed in it.
+///
+/// The device's answers are its own: one that runs somebody else's code may give any.
+#[derive(Debug, Args)]
+pub(super) struct VerifyDevice {
+    #[command(flatten)]
+    checked: Checked,
+
+    #[command(flatten)]
+    device: Device,
+}
+
+impl VerifyDevice {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        let path = &self.checked.file;
+        let (file, opened) = self.checked.check(&Its::default())?;
+        let mut link = context.link()?;
+        let mut session = self.device.session(&mut link)?;
+        let held = held(&mut session, &file).map_err(|error| Failure::diagnosed(error, &mut session))?;
+        let (node, program) = (session.node(), file.head().program());
+        let Held { running, runs, differences, untold, .. } = &held;
+        let which = format!("program {program} of {}", path.display());
+        let verdict = match (held.is_same(), runs) {
+            (true, true) => format!("runs {which}, as far as it tells"),
+            (true, false) => format!("holds {which}, and does not run it, as far as it tells"),
+            (false, _) => format!("is not the device of {which}, or has another program"),
+        };
+        let mut words = format!("node {node}: {verdict}\n  running      {running}");
+        words += &format!("\n  signed by    key {:08X}h", opened.signed_by.id());
+        for difference in differences {
+            words += &format!("\n  differs      {difference}");
+        }
+        if !untold.is_empty() {
+            let objects: Vec<String> = untold.iter().map(ToString::to_string).collect();
+            words += &format!("\n  not told     {}", objects.join(", "));
+        }
+        context.out.result(words, || {
+            json!({
+                "command": "verify-device",
+                "node": node.get(),
+                "program": program,
+                "same": held.is_same(),
+                "runs": runs,
+                "device_type": running.0,
+                "bootloader": running.is_bootloader(),
+                "signed_by": opened.signed_by.id(),
+                "differences": differences,
+                "untold": untold.iter().map(ToString::to_string).collect::<Vec<_>>(),
+            })
+        });
+        match held.is_same() {
+            true => Ok(()),
+            false => Err(Failure::differs(node, differences.len())),
+        }
+    }
+}

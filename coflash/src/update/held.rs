@@ -1,0 +1,212 @@
+//! Whether a device holds the program of a sealed image, by all that the device tells: its identity,
+//! its keys, CRC and version of the program, and what it has recorded.
+//!
+//! These are a device's own words. One that runs somebody else's code says whatever that code says.
+
+use std::fmt;
+
+use canopen::program::{ProgramState, ACCESS, EVENTS};
+use canopen::program::{IDENTITY, PROGRAM_CONTROL, PROGRAM_ID, PROGRAM_VERSION};
+use canopen::Address;
+use seal::access::event;
+use serde::Serialize;
+use shared_abi::block_file::ProgramVersion;
+
+use crate::device::access::{events, told_challenge};
+use crate::device::error::{optional, Error};
+use crate::device::{DeviceType, Session};
+use crate::file::sealed::show::digits;
+use crate::file::sealed::SealedFile;
+
+/// What a device tells of the program of a sealed image.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Held {
+    /// Whether its bootloader runs, or an application.
+    pub running: DeviceType,
+    /// Whether the program runs.
+    pub runs: bool,
+    /// In what it is another device, or has another program. Without any it holds the program, as far
+    /// as it tells.
+    pub differences: Vec<Difference>,
+    /// The objects that it does not have, and that could not be compared therefore. An application
+    /// may lack some that the bootloader has.
+    pub untold: Vec<Address>,
+}
+
+/// One thing in which device and file differ.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Difference {
+    /// What it is.
+    pub what: Part,
+    /// What the file says.
+    pub file: String,
+    /// What the device tells.
+    pub device: String,
+}
+
+/// What is compared.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Part {
+    /// 1018h/1.
+    VendorId,
+    /// 1018h/2.
+    ProductCode,
+    /// 1018h/3, low 5 bits.
+    Hardware,
+    /// The chip's, in 2002h/1.
+    UniqueId,
+    /// Whether the device has keys: bit 31 of the last word of 2002h/1.
+    Keys,
+    /// 1F56h.
+    Crc,
+    /// 2005h.
+    Version,
+    /// That of the last installation of this program in 2003h.
+    InstalledCounter,
+    /// The same.
+    InstalledVersion,
+}
+
+impl fmt::Display for Part {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::VendorId => "vendor-ID (1018h/1)",
+            Self::ProductCode => "product code (1018h/2)",
+            Self::Hardware => "hardware revision (1018h/3)",
+            Self::UniqueId => "unique ID (2002h/1)",
+            Self::Keys => "keys (2002h/1)",
+            Self::Crc => "CRC of the program (1F56h)",
+            Self::Version => "version of the program (2005h)",
+            Self::InstalledCounter => "security counter of the last installation (2003h)",
+            Self::InstalledVersion => "version of the last installation (2003h)",
+        })
+    }
+}
+
+impl fmt::Display for Difference {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { what, file, device } = self;
+        write!(f, "{what}: the file has {file}, the device {device}")
+    }
+}
+
+impl Held {
+    /// Whether the device differs in nothing that it tells.
+    #[must_use]
+    pub fn is_same(&self) -> bool {
+        self.differences.is_empty()
+    }
+
+    fn differs(&mut self, what: Part, file: impl Into<String>, device: impl Into<String>) {
+        self.differences.push(Difference { what, file: file.into(), device: device.into() });
+    }
+
+    fn compare<T: PartialEq>(&mut self, what: Part, file: T, device: T, words: impl Fn(T) -> String) {
+        if file != device {
+            self.differs(what, words(file), words(device));
+        }
+    }
+}
+
+/// Compares what a device tells with what a sealed image says, in the bootloader or in an application.
+/// Nothing is changed in the device.
+///
+/// # Errors
+/// [`Error::NoAnswer`] and the like; an object that the device does not have is no error.
+pub fn held(session: &mut Session<'_>, file: &SealedFile) -> Result<Held, Error> {
+    const RUNNING: u32 = ProgramState::Running as u32;
+    let head = file.head();
+    let program = head.program();
+    let running = session.find()?;
+    let mut held = Held { running, runs: false, differences: Vec::new(), untold: Vec::new() };
+    let mut number = |held: &mut Held, at: Address| -> Result<Option<u32>, Error> {
+        let told = optional(session.read_number(at))?;
+        if told.is_none() {
+            held.untold.push(at);
+        }
+        Ok(told)
+    };
+
+    for (sub, what, said) in
+        [(1, Part::VendorId, head.vendor_id()), (2, Part::ProductCode, head.product_code())]
+    {
+        if let Some(device) = number(&mut held, Address::new(IDENTITY, sub))? {
+            held.compare(what, said, device, hexadecimal);
+        }
+    }
+    if head.hardware() != 0 {
+        if let Some(device) = number(&mut held, Address::new(IDENTITY, 3))? {
+            if head.hardware() >> (device & 31) & 1 == 0 {
+                held.differs(
+                    Part::Hardware,
+                    format!("the mask {:08X}h", head.hardware()),
+                    hexadecimal(device),
+                );
+            }
+        }
+    }
+    held.runs = number(&mut held, Address::new(PROGRAM_CONTROL, program))? == Some(RUNNING);
+    match number(&mut held, Address::new(PROGRAM_ID, program))? {
+        Some(0) if head.crc() != 0 => held.differs(Part::Crc, hexadecimal(head.crc()), "no program"),
+        Some(device) => held.compare(Part::Crc, head.crc(), device, hexadecimal),
+        // Nothing else would tell the program.
+        None => held.differs(Part::Crc, hexadecimal(head.crc()), "tells none"),
+    }
+    if let Some(device) = number(&mut held, Address::new(PROGRAM_VERSION, program))? {
+        held.compare(Part::Version, head.version(), device, release);
+    }
+    compare_access(session, file, &mut held)?;
+    compare_events(session, file, &mut held)?;
+    Ok(held)
+}
+
+/// 2002h: which chip it is, and whether it is sealed.
+fn compare_access(session: &mut Session<'_>, file: &SealedFile, held: &mut Held) -> Result<(), Error> {
+    match told_challenge(session)? {
+        Some(challenge) => {
+            let only_for = file.head().unique_id();
+            if only_for != [0; 12] {
+                held.compare(Part::UniqueId, only_for, challenge.unique_id(), |id| digits(&id));
+            }
+            if !challenge.is_sealed() {
+                held.differs(Part::Keys, "a signature to be checked", "is not sealed, it has no keys");
+            }
+        }
+        None if held.running.is_bootloader() => {
+            let device = "has a bootloader that knows no sealed images";
+            held.differs(Part::Keys, "a signature to be checked", device);
+        }
+        None => held.untold.push(Address::new(ACCESS, 1)),
+    }
+    Ok(())
+}
+
+/// 2003h: what was installed as this program last. One that is not among the last eight events is not
+/// told.
+fn compare_events(session: &mut Session<'_>, file: &SealedFile, held: &mut Held) -> Result<(), Error> {
+    let head = file.head();
+    let installed = event::INSTALLED | u32::from(head.program());
+    let last = match events(session) {
+        Ok(events) => events.into_iter().find(|event| event.what == installed),
+        Err(Error::Refused { .. }) => None,
+        Err(error) => return Err(error),
+    };
+    match last {
+        Some(last) => {
+            held.compare(Part::InstalledCounter, head.counter(), last.counter, |number| number.to_string());
+            held.compare(Part::InstalledVersion, head.version(), last.version, release);
+        }
+        None => held.untold.push(Address::new(EVENTS, 1)),
+    }
+    Ok(())
+}
+
+fn hexadecimal(number: u32) -> String {
+    format!("{number:08X}h")
+}
+
+fn release(version: u32) -> String {
+    ProgramVersion(version).to_string()
+}
