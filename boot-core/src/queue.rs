@@ -115,6 +115,12 @@ impl<'b> Queue<'b> {
         self.word(self.queued)
     }
 
+    /// The first four bytes of the open piece, if it has as many.
+    #[cfg(feature = "sealed")]
+    pub(crate) fn open_word(&self) -> u32 {
+        self.word(self.queued + PIECE_HEADER)
+    }
+
     /// The open piece is good: it joins the queue.
     pub(crate) fn commit(&mut self) {
         let size = self.open_size();

@@ -12,7 +12,8 @@ use std::time::Duration;
 
 use coflash::file::sealed::{verify, Device, Kek, PublicKey};
 use coflash::file::{ihex, raw};
-use fake::{Deed, Fake, Maker, APPLICATION, BOOTLOADER};
+use fake::vault::Vault;
+use fake::{Fake, APPLICATION, BOOTLOADER};
 use serde_json::Value;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use tool::{coflash, serve, Done, Folder};
@@ -626,46 +627,13 @@ fn a_bootloader_gets_its_keys() {
     assert!(done.exit == 2 && done.err.contains("give --board or --layout"), "{}", done.err);
 }
 
-/// A device that takes sealed images: it keeps what it is sent.
-struct Vault {
-    kept: Arc<Mutex<Vec<u8>>>,
-    room: u32,
-    status: u32,
-}
-
-impl Maker for Vault {
-    fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
-        let kept = self.kept.lock().unwrap();
-        match at {
-            (0x2004, 1) => Some(Ok([START.to_le_bytes(), self.room.to_le_bytes()].concat())),
-            (0x1F56, 1) => Some(Ok(kept.get(32..36).unwrap_or(&[0; 4]).to_vec())),
-            (0x1F57, 1) if !kept.is_empty() && self.status != 0 => {
-                Some(Ok(self.status.to_le_bytes().to_vec()))
-            }
-            _ => None,
-        }
-    }
-
-    fn write(&mut self, at: (u16, u8), data: &[u8], _: u32) -> Option<Result<Deed, u32>> {
-        if at != (0x1F50, 1) {
-            return None;
-        }
-        *self.kept.lock().unwrap() = data.to_vec();
-        Some(if self.status == 0 { Ok(Deed::Nothing) } else { Err(0x0800_0020) })
-    }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
-    }
-}
-
 /// Flashes this file; gives what was said, what the device was sent, and what else was written.
 fn flashed(file: &str, room: u32, status: u32, more: &[&str]) -> (Done, Vec<u8>, Vec<String>) {
     let kept: Arc<Mutex<Vec<u8>>> = Arc::default();
     let mut fake = Fake::new(APPLICATION);
     fake.erase_time = Duration::from_millis(30);
     fake.restart_time = Duration::from_millis(20);
-    fake.maker = Some(Box::new(Vault { kept: kept.clone(), room, status }));
+    fake.maker = Some(Box::new(Vault { kept: kept.clone(), start: START, room, status }));
     let (bus, server) = serve(fake);
     let done = coflash(&[&["flash", file, "--bus", &bus, "-N", "5"], more].concat());
     let fake = server.join().unwrap();
@@ -724,7 +692,7 @@ fn a_sealed_image_goes_into_a_device_as_it_is() {
     for dialect in ["raw", "hex"] {
         let kept: Arc<Mutex<Vec<u8>>> = Arc::default();
         let mut fake = Fake::new(BOOTLOADER);
-        fake.maker = Some(Box::new(Vault { kept: kept.clone(), room: 0x10000, status: 0 }));
+        fake.maker = Some(Box::new(Vault { kept: kept.clone(), start: START, room: 0x10000, status: 0 }));
         let (bus, server) = serve(fake);
         let done = coflash(&["flash", &file, "--bus", &bus, "-N", "5", "--dialect", dialect]);
         assert_eq!(done.exit, 0, "{}", done.err);

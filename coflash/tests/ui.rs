@@ -5,16 +5,18 @@
 use std::io::{ErrorKind, Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
+use coflash::file::sealed::{Kek, Sealer, SigningKey};
 use coflash::ui::{Options, Server};
 use serde_json::{json, Value};
 
 mod fake;
 mod tool;
 
+use fake::vault::Vault;
 use fake::Fake;
 
 /// How long something may take before it counts as hanging. Nothing is measured with it.
@@ -345,6 +347,83 @@ fn files_of_every_kind_are_taken_or_refused_with_their_name() {
     );
     assert_eq!(ui.raw(head.as_bytes()).status, 413);
     assert_eq!(ui.get("").status, 200);
+}
+
+/// A sealed image for the fake device, of 1000 bytes.
+fn sealed(sealer: Sealer<'_>) -> Vec<u8> {
+    let key = SigningKey::from_seed([2; 32]).unwrap();
+    let sealer = Sealer { vendor_id: 0x3F, product_code: 1234, counter: 7, version: 0x0064_0A01, ..sealer };
+    sealer.seal(&[0x5A; 1000], &key).unwrap()
+}
+
+#[test]
+fn a_sealed_image_shows_what_it_says_or_is_refused_with_what_to_do() {
+    let ui = Ui::new(None);
+    let kek = [Kek::new([7; 32]).unwrap()];
+    let file = sealed(Sealer { compress: true, encrypt_for: &kek, ..Sealer::default() });
+    assert_eq!(ui.file("app.cbs", &file).status, 200);
+    let state = ui.until("the file", |state| !state["firmware"].is_null());
+    let shown = &state["firmware"];
+    let signer = SigningKey::from_seed([2; 32]).unwrap().public().id();
+    let seal = json!({
+        "program": 1, "counter": 7, "signed_by": [signer], "opened_by": [kek[0].id()],
+        "flags": ["encrypted", "compressed"],
+    });
+    assert_eq!(shown["seal"], seal);
+    assert_eq!([&shown["vendor_id"], &shown["product_code"]], [&json!(0x3F), &json!(1234)]);
+    assert_eq!([&shown["program_size"], &shown["version"]], [&json!(1000), &json!("V1.10r100")]);
+    let words = shown["inspection"].as_str().unwrap();
+    assert!(words.starts_with("sealed image, well-formed") && words.contains("counter      7"), "{words}");
+
+    // For another program than the one that was chosen; it is gone then, as any other file.
+    let other = ui.post("settings", &json!({ "board": null, "program": 2 }));
+    assert_eq!(other.status, 422, "{}", other.body);
+    let other = other.json();
+    assert_eq!(other["words"], "app.cbs: it is program 1, and program 2 is written");
+    assert!(other["advice"].as_str().unwrap().contains("seal the program for it"), "{other}");
+    ui.until("no file", |state| state["firmware"].is_null());
+    assert_eq!(ui.post("settings", &json!({ "board": null, "program": 1 })).status, 200);
+    for (bytes, words) in [
+        (&file[..file.len() - 1], "app.cbs: it is cut off"),
+        (&[&file[..4], &[0; 4], &file[8..]].concat(), "app.cbs: the head is damaged"),
+        (&[&file[..], b"x"].concat(), "app.cbs: it has"),
+    ] {
+        let answer = ui.file("app.cbs", bytes);
+        assert_eq!(answer.status, 422, "{}", answer.body);
+        assert!(answer.json()["words"].as_str().unwrap().starts_with(words), "{}", answer.body);
+    }
+}
+
+/// A sealed image goes into the device as it is; one that it refuses is told with what to do.
+#[test]
+fn a_sealed_image_is_sent_as_it_is_and_the_device_judges_it() {
+    let file = sealed(Sealer::default());
+    for (status, phase, words, advice) in [
+        (0, "done", "done in", None),
+        (0x8A, "failed", "the program's signature is wrong", Some("coflash verify")),
+        (0x8C, "failed", "the program is older than the device allows", Some("--counter")),
+        (0x8E, "failed", "the device has no key for this program", Some("coflash show")),
+    ] {
+        let kept: Arc<Mutex<Vec<u8>>> = Arc::default();
+        let mut fake = Fake::new(fake::BOOTLOADER);
+        fake.erase_time = Duration::from_millis(30);
+        let vault = Vault { kept: kept.clone(), start: 0x0801_0000, room: 0x10000, status };
+        fake.maker = Some(Box::new(vault));
+        let (bus, _server) = tool::serve(fake);
+        let ui = Ui::new(Some(bus));
+        ui.until("the adapter", |state| state["adapter"]["state"] == "open");
+        assert_eq!(ui.file("app.cbs", &file).status, 200);
+        ui.post("update", &json!({ "nodes": [fake::NODE], "trial": true, "start": true }));
+        let state = ui.until("the end", |state| !state["notice"].is_null() && state["task"].is_null());
+        let update = &state["updates"][0];
+        assert_eq!(update["phase"], phase, "{update}");
+        assert!(update["words"].as_str().unwrap().contains(words), "{update}");
+        match advice {
+            Some(advice) => assert!(update["advice"].as_str().unwrap().contains(advice), "{update}"),
+            None => assert!(update["advice"].is_null(), "{update}"),
+        }
+        assert!(*kept.lock().unwrap() == file, "{status:02X}h");
+    }
 }
 
 /// A device that is still erasing when a test has seen all it wants to see.

@@ -1,13 +1,26 @@
 //! Job file and configuration file.
 //!
 //! Must hold: any text gives a job, settings, or a fault whose place is in the text; each device of
-//! a job has an image and is named, and no two are the same one; each setting is one that there is.
+//! a job has an image and is named, and no two are the same one; each setting is one that there is, with a
+//! value of its kind.
 #![no_main]
 
 use std::path::Path;
 
-use coflash::update::{config, job};
+use coflash::update::config::{self, Setting};
+use coflash::update::job;
 use libfuzzer_sys::fuzz_target;
+
+/// Options of a tool, and whether each is a switch.
+const KEYS: [(&str, bool); 7] = [
+    ("bus", false),
+    ("node", false),
+    ("board", false),
+    ("block-size", false),
+    ("sdo-timeout", false),
+    ("verify", true),
+    ("json", true),
+];
 
 fuzz_target!(|bytes: &[u8]| {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
@@ -28,11 +41,14 @@ fuzz_target!(|bytes: &[u8]| {
             }
         }
     }
-    match config::parse(text) {
+    let is_switch = |key: &str| KEYS.iter().find(|(known, _)| *known == key).map(|(_, switch)| *switch);
+    match config::parse(text, &is_switch) {
         Err(config::Fault::Line(line, what)) => assert!((1..=lines).contains(&line) && !what.is_empty()),
         Err(config::Fault::Setting(what)) => assert!(!what.is_empty()),
         Ok(settings) => {
-            assert!(settings.iter().all(|(key, _)| config::KEYS.contains(&key.as_str())));
+            for (key, setting) in &settings {
+                assert_eq!(is_switch(key), Some(matches!(setting, Setting::Switch(_))), "{key}");
+            }
         }
     }
 });

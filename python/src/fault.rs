@@ -1,7 +1,9 @@
 //! What went wrong, and the exception that Python gets for it (`coflash/errors.py`).
 
 use coflash::device::Error;
+use coflash::file::sealed::Refusal;
 use coflash::file::FileError;
+use coflash::update::refusal_number;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
@@ -12,6 +14,8 @@ pub enum Fault {
     Value(String),
     /// The file is.
     File(FileError),
+    /// The sealed image of this name is.
+    Sealed(String, Refusal),
     /// Bus or device are.
     Device(Error),
 }
@@ -28,6 +32,10 @@ impl Fault {
         let (class, number, what, advice) = match self {
             Self::Value(what) => return PyValueError::new_err(what),
             Self::File(error) => ("FileError", error.error.cause.number(), error.to_string(), String::new()),
+            Self::Sealed(file, refusal) => {
+                let what = format!("{file}: {refusal}");
+                ("FileError", refusal_number(&refusal), what, refusal.advice().to_owned())
+            }
             Self::Device(error) => {
                 let class = match &error {
                     Error::Adapter(_) => "BusError",

@@ -15,8 +15,9 @@ use coflash::bus::decode::state_words;
 use coflash::bus::Link;
 use coflash::device::{self, Dialect, ScanOptions, Session, Timing};
 use coflash::file::convert::{blocks_of, ConvertError, Options, Region};
-use coflash::file::{self, BlockFile, Format};
-use coflash::update::{self, FlashOptions, Password, Target};
+use coflash::file::sealed::SealedFile;
+use coflash::file::{self, limit, Format};
+use coflash::update::{self, FlashOptions, Password, Program};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -76,10 +77,10 @@ fn flash<'py>(
     if !(1..=254).contains(&program) {
         return Err(PyValueError::new_err("programs are 1 to 254"));
     }
-    let blocks = program_of(&file, board.as_deref(), address, program).map_err(|fault| fault.raise(py))?;
+    let content = program_of(&file, board.as_deref(), address, program).map_err(|fault| fault.raise(py))?;
     let target = match check_target {
         false => None,
-        true => Some(Target::of(&blocks).ok_or_else(|| {
+        true => Some(content.target().ok_or_else(|| {
             PyValueError::new_err("check_target: the file does not say for which device it is")
         })?),
     };
@@ -98,7 +99,7 @@ fn flash<'py>(
         session.cancel_by(cancelled);
         // Who listens is gone only when the update was given up.
         let mut tell = |event: update::Event| drop(events.send(json!(event.line(node))));
-        Ok(update::flash(&mut session, &blocks, &options, &mut tell)?)
+        Ok(update::flash_program(&mut session, &content, &options, &mut tell)?)
     })?;
     object(py, &report)
 }
@@ -197,13 +198,14 @@ fn object<'py>(py: Python<'py>, value: &impl Serialize) -> PyResult<Bound<'py, P
     Ok(pythonize::pythonize(py, value)?)
 }
 
-/// The blocks of a file, for this board if one is named; a raw binary goes to its address.
+/// A sealed image as it is, or the blocks of any other file, for this board if one is named; a raw
+/// binary goes to its address.
 fn program_of(
     path: &std::path::Path,
     board: Option<&str>,
     address: Option<u32>,
     program: u8,
-) -> Result<BlockFile, Fault> {
+) -> Result<Program, Fault> {
     let region = match board {
         None => Region::Unknown,
         Some(name) => {
@@ -214,11 +216,18 @@ fn program_of(
             Region::Strict((*region).into())
         }
     };
+    let fault = |error: file::ReadError| Fault::File(error.of(path.display()));
+    let bytes = limit::read(path).map_err(|cause| fault(file::Place::File.fault(cause)))?;
+    if Format::detect(&bytes) == Some(Format::Sealed) {
+        let sealed = SealedFile::for_program(bytes, program);
+        let sealed = sealed.map_err(|refusal| Fault::Sealed(path.display().to_string(), refusal))?;
+        return Ok(Arc::new(sealed).into());
+    }
     let format = address.map(|_| Format::Raw);
-    let firmware = file::load(path, format, address).map_err(Fault::File)?;
+    let firmware = file::read(&bytes, format, address).map_err(fault)?;
     match blocks_of(firmware, &Options::default().region(region)) {
-        Ok(converted) => Ok(converted.file),
-        Err(ConvertError::File(error)) => Err(Fault::File(error.of(path.display()))),
+        Ok(converted) => Ok(Arc::new(converted.file).into()),
+        Err(ConvertError::File(error)) => Err(fault(error)),
         Err(error) => Err(Fault::Value(error.to_string())),
     }
 }

@@ -124,6 +124,49 @@ def test_the_file_is_read_before_the_bus_is_opened(tmp_path):
     assert caught.value.number == 0x6000_0015
 
 
+def sealed(program=1, cut=0) -> bytes:
+    """A sealed image with a signature of nobody's, by the table of the format (docs/protocol.md)."""
+    image = bytes([0x5A]) * 600
+    manifest = bytearray(176)
+    manifest[:8] = b"CBS1" + len(manifest).to_bytes(2, "little") + bytes([1, 0])
+    # 4096 bytes of payload to a chunk, for any bootloader that knows the format.
+    manifest[24:28] = bytes([program, 12, 1, 0])
+    manifest[28:40] = b"".join(word.to_bytes(4, "little") for word in (len(image), crc32(image), len(image)))
+    signature = (1).to_bytes(4, "little") + bytes([1, 0, 64, 0]) + bytes(64)
+    file = bytes(manifest) + signature + bytes(32) + image
+    return file[: len(file) - cut]
+
+
+def test_a_sealed_image_is_read_before_the_bus_is_opened(tmp_path):
+    nowhere = "socketcand://127.0.0.1:1/can0"
+    path = tmp_path / "program.cbs"
+    # What the device would have said: 82h in 1F57h, wrong product, and the manual's number of a wrong format.
+    for file, number, words in [
+        (sealed(program=2), 0x6000_0182, "it is program 2, and program 1 is written"),
+        (sealed(cut=1), 0x6000_0002, "it is cut off"),
+        (b"CBS1" + bytes(200), 0x6000_0002, "the head is damaged"),
+    ]:
+        path.write_bytes(file)
+        with pytest.raises(coflash.FileError) as caught:
+            coflash.flash(nowhere, 5, path)
+        assert caught.value.number == number, hex(caught.value.number)
+        assert str(path) in caught.value.what and words in caught.value.what and caught.value.advice
+    # One that is well-formed is taken, whatever the options for other files say.
+    path.write_bytes(sealed())
+    with pytest.raises(coflash.BusError):
+        coflash.flash(nowhere, 5, path, board=BOARD, address=BASE, check_target=True)
+
+
+def test_a_device_without_sealed_images_refuses_one(nodes, tmp_path):
+    path = tmp_path / "program.cbs"
+    path.write_bytes(sealed())
+    with pytest.raises(coflash.DeviceError) as caught:
+        coflash.flash(nodes.bus, 5, path)
+    # The manual's number for a wrong format.
+    assert caught.value.number == 0x6000_0002, str(caught.value)
+    assert coflash.info(nodes.bus, 5)["bootloader"] is True
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -1,9 +1,14 @@
 //! The Python package (`python/`): its wheel is built and installed as a user has it, and its own
-//! tests are run against `coboot-node` over TCP.
+//! tests are run against `coboot-node` over TCP; and it updates the emulated sealed board.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::LazyLock;
 use std::{env, fs};
+
+use canopen::Address;
+use coboot_tests::endpoint::Endpoint;
+use coboot_tests::{firmware, sealed_board};
 
 /// The python of `cargo xtask test`, with the pinned third-party packages.
 fn python() -> Command {
@@ -37,13 +42,11 @@ fn only(folder: &Path) -> PathBuf {
     file.clone()
 }
 
-#[test]
-fn the_wheel_is_built_installed_and_passes_its_tests() {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
-    let package = root.join("python");
+/// The package as a user has it, in a folder of its own.
+static PACKAGE: LazyLock<PathBuf> = LazyLock::new(|| {
     let wheels = folder("python-wheels");
     let maturin = ["-m", "maturin", "build", "--profile", "dev", "--manifest-path"];
-    done(python().args(maturin).arg(package.join("Cargo.toml")).arg("--out").arg(&wheels));
+    done(python().args(maturin).arg(source().join("Cargo.toml")).arg("--out").arg(&wheels));
     let wheel = only(&wheels);
     // One for every Python from 3.9 on.
     let name = wheel.file_name().unwrap().to_string_lossy().into_owned();
@@ -52,9 +55,28 @@ fn the_wheel_is_built_installed_and_passes_its_tests() {
     let installed = folder("python-package");
     let pip = ["-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target"];
     done(python().args(pip).arg(&installed).arg(&wheel));
+    installed
+});
 
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap()
+}
+
+fn source() -> PathBuf {
+    root().join("python")
+}
+
+/// A python that has the package.
+fn with_package() -> Command {
+    let mut python = python();
+    python.current_dir(&*PACKAGE).env("PYTHONPATH", &*PACKAGE).env("PYTHONDONTWRITEBYTECODE", "1");
+    python
+}
+
+#[test]
+fn the_wheel_is_built_installed_and_passes_its_tests() {
     let cargo = env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    let manifest = root.join("Cargo.toml");
+    let manifest = root().join("Cargo.toml");
     let build =
         ["build", "--quiet", "--package", "coboot-node", "--message-format", "json", "--manifest-path"];
     let said = done(Command::new(cargo).args(build).arg(manifest));
@@ -62,14 +84,50 @@ fn the_wheel_is_built_installed_and_passes_its_tests() {
     let node = node.split('"').next().unwrap_or_default();
 
     let tests = ["-m", "pytest", "-q", "-p", "no:cacheprovider"];
-    let said = done(
-        python()
-            .args(tests)
-            .arg(package.join("tests"))
-            .current_dir(&installed)
-            .env("PYTHONPATH", &installed)
-            .env("PYTHONDONTWRITEBYTECODE", "1")
-            .env("COBOOT_NODE", node),
-    );
+    let said = done(with_package().args(tests).arg(source().join("tests")).env("COBOOT_NODE", node));
     assert!(said.contains(" passed") && !said.contains("skipped"), "{said}");
+}
+
+/// What a test bench would write: one line for each file, with the error's number.
+const SEALED: &str = "
+import sys, coflash
+bus, *files = sys.argv[1:]
+for file in files:
+    try:
+        report = coflash.flash(bus, 1, file, verify=True)
+        print(f'{report[\"size\"]} bytes, CRC {report[\"crc\"]:08X}')
+    except coflash.DeviceError as error:
+        print(f'{error.number:#010x}: {error.what}')
+";
+
+/// A sealed device takes the genuine file and refuses another, by the number of 1F57h.
+#[test]
+fn a_sealed_device_is_updated_from_python() {
+    let mut bench = sealed_board::board();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let mut endpoint = Endpoint::new(bench);
+    let image = firmware::raw(firmware::APP_V1);
+    let genuine = sealed_board::sealer(sealed_board::COUNTER).seal(&image, &sealed_board::release()).unwrap();
+    let mut flipped = genuine.clone();
+    // In the hash of the image, which the signature covers.
+    flipped[50] ^= 1;
+    let folder = folder("python-sealed");
+    let mut python = with_package();
+    python.args(["-c", SEALED]).arg(endpoint.url());
+    for (name, bytes) in [("flipped.cbs", &flipped), ("genuine.cbs", &genuine)] {
+        let path = folder.join(name);
+        fs::write(&path, bytes).unwrap();
+        python.arg(path);
+    }
+    let output = endpoint.run(&mut python);
+    let said = [&output.stdout[..], &output.stderr[..]].concat();
+    let said = String::from_utf8_lossy(&said);
+    let lines: Vec<&str> = said.lines().collect();
+    let [refused, taken] = lines.as_slice() else { panic!("{said}") };
+    assert!(refused.starts_with("0x6000018a: ") && refused.contains("signature"), "{said}");
+    let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&image);
+    assert_eq!(*taken, format!("{} bytes, CRC {crc:08X}", image.len()));
+    assert_eq!(endpoint.bench.session().read_text(Address::new(0x100A, 0)).unwrap(), "1.0.0");
+    endpoint.bench.assert_nothing_unmodelled();
 }

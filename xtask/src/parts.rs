@@ -7,12 +7,17 @@ use addr2line::Loader;
 
 use crate::{workspace, Outcome};
 
-/// Bytes by part of the code and data at these addresses of an ELF file. A part is a module of one
-/// of our crates (`boot-core/intake`), or somebody else's crate.
+/// The part of long runs of zeros: statics that begin as nothing.
+pub const ZEROS: &str = "(zeros)";
+/// Fewer zeros in a row belong to the code or data that they stand in.
+const LONG: usize = 64;
+
+/// Bytes by part of the code and data with these contents from this address of an ELF file on. A part
+/// is a module of one of our crates (`boot-core/intake`), or somebody else's crate.
 ///
 /// # Errors
 /// When the file has no debug information that can be read.
-pub fn of(elf: &Path, address: u32, size: u32) -> Outcome<BTreeMap<String, u32>> {
+pub fn of(elf: &Path, address: u32, contents: &[u8]) -> Outcome<BTreeMap<String, u32>> {
     /// The length of the shortest instruction.
     const STEP: usize = 2;
     let unreadable = |error: &dyn std::fmt::Display| {
@@ -21,13 +26,23 @@ pub fn of(elf: &Path, address: u32, size: u32) -> Outcome<BTreeMap<String, u32>>
     let loader = Loader::new(elf).map_err(|error| unreadable(&error))?;
     let root = workspace::root();
     let mut parts = BTreeMap::new();
-    for at in (address..address + size).step_by(STEP) {
-        let mut frames = loader.find_frames(at.into()).map_err(|error| unreadable(&error))?;
+    let mut at = 0;
+    while at < contents.len() {
+        let zeros = contents[at..].iter().take_while(|byte| **byte == 0).count();
+        if zeros >= LONG {
+            *parts.entry(ZEROS.to_owned()).or_default() += zeros as u32;
+            at += zeros;
+            continue;
+        }
+        let mut frames =
+            loader.find_frames(u64::from(address) + at as u64).map_err(|error| unreadable(&error))?;
         let mut files = Vec::new();
         while let Some(frame) = frames.next().map_err(|error| unreadable(&error))? {
             files.extend(frame.location.and_then(|location| location.file).map(str::to_owned));
         }
-        *parts.entry(part(&files, root)).or_default() += STEP as u32;
+        let step = STEP.min(contents.len() - at);
+        *parts.entry(part(&files, root)).or_default() += step as u32;
+        at += step;
     }
     Ok(parts)
 }

@@ -14,14 +14,16 @@ use crate::setup::{Part, Setup};
 use crate::{build, pack, parts, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask size [--board BOARD] [--yes]
+usage: cargo xtask size [--board BOARD] [--image IMAGE] [--yes]
 
 Builds the bootloader, prints its flash by section, by part, by variant and by board, and fails when
 it is over the budget on any board, or with sealed images over what the key block leaves of the
 region. What runs from RAM lies in flash packed: sizes are told as they are unpacked (raw) and as the
-flash has them (packed). A share of what is packed is an estimate: as much of it as of the raw.
+flash has them (packed). A share of what is packed is an estimate: as much of it as of the raw, but
+for long runs of zeros, which take next to nothing.
 
   --board BOARD   the board of the tables (default: stm32f407g-disc1)
+  --image IMAGE   this bootloader alone, bootloader-sealed for one, by section and by part
   --yes           installs what is missing with sudo
 ";
 
@@ -31,17 +33,14 @@ pub const BUDGET: u32 = 22 * 1024;
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
+    let one = args.value("--image")?;
     let setup = Setup::from(&mut args);
     args.none_left()?;
     setup.prepare(&[Part::Firmware])?;
-    let dir = build::images(board, &["bootloader"])?;
-    let path = dir.join("bootloader.elf");
-    let elf = read(&path)?;
-    let flash = Flash::of(&elf, board.bootloader)?;
-    print!("\n{}", flash.table());
-    let image = elf.sections.iter().find(|section| section.name == pack::IMAGE);
-    let image = image.ok_or("the bootloader has no RAM image.")?;
-    print!("\n{}", by_part(&elf, parts::of(&path, image.address, image.size)?));
+    let flash = tables(board, one.as_deref().unwrap_or("bootloader"))?;
+    if one.is_some() {
+        return Ok(());
+    }
     print!("\n{}", by_variant(board)?);
     println!(
         "\n{} if nothing were packed; {} of flash are kept for it",
@@ -66,6 +65,20 @@ pub fn run(mut args: Args) -> Outcome {
         within = within.and(flash.within(room.size).map_err(|problem| format!("{}: {problem}", board.board)));
     }
     within
+}
+
+/// Builds an image and prints its flash by section and by part.
+fn tables(board: &Layout, name: &str) -> Outcome<Flash> {
+    let path = build::images(board, &[name])?.join(name).with_extension("elf");
+    let elf = read(&path)?;
+    let flash = Flash::of(&elf, board.bootloader)?;
+    print!("\n{}", flash.table());
+    let image = elf.sections.iter().find(|section| section.name == pack::IMAGE);
+    let image = image.ok_or_else(|| format!("{name} is no bootloader: it has no RAM image."))?;
+    let file = fs::read(&path).map_err(|error| format!("{}: {error}.", workspace::shown(&path)))?;
+    let contents = &file[image.offset as usize..][..image.size as usize];
+    print!("\n{}", by_part(&elf, parts::of(&path, image.address, contents)?));
+    Ok(flash)
 }
 
 /// Reads an ELF file.
@@ -106,9 +119,10 @@ impl Packed {
         Some(Self { stored: size_of(pack::PACKED)?, raw: size_of(pack::IMAGE)? })
     }
 
-    /// The share of so many raw bytes.
-    fn share(self, raw: u32) -> u32 {
-        (u64::from(raw) * u64::from(self.stored)).div_ceil(u64::from(self.raw.max(1))) as u32
+    /// The share of so many raw bytes, where so many of all are zeros that take nothing.
+    fn share(self, raw: u32, zeros: u32) -> u32 {
+        let counted = u64::from(self.raw.saturating_sub(zeros).max(1));
+        (u64::from(raw) * u64::from(self.stored)).div_ceil(counted) as u32
     }
 }
 
@@ -202,12 +216,20 @@ fn by_variant(board: &Layout) -> Outcome<String> {
 /// what runs from flash is told by its section.
 fn by_part(elf: &Elf, image: BTreeMap<String, u32>) -> String {
     let packed = Packed::of(elf);
-    let share = |raw| packed.as_ref().map_or(raw, |packed| packed.share(raw));
+    let zeros = image.get(parts::ZEROS).copied().unwrap_or(0);
+    let share = |part: &str, raw| match packed {
+        Some(_) if part == parts::ZEROS => 0,
+        Some(packed) => packed.share(raw, zeros),
+        None => raw,
+    };
     let plain = elf.sections.iter().filter(|section| section.loaded);
     let plain = plain.filter(|section| section.name != pack::PACKED && section.name != pack::IMAGE);
     let plain = plain.map(|section| (format!("{} (in flash)", section.name), section.size, section.size));
-    let mut rows: Vec<_> =
-        image.into_iter().map(|(part, raw)| (part, raw, share(raw))).chain(plain).collect();
+    let row = |(part, raw): (String, u32)| {
+        let share = share(&part, raw);
+        (part, raw, share)
+    };
+    let mut rows: Vec<_> = image.into_iter().map(row).chain(plain).collect();
     let all = rows.iter().fold((0, 0), |all, (_, raw, share)| (all.0 + raw, all.1 + share));
     rows.push(("(all)".to_owned(), all.0, all.1));
     rows.sort_by_key(|(_, raw, _)| cmp::Reverse(*raw));
@@ -275,7 +297,9 @@ mod tests {
     #[test]
     fn what_is_packed_counts_by_its_share() {
         let packed = Packed { stored: 10, raw: 40 };
-        assert_eq!((packed.share(40), packed.share(8), packed.share(9), packed.share(0)), (10, 2, 3, 0));
+        let share = |raw| packed.share(raw, 0);
+        assert_eq!((share(40), share(8), share(9), share(0)), (10, 2, 3, 0));
+        assert_eq!(packed.share(8, 20), 4, "half of all are zeros");
         let flash = Flash { sections: Vec::new(), used: 100, packed: Some(packed) };
         assert_eq!(flash.raw(), 130);
 
@@ -289,5 +313,8 @@ mod tests {
         assert!(table.contains("core                                 2       1\n"), "{table}");
         assert!(table.contains(".vectors (in flash)                 32      32\n"), "{table}");
         assert!(table.contains("(all)                               40      36\n"), "{table}");
+        let table = by_part(&elf, [("a/b".to_owned(), 4), (parts::ZEROS.to_owned(), 4)].into());
+        assert!(table.contains("a/b                                  4       4\n"), "{table}");
+        assert!(table.contains("(zeros)                              4       0\n"), "{table}");
     }
 }

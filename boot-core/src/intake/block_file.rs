@@ -7,6 +7,8 @@
 
 use canopen::program::FlashError;
 use canopen::AbortCode;
+#[cfg(feature = "sealed")]
+use seal::wire::MAGIC;
 use shared_abi::block_file::{
     Control, Header, Last, FRAMING, HEADER_SIZE, LAST_SIZE, LAST_SIZE_2008, MAX_BLOCK_SIZE, NUMBER_CONTROL,
     NUMBER_LAST,
@@ -111,6 +113,9 @@ impl Format for BlockFile {
             }
             #[cfg(feature = "sealed")]
             _ if to.judge.sealed_only => {
+                if header.number == 1 && to.queue.open_word() != u32::from_le_bytes(MAGIC) {
+                    return Err(Refusal::unfit(FlashError::NoAccess));
+                }
                 to.queue.commit_bytes();
                 to.progress.block = true;
             }

@@ -14,11 +14,11 @@ use coflash::file::convert::Label;
 use coflash::file::judge::judge;
 use coflash::file::limit::read_text;
 use coflash::file::sealed::show::flags;
-use coflash::file::sealed::{Refusal, SealedFile};
+use coflash::file::sealed::SealedFile;
 use coflash::update::dialect::is_data;
 use coflash::update::job::{self, Entry, Settings};
 use coflash::update::many::{flash_in_turn, flash_many, Job, ManyOptions};
-use coflash::update::{flash_program, Event, FlashOptions, Program, Target};
+use coflash::update::{flash_program, Event, FlashOptions, Program};
 use serde_json::json;
 use shared_abi::block_file::ProgramVersion;
 
@@ -256,15 +256,15 @@ impl Flash {
         label: Label,
     ) -> Result<Program, Failure> {
         if is_sealed(path) {
-            let file = SealedFile::parse(verify::read(path)?.image);
+            let bytes = verify::read(path)?.image;
+            let file = match self.force {
+                true => SealedFile::parse(bytes),
+                false => SealedFile::for_program(bytes, program),
+            };
             let file = file.map_err(|refusal| Failure::sealed(path, &refusal))?;
             if self.in_blocks {
                 // Where the program starts the device tells; whether such blocks can be is known now.
                 file.blocks(0, source.block_size()).map_err(|error| Failure::convert(error, path))?;
-            }
-            let image = file.head().program();
-            if image != program && !self.force {
-                return Err(Failure::sealed(path, &Refusal::Program { image, device: program }));
             }
             return Ok(Arc::new(file).into());
         }
@@ -289,11 +289,7 @@ impl Flash {
         let check = settings.check_target.unwrap_or(self.check_target || self.legacy.check_target());
         let advice = "convert it with --vid and --pid, or give them here";
         let unnamed = || Failure::usage("the file does not say for which device it is", advice);
-        let target = match file {
-            Program::Blocks(file) => Target::of(file),
-            Program::Sealed(file) => Some(Target::of_sealed(file)),
-        };
-        let check_target = if check { Some(target.ok_or_else(unnamed)?) } else { None };
+        let check_target = if check { Some(file.target().ok_or_else(unnamed)?) } else { None };
         Ok(FlashOptions::default()
             .program(self.program)
             .repeats(self.block_repeats)

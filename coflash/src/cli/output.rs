@@ -4,19 +4,18 @@ use std::fmt;
 use std::io::{self, IsTerminal, Write as _};
 use std::path::Path;
 
-use canopen::program::FlashError;
 use canopen::NodeId;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::Args;
 use coflash::bus::AdapterError;
 use coflash::device::diagnose::{diagnose, Diagnosis};
-use coflash::device::error::{flash_error_number, LssFailure};
+use coflash::device::error::LssFailure;
 use coflash::device::{legacy, Session};
 use coflash::file::convert::ConvertError;
 use coflash::file::sealed::Refusal;
 use coflash::file::{judge, Cause, FileError};
 use coflash::update::job::Fault;
-use coflash::update::{Left, Look};
+use coflash::update::{refusal_number, Left, Look};
 use coflash::Error;
 use serde_json::{json, Value};
 
@@ -408,10 +407,7 @@ impl Failure {
 
     /// A sealed image that breaks a rule.
     pub(super) fn sealed(path: &Path, refusal: &Refusal) -> Self {
-        let number = match refusal {
-            Refusal::NotSealed => Some(judge::Fault::NUMBER),
-            refusal => FlashError::from_code(refusal.fault() as u8).map(flash_error_number),
-        };
+        let number = Some(refusal_number(refusal));
         let (what, advice) = (format!("{}: {refusal}", path.display()), refusal.advice().to_string());
         // The manual's tools know no such files.
         let legacy = Exit::File.legacy();

@@ -5,31 +5,35 @@ use std::sync::Arc;
 use shared_abi::block_file::ProgramVersion;
 use shared_abi::layout;
 
-use super::state::{Firmware, Notice, Settings};
+use super::state::{Firmware, Notice, Seal, Settings};
 use crate::file::convert::{blocks_of, ConvertError, Options, Region};
 use crate::file::inspect::Inspection;
+use crate::file::sealed::show::flags;
+use crate::file::sealed::SealedFile;
 use crate::file::{self, label, AddressRange, BlockFile, Format};
+use crate::update::{Program, Target};
 
 /// The most bytes of a file: an ELF of the largest program with all that a debugger wants to know.
 pub(super) const FILE_MAX: usize = 32 * 1024 * 1024;
 /// The longest name that is shown.
 const NAME_MAX: usize = 120;
 
-/// A file that was read, checked and cut into blocks.
+/// A file that was read, checked and, unless it is sealed, cut into blocks.
 #[derive(Debug)]
 pub(super) struct Loaded {
     /// The file itself: other settings make other blocks of it.
     pub(super) bytes: Arc<Vec<u8>>,
-    pub(super) blocks: Arc<BlockFile>,
+    pub(super) program: Program,
     pub(super) shown: Firmware,
 }
 
-/// Reads a file and makes its blocks.
+/// Reads a file and makes its blocks; a sealed image stays as it is.
 pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Result<Loaded, Notice> {
     let name = printable(name);
     let bad = |error: &dyn std::fmt::Display| {
-        let advice = "choose the firmware file itself: Intel HEX, S-record, ELF or block file; a raw binary \
-                      (.bin) needs a board that says where it belongs";
+        let advice =
+            "choose the firmware file itself: Intel HEX, S-record, ELF, block file or sealed image; \
+                      a raw binary (.bin) needs a board that says where it belongs";
         Notice::failed(error.to_string(), advice)
     };
     if bytes.len() > FILE_MAX {
@@ -37,6 +41,9 @@ pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Resu
         return Err(Notice::failed(words, "choose the firmware file itself"));
     }
     let region = region(settings)?;
+    if Format::detect(&bytes) == Some(Format::Sealed) {
+        return sealed(bytes, name, settings);
+    }
     // A raw file looks like nothing in particular: its name tells it, and the board its place.
     let raw = name.to_lowercase().ends_with(".bin");
     let (format, place) = match (Format::detect(&bytes), region) {
@@ -69,9 +76,36 @@ pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Resu
             .and_then(|inspection| inspection.software_version)
             .or(label.and_then(|label| label.2)),
         left_out: converted.left_out,
+        seal: None,
         name,
     };
-    Ok(Loaded { bytes, blocks: Arc::new(blocks), shown })
+    Ok(Loaded { bytes, program: Arc::new(blocks).into(), shown })
+}
+
+/// Takes a sealed image, which only the device's keys open.
+fn sealed(bytes: Arc<Vec<u8>>, name: String, settings: &Settings) -> Result<Loaded, Notice> {
+    let file = SealedFile::for_program(bytes.to_vec(), settings.program);
+    let file = file.map_err(|refusal| Notice::failed(format!("{name}: {refusal}"), refusal.advice()))?;
+    let (head, sealed, target) = (file.head(), file.parts(), Target::of_sealed(&file));
+    let shown = Firmware {
+        size: bytes.len(),
+        inspection: sealed.to_string(),
+        program_size: head.size(),
+        crc: head.crc(),
+        vendor_id: Some(target.vendor_id),
+        product_code: Some(target.product_code),
+        version: Some(ProgramVersion(head.version()).to_string()),
+        left_out: 0,
+        seal: Some(Seal {
+            program: head.program(),
+            counter: head.counter(),
+            signed_by: sealed.signers(),
+            opened_by: sealed.recipients().map(|recipient| recipient.key_id()).collect(),
+            flags: flags(head.flags()).collect(),
+        }),
+        name,
+    };
+    Ok(Loaded { bytes, program: Arc::new(file).into(), shown })
 }
 
 /// For whom the program is: vendor-ID, product code and version, out of block 0 or behind the

@@ -132,7 +132,7 @@ pub(super) struct Firmware {
     pub(super) size: usize,
     /// What `inspect` says.
     pub(super) inspection: String,
-    /// What the conversion to blocks made of it.
+    /// Bytes of the program in flash.
     pub(super) program_size: u32,
     pub(super) crc: u32,
     pub(super) vendor_id: Option<u32>,
@@ -140,6 +140,23 @@ pub(super) struct Firmware {
     pub(super) version: Option<String>,
     /// Bytes that the conversion left out.
     pub(super) left_out: u64,
+    /// What a sealed image says beside.
+    pub(super) seal: Option<Seal>,
+}
+
+/// What a sealed image says of itself; the device judges whether it is true.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub(super) struct Seal {
+    /// The program's number on the board.
+    pub(super) program: u8,
+    /// The security counter.
+    pub(super) counter: u32,
+    /// The keys that have signed it, by their ids.
+    pub(super) signed_by: Vec<u32>,
+    /// The key-encryption keys of which each opens it; none where it is not encrypted.
+    pub(super) opened_by: Vec<u32>,
+    /// Its flags in words.
+    pub(super) flags: Vec<&'static str>,
 }
 
 /// What is being done.

@@ -140,7 +140,7 @@ fn update_all(
 ) -> Notice {
     let jobs: Vec<One> = nodes
         .iter()
-        .map(|node| One::new(*node, file.blocks.clone(), for_node(shared, file, *node, options)))
+        .map(|node| One::new(*node, file.program.clone(), for_node(shared, file, *node, options)))
         .collect();
     let many = ManyOptions::default().at_once(AT_ONCE).cancelled(shared.cancelled.clone());
     let tell = |number: usize, event: Event| {

@@ -4,8 +4,12 @@
 use std::borrow::Cow;
 use std::sync::Arc;
 
-use crate::file::sealed::SealedFile;
-use crate::file::BlockFile;
+use canopen::program::FlashError;
+
+use super::options::Target;
+use crate::device::error::flash_error_number;
+use crate::file::sealed::{Refusal, SealedFile};
+use crate::file::{judge, BlockFile};
 
 /// What an update brings into a device.
 #[derive(Clone, Copy, Debug)]
@@ -53,10 +57,31 @@ pub enum Program {
 }
 
 impl Program {
+    /// The device that it names, if it names one.
+    #[must_use]
+    pub fn target(&self) -> Option<Target> {
+        match self {
+            Self::Blocks(file) => Target::of(file),
+            Self::Sealed(file) => Some(Target::of_sealed(file)),
+        }
+    }
+
     pub(super) fn content(&self) -> Content<'_> {
         match self {
             Self::Blocks(file) => Content::Blocks(file),
             Self::Sealed(file) => Content::Sealed(file),
+        }
+    }
+}
+
+/// The stable number of a sealed image that is refused without a device: the one that a device with the
+/// same keys would have brought about, or that of what is no program.
+#[must_use]
+pub fn refusal_number(refusal: &Refusal) -> u32 {
+    match refusal {
+        Refusal::NotSealed => judge::Fault::NUMBER,
+        refusal => {
+            FlashError::from_code(refusal.fault() as u8).map_or(judge::Fault::NUMBER, flash_error_number)
         }
     }
 }

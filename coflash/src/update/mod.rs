@@ -26,7 +26,7 @@ mod toml_line;
 mod trial;
 
 pub use self::catch::{catch, CatchOptions, Caught};
-pub use self::content::Program;
+pub use self::content::{refusal_number, Program};
 pub use self::event::{Event, Report};
 pub use self::flash::{flash, flash_program, flash_sealed};
 pub use self::held::{held, Difference, Held, Part};

@@ -21,6 +21,8 @@ pub fn left(events: &[Event]) -> DeviceState {
     }
 }
 
+pub mod vault;
+
 pub const NODE: u8 = 5;
 pub const APPLICATION: u32 = 0x0002_0192;
 pub const BOOTLOADER: u32 = 0x1000_0000;

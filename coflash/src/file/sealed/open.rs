@@ -25,7 +25,11 @@ pub struct Sealed<'a> {
 
 /// A sealed image as a file has it.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct SealedFile(Vec<u8>);
+pub struct SealedFile {
+    bytes: Vec<u8>,
+    /// Bytes of the head.
+    head: usize,
+}
 
 impl SealedFile {
     /// Takes a file that [`Sealed::parse`] understands.
@@ -33,14 +37,26 @@ impl SealedFile {
     /// # Errors
     /// Those of [`Sealed::parse`].
     pub fn parse(bytes: Vec<u8>) -> Result<Self, Refusal> {
-        Sealed::parse(&bytes)?;
-        Ok(Self(bytes))
+        let head = Sealed::parse(&bytes)?.head.0.len();
+        Ok(Self { bytes, head })
+    }
+
+    /// The same for a file that is to be written as this program.
+    ///
+    /// # Errors
+    /// Those of [`Self::parse`], and [`Refusal::Program`].
+    pub fn for_program(bytes: Vec<u8>, program: u8) -> Result<Self, Refusal> {
+        let file = Self::parse(bytes)?;
+        match file.head().program() {
+            image if image != program => Err(Refusal::Program { image, device: program }),
+            _ => Ok(file),
+        }
     }
 
     /// All of its bytes: what a device gets.
     #[must_use]
     pub fn bytes(&self) -> &[u8] {
-        &self.0
+        &self.bytes
     }
 
     /// Manifest, certificate and signatures.
@@ -52,8 +68,7 @@ impl SealedFile {
     /// Its parts.
     #[must_use]
     pub fn parts(&self) -> Sealed<'_> {
-        // `parse` has found the head to be there.
-        let (head, chunks) = self.0.split_at(head_size(&self.0).unwrap_or_default());
+        let (head, chunks) = self.bytes.split_at(self.head);
         Sealed { head: Head(head), chunks }
     }
 }

@@ -63,9 +63,22 @@ function file(firmware) {
     ["CRC", hex(firmware.crc)],
     ["Version", firmware.version ?? "not told"],
     ["Made for", firmware.vendor_id === null ? "not told" : `vendor-ID ${hex(firmware.vendor_id)}, product code ${hex(firmware.product_code)}`],
+    ...(firmware.seal ? seal(firmware.seal) : []),
     ...(firmware.left_out > 0 ? [["Left out", `${firmware.left_out} bytes outside the program's region`]] : []),
   ]);
   text($("inspection"), firmware.inspection);
+}
+
+/** What a sealed image says of itself; whether it is true is for the device to say. */
+function seal({ program, counter, signed_by, opened_by, flags }) {
+  const keys = (ids) => ids.map(hex).join(", ");
+  return [
+    ["Program number", program],
+    ["Security counter", counter],
+    ["Signed by", `key ${keys(signed_by)} (the device checks it)`],
+    ["Encrypted for", opened_by.length > 0 ? `key ${keys(opened_by)}` : "nobody: it is not encrypted"],
+    ["Sealed as", flags.length > 0 ? flags.join(", ") : "it is in flash"],
+  ];
 }
 
 /** Takes the one file that was dropped or chosen. */
