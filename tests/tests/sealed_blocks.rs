@@ -1,0 +1,201 @@
+//! A sealed image inside a block file, block by block, for masters that know block files and nothing
+//! else: what the sealed device takes, what it refuses, and that the old program stays.
+
+use canopen::program::ProgramControl;
+use canopen::Address;
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::firmware;
+use coboot_tests::sealed_board::{board, release, sealer, write, COUNTER, KEKS};
+use coflash::device::{Doing, Transfers};
+use coflash::file::sealed::{SealedFile, Sealer};
+use coflash::update::{flash_sealed, FlashOptions};
+use coflash::Error;
+
+const DATA: Address = Address::new(0x1F50, 1);
+const STATUS: Address = Address::new(0x1F57, 1);
+const CRC_OF_PROGRAM: Address = Address::new(0x1F56, 1);
+const VERSION: Address = Address::new(0x100A, 0);
+
+/// 1F57h (SYS TEC manual, table 3; from 8Ah on of sealed images).
+mod status {
+    pub const OK: u32 = 0;
+    pub const FORMAT: u32 = 0x04;
+    pub const CRC: u32 = 0x06;
+    pub const NO_ACCESS: u32 = 0x84;
+    pub const SEQUENCE: u32 = 0x88;
+    pub const SIGNATURE: u32 = 0x8A;
+}
+
+fn seal(sealer: &Sealer<'_>, image: &str) -> Vec<u8> {
+    sealer.seal(&firmware::raw(image), &release()).expect("it can be sealed")
+}
+
+/// Its blocks, each as one download.
+fn blocks(file: &[u8], size: usize) -> Vec<Vec<u8>> {
+    let file = SealedFile::parse(file.to_vec()).expect("it is one");
+    let start = firmware::board().programs[0].base;
+    let blocks = file.blocks(start, size).expect("it can be cut");
+    blocks.blocks().iter().map(|block| block.emit_with(blocks.checksum())).collect()
+}
+
+/// Sends a block, and waits until the device is not busy any more; 1F57h.
+fn send(bench: &mut Bench, block: &[u8]) -> u32 {
+    let mut session = bench.session();
+    match session.write(DATA, block, Doing::Program, &mut |_| {}) {
+        Ok(()) | Err(Error::Refused { .. }) => {}
+        Err(error) => panic!("{error}"),
+    }
+    session.await_idle(1, Doing::Read(STATUS)).expect("1F57h is answered").to_word()
+}
+
+fn clear(bench: &mut Bench) {
+    let mut session = bench.session();
+    session.command(1, ProgramControl::Clear).expect("CLEAR is answered");
+    session.await_idle(1, Doing::Command(ProgramControl::Clear)).expect("1F57h is answered");
+}
+
+/// Sends all of them; the first answer that is not OK.
+fn send_all(bench: &mut Bench, blocks: &[Vec<u8>]) -> u32 {
+    clear(bench);
+    blocks.iter().map(|block| send(bench, block)).find(|word| *word != status::OK).unwrap_or(status::OK)
+}
+
+fn assert_runs(bench: &mut Bench, version: &str, what: &str) {
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    bench.await_boot_up(1000);
+    bench.run_ms(50);
+    assert!(!bench.is_bootloader(NODE), "{what}: it does not start");
+    assert_eq!(bench.session().read_text(VERSION).unwrap(), version, "{what}");
+    bench.session().command(1, ProgramControl::Stop).unwrap();
+    bench.run_ms(100);
+    assert!(bench.is_bootloader(NODE), "{what}");
+}
+
+/// A sealed board in its bootloader, with version 1, which has come as one download.
+fn board_with_a_program() -> Bench {
+    let mut bench = board();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let file = seal(&sealer(COUNTER), firmware::APP_V1);
+    assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
+    assert_runs(&mut bench, "1.0.0", "version 1");
+    bench
+}
+
+#[test]
+fn sealed_images_in_blocks_are_installed() {
+    let mut bench = board_with_a_program();
+    let everything = Sealer { encrypt_for: &*KEKS, compress: true, ..sealer(COUNTER) };
+    let versions = [(firmware::APP_V2, "2.0.0"), (firmware::APP_V1, "1.0.0")];
+    for (sealer, size) in [(sealer(COUNTER), 4096), (everything.clone(), 1024), (everything, 100)] {
+        for (image, version) in versions {
+            let blocks = blocks(&seal(&sealer, image), size);
+            assert_eq!(send_all(&mut bench, &blocks), status::OK, "{version} in blocks of {size}");
+            let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&firmware::raw(image));
+            assert_eq!(bench.session().read_number(CRC_OF_PROGRAM).unwrap(), crc);
+            assert_runs(&mut bench, version, version);
+        }
+    }
+    bench.assert_nothing_unmodelled();
+}
+
+/// The host tool's way.
+#[test]
+fn coflash_sends_a_sealed_image_in_blocks() {
+    let mut bench = board_with_a_program();
+    let file = SealedFile::parse(seal(&sealer(COUNTER), firmware::APP_V2)).unwrap();
+    let options = FlashOptions::default().blocks(Some(512));
+    flash_sealed(&mut bench.session(), &file, &options, &mut |_| {}).unwrap();
+    assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
+    bench.assert_nothing_unmodelled();
+}
+
+/// Before the first authentic chunk nothing is lost, whatever is wrong with the blocks.
+#[test]
+fn what_is_not_authentic_costs_nothing() {
+    type Spoil = fn(&mut Vec<Vec<u8>>);
+    /// A block with other data, and the CRC that it has to have.
+    fn with_data(block: &[u8], change: impl Fn(&mut [u8])) -> Vec<u8> {
+        let mut block = block.to_vec();
+        let end = block.len() - 4;
+        change(&mut block[12..end]);
+        let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&block[..end]);
+        block[end..].copy_from_slice(&crc.to_le_bytes());
+        block
+    }
+    let mut bench = board_with_a_program();
+    let program = (firmware::board().programs[0].base - firmware::board().chip.flash.base) as usize;
+    let genuine = blocks(&seal(&sealer(COUNTER), firmware::APP_V2), 128);
+    let cases: [(&str, Spoil, u32); 6] = [
+        (
+            "a flipped bit in the manifest",
+            |all| all[1] = with_data(&all[1], |data| data[50] ^= 1),
+            status::SIGNATURE,
+        ),
+        ("a flipped bit, and the block's CRC tells", |all| all[1][50] ^= 1, status::CRC),
+        ("no sealed image", |all| all[1] = with_data(&all[1], |data| data[0] ^= 1), status::NO_ACCESS),
+        ("a block is left out", |all| drop(all.remove(2)), status::SEQUENCE),
+        ("block 0 again in the middle", |all| all.insert(2, all[0].clone()), status::SEQUENCE),
+        ("the end comes too early", |all| drop(all.drain(2..all.len() - 1)), status::FORMAT),
+    ];
+    for (what, spoil, expected) in cases {
+        let mut blocks = genuine.clone();
+        spoil(&mut blocks);
+        let before = bench.machine().flash()[program..].to_vec();
+        assert_eq!(send_all(&mut bench, &blocks), expected, "{what}");
+        assert!(bench.machine().flash()[program..] == before[..], "{what}: the flash is another");
+        // A bad signature slows the device down.
+        bench.run_ms(1000);
+        assert_runs(&mut bench, "1.0.0", what);
+    }
+    let unsealed = firmware::blocks(firmware::APP_V2);
+    let unsealed: Vec<_> =
+        unsealed.blocks().iter().map(|block| block.emit_with(unsealed.checksum())).collect();
+    assert_eq!(send_all(&mut bench, &unsealed), status::NO_ACCESS);
+    assert_runs(&mut bench, "1.0.0", "an unsealed block file");
+    assert_eq!(send_all(&mut bench, &genuine), status::OK);
+    assert_runs(&mut bench, "2.0.0", "and the genuine one");
+    bench.assert_nothing_unmodelled();
+}
+
+/// Between two blocks others come: a block again, one that arrives damaged, a sealed image as one
+/// download, a reset. The download goes on, or begins anew behind CLEAR, and nothing else is started.
+#[test]
+fn blocks_among_other_work() {
+    let mut bench = board_with_a_program();
+    let file = seal(&sealer(COUNTER), firmware::APP_V2);
+    let blocks = blocks(&file, 512);
+    clear(&mut bench);
+    for (at, block) in blocks.iter().enumerate() {
+        if at == 6 {
+            let mut damaged = block.clone();
+            damaged[100] ^= 8;
+            assert_eq!(send(&mut bench, &damaged), status::CRC);
+            assert_eq!(send(&mut bench, &blocks[4]), status::SEQUENCE, "that one is there");
+            // A second client with the same image in one go.
+            assert_ne!(send(&mut bench, &file), status::OK);
+        }
+        assert_eq!(send(&mut bench, block), status::OK, "block {at}");
+    }
+    assert_runs(&mut bench, "2.0.0", "the download went on");
+    // Broken off, by CLEAR and by the power.
+    let blocks = self::blocks(&seal(&sealer(COUNTER), firmware::APP_V1), 512);
+    for power in [false, true] {
+        clear(&mut bench);
+        // Behind the first chunk.
+        for block in &blocks[..14] {
+            assert_eq!(send(&mut bench, block), status::OK);
+        }
+        if power {
+            bench.power_off();
+            bench.run_ms(100);
+            bench.power_on();
+            bench.await_boot_up(1000);
+            bench.run_ms(500);
+            assert!(bench.is_bootloader(NODE), "half a program does not start");
+        }
+        assert_eq!(send_all(&mut bench, &blocks), status::OK, "power cut: {power}");
+        assert_runs(&mut bench, "1.0.0", "begun anew");
+    }
+    bench.assert_nothing_unmodelled();
+}
