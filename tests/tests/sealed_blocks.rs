@@ -179,8 +179,8 @@ fn blocks_among_other_work() {
     }
     assert_runs(&mut bench, "2.0.0", "the download went on");
     // Broken off, by CLEAR and by the power.
-    let blocks = self::blocks(&seal(&sealer(COUNTER), firmware::APP_V1), 512);
-    for power in [false, true] {
+    for (power, image, version) in [(false, firmware::APP_V1, "1.0.0"), (true, firmware::APP_V2, "2.0.0")] {
+        let blocks = self::blocks(&seal(&sealer(COUNTER), image), 512);
         clear(&mut bench);
         // Behind the first chunk.
         for block in &blocks[..14] {
@@ -195,7 +195,7 @@ fn blocks_among_other_work() {
             assert!(bench.is_bootloader(NODE), "half a program does not start");
         }
         assert_eq!(send_all(&mut bench, &blocks), status::OK, "power cut: {power}");
-        assert_runs(&mut bench, "1.0.0", "begun anew");
+        assert_runs(&mut bench, version, "begun anew");
     }
     bench.assert_nothing_unmodelled();
 }
