@@ -372,6 +372,19 @@ fn blocks_that_carry_no_whole_image_are_refused() {
     assert!(fault(&wrong).contains("CRC of block 2 is"));
     let wrong = [&good[..count - 1], &[last(&image[1..])]].concat();
     assert!(fault(&wrong).contains("does not fit the blocks before it"));
+    // CRC-16, which is right everywhere, and which no sealed device takes.
+    let crc_16 = crc::Crc::<u16>::new(&crc::CRC_16_XMODEM);
+    let with_crc_16 = |mut block: Vec<u8>| {
+        if block.starts_with(&[0xFF; 4]) {
+            block[16..20].copy_from_slice(&u32::from(crc_16.checksum(&image)).to_le_bytes());
+        }
+        let end = block.len() - 4;
+        let crc = u32::from(crc_16.checksum(&block[..end]));
+        block[end..].copy_from_slice(&crc.to_le_bytes());
+        block
+    };
+    let words = fault(&good.iter().cloned().map(with_crc_16).collect::<Vec<_>>());
+    assert!(words.contains("takes blocks with CRC-32 alone"), "{words}");
     // Erased flash in front of it or behind it is no part of it.
     let behind = [&good[..count - 1], &[last(&[&image[..], &[0xFF; 4]].concat())]].concat();
     assert!(fault(&behind).contains("does not fit the blocks before it"));

@@ -10,7 +10,7 @@ use coflash::device::lock::Lock;
 use coflash::device::lss::{ensure_node_id, LssAddress};
 use coflash::device::Dialect;
 use coflash::file::block_file::BlockFile;
-use coflash::file::convert::Label;
+use coflash::file::convert::{blocks_of_sealed, Label};
 use coflash::file::judge::judge;
 use coflash::file::limit::read_text;
 use coflash::file::sealed::show::flags;
@@ -264,7 +264,8 @@ impl Flash {
             let file = file.map_err(|refusal| Failure::sealed(path, &refusal))?;
             if self.in_blocks {
                 // Where the program starts the device tells; whether such blocks can be is known now.
-                file.blocks(0, source.block_size()).map_err(|error| Failure::convert(error, path))?;
+                blocks_of_sealed(&file, 0, source.block_size())
+                    .map_err(|error| Failure::convert(error, path))?;
             }
             return Ok(Arc::new(file).into());
         }

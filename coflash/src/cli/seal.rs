@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use coflash::file::block_file::BlockFile;
-use coflash::file::convert::{blocks_of, DEFAULT_BLOCK_SIZE};
+use coflash::file::convert::{blocks_of, blocks_of_sealed, DEFAULT_BLOCK_SIZE};
 use coflash::file::judge::judge;
 use coflash::file::label::label_of;
 use coflash::file::limit;
@@ -208,7 +208,8 @@ pub(super) fn put(output: &Path, image: Vec<u8>, form: Form) -> Result<SealedFil
     match form {
         Form::Plain => write(output, file.bytes())?,
         Form::Blocks { start, size } => {
-            let blocks = file.blocks(start, size).map_err(|error| Failure::convert(error, output))?;
+            let blocks = blocks_of_sealed(&file, start, size);
+            let blocks = blocks.map_err(|error| Failure::convert(error, output))?;
             write(output, &blocks.emit())?;
         }
     }

@@ -9,7 +9,9 @@ use super::fault::{Cause, Place, ReadError};
 use super::image::Image;
 use super::label::label_of;
 use super::range::AddressRange;
+use super::raw;
 use super::read::Firmware;
+use super::sealed::SealedFile;
 
 /// The manual's `--block-size`: 1024 bytes, framing included.
 pub const DEFAULT_BLOCK_SIZE: usize = 0x400;
@@ -269,6 +271,24 @@ pub fn blocks_of(firmware: Firmware, options: &Options) -> Result<Converted, Con
             Ok(Converted { file, left_out: 0 })
         }
     }
+}
+
+/// The blocks that carry a sealed image, of at most `block_size` bytes with framing, to a device whose
+/// program starts at `start`: its bytes in order from there on, and block 0 with what it says.
+///
+/// # Errors
+/// [`ConvertError::BlockSize`], [`ConvertError::Start`], and [`ConvertError::File`] for one that runs
+/// over the end of the address space.
+pub fn blocks_of_sealed(file: &SealedFile, start: u32, block_size: usize) -> Result<BlockFile, ConvertError> {
+    let head = file.head();
+    let label = Label::Release {
+        vendor_id: head.vendor_id(),
+        product_code: head.product_code(),
+        version: head.version(),
+        date: head.created(),
+    };
+    let bytes = raw::read(file.bytes(), Some(start))?;
+    Ok(convert(&bytes, &Options::default().block_size(block_size).label(label))?.file)
 }
 
 /// Data bytes of the largest block: whole words.

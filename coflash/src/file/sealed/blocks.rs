@@ -1,14 +1,14 @@
 //! A sealed image in a block file: blocks 1 to N carry it piece by piece, as they carry a program,
 //! from the program's first address on; block 0 tells what the manifest tells, and the last block
 //! has size and CRC of the sealed image. For masters that know block files and nothing else.
+//!
+//! [`blocks_of_sealed`](crate::file::convert::blocks_of_sealed) makes such a file.
 
 use shared_abi::block_file::{Header, HEADER_SIZE};
 
-use super::open::{Sealed, SealedFile};
+use super::open::Sealed;
 use crate::file::block_file::{BlockFile, Checksum, FRAMING};
-use crate::file::convert::{convert, ConvertError, Label, Options};
 use crate::file::fault::{Cause, Place, ReadError};
-use crate::file::raw;
 
 /// So many of a file's first bytes tell whether it is a sealed image, in blocks or not: block 0 has
 /// 24 bytes of data at most.
@@ -70,24 +70,4 @@ pub fn carried(bytes: Vec<u8>) -> Result<Carried, ReadError> {
         return Err(Place::Offset(offset).fault(Cause::ProgramCrc { size, crc }));
     }
     Ok(Carried { image, blocks: Some(file) })
-}
-
-impl SealedFile {
-    /// The blocks that carry it, of at most `block_size` bytes with framing, to a device whose program
-    /// starts at `start`.
-    ///
-    /// # Errors
-    /// [`ConvertError::BlockSize`], [`ConvertError::Start`], and [`ConvertError::File`] for one that
-    /// runs over the end of the address space.
-    pub fn blocks(&self, start: u32, block_size: usize) -> Result<BlockFile, ConvertError> {
-        let head = self.head();
-        let label = Label::Release {
-            vendor_id: head.vendor_id(),
-            product_code: head.product_code(),
-            version: head.version(),
-            date: head.created(),
-        };
-        let bytes = raw::read(self.bytes(), Some(start))?;
-        Ok(convert(&bytes, &Options::default().block_size(block_size).label(label))?.file)
-    }
 }

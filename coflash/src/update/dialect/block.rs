@@ -10,6 +10,7 @@ use super::procedure::{enter_by_call, Downloaded, Procedure};
 use crate::device::region::program_region;
 use crate::device::{DeviceType, Dialect, Doing, Error, Session, Transfers};
 use crate::file::block_file::{Block as FileBlock, BlockFile};
+use crate::file::convert::blocks_of_sealed;
 use crate::file::sealed::SealedFile;
 use crate::update::content::Content;
 use crate::update::course::Course;
@@ -88,7 +89,7 @@ fn cut(
     let region = program_region(session, program)?;
     let region =
         region.ok_or_else(|| not_cut("the device does not tell where its program starts (2004h)"))?;
-    sealed.blocks(region.base, block_size).map_err(|error| not_cut(&error.to_string()))
+    blocks_of_sealed(sealed, region.base, block_size).map_err(|error| not_cut(&error.to_string()))
 }
 
 /// Steps 4 to 9: erases and sends all blocks; gives how many had to be repeated, and how long they took.
