@@ -6,12 +6,10 @@ when both ways gave the same, else with 1.
     block_upload_client.py 127.0.0.1:29536 1
 """
 
-import argparse
 import sys
 
-import can
-import canopen
-from canopen.sdo.exceptions import SdoError
+import client
+from canopen_client import Failed, step
 
 # Mandatory ones, the texts of the device, and the program objects of CiA 302-3.
 OBJECTS = [(0x1000, 0), (0x1008, 0), (0x1009, 0), (0x100A, 0), (0x1018, 0), (0x1018, 1), (0x1018, 4)]
@@ -29,31 +27,20 @@ def read(node, index, subindex, block):
             data += part
 
 
+def compare(node):
+    for index, subindex in OBJECTS:
+        by_block = read(node, index, subindex, True)
+        in_segments = node.sdo.upload(index, subindex)
+        step(f"{index:04X}h/{subindex}: {by_block.hex()}")
+        if by_block != in_segments:
+            raise Failed(f"in segments it is {in_segments.hex()}")
+
+
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("address", help="HOST:PORT of the socketcand server")
+    parser = client.arguments(__doc__)
     parser.add_argument("node", type=int)
-    arguments = parser.parse_args()
-    host, port = arguments.address.rsplit(":", 1)
-    network = canopen.Network()
-    try:
-        network.connect(interface="socketcand", host=host, port=int(port), channel="can0", tcp_tune=True)
-        node = canopen.RemoteNode(arguments.node, canopen.ObjectDictionary())
-        network.add_node(node)
-        node.sdo.RESPONSE_TIMEOUT = 2.0
-        for index, subindex in OBJECTS:
-            by_block = read(node, index, subindex, True)
-            in_segments = node.sdo.upload(index, subindex)
-            print(f"{index:04X}h/{subindex}: {by_block.hex()}", flush=True)
-            if by_block != in_segments:
-                print(f"failed: in segments it is {in_segments.hex()}", file=sys.stderr)
-                return 1
-    except (SdoError, can.CanError, OSError) as error:
-        print(f"failed: {error}", file=sys.stderr)
-        return 1
-    finally:
-        network.disconnect()
-    return 0
+    options = parser.parse_args()
+    return client.run(options.address, compare, options.node)
 
 
 if __name__ == "__main__":

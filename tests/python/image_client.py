@@ -8,14 +8,10 @@ ends with 0 when all went well, else with 1.
     image_client.py 127.0.0.1:29536 app.bin [--block]
 """
 
-import argparse
 import sys
 import zlib
 
-import can
-import canopen
-from canopen.sdo.exceptions import SdoError
-
+import client
 from canopen_client import Device, Failed, object_dictionary, step
 
 # Values of 1F51h (CiA 302-3).
@@ -55,27 +51,11 @@ def update(device, image, block):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("address", help="HOST:PORT of the socketcand server")
-    parser.add_argument("image", help="a raw image, from the start of the program on")
-    parser.add_argument("--block", action="store_true", help="by SDO block transfer")
-    arguments = parser.parse_args()
-    with open(arguments.image, "rb") as file:
-        image = file.read()
-    host, port = arguments.address.rsplit(":", 1)
-    network = canopen.Network()
-    try:
-        network.connect(interface="socketcand", host=host, port=int(port), channel="can0", tcp_tune=True)
-        node = canopen.RemoteNode(1, object_dictionary())
-        network.add_node(node)
-        node.sdo.RESPONSE_TIMEOUT = 2.0
-        update(Device(node, 60.0), image, arguments.block)
-    except (Failed, SdoError, can.CanError, OSError) as error:
-        print(f"failed: {error}", file=sys.stderr)
-        return 1
-    finally:
-        network.disconnect()
-    return 0
+    parser = client.image_arguments(__doc__, "a raw image, from the start of the program on")
+    options = parser.parse_args()
+    image = client.read(options.image)
+    act = lambda node: update(Device(node, 60.0), image, options.block)
+    return client.run(options.address, act, dictionary=object_dictionary())
 
 
 if __name__ == "__main__":

@@ -1,76 +1,44 @@
 """An unmodified python-canopen that writes a sealed image, and knows nothing of what is in it.
 
-Nothing of the client is set but the SDO time-out, which is on the clock of a machine that may have
-other work: tests in virtual time show that no answer takes 5 ms.
-
-    sealed_client.py 127.0.0.1:29536 app.cbs [--block]
+    sealed_client.py 127.0.0.1:29536 app.cbs [--block] [--as-it-comes]
 """
 
-import argparse
 import sys
-import time
 
-import can
-import canopen
 from canopen.sdo.exceptions import SdoError
 
-# Values of 1F51h (CiA 302-3).
-START, CLEAR = 1, 3
+import client
+from canopen_client import CLEAR, START, Device, object_dictionary, step
+
+# What 1F51h reads while the program runs (CiA 302-3).
+STARTED = 1
 
 
-def number(node, index):
-    return int.from_bytes(node.sdo.upload(index, 1), "little")
-
-
-def wait_until_idle(node):
-    until = time.monotonic() + 60
-    while number(node, 0x1F57) & 1:
-        if time.monotonic() > until:
-            raise OSError("1F57h stays busy")
-        time.sleep(0.05)
-
-
-def update(node, image, block):
-    node.sdo.download(0x1F51, 1, bytes([CLEAR]))
-    wait_until_idle(node)
+def update(device, image, block):
+    device.command(CLEAR, "clear")
     try:
         if block:
-            with node.sdo.open(0x1F50, 1, "wb", size=len(image), block_transfer=True) as stream:
+            with device.sdo.open(0x1F50, 1, "wb", size=len(image), block_transfer=True) as stream:
                 stream.write(image)
         else:
-            node.sdo.download(0x1F50, 1, image)
+            device.sdo.download(0x1F50, 1, image)
     except SdoError as error:
-        print(f"the transfer ended: {error}", flush=True)
-    wait_until_idle(node)
-    status = number(node, 0x1F57)
-    print(f"1F57h = {status:08X}h, 1F56h = {number(node, 0x1F56):08X}h", flush=True)
-    if status == 0:
-        node.sdo.download(0x1F51, 1, bytes([START]))
-        node.nmt.wait_for_bootup(5)
-        print("started", flush=True)
+        step(f"the transfer ended: {error}")
+    device.wait_until_idle("download")
+    control = device.sdo[0x1F51][1]
+    control.raw = START
+    device.wait_for(lambda _: control.raw == STARTED, "start")
+    step("started")
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("address", help="HOST:PORT of the socketcand server")
-    parser.add_argument("image", help="a sealed image")
-    parser.add_argument("--block", action="store_true", help="by SDO block transfer")
-    arguments = parser.parse_args()
-    with open(arguments.image, "rb") as file:
-        image = file.read()
-    host, port = arguments.address.rsplit(":", 1)
-    network = canopen.Network()
-    try:
-        network.connect(interface="socketcand", host=host, port=int(port), channel="can0", tcp_tune=True)
-        node = network.add_node(1)
-        node.sdo.RESPONSE_TIMEOUT = 2.0
-        update(node, image, arguments.block)
-    except (SdoError, can.CanError, OSError) as error:
-        print(f"failed: {error}", file=sys.stderr)
-        return 1
-    finally:
-        network.disconnect()
-    return 0
+    parser = client.image_arguments(__doc__, "a sealed image")
+    parser.add_argument("--as-it-comes", action="store_true", help="with the library's own SDO time-out")
+    options = parser.parse_args()
+    image = client.read(options.image)
+    act = lambda node: update(Device(node, 60.0), image, options.block)
+    timeout = None if options.as_it_comes else 2.0
+    return client.run(options.address, act, dictionary=object_dictionary(), timeout=timeout)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,7 @@
 //! A device that takes sealed images alone, on the flash model: the keys that it trusts, the files
 //! that come to it, and what may be found in its flash.
 
-use std::cell::{RefCell, RefMut};
-use std::rc::Rc;
 use std::sync::OnceLock;
-use std::task::Poll;
 
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config, PasswordObject};
 use boot_core::canopen::device::Device as Identity;
@@ -14,7 +11,7 @@ use boot_core::canopen::{AbortCode, BitRate, Instant, NodeId};
 use boot_core::control::{Policy, Step};
 use boot_core::crc::CrcKind;
 use boot_core::decision::{self, decide, BootDecision, Circumstances};
-use boot_core::flash::{Flash, FlashFault, Operation};
+use boot_core::flash::Flash;
 use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
 use boot_core::program::{verify, Invalid, VerifiedProgram};
@@ -23,12 +20,12 @@ use boot_core::unseal::Room;
 use coflash::file::sealed::{hash, key_block, Certificate, Kek, Role, Sealer, SigningKey};
 use seal::access::{right, CHALLENGE, DOMAIN as ACCESS_DOMAIN, SIGNED_CHALLENGE};
 use seal::wire::{head_size, CERTIFICATE, DOMAIN, ED25519};
-use shared_abi::geometry::{Region, Sector};
+use shared_abi::geometry::Region;
 use shared_abi::label::{self, Label};
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
-use crate::powercut::model::{ModelFlash, CHIP, ONE_PROGRAM, TWO_PROGRAMS};
+use crate::powercut::model::{Chip, ModelFlash, CHIP, ONE_PROGRAM, TWO_PROGRAMS};
 
 // --- setups
 
@@ -371,36 +368,6 @@ impl Parts {
 
 // --- the device
 
-/// The flash, which outlives the bootloader that works on it.
-#[derive(Clone)]
-pub struct Chip(Rc<RefCell<ModelFlash>>);
-
-impl Chip {
-    /// As a debug probe sees it.
-    #[must_use]
-    pub fn model(&self) -> RefMut<'_, ModelFlash> {
-        self.0.borrow_mut()
-    }
-}
-
-impl Flash for Chip {
-    fn read(&self, address: u32, buffer: &mut [u8]) {
-        self.0.borrow().read(address, buffer);
-    }
-
-    fn start(&mut self, operation: Operation) -> Result<(), FlashFault> {
-        self.model().start(operation)
-    }
-
-    fn sector_at(&self, address: u32) -> Option<Sector> {
-        self.0.borrow().sector_at(address)
-    }
-
-    fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
-        self.model().poll()
-    }
-}
-
 /// What the rest of a device uses of its bootloader.
 pub trait Node: Objects + LssDevice {
     /// A bounded piece of work; whether there was none.
@@ -456,7 +423,7 @@ impl Device {
     /// With this flash.
     #[must_use]
     pub fn on(setup: &'static Setup, flash: ModelFlash) -> Self {
-        Self { setup, chip: Chip(Rc::new(RefCell::new(flash))), buffer: 2048 }
+        Self { setup, chip: Chip::new(flash), buffer: 2048 }
     }
 
     /// With an empty flash but for this key block.

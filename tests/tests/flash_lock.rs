@@ -5,11 +5,11 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
+use coboot_tests::sealed_board::{board, open_board, release, sealer, COUNTER};
 use coflash::device::{Doing, Transfers};
-use coflash::file::sealed::{key_block, Sealer, SigningKey};
+use coflash::file::sealed::Sealer;
 use emulator::machine::{ResetCause, Stop};
 
-const BOOTLOADER: &str = "bootloader-sealed.elf";
 const DATA: Address = Address::new(0x1F50, 1);
 /// The program logs here.
 const OUT: u32 = 0x2000_0000;
@@ -110,13 +110,8 @@ struct Log {
     callgate: i32,
 }
 
-/// Installs a file on a board with this key block, if any, and starts it.
-fn installed(file: &[u8], keys: Option<&[u8]>) -> Bench {
-    let mut bench = Bench::of_image(BOOTLOADER);
-    if let Some(keys) = keys {
-        let place = firmware::board().key_block().base;
-        bench.machine().load_bin(place, keys).unwrap();
-    }
+/// Installs a file on a board and starts it.
+fn installed(mut bench: Bench, file: &[u8]) -> Bench {
     bench.power_on();
     bench.await_boot_up(100);
     let mut session = bench.session();
@@ -151,28 +146,12 @@ fn log(bench: &mut Bench) -> Log {
     }
 }
 
-fn sealer() -> Sealer<'static> {
-    Sealer {
-        vendor_id: bsp::IDENTITY.vendor_id,
-        product_code: bsp::IDENTITY.product_code,
-        counter: 1,
-        ..Sealer::default()
-    }
-}
-
-fn keys() -> (SigningKey, Vec<u8>) {
-    let root = SigningKey::from_seed([7; 32]).unwrap();
-    let block = key_block(&[root.public()], &[], 0, 0, false).unwrap();
-    (root, block.to_vec())
-}
-
 /// RM0090 sections 3.5.1 and 3.6.2: locked until the next reset, and a bus error for every key, the
 /// right ones included. The core's registers are as after a reset (PM0214 section 4.4: CCR has
 /// STKALIGN, the others are 0).
 #[test]
 fn a_sealed_program_cannot_open_flash_and_option_bytes() {
-    let (root, block) = keys();
-    let mut bench = installed(&sealer().seal(&program(), &root).unwrap(), Some(&block));
+    let mut bench = installed(board(), &sealer(COUNTER).seal(&program(), &release()).unwrap());
     for start in ["fresh", "by itself"] {
         let log = log(&mut bench);
         assert_eq!(log.core, [0, 0x200, 0, 0], "{start}: ACTLR, CCR, SHCSR, CFSR");
@@ -191,10 +170,9 @@ fn a_sealed_program_cannot_open_flash_and_option_bytes() {
 /// Back by a jump: the flash is locked then, and the boot stage makes a reset of it.
 #[test]
 fn a_sealed_program_that_jumps_back_can_be_updated() {
-    let (root, block) = keys();
     let image = firmware::raw(firmware::APP_V1);
-    let file = |counter| Sealer { counter, ..sealer() }.seal(&image, &root).unwrap();
-    let mut bench = installed(&file(1), Some(&block));
+    let file = |counter| sealer(counter).seal(&image, &release()).unwrap();
+    let mut bench = installed(board(), &file(COUNTER));
     bench.await_boot_up(2000);
     // Not fresh any more: 80h is a call.
     bench.power_off();
@@ -209,7 +187,7 @@ fn a_sealed_program_that_jumps_back_can_be_updated() {
     assert_eq!(stops, [Stop::Reset(ResetCause::Software)]);
     assert!(bench.is_bootloader(NODE));
     bench.session().command(1, ProgramControl::Clear).unwrap();
-    bench.session().write(DATA, &file(2), Doing::Program, &mut |_| {}).unwrap();
+    bench.session().write(DATA, &file(COUNTER + 1), Doing::Program, &mut |_| {}).unwrap();
     bench.session().command(1, ProgramControl::Start).unwrap();
     bench.await_boot_up(5000);
     assert!(!bench.is_bootloader(NODE));
@@ -219,9 +197,8 @@ fn a_sealed_program_that_jumps_back_can_be_updated() {
 /// The manifest says that the application writes the flash itself.
 #[test]
 fn a_sealed_program_that_writes_flash_is_not_locked_out() {
-    let (root, block) = keys();
-    let file = Sealer { writes_flash: true, ..sealer() }.seal(&program(), &root).unwrap();
-    let mut bench = installed(&file, Some(&block));
+    let file = Sealer { writes_flash: true, ..sealer(COUNTER) }.seal(&program(), &release()).unwrap();
+    let mut bench = installed(board(), &file);
     let log = log(&mut bench);
     assert_eq!((log.faults, log.locks), (0, [0, 0x0FFF_AAEC]));
     assert_eq!(log.callgate, 0);
@@ -230,7 +207,7 @@ fn a_sealed_program_that_writes_flash_is_not_locked_out() {
 /// A device without keys is an open one.
 #[test]
 fn a_program_that_is_not_sealed_is_not_locked_out() {
-    let mut bench = installed(&program(), None);
+    let mut bench = installed(open_board(), &program());
     let log = log(&mut bench);
     assert_eq!((log.faults, log.locks), (0, [0, 0x0FFF_AAEC]));
     assert_eq!(log.callgate, 0);

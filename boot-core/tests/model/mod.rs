@@ -2,9 +2,10 @@
 //! power on demand.
 #![allow(dead_code)]
 
-use std::cell::Cell;
+use std::cell::{Cell, RefCell, RefMut};
 use std::collections::BTreeMap;
 use std::panic::panic_any;
+use std::rc::Rc;
 use std::task::Poll;
 
 use boot_core::flash::{Flash, FlashFault, Operation as Started};
@@ -314,4 +315,37 @@ pub fn quiet_power_cuts() {
             default(info);
         }
     }));
+}
+
+/// The flash for a bootloader that it outlives: what is done to one of them is done to all.
+#[derive(Clone)]
+pub struct Chip(Rc<RefCell<ModelFlash>>);
+
+impl Chip {
+    pub fn new(flash: ModelFlash) -> Self {
+        Self(Rc::new(RefCell::new(flash)))
+    }
+
+    /// As a debug probe sees it.
+    pub fn model(&self) -> RefMut<'_, ModelFlash> {
+        self.0.borrow_mut()
+    }
+}
+
+impl Flash for Chip {
+    fn read(&self, address: u32, buffer: &mut [u8]) {
+        self.0.borrow().read(address, buffer);
+    }
+
+    fn start(&mut self, operation: Started) -> Result<(), FlashFault> {
+        self.model().start(operation)
+    }
+
+    fn sector_at(&self, address: u32) -> Option<Sector> {
+        self.0.borrow().sector_at(address)
+    }
+
+    fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
+        self.model().poll()
+    }
 }

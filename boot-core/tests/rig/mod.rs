@@ -5,26 +5,22 @@
 //! the bootloader, or of what it keeps in flash, changes these two functions.
 #![allow(dead_code, reason = "each test file uses some of it")]
 
-use std::cell::{RefCell, RefMut};
-use std::rc::Rc;
-use std::task::Poll;
-
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config, PasswordObject};
 use boot_core::control::{Erase, Policy, Step};
-use boot_core::flash::{Flash, FlashFault, Operation};
+use boot_core::flash::Flash;
 use boot_core::profile::Profile;
 use boot_core::store::{Journal, NodeParameters, Parameters, ProgramRecord};
 use canopen::device::Device;
 use canopen::lss::LssDevice;
 use canopen::od::{Address, Entry, Objects};
 use canopen::{AbortCode, BitRate, Instant, NodeId};
-use shared_abi::geometry::{Region, Sector};
+use shared_abi::geometry::Region;
 use shared_abi::label::{self, Label};
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
 use crate::ihex::{record, END_OF_FILE};
-use crate::model::{ModelFlash, CHIP, ONE_PROGRAM, TWO_PROGRAMS};
+use crate::model::{Chip, ModelFlash, CHIP, ONE_PROGRAM, TWO_PROGRAMS};
 
 // --- setups
 
@@ -124,34 +120,6 @@ impl Setup {
 
 // --- the device
 
-/// The flash, which outlives the bootloader that works on it.
-#[derive(Clone)]
-pub struct Chip(Rc<RefCell<ModelFlash>>);
-
-impl Chip {
-    pub fn model(&self) -> RefMut<'_, ModelFlash> {
-        self.0.borrow_mut()
-    }
-}
-
-impl Flash for Chip {
-    fn read(&self, address: u32, buffer: &mut [u8]) {
-        self.0.borrow().read(address, buffer);
-    }
-
-    fn start(&mut self, operation: Operation) -> Result<(), FlashFault> {
-        self.model().start(operation)
-    }
-
-    fn sector_at(&self, address: u32) -> Option<Sector> {
-        self.0.borrow().sector_at(address)
-    }
-
-    fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
-        self.model().poll()
-    }
-}
-
 /// What the rest of a device uses of its bootloader.
 pub trait Node: Objects + LssDevice {
     /// A bounded piece of work; whether there was none.
@@ -205,7 +173,7 @@ impl Rig {
 
     /// With this flash.
     pub fn on(setup: &'static Setup, buffer: usize, flash: ModelFlash) -> Self {
-        let chip = Chip(Rc::new(RefCell::new(flash)));
+        let chip = Chip::new(flash);
         let node = Self::boot(setup, &chip, buffer);
         Self { setup, chip, node, buffer }
     }

@@ -1,0 +1,87 @@
+//! An unmodified python-canopen writes sealed images into the emulated device, in real time.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::{Mutex, PoisonError};
+use std::{env, fs};
+
+use canopen::program::ProgramControl;
+use canopen::Address;
+use coboot_tests::endpoint::Endpoint;
+use coboot_tests::firmware;
+use coboot_tests::sealed_board::{board, release, sealer, COUNTER, KEKS};
+use coflash::file::sealed::Sealer;
+
+/// 100Ah, software version.
+const VERSION: Address = Address::new(0x100A, 0);
+
+/// One client at a time: another one would only take the processor away from it.
+static ALONE: Mutex<()> = Mutex::new(());
+
+fn endpoint() -> Endpoint {
+    let mut bench = board();
+    bench.power_on();
+    bench.await_boot_up(100);
+    Endpoint::new(bench)
+}
+
+/// By either transfer; a flipped bit is refused. The time-out is a generous one: it is on the clock of a
+/// machine that may have other work.
+#[test]
+fn an_unmodified_python_canopen_writes_a_sealed_image() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut endpoint = endpoint();
+    let genuine = Sealer { compress: true, ..sealer(COUNTER) };
+    let genuine = genuine.seal(&firmware::raw(firmware::APP_V1), &release()).unwrap();
+    let mut flipped = genuine.clone();
+    flipped[50] ^= 1;
+    for (way, file, said) in [
+        (None, &flipped, "1F57h = 0000008Ah"),
+        (Some("--block"), &genuine, "started"),
+        (None, &genuine, "started"),
+    ] {
+        let output = python_canopen(&mut endpoint, "app.cbs", file, way.as_slice());
+        // A bad signature slows the device down for half a second.
+        endpoint.bench.run_ms(1000);
+        let text = [output.stdout, output.stderr].concat();
+        let text = String::from_utf8_lossy(&text);
+        assert!(text.contains(said), "{way:?}: {text}");
+        if said == "started" {
+            assert!(output.status.success(), "{text}");
+            assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), "1.0.0");
+            endpoint.bench.session().command(1, ProgramControl::Stop).unwrap();
+            endpoint.bench.run_ms(100);
+        }
+    }
+    endpoint.bench.assert_nothing_unmodelled();
+}
+
+/// The client as it comes: its own SDO time-out of 0.3 s, its own size of blocks. On the clock of a machine
+/// that has other work an answer may come late, which is nobody's fault here; then it is tried again.
+#[test]
+fn a_python_canopen_as_it_comes_writes_a_sealed_image_by_block_transfer() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut endpoint = endpoint();
+    let genuine = Sealer { encrypt_for: &*KEKS, compress: true, ..sealer(COUNTER) };
+    let genuine = genuine.seal(&firmware::raw(firmware::APP_V1), &release()).unwrap();
+    let mut said = String::new();
+    let done = (0..10).any(|_| {
+        let ways = ["--block", "--as-it-comes"];
+        let output = python_canopen(&mut endpoint, "as-it-comes.cbs", &genuine, &ways);
+        said += &String::from_utf8_lossy(&[output.stdout, output.stderr].concat());
+        output.status.success()
+    });
+    assert!(done && said.contains("started\n"), "{said}");
+    assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), "1.0.0");
+    endpoint.bench.assert_nothing_unmodelled();
+}
+
+/// Has python-canopen write these bytes, by a file of this name.
+fn python_canopen(endpoint: &mut Endpoint, name: &str, bytes: &[u8], ways: &[&str]) -> Output {
+    let python = env::var_os("COBOOT_PYTHON")
+        .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
+    let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(name);
+    fs::write(&path, bytes).unwrap();
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/sealed_client.py");
+    endpoint.run(Command::new(python).arg(script).arg(endpoint.address()).arg(path).args(ways))
+}
