@@ -13,7 +13,7 @@ use std::time::Duration;
 use coflash::file::sealed::{verify, Device, Kek, PublicKey};
 use coflash::file::{ihex, raw};
 use fake::vault::Vault;
-use fake::{Fake, APPLICATION, BOOTLOADER};
+use fake::{Deed, Fake, Maker, APPLICATION, BOOTLOADER};
 use serde_json::Value;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use tool::{coflash, serve, Done, Folder};

@@ -261,3 +261,36 @@ fn the_holder_of_the_root_key_gets_rights_and_the_device_remembers() {
     let told: Vec<u32> = events(&mut bench.session()).unwrap().iter().map(|event| event.what).collect();
     assert_eq!(told, [event::UNLOCKED | right::ERASE, event::INSTALLED | 1]);
 }
+
+/// Who has the root key opens the device for good: unsealed programs are taken and started from the
+/// next reset on, over power-off, and sealed ones as before. Nobody else does.
+#[test]
+fn the_holder_of_the_root_key_opens_the_device_for_good() {
+    let mut bench = board_with_a_program();
+    let ask_by = |bench: &mut Bench, signer: &SigningKey| {
+        let asked = (right::OPEN, 0, root().public().id());
+        let challenge = challenge(&mut bench.session()).unwrap();
+        assert!(challenge.is_sealed());
+        ask(&mut bench.session(), asked, &signer.sign(&challenge.tbs(asked.0, asked.1, asked.2))).unwrap()
+    };
+    let raw = firmware::raw(firmware::APP_V2);
+    assert!(!ask_by(&mut bench, &key(99)), "a root's id, and another one's signature");
+    bench.run_ms(3000);
+    assert!(ask_by(&mut bench, &root()));
+    assert_eq!(write(&mut bench, &raw, Transfers::Segments).1, status::NO_ACCESS, "not before the reset");
+    for round in 0..2 {
+        bench.power_off();
+        bench.run_ms(100);
+        bench.power_on();
+        bench.await_program(1000);
+        call_back(&mut bench);
+        assert!(!challenge(&mut bench.session()).unwrap().is_sealed(), "round {round}");
+        assert_eq!(write(&mut bench, &raw, Transfers::Segments), (None, status::OK));
+        start(&mut bench, firmware::APP_V2, "2.0.0");
+        call_back(&mut bench);
+    }
+    let sealed = seal(&sealer(COUNTER), firmware::APP_V1);
+    assert_eq!(write(&mut bench, &sealed, Transfers::Blocks), (None, status::OK));
+    start(&mut bench, firmware::APP_V1, "1.0.0");
+    bench.assert_nothing_unmodelled();
+}

@@ -48,6 +48,8 @@ enum Right {
     Store,
     /// Read programs back.
     ReadBack,
+    /// Leave the sealed state for good, from the next reset on: any program is taken and started.
+    Open,
 }
 
 impl Right {
@@ -58,6 +60,7 @@ impl Right {
             Self::LowerCounter => right::LOWER_COUNTER,
             Self::Store => right::STORE,
             Self::ReadBack => right::READ_BACK,
+            Self::Open => right::OPEN,
         }
     }
 }
@@ -91,8 +94,13 @@ impl Unlock {
                 "name the private key of a root that the device has (coflash key show), and wait half a minute",
             ));
         }
+        let words = if rights & right::OPEN != 0 {
+            "granted; the device is open from the next reset on (coflash reset)"
+        } else {
+            "granted until the next reset"
+        };
         context.out.result(
-            format_args!("node {node}: granted until the next reset"),
+            format_args!("node {node}: {words}"),
             || json!({ "command": "unlock", "node": node.get(), "rights": rights }),
         );
         Ok(())

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use canopen::program::{ACCESS, EVENTS};
 use canopen::Address;
-use seal::access::{event, CHALLENGE, DOMAIN, SIGNED_CHALLENGE};
+use seal::access::{event, CHALLENGE, DOMAIN, SEALED, SIGNED_CHALLENGE};
 use seal::wire::{array, word};
 
 use super::{Doing, Error, Session};
@@ -16,10 +16,8 @@ const VERDICT: Duration = Duration::from_secs(2);
 /// How often it is asked meanwhile.
 const PERIOD: Duration = Duration::from_millis(50);
 
-/// The rights in the last word of 2002h/1.
+/// The rights in the last word of 2002h/1; beside them is [`SEALED`].
 const RIGHTS: u32 = 0xFFFF;
-/// In the same word: the device is sealed, it has a key block.
-const SEALED: u32 = 1 << 31;
 
 /// What a device wants to be signed together with a request (2002h/1).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
