@@ -7,6 +7,7 @@ use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::sealed_board::{board, release, sealer, write, COUNTER, KEKS};
 use coflash::device::{Doing, Transfers};
+use coflash::file::convert::blocks_of_sealed;
 use coflash::file::sealed::{SealedFile, Sealer};
 use coflash::update::{flash_sealed, FlashOptions};
 use coflash::Error;
@@ -34,7 +35,7 @@ fn seal(sealer: &Sealer<'_>, image: &str) -> Vec<u8> {
 fn blocks(file: &[u8], size: usize) -> Vec<Vec<u8>> {
     let file = SealedFile::parse(file.to_vec()).expect("it is one");
     let start = firmware::board().programs[0].base;
-    let blocks = file.blocks(start, size).expect("it can be cut");
+    let blocks = blocks_of_sealed(&file, start, size).expect("it can be cut");
     blocks.blocks().iter().map(|block| block.emit_with(blocks.checksum())).collect()
 }
 

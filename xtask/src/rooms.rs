@@ -22,7 +22,7 @@ const BOOT_CORE: &[Rule] = &[
     Rule { room: "store", may_use: &["crc", "flash", "sequence"] },
     Rule { room: "program", may_use: &["crc", "flash", "keys", "store"] },
     Rule { room: "decision", may_use: &["program"] },
-    Rule { room: "keys", may_use: &["flash"] },
+    Rule { room: "keys", may_use: &["flash", "store"] },
     Rule { room: "queue", may_use: &[] },
     Rule { room: "refusal", may_use: &[] },
     Rule { room: "policy", may_use: &["crc"] },

@@ -207,7 +207,7 @@ pub(super) fn value(file: &SealedFile) -> Value {
         "hash": digits(head.image_hash()),
         "chain": digits(&head.chain()),
         "nonce": digits(&head.nonce()),
-        "dictionary": Some(head.dictionary()).filter(|hash| *hash != [0; 32]).map(|hash| digits(&hash)),
+        "dictionary": Some(head.dictionary()).filter(|hash| *hash != [0; 32]).map(digits),
         "recipients": sealed.recipients().map(|recipient| recipient.key_id()).collect::<Vec<_>>(),
         "text": record(tag::TEXT).map(text),
         "source": record(tag::SOURCE).map(text),
