@@ -501,11 +501,6 @@ impl<'b> Programmer<'b> {
             {
                 if let Some(ahead) = target.untouched.take() {
                     target.ahead = target.ahead.max(ahead);
-                    // All of an authentic image may be erased ahead of its data.
-                    #[cfg(feature = "sealed")]
-                    if self.unsealer.is_active() && target.erased < target.region.end() {
-                        target.ahead = target.region.base + self.unsealer.expected().size;
-                    }
                     let program = target.program;
                     self.void(program);
                 }
