@@ -254,6 +254,16 @@ pub fn crc32(bytes: &[u8]) -> u32 {
     crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(bytes)
 }
 
+/// A block of a block file (SYS TEC manual L-1112d_10, chapter 5.1).
+#[must_use]
+pub fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
+    let header = [number, address, data.len() as u32];
+    let mut block: Vec<u8> = header.iter().flat_map(|word| word.to_le_bytes()).collect();
+    block.extend(data);
+    block.extend(crc32(&block).to_le_bytes());
+    block
+}
+
 /// A sealed image in its parts, to be made wrong.
 #[derive(Clone)]
 pub struct Parts {

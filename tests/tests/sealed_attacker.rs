@@ -25,8 +25,8 @@ use boot_core::flash::FlashFault;
 use coboot_tests::ihex::intel_hex;
 use coboot_tests::powercut::model::{quiet_power_cuts, Cut, PowerCut};
 use coboot_tests::sealed::{
-    certificate, image, keys, seal, sealer, Device, Host, Parts, Setup, CONFIRMED_2, ESACADEMY_2, FORMS,
-    LIFT_2, STANDARD_1, STANDARD_2,
+    block, certificate, crc32, image, keys, seal, sealer, Device, Host, Parts, Setup, CONFIRMED_2,
+    ESACADEMY_2, FORMS, LIFT_2, STANDARD_1, STANDARD_2,
 };
 use coflash::file::sealed::{Certificate, Sealer};
 use random::Random;
@@ -319,20 +319,8 @@ impl Attack<'_> {
         self.tell(format!("password for {program}: {answer:?}"));
     }
 
-    fn download(&mut self, host: &mut Host<'_>, disturbed: usize) {
-        let program = 1 + self.random.below(usize::from(self.setup.programs())) as u8;
-        let (what, bytes) = file(&mut self.random, self.setup, self.world, program);
-        if self.random.chance(80) {
-            host.wait();
-        }
-        if self.random.chance(90) {
-            self.password(host, program);
-            let answer = host.command(program, 3);
-            self.tell(format!("CLEAR of {program}: {answer:?}"));
-            if self.random.chance(70) {
-                host.settle();
-            }
-        }
+    /// One transfer.
+    fn send(&mut self, host: &mut Host<'_>, disturbed: usize, program: u8, what: &str, bytes: &[u8]) {
         let piece = 1 + self.random.below(7);
         let mut sent = 0;
         let mut answer = host.begin(program, &[], 7);
@@ -350,6 +338,64 @@ impl Attack<'_> {
         if answer.is_ok() {
             answer = host.end(program);
             self.tell(format!("end: {answer:?}"));
+        }
+    }
+
+    /// A block file: a transfer for each block, and now and then one that is not in its turn, twice
+    /// there, or damaged.
+    fn send_in_blocks(
+        &mut self,
+        host: &mut Host<'_>,
+        disturbed: usize,
+        program: u8,
+        what: &str,
+        bytes: &[u8],
+    ) {
+        let base = self.setup.region(program).base;
+        let size = 1 + self.random.below(600);
+        let mut blocks = vec![block(0, 0, &[0; 8])];
+        let mut address = base;
+        for (number, data) in (1..).zip(bytes.chunks(size)) {
+            blocks.push(block(number, address, data));
+            address += data.len() as u32;
+        }
+        let last = [bytes.len() as u32, crc32(bytes)];
+        blocks.push(block(u32::MAX, 0, &last.map(u32::to_le_bytes).concat()));
+        if self.random.chance(20) {
+            let (at, other) = (self.random.below(blocks.len()), self.random.below(blocks.len()));
+            match self.random.below(4) {
+                0 => drop(blocks.remove(at)),
+                1 => blocks.insert(other, blocks[at].clone()),
+                2 => blocks.swap(at, other),
+                _ => blocks[at][other % 12] ^= 1 << self.random.below(8),
+            }
+        }
+        for block in &blocks {
+            self.send(host, disturbed, program, &format!("a block of {} of {what}", block.len()), block);
+            if self.random.chance(70) {
+                host.settle();
+            }
+        }
+    }
+
+    fn download(&mut self, host: &mut Host<'_>, disturbed: usize) {
+        let program = 1 + self.random.below(usize::from(self.setup.programs())) as u8;
+        let (what, bytes) = file(&mut self.random, self.setup, self.world, program);
+        if self.random.chance(80) {
+            host.wait();
+        }
+        if self.random.chance(90) {
+            self.password(host, program);
+            let answer = host.command(program, 3);
+            self.tell(format!("CLEAR of {program}: {answer:?}"));
+            if self.random.chance(70) {
+                host.settle();
+            }
+        }
+        if self.random.chance(30) {
+            self.send_in_blocks(host, disturbed, program, &what, &bytes);
+        } else {
+            self.send(host, disturbed, program, &what, &bytes);
         }
         while self.random.chance(disturbed) {
             self.disturb(host);

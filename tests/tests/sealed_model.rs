@@ -5,7 +5,7 @@ use boot_core::canopen::{AbortCode, BitRate, NodeId};
 use boot_core::program::Invalid;
 use coboot_tests::ihex::intel_hex;
 use coboot_tests::sealed::{
-    certificate, crc32, default_keys, image, keys, seal, sealer, Device, Host, Setup, CLR_SIGNATURE,
+    block, certificate, crc32, default_keys, image, keys, seal, sealer, Device, Host, Setup, CLR_SIGNATURE,
     CONFIRMED_1, CONSTANT_1, EPOCH, ESACADEMY_2, FORMS, LIFT_2, SET_SIGNATURE, STANDARD_1, STANDARD_2, START,
 };
 use coflash::file::sealed::{key_block, Certificate, Sealer};
@@ -213,13 +213,6 @@ fn the_same_image_again_costs_nothing() {
 /// is not, because it says nothing yet of what comes.
 fn unsealed(setup: &Setup, number: u8, image: &[u8]) -> [(Option<Vec<u8>>, Vec<u8>); 3] {
     let base = setup.region(number).base;
-    let block = |number: u32, address: u32, data: &[u8]| {
-        let header = [number, address, data.len() as u32];
-        let mut block: Vec<u8> = header.iter().flat_map(|word| word.to_le_bytes()).collect();
-        block.extend(data);
-        block.extend(crc32(&block).to_le_bytes());
-        block
-    };
     let control = (!setup.is_data(number)).then(|| block(0, 0, &[0; 8]));
     let hex = intel_hex(base, image).into_bytes();
     [(None, image.to_vec()), (None, hex), (control, block(1, base, &image[..256]))]
