@@ -7,6 +7,7 @@ use core::mem::MaybeUninit;
 
 use shared_abi::callgate;
 use shared_abi::geometry::CORE_VECTORS;
+use shared_abi::layout::{KNOWS_SEALED_IMAGES, MARK_OFFSET};
 use shared_abi::ram_image::{self, Method};
 
 use crate::boot_report::BootReport;
@@ -35,6 +36,14 @@ global_asm!(
     ".section .core_vectors, \"a\"",
     ".word _stack_start",
     ".word Reset",
+    ".rept {faults}",
+    ".word boot_fault",
+    ".endr",
+    ".if {is_sealed}",
+    ".word {mark}",
+    ".else",
+    ".word boot_fault",
+    ".endif",
     ".rept {others}",
     ".word boot_fault",
     ".endr",
@@ -45,7 +54,10 @@ global_asm!(
     "ldr r0, ={resident}",
     "ldr pc, [r0, {fault}]",
     ".ltorg",
-    others = const CORE_VECTORS - 2,
+    faults = const MARK_OFFSET / 4 - 2,
+    is_sealed = const cfg!(feature = "sealed") as u32,
+    mark = const KNOWS_SEALED_IMAGES,
+    others = const CORE_VECTORS - MARK_OFFSET / 4 - 1,
     resident = sym RESIDENT,
     fault = const FAULT,
 );

@@ -20,6 +20,12 @@ pub mod toml;
 /// Bytes of [`Layout::key_block`].
 pub const KEY_BLOCK_SIZE: u32 = 256;
 
+/// Where in the bootloader's vector table a word stands that is no vector (PM0214 section 2.3.4:
+/// reserved): [`KNOWS_SEALED_IMAGES`] in a bootloader for which a key block means something.
+pub const MARK_OFFSET: u32 = 0x1C;
+/// See [`MARK_OFFSET`].
+pub const KNOWS_SEALED_IMAGES: u32 = u32::from_le_bytes(*b"CBS1");
+
 /// Every board that coboot knows, for tools that take a board by name.
 pub const BOARDS: &[&Layout] = &[
     &stm32f407g_disc1::LAYOUT,

@@ -54,7 +54,6 @@ pub mod key_block;
 mod lzma;
 pub mod open;
 pub mod provision;
-mod ram_image;
 pub mod sealer;
 pub mod show;
 

@@ -1,10 +1,8 @@
 //! The bootloader of a sealed device: its image with the key block in its place.
 
 use seal::key_block::SIZE;
-use seal::wire::DOMAIN;
-use shared_abi::layout::Layout;
+use shared_abi::layout::{Layout, KNOWS_SEALED_IMAGES, MARK_OFFSET};
 
-use super::ram_image::unpacked;
 use crate::file::fault::Place;
 use crate::file::image::{Image, Pieces};
 use crate::file::range::AddressRange;
@@ -32,11 +30,8 @@ pub enum ProvisionFault {
         /// Where it must begin.
         start: u32,
     },
-    /// No bootloader of this house.
-    #[error("it has no RAM image whose CRC is right: it is no bootloader of coboot, or damaged; give the one that `cargo xtask build` made")]
-    NoRamImage,
     /// A bootloader to which keys mean nothing.
-    #[error("it is a bootloader that knows no sealed images, and would take any program in spite of the keys: give one that was built with the feature `sealed` (bootloader-sealed)")]
+    #[error("it is no bootloader of coboot that knows sealed images, so keys would mean nothing to it, and it would take any program: give one that was built with the feature `sealed` (bootloader-sealed)")]
     Open,
     /// Something is where the keys go.
     #[error("it has data of its own at {0}, where the keys go: give a bootloader without keys")]
@@ -56,6 +51,9 @@ pub fn provision(bootloader: &Image, layout: &Layout, block: &[u8; SIZE]) -> Res
     if found.first != region.first {
         return Err(ProvisionFault::Start { found: found.first, start: region.first });
     }
+    if bootloader.bytes(region.first + MARK_OFFSET) != Some(KNOWS_SEALED_IMAGES.to_le_bytes()) {
+        return Err(ProvisionFault::Open);
+    }
     let place = AddressRange::from(layout.key_block());
     // A raw image of the whole region has erased flash there.
     if bootloader.part(place).is_some_and(|there| there.only_byte() != Some(0xFF)) {
@@ -67,23 +65,7 @@ pub fn provision(bootloader: &Image, layout: &Layout, block: &[u8; SIZE]) -> Res
         pieces.add(address, data, Place::File);
     }
     pieces.add(place.first, block.to_vec(), Place::File);
-    check_capable(bootloader)?;
     Ok(pieces.in_order())
-}
-
-/// Refuses a bootloader that knows no sealed images. One that does has the words in its RAM image that
-/// stand in front of each signed manifest: without them it could verify none.
-fn check_capable(bootloader: &Image) -> Result<(), ProvisionFault> {
-    let mut flash = Vec::new();
-    let first = bootloader.span().first;
-    for (address, data) in bootloader.segments() {
-        // The region bounds what is in between.
-        flash.resize((address - first) as usize, 0xFF);
-        flash.extend(data);
-    }
-    let image = unpacked(&flash).ok_or(ProvisionFault::NoRamImage)?;
-    let knows = image.windows(DOMAIN.len()).any(|words| words == DOMAIN);
-    knows.then_some(()).ok_or(ProvisionFault::Open)
 }
 
 #[cfg(test)]
@@ -97,30 +79,28 @@ mod tests {
         raw::read(bytes, Some(address)).unwrap()
     }
 
-    /// So many bytes of a bootloader whose RAM image, not packed, has these words in it.
-    fn bootloader(words: &[u8], size: usize) -> Vec<u8> {
-        let stored = [words, &vec![0x5A; size - 24 - words.len()]].concat();
-        let length = stored.len() as u32;
-        // Without a CRC, as the linker lays it down.
-        let header = [0, shared_abi::ram_image::SERVICES_VERSION, 0, length, length].map(u32::to_le_bytes);
-        [b"CBI1", &header.concat()[..], &stored].concat()
+    /// So many bytes of a bootloader, with this in the place of the mark.
+    fn bootloader(mark: &[u8; 4], size: usize) -> Vec<u8> {
+        let mut bytes = vec![0x5A; size];
+        bytes[0x1C..0x20].copy_from_slice(mark);
+        bytes
     }
 
     #[test]
     fn a_bootloader_that_knows_no_sealed_images_gets_no_keys() {
         let base = LAYOUT.bootloader.base;
         let provision = |bytes: &[u8]| provision(&image(base, bytes), &LAYOUT, &[7; SIZE]);
-        let words = b"coboot sealed image 1\0";
-        assert!(provision(&bootloader(words, 0x400)).is_ok());
-        assert_eq!(provision(&bootloader(&words[1..], 0x400)), Err(ProvisionFault::Open));
-        assert_eq!(provision(&bootloader(b"", 0x400)), Err(ProvisionFault::Open));
-        assert_eq!(provision(&[words, &[0x5A; 0x400][..]].concat()), Err(ProvisionFault::NoRamImage));
+        assert!(provision(&bootloader(b"CBS1", 0x400)).is_ok());
+        for none in [b"CBS2", b"\0\0\0\0", b"\xFF\xFF\xFF\xFF"] {
+            assert_eq!(provision(&bootloader(none, 0x400)), Err(ProvisionFault::Open));
+        }
+        assert_eq!(provision(&bootloader(b"CBS1", 0x400)[..0x1F]), Err(ProvisionFault::Open), "cut off");
     }
 
     #[test]
     fn the_keys_lie_at_the_end_of_the_bootloaders_flash() {
         let (base, size) = (LAYOUT.bootloader.base, LAYOUT.bootloader.size);
-        let own = bootloader(DOMAIN, 0x400);
+        let own = bootloader(b"CBS1", 0x400);
         let whole = [&own[..], &vec![0xFF; size as usize - 0x400]].concat();
         for bytes in [&whole[..], &whole[..0x400], &whole[..0x401]] {
             let made = provision(&image(base, bytes), &LAYOUT, &[7; SIZE]).unwrap();
