@@ -488,11 +488,12 @@ impl BxCan {
     /// Goes where INRQ and SLEEP say, at once where the bus has no part in it.
     fn follow_mode_bits(&mut self, now: Time) {
         let target = match (self.mcr & mcr::INRQ != 0, self.mcr & mcr::SLEEP != 0) {
-            (true, false) => Some(Rest::Initialisation),
+            // With SLEEP, too: no arrow of the mode diagram (RM0090, figure "bxCAN operating modes")
+            // takes both, but ST's HAL sets INRQ first and waits for INAK before it clears SLEEP, and
+            // that runs on boards in the field.
+            (true, _) => Some(Rest::Initialisation),
             (false, true) => Some(Rest::Sleep),
             (false, false) => None,
-            // No arrow of the mode diagram (RM0090, figure "bxCAN operating modes") takes both.
-            (true, true) => return self.leaving = None,
         };
         match (self.mode, target) {
             (Mode::Resting(_) | Mode::Synchronising { .. }, Some(rest)) => self.rest(rest),

@@ -588,3 +588,24 @@ fn a_reset_of_can2_leaves_the_filters_alone() {
     bench.can.follow(&master, true);
     assert!(bench.can.filters.accept(Share::Can2, &Frame::standard(1, &[]).unwrap()).is_none());
 }
+
+/// The order of ST's HAL: INRQ while SLEEP is still set, INAK is waited for, then SLEEP is cleared. The
+/// same to stop it.
+#[test]
+fn initialisation_is_entered_out_of_sleep() {
+    let mut bench = Bench::new();
+    bench.write(MCR, 0x1_0003);
+    assert_eq!(bench.read(MSR) & 3, 1, "INAK, and no SLAK");
+    bench.write(BTR, 0x001C_0014);
+    assert_eq!(bench.read(BTR), 0x001C_0014, "the bit timing can be written");
+    bench.write(MCR, 0x1_0001);
+    assert_eq!(bench.read(MSR) & 3, 1);
+    bench.write(MCR, 0x1_0000);
+    bench.event(BusEvent::Recessive { sequences: 1 });
+    assert_eq!(bench.read(MSR) & 3, 0, "it has joined the bus");
+    bench.write(MCR, 0x1_0003);
+    bench.event(BusEvent::Released);
+    assert_eq!(bench.read(MSR) & 3, 1, "and stops");
+    bench.write(MCR, 0x1_0002);
+    assert_eq!(bench.read(MSR) & 3, 2, "without INRQ it sleeps");
+}
