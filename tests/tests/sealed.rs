@@ -147,7 +147,7 @@ fn what_is_not_genuine_is_refused_and_the_old_program_starts() {
         ),
         ("cut off behind the head", genuine[..first_chunk].to_vec(), status::FORMAT),
         ("a raw image", image.clone(), status::NO_ACCESS),
-        ("blocks", firmware::blocks(firmware::APP_V2).emit(), status::NO_ACCESS),
+        ("a block file in one transfer", firmware::blocks(firmware::APP_V2).emit(), status::FORMAT),
     ] {
         for transfers in [Transfers::Segments, Transfers::Blocks] {
             let before = bench.machine().flash().to_vec();
