@@ -2,6 +2,7 @@
 
 use std::env;
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 
 use shared_abi::layout::{self, Layout};
 
@@ -15,9 +16,14 @@ pub const PROFILE: &str = "firmware";
 /// The board taken where `--board` names none.
 pub const DEFAULT_BOARD: &str = "stm32f407g-disc1";
 
-/// The root of the repository.
+/// The root of the repository: of the one that cargo runs this in. (A copy of it may hold a program
+/// that was built in the original.)
 pub fn root() -> &'static Path {
-    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("this crate lies one folder below the root")
+    static ROOT: OnceLock<PathBuf> = OnceLock::new();
+    ROOT.get_or_init(|| {
+        let package = env::var_os("CARGO_MANIFEST_DIR").unwrap_or_else(|| env!("CARGO_MANIFEST_DIR").into());
+        Path::new(&package).parent().expect("every crate lies one folder below the root").to_owned()
+    })
 }
 
 /// Cargo's folder for what it builds; ours for the firmware and the Python environment.
