@@ -163,6 +163,30 @@ pub const STM32F446RE: Geometry = Geometry {
 pub const CHIPS: &[&Geometry] = &[&STM32F407VG, &STM32F429ZI, &STM32F446RE];
 
 impl Geometry {
+    /// The line of the family that the chip is of: `stm32f407`.
+    #[must_use]
+    pub fn line(&self) -> &'static str {
+        self.chip.get(..9).unwrap_or(self.chip)
+    }
+
+    /// Whether this is its name: the order code as people write it, in any case, with or without
+    /// package, temperature range and what follows them (`STM32F407VGT6TR`).
+    #[must_use]
+    pub fn is_named(&self, name: &str) -> bool {
+        let Some((code, rest)) = name.split_at_checked(self.chip.len()) else { return false };
+        let is_rest = match rest.as_bytes() {
+            [] => true,
+            [package, range, more @ ..] => {
+                package.is_ascii_alphabetic()
+                    && range.is_ascii_digit()
+                    && more.len() <= 3
+                    && more.iter().all(u8::is_ascii_alphanumeric)
+            }
+            _ => false,
+        };
+        code.eq_ignore_ascii_case(self.chip) && is_rest
+    }
+
     /// Gives the geometry back if it can be that of a chip; fails the build with the broken rule's
     /// words if not.
     #[must_use]

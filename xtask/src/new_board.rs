@@ -18,7 +18,7 @@ steps to go through, and registers the board in the crates that have to know of 
 from there.
 
   NAME            of the board, as it will be given to --board: small letters, digits and hyphens
-  --chip CHIP     its chip, of those in shared-abi/src/geometry.rs
+  --chip CHIP     its chip, of those in shared-abi/src/geometry.rs, as it is ordered: STM32F407VGT6
   --from BOARD    the board whose pins and clocks stand there at first (default: stm32f407g-disc1)
 ";
 
@@ -59,7 +59,12 @@ fn write(path: &Path, text: &str) -> Outcome {
 }
 
 fn chip_by_name(name: &str) -> Outcome<&'static Geometry> {
-    CHIPS.iter().copied().find(|chip| chip.chip == name).ok_or_else(|| {
+    const WITHOUT_CAN: [&str; 3] = ["stm32f401", "stm32f410", "stm32f411"];
+    CHIPS.iter().copied().find(|chip| chip.is_named(name)).ok_or_else(|| {
+        let line = name.get(..9).unwrap_or(name).to_ascii_lowercase();
+        if WITHOUT_CAN.contains(&&*line) {
+            return format!("an {} has no CAN controller.", line.to_ascii_uppercase());
+        }
         let known: Vec<_> = CHIPS.iter().map(|chip| chip.chip).collect();
         format!(
             "no chip \"{name}\" is known; there is: {}. Another one starts in shared-abi/src/geometry.rs, with the \
@@ -300,6 +305,21 @@ mod tests {
     use super::*;
     use shared_abi::geometry::{STM32F429ZI, STM32F446RE};
 
+    #[test]
+    fn chips_are_named_as_people_write_them() {
+        for name in ["stm32f429zi", "STM32F429ZI", "STM32F429ZIT6", "stm32f429zit6tr", "STM32F429ZIY7"] {
+            assert_eq!(chip_by_name(name), Ok(&STM32F429ZI), "{name}");
+        }
+        for name in
+            ["", "stm32f429z", "stm32f429zit", "stm32f429zi6t", "stm32f429zit6 x", "stm32f429zi\u{e9}6"]
+        {
+            assert!(chip_by_name(name).unwrap_err().contains("is known"), "{name}");
+        }
+        for name in ["STM32F401RE", "stm32f411ceu6"] {
+            assert!(chip_by_name(name).unwrap_err().contains("has no CAN controller"), "{name}");
+        }
+    }
+
     fn read(path: &str) -> Outcome<String> {
         fs::read_to_string(workspace::root().join(path)).map_err(|error| error.to_string())
     }
@@ -365,7 +385,7 @@ mod tests {
             assert!(changes(name, &STM32F446RE, "nucleo-f446re", &read).is_err(), "{name}");
         }
         assert!(changes("good", &STM32F446RE, "nowhere", &read).err().unwrap().contains("--from nowhere"));
-        assert!(chip_by_name("stm32f401").unwrap_err().contains("stm32f446re"));
+        assert!(chip_by_name("stm32f999").unwrap_err().contains("stm32f446re"));
         let odd = |path: &str| Ok(read(path)?.replace("pub use board::*;", ""));
         assert!(changes("good", &STM32F446RE, "nucleo-f446re", &odd)
             .err()

@@ -116,9 +116,9 @@ static F446: Variant = Variant {
 /// The variant of a chip.
 #[must_use]
 pub fn of(chip: &Geometry) -> &'static Variant {
-    match chip.chip.get(..9) {
-        Some("stm32f446") => &F446,
-        Some("stm32f427" | "stm32f429" | "stm32f437" | "stm32f439") => &F429,
+    match chip.line() {
+        "stm32f446" => &F446,
+        "stm32f427" | "stm32f429" | "stm32f437" | "stm32f439" => &F429,
         _ => &F407,
     }
 }
