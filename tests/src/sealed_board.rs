@@ -15,6 +15,27 @@ use crate::firmware;
 const DATA: Address = Address::new(0x1F50, 1);
 const STATUS: Address = Address::new(0x1F57, 1);
 
+/// The words of 1F57h: the error code from bit 1 on (SYS TEC manual, table 3; from 8Ah on those of
+/// sealed images).
+pub mod status {
+    /// All is well.
+    pub const OK: u32 = 0;
+    /// FORMAT.
+    pub const FORMAT: u32 = 0x04;
+    /// CRC.
+    pub const CRC: u32 = 0x06;
+    /// NO_ACCESS.
+    pub const NO_ACCESS: u32 = 0x84;
+    /// SEQUENCE.
+    pub const SEQUENCE: u32 = 0x88;
+    /// SIGNATURE.
+    pub const SIGNATURE: u32 = 0x8A;
+    /// ROLLBACK.
+    pub const ROLLBACK: u32 = 0x8C;
+    /// KEY.
+    pub const KEY: u32 = 0x8E;
+}
+
 /// The lowest security counter that a new device takes, and the counter of [`sealer`].
 pub const COUNTER: u32 = 7;
 

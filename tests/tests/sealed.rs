@@ -10,7 +10,9 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coboot_tests::sealed_board::{board, key, open_board, release, root, sealer, write, COUNTER, KEKS};
+use coboot_tests::sealed_board::{
+    board, key, open_board, release, root, sealer, status, write, COUNTER, KEKS,
+};
 use coflash::device::access::{ask, challenge, events};
 use coflash::device::{Doing, Transfers};
 use coflash::file::sealed::{Kek, Sealer, SigningKey};
@@ -18,17 +20,6 @@ use seal::access::{event, right};
 
 const VERSION: Address = Address::new(0x100A, 0);
 const CRC_OF_PROGRAM: Address = Address::new(0x1F56, 1);
-
-/// The words of 1F57h: the error code from bit 1 on (SYS TEC manual, table 3; from 8Ah on those of
-/// sealed images).
-mod status {
-    pub const OK: u32 = 0;
-    pub const FORMAT: u32 = 0x04;
-    pub const NO_ACCESS: u32 = 0x84;
-    pub const SIGNATURE: u32 = 0x8A;
-    pub const ROLLBACK: u32 = 0x8C;
-    pub const KEY: u32 = 0x8E;
-}
 
 fn crc32(bytes: &[u8]) -> u32 {
     crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(bytes)

@@ -5,7 +5,7 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coboot_tests::sealed_board::{board, release, sealer, write, COUNTER, KEKS};
+use coboot_tests::sealed_board::{board, release, sealer, status, write, COUNTER, KEKS};
 use coflash::device::{Doing, Transfers};
 use coflash::file::convert::blocks_of_sealed;
 use coflash::file::sealed::{SealedFile, Sealer};
@@ -16,16 +16,6 @@ const DATA: Address = Address::new(0x1F50, 1);
 const STATUS: Address = Address::new(0x1F57, 1);
 const CRC_OF_PROGRAM: Address = Address::new(0x1F56, 1);
 const VERSION: Address = Address::new(0x100A, 0);
-
-/// 1F57h (SYS TEC manual, table 3; from 8Ah on of sealed images).
-mod status {
-    pub const OK: u32 = 0;
-    pub const FORMAT: u32 = 0x04;
-    pub const CRC: u32 = 0x06;
-    pub const NO_ACCESS: u32 = 0x84;
-    pub const SEQUENCE: u32 = 0x88;
-    pub const SIGNATURE: u32 = 0x8A;
-}
 
 fn seal(sealer: &Sealer<'_>, image: &str) -> Vec<u8> {
     sealer.seal(&firmware::raw(image), &release()).expect("it can be sealed")
