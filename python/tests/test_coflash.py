@@ -233,6 +233,8 @@ def test_other_threads_run_while_it_works(nodes):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no such signal")
 def test_ctrl_c_ends_it(nodes):
+    # A shell starts what runs in the background with this signal ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     main = threading.main_thread().ident
 
     def interrupt():

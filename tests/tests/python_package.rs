@@ -6,6 +6,7 @@ use std::process::Command;
 use std::sync::LazyLock;
 use std::{env, fs};
 
+use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::{firmware, sealed_board};
@@ -115,7 +116,8 @@ fn a_sealed_device_is_updated_from_python() {
     let folder = folder("python-sealed");
     let mut python = with_package();
     python.args(["-c", SEALED]).arg(endpoint.url());
-    for (name, bytes) in [("flipped.cbs", &flipped), ("genuine.cbs", &genuine)] {
+    // A bad signature makes the device wait, so that one comes last.
+    for (name, bytes) in [("genuine.cbs", &genuine), ("flipped.cbs", &flipped)] {
         let path = folder.join(name);
         fs::write(&path, bytes).unwrap();
         python.arg(path);
@@ -124,10 +126,12 @@ fn a_sealed_device_is_updated_from_python() {
     let said = [&output.stdout[..], &output.stderr[..]].concat();
     let said = String::from_utf8_lossy(&said);
     let lines: Vec<&str> = said.lines().collect();
-    let [refused, taken] = lines.as_slice() else { panic!("{said}") };
+    let [taken, refused] = lines.as_slice() else { panic!("{said}") };
     assert!(refused.starts_with("0x6000018a: ") && refused.contains("signature"), "{said}");
     let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&image);
     assert_eq!(*taken, format!("{} bytes, CRC {crc:08X}", image.len()));
+    endpoint.bench.session().command(1, ProgramControl::Start).unwrap();
+    endpoint.bench.await_boot_up(1000);
     assert_eq!(endpoint.bench.session().read_text(Address::new(0x100A, 0)).unwrap(), "1.0.0");
     endpoint.bench.assert_nothing_unmodelled();
 }
