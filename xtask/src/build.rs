@@ -179,6 +179,34 @@ pub fn all(board: &Layout) -> Outcome<PathBuf> {
     images(board, &Variant::of(board).map(|variant| variant.name).collect::<Vec<_>>())
 }
 
+/// Builds everything for several boards: [`all`] and [`c_applications`], chips beside one another,
+/// since the last step of each image keeps one core busy.
+///
+/// # Errors
+/// As for [`images`]; the first one.
+pub fn boards(boards: &[&Layout]) -> Outcome {
+    let mut chips: Vec<&str> = boards.iter().map(|board| board.chip.line()).collect();
+    chips.sort_unstable();
+    chips.dedup();
+    std::thread::scope(|scope| {
+        let builders: Vec<_> = chips
+            .into_iter()
+            .map(|chip| {
+                scope.spawn(move || {
+                    boards.iter().filter(|board| board.chip.line() == chip).try_for_each(|board| {
+                        all(board)?;
+                        c_applications(board)
+                    })
+                })
+            })
+            .collect();
+        // A builder that panics has told why.
+        builders
+            .into_iter()
+            .try_for_each(|builder| builder.join().unwrap_or_else(|_| Err("a build broke off.".into())))
+    })
+}
+
 /// Builds the application in C for each program of a board. A board that app-c/boards does not know
 /// has none.
 ///
@@ -259,14 +287,13 @@ pub fn to_look_at(board: &Layout, features: &str, product: Option<&str>) -> Outc
     let mut cargo = cargo_for("bootloader", board, features);
     cargo.env("CARGO_TERM_QUIET", "true");
     process::run(with_product(&mut cargo, product))?;
-    pack::pack(&built("bootloader")?)
+    pack::pack(&built(board, "bootloader")?)
 }
 
 /// The arguments that make cargo work on a firmware package for a board; for `cargo clippy`, too.
 pub fn firmware_args(package: &str, board: &Layout, features: &str) -> Vec<String> {
     let features = format!("board-{},{features}", board.board);
-    // A folder of its own: another target and profile, built while host crates may be building.
-    let target_dir = workspace::target_dir().join("fw").display().to_string();
+    let target_dir = target_dir(board).display().to_string();
     [
         ["--package", package],
         ["--target", TARGET],
@@ -287,6 +314,12 @@ pub fn tests_args(board: &Layout) -> Vec<String> {
     ["--package=coboot-tests", "--no-default-features", &features].map(str::to_owned).to_vec()
 }
 
+/// Where cargo builds the firmware of a board. A folder for each chip: cargo locks its folder, so
+/// that two chips can be built at once, and a host crate besides; they share no HAL anyway.
+fn target_dir(board: &Layout) -> PathBuf {
+    workspace::target_dir().join("fw").join(board.chip.line())
+}
+
 include!("../../linker/packs_well.rs");
 
 /// A call of cargo that builds an image. What it adds to the compiler's arguments holds for the last
@@ -305,7 +338,7 @@ fn cargo_for(package: &str, board: &Layout, features: &str) -> Command {
 fn build(board: &Layout, variant: &Variant) -> Outcome<Vec<u8>> {
     let mut cargo = cargo_for(variant.package, board, variant.features);
     process::run(with_product(&mut cargo, variant.product))?;
-    built(variant.package)
+    built(board, variant.package)
 }
 
 /// Chooses a product for what cargo builds.
@@ -317,8 +350,8 @@ fn with_product<'a>(cargo: &'a mut Command, product: Option<&str>) -> &'a mut Co
 }
 
 /// The ELF file that cargo built last of a package.
-fn built(package: &str) -> Outcome<Vec<u8>> {
-    let path = workspace::target_dir().join("fw").join(TARGET).join(PROFILE).join(package);
+fn built(board: &Layout, package: &str) -> Outcome<Vec<u8>> {
+    let path = target_dir(board).join(TARGET).join(PROFILE).join(package);
     fs::read(&path)
         .map_err(|error| format!("cargo built {package}, but {} cannot be read: {error}.", path.display()))
 }
