@@ -130,8 +130,7 @@ fn check(shown: &Shown) -> Option<String> {
         ["cargo", job, rest @ ..] if CARGO.contains(job) => {
             let package = rest.iter().position(|word| matches!(*word, "-p" | "--package"));
             let package = package.and_then(|at| rest.get(at + 1));
-            let folder = package.map(|name| workspace::root().join(name.trim_start_matches("coboot-")));
-            let there = folder.is_none_or(|folder| folder.join("Cargo.toml").exists());
+            let there = package.is_none_or(|name| is_package(name));
             (!there).then(|| format!("there is no package {}", package.unwrap_or(&"")))
         }
         [program, rest @ ..] if program.contains('/') || program.starts_with("python") => {
@@ -144,6 +143,17 @@ fn check(shown: &Shown) -> Option<String> {
         [program, ..] if FOREIGN.contains(program) => None,
         words => Some(format!("nobody knows {words:?}")),
     }
+}
+
+/// Whether a folder of the workspace holds the package of this name.
+fn is_package(name: &str) -> bool {
+    let folders = fs::read_dir(workspace::root()).expect("the workspace can be read");
+    let named = format!("name = \"{name}\"");
+    folders.flatten().any(|folder| {
+        let manifest = fs::read_to_string(folder.path().join("Cargo.toml")).unwrap_or_default();
+        let package = manifest.split("\n[").next().unwrap_or_default();
+        package.starts_with("[package]") && package.lines().any(|line| line == named)
+    })
 }
 
 /// What is wrong with what stands behind a job.

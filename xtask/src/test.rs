@@ -20,7 +20,7 @@ among those with the firmware of every other board.
 
   --board BOARD   only the tests that run firmware, all of them, with that of this board
   --yes           installs what is missing with sudo
-  ARGS            go to cargo test: `cargo xtask test -p canopen sdo`, `cargo xtask test -- --nocapture`
+  ARGS            go to cargo test: `cargo xtask test -p coboot-canopen sdo`, `cargo xtask test -- --nocapture`
 
 The tests find what was built by these variables: COBOOT_BOARD, COBOOT_FIRMWARE_DIR (bootloader.elf,
 app-v1.elf, app-v2.elf, app-c.elf), COBOOT_COFLASH (the command line of the host tool), COBOOT_NODE (the node
