@@ -53,6 +53,11 @@ pub const PROGRAM_2: &str = "app-program-2.elf";
 pub const APP_C: &str = "app-c.elf";
 /// See [`APP_C`].
 pub const APP_C_PROGRAM_2: &str = "app-c-program-2.elf";
+/// The application in C with object 2100h, which calls the callgate by hand, and the same one at the
+/// place of the second program.
+pub const APP_C_PROBE: &str = "app-c-probe.elf";
+/// See [`APP_C_PROBE`].
+pub const APP_C_PROBE_PROGRAM_2: &str = "app-c-probe-program-2.elf";
 
 /// The name of an image of another board than the one that the tests are about.
 #[must_use]

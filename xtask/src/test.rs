@@ -9,7 +9,7 @@ use shared_abi::layout::{stm32f407g_disc1_can2, Layout, BOARDS};
 
 use crate::args::Args;
 use crate::setup::{self, Part, Setup};
-use crate::{build, process, workspace, Outcome};
+use crate::{build, examples, process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask test [--board BOARD] [--yes] [ARGS]
@@ -31,7 +31,15 @@ pub fn run(mut args: Args) -> Outcome {
     let chosen_board = args.has("--board");
     let board = workspace::board(&mut args)?;
     let setup = Setup::from(&mut args);
-    setup.prepare(&[Part::Firmware, Part::C, Part::Emulator, Part::Python, Part::Gdb, Part::Browser])?;
+    setup.prepare(&[
+        Part::Firmware,
+        Part::C,
+        Part::Examples,
+        Part::Emulator,
+        Part::Python,
+        Part::Gdb,
+        Part::Browser,
+    ])?;
     let chosen = args.rest();
     // A run without arguments takes the main tests through the other chips, too.
     let others: Vec<&Layout> = BOARDS
@@ -44,6 +52,7 @@ pub fn run(mut args: Args) -> Outcome {
     build::boards(&[board].into_iter().chain(two).chain(others.iter().copied()).collect::<Vec<_>>())?;
     // And one that talks through CAN2.
     build::images(&stm32f407g_disc1_can2::LAYOUT, &build::MAIN)?;
+    examples::all()?;
     let programs = ["--package", "coflash", "--package", "coboot-node"];
     process::run(process::cargo("build").current_dir(workspace::root()).args(programs))?;
     let built = |name: &str| {
