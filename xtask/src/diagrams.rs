@@ -9,28 +9,53 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::{stm32f407g_disc1, Layout};
 
 use crate::args::Args;
-use crate::{process, workspace, Outcome};
+use crate::{process, timing, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask diagrams
 
-Draws the pictures in docs/diagrams/: each FILE.dot there by Graphviz, and the memory map of the
-stm32f407g-disc1 from its layout. Needs `dot` (Debian's package graphviz). The SVG files are checked
-in; a test tells when one is older than what it is drawn from.
+Draws the pictures in docs/diagrams/: each FILE.dot there by Graphviz, each FILE.timing as a timing
+diagram (xtask/src/timing.rs), and the memory map of the stm32f407g-disc1 from its layout. Needs
+`dot` (Debian's package graphviz). The SVG files are checked in; a test tells when one is older than
+what it is drawn from.
 ";
 
-/// The drawn ones, without ending.
-const DRAWN: [&str; 2] = ["boot", "update"];
+/// The names of the sources with this ending, without it.
+fn sources(ending: &str) -> Outcome<Vec<String>> {
+    let folder = path("");
+    let entries = fs::read_dir(&folder)
+        .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&folder)))?;
+    let name = |path: PathBuf| {
+        let is_source = path.extension().is_some_and(|extension| extension == ending);
+        is_source.then(|| path.file_stem().unwrap_or_default().to_string_lossy().into_owned())
+    };
+    let mut names: Vec<_> = entries.flatten().filter_map(|entry| name(entry.path())).collect();
+    names.sort();
+    Ok(names)
+}
+
+/// The text of a source.
+fn source(name: &str, ending: &str) -> Outcome<String> {
+    let source = path(&format!("{name}.{ending}"));
+    fs::read_to_string(&source)
+        .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&source)))
+}
+
+/// A timing diagram.
+fn timing_diagram(name: &str) -> Outcome<String> {
+    timing::drawn(&source(name, "timing")?).map_err(|problem| format!("{name}.timing: {problem}"))
+}
 
 pub fn run(args: Args) -> Outcome {
     args.none_left()?;
     // First what needs no tool.
     write(&path("memory.svg"), &memory_map(&stm32f407g_disc1::LAYOUT))?;
-    for name in DRAWN {
-        let source = path(&format!("{name}.dot"));
-        let text = fs::read_to_string(&source)
-            .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&source)))?;
-        let drawn = process::output(Command::new("dot").arg("-Tsvg").arg(&source))
+    for name in sources("timing")? {
+        write(&path(&format!("{name}.svg")), &timing_diagram(&name)?)?;
+    }
+    for name in sources("dot")? {
+        let text = source(&name, "dot")?;
+        let drawn = process::output(Command::new("dot").arg("-Tsvg").arg(path(&format!("{name}.dot"))))
             .map_err(|problem| format!("{problem} Graphviz is needed: sudo apt-get install -y graphviz"))?;
         write(&path(&format!("{name}.svg")), &marked(&drawn, &text)?)?;
     }
@@ -141,8 +166,18 @@ mod tests {
 
     #[test]
     fn the_pictures_are_those_of_their_sources() {
-        for name in DRAWN {
-            let source = fs::read_to_string(path(&format!("{name}.dot"))).unwrap();
+        let timings = sources("timing").unwrap();
+        for name in &timings {
+            let picture = fs::read_to_string(path(&format!("{name}.svg"))).unwrap();
+            assert!(
+                picture == timing_diagram(name).unwrap(),
+                "{name}.svg is old: run `cargo xtask diagrams`"
+            );
+        }
+        let drawn = sources("dot").unwrap();
+        assert!(drawn.len() > 5 && !timings.is_empty(), "{drawn:?} {timings:?}");
+        for name in drawn {
+            let source = source(&name, "dot").unwrap();
             let picture = fs::read_to_string(path(&format!("{name}.svg"))).unwrap();
             assert!(picture.starts_with(&mark(&source)), "{name}.svg is old: run `cargo xtask diagrams`");
         }

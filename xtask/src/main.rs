@@ -10,6 +10,7 @@ use std::process::ExitCode;
 mod args;
 mod arrows;
 mod bench;
+mod book;
 mod build;
 mod demo;
 mod diagrams;
@@ -23,6 +24,7 @@ mod fuzz;
 mod header;
 mod json;
 mod layout;
+mod links;
 mod lint;
 mod modules;
 mod new_board;
@@ -34,11 +36,13 @@ mod parts;
 mod portable;
 mod powercut;
 mod process;
+mod record;
 mod rooms;
 mod sbom;
 mod setup;
 mod size;
 mod test;
+mod timing;
 mod workspace;
 mod zx0;
 
@@ -110,6 +114,13 @@ const JOBS: &[Job] = &[
         help: diagrams::HELP,
         run: diagrams::run,
     },
+    Job {
+        name: "record",
+        about: "the picture of the two windows, out of what the programs print",
+        help: record::HELP,
+        run: record::run,
+    },
+    Job { name: "docs", about: "the pages as a site, its links checked", help: book::HELP, run: book::run },
     Job { name: "eds", about: "the EDS files of bootloader and application", help: eds::HELP, run: eds::run },
     Job {
         name: "fuzz",

@@ -49,6 +49,19 @@ pub fn output(command: &mut Command) -> Outcome<String> {
     String::from_utf8(output.stdout).map_err(|_| format!("`{}` printed what is no text.", line(command)))
 }
 
+/// Runs a program to its end and gives back what it printed to its standard error.
+///
+/// # Errors
+/// When it cannot be started, or fails.
+pub fn messages(command: &mut Command) -> Outcome<String> {
+    let output = command.stdin(Stdio::null()).output().map_err(|error| not_started(command, &error))?;
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    if !output.status.success() {
+        return Err(format!("`{}` failed ({}): {}", line(command), output.status, said.trim()));
+    }
+    Ok(said)
+}
+
 /// Whether a program can be started and ends well; what it prints is not shown.
 pub fn succeeds(program: impl AsRef<OsStr>, args: &[&str]) -> bool {
     let mut command = Command::new(program);

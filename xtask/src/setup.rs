@@ -314,14 +314,38 @@ pub fn tool(name: &str, version: &str) -> Outcome<OsString> {
     folders.extend(env::split_paths(&env::var_os("PATH").unwrap_or_default()));
     let there = |folder: &PathBuf| folder.join(name).with_extension(env::consts::EXE_EXTENSION).is_file();
     if !folders.iter().any(there) {
-        println!("Installing {name} into {} ...", workspace::shown(&tools));
-        let mut install = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-        install.args(["install", "--quiet", "--locked", name, "--version", version, "--root"]);
-        install.arg(&tools).env("CARGO_TARGET_DIR", tools.join("build"));
-        process::run(&mut install)
-            .map_err(|problem| format!("{problem} It needs a connection to crates.io, once."))?;
+        install(name, version, &[])?;
     }
     env::join_paths(folders).map_err(|error| format!("the PATH cannot be extended: {error}."))
+}
+
+/// Sees to it that a program that cargo installs is in `target/tools`, in this version and no other;
+/// gives its path. `options` go to `cargo install`.
+///
+/// # Errors
+/// When it is missing and cannot be installed.
+pub fn pinned_tool(name: &str, version: &str, options: &[&str]) -> Outcome<PathBuf> {
+    let program = workspace::target_dir().join("tools/bin").join(name);
+    let program = program.with_extension(env::consts::EXE_EXTENSION);
+    let said = process::output(Command::new(&program).arg("--version")).unwrap_or_default();
+    if !said.trim_end().ends_with(version) {
+        install(name, version, options)?;
+    }
+    Ok(program)
+}
+
+/// Installs a program into `target/tools`.
+fn install(name: &str, version: &str, options: &[&str]) -> Outcome {
+    let tools = workspace::target_dir().join("tools");
+    println!("Installing {name} {version} into {} ...", workspace::shown(&tools));
+    let mut install = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    install.args(["install", "--quiet", "--locked", name, "--version", version]).args(options);
+    install.arg("--root").arg(&tools).env("CARGO_TARGET_DIR", tools.join("build"));
+    process::run(&mut install)
+        .map_err(|problem| format!("{problem} It needs a connection to crates.io, once."))?;
+    // What it was built from is large and not needed again.
+    let _ = fs::remove_dir_all(tools.join("build"));
+    Ok(())
 }
 
 fn rust_components() -> Outcome {

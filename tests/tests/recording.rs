@@ -1,0 +1,44 @@
+//! The recorded windows of the README against what `coflash` prints today.
+
+use std::process::Command;
+use std::{env, fs};
+
+use coboot_tests::bench::Bench;
+use coboot_tests::endpoint::Endpoint;
+
+const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/pictures/two-windows.txt");
+
+/// What stays the same from build to build and from run to run: words with a digit in them (sizes,
+/// CRCs, times) are one and the same word, and progress comes in as many lines as it likes.
+fn lasting(text: &str) -> Vec<String> {
+    let is_progress = |line: &&str| line.contains(" % ") || line.trim() == "…";
+    let word = |word: &str| {
+        let varies = word.bytes().any(|byte| byte.is_ascii_digit());
+        if varies { "#" } else { word }.to_owned()
+    };
+    let words = |line: &str| line.split_whitespace().map(word).collect::<Vec<_>>().join(" ");
+    text.lines().filter(|line| !is_progress(line)).map(words).collect()
+}
+
+#[test]
+fn the_recorded_update_is_what_the_tool_prints() {
+    let text = fs::read_to_string(RECORDING).unwrap();
+    let calls: Vec<&str> = text.split("$ coflash ").skip(1).collect();
+    assert_eq!(calls.len(), 3);
+
+    let coflash = env::var("COBOOT_COFLASH").expect("COBOOT_COFLASH; cargo xtask test sets it");
+    let images = env::var("COBOOT_FIRMWARE_DIR").expect("COBOOT_FIRMWARE_DIR; cargo xtask test sets it");
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let mut endpoint = Endpoint::new(bench);
+    for call in calls {
+        let (line, recorded) = call.split_once('\n').unwrap();
+        let mut command = Command::new(&coflash);
+        command.args(line.split(' ')).env("COFLASH_BUS", endpoint.url()).current_dir(&images);
+        let output = endpoint.run(&mut command);
+        let printed = String::from_utf8(output.stdout).unwrap();
+        assert!(output.status.success(), "{line}: {}", String::from_utf8_lossy(&output.stderr));
+        assert_eq!(lasting(recorded), lasting(&printed), "{line}: run `cargo xtask record`");
+    }
+}

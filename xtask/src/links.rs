@@ -1,0 +1,203 @@
+//! The links of the pages: each leads to a file of the repository, and to a heading that it has.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::{Component, Path, PathBuf};
+
+use crate::{workspace, Outcome};
+
+/// The pages outside `docs/`.
+pub const AT_ROOT: [&str; 4] = ["README.md", "CHANGELOG.md", "LICENSES.md", "SECURITY.md"];
+
+/// A link within the repository.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Link {
+    /// The page and the line of it.
+    pub place: String,
+    /// The file, from the root of the repository on.
+    pub file: PathBuf,
+    /// The heading, as a browser names it.
+    pub heading: Option<String>,
+}
+
+/// Every page, from the root of the repository on.
+///
+/// # Errors
+/// When a folder cannot be read.
+pub fn pages() -> Outcome<Vec<PathBuf>> {
+    let mut pages: Vec<PathBuf> = AT_ROOT.iter().map(PathBuf::from).collect();
+    let mut folders = vec![PathBuf::from("docs")];
+    while let Some(folder) = folders.pop() {
+        let entries = fs::read_dir(workspace::root().join(&folder))
+            .map_err(|error| format!("{} cannot be read: {error}.", folder.display()))?;
+        for name in entries.flatten().map(|entry| folder.join(entry.file_name())) {
+            if workspace::root().join(&name).is_dir() {
+                folders.push(name);
+            } else if name.extension().is_some_and(|extension| extension == "md") {
+                pages.push(name);
+            }
+        }
+    }
+    pages.sort();
+    Ok(pages)
+}
+
+/// The text of a page.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn text(page: &Path) -> Outcome<String> {
+    fs::read_to_string(workspace::root().join(page))
+        .map_err(|error| format!("{} cannot be read: {error}.", page.display()))
+}
+
+/// All links of all pages that stay within the repository.
+///
+/// # Errors
+/// When a page cannot be read.
+pub fn all() -> Outcome<Vec<Link>> {
+    let mut links = Vec::new();
+    for page in pages()? {
+        links.extend(of_page(&page, &text(&page)?));
+    }
+    Ok(links)
+}
+
+/// What is wrong with the links of the pages, a line each.
+///
+/// # Errors
+/// When a page cannot be read.
+pub fn faults() -> Outcome<Vec<String>> {
+    let mut known: BTreeMap<PathBuf, BTreeSet<String>> = BTreeMap::new();
+    for page in pages()? {
+        let headings = headings(&text(&page)?).into_iter().collect();
+        known.insert(page, headings);
+    }
+    let fault = |link: &Link| {
+        let shown = link.file.display();
+        if !workspace::root().join(&link.file).is_file() {
+            return Some(format!("{}: {shown} is not there, or is no file", link.place));
+        }
+        let heading = link.heading.as_ref()?;
+        let there = known.get(&link.file).is_some_and(|headings| headings.contains(heading));
+        (!there).then(|| format!("{}: {shown} has no heading #{heading}", link.place))
+    };
+    Ok(all()?.iter().filter_map(fault).collect())
+}
+
+/// The lines of a page that are no code, with their numbers; code within a line is blanked.
+fn prose(text: &str) -> Vec<(usize, String)> {
+    let mut is_code = false;
+    let mut prose = Vec::new();
+    for (number, line) in (1..).zip(text.lines()) {
+        if line.trim_start().starts_with("```") {
+            is_code = !is_code;
+        } else if !is_code {
+            let parts = line.split('`').enumerate();
+            let parts: Vec<_> = parts.map(|(at, part)| if at % 2 == 0 { part } else { "" }).collect();
+            prose.push((number, parts.join("`")));
+        }
+    }
+    prose
+}
+
+/// The links of a page that stay within the repository. A link's target stands in one line.
+pub fn of_page(page: &Path, text: &str) -> Vec<Link> {
+    let mut links = Vec::new();
+    for (number, line) in prose(text) {
+        for (at, _) in line.match_indices("](") {
+            let Some((target, _)) = line[at + 2..].split_once(')') else { continue };
+            if target.contains("://") || target.starts_with("mailto:") {
+                continue;
+            }
+            let (file, heading) = match target.split_once('#') {
+                Some((file, heading)) => (file, Some(heading.to_owned())),
+                None => (target, None),
+            };
+            let file = if file.is_empty() { page.to_owned() } else { page.with_file_name(file) };
+            let place = format!("{}:{number}", page.display());
+            links.push(Link { place, file: plain(&file), heading });
+        }
+    }
+    links
+}
+
+/// A path without `..` in it.
+fn plain(path: &Path) -> PathBuf {
+    let mut plain = PathBuf::new();
+    for part in path.components() {
+        match part {
+            Component::ParentDir => drop(plain.pop()),
+            part => plain.push(part),
+        }
+    }
+    plain
+}
+
+/// The headings of a page as links name them. GitHub and mdBook make a name in the same way: small
+/// letters, digits, `_` and `-` stay, a blank becomes `-`, the rest goes; the second of two equal
+/// names has `-1` behind it.
+fn headings(text: &str) -> Vec<String> {
+    let mut is_code = false;
+    let mut names: Vec<String> = Vec::new();
+    let mut seen: BTreeMap<String, usize> = BTreeMap::new();
+    for line in text.lines() {
+        if line.trim_start().starts_with("```") {
+            is_code = !is_code;
+        }
+        let level = line.len() - line.trim_start_matches('#').len();
+        let words = line[level..].trim();
+        if is_code || !(1..=6).contains(&level) || !line[level..].starts_with(' ') {
+            continue;
+        }
+        let kept = words.to_lowercase();
+        let kept = kept.chars().filter(|c| c.is_alphanumeric() || matches!(c, ' ' | '-' | '_'));
+        let name: String = kept.map(|c| if c == ' ' { '-' } else { c }).collect();
+        let count = seen.entry(name.clone()).or_insert(0);
+        names.push(if *count == 0 { name } else { format!("{name}-{count}") });
+        *count += 1;
+    }
+    names
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn links_are_found_outside_of_code_and_lead_from_their_page_on() {
+        let page = "See [a](b.md), ![c](../d.svg) and [e](#f-g) or `[x](y)`.\n```\n[no](no)\n```\n\
+                    [far](https://example.invalid/) [up](../adr/h.md#i)\n";
+        let found = of_page(Path::new("docs/adr/page.md"), page);
+        let shown: Vec<_> = found
+            .iter()
+            .map(|link| format!("{} {} {:?}", link.place, link.file.display(), link.heading))
+            .collect();
+        assert_eq!(
+            shown,
+            [
+                "docs/adr/page.md:1 docs/adr/b.md None",
+                "docs/adr/page.md:1 docs/d.svg None",
+                "docs/adr/page.md:1 docs/adr/page.md Some(\"f-g\")",
+                "docs/adr/page.md:5 docs/adr/h.md Some(\"i\")",
+            ]
+        );
+    }
+
+    /// Names of headings as GitHub shows them for these very lines.
+    #[test]
+    fn headings_have_the_names_that_browsers_use() {
+        let page = "# 1F51h: commands\n```sh\n# no heading\n```\n## `read` and write\n### CANopenNode's \
+                    canopend\n## Read and write\n#hash\n";
+        assert_eq!(
+            headings(page),
+            ["1f51h-commands", "read-and-write", "canopennodes-canopend", "read-and-write-1"]
+        );
+    }
+
+    #[test]
+    fn links_between_the_pages_lead_to_files_and_headings() {
+        assert_eq!(faults().unwrap(), Vec::<String>::new());
+        assert!(all().unwrap().len() > 100);
+    }
+}
