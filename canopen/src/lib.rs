@@ -28,7 +28,6 @@
 extern crate alloc;
 
 mod abort;
-pub mod application;
 pub mod bit_rate;
 #[cfg(feature = "debugger")]
 pub mod debugger;

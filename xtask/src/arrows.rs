@@ -37,13 +37,16 @@ const RULES: &[Rule] = &[
     Rule { name: "canopen", may_use: &[] },
     Rule { name: "seal", may_use: &[] },
     Rule { name: "boot-core", may_use: &["canopen", "seal", "shared-abi"] },
-    Rule { name: "bsp", may_use: &["shared-abi"] },
-    Rule { name: "bootloader", may_use: &["boot-core", "bsp", "seal", "shared-abi"] },
-    Rule { name: "app-template", may_use: &["canopen", "bsp", "shared-abi"] },
+    Rule { name: "coboot-app", may_use: &["canopen", "shared-abi"] },
+    // On the host alone: build scripts and tools.
+    Rule { name: "coboot-linker", may_use: &["shared-abi"] },
+    Rule { name: "bsp", may_use: &["canopen", "shared-abi"] },
+    Rule { name: "bootloader", may_use: &["boot-core", "bsp", "coboot-linker", "seal", "shared-abi"] },
+    Rule { name: "app-template", may_use: &["canopen", "coboot-app", "coboot-linker", "bsp", "shared-abi"] },
     Rule { name: "vendor-can", may_use: &[] },
-    Rule { name: "coflash", may_use: &["canopen", "seal", "shared-abi", "vendor-can"] },
+    Rule { name: "coflash", may_use: &["canopen", "coboot-linker", "seal", "shared-abi", "vendor-can"] },
     Rule { name: "coflash-native", may_use: &["canopen", "coflash", "shared-abi"] },
-    Rule { name: "coboot-node", may_use: &["boot-core", "canopen", "coflash", "shared-abi"] },
+    Rule { name: "coboot-node", may_use: &["boot-core", "canopen", "coboot-app", "coflash", "shared-abi"] },
     Rule { name: "emulator", may_use: &["shared-abi"] },
     Rule {
         name: "coboot-tests",
@@ -53,7 +56,7 @@ const RULES: &[Rule] = &[
 ];
 
 /// The crates that need no `unsafe` and say so to the compiler.
-const PURE: &[&str] = &["canopen", "seal", "boot-core", "coflash", "coboot-node", "xtask"];
+const PURE: &[&str] = &["canopen", "seal", "boot-core", "coboot-linker", "coflash", "coboot-node", "xtask"];
 /// How they say it.
 const FORBID: &str = "#![forbid(unsafe_code)]";
 
@@ -308,6 +311,10 @@ mod tests {
             "bootloader -> bsp",
             "app-template -> canopen",
             "app-template -> bsp",
+            "app-template -> coboot-app",
+            "app-template build coboot-linker",
+            "coboot-app -> canopen",
+            "bsp -> canopen",
             "coflash -> canopen",
             "emulator -> shared-abi",
             "emulator -> unicorn-engine",
@@ -325,6 +332,10 @@ mod tests {
         for arrow in [
             "app-template -> boot-core",
             "app-template dev boot-core",
+            "coboot-app -> boot-core",
+            "coboot-app -> bsp",
+            "coboot-linker -> coboot-app",
+            "bsp -> boot-core",
             "canopen -> shared-abi",
             "canopen dev boot-core",
             "shared-abi -> canopen",
