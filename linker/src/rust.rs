@@ -29,11 +29,12 @@ impl fmt::Display for Expression<'_> {
             handoff,
             warm_start,
         } = self.0;
-        let Geometry { chip: name, flash, sectors, second_bank, sram, ccm, interrupts, ports } = chip;
+        let Geometry { chip: name, line, flash, sectors, second_bank, sram, ccm, interrupts, ports } = chip;
         writeln!(f, "::coboot_app::layout::Layout {{")?;
         writeln!(f, "    board: {board:?},")?;
         writeln!(f, "    chip: &::coboot_app::geometry::Geometry {{")?;
         writeln!(f, "        chip: {name:?},")?;
+        writeln!(f, "        line: ::coboot_app::geometry::Line::{line:?},")?;
         writeln!(f, "        flash: {},", Place(*flash))?;
         writeln!(f, "        sectors: &[")?;
         for run in *sectors {

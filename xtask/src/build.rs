@@ -190,7 +190,7 @@ pub fn all(board: &Layout) -> Outcome<PathBuf> {
 /// # Errors
 /// As for [`images`]; the first one.
 pub fn boards(boards: &[&Layout]) -> Outcome {
-    let mut chips: Vec<&str> = boards.iter().map(|board| board.chip.line()).collect();
+    let mut chips: Vec<&str> = boards.iter().map(|board| board.chip.line.name()).collect();
     chips.sort_unstable();
     chips.dedup();
     std::thread::scope(|scope| {
@@ -198,7 +198,7 @@ pub fn boards(boards: &[&Layout]) -> Outcome {
             .into_iter()
             .map(|chip| {
                 scope.spawn(move || {
-                    boards.iter().filter(|board| board.chip.line() == chip).try_for_each(|board| {
+                    boards.iter().filter(|board| board.chip.line.name() == chip).try_for_each(|board| {
                         all(board)?;
                         c_applications(board)
                     })
@@ -338,7 +338,7 @@ pub fn tests_args(board: &Layout) -> Vec<String> {
 /// Where cargo builds the firmware of a board. A folder for each chip: cargo locks its folder, so
 /// that two chips can be built at once, and a host crate besides; they share no HAL anyway.
 fn target_dir(board: &Layout) -> PathBuf {
-    workspace::target_dir().join("fw").join(board.chip.line())
+    workspace::target_dir().join("fw").join(board.chip.line.name())
 }
 
 include!("../../linker/packs_well.rs");
