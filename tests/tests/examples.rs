@@ -271,3 +271,45 @@ fn a_program_that_sets_vtor_wrong_ends_in_the_bootloader() {
     assert!(bench.is_bootloader(NODE), "it has kept the device");
     assert_eq!(bench.session().read_number(CRC).unwrap(), blocks.program_crc(), "it is still there");
 }
+
+/// The first block of a page in this language.
+fn block<'p>(page: &'p str, language: &str) -> &'p str {
+    let (_, behind) = page.split_once(&format!("```{language}\n")).expect("a block");
+    behind.split_once("```").expect("its end").0
+}
+
+/// The page for projects of CubeIDE: the sample links with the script that the page shows, and its code
+/// compiles beside as much of the HAL as it uses.
+#[test]
+fn the_blocks_of_the_page_for_cube_link_and_compile() {
+    let house = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let page = fs::read_to_string(house.join("docs/cube.md")).expect("the page");
+    let project = Project::new("cube")
+        .edit("app-c/startup.c", "section(\".vector_table\")", "section(\".isr_vector\")")
+        .edit("app-c/startup.c", "    [1] = reset,", "    [1] = Reset_Handler,")
+        .edit("app-c/startup.c", "void reset(void);", "void Reset_Handler(void);")
+        .edit("app-c/startup.c", "void reset(void)\n{", "void Reset_Handler(void)\n{")
+        .edit("app-c/startup.c", "extern uint32_t _stack_start,", "extern uint32_t _estack,")
+        .edit("app-c/startup.c", "&_stack_start", "&_estack");
+    let script = project.0.join("app-c/app.x");
+    let before = fs::read_to_string(&script).unwrap();
+    let (_, as_it_was) = before.split_once("  INCLUDE coboot.x\n").expect("the sample's script");
+    fs::write(&script, format!("{}{as_it_was}", block(&page, "ld"))).unwrap();
+    let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
+    let sample = Project::new("cube-sample").build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
+    assert_eq!(firmware::blocks_of_file(&elf), firmware::blocks_of_file(&sample), "the same program");
+
+    let hal = "#include <stdint.h>\ntypedef struct { int state; } CAN_HandleTypeDef;\n\
+               uint32_t HAL_CAN_GetTxMailboxesFreeLevel(const CAN_HandleTypeDef *can);\nuint32_t HAL_GetTick(void);\n\
+               void NVIC_SystemReset(void);\nvoid HardFault_Handler(void);\nvoid Error_Handler(void);\n\
+               void coboot_init(void);\nvoid coboot_poll(void);\n";
+    let folder = project.0.join("hal");
+    fs::create_dir_all(&folder).unwrap();
+    fs::write(folder.join("main.h"), hal).unwrap();
+    fs::write(folder.join("main.c"), block(&page, "c")).unwrap();
+    let mut gcc = Command::new("arm-none-eabi-gcc");
+    gcc.args(["-mcpu=cortex-m4", "-mthumb", "-std=gnu11", "-ffreestanding", "-Wall", "-Wextra", "-Werror"]);
+    gcc.arg("-I").arg(house.join("app-c")).arg("-c").arg(folder.join("main.c"));
+    let output = gcc.arg("-o").arg(folder.join("main.o")).output().expect("it can be started");
+    assert!(output.status.success(), "{}", text(&output));
+}
