@@ -1,6 +1,6 @@
 //! The images that `cargo xtask build` made.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::{env, fs};
 
 use coflash::file::block_file::BlockFile;
@@ -95,7 +95,16 @@ pub fn dir() -> PathBuf {
 #[must_use]
 pub fn blocks(name: &str) -> BlockFile {
     let _ = elf(name);
-    let image = coflash::file::read::load(&dir().join(name), None, None).expect("an ELF of ours");
+    blocks_of_file(&dir().join(name))
+}
+
+/// The same for an ELF file anywhere.
+///
+/// # Panics
+/// If it is none, or does not fit the board.
+#[must_use]
+pub fn blocks_of_file(elf: &Path) -> BlockFile {
+    let image = coflash::file::read::load(elf, None, None).expect("an ELF of ours");
     let options = Options::default().region(Region::Strict(board().programs[0].into()));
     blocks_of(image, &options).expect("it lies in the program's flash").file
 }

@@ -143,7 +143,7 @@ pub fn run(mut args: Args) -> Outcome {
     let (every, unpacked) = (args.flag("--all"), args.flag("--unpacked"));
     let mut names = args.rest();
     let all = names.len();
-    names.retain(|name| name != C);
+    names.retain(|name| name != C_APPLICATION);
     let in_c = every || names.len() < all;
     let chosen: Vec<_> = match names.as_slice() {
         [] if every => Variant::of(board).collect(),
@@ -224,7 +224,7 @@ pub fn c_applications(board: &Layout) -> Outcome {
         return Ok(());
     }
     for (number, region) in (1..).zip(board.programs) {
-        for (name, more) in [(C, None), ("app-c-probe", Some(PROBE))] {
+        for (name, more) in [(C_APPLICATION, None), ("app-c-probe", Some(PROBE))] {
             let name = if number == 1 { name.to_owned() } else { format!("{name}-program-{number}") };
             let elf = c_application(board, number, &name, more)?;
             report(&elf, *region)?;
@@ -264,8 +264,8 @@ fn c_application(board: &Layout, number: u8, name: &str, more: Option<&str>) -> 
     Ok(elf)
 }
 
-/// The name that stands for the applications in C.
-const C: &str = "app-c";
+/// The name of the application in C; for a build it stands for all applications in C.
+pub const C_APPLICATION: &str = "app-c";
 /// What the application in C is made of.
 const C_SOURCES: [&str; 8] =
     ["startup.c", "board.c", "can.c", "coboot/reentry.c", "coboot/program.c", "objects.c", "sdo.c", "main.c"];

@@ -4,7 +4,7 @@ use std::fs;
 
 use shared_abi::layout::BOARDS;
 
-use crate::build::VARIANTS;
+use crate::build::{C_APPLICATION, VARIANTS};
 use crate::pages::{self, Shown};
 use crate::{workspace, JOBS};
 
@@ -172,6 +172,7 @@ fn job_options(job: &str, help: &str, words: &[&str]) -> Option<String> {
             _ if name.starts_with('-') => return Some(format!("cargo xtask {job} has no {name}")),
             _ if job == "build"
                 && !pages::is_placeholder(name)
+                && name != C_APPLICATION
                 && !VARIANTS.iter().any(|variant| variant.name == name) =>
             {
                 return Some(format!("there is no image {name}"));
