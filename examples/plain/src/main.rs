@@ -50,10 +50,7 @@ fn main() -> ! {
     core.SYST.enable_interrupt();
     core.SYST.enable_counter();
 
-    let start = Start::read(
-        &LAYOUT,
-        Defaults { node_id: Some(1), bit_rate: 125_000, serial_number: 0 },
-    );
+    let start = Start::read(&LAYOUT, Defaults { node_id: Some(1), bit_rate: 125_000, serial_number: 0 });
 
     let gpiod = device.GPIOD.split(&mut rcc);
     let can = device.CAN1.can((gpiod.pd1, gpiod.pd0), &mut rcc);
@@ -131,8 +128,7 @@ fn receive(can: &mut Port) -> Option<Frame> {
 }
 
 fn send(can: &mut Port, frame: &Frame) {
-    let (Some(id), Some(data)) = (bxcan::StandardId::new(frame.id()), bxcan::Data::new(frame.data()))
-    else {
+    let (Some(id), Some(data)) = (bxcan::StandardId::new(frame.id()), bxcan::Data::new(frame.data())) else {
         return;
     };
     // Without a free mailbox the frame is lost: an answer is asked for again, a heartbeat follows.
