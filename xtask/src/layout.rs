@@ -74,4 +74,15 @@ mod tests {
         let lines = |text: &str| text.lines().map(|line| line.trim_end().to_owned()).collect::<Vec<_>>();
         assert_eq!(lines(copy), lines(&map), "copy the output of `cargo xtask layout` into README.md");
     }
+
+    /// The block that the guide for applications shows links as it stands there: it is what is printed.
+    #[test]
+    fn the_guide_shows_the_linker_block_as_it_is() {
+        let guide = fs::read_to_string(workspace::root().join("docs/application.md")).unwrap();
+        let command = "cargo xtask layout --ld program-1 --board stm32f407g-disc1";
+        let (_, behind) = guide.split_once(&format!("<!-- printed by: {command} -->\n```text\n")).unwrap();
+        let (copy, _) = behind.split_once("```").unwrap();
+        let printed = LAYOUT.linker_script(image_by_name(&LAYOUT, "program-1").unwrap()).to_string();
+        assert_eq!(copy, printed, "copy the output of `{command}` into docs/application.md");
+    }
 }

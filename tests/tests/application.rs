@@ -1,0 +1,156 @@
+//! The application that docs/application.md goes through (`examples/plain`): built as a package of its
+//! own, as a stranger's is, and run under the real bootloader; and what happens where an application
+//! gets it wrong.
+
+use std::path::Path;
+use std::process::Command;
+use std::sync::Mutex;
+
+use canopen::program::ProgramControl;
+use canopen::Address;
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::firmware;
+use coflash::file::block_file::BlockFile;
+use coflash::file::convert::{blocks_of, Options, Region};
+use coflash::file::label::label_of;
+use coflash::file::read::{read, Firmware};
+use coflash::update::{flash, FlashOptions};
+use shared_abi::layout::stm32f407g_disc1::LAYOUT;
+use shared_abi::layout::toml::Toml;
+
+/// One build at a time: they share a folder.
+static BUILD: Mutex<()> = Mutex::new(());
+
+/// The ELF of `examples/plain` with these features. `None` where the tests are about another board.
+fn plain(features: &str) -> Option<Vec<u8>> {
+    if firmware::board().board != LAYOUT.board {
+        println!("not run: the example is for {}", LAYOUT.board);
+        return None;
+    }
+    let _one = BUILD.lock();
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let target = root.join("target/examples");
+    let status = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()))
+        .current_dir(root.join("examples/plain"))
+        .args(["build", "--quiet", "--locked", "--release", "--target", "thumbv7em-none-eabihf"])
+        .args(["--features", features, "--target-dir"])
+        .arg(&target)
+        .status()
+        .expect("cargo can be started");
+    assert!(status.success(), "examples/plain does not build");
+    Some(std::fs::read(target.join("thumbv7em-none-eabihf/release/plain")).expect("it was built"))
+}
+
+fn blocks(elf: &[u8]) -> BlockFile {
+    let options = Options::default().region(Region::Strict(LAYOUT.programs[0].into()));
+    blocks_of(read(elf, None, None).expect("an ELF"), &options).expect("it lies in the program's flash").file
+}
+
+fn board() -> Bench {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    bench
+}
+
+fn number(bench: &mut Bench, index: u16, sub: u8) -> u32 {
+    bench.session().read_number(Address::new(index, sub)).unwrap()
+}
+
+fn power_cycle(bench: &mut Bench) {
+    bench.power_off();
+    bench.run_ms(10);
+    bench.power_on();
+    bench.run_ms(500);
+}
+
+/// Step 1: the memory map that is checked in is the one that is printed.
+#[test]
+fn its_memory_map_is_the_boards() {
+    let map = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/plain/board.toml");
+    let printed = Toml(&LAYOUT).to_string();
+    assert_eq!(
+        std::fs::read_to_string(map).unwrap(),
+        printed,
+        "cargo xtask layout --toml --board stm32f407g-disc1 > examples/plain/board.toml"
+    );
+}
+
+/// Steps 2 to 6, and "All of it": the second update begins in the running program.
+#[test]
+fn it_is_updated_twice_and_answers_what_a_host_asks() {
+    let Some(elf) = plain("") else { return };
+    let blocks = blocks(&elf);
+    let mut bench = board();
+    for _ in 0..2 {
+        flash(&mut bench.session(), &blocks, &FlashOptions::default().force(true), &mut |_| {}).unwrap();
+        assert!(!bench.is_bootloader(NODE));
+        assert_eq!(number(&mut bench, 0x1F51, 1), 1);
+        assert_eq!(number(&mut bench, 0x1F56, 1), blocks.program_crc());
+        assert_eq!(number(&mut bench, 0x1F57, 1), 0);
+        assert_eq!(number(&mut bench, 0x1018, 2), bsp::IDENTITY.product_code);
+    }
+    // Step 5: three resets by the NMT master are no crashes.
+    for _ in 0..5 {
+        bench.post(0, &[0x81, NODE]);
+        bench.await_program(1000);
+        bench.run_ms(20);
+    }
+    assert!(!bench.is_bootloader(NODE));
+    // Step 3: STOP is answered by the bootloader, in the program's place.
+    bench.session().command(1, ProgramControl::Stop).unwrap();
+    assert!(bench.is_bootloader(NODE));
+    bench.assert_nothing_unmodelled();
+}
+
+/// Step 7: without a confirmation the bootloader is there behind a power-off, with one the program.
+#[test]
+fn a_trial_confirms_itself_when_its_master_has_started_it() {
+    let Some(elf) = plain("") else { return };
+    let mut bench = board();
+    flash(&mut bench.session(), &blocks(&elf), &FlashOptions::default().start(false), &mut |_| {}).unwrap();
+    for confirms in [false, true] {
+        bench.session().command(1, ProgramControl::Start).unwrap();
+        bench.await_program(1000);
+        bench.run_ms(20);
+        if confirms {
+            bench.post(0, &[1, NODE]);
+            bench.run_ms(600);
+        }
+        power_cycle(&mut bench);
+        assert_eq!(bench.is_bootloader(NODE), !confirms, "confirmed: {confirms}");
+    }
+}
+
+/// It is taken, and tells nobody whom it is for.
+#[test]
+fn a_program_without_a_label_is_taken_by_every_device() {
+    let Some(elf) = plain("") else { return };
+    let labelled = |elf: &[u8]| match read(elf, None, None).expect("an ELF") {
+        Firmware::Image(image) => label_of(&image, LAYOUT.programs[0].base),
+        Firmware::Blocks(_) => panic!("an ELF is no block file"),
+    };
+    let label = labelled(&elf).expect("label! puts one there");
+    assert_eq!((label.vendor_id, label.product_code, label.version), (0, bsp::IDENTITY.product_code, 1));
+    let Some(without) = plain("without-label") else { return };
+    assert_eq!(labelled(&without), None);
+    let mut bench = board();
+    flash(&mut bench.session(), &blocks(&without), &FlashOptions::default(), &mut |_| {}).unwrap();
+    assert!(!bench.is_bootloader(NODE));
+}
+
+/// Its first interrupt is the bootloader's. It never answers, is not released, and goes when a good
+/// one comes.
+#[test]
+fn a_program_with_vtor_at_the_bootloader_is_told_to_be_silent_and_is_replaced() {
+    let (Some(good), Some(wrong)) = (plain(""), plain("wrong-vtor")) else { return };
+    let mut bench = board();
+    let error =
+        flash(&mut bench.session(), &blocks(&wrong), &FlashOptions::default(), &mut |_| {}).unwrap_err();
+    assert!(error.to_string().contains("the program is not released for autostart"), "{error}");
+    bench.run_ms(3000);
+    power_cycle(&mut bench);
+    assert!(bench.is_bootloader(NODE), "it was not released: {error}");
+    flash(&mut bench.session(), &blocks(&good), &FlashOptions::default(), &mut |_| {}).unwrap();
+    assert!(!bench.is_bootloader(NODE));
+}
