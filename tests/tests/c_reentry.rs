@@ -1,0 +1,142 @@
+//! The way back in C (`app-c/coboot/reentry.c`) beside that in Rust (`canopen::application`): whatever
+//! comes, in whatever order, both do the same.
+
+use std::fmt::Write as _;
+use std::path::Path;
+use std::process::Command;
+use std::{env, fs};
+
+use canopen::application::{Departure, Next};
+use canopen::time::Instant;
+use coboot_tests::random::Random;
+
+/// Reads a script of events, and prints what the program does about each: for `b REQUEST NOW`, a command
+/// that was taken, whether it is possible; for `p QUIET NOW`, the next step, and in the end the request.
+/// `n` begins anew.
+const HARNESS: &str = r#"
+#include <stdio.h>
+#include "coboot.h"
+#include "reentry.h"
+
+int main(int count, char **words)
+{
+    struct coboot_reentry reentry = { 0 };
+    FILE *script = count == 2 ? fopen(words[1], "r") : NULL;
+    unsigned long what, now;
+    char event;
+
+    if (script == NULL) {
+        return 1;
+    }
+    while (fscanf(script, " %c %lu %lu", &event, &what, &now) == 3) {
+        if (event == 'n') {
+            const struct coboot_reentry none = { 0 };
+            reentry = none;
+        } else if (event == 'b') {
+            puts(coboot_reentry_begin(&reentry, (uint32_t)what, 7, (uint32_t)now) ? "taken" : "refused");
+        } else {
+            const enum coboot_next next = coboot_reentry_proceed(&reentry, what != 0, (uint32_t)now);
+            if (next == COBOOT_LEAVE) {
+                printf("leave %lu\n", (unsigned long)reentry.request);
+            } else {
+                puts(next == COBOOT_SERVE ? "serve" : "wait");
+            }
+        }
+    }
+    return 0;
+}
+"#;
+
+/// Requests of the warm-start cell by their numbers: stay, start, power-on, owed, confirm, store node.
+const REQUESTS: [u32; 6] = [1, 3, 5, 7, 10, 12];
+const OWED: u32 = 7;
+const CONFIRM: u32 = 10;
+
+/// What an application on `Departure` does: the rules that stand outside of it are those of
+/// `app-template/src/objects.rs`.
+#[derive(Default)]
+struct Model {
+    departure: Option<Departure<u32>>,
+    /// What it leaves with, as far as is known.
+    confirms: bool,
+    silent: bool,
+}
+
+impl Model {
+    fn begin(&mut self, request: u32, now: Instant) -> bool {
+        if self.silent || self.confirms && request != CONFIRM {
+            return false;
+        }
+        let departure = self.departure.get_or_insert(Departure::NONE);
+        if request == OWED {
+            departure.begin_silent(request, now);
+            self.silent = true;
+        } else {
+            departure.begin(request, !matches!(request, 3 | 5), now);
+        }
+        self.confirms |= request == CONFIRM;
+        true
+    }
+
+    fn proceed(&mut self, quiet: bool, now: Instant) -> Next<u32> {
+        self.departure.as_mut().map_or(Next::Serve, |departure| departure.proceed(quiet, now))
+    }
+}
+
+#[test]
+fn c_and_rust_leave_at_the_same_time_with_the_same_request() {
+    let mut random = Random(0x1F51);
+    let (mut script, mut expected) = (String::new(), Vec::new());
+    let mut left = [0_usize; REQUESTS.len()];
+    for _ in 0..3000 {
+        // Also where the counter of milliseconds runs over.
+        let mut now =
+            if random.chance(50) { u32::MAX - random.below(600) as u32 } else { random.next() as u32 };
+        let mut model = Model::default();
+        writeln!(script, "n 0 {now}").unwrap();
+        for _ in 0..200 {
+            let request = random.chance(8).then(|| random.pick(&REQUESTS));
+            let told = if let Some(request) = request {
+                writeln!(script, "b {request} {now}").unwrap();
+                let possible = model.begin(request, Instant::from_millis(now));
+                if possible { "taken" } else { "refused" }.to_owned()
+            } else {
+                let quiet = random.chance(70);
+                writeln!(script, "p {} {now}", u8::from(quiet)).unwrap();
+                match model.proceed(quiet, Instant::from_millis(now)) {
+                    Next::Serve => "serve".to_owned(),
+                    Next::Wait => "wait".to_owned(),
+                    Next::Leave(request) => format!("leave {request}"),
+                }
+            };
+            let leaves: Option<u32> = told.strip_prefix("leave ").and_then(|request| request.parse().ok());
+            expected.push(told);
+            if let Some(request) = leaves {
+                left[REQUESTS.iter().position(|known| *known == request).expect("one of them")] += 1;
+                break;
+            }
+            now = now.wrapping_add(random.below(4) as u32);
+        }
+    }
+    assert!(left.iter().all(|count| *count > 50), "not every request was seen: {left:?}");
+
+    let scratch = |name: &str| Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    let (source, events, program) =
+        (scratch("reentry-harness.c"), scratch("reentry-events"), scratch("reentry-harness"));
+    fs::write(&source, HARNESS).unwrap();
+    fs::write(&events, script).unwrap();
+    let library = Path::new(env!("CARGO_MANIFEST_DIR")).join("../app-c/coboot");
+    let mut clang = Command::new(env::var_os("CLANG").unwrap_or_else(|| "clang".into()));
+    clang.args(["-std=c11", "-O1", "-Wall", "-Wextra", "-Wconversion", "-Werror"]);
+    clang.args(["-fsanitize=undefined", "-fsanitize-trap=undefined"]);
+    clang.arg("-I").arg(&library).arg(&source).arg(library.join("reentry.c")).arg("-o").arg(&program);
+    let output = clang.output().expect("`cargo xtask setup` installs clang");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let output = Command::new(&program).arg(&events).output().expect("it was just built");
+    assert!(output.status.success());
+    let told = String::from_utf8(output.stdout).unwrap();
+    let told: Vec<_> = told.lines().collect();
+    assert_eq!(told.len(), expected.len());
+    let differs = told.iter().zip(&expected).position(|(c, rust)| c != rust);
+    assert_eq!(differs, None, "event {differs:?}: C {:?}", differs.map(|at| (told[at], &expected[at])));
+}
