@@ -217,7 +217,7 @@ fn works(root: &Path, program: &str) -> Outcome {
     said_in(&run(&["--version"])?, VERSION, "coflash --version")?;
     let app = root.join("app.bin");
     fs::write(&app, sample()).map_err(|error| unwritable(&app, &error))?;
-    run(&["convert", "app.bin", "app.blk", "--start-address", "0x08010000", "--board", "stm32f407g-disc1"])?;
+    run(&["convert", "app.bin", "app.blk", "-I", "binary", "--board", "stm32f407g-disc1"])?;
     said_in(&run(&["inspect", "app.blk"])?, "can be a program", "coflash inspect")?;
     for file in ["app.bin", "app.blk"] {
         fs::remove_file(root.join(file)).map_err(|error| unwritable(&root.join(file), &error))?;
