@@ -29,6 +29,7 @@ mod lint;
 mod modules;
 mod new_board;
 mod pack;
+mod package;
 #[cfg(test)]
 mod pages;
 mod pairs;
@@ -169,6 +170,12 @@ const JOBS: &[Job] = &[
         about: "the software bills of materials of bootloader and host tool",
         help: sbom::HELP,
         run: sbom::run,
+    },
+    Job {
+        name: "package",
+        about: "what is handed out: archives, packages, wheel, sums; installed and run by --check",
+        help: package::HELP,
+        run: package::run,
     },
     Job {
         name: "portable",

@@ -45,6 +45,10 @@ pub enum Part {
     Browser,
     /// Formatter and linter.
     Lint,
+    /// The package for Debian.
+    Deb,
+    /// The program for Windows: a linker for it.
+    Windows,
 }
 
 /// How far the set-up may go.
@@ -167,6 +171,8 @@ enum Tool {
     Venv,
     Gdb,
     Chromium,
+    Dpkg,
+    Mingw,
 }
 
 impl Tool {
@@ -184,6 +190,8 @@ impl Tool {
             Self::Venv => "python3-venv",
             Self::Gdb => "gdb-multiarch",
             Self::Chromium => "chromium",
+            Self::Dpkg => "dpkg",
+            Self::Mingw => "gcc-mingw-w64-x86-64",
         }
     }
 
@@ -213,6 +221,8 @@ impl Tool {
             // Debian's python3 comes without ensurepip.
             Self::Venv => process::succeeds("python3", &["-c", "import venv, ensurepip"]),
             Self::Gdb => process::succeeds("gdb-multiarch", &["--version"]),
+            Self::Dpkg => process::succeeds("dpkg-deb", &["--version"]),
+            Self::Mingw => process::succeeds("x86_64-w64-mingw32-gcc", &["--version"]),
             // The tests look for it in the same places.
             Self::Chromium => match env::var_os("COBOOT_CHROMIUM") {
                 Some(chromium) => process::succeeds(chromium, &["--version"]),
@@ -234,6 +244,8 @@ fn missing_packages(parts: &[Part], is_there: impl Fn(Tool) -> bool) -> Vec<&'st
             Part::Examples => &[Tool::ArmGcc, Tool::Clang, Tool::Make, Tool::Cmake],
             Part::Gdb => &[Tool::Gdb],
             Part::Browser => &[Tool::Chromium],
+            Part::Deb => &[Tool::Dpkg],
+            Part::Windows => &[Tool::Mingw],
             Part::Python if !python_environment_is_there() => &[Tool::Python, Tool::Venv],
             Part::Python | Part::Firmware | Part::Lint => &[],
         });
@@ -428,6 +440,7 @@ mod tests {
             ["clang", "cmake", "gcc-arm-none-eabi", "make"]
         );
         assert_eq!(missing_packages(&[Part::Browser], nothing), ["chromium"]);
+        assert_eq!(missing_packages(&[Part::Windows, Part::Deb], nothing), ["dpkg", "gcc-mingw-w64-x86-64"]);
         assert!(missing_packages(&[Part::C, Part::Emulator, Part::Python], |_| true).is_empty());
     }
 

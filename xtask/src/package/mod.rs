@@ -1,0 +1,384 @@
+//! `cargo xtask package`: what is handed out of the host tool, and the crates for the registry.
+
+mod build;
+mod check;
+mod deb;
+mod notices;
+#[cfg(test)]
+mod workflow;
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::{fs, io};
+
+use sha2::{Digest, Sha256};
+
+use crate::args::Args;
+use crate::json::Value;
+use crate::setup::{self, Setup};
+use crate::{process, sbom, workspace, Outcome};
+
+pub const HELP: &str = "\
+usage: cargo xtask package [--check] [--draft] [--yes] [PART ...]
+
+Makes what is handed out, in target/dist. Without a PART it makes all of them:
+
+  source    the sources of the commit, as an archive
+  linux     coflash for Linux, linked statically, with manual pages, completions and udev rules
+  deb       the same as a package for Debian and Ubuntu (amd64)
+  windows   coflash.exe (x86-64)
+  python    the wheel
+  sbom      the software bills of materials of coflash and of the bootloader
+  crates    the crates for the registry, packaged as `cargo publish` would (in target/dist-build/package)
+
+SHA256SUMS has the sums of all files in target/dist.
+
+  --check   installs each part into an empty root and runs it; builds coflash from the source archive in another
+            folder and compares the two programs byte by byte; verifies the crates against each other. This takes
+            a quarter of an hour and more on two cores, so it is a job of its own and no part of .ci/run.
+  --draft   a trial: also packs a tree with changes that are not committed (the source archive is without them),
+            or a commit without the tag of its version
+  --yes     installs missing packages with sudo
+";
+
+/// Linux, without a C library of the system.
+const LINUX: &str = "x86_64-unknown-linux-musl";
+const WINDOWS: &str = "x86_64-pc-windows-gnu";
+/// All members of the workspace have the same.
+const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+/// The names of the parts, in the order in which they are made.
+const PARTS: [&str; 7] = ["source", "linux", "deb", "windows", "python", "sbom", "crates"];
+
+/// Where things go, and the time that they carry.
+struct Release {
+    /// What is handed out.
+    dist: PathBuf,
+    /// Cargo's folder for it, and what is made in between.
+    build: PathBuf,
+    /// The time of the commit, in seconds since 1970: archives carry it, and no other time.
+    epoch: String,
+    draft: bool,
+}
+
+impl Release {
+    fn file(&self, suffix: &str) -> PathBuf {
+        self.dist.join(format!("coflash-{VERSION}{suffix}"))
+    }
+
+    fn source(&self) -> PathBuf {
+        self.dist.join(format!("coboot-{VERSION}.tar.gz"))
+    }
+
+    fn linux(&self) -> PathBuf {
+        self.file("-x86_64-linux.tar.gz")
+    }
+
+    fn deb(&self) -> PathBuf {
+        self.dist.join(format!("coflash_{VERSION}_amd64.deb"))
+    }
+
+    fn windows(&self) -> PathBuf {
+        self.file("-x86_64-windows.exe")
+    }
+
+    /// An empty folder of this name among what is made in between.
+    fn empty(&self, name: &str) -> Outcome<PathBuf> {
+        let folder = self.build.join(name);
+        remove(&folder)?;
+        fs::create_dir_all(&folder).map_err(|error| unwritable(&folder, &error))?;
+        Ok(folder)
+    }
+}
+
+pub fn run(mut args: Args) -> Outcome {
+    let setup = Setup::from(&mut args);
+    let checked = args.flag("--check");
+    let draft = args.flag("--draft");
+    let parts = parts(args.rest())?;
+    if !draft {
+        releasable(&git(&["status", "--porcelain"])?, &git(&["tag", "--points-at", "HEAD"])?)?;
+    }
+    let target = workspace::target_dir();
+    let release = Release {
+        dist: target.join("dist"),
+        build: target.join("dist-build"),
+        epoch: git(&["log", "-1", "--format=%ct"])?.trim().to_owned(),
+        draft,
+    };
+    if parts == PARTS {
+        remove(&release.dist)?;
+    }
+    fs::create_dir_all(&release.dist).map_err(|error| unwritable(&release.dist, &error))?;
+    for part in &parts {
+        println!("== {part}");
+        make(&release, &setup, part)?;
+    }
+    sums(&release.dist)?;
+    if checked {
+        for part in &parts {
+            println!("== check: {part}");
+            check::part(&release, &setup, part)?;
+        }
+        check::sums(&release.dist)?;
+    }
+    Ok(())
+}
+
+/// The parts that are named, or all; in the order of [`PARTS`].
+fn parts(words: Vec<String>) -> Outcome<Vec<&'static str>> {
+    if let Some(unknown) = words.iter().find(|word| !PARTS.contains(&word.as_str())) {
+        return Err(format!("there is no part \"{unknown}\"; there is: {}.", PARTS.join(", ")));
+    }
+    let wanted = |part: &&str| words.is_empty() || words.iter().any(|word| word == part);
+    Ok(PARTS.into_iter().filter(wanted).collect())
+}
+
+/// Whether a commit may be released: nothing is changed beside it, and it has the tag of its version.
+fn releasable(status: &str, tags: &str) -> Outcome {
+    let changed: Vec<&str> = status.lines().collect();
+    if let Some(first) = changed.first() {
+        return Err(format!(
+            "the tree has changes that are not committed ({} files, the first: {}). Commit them or put them away \
+             (`git stash -u`); or add --draft for a trial.",
+            changed.len(),
+            first.trim()
+        ));
+    }
+    let tag = format!("v{VERSION}");
+    if !tags.lines().any(|known| known == tag) {
+        return Err(format!(
+            "the commit has no tag {tag}, the version in Cargo.toml. Put it there (`git tag {tag}`), or set the version \
+             that is meant in Cargo.toml first; or add --draft for a trial."
+        ));
+    }
+    Ok(())
+}
+
+fn make(release: &Release, setup: &Setup, part: &str) -> Outcome {
+    match part {
+        "source" => source(release),
+        "linux" => linux(release),
+        "deb" => {
+            setup.prepare(&[setup::Part::Deb])?;
+            deb::make(release)
+        }
+        "windows" => {
+            setup.prepare(&[setup::Part::Windows])?;
+            let program = build::program(workspace::root(), &release.build, WINDOWS)?;
+            copy(&program, &release.windows())?;
+            notices_beside(release)
+        }
+        "python" => {
+            setup.prepare(&[setup::Part::Python])?;
+            build::wheel(release)?;
+            notices_beside(release)
+        }
+        "sbom" => bills(release),
+        _ => crates(release),
+    }
+}
+
+/// The sources of the commit. git sorts them and gives each the commit's time.
+fn source(release: &Release) -> Outcome {
+    let tar = release.build.join("source.tar");
+    fs::create_dir_all(&release.build).map_err(|error| unwritable(&release.build, &error))?;
+    let mut archive = git_command(&["-c", "tar.umask=0022", "archive", "--format=tar"]);
+    archive.arg(format!("--prefix=coboot-{VERSION}/")).arg("--output").arg(&tar).arg("HEAD");
+    process::run(&mut archive)?;
+    process::run(Command::new("gzip").args(["-9", "--no-name", "--force"]).arg(&tar))?;
+    copy(&release.build.join("source.tar.gz"), &release.source())
+}
+
+/// The program for Linux and what belongs to it, as an archive.
+fn linux(release: &Release) -> Outcome {
+    let stage = release.empty("stage")?;
+    let name = format!("coflash-{VERSION}");
+    let folder = stage.join(&name);
+    build::with_extras(release, &folder)?;
+    for file in ["LICENSE-MIT", "LICENSE-APACHE", "coflash/README.md"] {
+        let from = workspace::root().join(file);
+        copy(&from, &folder.join(from.file_name().unwrap_or_default()))?;
+    }
+    let mut tar = Command::new("tar");
+    tar.args(["--sort=name", "--owner=0", "--group=0", "--numeric-owner", "--mode=u+rw,go+r-w"]);
+    tar.arg(format!("--mtime=@{}", release.epoch)).args(["--use-compress-program", "gzip -9n"]);
+    process::run(
+        tar.arg("--directory").arg(&stage).arg("--create").arg("--file").arg(release.linux()).arg(name),
+    )?;
+    remove(&stage)
+}
+
+/// The notices of what is linked into the program, for the files that have no room for them.
+fn notices_beside(release: &Release) -> Outcome {
+    write(&release.file("-THIRD-PARTY.txt"), &notices::text()?)
+}
+
+fn bills(release: &Release) -> Outcome {
+    sbom::run(Args::new(std::iter::empty()))?;
+    let folder = workspace::target_dir().join("sbom");
+    let board = workspace::DEFAULT_BOARD;
+    copy(&folder.join("coflash-all-systems.cdx.json"), &release.file(".cdx.json"))?;
+    let bootloader = release.dist.join(format!("bootloader-{VERSION}-{board}.cdx.json"));
+    copy(&folder.join(format!("bootloader-{board}.cdx.json")), &bootloader)
+}
+
+/// The crates for the registry. What is in them is checked by [`check::part`].
+fn crates(release: &Release) -> Outcome {
+    process::run(package_crates(release)?.arg("--no-verify"))
+}
+
+/// `cargo package` of all crates that may be published. They go in one call, since they depend on each
+/// other and none is in the registry yet.
+fn package_crates(release: &Release) -> Outcome<Command> {
+    let said = process::output(process::cargo("metadata").args(["--no-deps", "--format-version", "1"]))?;
+    let mut command = process::cargo("package");
+    command.args(["--locked", "--target-dir"]).arg(&release.build);
+    for name in published(&Value::parse(&said)?) {
+        command.args(["--package", &name]);
+    }
+    if release.draft {
+        command.arg("--allow-dirty");
+    }
+    Ok(command)
+}
+
+/// The packages without `publish = false`.
+fn published(metadata: &Value) -> Vec<String> {
+    let packages = metadata.get("packages").items().iter();
+    let published = packages.filter(|package| *package.get("publish") == Value::Null);
+    published.filter_map(|package| package.get("name").text().map(str::to_owned)).collect()
+}
+
+/// Writes SHA256SUMS, as `sha256sum --check` reads it.
+fn sums(dist: &Path) -> Outcome {
+    let entries = fs::read_dir(dist).map_err(|error| unreadable(dist, &error))?;
+    let mut files: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).collect();
+    files.sort();
+    let mut text = String::new();
+    for file in files.iter().filter(|file| !file.ends_with(SUMS)) {
+        let bytes = fs::read(file).map_err(|error| unreadable(file, &error))?;
+        let sum: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+        let name = file.file_name().unwrap_or_default().to_string_lossy();
+        let _ = writeln!(text, "{sum}  {name}");
+        println!("{:>9} KiB  {}", bytes.len().div_ceil(1024), workspace::shown(file));
+    }
+    write(&dist.join(SUMS), &text)
+}
+
+const SUMS: &str = "SHA256SUMS";
+
+fn git_command(words: &[&str]) -> Command {
+    let mut git = Command::new("git");
+    git.arg("-C").arg(workspace::root()).args(words);
+    git
+}
+
+fn git(words: &[&str]) -> Outcome<String> {
+    process::output(&mut git_command(words)).map_err(|problem| {
+        format!("{problem}\nA package needs the commit that it is made of: run this in a clone of the repository.")
+    })
+}
+
+fn copy(from: &Path, to: &Path) -> Outcome {
+    let copied = || -> io::Result<()> {
+        if let Some(folder) = to.parent() {
+            fs::create_dir_all(folder)?;
+        }
+        fs::copy(from, to).map(drop)
+    };
+    copied().map_err(|error| {
+        format!("{} cannot be copied to {}: {error}.", workspace::shown(from), workspace::shown(to))
+    })
+}
+
+fn write(file: &Path, text: &str) -> Outcome {
+    let written = || -> io::Result<()> {
+        if let Some(folder) = file.parent() {
+            fs::create_dir_all(folder)?;
+        }
+        fs::write(file, text)
+    };
+    written().map_err(|error| unwritable(file, &error))
+}
+
+/// Removes a folder with all that is in it, if it is there.
+fn remove(folder: &Path) -> Outcome {
+    match fs::remove_dir_all(folder) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            Err(format!("{} cannot be removed: {error}.", workspace::shown(folder)))
+        }
+        _ => Ok(()),
+    }
+}
+
+fn unwritable(path: &Path, error: &io::Error) -> String {
+    format!("{} cannot be written: {error}.", workspace::shown(path))
+}
+
+fn unreadable(path: &Path, error: &io::Error) -> String {
+    format!("{} cannot be read: {error}.", workspace::shown(path))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_are_made_in_their_order_and_each_once() {
+        let words = |text: &str| text.split_whitespace().map(str::to_owned).collect();
+        assert_eq!(parts(words("")), Ok(PARTS.to_vec()));
+        assert_eq!(parts(words("deb source deb")), Ok(vec!["source", "deb"]));
+        assert!(parts(words("deb rpm")).unwrap_err().contains("\"rpm\""));
+        assert!(parts(words("--chekc")).unwrap_err().contains("--chekc"));
+    }
+
+    #[test]
+    fn a_dirty_tree_and_a_commit_without_its_tag_are_told() {
+        let tag = format!("v{VERSION}\n");
+        assert_eq!(releasable("", &tag), Ok(()));
+        assert_eq!(releasable("", &format!("nightly\n{tag}")), Ok(()));
+        let dirty = releasable(" M README.md\n?? new\n", &tag).unwrap_err();
+        assert!(
+            dirty.contains("2 files") && dirty.contains("README.md") && dirty.contains("--draft"),
+            "{dirty}"
+        );
+        for tags in ["", "v0.0.9\n", &format!("v{VERSION}0\n")] {
+            let untagged = releasable("", tags).unwrap_err();
+            assert!(untagged.contains(&format!("git tag v{VERSION}")), "{untagged}");
+        }
+    }
+
+    #[test]
+    fn what_is_not_for_the_registry_stays_here() {
+        let text = r#"{"packages":[{"name":"a","publish":null},{"name":"b","publish":[]}]}"#;
+        assert_eq!(published(&Value::parse(text).unwrap()), ["a"]);
+    }
+
+    /// No adapter that the tool knows is without its rule, and the rules speak of no other.
+    #[test]
+    fn the_udev_rules_are_those_of_the_adapters() {
+        let read = |file: &str| fs::read_to_string(workspace::root().join("coflash").join(file)).unwrap();
+        let mut wanted = Vec::new();
+        for (file, constant, subsystem) in
+            [("src/bus/gs_usb/usb.rs", "const DEVICES", "usb"), ("src/bus/ports.rs", "const SLCAN", "tty")]
+        {
+            let source = read(file);
+            let (_, list) = source.split_once(constant).unwrap();
+            let (list, _) = list.split_once("];\n").unwrap();
+            for pair in list.split('(').skip(2) {
+                let ids: Vec<_> = pair.split("0x").skip(1).map(|id| id[..4].to_lowercase()).collect();
+                let [vendor, product] = ids.as_slice() else { panic!("{pair}") };
+                wanted.push(format!(
+                    "SUBSYSTEM==\"{subsystem}\", ATTRS{{idVendor}}==\"{vendor}\", ATTRS{{idProduct}}==\"{product}\", \
+                     TAG+=\"uaccess\""
+                ));
+            }
+        }
+        assert!(wanted.len() >= 7, "{wanted:?}");
+        let rules = read("packaging/70-coflash.rules");
+        let rules: Vec<_> = rules.lines().filter(|line| !line.is_empty() && !line.starts_with('#')).collect();
+        assert_eq!(rules, wanted);
+    }
+}

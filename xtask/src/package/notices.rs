@@ -1,0 +1,124 @@
+//! What others wrote of the program: each crate with its licence, and the texts of the licences.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::unreadable;
+use crate::json::Value;
+use crate::{process, workspace, Outcome};
+
+/// What is no crate, by name, with its licence's file.
+const OTHERS: [(&str, &str); 1] =
+    [("uPlot 1.6.32: MIT (https://github.com/leeoniya/uPlot)", "coflash/src/ui/page/uPlot.LICENSE")];
+/// How the files begin that have to go with a copy.
+const NOTICES: [&str; 6] = ["LICENSE", "LICENCE", "COPYING", "COPYRIGHT", "NOTICE", "UNLICENSE"];
+
+/// The notices of all crates that are linked into `coflash`, of every system. The same Cargo.lock
+/// gives the same text.
+pub fn text() -> Outcome<String> {
+    let tree = ["--locked", "--package", "coflash", "--prefix", "none", "--edges", "normal", "--no-dedupe"];
+    let mut cargo = process::cargo("tree");
+    let tree = process::output(cargo.args(tree).args(["--target", "all", "--format", "{p}"]))?;
+    let linked: BTreeSet<String> = tree.lines().filter_map(name_and_version).collect();
+    let metadata = process::output(process::cargo("metadata").args(["--locked", "--format-version", "1"]))?;
+    let mut crates = BTreeMap::new();
+    for package in Value::parse(&metadata)?.get("packages").items() {
+        if let Some((line, folder)) = of(package, &linked) {
+            crates.insert(line, notices_in(&folder)?);
+        }
+    }
+    for (line, file) in OTHERS {
+        let file = workspace::root().join(file);
+        let text = fs::read_to_string(&file).map_err(|error| unreadable(&file, &error))?;
+        crates.insert(line.to_owned(), vec![text]);
+    }
+    Ok(page(&crates))
+}
+
+/// `name v1.2.3 (…)` as `name 1.2.3`.
+fn name_and_version(line: &str) -> Option<String> {
+    let mut words = line.split(' ');
+    Some(format!("{} {}", words.next()?, words.next()?.strip_prefix('v')?))
+}
+
+/// The line of a crate of others among those that are linked, and its folder.
+fn of(package: &Value, linked: &BTreeSet<String>) -> Option<(String, PathBuf)> {
+    package.get("source").text()?;
+    let name = format!("{} {}", package.get("name").text()?, package.get("version").text()?);
+    let folder = Path::new(package.get("manifest_path").text()?).parent()?.to_owned();
+    let licence = package.get("license").text().unwrap_or("its own, see below");
+    let home = package.get("repository").text().map(|home| format!(" ({home})")).unwrap_or_default();
+    linked.contains(&name).then(|| (format!("{name}: {licence}{home}"), folder))
+}
+
+/// The texts in a crate's folder that have to go with a copy.
+fn notices_in(folder: &Path) -> Outcome<Vec<String>> {
+    let entries = fs::read_dir(folder).map_err(|error| unreadable(folder, &error))?;
+    let is_notice = |path: &PathBuf| {
+        let name = path.file_name().unwrap_or_default().to_string_lossy().to_uppercase();
+        path.is_file() && NOTICES.iter().any(|start| name.starts_with(start))
+    };
+    let mut files: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).filter(is_notice).collect();
+    files.sort();
+    let read = |file: &PathBuf| fs::read_to_string(file).map_err(|error| unreadable(file, &error));
+    files.iter().map(read).collect()
+}
+
+/// The page: all names with their licences, then every text once, under the names that have it.
+fn page(crates: &BTreeMap<String, Vec<String>>) -> String {
+    let mut page = String::from(
+        "coflash contains the work of others, listed here with licences and notices. The sources of each crate\n\
+         are at https://crates.io, under its name and version.\n\n",
+    );
+    let mut texts: BTreeMap<String, Vec<&str>> = BTreeMap::new();
+    for (line, notices) in crates {
+        let _ = writeln!(page, "{line}");
+        for notice in notices {
+            let text: Vec<&str> = notice.lines().map(str::trim_end).collect();
+            let name = line.split(": ").next().unwrap_or_default();
+            texts.entry(text.join("\n").trim().to_owned()).or_default().push(name);
+        }
+    }
+    for (text, names) in texts {
+        let _ = write!(page, "\n{}\n{}:\n\n{text}\n", "-".repeat(78), names.join(", "));
+    }
+    page
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_text_stands_once_under_all_names_that_have_it() {
+        let crates = BTreeMap::from([
+            ("a 1.0.0: MIT".to_owned(), vec!["Take it.\r\n".to_owned()]),
+            ("b 2.0.0: MIT".to_owned(), vec!["Take it.".to_owned(), "Or that.".to_owned()]),
+        ]);
+        let page = page(&crates);
+        assert_eq!(page.matches("Take it.").count(), 1, "{page}");
+        assert!(page.contains("a 1.0.0, b 2.0.0:\n\nTake it."), "{page}");
+        assert!(page.contains("b 2.0.0:\n\nOr that."), "{page}");
+    }
+
+    /// What cargo says of the program itself: crates of each system, no tools of tests, nothing of
+    /// ours, and a text for the licences that demand one.
+    #[test]
+    fn every_linked_crate_is_named() {
+        let text = text().unwrap();
+        let names: BTreeSet<&str> = text
+            .lines()
+            .take_while(|line| !line.starts_with("---"))
+            .filter_map(|line| line.split(' ').next())
+            .collect();
+        for name in ["clap", "serialport", "socketcan", "nusb", "windows-sys", "uPlot"] {
+            assert!(names.contains(name), "{name}: {names:?}");
+        }
+        for name in ["coboot-abi", "proptest", "unicorn-engine", "rtic"] {
+            assert!(!names.contains(name), "{name}");
+        }
+        assert!(text.contains("Leon Sorokin") && text.contains("Mozilla Public License"));
+    }
+}
