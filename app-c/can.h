@@ -5,6 +5,10 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 struct can_frame {
     uint16_t id;
     uint8_t len;
@@ -23,4 +27,7 @@ void can_send(enum can_mailbox mailbox, const struct can_frame *frame);
 /* Takes the next frame. False where there is none. */
 bool can_receive(struct can_frame *frame);
 
+#ifdef __cplusplus
+}
+#endif
 #endif

@@ -3,8 +3,11 @@
 
 extern uint32_t _stack_start, __data_start, __data_end, __bss_start, __bss_end;
 extern const uint32_t __data_load;
+/* Functions that run before `main`: the constructors of static objects in C++. */
+extern void (*const __init_array_start[])(void);
+extern void (*const __init_array_end[])(void);
 
-void main(void);
+int main(void);
 void tick(void);
 void reset(void);
 
@@ -16,17 +19,19 @@ static void unexpected(void)
     }
 }
 
-/* More interrupts than any chip of the family has, so that every vector is somebody's. */
-enum { EXCEPTIONS = 16, INTERRUPTS = 112 };
+/* Those of the core, and the interrupt lines of the chip, which the build names. The label stands behind the vectors, so
+ * there is no room for more; the linker script compares the number with the chip's.
+ */
+enum { EXCEPTIONS = 16, VECTORS = EXCEPTIONS + INTERRUPT_LINES };
 
 typedef void (*vector)(void);
 
-__attribute__((section(".vector_table"), used)) static const vector vectors[EXCEPTIONS + INTERRUPTS] = {
+__attribute__((section(".vector_table"), used)) static const vector vectors[VECTORS] = {
     [0] = (vector)(uintptr_t)&_stack_start,
     [1] = reset,
     [2 ... 14] = unexpected,
     [15] = tick,
-    [16 ... EXCEPTIONS + INTERRUPTS - 1] = unexpected,
+    [EXCEPTIONS ... VECTORS - 1] = unexpected,
 };
 
 void reset(void)
@@ -40,6 +45,9 @@ void reset(void)
     }
     for (volatile uint32_t *to = &__bss_start; to < &__bss_end; to++) {
         *to = 0;
+    }
+    for (void (*const *function)(void) = __init_array_start; function < __init_array_end; function++) {
+        (*function)();
     }
     main();
     unexpected();

@@ -4,8 +4,7 @@
 //! |---|---|
 //! | `main.rs` | wiring of the tasks: put your own beside them |
 //! | `entries.rs` | the table of the object dictionary: add your objects; keep 1F51h, 1F56h and 1F57h |
-//! | `objects.rs` | the values behind it, with the 1F51h callback |
-//! | `coboot.rs` | everything between application and bootloader: keep it as it is |
+//! | `objects.rs` | the values behind it; what is coboot's of them is asked of `coboot-app` |
 //! | `debugger.rs` | the debugger interface (feature `debugger`): never in a product |
 //!
 //! Priorities: 4 and 3 serve the bus, 1 and `idle` are the application's. 2 is left free for the
@@ -13,7 +12,6 @@
 #![no_std]
 #![no_main]
 
-mod coboot;
 mod debugger;
 mod entries;
 mod objects;
@@ -33,20 +31,17 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
 
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]
 mod app {
-    use bsp::can::{BitTiming, Errors, Mode};
-    use bsp::{pac, CanPort, CAN_CLOCK, LAYOUT};
-    use canopen::bit_rate::Heard;
-    use canopen::line::{Confinement, Status, CONTROLLER_OVERRUN, QUEUE_OVERRUN};
+    use bsp::{line, pac, CanPort, BIT_RATE, LAYOUT, NODE_ID};
     use canopen::node::{self, NmtPolicy};
-    use canopen::slave::{self, Output, Slave, SlaveDevice};
-    use canopen::{BitRate, CobId, Frame, Instant};
+    use canopen::slave::{self, Slave, SlaveDevice};
+    use canopen::{BitRate, Frame, Instant, NodeId};
+    use coboot_app::{Bootloader, Defaults, Exit, Next, Start};
     use heapless::spsc::{Consumer, Producer, Queue};
     use rtic::Mutex;
     use rtic_monotonics::fugit::ExtU32;
     use rtic_monotonics::Monotonic;
 
     use super::Mono;
-    use crate::coboot::{self, Departure, Leave, ReentryPath};
     use crate::debugger::{self, Debugger};
     use crate::objects::{Application, HEARTBEAT_MS};
 
@@ -54,6 +49,13 @@ mod app {
     const RX_QUEUE: usize = 16;
     /// How often the protocol looks at its deadlines, in ms.
     const TICK_MS: u32 = 5;
+    /// What the program goes by where no bootloader has started it.
+    const DEFAULT_BIT_RATE: BitRate = match BitRate::from_bits_per_second(BIT_RATE) {
+        Some(rate) => rate,
+        None => panic!("board: the bit rate must be one of CANopen's, or 0 to find it out"),
+    };
+    /// From the protocol task to `idle`, where no exception is active: how the device is to leave.
+    static EXIT: Exit = Exit::new();
 
     #[shared]
     struct Shared {
@@ -67,7 +69,6 @@ mod app {
         slave: Slave,
         application: Application,
         debugger: Debugger,
-        departure: Departure,
         led: bsp::Led,
     }
 
@@ -83,8 +84,17 @@ mod app {
 
         // Same node-ID and bit rate as the bootloader: whoever talked to it goes on talking to
         // this.
-        let start = coboot::read_handoff(LAYOUT);
-        let application = Application::new(&start);
+        let start = Start::read(
+            LAYOUT,
+            Defaults {
+                node_id: NodeId::new(NODE_ID).map(NodeId::get),
+                bit_rate: BIT_RATE,
+                serial_number: bsp::serial_number(),
+            },
+        );
+        let node_id = start.node_id.and_then(NodeId::new);
+        let bit_rate = BitRate::from_bits_per_second(start.bit_rate).unwrap_or(DEFAULT_BIT_RATE);
+        let application = Application::new(&start, bit_rate);
         let config = slave::Config {
             node: node::Config {
                 heartbeat_ms: HEARTBEAT_MS,
@@ -100,10 +110,9 @@ mod app {
             Local {
                 received,
                 to_handle,
-                slave: Slave::new(application.lss_address(), start.node_id, start.bit_rate, config),
+                slave: Slave::new(application.lss_address(), node_id, bit_rate, config),
                 application,
                 debugger: Debugger::start(),
-                departure: Departure::NONE,
                 led: board.led,
             },
         )
@@ -112,7 +121,9 @@ mod app {
     #[idle]
     fn idle(_: idle::Context) -> ! {
         loop {
-            coboot::reenter_if_requested();
+            if let Some((path, request)) = EXIT.asked() {
+                Bootloader::new(LAYOUT).leave(path, request);
+            }
             cortex_m::asm::wfi();
         }
     }
@@ -120,35 +131,21 @@ mod app {
     /// Empties the controller's FIFO: three frames deep, so nothing may hold this task up.
     #[task(binds = CAN1_RX0, shared = [can], local = [received], priority = 4)]
     fn can_rx(mut cx: can_rx::Context) {
-        cx.shared.can.lock(|can| {
-            while let Some(frame) = can.receive() {
-                // A full queue drops the frame; the client's time-out repeats it, and an emergency
-                // tells.
-                if cx.local.received.enqueue(frame).is_err() {
-                    can.record_overrun();
-                }
-            }
-        });
+        cx.shared.can.lock(|can| line::receive(can, |frame| cx.local.received.enqueue(frame).is_ok()));
         rtic::pend(pac::Interrupt::CAN1_TX);
     }
 
     /// Speaks CANopen: whenever a frame came in, a mailbox became free or time has passed.
-    #[task(
-        binds = CAN1_TX,
-        shared = [can],
-        local = [to_handle, slave, application, debugger, departure],
-        priority = 3
-    )]
+    #[task(binds = CAN1_TX, shared = [can], local = [to_handle, slave, application, debugger], priority = 3)]
     fn protocol(cx: protocol::Context) {
         let now = Instant::from_millis(Mono::now().ticks());
         let protocol::SharedResources { mut can, .. } = cx.shared;
-        let protocol::LocalResources { to_handle, slave, application, debugger, departure, .. } = cx.local;
-        if coboot::proceed(departure, slave.is_idle() && can.lock(|can| can.is_idle()), now) {
+        let protocol::LocalResources { to_handle, slave, application, debugger, .. } = cx.local;
+        application.set_time(now);
+        if !serves(slave, &mut can, application) {
             return;
         }
-        #[cfg(feature = "lift")]
-        application.set_time(now);
-        let status = can.lock(status);
+        let status = can.lock(line::status);
         let device = debugger.attach(application);
         #[cfg(feature = "debugger")]
         let device = &mut { device };
@@ -162,16 +159,27 @@ mod app {
             carry_out(slave, &mut can, now, device);
             let Some(frame) = to_handle.dequeue() else { return };
             if slave.handle(&frame, now, device) {
-                let leave = Leave::Answered(application.reset_request());
-                coboot::begin(departure, ReentryPath::SystemReset, leave, slave, now);
+                application.control.restart(now.as_millis());
             }
-            if let Some((path, leave)) = application.take_leave() {
-                coboot::begin(departure, path, leave, slave, now);
-                if coboot::proceed(departure, slave.is_idle() && can.lock(|can| can.is_idle()), now) {
-                    return;
-                }
+            application.leave_owed(slave);
+            if !serves(slave, &mut can, application) {
+                return;
             }
         }
+    }
+
+    /// Goes on with the way out, if the device is on it. Whether requests are served.
+    fn serves(slave: &Slave, can: &mut impl Mutex<T = CanPort>, application: &mut Application) -> bool {
+        let bus_idle = slave.is_idle() && can.lock(CanPort::is_idle);
+        match application.proceed(bus_idle) {
+            Next::Serve => return true,
+            Next::Wait => {}
+            Next::Leave(request) => {
+                EXIT.ask(application.path(request), request);
+                debugger::release_program();
+            }
+        }
+        false
     }
 
     /// Does what the slave says, until it says nothing.
@@ -181,42 +189,8 @@ mod app {
         now: Instant,
         device: &mut impl SlaveDevice,
     ) {
-        while let Some(output) = slave.poll(now, can.lock(|can| can.has_room()), device) {
-            match output {
-                Output::Send(frame) => can.lock(|can| can.send(&frame)),
-                Output::Join(rate) => configure(can, rate, Mode::Normal),
-                Output::Listen(rate) => configure(can, rate, Mode::Silent),
-                Output::RecoverFromBusOff => can.lock(|can| can.recover_from_bus_off()),
-                Output::Accept(ids) => can.lock(|can| can.accept(ids.map(CobId::get))),
-            }
-        }
-    }
-
-    fn configure(can: &mut impl Mutex<T = CanPort>, rate: BitRate, mode: Mode) {
-        // Another rate is asked for by nobody: `coboot::supports` says so.
-        if let Some(timing) = BitTiming::new(CAN_CLOCK, rate.or_zero()) {
-            can.lock(|can| can.configure(timing, mode));
-        }
-    }
-
-    /// What the slave wants to know of its line.
-    fn status(can: &mut CanPort) -> Status {
-        let errors = can.errors();
-        let lost = can.take_overruns();
-        Status {
-            confinement: match errors {
-                Errors { off: true, .. } => Confinement::BusOff,
-                Errors { passive: true, .. } => Confinement::Passive,
-                _ => Confinement::Active,
-            },
-            heard: match errors {
-                Errors { joined: false, .. } => Heard::NeverIdle,
-                Errors { last: None, .. } => Heard::Nothing,
-                Errors { last: Some(Ok(())), .. } => Heard::Frame,
-                Errors { last: Some(Err(())), .. } => Heard::Error,
-            },
-            lost: u16::from(lost.in_controller) * CONTROLLER_OVERRUN
-                + u16::from(lost.in_queue) * QUEUE_OVERRUN,
+        while let Some(output) = slave.poll(now, can.lock(CanPort::has_room), device) {
+            can.lock(|can| line::carry_out(can, output));
         }
     }
 

@@ -1,30 +1,28 @@
-//! The object dictionary of the application, with the 1F51h callback that calls the bootloader
-//! back.
+//! The values behind the application's object dictionary. Those of 1F51h, 1F56h and 1F57h come from
+//! `coboot-app`, which also says when the device is to go back to its bootloader.
 
 use core::task::Poll;
 
-use bsp::{IDENTITY, LAYOUT};
-use canopen::application::{react, Reaction, Standing};
+use bsp::{line, IDENTITY, LAYOUT};
 use canopen::device::Device;
 use canopen::emcy::Emcy;
 use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Address, Entry, Objects};
 #[cfg(feature = "lift")]
+use canopen::password::Lock;
+#[cfg(feature = "lift")]
 use canopen::program::UNLOCK;
 use canopen::program::{
-    region_value, FlashStatus, ProgramControl, ProgramState, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID,
-    PROGRAM_REGION, PROGRAM_VERSION, UNLOCK_ENTRIES,
+    region_value, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION, UNLOCK_ENTRIES,
 };
+use canopen::slave::Slave;
 use canopen::slave::SlaveDevice;
-#[cfg(feature = "lift")]
-use canopen::{password::Lock, Instant};
-use canopen::{AbortCode, BitRate, NodeId};
-use shared_abi::callgate::{PROGRAM_INSTALLED, PROGRAM_SIGNED};
-use shared_abi::label::Label;
-use shared_abi::warm_start::{BootRequest, Owed};
+use canopen::{AbortCode, BitRate, Instant, NodeId};
+use coboot_app::callgate::PROGRAM_SIGNED;
+use coboot_app::warm_start::{BootRequest, Owed};
+use coboot_app::{Answer, Bootloader, Next, ProgramControl, ReentryPath, Services, Start};
 
-use crate::coboot::{self, Confirmed, Leave, ReentryPath, Start};
 use crate::debugger;
 use crate::entries::{entries, entry_count, CONFIRMATION, REENTRY_PATH};
 
@@ -57,40 +55,35 @@ static ENTRIES: [Entry; ENTRY_COUNT] = entries(PROGRAMS).with(&debugger::ENTRIES
 static WITH_PASSWORD: [Entry; ENTRY_COUNT + UNLOCK_ENTRIES.len()] =
     entries(PROGRAMS).with(&debugger::ENTRIES).with(&UNLOCK_ENTRIES).entries();
 
-/// Whom this image is for, at the place where the bootloader looks before it takes a raw image or
-/// HEX file.
-#[used]
-#[link_section = ".label"]
-static LABEL: Label =
-    Label::new(IDENTITY.vendor_id, IDENTITY.product_code, if cfg!(feature = "version-2") { 2 } else { 1 });
+// Whom this image is for, at the place where the bootloader looks before it takes a raw image or HEX
+// file.
+coboot_app::label!(
+    vendor_id: IDENTITY.vendor_id,
+    product_code: IDENTITY.product_code,
+    version: if cfg!(feature = "version-2") { 2 } else { 1 },
+);
 
 /// 100Ah as update tools find it in the image (CiA 814-1 clause 6.5).
 #[used]
 static MARKED_VERSION: &str = concat!("$CANopenSoftwareVersion\0", version!(), "\0");
 
+/// The bootloader underneath.
+const BOOTLOADER: Bootloader = Bootloader::new(LAYOUT);
+
 /// The application's state, as far as the bus sees it.
 pub struct Application {
     device: Device,
-    program_crc: u32,
-    /// Which program this is.
-    program: u8,
+    /// 1F51h, 1F56h, 1F57h, and the way back.
+    pub control: ProgramControl,
+    bootloader: Bootloader,
     /// The re-entry path (2000h).
     path: ReentryPath,
-    leave: Option<Leave>,
-    /// What a master was promised of the reset that is due: the bootloader, or that this program is
-    /// confirmed by it. Nobody else takes that away.
-    promised: Option<BootRequest>,
-    /// The next 80h to this program confirms it.
-    fresh: bool,
-    /// The node-ID as which the bootloader can answer in this program's place.
-    bootloader_answers: Option<NodeId>,
+    /// An answer that the SDO server has yet to withhold.
+    owed: Option<Owed>,
     #[cfg(feature = "lift")]
     lock: Lock,
     /// The time that was told last.
-    #[cfg(feature = "lift")]
     now: Instant,
-    /// The password came: 1F51h = 2 and NMT reset node lead into the bootloader.
-    armed: bool,
     emcy: Emcy,
     /// Node-ID in force.
     id: Option<NodeId>,
@@ -100,7 +93,7 @@ pub struct Application {
 
 impl Application {
     /// From how the device came up. Asks the bootloader for the CRC over this program, once.
-    pub fn new(start: &Start) -> Self {
+    pub fn new(start: &Start, bit_rate: BitRate) -> Self {
         let device = Device {
             device_type: DEVICE_TYPE,
             name: IDENTITY.device_name,
@@ -112,23 +105,21 @@ impl Application {
             revision: IDENTITY.revision,
             serial_number: start.serial_number,
         };
+        let control = ProgramControl::new(start, PROGRAMS, BOOTLOADER.program_crc(start.program));
+        // The bootloader of a lift is node 126, whatever this program is.
+        let control = if cfg!(feature = "lift") { control.answering_itself() } else { control };
         Self {
             device,
-            program_crc: coboot::program_crc(start.program),
-            program: start.program,
+            control,
+            bootloader: BOOTLOADER,
             path: ReentryPath::default(),
-            leave: None,
-            promised: None,
-            fresh: start.fresh,
-            bootloader_answers: start.bootloader_answers(),
+            owed: None,
             #[cfg(feature = "lift")]
             lock: Lock::new(shared_abi::LIFT_PASSWORD),
-            #[cfg(feature = "lift")]
             now: Instant::from_millis(0),
-            armed: false,
-            bit_rate: start.bit_rate,
+            bit_rate,
             emcy: Emcy::new(),
-            id: start.node_id,
+            id: start.node_id.and_then(NodeId::new),
         }
     }
 
@@ -137,80 +128,37 @@ impl Application {
         self.device.lss_address()
     }
 
-    /// Whether and how the device shall go back to the bootloader, once.
-    pub fn take_leave(&mut self) -> Option<(ReentryPath, Leave)> {
-        self.leave.take().map(|leave| (self.path, leave))
-    }
-
-    /// With which request the device restarts when the NMT master says so.
-    pub fn reset_request(&self) -> BootRequest {
-        if self.armed {
-            BootRequest::Stay
-        } else {
-            BootRequest::PowerOn
-        }
-    }
-
     /// Tells the time: at least every few milliseconds.
-    #[cfg(feature = "lift")]
     pub fn set_time(&mut self, now: Instant) {
         self.now = now;
         // Asked at least now and then, as it wants.
+        #[cfg(feature = "lift")]
         let _ = self.lock.is_waiting(now);
     }
 
-    /// The 1F51h callback. It runs before the SDO answer is sent, so it only notes what is to be done:
-    /// `main` sends the answer and leaves, or leaves the answer to the bootloader.
-    fn program_control(&mut self, program: u8, command: ProgramControl) -> Result<(), AbortCode> {
-        let node_id = self.bootloader_answers.filter(|id| self.id == Some(*id));
-        let Self { fresh, armed, .. } = *self;
-        let standing = Standing { fresh, armed, can_hand_over: node_id.is_some() };
-        self.leave = Some(match react(command, program == self.program, standing)? {
-            Reaction::Nothing => return Ok(()),
-            Reaction::Confirm => return self.confirm(),
-            Reaction::CallBack => return self.promise(BootRequest::Stay),
-            _ if matches!(self.promised, Some(BootRequest::Confirm(_))) => {
-                return Err(AbortCode::DEVICE_STATE);
-            }
-            Reaction::Restart => Leave::Answered(BootRequest::Start(program)),
-            Reaction::HandOver => {
-                let node_id = node_id.map_or(0, NodeId::get);
-                Leave::Owed(Owed { program, value: command as u8, node_id })
-            }
-        });
-        Ok(())
+    /// Goes on with the way out, if the device is on it.
+    pub fn proceed(&mut self, bus_idle: bool) -> Next<BootRequest> {
+        self.control.proceed(bus_idle, self.now.as_millis())
     }
 
-    /// The device leaves with this request, unless it was promised to leave with another one.
-    fn promise(&mut self, request: BootRequest) -> Result<(), AbortCode> {
-        if self.promised.is_some_and(|promised| promised != request) {
-            return Err(AbortCode::DEVICE_STATE);
-        }
-        self.promised = Some(request);
-        self.leave = Some(Leave::Answered(request));
-        Ok(())
-    }
-
-    /// This program is good.
-    fn confirm(&mut self) -> Result<(), AbortCode> {
-        let confirmed = coboot::confirm(self.program);
-        // Until it is stored, an 80h that comes again means the same.
-        self.fresh &= confirmed == Ok(Confirmed::AtReset);
-        match confirmed {
-            Ok(Confirmed::Now) => Ok(()),
-            Ok(Confirmed::AtReset) => self.promise(BootRequest::Confirm(self.program)),
-            Err(_) => Err(AbortCode::HARDWARE),
+    /// On which path the device leaves with this request: an NMT master gets a reset.
+    pub fn path(&self, request: BootRequest) -> ReentryPath {
+        match request {
+            BootRequest::PowerOn => ReentryPath::SystemReset,
+            _ => self.path,
         }
     }
 
-    /// What 1F51h reads.
-    fn program_state(&self, program: u8) -> ProgramState {
-        if program == self.program {
-            return ProgramState::Running;
-        }
-        match coboot::program_info(program) {
-            Ok(info) if info.flags & PROGRAM_INSTALLED != 0 => ProgramState::Stopped,
-            _ => ProgramState::Absent,
+    /// To be called behind every frame: takes an answer back that the bootloader is to send. Where the
+    /// client has written in segments that cannot be, so the command is judged once more.
+    pub fn leave_owed(&mut self, slave: &mut Slave) {
+        let Some(owed) = self.owed.take() else { return };
+        let now = self.now.as_millis();
+        let Owed { program, value, .. } = owed;
+        if slave.withdraw_answer(&[0x60, 0x51, 0x1F, program, 0, 0, 0, 0]) {
+            self.control.leave_owed(owed, now);
+        } else if let Err(abort) = self.control.write_answered(program, &[value], now, &mut self.bootloader) {
+            slave.refuse(abort.into());
         }
     }
 }
@@ -231,22 +179,22 @@ impl Objects for Application {
         if let Some(read) = self.device.read(at, buf) {
             return read;
         }
+        let Self { control, bootloader, .. } = self;
         match at.index {
-            PROGRAM_CONTROL => put(buf, &[self.program_state(at.sub) as u8]),
-            PROGRAM_ID if at.sub == self.program => put(buf, &self.program_crc.to_le_bytes()),
-            PROGRAM_ID => put(buf, &coboot::program_info(at.sub).map_or(0, |info| info.crc).to_le_bytes()),
-            FLASH_STATUS => put(buf, &FlashStatus::OK.to_word().to_le_bytes()),
+            PROGRAM_CONTROL => put(buf, &[control.state(at.sub, bootloader)?]),
+            PROGRAM_ID => put(buf, &control.identification(at.sub, bootloader)?.to_le_bytes()),
+            FLASH_STATUS => put(buf, &control.flash_status(at.sub)?.to_le_bytes()),
             PROGRAM_REGION => {
                 let region = LAYOUT.program(at.sub).ok_or(AbortCode::NO_DATA)?;
                 put(buf, &region_value(region.base, region.size))
             }
             PROGRAM_VERSION => {
-                let version = coboot::program_info(at.sub).map_or(0, |info| info.version);
+                let version = bootloader.program_info(at.sub).map_or(0, |info| info.version);
                 put(buf, &version.to_le_bytes())
             }
             REENTRY_PATH => put(buf, &[self.path as u8]),
             CONFIRMATION => {
-                let info = coboot::program_info(self.program).map_err(|_| AbortCode::DEVICE_STATE)?;
+                let info = bootloader.program_info(control.program()).map_err(|_| AbortCode::DEVICE_STATE)?;
                 put(buf, &[info.flags as u8])
             }
             _ => Err(AbortCode::NO_DATA),
@@ -257,12 +205,20 @@ impl Objects for Application {
         if let Some(written) = self.emcy.write(at, data) {
             return written;
         }
+        let now = self.now.as_millis();
         match (at.index, data) {
-            (PROGRAM_CONTROL, &[value]) => self.program_control(at.sub, ProgramControl::try_from(value)?),
+            // The callback runs before the SDO answer is sent. So it takes a note, and no more.
+            (PROGRAM_CONTROL, data) => {
+                match self.control.write(at.sub, data, now, &mut self.bootloader)? {
+                    Answer::Send => {}
+                    Answer::Withhold(owed) => self.owed = Some(owed),
+                }
+                Ok(())
+            }
             #[cfg(feature = "lift")]
             (UNLOCK, password) => {
                 self.lock.open(password, self.now)?;
-                self.armed = true;
+                self.control.arm();
                 Ok(())
             }
             (REENTRY_PATH, &[value]) => {
@@ -271,9 +227,10 @@ impl Objects for Application {
             }
             (CONFIRMATION, &[value @ 0..=3]) => {
                 if u32::from(value) & PROGRAM_SIGNED != 0 {
-                    return self.confirm().map_err(|_| AbortCode::DEVICE_STATE);
+                    let confirmed = self.control.confirm(now, &mut self.bootloader);
+                    return confirmed.map_err(|_| AbortCode::DEVICE_STATE);
                 }
-                coboot::invalidate(self.program).map_err(|_| AbortCode::DEVICE_STATE)
+                self.bootloader.invalidate(self.control.program()).map_err(|_| AbortCode::DEVICE_STATE)
             }
             (CONFIRMATION, _) => Err(AbortCode::INVALID_VALUE),
             _ => Err(AbortCode::UNSUPPORTED_ACCESS),
@@ -287,16 +244,16 @@ impl Objects for Application {
 
 impl LssDevice for Application {
     fn supports(&mut self, rate: BitRate) -> bool {
-        coboot::supports(rate)
+        line::supports(rate)
     }
 
     /// Storing is the bootloader's: its journal lies in flash that this program does not own.
     fn store(&mut self, id: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {
         let rate = rate.unwrap_or(self.bit_rate);
-        let stored = coboot::store_node(id, rate).map_err(|_| StoreError::Failed);
-        if stored.is_ok() && self.bootloader_answers.is_some() {
-            // It comes up with these from now on.
-            self.bootloader_answers = id.filter(|_| rate == self.bit_rate);
+        let id = id.map(NodeId::get);
+        let stored = self.bootloader.store_node(id, rate.or_zero()).map_err(|_| StoreError::Failed);
+        if stored.is_ok() {
+            self.control.node_stored(id, rate == self.bit_rate);
         }
         Poll::Ready(stored)
     }
@@ -309,5 +266,6 @@ impl SlaveDevice for Application {
 
     fn node_id_changed(&mut self, id: Option<NodeId>) {
         self.id = id;
+        self.control.node_id_changed(id.map(NodeId::get));
     }
 }

@@ -39,3 +39,8 @@ pub mod unseal;
 /// other for them.
 pub use canopen;
 pub use crc::crc32;
+
+/// The example on the crate's page compiles and runs.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

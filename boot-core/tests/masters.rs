@@ -4,7 +4,7 @@
 //! vouches for a program that is not there. The same seed plays the same attack:
 //!
 //! ```sh
-//! COBOOT_ATTACKS=20000 cargo test --release -p boot-core --test masters
+//! COBOOT_ATTACKS=20000 cargo test --release -p coboot-core --test masters
 //! ```
 
 mod bench;

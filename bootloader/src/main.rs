@@ -47,9 +47,7 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]
 mod app {
     use boot_core::bootloader::{self, entries, entry_count, Bootloader, Extras};
-    use boot_core::canopen::bit_rate::Heard;
     use boot_core::canopen::device::Device;
-    use boot_core::canopen::line::{Confinement, Status, CONTROLLER_OVERRUN, QUEUE_OVERRUN};
     use boot_core::canopen::lss;
     use boot_core::canopen::node::{self, NmtPolicy};
     use boot_core::canopen::od::Entry;
@@ -59,10 +57,9 @@ mod app {
     use boot_core::control::Step;
     use boot_core::store::NodeParameters;
     use boot_core::unseal::Room;
-    use bsp::can::{Errors, Mode};
     use bsp::clock::Source;
     use bsp::hal::rcc::RccExt;
-    use bsp::{pac, CanPort, CLOCK_TREE, IDENTITY, LAYOUT};
+    use bsp::{line, pac, CanPort, CLOCK_TREE, IDENTITY, LAYOUT};
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
     use rtic::Mutex;
@@ -232,15 +229,7 @@ mod app {
     /// Empties the controller's FIFO: three frames deep, so nothing may hold this task up.
     #[task(binds = CAN1_RX0, shared = [can], local = [received], priority = 3)]
     fn can_rx(mut cx: can_rx::Context) {
-        cx.shared.can.lock(|can| {
-            while let Some(frame) = can.receive() {
-                // A full queue drops the frame; the client's time-out repeats it, and an emergency
-                // tells.
-                if cx.local.received.enqueue(frame).is_err() {
-                    can.record_overrun();
-                }
-            }
-        });
+        cx.shared.can.lock(|can| line::receive(can, |frame| cx.local.received.enqueue(frame).is_ok()));
         rtic::pend(pac::Interrupt::CAN1_TX);
     }
 
@@ -263,7 +252,7 @@ mod app {
             }
             return;
         }
-        let status = can.lock(status);
+        let status = can.lock(line::status);
         let finishing = bootloader.lock(|bootloader| {
             bootloader.set_time(now);
             let device = debugger.attach(bootloader);
@@ -325,41 +314,7 @@ mod app {
             if let Output::Send(frame) = &output {
                 log::sent(frame);
             }
-            can.lock(|can| match output {
-                Output::Send(frame) => can.send(&frame),
-                Output::Join(rate) => configure(can, rate, Mode::Normal),
-                Output::Listen(rate) => configure(can, rate, Mode::Silent),
-                Output::RecoverFromBusOff => can.recover_from_bus_off(),
-                Output::Accept(ids) => can.accept(ids.map(CobId::get)),
-            });
-        }
-    }
-
-    fn configure(can: &mut CanPort, rate: BitRate, mode: Mode) {
-        // Another rate is asked for by nobody: `product::supports` says so.
-        if let Some(Some(timing)) = product::TIMINGS.get(rate as usize) {
-            can.configure(*timing, mode);
-        }
-    }
-
-    /// What the slave wants to know of its line.
-    fn status(can: &mut CanPort) -> Status {
-        let errors = can.errors();
-        let lost = can.take_overruns();
-        Status {
-            confinement: match errors {
-                Errors { off: true, .. } => Confinement::BusOff,
-                Errors { passive: true, .. } => Confinement::Passive,
-                _ => Confinement::Active,
-            },
-            heard: match errors {
-                Errors { joined: false, .. } => Heard::NeverIdle,
-                Errors { last: None, .. } => Heard::Nothing,
-                Errors { last: Some(Ok(())), .. } => Heard::Frame,
-                Errors { last: Some(Err(())), .. } => Heard::Error,
-            },
-            lost: u16::from(lost.in_controller) * CONTROLLER_OVERRUN
-                + u16::from(lost.in_queue) * QUEUE_OVERRUN,
+            can.lock(|can| line::carry_out(can, output));
         }
     }
 

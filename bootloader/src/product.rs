@@ -16,8 +16,8 @@ use boot_core::flash::Flash;
 use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
 use boot_core::store::{Journal, NodeParameters};
-use bsp::can::BitTiming;
-use bsp::{BIT_RATE, CAN_CLOCK, IDENTITY, LAYOUT, NODE_ID};
+use bsp::line::TIMINGS;
+use bsp::{BIT_RATE, IDENTITY, LAYOUT, NODE_ID};
 use shared_abi::block_file;
 use shared_abi::warm_start::Cell;
 
@@ -360,9 +360,6 @@ pub const fn supports(rate: BitRate) -> bool {
         }
     }
 }
-
-/// How the board's CAN controller makes each bit rate.
-pub const TIMINGS: [Option<BitTiming>; 9] = BitTiming::table(CAN_CLOCK, BitRate::TABLE);
 
 /// The warm-start cell of this board.
 pub fn warm_start_cell() -> Cell {

@@ -15,6 +15,7 @@ pub mod clock;
 pub mod debugger;
 #[cfg(target_arch = "arm")]
 mod drivers;
+pub mod line;
 #[cfg(all(target_arch = "arm", feature = "monitor"))]
 pub mod monitor;
 #[cfg(any(feature = "uart", not(target_arch = "arm")))]

@@ -28,7 +28,6 @@
 extern crate alloc;
 
 mod abort;
-pub mod application;
 pub mod bit_rate;
 #[cfg(feature = "debugger")]
 pub mod debugger;
@@ -52,3 +51,8 @@ pub use bit_rate::BitRate;
 pub use frame::{CobId, Frame, NodeId};
 pub use od::{Address, Objects};
 pub use time::Instant;
+
+/// The example on the crate's page compiles and runs.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -46,3 +46,8 @@ pub mod update;
 
 pub use bus::Adapter;
 pub use device::{Error, Session};
+
+/// The example on the crate's page compiles and runs.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

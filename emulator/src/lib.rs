@@ -16,3 +16,8 @@ pub mod serial;
 pub mod socketcand;
 pub mod time;
 pub mod world;
+
+/// The example on the crate's page compiles and runs.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -8,21 +8,21 @@ use std::io;
 use std::time::Duration;
 
 use boot_core::bootloader::{self, Bootloader};
-use boot_core::canopen::application::{Departure, Next};
 use boot_core::canopen::node::{self, NmtPolicy, Node};
 use boot_core::canopen::od::Entry;
 use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
-use boot_core::canopen::{AbortCode, CobId, Frame, Instant, NodeId};
+use boot_core::canopen::{CobId, Frame, Instant, NodeId};
 use boot_core::control::Step;
 use boot_core::decision::{decide, BootDecision, Circumstances, Policy, StayReason};
 use boot_core::program::verify;
 use boot_core::store::Journal;
 use boot_core::store::NodeParameters;
 use boot_core::unseal::Room;
+use coboot_app::{Defaults, Next, Start};
 use shared_abi::warm_start::{BootRequest, Owed};
 
 use crate::file_flash::FileFlash;
-use crate::stand_in::{Leave, StandIn, Started};
+use crate::stand_in::StandIn;
 use crate::supports;
 
 /// Bytes of blocks that may wait for the flash, as in the firmware for the STM32F407.
@@ -111,8 +111,6 @@ struct Running<D> {
     told: Option<NodeId>,
     /// The way out of the bootloader.
     pending_reset: Option<PendingReset>,
-    /// The way out of a program.
-    departure: Departure<BootRequest>,
     /// What was asked of the program, and left to be answered by the bootloader.
     owed: Option<Frame>,
 }
@@ -246,12 +244,19 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                     None => Phase::Silent(Idle { flash, buffer }),
                     Some(entries) => {
                         let says = boot_core::canopen::device::Device { serial_number, ..config.device };
-                        let started = Started {
+                        let defaults = Defaults {
+                            node_id: node.id.map(NodeId::get),
+                            bit_rate: node.bit_rate.or_zero(),
+                            serial_number,
+                        };
+                        let start = Start {
                             program: number,
                             fresh: matches!(request, Some(BootRequest::Fresh(_))),
-                            bootloader_answers: node.id.filter(|_| config.node_id.is_none()),
+                            ..Start::new(None, defaults)
                         };
-                        let device = StandIn::new(entries, says, started, flash, config.layout);
+                        // A lift's bootloader is another node.
+                        let hands_over = config.node_id.is_none();
+                        let device = StandIn::new(entries, says, &start, hands_over, flash, config.layout);
                         let address = device.lss_address();
                         let slave = slave(address, node, config.device.heartbeat_ms, NmtPolicy::Follow);
                         Phase::StandIn(Box::new(Running::new(device, slave, node.id)), buffer)
@@ -285,7 +290,7 @@ fn slave(
 
 impl<D: SlaveDevice> Running<D> {
     fn new(device: D, slave: Slave, told: Option<NodeId>) -> Self {
-        Self { device, slave, told, pending_reset: None, departure: Departure::NONE, owed: None }
+        Self { device, slave, told, pending_reset: None, owed: None }
     }
 
     fn handle(&mut self, frame: &Frame, now: Instant) {
@@ -344,34 +349,20 @@ impl<D: SlaveDevice> Running<D> {
 /// A program, which leaves as the application template does.
 impl Running<StandIn> {
     fn handle_in_program(&mut self, frame: &Frame, now: Instant) {
-        if self.departure.proceed(false, now) != Next::Serve {
+        if self.device.control.proceed(false, now.as_millis()) != Next::Serve {
             return;
         }
+        self.device.set_time(now);
         if self.slave.handle(frame, now, &mut self.device) {
-            self.departure.begin(BootRequest::PowerOn, false, now);
+            self.device.control.restart(now.as_millis());
         }
-        match self.device.take_leave() {
-            None => {}
-            Some(Leave::Answered(request)) => {
-                self.departure.begin(request, request == BootRequest::Stay, now);
-            }
-            Some(Leave::Owed(owed)) => {
-                if self.slave.withdraw_answer(&[0x60, 0x51, 0x1F, owed.program, 0, 0, 0, 0]) {
-                    self.departure.begin_silent(BootRequest::Owed(owed), now);
-                } else if owed.value == 0 {
-                    // Written in segments, whose end only the program can acknowledge.
-                    self.departure.begin(BootRequest::Stay, true, now);
-                } else {
-                    self.slave.refuse(AbortCode::DEVICE_STATE);
-                }
-            }
-        }
+        self.device.leave_owed(&mut self.slave);
     }
 
     /// Leaves if it is time, with this request, or sends what there is to send.
     fn leave_or_exchange(&mut self, now: Instant, send: &mut impl FnMut(Frame)) -> Option<BootRequest> {
         let quiet = self.slave.is_idle();
-        match self.departure.proceed(quiet, now) {
+        match self.device.control.proceed(quiet, now.as_millis()) {
             Next::Leave(request) => return Some(request),
             Next::Wait => {}
             Next::Serve => self.send(now, send),

@@ -27,3 +27,8 @@ use boot_core::canopen::BitRate;
 pub fn supports(rate: BitRate) -> bool {
     rate != BitRate::Auto
 }
+
+/// The example on the crate's page compiles and runs.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

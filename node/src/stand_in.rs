@@ -4,21 +4,21 @@
 
 use std::task::Poll;
 
-use boot_core::canopen::application::{react, Reaction, Standing};
 use boot_core::canopen::device::{self, Device};
 use boot_core::canopen::lss::{LssAddress, LssDevice, StoreError};
 use boot_core::canopen::od::{put, Address, Entry, Objects};
 use boot_core::canopen::program::{
-    region_value, FlashStatus, ProgramControl, ProgramState, CONTROL_ARRAYS, FLASH_STATUS, PROGRAM_CONTROL,
-    PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION,
+    region_value, CONTROL_ARRAYS, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION,
 };
-use boot_core::canopen::slave::SlaveDevice;
-use boot_core::canopen::{AbortCode, BitRate, NodeId};
+use boot_core::canopen::slave::{Slave, SlaveDevice};
+use boot_core::canopen::{AbortCode, BitRate, Instant, NodeId};
 use boot_core::flash::run;
 use boot_core::store::{Journal, Key, Parameters as _, ProgramRecord};
+use coboot_app::callgate::{CallgateError, ProgramArgs, Status, PROGRAM_INSTALLED, PROGRAM_SIGNED};
+use coboot_app::{Answer, Confirmed, ProgramControl, Services, Start};
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
-use shared_abi::warm_start::{BootRequest, Owed};
+use shared_abi::warm_start::Owed;
 
 use crate::file_flash::FileFlash;
 
@@ -27,50 +27,77 @@ const DEVICE_TYPE: u32 = 0;
 /// 100Ah. Nobody shall take it for the program itself.
 const SOFTWARE_VERSION: &str = "coboot-node stand-in";
 
-/// How the device leaves for a command.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Leave {
-    /// The program answers, and the bootloader finds this request.
-    Answered(BootRequest),
-    /// The bootloader answers.
-    Owed(Owed),
-}
-
-/// Which program it stands for, and how that came up.
-#[derive(Clone, Copy, Debug)]
-pub struct Started {
-    /// Its number.
-    pub program: u8,
-    /// It was started right behind its download in one go: the first 80h confirms it.
-    pub fresh: bool,
-    /// The node-ID in force, if the bootloader has the same one and can answer in its place.
-    pub bootloader_answers: Option<NodeId>,
-}
-
 /// The stand-in of a program.
 #[derive(Debug)]
 pub struct StandIn {
     entries: &'static [Entry],
     device: Device,
-    started: Started,
+    /// 1F51h, 1F56h, 1F57h, and the way back.
+    pub control: ProgramControl,
+    underneath: Underneath,
+    /// An answer that the SDO server has yet to withhold.
+    owed: Option<Owed>,
+    /// The time that was told last.
+    now: Instant,
+}
+
+/// What a program has of its bootloader, without one.
+#[derive(Debug)]
+struct Underneath {
     flash: FileFlash,
     /// Where programs and journal are.
     layout: &'static Layout,
-    leave: Option<Leave>,
+}
+
+impl Underneath {
+    /// What is known of a program.
+    fn record(&self, program: u8) -> Option<ProgramRecord> {
+        ProgramRecord::load(&Journal::open(&self.flash, self.layout.parameters), &self.flash, program)
+    }
+}
+
+impl Services for Underneath {
+    fn program_info(&mut self, number: u8) -> Result<ProgramArgs, CallgateError> {
+        let record = self.record(number).ok_or(CallgateError::Refused(Status::NoProgram as i32))?;
+        Ok(ProgramArgs {
+            number: number.into(),
+            size: record.size,
+            crc: record.crc,
+            version: record.version,
+            flags: PROGRAM_INSTALLED | if record.signed { PROGRAM_SIGNED } else { 0 },
+        })
+    }
+
+    /// What a program does through the callgate: it is signed, and needs no rescue window.
+    fn confirm(&mut self, number: u8) -> Result<Confirmed, CallgateError> {
+        let record = self.record(number).ok_or(CallgateError::Refused(Status::NoProgram as i32))?;
+        let mut journal = Journal::open(&self.flash, self.layout.parameters);
+        let confirmed = ProgramRecord { signed: true, confirmed: true, ..record };
+        journal.store(Key::Program(number), confirmed.value());
+        run(&mut self.flash, |flash, outcome| journal.next(flash, outcome))
+            .map(|()| Confirmed::Now)
+            .map_err(|_| CallgateError::Refused(Status::Failed as i32))
+    }
 }
 
 impl StandIn {
-    /// Of this program, on a device with this flash that says this of itself as a bootloader.
+    /// Of the program that came up so, on a device with this flash that says this of itself as a
+    /// bootloader. `hands_over`: the bootloader comes up as the same node.
     #[must_use]
     pub fn new(
         entries: &'static [Entry],
         bootloader: Device,
-        started: Started,
+        start: &Start,
+        hands_over: bool,
         flash: FileFlash,
         layout: &'static Layout,
     ) -> Self {
         let device = Device { device_type: DEVICE_TYPE, software_version: SOFTWARE_VERSION, ..bootloader };
-        Self { entries, device, started, flash, layout, leave: None }
+        let mut underneath = Underneath { flash, layout };
+        let crc = underneath.program_info(start.program).map_or(0, |info| info.crc);
+        let control = ProgramControl::new(start, layout.programs.len() as u8, crc);
+        let control = if hands_over { control } else { control.answering_itself() };
+        Self { entries, device, control, underneath, owed: None, now: Instant::from_millis(0) }
     }
 
     /// Its object dictionary on a device with so many programs.
@@ -91,54 +118,33 @@ impl StandIn {
         self.device.lss_address()
     }
 
-    /// Whether and how the device shall leave, once.
-    pub fn take_leave(&mut self) -> Option<Leave> {
-        self.leave.take()
+    /// Tells the time, before each frame.
+    pub fn set_time(&mut self, now: Instant) {
+        self.now = now;
+    }
+
+    /// To be called behind every frame: takes an answer back that the bootloader is to send. Where the
+    /// client has written in segments that cannot be, so the command is judged once more.
+    pub fn leave_owed(&mut self, slave: &mut Slave) {
+        let Some(owed) = self.owed.take() else { return };
+        let now = self.now.as_millis();
+        let Owed { program, value, .. } = owed;
+        if slave.withdraw_answer(&[0x60, 0x51, 0x1F, program, 0, 0, 0, 0]) {
+            self.control.leave_owed(owed, now);
+        } else if let Err(abort) = self.control.write_answered(program, &[value], now, &mut self.underneath) {
+            slave.refuse(abort.into());
+        }
     }
 
     /// The flash behind it.
     pub fn flash(&mut self) -> &mut FileFlash {
-        &mut self.flash
+        &mut self.underneath.flash
     }
 
     /// Ends; gives the flash back.
     #[must_use]
     pub fn into_flash(self) -> FileFlash {
-        self.flash
-    }
-
-    /// What is known of a program.
-    fn record(&self, program: u8) -> Option<ProgramRecord> {
-        ProgramRecord::load(&Journal::open(&self.flash, self.layout.parameters), &self.flash, program)
-    }
-
-    /// What a program does through the callgate: it is signed, and needs no rescue window.
-    fn confirm(&mut self, program: u8) -> Result<(), AbortCode> {
-        let record = self.record(program).ok_or(AbortCode::HARDWARE)?;
-        let mut journal = Journal::open(&self.flash, self.layout.parameters);
-        let confirmed = ProgramRecord { signed: true, confirmed: true, ..record };
-        journal.store(Key::Program(program), confirmed.value());
-        run(&mut self.flash, |flash, outcome| journal.next(flash, outcome)).map_err(|_| AbortCode::HARDWARE)
-    }
-
-    /// 1F51h: a command.
-    fn program_control(&mut self, program: u8, command: ProgramControl) -> Result<(), AbortCode> {
-        let Started { program: own, fresh, bootloader_answers } = self.started;
-        let standing = Standing { fresh, armed: false, can_hand_over: bootloader_answers.is_some() };
-        self.leave = Some(match react(command, program == own, standing)? {
-            Reaction::Nothing => return Ok(()),
-            Reaction::Confirm => {
-                self.started.fresh = false;
-                return self.confirm(program);
-            }
-            Reaction::CallBack => Leave::Answered(BootRequest::Stay),
-            Reaction::Restart => Leave::Answered(BootRequest::Start(program)),
-            Reaction::HandOver => {
-                let node_id = bootloader_answers.map_or(0, NodeId::get);
-                Leave::Owed(Owed { program, value: command as u8, node_id })
-            }
-        });
-        Ok(())
+        self.underneath.flash
     }
 }
 
@@ -151,26 +157,17 @@ impl Objects for StandIn {
         if let Some(read) = self.device.read(at, buf) {
             return read;
         }
+        let Self { control, underneath, .. } = self;
         match at.index {
-            PROGRAM_CONTROL => {
-                let state = match self.record(at.sub) {
-                    _ if at.sub == self.started.program => ProgramState::Running,
-                    Some(_) => ProgramState::Stopped,
-                    None => ProgramState::Absent,
-                };
-                put(buf, &[state as u8])
-            }
-            PROGRAM_ID => {
-                let crc = self.record(at.sub).map_or(0, |record| record.crc);
-                put(buf, &crc.to_le_bytes())
-            }
-            FLASH_STATUS => put(buf, &FlashStatus::OK.to_word().to_le_bytes()),
+            PROGRAM_CONTROL => put(buf, &[control.state(at.sub, underneath)?]),
+            PROGRAM_ID => put(buf, &control.identification(at.sub, underneath)?.to_le_bytes()),
+            FLASH_STATUS => put(buf, &control.flash_status(at.sub)?.to_le_bytes()),
             PROGRAM_REGION => {
-                let Region { base, size } = self.layout.program(at.sub).ok_or(AbortCode::NO_DATA)?;
+                let Region { base, size } = underneath.layout.program(at.sub).ok_or(AbortCode::NO_DATA)?;
                 put(buf, &region_value(base, size))
             }
             PROGRAM_VERSION => {
-                let version = self.record(at.sub).map_or(0, |record| record.version);
+                let version = underneath.program_info(at.sub).map_or(0, |info| info.version);
                 put(buf, &version.to_le_bytes())
             }
             _ => Err(AbortCode::NO_DATA),
@@ -178,8 +175,14 @@ impl Objects for StandIn {
     }
 
     fn write(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
-        let (PROGRAM_CONTROL, &[value]) = (at.index, data) else { return Err(AbortCode::UNSUPPORTED_ACCESS) };
-        self.program_control(at.sub, ProgramControl::try_from(value)?)
+        if at.index != PROGRAM_CONTROL {
+            return Err(AbortCode::UNSUPPORTED_ACCESS);
+        }
+        match self.control.write(at.sub, data, self.now.as_millis(), &mut self.underneath)? {
+            Answer::Send => {}
+            Answer::Withhold(owed) => self.owed = Some(owed),
+        }
+        Ok(())
     }
 }
 
@@ -197,6 +200,6 @@ impl LssDevice for StandIn {
 impl SlaveDevice for StandIn {
     fn node_id_changed(&mut self, id: Option<NodeId>) {
         // It is not stored: the bootloader comes up with the one that was in force before.
-        self.started.bootloader_answers = self.started.bootloader_answers.filter(|own| id == Some(*own));
+        self.control.node_id_changed(id.map(NodeId::get));
     }
 }

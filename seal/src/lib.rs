@@ -25,3 +25,8 @@ pub mod lzma;
 pub mod sha512;
 pub mod wire;
 mod words;
+
+/// The example on the crate's page compiles and runs.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -187,18 +187,7 @@ impl Callgate {
     }
 }
 
-#[cfg(target_arch = "arm")]
 impl Callgate {
-    /// Finds the callgate of the bootloader underneath.
-    ///
-    /// # Errors
-    /// [`CallgateError::Absent`] or [`CallgateError::Version`].
-    pub fn find(layout: &Layout) -> Result<Self, CallgateError> {
-        // SAFETY: a checked layout puts the table inside the flash, which is always readable; any
-        // bits make a `Table`.
-        Self::check(unsafe { (layout.callgate() as *const Table).read_volatile() })
-    }
-
     /// CRC-32/ISO-HDLC over `len` bytes of flash from `address` on.
     ///
     /// # Errors
@@ -256,6 +245,19 @@ impl Callgate {
         let mut args = ProgramArgs { number: number.into(), ..ProgramArgs::default() };
         self.call(Selector::Invalidate, (&raw mut args).cast())
     }
+}
+
+#[cfg(target_arch = "arm")]
+impl Callgate {
+    /// Finds the callgate of the bootloader underneath.
+    ///
+    /// # Errors
+    /// [`CallgateError::Absent`] or [`CallgateError::Version`].
+    pub fn find(layout: &Layout) -> Result<Self, CallgateError> {
+        // SAFETY: a checked layout puts the table inside the flash, which is always readable; any
+        // bits make a `Table`.
+        Self::check(unsafe { (layout.callgate() as *const Table).read_volatile() })
+    }
 
     fn call(&self, selector: Selector, args: *mut core::ffi::c_void) -> Result<(), CallgateError> {
         // SAFETY: `check` found the magic and the version of a table that a bootloader of ours put
@@ -279,7 +281,13 @@ impl Callgate {
     ///
     /// # Errors
     /// Always [`CallgateError::Absent`].
-    pub fn find(_layout: &Layout) -> Result<Self, CallgateError> {
+    pub const fn find(_layout: &Layout) -> Result<Self, CallgateError> {
+        Err(CallgateError::Absent)
+    }
+
+    /// The entry of a table is an address of the chip.
+    #[allow(clippy::unused_self)]
+    const fn call(&self, _: Selector, _: *mut core::ffi::c_void) -> Result<(), CallgateError> {
         Err(CallgateError::Absent)
     }
 }

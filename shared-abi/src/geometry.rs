@@ -1,6 +1,16 @@
-//! The silicon: what a chip has, as its reference manual states it (RM0090 rev 19 for
-//! STM32F405–F439, RM0390 for STM32F446: section 3 "Embedded flash memory" and section 2 "Memory
-//! map"). Nothing here is a choice of ours; the choices are in [`crate::layout`].
+//! The silicon: what a chip has, as its reference manual states it (section 3 "Embedded flash
+//! memory" and section 2 "Memory map" of RM0090 rev 19 for STM32F405 to F439, RM0402 for F412,
+//! RM0430 for F413 and F423, RM0390 for F446, RM0386 for F469 and F479). Nothing here is a choice of
+//! ours; the choices are in [`crate::layout`].
+//!
+//! A chip is what its line has ([`Line`]), and a size of flash. Its name tells both, and which pins
+//! are led out.
+
+mod chips;
+mod line;
+
+pub use chips::*;
+pub use line::{Limits, Line};
 
 /// A half-open range of addresses: `base..base + size`.
 #[repr(C)]
@@ -52,8 +62,9 @@ impl Region {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Sector {
-    /// Its number in the manual's table; [`Geometry::sector_code`] makes of it what goes into
-    /// `FLASH_CR.SNB`.
+    /// Its place among the chip's sectors, from 0 on: its number in the manual's table. (With 1 MiB in
+    /// two banks, that leaves 8 to 11 out: 8 here is 12 there.) [`Geometry::sector_code`] makes of it
+    /// what goes into `FLASH_CR.SNB`.
     pub number: u8,
     /// The bytes it covers.
     pub region: Region,
@@ -73,11 +84,14 @@ pub struct SectorRun {
 pub struct Geometry {
     /// Order code without package and temperature range, in lower case.
     pub chip: &'static str,
+    /// The line that it is of.
+    pub line: Line,
     /// The main flash.
     pub flash: Region,
     /// Its sectors, in address order.
     pub sectors: &'static [SectorRun],
-    /// Number of the first sector of the second bank, on a chip that has two.
+    /// Number of the first sector of the second bank, on a chip that has two: 12, or 8 with 1 MiB
+    /// in two banks.
     pub second_bank: Option<u8>,
     /// The RAM that both the CPU and the bus masters reach, as one contiguous range.
     pub sram: Region,
@@ -98,75 +112,79 @@ pub const CORE_VECTORS: u32 = 16;
 /// Bytes of them.
 pub const CORE_VECTORS_SIZE: u32 = CORE_VECTORS * 4;
 
-/// STM32F407VG and STM32F407IG: 1 MiB flash, 112 + 16 KiB SRAM, 64 KiB CCM.
-///
-/// RM0090 table 5 (sectors), table 61 (82 interrupt lines).
-pub const STM32F407VG: Geometry = Geometry {
-    chip: "stm32f407vg",
-    flash: Region::new(0x0800_0000, 1024 * KIB),
-    sectors: &[
-        SectorRun { count: 4, size: 16 * KIB },
-        SectorRun { count: 1, size: 64 * KIB },
-        SectorRun { count: 7, size: 128 * KIB },
-    ],
-    second_bank: None,
-    sram: Region::new(0x2000_0000, 128 * KIB),
-    ccm: Region::new(0x1000_0000, 64 * KIB),
-    interrupts: 82,
-    ports: 9,
-}
-.checked();
+/// Where flash, SRAM and CCM begin on every chip.
+const FLASH: u32 = 0x0800_0000;
+const SRAM: u32 = 0x2000_0000;
+const CCM: u32 = 0x1000_0000;
 
-/// STM32F429ZI and its packages: 2 MiB flash in two banks, 112 + 16 + 64 KiB SRAM, 64 KiB CCM.
-///
-/// RM0090 (sectors; SRAM1, SRAM2 and SRAM3 follow one another); 91 interrupt lines as the PAC has
-/// them.
-pub const STM32F429ZI: Geometry = Geometry {
-    chip: "stm32f429zi",
-    flash: Region::new(0x0800_0000, 2048 * KIB),
-    sectors: &[
-        SectorRun { count: 4, size: 16 * KIB },
-        SectorRun { count: 1, size: 64 * KIB },
-        SectorRun { count: 7, size: 128 * KIB },
-        SectorRun { count: 4, size: 16 * KIB },
-        SectorRun { count: 1, size: 64 * KIB },
-        SectorRun { count: 7, size: 128 * KIB },
-    ],
-    second_bank: Some(12),
-    sram: Region::new(0x2000_0000, (112 + 16 + 64) * KIB),
-    ccm: Region::new(0x1000_0000, 64 * KIB),
-    interrupts: 91,
-    ports: 11,
-}
-.checked();
+/// The sectors of a bank, or of a flash of one bank: four of 16 KiB, one of 64 and the rest of 128
+/// (RM0090 tables 5 and 6, RM0402, RM0430, RM0390 and RM0386: flash module organization).
+const SMALL: [SectorRun; 2] =
+    [SectorRun { count: 4, size: 16 * KIB }, SectorRun { count: 1, size: 64 * KIB }];
 
-/// STM32F446RE: 512 KiB flash, 112 + 16 KiB SRAM, no CCM.
-///
-/// RM0390 (sectors, memory map); 97 interrupt lines as the PAC has them.
-pub const STM32F446RE: Geometry = Geometry {
-    chip: "stm32f446re",
-    flash: Region::new(0x0800_0000, 512 * KIB),
-    sectors: &[
-        SectorRun { count: 4, size: 16 * KIB },
-        SectorRun { count: 1, size: 64 * KIB },
-        SectorRun { count: 3, size: 128 * KIB },
-    ],
-    second_bank: None,
-    sram: Region::new(0x2000_0000, 128 * KIB),
-    ccm: Region::new(0x1000_0000, 0),
-    interrupts: 97,
-    ports: 8,
+/// One bank with so many sectors of 128 KiB.
+const fn bank(large: u8) -> [SectorRun; 3] {
+    [SMALL[0], SMALL[1], SectorRun { count: large, size: 128 * KIB }]
 }
-.checked();
 
-/// Every chip that is described here.
-pub const CHIPS: &[&Geometry] = &[&STM32F407VG, &STM32F429ZI, &STM32F446RE];
+/// Two of them behind one another.
+const fn two_banks(large: u8) -> [SectorRun; 6] {
+    let [a, b, c] = bank(large);
+    [a, b, c, a, b, c]
+}
+
+/// The chip of this name, as people write it ([`Geometry::is_named`]).
+#[must_use]
+pub fn by_name(name: &str) -> Option<&'static Geometry> {
+    CHIPS.iter().copied().find(|chip| chip.is_named(name))
+}
+
+/// Bytes as the text that they are.
+const fn text(bytes: &[u8]) -> &str {
+    match core::str::from_utf8(bytes) {
+        Ok(text) => text,
+        Err(_) => panic!("no text"),
+    }
+}
 
 impl Geometry {
-    /// The line of the family that the chip is of: `stm32f407`.
+    /// The chip of a line by its name in lower case, whose last letter tells the flash.
+    const fn new(line: Line, chip: &'static str) -> Self {
+        let (kib, sectors, second_bank): (u32, &[SectorRun], _) = match chip.as_bytes()[10] {
+            b'c' => (256, &const { bank(1) }, None),
+            b'e' => (512, &const { bank(3) }, None),
+            b'g' => (1024, &const { bank(7) }, None),
+            b'h' => (1536, &const { bank(11) }, None),
+            b'i' => (2048, &const { two_banks(7) }, Some(12)),
+            _ => panic!("the last letter of a chip's name is the flash: C, E, G, H or I"),
+        };
+        Self {
+            chip,
+            line,
+            flash: Region::new(FLASH, kib * KIB),
+            sectors,
+            second_bank,
+            sram: Region::new(SRAM, line.sram()),
+            ccm: Region::new(CCM, line.ccm()),
+            interrupts: line.interrupts(),
+            ports: line.ports(),
+        }
+        .checked()
+    }
+
+    /// The same chip with its 1 MiB in two banks, as the option bit DB1M makes it: sectors 0 to 7
+    /// and 12 to 19 of the manual (RM0090 table 9, RM0386). The option is set in production.
+    ///
+    /// # Panics
+    /// At compile time, if the chip has no such option.
     #[must_use]
-    pub fn line(&self) -> &'static str {
-        self.chip.get(..9).unwrap_or(self.chip)
+    pub const fn in_two_banks(self) -> Self {
+        use Line::*;
+        assert!(
+            matches!(self.line, F427 | F429 | F437 | F439 | F469 | F479) && self.flash.size == 1024 * KIB,
+            "DB1M is an option of the STM32F42x, F43x, F469 and F479 with 1 MiB"
+        );
+        Self { sectors: &const { two_banks(3) }, second_bank: Some(8), ..self }.checked()
     }
 
     /// Whether this is its name: the order code as people write it, in any case, with or without
@@ -223,8 +241,8 @@ impl Geometry {
             return Err("the sectors do not add up to the flash");
         }
         if let Some(first) = self.second_bank {
-            if first != 12 || self.sector(first).is_none() {
-                return Err("the second bank of an STM32F4 begins with sector 12");
+            if first as u32 * 2 != count || !matches!(first, 8 | 12) {
+                return Err("the second bank of an STM32F4 is as large as the first: 8 or 12 sectors each");
             }
         }
         if self.interrupts == 0 || self.vector_table_alignment() > 512 {
@@ -395,6 +413,77 @@ mod tests {
         assert_eq!(STM32F446RE.sector_at(0x0807_FFFF).unwrap().number, 7);
         assert_eq!(STM32F446RE.sector_at(0x0808_0000), None);
         assert_eq!(STM32F446RE.sector_code(7), 7);
+    }
+
+    /// RM0090 table 9 (DB1M = 1) and section 3.9.8, at the borders.
+    #[test]
+    fn a_mebibyte_in_two_banks_is_that_of_the_manual() {
+        let chip = STM32F429ZG.in_two_banks();
+        for (place, base, kib, code) in [
+            (0, 0x0800_0000, 16, 0b00000),
+            (7, 0x0806_0000, 128, 0b00111),
+            (8, 0x0808_0000, 16, 0b10000),
+            (12, 0x0809_0000, 64, 0b10100),
+            (13, 0x080A_0000, 128, 0b10101),
+            (15, 0x080E_0000, 128, 0b10111),
+        ] {
+            let sector = Sector { number: place, region: Region::new(base, kib * 1024) };
+            assert_eq!(chip.sector(place), Some(sector));
+            assert_eq!(chip.sector_code(place), code, "sector {place}");
+        }
+        assert_eq!(chip.sector(16), None);
+        assert_eq!((STM32F429ZG.sectors().count(), STM32F429ZG.second_bank), (12, None));
+    }
+
+    /// Flash, SRAM, CCM in KiB and device identifier as ST's CMSIS packs have them (Keil.STM32F4xx_DFP
+    /// 2.17.1), a line of chips in each row.
+    #[test]
+    fn memories_are_those_of_the_packs() {
+        for (line, letters, sram, ccm) in [
+            ("stm32f405", "eg", 128, 64),
+            ("stm32f407", "eg", 128, 64),
+            ("stm32f412", "eg", 256, 0),
+            ("stm32f413", "gh", 320, 0),
+            ("stm32f415", "g", 128, 64),
+            ("stm32f417", "eg", 128, 64),
+            ("stm32f423", "h", 320, 0),
+            ("stm32f427", "gi", 192, 64),
+            ("stm32f429", "egi", 192, 64),
+            ("stm32f437", "gi", 192, 64),
+            ("stm32f439", "gi", 192, 64),
+            ("stm32f446", "ce", 128, 0),
+            ("stm32f469", "egi", 320, 64),
+            ("stm32f479", "gi", 320, 64),
+        ] {
+            let of_line = || CHIPS.iter().filter(|chip| chip.chip.starts_with(line));
+            for chip in of_line() {
+                assert_eq!(chip.line.name(), line);
+                assert_eq!((chip.sram.size / 1024, chip.ccm.size / 1024), (sram, ccm), "{}", chip.chip);
+                let letter = chip.chip.chars().last().unwrap();
+                assert!(letters.contains(letter), "{}", chip.chip);
+                let kib = [('c', 256), ('e', 512), ('g', 1024), ('h', 1536), ('i', 2048)];
+                assert!(kib.contains(&(letter, chip.flash.size / 1024)), "{}", chip.chip);
+            }
+            for letter in letters.chars() {
+                assert!(of_line().any(|chip| chip.chip.ends_with(letter)), "{line} with {letter}");
+            }
+        }
+        // The packs list as many.
+        assert_eq!(CHIPS.len(), 125);
+    }
+
+    #[test]
+    fn chips_are_named_as_people_write_them() {
+        for name in ["stm32f429zi", "STM32F429ZI", "STM32F429ZIT6", "stm32f429zit6tr", "STM32F429ZIY7"] {
+            assert_eq!(by_name(name), Some(&STM32F429ZI), "{name}");
+        }
+        for name in ["", "stm32f429z", "stm32f429zit", "stm32f429zi6t", "stm32f429zit6 x", "STM32F411RE"] {
+            assert_eq!(by_name(name), None, "{name}");
+        }
+        for chip in CHIPS {
+            assert_eq!(by_name(chip.chip), Some(*chip));
+            assert_eq!(Line::of(chip.chip), Some(chip.line));
+        }
     }
 
     #[test]

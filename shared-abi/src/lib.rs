@@ -62,3 +62,8 @@ pub const CHECK_SEED: u32 = 0xC0B0_07A5;
 pub const CHECK_ROTATION: u32 = 5;
 /// What it is multiplied with after each word.
 pub const CHECK_FACTOR: u32 = 0x9E37_79B1;
+
+/// The example on the crate's page compiles and runs.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

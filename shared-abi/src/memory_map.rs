@@ -13,7 +13,7 @@
 //! memory: some of them stall the bus while they have no clock. The bit-band aliases and the alias
 //! of the flash at 0 are left out because they lead around this table.
 
-use crate::geometry::{Geometry, Region, STM32F407VG, STM32F429ZI, STM32F446RE};
+use crate::geometry::{Geometry, Line, Region};
 
 /// One-time programmable bytes, unique ID and flash size (RM0090, embedded flash and device
 /// electronic signature).
@@ -84,23 +84,54 @@ const F446: &[Region] = &[
     Region::new(0x4002_6000, 0x0800), // DMA1, DMA2
 ];
 
-/// The peripherals of a chip, which its number of interrupt lines tells: firmware does without the
-/// names. A chip that is not listed has none: its memory can be looked at all the same.
-const fn peripherals(chip: &Geometry) -> &'static [Region] {
-    const LINES_F407: u16 = STM32F407VG.interrupts;
-    const LINES_F429: u16 = STM32F429ZI.interrupts;
-    const LINES_F446: u16 = STM32F446RE.interrupts;
-    match chip.interrupts {
-        LINES_F407 => F407,
-        LINES_F429 => F429,
-        LINES_F446 => F446,
-        _ => &[],
+/// RM0402 (STM32F412): register boundary addresses.
+const F412: &[Region] = &[
+    Region::new(0x4000_0000, 0x2400), // TIM2 to TIM7, TIM12 to TIM14
+    Region::new(0x4000_2800, 0x2400), // RTC to USART3
+    Region::new(0x4000_5400, 0x1800), // I2C1 to I2C3, FMPI2C1, CAN1, CAN2
+    Region::new(0x4000_7000, 0x0400), // PWR
+    Region::new(0x4001_0000, 0x0800), // TIM1, TIM8
+    Region::new(0x4001_1000, 0x0800), // USART1, USART6
+    Region::new(0x4001_2000, 0x0400), // ADC
+    Region::new(0x4001_2C00, 0x2000), // SDIO, SPI1, SPI4, SYSCFG, EXTI, TIM9 to TIM11
+    Region::new(0x4001_5000, 0x0400), // SPI5
+    Region::new(0x4001_6000, 0x0400), // DFSDM1
+    Region::new(0x4002_0000, 0x2000), // GPIOA to GPIOH
+    Region::new(0x4002_3000, 0x0400), // CRC
+    Region::new(0x4002_3800, 0x0800), // RCC, flash
+    Region::new(0x4002_6000, 0x0800), // DMA1, DMA2
+];
+
+/// RM0430 (STM32F413 and F423): register boundary addresses.
+const F413: &[Region] = &[
+    Region::new(0x4000_0000, 0x8000), // TIM2 to UART8
+    Region::new(0x4001_0000, 0x0800), // TIM1, TIM8
+    Region::new(0x4001_1000, 0x1400), // USART1, USART6, UART9, UART10, ADC
+    Region::new(0x4001_2C00, 0x2000), // SDIO, SPI1, SPI4, SYSCFG, EXTI, TIM9 to TIM11
+    Region::new(0x4001_5000, 0x0400), // SPI5
+    Region::new(0x4001_5800, 0x0400), // SAI1
+    Region::new(0x4001_6000, 0x0800), // DFSDM1, DFSDM2
+    Region::new(0x4002_0000, 0x2000), // GPIOA to GPIOH
+    Region::new(0x4002_3000, 0x0400), // CRC
+    Region::new(0x4002_3800, 0x0800), // RCC, flash
+    Region::new(0x4002_6000, 0x0800), // DMA1, DMA2
+];
+
+/// The peripherals of a chip. Those of the F469 and F479 that are more than the F429's, DSI and
+/// QUADSPI, are left out.
+const fn peripherals(line: Line) -> &'static [Region] {
+    match line {
+        Line::F405 | Line::F407 | Line::F415 | Line::F417 => F407,
+        Line::F412 => F412,
+        Line::F413 | Line::F423 => F413,
+        Line::F446 => F446,
+        Line::F427 | Line::F429 | Line::F437 | Line::F439 | Line::F469 | Line::F479 => F429,
     }
 }
 
 /// Whether these bytes are registers, all of one peripheral or of neighbours, and whole ones.
 fn are_registers(chip: &Geometry, address: u32, len: u32) -> bool {
-    let all = peripherals(chip).iter().chain(&CORE);
+    let all = peripherals(chip.line).iter().chain(&CORE);
     address.is_multiple_of(4) && len.is_multiple_of(4) && within(all, address, len)
 }
 
@@ -127,7 +158,7 @@ pub fn may_write(chip: &Geometry, address: u32, len: u32) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::CHIPS;
+    use crate::geometry::{CHIPS, STM32F407VG, STM32F412RG, STM32F413RH, STM32F429ZI, STM32F446RE};
 
     /// First and last word of what there is, and the words beside it (RM0090 tables 1 and 5).
     #[test]
@@ -182,31 +213,29 @@ mod tests {
 
     #[test]
     fn the_chips_differ_where_their_manuals_do() {
+        let chips = [&STM32F407VG, &STM32F412RG, &STM32F413RH, &STM32F429ZI, &STM32F446RE];
         for (address, on) in [
-            (0x2002_F000, [false, true, false]), // SRAM3
-            (0x4000_7800, [false, true, false]), // UART7
-            (0x4000_6000, [false, false, true]), // FMPI2C1
-            (0x4000_3400, [true, true, false]),  // I2S2ext
-            (0x4001_3400, [false, true, true]),  // SPI4
-            (0x4002_2000, [true, true, false]),  // GPIOI
-            (0x4002_2800, [false, true, false]), // GPIOK
-            (0x1000_0000, [true, true, false]),  // CCM
-            (0x081F_FFFC, [false, true, false]), // second bank
+            (0x2002_F000, [false, true, true, true, false]), // SRAM above 128 KiB
+            (0x2004_0000, [false, false, true, false, false]), // SRAM2 of the F413
+            (0x4000_4C00, [true, false, true, true, true]),  // UART4
+            (0x4000_6C00, [false, false, true, false, true]), // CAN3; HDMI-CEC of the F446
+            (0x4000_7400, [true, false, true, true, true]),  // DAC
+            (0x4000_7800, [false, false, true, true, false]), // UART7
+            (0x4000_6000, [false, true, true, false, true]), // FMPI2C1
+            (0x4000_3400, [true, true, true, true, false]),  // I2S2ext
+            (0x4001_1800, [false, false, true, false, false]), // UART9
+            (0x4001_3400, [false, true, true, true, true]),  // SPI4
+            (0x4001_5000, [false, true, true, true, false]), // SPI5
+            (0x4001_6000, [false, true, true, false, false]), // DFSDM1
+            (0x4002_2000, [true, false, false, true, false]), // GPIOI
+            (0x4002_2800, [false, false, false, true, false]), // GPIOK
+            (0x4002_4000, [true, false, false, true, true]), // backup SRAM
+            (0x1000_0000, [true, false, false, true, false]), // CCM
+            (0x0817_FFFC, [false, false, true, true, false]), // the last sector of the F413
+            (0x081F_FFFC, [false, false, false, true, false]), // second bank
         ] {
-            let [a, b, c] = [&STM32F407VG, &STM32F429ZI, &STM32F446RE].map(|chip| may_read(chip, address, 4));
-            assert_eq!([a, b, c], on, "{address:08X}");
+            assert_eq!(chips.map(|chip| may_read(chip, address, 4)), on, "{address:08X}");
         }
-    }
-
-    /// The firmware's layout has none.
-    #[test]
-    fn a_chip_is_known_without_its_name() {
-        for chip in CHIPS {
-            let nameless = Geometry { chip: "", ..**chip };
-            assert!(may_read(&nameless, 0x4002_3800, 4) && may_write(&nameless, 0x4000_6400, 4));
-        }
-        let other = Geometry { interrupts: 1, ..STM32F407VG };
-        assert!(!may_read(&other, 0x4002_3800, 4) && may_read(&other, 0x0800_0000, 4));
     }
 
     #[test]

@@ -90,7 +90,7 @@ fn a_geometry_that_no_chip_has_is_refused() {
             "more than 24 sectors",
             Geometry { sectors: &[SectorRun { count: 32, size: 16 * 1024 }], ..STM32F446RE },
         ),
-        ("begins with sector 12", Geometry { second_bank: Some(12), ..STM32F446RE }),
+        ("8 or 12 sectors each", Geometry { second_bank: Some(4), ..STM32F446RE }),
         ("interrupt lines", Geometry { interrupts: 113, ..STM32F446RE }),
         ("whole pages", Geometry { sram: Region::new(0x2000_0000, 1000), ..STM32F446RE }),
     ];

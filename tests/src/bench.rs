@@ -25,6 +25,20 @@ pub const RESCUE_WINDOW_MS: u64 = 300;
 pub const NODE: u8 = 1;
 /// See [`NODE`].
 pub const BIT_RATE: u32 = 125_000;
+/// Identifiers of its SDO server and of its heartbeat (CiA 301, 7.3.3: predefined connection set).
+pub const REQUEST: u16 = 0x600 + NODE as u16;
+/// See [`REQUEST`].
+pub const RESPONSE: u32 = 0x580 + NODE as u32;
+/// See [`REQUEST`].
+pub const HEARTBEAT: u32 = 0x700 + NODE as u32;
+
+/// The SDO request 1F51h/1 := value (CiA 301, 7.2.4.3.3).
+#[must_use]
+pub const fn control(value: u8) -> [u8; 8] {
+    [0x2F, 0x51, 0x1F, 1, value, 0, 0, 0]
+}
+/// Its acknowledgement.
+pub const ACKNOWLEDGED: [u8; 8] = [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0];
 
 /// Boards on a bus.
 pub struct Bench {

@@ -1,6 +1,6 @@
 //! The images that `cargo xtask build` made.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::{env, fs};
 
 use coflash::file::block_file::BlockFile;
@@ -53,6 +53,11 @@ pub const PROGRAM_2: &str = "app-program-2.elf";
 pub const APP_C: &str = "app-c.elf";
 /// See [`APP_C`].
 pub const APP_C_PROGRAM_2: &str = "app-c-program-2.elf";
+/// The application in C with object 2100h, which calls the callgate by hand, and the same one at the
+/// place of the second program.
+pub const APP_C_PROBE: &str = "app-c-probe.elf";
+/// See [`APP_C_PROBE`].
+pub const APP_C_PROBE_PROGRAM_2: &str = "app-c-probe-program-2.elf";
 
 /// The name of an image of another board than the one that the tests are about.
 #[must_use]
@@ -90,7 +95,16 @@ pub fn dir() -> PathBuf {
 #[must_use]
 pub fn blocks(name: &str) -> BlockFile {
     let _ = elf(name);
-    let image = coflash::file::read::load(&dir().join(name), None, None).expect("an ELF of ours");
+    blocks_of_file(&dir().join(name))
+}
+
+/// The same for an ELF file anywhere.
+///
+/// # Panics
+/// If it is none, or does not fit the board.
+#[must_use]
+pub fn blocks_of_file(elf: &Path) -> BlockFile {
+    let image = coflash::file::read::load(elf, None, None).expect("an ELF of ours");
     let options = Options::default().region(Region::Strict(board().programs[0].into()));
     blocks_of(image, &options).expect("it lies in the program's flash").file
 }

@@ -18,6 +18,6 @@ pub mod model;
 mod points;
 mod scenario;
 
-pub use device::Bug;
+pub use device::{Bug, DECISION};
 pub use points::{reproduce, run, shows, Point, Report, Shown};
 pub use scenario::{Scenario, SCENARIOS};

@@ -10,7 +10,7 @@ use boot_core::canopen::od::{Address, Entry, Objects};
 use boot_core::canopen::{AbortCode, BitRate, Instant, NodeId};
 use boot_core::control::{Policy, Step};
 use boot_core::crc::CrcKind;
-use boot_core::decision::{self, decide, BootDecision, Circumstances};
+use boot_core::decision::{decide, BootDecision, Circumstances};
 use boot_core::flash::Flash;
 use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
@@ -26,6 +26,7 @@ use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
 use crate::powercut::model::{Chip, ModelFlash, CHIP, ONE_PROGRAM, TWO_PROGRAMS};
+use crate::powercut::DECISION;
 
 // --- setups
 
@@ -407,15 +408,6 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Node for Bootloader<'_, F, 
         Bootloader::set_time(self, now);
     }
 }
-
-const DECISION: decision::Policy = decision::Policy {
-    autostart: Some(1),
-    max_crash_resets: 3,
-    node_ids: 1..=127,
-    rescue_window_ms: 0,
-    rescue_window_confirmed_ms: 0,
-    start_allowed: |_| true,
-};
 
 const BOARD_NODE: NodeParameters = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
 

@@ -6,13 +6,10 @@ use std::path::Path;
 use std::process::Command;
 
 use canopen::Address;
-use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coflash::update::{flash, FlashOptions};
-
-const REQUEST: u16 = 0x600 + NODE as u16;
-const RESPONSE: u32 = 0x580 + NODE as u32;
 
 fn bootloader() -> Bench {
     let mut bench = Bench::new();

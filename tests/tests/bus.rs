@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 
 use canopen::program::ProgramControl;
 use canopen::{Address, BitRate};
-use coboot_tests::bench::{Bench, NODE, RESCUE_WINDOW_MS};
+use coboot_tests::bench::{Bench, NODE, REQUEST, RESCUE_WINDOW_MS, RESPONSE};
 use coboot_tests::firmware;
 use coflash::device::{Doing, Session};
 use coflash::update::{flash, Event, FlashOptions};
@@ -19,8 +19,6 @@ const VERSION: Address = Address::new(0x100A, 0);
 const LSS_REQUEST: u16 = 0x7E5;
 const LSS_RESPONSE: u32 = 0x7E4;
 
-const REQUEST: u16 = 0x600 + NODE as u16;
-const RESPONSE: u32 = 0x580 + NODE as u32;
 /// One bit, and the shortest pause between two frames (ISO 11898-1: 3 bits), at 1 Mbit/s.
 const BIT: Span = Span::from_micros(1);
 const INTERMISSION: Span = Span(3 * BIT.0);

@@ -36,8 +36,10 @@ const BUSY: i32 = -4;
 const FAILED: i32 = -5;
 const BAD_ARGUMENT: i32 = -6;
 const NO_PROGRAM: i32 = -7;
+/// The version in its label.
+const VERSION: u32 = 1;
 
-/// Sub-indices of the application's object 2100h (app-c/probe.h).
+/// Sub-indices of the application's object 2100h (tests/c/probe.c).
 mod probe {
     use canopen::Address;
     pub const SELECTOR: Address = Address::new(0x2100, 1);
@@ -70,7 +72,7 @@ fn running_board() -> (Bench, Report) {
     let mut bench = Bench::new();
     bench.power_on();
     bench.await_boot_up(100);
-    let report = install(&mut bench, firmware::APP_C);
+    let report = install(&mut bench, firmware::APP_C_PROBE);
     bench.events();
     (bench, report)
 }
@@ -151,7 +153,7 @@ fn it_is_a_node_like_any_other() {
     bench.await_boot_up(100);
     let identity = [1, 2, 3, 4].map(|sub| Address::new(0x1018, sub));
     let of_bootloader = identity.map(|at| number(&mut bench, at));
-    let report = install(&mut bench, firmware::APP_C);
+    let report = install(&mut bench, firmware::APP_C_PROBE);
     bench.events();
     let program = firmware::board().programs[0];
     let start = (program.base - firmware::board().chip.flash.base) as usize;
@@ -288,7 +290,7 @@ fn every_service_works_on_the_stack_alone() {
         let (status, words) = run(&mut bench, READ_NODE, [0, 0, 3, 4, 5]);
         assert_eq!((status, words), (OK, [1, 125_000, 3, 4, 5]));
         let installed_signed = 0b11;
-        let info = [1, report.program_size, report.program_crc, 0, installed_signed];
+        let info = [1, report.program_size, report.program_crc, VERSION, installed_signed];
         assert_eq!(run(&mut bench, PROGRAM_INFO, [1, 9, 9, 9, 9]), (OK, info));
         assert_eq!(run(&mut bench, INVALIDATE, [1, 6, 7, 8, 9]), (OK, [1, 6, 7, 8, 9]));
         assert_eq!(run(&mut bench, PROGRAM_INFO, [1; 5]).1[4], 0b01);
@@ -535,7 +537,7 @@ fn a_flash_that_refuses_is_told_and_harms_nothing() {
             assert_eq!((called.status, called.words), (FAILED, words), "{selector}");
         }
     }
-    let info = [1, report.program_size, report.program_crc, 0, 0b11];
+    let info = [1, report.program_size, report.program_crc, VERSION, 0b11];
     assert_eq!(call(&mut bench, PROGRAM_INFO, [1; 5]).words, info, "still signed");
     assert_eq!(call(&mut bench, READ_NODE, [0; 5]).words[..2], [1, 125_000]);
     assert_eq!(call(&mut bench, CRC32, [firmware::board().programs[0].base, 4, 0, 0, 0]).status, OK);
@@ -556,7 +558,7 @@ fn a_trial_confirms_itself_and_takes_it_back() {
     bench.power_on();
     bench.await_boot_up(100);
     let options = FlashOptions::default().start(false);
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_C), &options, &mut |_| {}).unwrap();
+    flash(&mut bench.session(), &firmware::blocks(firmware::APP_C_PROBE), &options, &mut |_| {}).unwrap();
     let start_unsigned = |bench: &mut Bench| {
         for command in [ProgramControl::ClrSignature, ProgramControl::Start] {
             bench.session().command(1, command).unwrap();
@@ -593,14 +595,14 @@ fn the_other_program_and_a_program_for_the_other_place() {
 
     // coflash sees it before anything is sent.
     let options = Options::default().region(strict(1));
-    let refused = blocks_of(elf(firmware::APP_C_PROGRAM_2), &options).unwrap_err().to_string();
+    let refused = blocks_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &options).unwrap_err().to_string();
     assert!(refused.contains("0x08080000"), "{refused}");
 
     let mut bench = Bench::of_image(&image(firmware::BOOTLOADER));
     bench.power_on();
     bench.await_boot_up(100);
     // A host that does not know the board is told by the device, and sends nothing.
-    let blocks = blocks_of(elf(firmware::APP_C_PROGRAM_2), &Options::default()).unwrap().file;
+    let blocks = blocks_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &Options::default()).unwrap().file;
     let refused = flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).unwrap_err();
     assert!(matches!(refused, Error::OtherRegion { .. }), "{refused}");
     assert_eq!(number(&mut bench, Address::new(0x1F57, 1)), 0, "untouched");
@@ -614,7 +616,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
     // its vectors point to the second.
     let moved = layout.programs[0].base.wrapping_sub(layout.programs[1].base);
     let options = Options::default().region(strict(1)).adjust_start(moved);
-    let blocks = blocks_of(elf(firmware::APP_C_PROGRAM_2), &options).unwrap().file;
+    let blocks = blocks_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &options).unwrap().file;
     let refused = flash(&mut bench.session(), &blocks, &once, &mut |_| {}).unwrap_err();
     println!("{refused}");
     let status = number(&mut bench, Address::new(0x1F57, 1));
@@ -626,7 +628,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
     assert!(bench.is_bootloader(NODE));
 
     // And the right ones.
-    let blocks = blocks_of(elf(firmware::APP_C), &Options::default().region(strict(1))).unwrap().file;
+    let blocks = blocks_of(elf(firmware::APP_C_PROBE), &Options::default().region(strict(1))).unwrap().file;
     flash(&mut bench.session(), &blocks, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
     assert_eq!(call(&mut bench, PROGRAM_INFO, [2, 9, 9, 9, 9]).words, [2, 0, 0, 0, 0]);
     for selector in [CONFIRM, INVALIDATE] {
@@ -635,10 +637,10 @@ fn the_other_program_and_a_program_for_the_other_place() {
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
     let options = Options::default().region(strict(2));
-    let blocks = blocks_of(elf(firmware::APP_C_PROGRAM_2), &options).unwrap().file;
+    let blocks = blocks_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &options).unwrap().file;
     let second = FlashOptions::default().program(2).trial_run(false);
     let report = flash(&mut bench.session(), &blocks, &second, &mut |_| {}).unwrap();
     assert_eq!(number(&mut bench, Address::new(0x1F56, 2)), report.program_crc, "its own");
     let info = call(&mut bench, PROGRAM_INFO, [2, 9, 9, 9, 9]).words;
-    assert_eq!(info, [2, report.program_size, report.program_crc, 0, 0b11]);
+    assert_eq!(info, [2, report.program_size, report.program_crc, VERSION, 0b11]);
 }

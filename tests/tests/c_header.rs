@@ -1,15 +1,17 @@
-//! The generated C header, compiled: what C makes of it is what Rust has.
+//! The generated C header, compiled as C and as C++: what they make of it is what Rust has.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, fs};
 
-/// A program that prints what the header's functions make, as bytes, and a verdict on records that
-/// come in as bytes.
+/// A program in C and C++ that prints what the header's functions make, as bytes, and a verdict on
+/// records that come in as bytes.
 const PROGRAM: &str = r#"
 #include <stdio.h>
 #include <string.h>
 #include "coboot.h"
+
+COBOOT_LABEL(0x319, 0x4007D151, 0x00010203);
 
 static void print(const void *record, size_t len)
 {
@@ -23,13 +25,16 @@ int main(void)
 {
     static const unsigned char handoff[48] = {
         'C', 'B', 'H', 'O', 2, 0, 48, 0, 5, 1, 3, 1, 0x48, 0xE8, 0x01, 0x00,
-        0x02, 0x00, 0x01, 0x00, 0xEF, 0xBE, 0xAD, 0xDE, 1, [44] = 0x91, 0x69, 0x48, 0x4E,
+        0x02, 0x00, 0x01, 0x00, 0xEF, 0xBE, 0xAD, 0xDE, 1, 0, 0, 0,
+        0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0x91, 0x69, 0x48, 0x4E,
     };
     /* Of a bootloader that knew no flags. */
     static const unsigned char older[48] = {
         'C', 'B', 'H', 'O', 1, 0, 48, 0, 5, 1, 3, 1, 0x48, 0xE8, 0x01, 0x00,
-        0x02, 0x00, 0x01, 0x00, 0xEF, 0xBE, 0xAD, 0xDE, [44] = 0xDD, 0x3C, 0xA8, 0xD2,
+        0x02, 0x00, 0x01, 0x00, 0xEF, 0xBE, 0xAD, 0xDE, 0, 0, 0, 0,
+        0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xDD, 0x3C, 0xA8, 0xD2,
     };
+    print(&coboot_label_of_image, sizeof coboot_label_of_image);
     struct coboot_warm_start cell = coboot_request(COBOOT_REQUEST_STAY, 0);
     print(&cell, sizeof cell);
     cell = coboot_request(COBOOT_REQUEST_TRIAL, 1);
@@ -74,19 +79,24 @@ int main(void)
 "#;
 
 fn include() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../app-c")
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../app-c/coboot")
+}
+
+/// A compiler that takes nothing lightly.
+fn strict(compiler: &str) -> Command {
+    let mut compiler = Command::new(compiler);
+    compiler.args(["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wcast-align", "-Werror"]);
+    compiler.arg("-I").arg(include());
+    compiler
 }
 
 fn clang() -> Command {
-    let mut clang = Command::new(env::var_os("CLANG").unwrap_or_else(|| "clang".into()));
-    clang.args(["-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wcast-align", "-Werror"]);
-    clang.arg("-I").arg(include());
-    clang
+    strict(&env::var("CLANG").unwrap_or_else(|_| "clang".into()))
 }
 
 fn succeed(command: &mut Command) -> String {
     let output = command.output().unwrap_or_else(|error| {
-        panic!("{command:?}: {error}. `cargo xtask setup` installs clang.");
+        panic!("{command:?}: {error}. `cargo xtask setup` installs the compilers.");
     });
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     String::from_utf8(output.stdout).unwrap()
@@ -97,20 +107,11 @@ fn scratch(name: &str) -> PathBuf {
 }
 
 /// The bytes are those of tests/abi.rs, whose check words come from an implementation in a third
-/// language.
+/// language; so does that of the label.
 #[test]
-fn c_makes_the_same_bytes_and_comes_to_the_same_verdicts() {
-    let (source, program) = (scratch("header.c"), scratch("header"));
-    fs::write(&source, PROGRAM).unwrap();
-    succeed(
-        clang()
-            .args(["-O2", "-fsanitize=undefined", "-fsanitize-trap=undefined"])
-            .arg(&source)
-            .arg("-o")
-            .arg(&program),
-    );
-    let printed = succeed(&mut Command::new(&program));
+fn c_and_cpp_make_the_same_bytes_and_come_to_the_same_verdicts() {
     let expected = "\
+        43424C311903000051D10740030201000000000000000000000000009CC74AA3\n\
         434257310100000000000000F0B728D9\n\
         434257310200000001000000CD5920E5\n\
         434257310300000001000000F981E052\n\
@@ -119,25 +120,77 @@ fn c_makes_the_same_bytes_and_comes_to_the_same_verdicts() {
         0\n\
         00\n\
         011211\n";
-    assert_eq!(printed, expected);
+    for (extension, standard) in [("c", "-std=c11"), ("c", "-std=gnu17"), ("cpp", "-std=c++17")] {
+        let (source, program) = (scratch("header").with_extension(extension), scratch("header"));
+        fs::write(&source, PROGRAM).unwrap();
+        succeed(
+            clang()
+                .args([standard, "-O2", "-fsanitize=undefined", "-fsanitize-trap=undefined"])
+                // Those that need the library of C++.
+                .arg("-fno-sanitize=function,vptr")
+                .arg(&source)
+                .arg("-o")
+                .arg(&program),
+        );
+        assert_eq!(succeed(&mut Command::new(&program)), expected, "{standard}");
+    }
 }
 
-/// Both float ABIs of the chip, as C and as freestanding as it gets: the assertions on sizes and
-/// offsets hold there, too.
+/// What a program for the chip takes from the header and from the library.
+const FOR_THE_CHIP: &str = r#"
+#include "coboot.h"
+#include "program.h"
+
+COBOOT_LABEL(1, 2, 3);
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+int call(void);
+void leave(void);
+#ifdef __cplusplus
+}
+#endif
+
+int call(void)
+{
+    const struct coboot_callgate *gate = coboot_callgate();
+    struct coboot_handoff handoff;
+    struct coboot_node_args node;
+    struct coboot_program_args program;
+    uint32_t crc;
+    return coboot_read_handoff(&handoff) && coboot_crc32(gate, 0, 4, &crc) == 0 && coboot_read_node(gate, &node) == 0
+        && coboot_store_node(gate, 1, 125000) == 0 && coboot_program_info(gate, 1, &program) == 0
+        && coboot_confirm(gate, 1) == 0 && coboot_invalidate(gate, 1) == 0;
+}
+
+void leave(void)
+{
+    coboot_reset(COBOOT_REQUEST_STORE_NODE, coboot_stored_node(1, 125000));
+}
+"#;
+
+/// By both compilers, as C and as C++, as freestanding as it gets: the assertions on sizes and
+/// offsets hold there, too. Clang for both float ABIs of the chip.
 #[test]
 fn it_compiles_for_the_chip() {
-    let source = scratch("chip.c");
-    fs::write(
-        &source,
-        "#include \"coboot.h\"\nint there(void);\nint there(void) { return coboot_callgate() != NULL; }\n",
-    )
-    .unwrap();
-    for target in ["thumbv7em-none-eabihf", "thumbv7em-none-eabi"] {
-        let target = format!("--target={target}");
-        for standard in ["-std=c11", "-std=gnu17"] {
-            let mut clang = clang();
-            clang.args([&target, "-mcpu=cortex-m4", "-ffreestanding", "-Os", standard, "-c"]);
-            succeed(clang.arg(&source).arg("-o").arg(scratch("chip.o")));
+    let gcc = |name: &str| {
+        let mut gcc = strict(name);
+        gcc.arg("-mthumb");
+        gcc
+    };
+    let clang = |target: &str| {
+        let mut clang = clang();
+        clang.arg(format!("--target={target}"));
+        clang
+    };
+    for (extension, standard) in [("c", "-std=c11"), ("c", "-std=gnu17"), ("cpp", "-std=c++17")] {
+        let source = scratch("chip").with_extension(extension);
+        fs::write(&source, FOR_THE_CHIP).unwrap();
+        let name = if extension == "c" { "arm-none-eabi-gcc" } else { "arm-none-eabi-g++" };
+        for mut compiler in [clang("thumbv7em-none-eabihf"), clang("thumbv7em-none-eabi"), gcc(name)] {
+            compiler.args(["-mcpu=cortex-m4", "-ffreestanding", "-Os", standard, "-c"]);
+            succeed(compiler.arg(&source).arg("-o").arg(scratch("chip.o")));
         }
     }
 }

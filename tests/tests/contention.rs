@@ -6,15 +6,13 @@ use std::time::Duration;
 
 use canopen::program::ProgramControl;
 use canopen::{Address, BitRate};
-use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
 use coflash::bus::Adapter;
 use coflash::device::{Doing, Transfers};
 use coflash::update::{flash, FlashOptions};
 use emulator::time::{Span, Time};
 
-const REQUEST: u16 = 0x600 + NODE as u16;
-const RESPONSE: u32 = 0x580 + NODE as u32;
 const DATA: Address = Address::new(0x1F50, 1);
 const READ_1000: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
 const READ_1008: [u8; 8] = [0x40, 0x08, 0x10, 0, 0, 0, 0, 0];

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use canopen::debugger::Stop as DebugStop;
 use canopen::Address;
-use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::bench::{Bench, HEARTBEAT, NODE};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::{firmware, script};
 use coflash::device::debugger::{Debugger, NoBreakpoint, Stopped};
@@ -20,7 +20,6 @@ use object::{Object, ObjectSymbol};
 const COMMAND: Address = Address::new(0x1025, 1);
 const STATUS: Address = Address::new(0x1025, 2);
 const DATA: Address = Address::new(0x1025, 4);
-const HEARTBEAT: u32 = 0x700 + NODE as u32;
 const EMERGENCY: u32 = 0x80 + NODE as u32;
 
 // The core's registers (DDI 0403E section C1).

@@ -2,7 +2,7 @@
 
 use canopen::program::{FlashError, ProgramControl};
 use canopen::Address;
-use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::bench::{Bench, HEARTBEAT, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
 use coflash::device::Doing;
 use coflash::update::event::Phase;
@@ -16,9 +16,6 @@ const DATA: Address = Address::new(0x1F50, 1);
 const CONTROL: Address = Address::new(0x1F51, 1);
 const STATUS: Address = Address::new(0x1F57, 1);
 const VERSION: Address = Address::new(0x100A, 0);
-const REQUEST: u16 = 0x600 + NODE as u16;
-const RESPONSE: u32 = 0x580 + NODE as u32;
-const HEARTBEAT: u32 = 0x700 + NODE as u32;
 
 /// A board in its bootloader, with nothing installed.
 fn empty_board() -> Bench {

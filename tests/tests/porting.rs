@@ -393,7 +393,7 @@ fn a_mistake_in_a_port_fails_the_build_and_is_named() {
     let board = "--features=board-nucleo-f446re";
     let triple = ["--target", TARGET, "--profile=firmware"];
     let look = |by: By| match by {
-        By::Layout => copy.cargo(&["check", "-p", "shared-abi"]),
+        By::Layout => copy.cargo(&["check", "-p", "coboot-abi"]),
         By::Board => copy.cargo(&["check", "-p", "bsp", board]),
         By::Drivers => {
             let features = format!("{board},uart");

@@ -3,7 +3,9 @@
 //! one in C alike.
 
 use canopen::program::ProgramControl;
-use coboot_tests::bench::{Bench, NODE, RESCUE_WINDOW_MS};
+use coboot_tests::bench::{
+    control, Bench, ACKNOWLEDGED, HEARTBEAT, NODE, REQUEST, RESCUE_WINDOW_MS, RESPONSE,
+};
 use coboot_tests::firmware;
 use coflash::update::steps::call_back;
 use coflash::update::{flash, FlashOptions};
@@ -11,16 +13,6 @@ use emulator::machine::Stop;
 use emulator::time::{Span, Time};
 
 const APPLICATIONS: [&str; 2] = [firmware::APP_V1, firmware::APP_C];
-
-const REQUEST: u16 = 0x600 + NODE as u16;
-const ANSWER: u32 = 0x580 + NODE as u32;
-const HEARTBEAT: u32 = 0x700 + NODE as u32;
-
-/// 1F51h/1 := value, and its acknowledgement (CiA 301, 7.2.4.3.3).
-const fn command(value: u8) -> [u8; 8] {
-    [0x2F, 0x51, 0x1F, 1, value, 0, 0, 0]
-}
-const ACKNOWLEDGED: [u8; 8] = [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0];
 
 fn running_board(image: &str) -> Bench {
     let mut bench = Bench::new();
@@ -41,7 +33,7 @@ fn reset(bench: &mut Bench) -> Time {
 
 /// The answers since then, with the times of their ends.
 fn answers(bench: &Bench, from: Time) -> Vec<(Time, [u8; 8])> {
-    let frames = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == ANSWER);
+    let frames = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == RESPONSE);
     frames.map(|(at, _, data)| (at, data.try_into().expect("8 bytes"))).collect()
 }
 
@@ -59,7 +51,7 @@ fn requests_between_the_answer_and_the_reset_are_served() {
         for leaving in [0x80, 0x02] {
             let mut bench = running_board(image);
             let from = bench.time();
-            assert_eq!(bench.ask(REQUEST, &command(leaving), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+            assert_eq!(bench.ask(REQUEST, &control(leaving), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
             // What is no request, and what is for somebody else.
             bench.post(REQUEST, &[0x40, 0, 0x10]);
             bench.post(REQUEST, &[0x80, 0, 0x10, 0, 0, 0, 0, 0]);
@@ -67,11 +59,11 @@ fn requests_between_the_answer_and_the_reset_are_served() {
             bench.post(0x000, &[0x81, NODE + 1]);
             // Start remote node: the state changes, and the heartbeat would tell.
             bench.post(0x000, &[0x01, NODE]);
-            let read = bench.ask(REQUEST, &[0x40, 0, 0x10, 0, 0, 0, 0, 0], ANSWER);
+            let read = bench.ask(REQUEST, &[0x40, 0, 0x10, 0, 0, 0, 0, 0], RESPONSE);
             assert_eq!(read.as_deref(), Some(&[0x43, 0, 0x10, 0, 0, 0, 0, 0][..]), "{image}");
-            let absent = bench.ask(REQUEST, &[0x40, 0xFF, 0x5F, 0, 0, 0, 0, 0], ANSWER);
+            let absent = bench.ask(REQUEST, &[0x40, 0xFF, 0x5F, 0, 0, 0, 0, 0], RESPONSE);
             assert_eq!(absent.as_deref(), Some(&[0x80, 0xFF, 0x5F, 0, 0, 0, 2, 6][..]), "{image}");
-            let signature = bench.ask(REQUEST, &command(0x83), ANSWER);
+            let signature = bench.ask(REQUEST, &control(0x83), RESPONSE);
             assert_eq!(signature.as_deref(), Some(&[0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 8][..]), "{image}");
             assert_eq!(bench.events(), [], "{image}: it is still there");
             bench.await_boot_up(1000);
@@ -93,7 +85,7 @@ fn a_call_in_quick_succession_is_acknowledged_each_time() {
         let mut bench = running_board(image);
         let from = bench.time();
         for _ in 0..4 {
-            assert_eq!(bench.ask(REQUEST, &command(0x80), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+            assert_eq!(bench.ask(REQUEST, &control(0x80), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
             bench.run_ms(3);
         }
         bench.await_boot_up(1000);
@@ -105,7 +97,7 @@ fn a_call_in_quick_succession_is_acknowledged_each_time() {
         let mut bench = running_board(image);
         let from = bench.time();
         while bench.time() - from < Span::from_millis(600) {
-            bench.post(REQUEST, &command(0x80));
+            bench.post(REQUEST, &control(0x80));
             bench.run_ms(4);
         }
         let reset = reset(&mut bench);
@@ -123,10 +115,10 @@ fn two_masters_are_both_answered() {
         for second in [0x00, 0x03] {
             let mut bench = running_board(image);
             let from = bench.time();
-            assert_eq!(bench.ask(REQUEST, &command(0x80), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+            assert_eq!(bench.ask(REQUEST, &control(0x80), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
             bench.run_ms(2);
             let asked = bench.time();
-            assert_eq!(bench.ask(REQUEST, &command(second), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+            assert_eq!(bench.ask(REQUEST, &control(second), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
             let took = bench.time() - asked;
             assert!(took <= Span::from_millis(25), "{image}, {second}: {} us", took.0 / 1_000_000);
             bench.run_ms(2);
@@ -139,11 +131,11 @@ fn two_masters_are_both_answered() {
         // 1F51h, and by NMT reset node.
         for nmt in [false, true] {
             let mut bench = running_board(image);
-            assert_eq!(bench.ask(REQUEST, &command(0x80), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+            assert_eq!(bench.ask(REQUEST, &control(0x80), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
             if nmt {
                 bench.post(0x000, &[0x81, NODE]);
             } else {
-                assert_eq!(bench.ask(REQUEST, &command(0x02), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+                assert_eq!(bench.ask(REQUEST, &control(0x02), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
             }
             bench.await_boot_up(1000);
             assert!(bench.is_bootloader(NODE), "{image}");
@@ -171,7 +163,7 @@ fn a_frame_on_its_way_is_not_cut_off() {
             // The request takes 1 ms on the bus; the heartbeat begins about then.
             let asked = Time(next.0 - Span::from_micros(2000 - 250 * offset).0);
             bench.world.run_until(asked);
-            bench.post(REQUEST, &command(0x00));
+            bench.post(REQUEST, &control(0x00));
             bench.await_boot_up(1000);
             bench.run_ms(10);
             let bad: Vec<_> = bench.records()[before..]
@@ -199,7 +191,7 @@ fn what_the_application_can_refuse_it_refuses_itself() {
             ([0x2F, 0x51, 0x1F, 1, 4, 0, 0, 0], [0x80, 0x51, 0x1F, 1, 0x30, 0, 0x09, 0x06]),
             ([0x2F, 0x51, 0x1F, 1, 0x84, 0, 0, 0], [0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 0x08]),
         ] {
-            assert_eq!(bench.ask(REQUEST, &request, ANSWER).as_deref(), Some(&answer[..]), "{image}");
+            assert_eq!(bench.ask(REQUEST, &request, RESPONSE).as_deref(), Some(&answer[..]), "{image}");
         }
         bench.run_ms(600);
         assert_eq!(bench.events(), [], "{image}: it stays");
@@ -224,7 +216,7 @@ fn a_clear_that_the_bootloader_refuses_is_aborted_by_it() {
         // It starts what it has taken.
         bench.run_ms(2000);
         assert!(!bench.is_bootloader(ESACADEMY));
-        let clear = bench.ask(request, &command(0x03), answer);
+        let clear = bench.ask(request, &control(0x03), answer);
         assert_eq!(clear.as_deref(), Some(&[0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 0x08][..]), "{image}");
         assert!(bench.is_bootloader(ESACADEMY));
         // 84h: NO_ACCESS.
@@ -240,9 +232,9 @@ fn commands_in_segments_are_answered_by_the_application() {
     let initiate = [0x21, 0x51, 0x1F, 1, 1, 0, 0, 0];
     for (value, end) in [(0, [0x20, 0, 0, 0, 0, 0, 0, 0]), (3, [0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 0x08])] {
         let mut bench = running_board(firmware::APP_V1);
-        assert_eq!(bench.ask(REQUEST, &initiate, ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+        assert_eq!(bench.ask(REQUEST, &initiate, RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
         let segment = [0x0D, value, 0, 0, 0, 0, 0, 0];
-        assert_eq!(bench.ask(REQUEST, &segment, ANSWER).as_deref(), Some(&end[..]), "{value}");
+        assert_eq!(bench.ask(REQUEST, &segment, RESPONSE).as_deref(), Some(&end[..]), "{value}");
         bench.run_ms(100);
         assert_eq!(bench.is_bootloader(NODE), value == 0, "{value}");
     }
@@ -331,11 +323,11 @@ fn the_first_80h_to_a_fresh_program_confirms_it() {
         // Whatever else is asked before: it stays fresh.
         bench.post(0x000, &[0x80, NODE]);
         assert_eq!(bench.session().read_number(canopen::Address::new(0x1F51, 1)).unwrap(), 1);
-        assert_eq!(bench.ask(REQUEST, &command(0x01), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
-        assert_eq!(bench.ask(REQUEST, &command(0x80), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+        assert_eq!(bench.ask(REQUEST, &control(0x01), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
+        assert_eq!(bench.ask(REQUEST, &control(0x80), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
         bench.run_ms(600);
         assert_eq!(bench.events(), [], "{image}: it stays");
-        assert_eq!(bench.ask(REQUEST, &command(0x80), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+        assert_eq!(bench.ask(REQUEST, &control(0x80), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
         bench.await_boot_up(1000);
         assert!(bench.is_bootloader(NODE), "{image}: the second is a call");
     }
@@ -348,7 +340,7 @@ fn a_program_that_80h_has_confirmed_has_no_rescue_window() {
         for confirm in [false, true] {
             let mut bench = fresh_board(image);
             if confirm {
-                assert!(bench.ask(REQUEST, &command(0x80), ANSWER).is_some());
+                assert!(bench.ask(REQUEST, &control(0x80), RESPONSE).is_some());
             }
             bench.run_ms(50);
             bench.power_off();
@@ -378,7 +370,7 @@ fn every_other_80h_is_a_call() {
             bench.await_program(1000);
         }),
         ("reset program", |bench| {
-            assert!(bench.ask(REQUEST, &command(0x02), ANSWER).is_some());
+            assert!(bench.ask(REQUEST, &control(0x02), RESPONSE).is_some());
             bench.await_boot_up(1000);
         }),
     ];
@@ -388,7 +380,7 @@ fn every_other_80h_is_a_call() {
             between(&mut bench);
             bench.run_ms(50);
             assert!(!bench.is_bootloader(NODE), "{image}, {what}");
-            assert!(bench.ask(REQUEST, &command(0x80), ANSWER).is_some());
+            assert!(bench.ask(REQUEST, &control(0x80), RESPONSE).is_some());
             bench.await_boot_up(1000);
             assert!(bench.is_bootloader(NODE), "{image}, {what}");
         }
@@ -407,13 +399,13 @@ fn every_other_80h_is_a_call() {
             if value == 0x83 {
                 raw_download(&mut bench, NODE, image);
             }
-            assert_eq!(bench.ask(REQUEST, &command(value), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+            assert_eq!(bench.ask(REQUEST, &control(value), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
         }
         bench.run_ms(100);
-        assert!(bench.ask(REQUEST, &command(0x01), ANSWER).is_some());
+        assert!(bench.ask(REQUEST, &control(0x01), RESPONSE).is_some());
         bench.await_boot_up(1000);
         bench.run_ms(50);
-        assert!(bench.ask(REQUEST, &command(0x80), ANSWER).is_some());
+        assert!(bench.ask(REQUEST, &control(0x80), RESPONSE).is_some());
         bench.await_boot_up(1000);
         assert!(bench.is_bootloader(NODE), "{image}, signed by 83h");
     }
@@ -432,12 +424,12 @@ fn a_confirmation_that_fails_is_told_and_leaves_the_way_back_open() {
         for sector in &sectors {
             bench.machine().protect_sector(*sector, true);
         }
-        let refused = bench.ask(REQUEST, &command(0x80), ANSWER);
+        let refused = bench.ask(REQUEST, &control(0x80), RESPONSE);
         assert_eq!(refused.as_deref(), Some(&[0x80, 0x51, 0x1F, 1, 0, 0, 0x06, 0x06][..]), "{image}");
         for sector in &sectors {
             bench.machine().protect_sector(*sector, false);
         }
-        assert_eq!(bench.ask(REQUEST, &command(0x80), ANSWER).as_deref(), Some(&ACKNOWLEDGED[..]));
+        assert_eq!(bench.ask(REQUEST, &control(0x80), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
         bench.await_boot_up(1000);
         assert!(bench.is_bootloader(NODE), "{image}");
     }

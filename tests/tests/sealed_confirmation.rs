@@ -3,7 +3,9 @@
 
 use canopen::program::ProgramControl;
 use canopen::Address;
-use coboot_tests::bench::{Bench, NODE, RESCUE_WINDOW_MS};
+use coboot_tests::bench::{
+    control, Bench, ACKNOWLEDGED, HEARTBEAT, NODE, REQUEST, RESCUE_WINDOW_MS, RESPONSE,
+};
 use coboot_tests::firmware;
 use coboot_tests::sealed_board::{board, release, sealer, write, COUNTER};
 use coflash::device::Transfers;
@@ -12,16 +14,7 @@ use shared_abi::warm_start::{BootRequest, StoredNode, WarmStart};
 const APPLICATIONS: [&str; 2] = [firmware::APP_V1, firmware::APP_C];
 const CRC: Address = Address::new(0x1F56, 1);
 
-const REQUEST: u16 = 0x600 + NODE as u16;
-const ANSWER: u32 = 0x580 + NODE as u32;
-const HEARTBEAT: u32 = 0x700 + NODE as u32;
-
-/// 1F51h/1 := value, its acknowledgement (CiA 301, 7.2.4.3.3), and its refusal because of the
-/// device's state (7.2.4.3.17).
-const fn command(value: u8) -> [u8; 8] {
-    [0x2F, 0x51, 0x1F, 1, value, 0, 0, 0]
-}
-const ACKNOWLEDGED: [u8; 8] = [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0];
+/// 1F51h/1, refused because of the device's state (CiA 301, 7.2.4.3.17).
 const REFUSED: [u8; 8] = [0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 0x08];
 
 /// A sealed board whose sealed program was downloaded in one go, and started.
@@ -50,7 +43,7 @@ fn boot_ups_after_power_off(bench: &mut Bench) -> usize {
 }
 
 fn ask(bench: &mut Bench, value: u8) -> Option<Vec<u8>> {
-    bench.ask(REQUEST, &command(value), ANSWER)
+    bench.ask(REQUEST, &control(value), RESPONSE)
 }
 
 /// As on an open device, but for the reset: acknowledged, confirmed for good, and the next 80h calls

@@ -2,7 +2,7 @@
 //! blocks.
 
 use canopen::{Address, BitRate};
-use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::bench::{Bench, HEARTBEAT, NODE, REQUEST, RESPONSE};
 use coboot_tests::ihex::intel_hex;
 use coboot_tests::{firmware, throughput};
 use coflash::device::{Doing, Transfers};
@@ -13,9 +13,6 @@ const DATA: Address = Address::new(0x1F50, 1);
 const CONTROL: Address = Address::new(0x1F51, 1);
 const IDENTIFICATION: Address = Address::new(0x1F56, 1);
 const VERSION: Address = Address::new(0x100A, 0);
-const REQUEST: u32 = 0x600 + NODE as u32;
-const RESPONSE: u32 = 0x580 + NODE as u32;
-const HEARTBEAT: u32 = 0x700 + NODE as u32;
 
 const CLEAR: u8 = 3;
 const RESET: u8 = 2;
@@ -101,7 +98,7 @@ fn never_silent_while_the_flash_is_slower_than_the_bus() {
         let mut beats: Vec<Time> = Vec::new();
         for (at, id, _) in bench.frames_since(from) {
             match id {
-                REQUEST => asked = at,
+                id if id == u32::from(REQUEST) => asked = at,
                 RESPONSE => slowest = slowest.max(at - asked),
                 HEARTBEAT => beats.push(at),
                 _ => {}

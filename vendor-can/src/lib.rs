@@ -19,3 +19,8 @@ mod load;
 pub mod pcan;
 
 pub use load::LoadError;
+
+/// The example on the crate's page compiles and runs.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -37,13 +37,16 @@ const RULES: &[Rule] = &[
     Rule { name: "canopen", may_use: &[] },
     Rule { name: "seal", may_use: &[] },
     Rule { name: "boot-core", may_use: &["canopen", "seal", "shared-abi"] },
-    Rule { name: "bsp", may_use: &["shared-abi"] },
-    Rule { name: "bootloader", may_use: &["boot-core", "bsp", "seal", "shared-abi"] },
-    Rule { name: "app-template", may_use: &["canopen", "bsp", "shared-abi"] },
+    Rule { name: "coboot-app", may_use: &["canopen", "shared-abi"] },
+    // On the host alone: build scripts and tools.
+    Rule { name: "coboot-linker", may_use: &["shared-abi"] },
+    Rule { name: "bsp", may_use: &["canopen", "shared-abi"] },
+    Rule { name: "bootloader", may_use: &["boot-core", "bsp", "coboot-linker", "seal", "shared-abi"] },
+    Rule { name: "app-template", may_use: &["canopen", "coboot-app", "coboot-linker", "bsp", "shared-abi"] },
     Rule { name: "vendor-can", may_use: &[] },
-    Rule { name: "coflash", may_use: &["canopen", "seal", "shared-abi", "vendor-can"] },
-    Rule { name: "coflash-python", may_use: &["canopen", "coflash", "shared-abi"] },
-    Rule { name: "coboot-node", may_use: &["boot-core", "canopen", "coflash", "shared-abi"] },
+    Rule { name: "coflash", may_use: &["canopen", "coboot-linker", "seal", "shared-abi", "vendor-can"] },
+    Rule { name: "coflash-native", may_use: &["canopen", "coflash", "shared-abi"] },
+    Rule { name: "coboot-node", may_use: &["boot-core", "canopen", "coboot-app", "coflash", "shared-abi"] },
     Rule { name: "emulator", may_use: &["shared-abi"] },
     Rule {
         name: "coboot-tests",
@@ -53,7 +56,7 @@ const RULES: &[Rule] = &[
 ];
 
 /// The crates that need no `unsafe` and say so to the compiler.
-const PURE: &[&str] = &["canopen", "seal", "boot-core", "coflash", "coboot-node", "xtask"];
+const PURE: &[&str] = &["canopen", "seal", "boot-core", "coboot-linker", "coflash", "coboot-node", "xtask"];
 /// How they say it.
 const FORBID: &str = "#![forbid(unsafe_code)]";
 
@@ -115,6 +118,8 @@ fn read(path: &Path) -> Outcome<String> {
 /// A crate of the workspace.
 #[derive(Debug, PartialEq, Eq)]
 struct Package {
+    /// What the sources call it: the name of its library, with dashes, or of the package if there is
+    /// no library. (The registry knows `canopen` as the package `coboot-canopen`.)
     name: String,
     folder: PathBuf,
     /// Names of all dependencies by their real names, with their kind (`normal`, `dev`, `build`).
@@ -123,6 +128,19 @@ struct Package {
 
 /// Reads what `cargo metadata --no-deps` printed.
 fn packages(metadata: &Value) -> Outcome<Vec<Package>> {
+    let mut libraries = BTreeMap::new();
+    for package in metadata.get("packages").items() {
+        let is_library = |target: &&Value| {
+            target.get("kind").items().iter().any(|kind| kind.text() != Some("custom-build"))
+                && target.get("crate_types").items().iter().any(|kind| kind.text() != Some("bin"))
+        };
+        let library = package.get("targets").items().iter().find(is_library);
+        if let (Some(name), Some(library)) = (package.get("name").text(), library) {
+            let library = library.get("name").text().unwrap_or_default().replace('_', "-");
+            libraries.insert(name.to_owned(), library);
+        }
+    }
+    let called = |package: &str| libraries.get(package).map_or(package, String::as_str).to_owned();
     let package = |value: &Value| -> Option<Package> {
         let mut dependencies = Vec::new();
         for dependency in value.get("dependencies").items() {
@@ -131,11 +149,11 @@ fn packages(metadata: &Value) -> Outcome<Vec<Package>> {
                 Some("dev") => "dev",
                 Some(_) => "build",
             };
-            dependencies.push((dependency.get("name").text()?.to_owned(), kind));
+            dependencies.push((called(dependency.get("name").text()?), kind));
         }
         let manifest = Path::new(value.get("manifest_path").text()?);
         Some(Package {
-            name: value.get("name").text()?.to_owned(),
+            name: called(value.get("name").text()?),
             folder: manifest.parent()?.to_owned(),
             dependencies,
         })
@@ -293,6 +311,10 @@ mod tests {
             "bootloader -> bsp",
             "app-template -> canopen",
             "app-template -> bsp",
+            "app-template -> coboot-app",
+            "app-template build coboot-linker",
+            "coboot-app -> canopen",
+            "bsp -> canopen",
             "coflash -> canopen",
             "emulator -> shared-abi",
             "emulator -> unicorn-engine",
@@ -310,6 +332,10 @@ mod tests {
         for arrow in [
             "app-template -> boot-core",
             "app-template dev boot-core",
+            "coboot-app -> boot-core",
+            "coboot-app -> bsp",
+            "coboot-linker -> coboot-app",
+            "bsp -> boot-core",
             "canopen -> shared-abi",
             "canopen dev boot-core",
             "shared-abi -> canopen",
@@ -342,23 +368,32 @@ mod tests {
     /// kind.
     #[test]
     fn metadata_is_read_by_the_real_names() {
-        let text = r#"{"packages":[{"name":"canopen","manifest_path":"/x/canopen/Cargo.toml","dependencies":[
+        let text = r#"{"packages":[{"name":"coboot-canopen","manifest_path":"/x/canopen/Cargo.toml","targets":[
+            {"kind":["custom-build"],"crate_types":["bin"],"name":"build-script-build"},
+            {"kind":["lib"],"crate_types":["lib"],"name":"canopen"},
+            {"kind":["bin"],"crate_types":["bin"],"name":"tool"}
+        ],"dependencies":[
             {"name":"heapless","source":"registry","req":"^0.9","kind":null,"rename":null,"optional":false},
-            {"name":"boot-core","source":null,"req":"*","kind":"dev","rename":"innocent","path":"/x/boot-core"},
+            {"name":"coboot-core","source":null,"req":"*","kind":"dev","rename":"innocent","path":"/x/boot-core"},
             {"name":"crc","source":"registry","req":"^3","kind":"build","rename":null,"target":"cfg(unix)"}
-        ]}],"workspace_members":[]}"#;
+        ]},{"name":"coboot-core","manifest_path":"/x/boot-core/Cargo.toml","targets":[
+            {"kind":["lib"],"crate_types":["lib"],"name":"boot_core"}
+        ],"dependencies":[]}],"workspace_members":[]}"#;
         let packages = packages(&Value::parse(text).unwrap()).unwrap();
         assert_eq!(
             packages,
-            [Package {
-                name: "canopen".into(),
-                folder: "/x/canopen".into(),
-                dependencies: vec![
-                    ("heapless".into(), "normal"),
-                    ("boot-core".into(), "dev"),
-                    ("crc".into(), "build")
-                ],
-            }]
+            [
+                Package {
+                    name: "canopen".into(),
+                    folder: "/x/canopen".into(),
+                    dependencies: vec![
+                        ("heapless".into(), "normal"),
+                        ("boot-core".into(), "dev"),
+                        ("crc".into(), "build")
+                    ],
+                },
+                Package { name: "boot-core".into(), folder: "/x/boot-core".into(), dependencies: vec![] }
+            ]
         );
         assert_eq!(broken_arrows(&packages).len(), 1);
         assert!(super::packages(&Value::parse("{}").unwrap()).is_err());

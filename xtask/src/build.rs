@@ -18,6 +18,7 @@ usage: cargo xtask build [NAME...] [--all] [--unpacked] [--board BOARD] [--yes]
 
 Builds images of a board and puts them into target/firmware/BOARD/NAME.elf. Without a NAME it builds
 bootloader, app-v1 and app-v2; the other names stand in xtask/src/build.rs, and a wrong one lists them.
+app-c is the application in C, for each program of the board, and with the tests' objects (app-c-probe).
 
   --all           every image of the board and the applications in C: what the tests need
   --unpacked      bootloaders as the linker makes them: the part that runs from RAM is not packed
@@ -140,19 +141,23 @@ pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let setup = Setup::from(&mut args);
     let (every, unpacked) = (args.flag("--all"), args.flag("--unpacked"));
-    let names = args.rest();
+    let mut names = args.rest();
+    let all = names.len();
+    names.retain(|name| name != C_APPLICATION);
+    let in_c = every || names.len() < all;
     let chosen: Vec<_> = match names.as_slice() {
         [] if every => Variant::of(board).collect(),
+        [] if in_c => Vec::new(),
         [] => MAIN.map(|name| Variant::by_name(board, name)).into_iter().collect::<Outcome<_>>()?,
         _ if every => return Err("--all and names do not go together.".into()),
         names => names.iter().map(|name| Variant::by_name(board, name)).collect::<Outcome<_>>()?,
     };
-    setup.prepare(if every { &[Part::Firmware, Part::C] } else { &[Part::Firmware] })?;
+    setup.prepare(if in_c { &[Part::Firmware, Part::C] } else { &[Part::Firmware] })?;
     for variant in chosen {
         let built = build(board, variant)?;
         put(board, variant, if unpacked { built } else { finished(variant, built)? })?;
     }
-    if every {
+    if in_c {
         c_applications(board)?;
     }
     Ok(())
@@ -179,8 +184,36 @@ pub fn all(board: &Layout) -> Outcome<PathBuf> {
     images(board, &Variant::of(board).map(|variant| variant.name).collect::<Vec<_>>())
 }
 
-/// Builds the application in C for each program of a board. A board that app-c/boards does not know
-/// has none.
+/// Builds everything for several boards: [`all`] and [`c_applications`], chips beside one another,
+/// since the last step of each image keeps one core busy.
+///
+/// # Errors
+/// As for [`images`]; the first one.
+pub fn boards(boards: &[&Layout]) -> Outcome {
+    let mut chips: Vec<&str> = boards.iter().map(|board| board.chip.line.name()).collect();
+    chips.sort_unstable();
+    chips.dedup();
+    std::thread::scope(|scope| {
+        let builders: Vec<_> = chips
+            .into_iter()
+            .map(|chip| {
+                scope.spawn(move || {
+                    boards.iter().filter(|board| board.chip.line.name() == chip).try_for_each(|board| {
+                        all(board)?;
+                        c_applications(board)
+                    })
+                })
+            })
+            .collect();
+        // A builder that panics has told why.
+        builders
+            .into_iter()
+            .try_for_each(|builder| builder.join().unwrap_or_else(|_| Err("a build broke off.".into())))
+    })
+}
+
+/// Builds the application in C for each program of a board, and the same with the tests' object 2100h.
+/// A board that app-c/boards does not know has none.
 ///
 /// # Errors
 /// When it does not build, or is no image of this board.
@@ -190,39 +223,54 @@ pub fn c_applications(board: &Layout) -> Outcome {
         eprintln!("  app-c/boards has no {}.h: no application in C", board.board);
         return Ok(());
     }
-    let dir = workspace::firmware_dir(board);
     for (number, region) in (1..).zip(board.programs) {
-        let name = if number == 1 { "app-c".to_owned() } else { format!("app-c-program-{number}") };
-        let work = dir.join("c").join(&name);
-        let write = |path: &Path, bytes: &[u8]| {
-            fs::write(path, bytes)
-                .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(path)))
-        };
-        fs::create_dir_all(&work)
-            .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&work)))?;
-        let script = board.linker_script(Image::Program(number)).to_string();
-        write(&work.join("layout.x"), script.as_bytes())?;
-        let mut objects = Vec::new();
-        for source in C_SOURCES {
-            let object = work.join(source).with_extension("o");
-            let mut clang = process::clang();
-            clang.current_dir(&sources).args(C_FLAGS);
-            clang.arg(format!("-DBOARD=\"boards/{}.h\"", board.board));
-            process::run(clang.arg("-c").arg(source).arg("-o").arg(&object))?;
-            objects.push(object);
+        for (name, more) in [(C_APPLICATION, None), ("app-c-probe", Some(PROBE))] {
+            let name = if number == 1 { name.to_owned() } else { format!("{name}-program-{number}") };
+            let elf = c_application(board, number, &name, more)?;
+            report(&elf, *region)?;
         }
-        let elf = dir.join(name).with_extension("elf");
-        let mut linker = Command::new(rust_lld()?);
-        linker.args(["-flavor", "gnu", "--gc-sections", "--nmagic", "--fatal-warnings", "-o"]).arg(&elf);
-        linker.arg("-L").arg(&work).arg("-T").arg(sources.join("app.x"));
-        process::run(linker.args(objects))?;
-        report(&elf, *region)?;
     }
     Ok(())
 }
 
+/// Builds the application in C for a place on a board, from its sources and one more; gives the ELF
+/// file.
+fn c_application(board: &Layout, number: u8, name: &str, more: Option<&str>) -> Outcome<PathBuf> {
+    let sources = workspace::root().join("app-c");
+    let dir = workspace::firmware_dir(board);
+    let work = dir.join("c").join(name);
+    fs::create_dir_all(&work)
+        .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&work)))?;
+    let (layout, script) = (work.join("layout.x"), board.linker_script(Image::Program(number)).to_string());
+    fs::write(&layout, script)
+        .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&layout)))?;
+    let mut objects = Vec::new();
+    for source in C_SOURCES.into_iter().chain(more) {
+        let file_name = Path::new(source).file_name().expect("a source is a file");
+        let object = work.join(file_name).with_extension("o");
+        let mut clang = process::clang();
+        clang.current_dir(&sources).args(C_FLAGS);
+        clang.arg(format!("-DBOARD=\"boards/{}.h\"", board.board));
+        clang.arg(format!("-DINTERRUPT_LINES={}", board.chip.interrupts));
+        process::run(clang.arg("-c").arg(source).arg("-o").arg(&object))?;
+        objects.push(object);
+    }
+    let elf = dir.join(name).with_extension("elf");
+    let mut linker = Command::new(rust_lld()?);
+    linker.args(["-flavor", "gnu", "--gc-sections", "--nmagic", "--fatal-warnings", "-o"]).arg(&elf);
+    linker.arg("-L").arg(&work).arg("-L").arg(sources.join("coboot"));
+    linker.arg("-T").arg(sources.join("app.x"));
+    process::run(linker.args(objects))?;
+    Ok(elf)
+}
+
+/// The name of the application in C; for a build it stands for all applications in C.
+pub const C_APPLICATION: &str = "app-c";
 /// What the application in C is made of.
-const C_SOURCES: [&str; 5] = ["startup.c", "can.c", "probe.c", "reentry.c", "main.c"];
+const C_SOURCES: [&str; 8] =
+    ["startup.c", "board.c", "can.c", "coboot/reentry.c", "coboot/program.c", "objects.c", "sdo.c", "main.c"];
+/// What adds the tests' objects to it.
+const PROBE: &str = "../tests/c/probe.c";
 /// How it is compiled. It keeps the FPU off, so it is compiled for a chip without one; what it
 /// calls in the bootloader takes and gives no floating-point numbers.
 const C_FLAGS: &[&str] = &[
@@ -237,6 +285,7 @@ const C_FLAGS: &[&str] = &[
     "-Os",
     "-g",
     "-fdebug-compilation-dir=app-c",
+    "-I.",
     "-Wall",
     "-Wextra",
     "-Werror",
@@ -259,14 +308,13 @@ pub fn to_look_at(board: &Layout, features: &str, product: Option<&str>) -> Outc
     let mut cargo = cargo_for("bootloader", board, features);
     cargo.env("CARGO_TERM_QUIET", "true");
     process::run(with_product(&mut cargo, product))?;
-    pack::pack(&built("bootloader")?)
+    pack::pack(&built(board, "bootloader")?)
 }
 
 /// The arguments that make cargo work on a firmware package for a board; for `cargo clippy`, too.
 pub fn firmware_args(package: &str, board: &Layout, features: &str) -> Vec<String> {
     let features = format!("board-{},{features}", board.board);
-    // A folder of its own: another target and profile, built while host crates may be building.
-    let target_dir = workspace::target_dir().join("fw").display().to_string();
+    let target_dir = target_dir(board).display().to_string();
     [
         ["--package", package],
         ["--target", TARGET],
@@ -287,6 +335,12 @@ pub fn tests_args(board: &Layout) -> Vec<String> {
     ["--package=coboot-tests", "--no-default-features", &features].map(str::to_owned).to_vec()
 }
 
+/// Where cargo builds the firmware of a board. A folder for each chip: cargo locks its folder, so
+/// that two chips can be built at once, and a host crate besides; they share no HAL anyway.
+fn target_dir(board: &Layout) -> PathBuf {
+    workspace::target_dir().join("fw").join(board.chip.line.name())
+}
+
 include!("../../linker/packs_well.rs");
 
 /// A call of cargo that builds an image. What it adds to the compiler's arguments holds for the last
@@ -305,7 +359,7 @@ fn cargo_for(package: &str, board: &Layout, features: &str) -> Command {
 fn build(board: &Layout, variant: &Variant) -> Outcome<Vec<u8>> {
     let mut cargo = cargo_for(variant.package, board, variant.features);
     process::run(with_product(&mut cargo, variant.product))?;
-    built(variant.package)
+    built(board, variant.package)
 }
 
 /// Chooses a product for what cargo builds.
@@ -317,8 +371,8 @@ fn with_product<'a>(cargo: &'a mut Command, product: Option<&str>) -> &'a mut Co
 }
 
 /// The ELF file that cargo built last of a package.
-fn built(package: &str) -> Outcome<Vec<u8>> {
-    let path = workspace::target_dir().join("fw").join(TARGET).join(PROFILE).join(package);
+fn built(board: &Layout, package: &str) -> Outcome<Vec<u8>> {
+    let path = target_dir(board).join(TARGET).join(PROFILE).join(package);
     fs::read(&path)
         .map_err(|error| format!("cargo built {package}, but {} cannot be read: {error}.", path.display()))
 }
@@ -350,7 +404,7 @@ fn put(board: &Layout, variant: &Variant, file: Vec<u8>) -> Outcome {
 ///
 /// # Errors
 /// When it lies outside its flash.
-fn report(image: &Path, region: Region) -> Outcome {
+pub fn report(image: &Path, region: Region) -> Outcome {
     let flash = Flash::of(&size::read(image)?, region)
         .map_err(|problem| format!("{}: {problem}", workspace::shown(image)))?;
     // Beside what cargo says: the standard output is the job's, which may be asked for JSON.

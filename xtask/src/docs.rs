@@ -4,7 +4,7 @@ use std::fs;
 
 use shared_abi::layout::BOARDS;
 
-use crate::build::VARIANTS;
+use crate::build::{C_APPLICATION, VARIANTS};
 use crate::pages::{self, Shown};
 use crate::{workspace, JOBS};
 
@@ -74,9 +74,9 @@ fn a_quote_that_has_changed_is_found() {
 }
 
 /// Commands that are nobody's of this house: of a shell, of the system, of other projects.
-const FOREIGN: [&str; 14] = [
-    "cd", "export", "ip", "base64", "candump", "canopend", "cocomm", "npm", "node", "openssl", "pip", "tar",
-    "unzip", "west",
+const FOREIGN: [&str; 15] = [
+    "cd", "export", "ip", "base64", "candump", "canopend", "cmake", "cocomm", "npm", "node", "openssl",
+    "pip", "tar", "unzip", "west",
 ];
 /// Cargo's own jobs that pages call; what is behind them names packages of the workspace.
 const CARGO: [&str; 3] = ["build", "run", "test"];
@@ -108,8 +108,7 @@ fn check(shown: &Shown) -> Option<String> {
         ["cargo", job, rest @ ..] if CARGO.contains(job) => {
             let package = rest.iter().position(|word| matches!(*word, "-p" | "--package"));
             let package = package.and_then(|at| rest.get(at + 1));
-            let folder = package.map(|name| workspace::root().join(name.trim_start_matches("coboot-")));
-            let there = folder.is_none_or(|folder| folder.join("Cargo.toml").exists());
+            let there = package.is_none_or(|name| is_package(name));
             (!there).then(|| format!("there is no package {}", package.unwrap_or(&"")))
         }
         [program, rest @ ..] if program.contains('/') || program.starts_with("python") => {
@@ -122,6 +121,17 @@ fn check(shown: &Shown) -> Option<String> {
         [program, ..] if FOREIGN.contains(program) => None,
         words => Some(format!("nobody knows {words:?}")),
     }
+}
+
+/// Whether a folder of the workspace holds the package of this name.
+fn is_package(name: &str) -> bool {
+    let folders = fs::read_dir(workspace::root()).expect("the workspace can be read");
+    let named = format!("name = \"{name}\"");
+    folders.flatten().any(|folder| {
+        let manifest = fs::read_to_string(folder.path().join("Cargo.toml")).unwrap_or_default();
+        let package = manifest.split("\n[").next().unwrap_or_default();
+        package.starts_with("[package]") && package.lines().any(|line| line == named)
+    })
 }
 
 /// What is wrong with what stands behind a job.
@@ -162,6 +172,7 @@ fn job_options(job: &str, help: &str, words: &[&str]) -> Option<String> {
             _ if name.starts_with('-') => return Some(format!("cargo xtask {job} has no {name}")),
             _ if job == "build"
                 && !pages::is_placeholder(name)
+                && name != C_APPLICATION
                 && !VARIANTS.iter().any(|variant| variant.name == name) =>
             {
                 return Some(format!("there is no image {name}"));

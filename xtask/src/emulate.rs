@@ -34,7 +34,7 @@ pub fn run(mut args: Args) -> Outcome {
     setup.prepare(needed)?;
 
     let mut emulator = process::cargo("run");
-    emulator.args(["--package", "emulator", "--bin", "emulate", "--", "--board", board.board]);
+    emulator.args(["--package", "coboot-emulator", "--bin", "emulate", "--", "--board", board.board]);
     if !another {
         let standard = if virtual_can { "bootloader-virtual-can" } else { "bootloader" };
         let bootloader = log.unwrap_or(standard);

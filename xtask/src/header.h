@@ -1,6 +1,6 @@
 /* What coboot and an application in C must agree on. Made from shared-abi by `cargo xtask header`: change it there.
  *
- * C11, freestanding, no library. Addresses come from the linker: `cargo xtask layout --ld program-1` prints the
+ * C11 or C++17, freestanding, no library. Addresses come from the linker: `cargo xtask layout --ld program-1` prints the
  * symbols __handoff, __warm_start and __callgate_table of a board. The functions that need the chip are there when
  * the compiler's target is Arm; the rest works on any machine.
  */
@@ -11,6 +11,16 @@
 #include <stddef.h>
 #include <stdint.h>
 
+/* What C and C++ spell differently. */
+#ifdef __cplusplus
+#define COBOOT_STATIC_ASSERT static_assert
+#define COBOOT_NORETURN [[noreturn]]
+extern "C" {
+#else
+#define COBOOT_STATIC_ASSERT _Static_assert
+#define COBOOT_NORETURN _Noreturn
+#endif
+
 /* The check word that guards a record in RAM. It tells a record from the noise of an unpowered RAM. */
 
 @CHECK@
@@ -18,7 +28,7 @@
 /* Over so many words. They are put together from bytes: records have smaller fields, too. */
 static inline uint32_t coboot_check_word(const void *record, size_t words)
 {
-    const unsigned char *byte = record;
+    const unsigned char *byte = (const unsigned char *)record;
     uint32_t fold = COBOOT_CHECK_SEED;
     for (size_t i = 0; i < words; i++, byte += 4) {
         uint32_t word = byte[0] | (uint32_t)byte[1] << 8 | (uint32_t)byte[2] << 16 | (uint32_t)byte[3] << 24;
@@ -27,6 +37,30 @@ static inline uint32_t coboot_check_word(const void *record, size_t words)
     }
     return ~fold;
 }
+
+/* The step of that function for one word, for constants. (The product has `fold` twice side by side, so that a shift
+ * rotates it.)
+ */
+#define COBOOT_FOLD(fold, word) \
+    (((uint32_t)((fold) * UINT64_C(0x100000001) >> (32 - COBOOT_CHECK_ROTATION)) ^ (uint32_t)(word)) \
+     * COBOOT_CHECK_FACTOR)
+
+/* ---- The label: whom the image is for, so that coflash and the bootloader refuse it for another device ---- */
+
+@LABEL@
+
+/* The label of this image, once in a program: COBOOT_LABEL(vendor-ID, product code, version). The first two are those of
+ * 1018h; 0 is any. The linker script puts the section `.label` at the symbol __label, behind the vectors.
+ */
+#define COBOOT_LABEL(vendor_id, product_code, version) \
+    __attribute__((section(".label"), used)) const struct coboot_label coboot_label_of_image = { \
+        COBOOT_LABEL_MAGIC, (vendor_id), (product_code), (version), { 0, 0, 0 }, \
+        COBOOT_LABEL_CHECK(vendor_id, product_code, version) \
+    }
+#define COBOOT_LABEL_CHECK(vendor_id, product_code, version) \
+    (~COBOOT_FOLD(COBOOT_FOLD(COBOOT_FOLD(COBOOT_FOLD(COBOOT_FOLD(COBOOT_FOLD(COBOOT_FOLD( \
+        COBOOT_CHECK_SEED, COBOOT_LABEL_MAGIC), vendor_id), product_code), version), 0), 0), 0))
+extern const struct coboot_label coboot_label_of_image;
 
 /* ---- The warm-start cell: what the application asks of the bootloader across a reset ---- */
 
@@ -141,7 +175,7 @@ static inline int32_t coboot_call(const struct coboot_callgate *gate, uint32_t s
 /* CRC-32/ISO-HDLC over flash: the function of 1F56h. */
 static inline int32_t coboot_crc32(const struct coboot_callgate *gate, uint32_t address, uint32_t len, uint32_t *crc)
 {
-    struct coboot_crc32_args args = { .address = address, .len = len };
+    struct coboot_crc32_args args = { address, len, 0 };
     int32_t status = coboot_call(gate, COBOOT_SELECTOR_CRC32, &args);
     *crc = args.crc;
     return status;
@@ -156,7 +190,7 @@ static inline int32_t coboot_read_node(const struct coboot_callgate *gate, struc
 /* Stores node-ID and bit rate; they are in force from the next reset on. */
 static inline int32_t coboot_store_node(const struct coboot_callgate *gate, uint32_t node_id, uint32_t bit_rate)
 {
-    struct coboot_node_args args = { .node_id = node_id, .bit_rate = bit_rate };
+    struct coboot_node_args args = { node_id, bit_rate };
     return coboot_call(gate, COBOOT_SELECTOR_STORE_NODE, &args);
 }
 
@@ -171,14 +205,14 @@ static inline int32_t coboot_program_info(const struct coboot_callgate *gate, ui
 /* Gives a program its signature: how a trial confirms itself. */
 static inline int32_t coboot_confirm(const struct coboot_callgate *gate, uint32_t number)
 {
-    struct coboot_program_args args = { .number = number };
+    struct coboot_program_args args = { number, 0, 0, 0, 0 };
     return coboot_call(gate, COBOOT_SELECTOR_CONFIRM, &args);
 }
 
 /* Takes a program's signature away: it does not start by itself any more. */
 static inline int32_t coboot_invalidate(const struct coboot_callgate *gate, uint32_t number)
 {
-    struct coboot_program_args args = { .number = number };
+    struct coboot_program_args args = { number, 0, 0, 0, 0 };
     return coboot_call(gate, COBOOT_SELECTOR_INVALIDATE, &args);
 }
 
@@ -186,7 +220,7 @@ static inline int32_t coboot_invalidate(const struct coboot_callgate *gate, uint
  * on the bus, then 10 ms in which requests are served. Who leaves with COBOOT_REQUEST_OWED does so
  * at once, and has not answered.
  */
-static inline _Noreturn void coboot_reset(uint32_t request, uint32_t argument)
+COBOOT_NORETURN static inline void coboot_reset(uint32_t request, uint32_t argument)
 {
     const struct coboot_warm_start cell = coboot_request(request, argument);
     __asm volatile("cpsid i" ::: "memory");
@@ -202,5 +236,9 @@ static inline _Noreturn void coboot_reset(uint32_t request, uint32_t argument)
     }
 }
 
+#endif
+
+#ifdef __cplusplus
+}
 #endif
 #endif

@@ -8,6 +8,7 @@ use std::mem::{offset_of, size_of};
 
 use shared_abi::callgate::{self, Crc32Args, NodeArgs, ProgramArgs, Selector, Status, Table};
 use shared_abi::handoff::{self, Handoff, ResetCause};
+use shared_abi::label::{self, Label};
 use shared_abi::warm_start::{self, BootRequest, Owed, StoredNode, WarmStart};
 
 use crate::args::Args;
@@ -17,10 +18,10 @@ pub const HELP: &str = "\
 usage: cargo xtask header
 
 Prints the C header of the ABI between bootloader and application, made from shared-abi: warm-start cell,
-handoff and callgate. It is the same for every board; addresses come from the linker, by the symbols that
-`cargo xtask layout --ld program-1` prints. app-c/coboot.h is a copy of it:
+handoff, callgate and label. It is the same for every board; addresses come from the linker, by the symbols that
+`cargo xtask layout --ld program-1` prints. app-c/coboot/coboot.h is a copy of it:
 
-    cargo xtask header > app-c/coboot.h
+    cargo xtask header > app-c/coboot/coboot.h
 ";
 
 /// The text of the header around its numbers.
@@ -43,6 +44,7 @@ pub fn header() -> String {
 fn parts() -> Vec<(&'static str, String)> {
     vec![
         ("CHECK", check()),
+        ("LABEL", label()),
         ("WARM_START", warm_start()),
         ("HANDOFF", handoff()),
         ("CALLGATE", callgate()),
@@ -80,7 +82,7 @@ macro_rules! structure {
 /// All fields of the ABI are unsigned numbers or arrays of words, so the size tells the type.
 fn structure(name: &str, size: usize, fields: &[Field]) -> String {
     let mut text = format!("struct {name} {{\n");
-    let mut assertions = format!("_Static_assert(sizeof(struct {name}) == {size}, \"{name}\");\n");
+    let mut assertions = format!("COBOOT_STATIC_ASSERT(sizeof(struct {name}) == {size}, \"{name}\");\n");
     for Field { name: field, offset, size } in fields {
         let _ = match size {
             1 => writeln!(text, "    uint8_t {field};"),
@@ -90,7 +92,7 @@ fn structure(name: &str, size: usize, fields: &[Field]) -> String {
         };
         let _ = writeln!(
             assertions,
-            "_Static_assert(offsetof(struct {name}, {field}) == {offset}, \"{name}: {field}\");"
+            "COBOOT_STATIC_ASSERT(offsetof(struct {name}, {field}) == {offset}, \"{name}: {field}\");"
         );
     }
     text + "};\n" + &assertions
@@ -111,6 +113,12 @@ fn check() -> String {
         ("CHECK_ROTATION", shared_abi::CHECK_ROTATION),
         ("CHECK_FACTOR", shared_abi::CHECK_FACTOR),
     ])
+}
+
+fn label() -> String {
+    defines([("LABEL_MAGIC", label::MAGIC)])
+        + "\n"
+        + &structure!("coboot_label", Label, magic, vendor_id, product_code, version, reserved, check)
 }
 
 /// Any owed answer: all have the same request.
@@ -243,8 +251,8 @@ mod tests {
 
     #[test]
     fn the_copy_in_the_c_application_is_up_to_date() {
-        let copy = fs::read_to_string(workspace::root().join("app-c/coboot.h")).unwrap();
-        assert!(copy == header(), "app-c/coboot.h is old: cargo xtask header > app-c/coboot.h");
+        let copy = fs::read_to_string(workspace::root().join("app-c/coboot/coboot.h")).unwrap();
+        assert!(copy == header(), "app-c/coboot/coboot.h is old: cargo xtask header > app-c/coboot/coboot.h");
     }
 
     #[test]
@@ -268,10 +276,10 @@ mod tests {
             "#define COBOOT_REQUEST_OWED UINT32_C(0x7)",
             "#define COBOOT_HANDOFF_FRESH UINT32_C(0x1)",
             "    uint32_t reserved[4];",
-            "_Static_assert(offsetof(struct coboot_handoff, flags) == 24, \"coboot_handoff: flags\");",
-            "_Static_assert(sizeof(struct coboot_handoff) == 48, \"coboot_handoff\");",
-            "_Static_assert(offsetof(struct coboot_handoff, reset_cause) == 10, \"coboot_handoff: reset_cause\");",
-            "_Static_assert(offsetof(struct coboot_callgate, entry) == 12, \"coboot_callgate: entry\");",
+            "COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, flags) == 24, \"coboot_handoff: flags\");",
+            "COBOOT_STATIC_ASSERT(sizeof(struct coboot_handoff) == 48, \"coboot_handoff\");",
+            "COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, reset_cause) == 10, \"coboot_handoff: reset_cause\");",
+            "COBOOT_STATIC_ASSERT(offsetof(struct coboot_callgate, entry) == 12, \"coboot_callgate: entry\");",
         ] {
             assert!(header.lines().any(|there| there == line), "{line}");
         }

@@ -19,6 +19,7 @@ mod docs;
 mod eds;
 mod elf;
 mod emulate;
+mod examples;
 mod fuzz;
 mod header;
 mod json;
@@ -100,6 +101,12 @@ const JOBS: &[Job] = &[
         about: "the C header of the ABI between bootloader and application",
         help: header::HELP,
         run: header::run,
+    },
+    Job {
+        name: "examples",
+        about: "the programs in examples/, each built by its own tools",
+        help: examples::HELP,
+        run: examples::run,
     },
     Job {
         name: "diagrams",

@@ -272,7 +272,7 @@ mod tests {
             features: features.map(str::to_owned).into(),
         };
         let names: BTreeSet<String> = closure(&released).unwrap().into_iter().map(|(name, _)| name).collect();
-        for name in ["bootloader", "boot-core", "canopen", "cortex-m-rt", "rtic", "bxcan", "syn"] {
+        for name in ["bootloader", "coboot-core", "coboot-canopen", "cortex-m-rt", "rtic", "bxcan", "syn"] {
             assert!(names.contains(name), "{name}: {names:?}");
         }
         for name in ["unicorn-engine", "coflash", "proptest"] {

@@ -18,7 +18,7 @@ usage: cargo xtask setup [--yes]
 
 Brings the machine to where every other job runs: the Rust target thumbv7em-none-eabihf, rustfmt and
 clippy (by rustup); cmake, make, pkg-config and libclang to build the emulator's CPU, clang for the application
-in C, gdb-multiarch, chromium for the tests of the page, python3 with venv (by apt-get); and a Python environment in target/python with tests/python/requirements.txt.
+in C, gcc-arm-none-eabi for the examples, gdb-multiarch, chromium for the tests of the page, python3 with venv (by apt-get); and a Python environment in target/python with tests/python/requirements.txt.
 
 The other jobs do this themselves, each for what it needs. As root it installs what is missing; for
 anyone else it stops with the line to run, or, with --yes, runs that line.
@@ -33,6 +33,8 @@ pub enum Part {
     Firmware,
     /// The application in C: a compiler for the chip.
     C,
+    /// The examples in C and C++: two compilers for the chip, and CMake.
+    Examples,
     /// The emulator: Unicorn is C built by cmake, and its bindings are made with libclang.
     Emulator,
     /// The third-party CANopen client: a Python environment.
@@ -57,6 +59,7 @@ pub fn run(mut args: Args) -> Outcome {
     setup.prepare(&[
         Part::Firmware,
         Part::C,
+        Part::Examples,
         Part::Emulator,
         Part::Python,
         Part::Gdb,
@@ -159,6 +162,7 @@ enum Tool {
     PkgConfig,
     Libclang,
     Clang,
+    ArmGcc,
     Python,
     Venv,
     Gdb,
@@ -175,6 +179,7 @@ impl Tool {
             Self::PkgConfig => "pkg-config",
             Self::Libclang => "libclang-dev",
             Self::Clang => "clang",
+            Self::ArmGcc => "gcc-arm-none-eabi",
             Self::Python => "python3",
             Self::Venv => "python3-venv",
             Self::Gdb => "gdb-multiarch",
@@ -202,6 +207,8 @@ impl Tool {
                 let arm = ["--target=thumbv7em-none-eabi", "-E", "-x", "c", "/dev/null"];
                 process::succeeds(process::clang().get_program(), &arm)
             }
+            // C and C++ without their libraries, which are ten times as large: the examples need none.
+            Self::ArmGcc => process::succeeds("arm-none-eabi-g++", &["--version"]),
             Self::Python => process::succeeds("python3", &["--version"]),
             // Debian's python3 comes without ensurepip.
             Self::Venv => process::succeeds("python3", &["-c", "import venv, ensurepip"]),
@@ -224,6 +231,7 @@ fn missing_packages(parts: &[Part], is_there: impl Fn(Tool) -> bool) -> Vec<&'st
         tools.extend_from_slice(match part {
             Part::Emulator => &[Tool::CCompiler, Tool::Make, Tool::Cmake, Tool::PkgConfig, Tool::Libclang],
             Part::C => &[Tool::Clang],
+            Part::Examples => &[Tool::ArmGcc, Tool::Clang, Tool::Make, Tool::Cmake],
             Part::Gdb => &[Tool::Gdb],
             Part::Browser => &[Tool::Chromium],
             Part::Python if !python_environment_is_there() => &[Tool::Python, Tool::Venv],
@@ -415,6 +423,10 @@ mod tests {
             ["cmake", "libclang-dev"]
         );
         assert_eq!(missing_packages(&[Part::C], nothing), ["clang"]);
+        assert_eq!(
+            missing_packages(&[Part::Examples, Part::C], nothing),
+            ["clang", "cmake", "gcc-arm-none-eabi", "make"]
+        );
         assert_eq!(missing_packages(&[Part::Browser], nothing), ["chromium"]);
         assert!(missing_packages(&[Part::C, Part::Emulator, Part::Python], |_| true).is_empty());
     }

@@ -9,7 +9,7 @@ use shared_abi::layout::{stm32f407g_disc1_can2, Layout, BOARDS};
 
 use crate::args::Args;
 use crate::setup::{self, Part, Setup};
-use crate::{build, process, workspace, Outcome};
+use crate::{build, examples, process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask test [--board BOARD] [--yes] [ARGS]
@@ -20,7 +20,7 @@ among those with the firmware of every other board.
 
   --board BOARD   only the tests that run firmware, all of them, with that of this board
   --yes           installs what is missing with sudo
-  ARGS            go to cargo test: `cargo xtask test -p canopen sdo`, `cargo xtask test -- --nocapture`
+  ARGS            go to cargo test: `cargo xtask test -p coboot-canopen sdo`, `cargo xtask test -- --nocapture`
 
 The tests find what was built by these variables: COBOOT_BOARD, COBOOT_FIRMWARE_DIR (bootloader.elf,
 app-v1.elf, app-v2.elf, app-c.elf), COBOOT_COFLASH (the command line of the host tool), COBOOT_NODE (the node
@@ -31,16 +31,28 @@ pub fn run(mut args: Args) -> Outcome {
     let chosen_board = args.has("--board");
     let board = workspace::board(&mut args)?;
     let setup = Setup::from(&mut args);
-    setup.prepare(&[Part::Firmware, Part::C, Part::Emulator, Part::Python, Part::Gdb, Part::Browser])?;
-    build::all(board)?;
-    build::c_applications(board)?;
-    // And one board with room for two programs, for the tests of that.
-    for two in BOARDS.iter().filter(|other| other.programs.len() > 1 && other.board != board.board) {
-        build::all(two)?;
-        build::c_applications(two)?;
-    }
+    setup.prepare(&[
+        Part::Firmware,
+        Part::C,
+        Part::Examples,
+        Part::Emulator,
+        Part::Python,
+        Part::Gdb,
+        Part::Browser,
+    ])?;
+    let chosen = args.rest();
+    // A run without arguments takes the main tests through the other chips, too.
+    let others: Vec<&Layout> = BOARDS
+        .iter()
+        .copied()
+        .filter(|other| !chosen_board && chosen.is_empty() && other.chip.chip != board.chip.chip)
+        .collect();
+    // The boards with room for two programs are for the tests of that.
+    let two = BOARDS.iter().copied().filter(|other| other.programs.len() > 1 && other.board != board.board);
+    build::boards(&[board].into_iter().chain(two).chain(others.iter().copied()).collect::<Vec<_>>())?;
     // And one that talks through CAN2.
     build::images(&stm32f407g_disc1_can2::LAYOUT, &build::MAIN)?;
+    examples::all()?;
     let programs = ["--package", "coflash", "--package", "coboot-node"];
     process::run(process::cargo("build").current_dir(workspace::root()).args(programs))?;
     let built = |name: &str| {
@@ -52,20 +64,15 @@ pub fn run(mut args: Args) -> Outcome {
     let python = setup::python().into_os_string();
     let mut suite =
         Suite { summary: Summary::default(), coflash: built("coflash"), node: built("coboot-node"), python };
-    let chosen = args.rest();
     if chosen_board {
         suite.run(board, &[build::tests_args(board), chosen].concat())?;
-    } else if chosen.is_empty() {
-        suite.run(board, &[])?;
-        for other in BOARDS.iter().filter(|other| other.chip.chip != board.chip.chip) {
-            build::all(other)?;
-            build::c_applications(other)?;
+    } else {
+        suite.run(board, &chosen)?;
+        for other in others {
             println!("\n-- {} --", other.board);
             let tests = MAIN_TESTS.iter().map(|test| format!("--test={test}"));
             suite.run(other, &build::tests_args(other).into_iter().chain(tests).collect::<Vec<_>>())?;
         }
-    } else {
-        suite.run(board, &chosen)?;
     }
     let summary = suite.summary;
 

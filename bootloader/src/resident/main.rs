@@ -15,7 +15,7 @@
 //! | `caches.rs` | the caches of the flash, off or on for a while | registers |
 //!
 //! It is a program of its own, so that the linker can see that it has no variables: nothing but the
-//! stack and its own code is there when it runs. `linker/build.rs` builds it, and the bootloader
+//! stack and its own code is there when it runs. `build.rs` builds it, and the bootloader
 //! carries it as bytes.
 #![no_std]
 #![no_main]

@@ -1,7 +1,7 @@
 //! Firmware files: read, checked, converted and written. No device, and no bus.
 
 pub mod block_file;
-pub mod board;
+pub use coboot_linker::board;
 pub mod convert;
 pub mod elf;
 pub mod fault;

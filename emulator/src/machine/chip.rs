@@ -287,7 +287,7 @@ impl Chip {
             clocks: rcc.clocks(),
             rcc,
             iwdg: Iwdg::default(),
-            gpio: ('A'..='K').take(variant.ports).map(Gpio::new).collect(),
+            gpio: ('A'..='K').take(geometry.ports.into()).map(Gpio::new).collect(),
             can: [BxCan::new(), BxCan::slave()],
             usarts: usart::INSTANCES.each_ref().map(Usart::new),
             pwr: Pwr::new(variant),

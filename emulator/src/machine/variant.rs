@@ -1,7 +1,7 @@
-//! What differs between the chips beside memories and interrupt lines: which registers and bits
-//! exist, and what they say of themselves. Other chips of the family go by the STM32F407.
+//! What differs between the lines of the family beside what `shared_abi::geometry` has: which
+//! registers and bits exist, and what they say of themselves.
 
-use shared_abi::geometry::Geometry;
+use shared_abi::geometry::{Geometry, Line};
 
 /// A register of RCC that is kept as written: (offset, reset value, bits that exist).
 pub type Plain = (u32, u32, u32);
@@ -13,19 +13,16 @@ pub struct Variant {
     pub name: &'static str,
     /// DBGMCU_IDCODE: device and revision.
     pub idcode: u32,
-    /// How many GPIO ports there are, from A on.
-    pub ports: usize,
     /// PWR_CR.VOS, and its value after a reset.
     pub voltage_scale: (u32, u32),
     /// The plain registers of RCC.
     pub rcc: &'static [Plain],
 }
 
-/// STM32F405/407, device 413h, revision Y (RM0090 section 38.6.1). Registers: sections 5 and 7.
+/// STM32F405/407/415/417, device 413h, revision Y (RM0090 section 38.6.1). Registers: sections 5 and 7.
 static F407: Variant = Variant {
     name: "STM32F407",
     idcode: 0x100F_6413,
-    ports: 9,
     voltage_scale: (1 << 14, 1 << 14),
     rcc: &[
         (0x10, 0, 0x2260_11FF),           // AHB1RSTR
@@ -53,7 +50,6 @@ static F407: Variant = Variant {
 static F429: Variant = Variant {
     name: "STM32F429",
     idcode: 0x2001_6419,
-    ports: 11,
     voltage_scale: (3 << 14, 3 << 14),
     rcc: &[
         (0x10, 0, 0x22E0_17FF),           // AHB1RSTR
@@ -85,7 +81,6 @@ static F429: Variant = Variant {
 static F446: Variant = Variant {
     name: "STM32F446",
     idcode: 0x1000_6421,
-    ports: 8,
     voltage_scale: (3 << 14, 3 << 14),
     rcc: &[
         (0x10, 0, 0x2060_10FF),           // AHB1RSTR
@@ -113,34 +108,147 @@ static F446: Variant = Variant {
     ],
 };
 
+/// STM32F412, device 441h, revision C (RM0402 section 30.6.1). Bits of the registers as the PAC has
+/// them; a reset leaves the regulator at scale 2 (RM0402, PWR_CR).
+static F412: Variant = Variant {
+    name: "STM32F412",
+    idcode: 0x3000_6441,
+    voltage_scale: (3 << 14, 2 << 14),
+    rcc: &[
+        (0x10, 0, 0x0060_10FF),           // AHB1RSTR
+        (0x14, 0, 0x0000_00C0),           // AHB2RSTR
+        (0x18, 0, 0x0000_0003),           // AHB3RSTR
+        (0x20, 0, 0x17E6_C9FF),           // APB1RSTR
+        (0x24, 0, 0x0117_7933),           // APB2RSTR
+        (0x30, 0x0010_0000, 0x0070_10FF), // AHB1ENR
+        (0x34, 0, 0x0000_00C0),           // AHB2ENR
+        (0x38, 0, 0x0000_0003),           // AHB3ENR
+        (0x40, 0, 0x17E6_CDFF),           // APB1ENR
+        (0x44, 0, 0x0117_F933),           // APB2ENR
+        (0x50, 0x0061_90FF, 0x0061_90FF), // AHB1LPENR
+        (0x54, 0x0000_00C0, 0x0000_00C0), // AHB2LPENR
+        (0x58, 0x0000_0003, 0x0000_0003), // AHB3LPENR
+        (0x60, 0x17E6_CDFF, 0x17E6_CDFF), // APB1LPENR
+        (0x64, 0x0117_F933, 0x0117_F933), // APB2LPENR
+        (0x80, 0, 0xFFFF_FFFF),           // SSCGR
+        (0x84, 0x2400_3000, 0x7F40_7FFF), // PLLI2SCFGR
+        (0x8C, 0, 0x9F00_8000),           // DCKCFGR
+        (0x90, 0, 0x0000_00FF),           // CKGATENR
+        (0x94, 0, 0x18C0_0000),           // DCKCFGR2
+        (0x04, 0x2400_3010, 0x7F43_7FFF), // PLLCFGR
+    ],
+};
+
+/// STM32F413/423, device 463h, revision A (RM0430, DBGMCU_IDCODE). As for the F412.
+static F413: Variant = Variant {
+    name: "STM32F413",
+    idcode: 0x1000_6463,
+    voltage_scale: (3 << 14, 2 << 14),
+    rcc: &[
+        (0x10, 0, 0x0060_10FF),           // AHB1RSTR
+        (0x14, 0, 0x0000_00D0),           // AHB2RSTR
+        (0x18, 0, 0x0000_0003),           // AHB3RSTR
+        (0x20, 0, 0xFFFE_CBFF),           // APB1RSTR
+        (0x24, 0, 0x0357_79F3),           // APB2RSTR
+        (0x30, 0x0010_0000, 0x0070_10FF), // AHB1ENR
+        (0x34, 0, 0x0000_00D0),           // AHB2ENR
+        (0x38, 0, 0x0000_0003),           // AHB3ENR
+        (0x40, 0, 0xFFFE_CFFF),           // APB1ENR
+        (0x44, 0, 0x0357_F9F3),           // APB2ENR
+        (0x50, 0x0063_90FF, 0x0063_90FF), // AHB1LPENR
+        (0x54, 0x0000_00D0, 0x0000_00D0), // AHB2LPENR
+        (0x58, 0x0000_0003, 0x0000_0003), // AHB3LPENR
+        (0x60, 0xFFFE_CFFF, 0xFFFE_CFFF), // APB1LPENR
+        (0x64, 0x0357_F9F3, 0x0357_F9F3), // APB2LPENR
+        (0x80, 0, 0xFFFF_FFFF),           // SSCGR
+        (0x84, 0x2400_3000, 0x7F40_7FFF), // PLLI2SCFGR
+        (0x8C, 0, 0x9FF0_DF1F),           // DCKCFGR
+        (0x90, 0, 0x0000_00FF),           // CKGATENR
+        (0x94, 0, 0xD8C0_0000),           // DCKCFGR2
+        (0x04, 0x2400_3010, 0x7F43_7FFF), // PLLCFGR
+    ],
+};
+
+/// STM32F469/479, device 434h, revision A (RM0386, DBGMCU_IDCODE). Bits of the registers as the PAC
+/// has them.
+static F469: Variant = Variant {
+    name: "STM32F469",
+    idcode: 0x1000_6434,
+    voltage_scale: (3 << 14, 3 << 14),
+    rcc: &[
+        (0x10, 0, 0x22E0_17FF),           // AHB1RSTR
+        (0x14, 0, 0x0000_00F1),           // AHB2RSTR
+        (0x18, 0, 0x0000_0003),           // AHB3RSTR
+        (0x20, 0, 0xF6FE_C9FF),           // APB1RSTR
+        (0x24, 0, 0x0C77_7933),           // APB2RSTR
+        (0x30, 0x0010_0000, 0x7EF4_17FF), // AHB1ENR
+        (0x34, 0, 0x0000_00F1),           // AHB2ENR
+        (0x38, 0, 0x0000_0003),           // AHB3ENR
+        (0x40, 0, 0xF6FE_C9FF),           // APB1ENR
+        (0x44, 0, 0x0C77_7F33),           // APB2ENR
+        (0x50, 0x7EEF_97FF, 0x7EEF_97FF), // AHB1LPENR
+        (0x54, 0x0000_00F1, 0x0000_00F1), // AHB2LPENR
+        (0x58, 0x0000_0003, 0x0000_0003), // AHB3LPENR
+        (0x60, 0xF6FE_C9FF, 0xF6FE_C9FF), // APB1LPENR
+        (0x64, 0x0C77_7F33, 0x0C77_7F33), // APB2LPENR
+        (0x80, 0, 0xFFFF_FFFF),           // SSCGR
+        (0x84, 0x2000_3000, 0x7F00_7FC0), // PLLI2SCFGR
+        (0x88, 0x2400_3000, 0x7F03_7FC0), // PLLSAICFGR
+        (0x8C, 0, 0x39F3_1F1F),           // DCKCFGR
+        (0x04, 0x2400_3010, 0x7F43_7FFF), // PLLCFGR
+    ],
+};
+
 /// The variant of a chip.
 #[must_use]
 pub fn of(chip: &Geometry) -> &'static Variant {
-    match chip.line() {
-        "stm32f446" => &F446,
-        "stm32f427" | "stm32f429" | "stm32f437" | "stm32f439" => &F429,
-        _ => &F407,
+    match chip.line {
+        Line::F405 | Line::F407 | Line::F415 | Line::F417 => &F407,
+        Line::F412 => &F412,
+        Line::F413 | Line::F423 => &F413,
+        Line::F427 | Line::F429 | Line::F437 | Line::F439 => &F429,
+        Line::F446 => &F446,
+        Line::F469 | Line::F479 => &F469,
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use shared_abi::geometry::{STM32F407VG, STM32F429ZI, STM32F446RE};
+    use shared_abi::geometry::{Line, CHIPS};
 
     use super::*;
 
+    /// Device identifiers: RM0090 section 38.6.1, RM0402, RM0430, RM0390 and RM0386, DBGMCU_IDCODE.
     #[test]
     fn each_chip_has_its_own() {
-        // Device identifiers: RM0090 section 38.6.1, RM0390, DBGMCU_IDCODE.
-        for (chip, device) in [(&STM32F407VG, 0x413), (&STM32F429ZI, 0x419), (&STM32F446RE, 0x421)] {
+        for chip in CHIPS {
+            let device = match &chip.chip[7..9] {
+                "05" | "07" | "15" | "17" => 0x413,
+                "27" | "29" | "37" | "39" => 0x419,
+                "46" => 0x421,
+                "69" | "79" => 0x434,
+                "12" => 0x441,
+                "13" | "23" => 0x463,
+                other => panic!("{other}"),
+            };
             assert_eq!(of(chip).idcode & 0xFFF, device, "{}", chip.chip);
+        }
+    }
+
+    /// Each line has a port for each bit of AHB1ENR below that of the CRC, and no other.
+    #[test]
+    fn the_ports_of_a_line_have_clocks() {
+        for line in Line::ALL {
+            let chip = CHIPS.iter().find(|chip| chip.line == line).expect("every line has a chip");
+            let (.., clocks) = of(chip).rcc.iter().find(|&&(at, ..)| at == 0x30).expect("AHB1ENR");
+            assert_eq!(clocks & 0xFFF, (1 << chip.ports) - 1, "{}", line.name());
         }
     }
 
     /// Where a bit resets a block, a bit enables it.
     #[test]
     fn the_reset_bits_of_a_block_have_clocks() {
-        for variant in [&F407, &F429, &F446] {
+        for variant in [&F407, &F412, &F413, &F429, &F446, &F469] {
             let mask =
                 |offset| variant.rcc.iter().find(|&&(at, ..)| at == offset).map_or(0, |&(.., mask)| mask);
             for reset in [0x10, 0x14, 0x18, 0x20, 0x24] {

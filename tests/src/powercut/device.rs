@@ -87,7 +87,8 @@ static ESACADEMY: Config = Config {
 };
 static HASTY: Config = Config { download: Policy { erase: |_| Erase::AtOnce, ..CONFIG.download }, ..CONFIG };
 
-const DECISION: decision::Policy = decision::Policy {
+/// How a device of these tests decides what starts: program 1 by itself, and no rescue window.
+pub const DECISION: decision::Policy = decision::Policy {
     autostart: Some(1),
     max_crash_resets: 3,
     node_ids: 1..=127,

@@ -3,7 +3,7 @@
 
 use canopen::program::ProgramControl;
 use canopen::BitRate;
-use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::bench::{Bench, REQUEST, RESPONSE};
 use coboot_tests::firmware;
 use coboot_tests::sealed_board::{board, open_board, provision, release, sealer, write, COUNTER, KEK};
 use coboot_tests::throughput::{change_over, code};
@@ -16,8 +16,6 @@ use object::{Endianness, Object, ObjectSection, SectionFlags};
 
 use super::{call_back, kinds, start, status};
 
-const REQUEST: u16 = 0x600 + NODE as u16;
-const RESPONSE: u32 = 0x580 + NODE as u32;
 const READ_1000: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
 const READ_STATUS: [u8; 8] = [0x40, 0x57, 0x1F, 1, 0, 0, 0, 0];
 

@@ -1,6 +1,6 @@
 /* What coboot and an application in C must agree on. Made from shared-abi by `cargo xtask header`: change it there.
  *
- * C11, freestanding, no library. Addresses come from the linker: `cargo xtask layout --ld program-1` prints the
+ * C11 or C++17, freestanding, no library. Addresses come from the linker: `cargo xtask layout --ld program-1` prints the
  * symbols __handoff, __warm_start and __callgate_table of a board. The functions that need the chip are there when
  * the compiler's target is Arm; the rest works on any machine.
  */
@@ -11,6 +11,16 @@
 #include <stddef.h>
 #include <stdint.h>
 
+/* What C and C++ spell differently. */
+#ifdef __cplusplus
+#define COBOOT_STATIC_ASSERT static_assert
+#define COBOOT_NORETURN [[noreturn]]
+extern "C" {
+#else
+#define COBOOT_STATIC_ASSERT _Static_assert
+#define COBOOT_NORETURN _Noreturn
+#endif
+
 /* The check word that guards a record in RAM. It tells a record from the noise of an unpowered RAM. */
 
 #define COBOOT_CHECK_SEED UINT32_C(0xC0B007A5)
@@ -20,7 +30,7 @@
 /* Over so many words. They are put together from bytes: records have smaller fields, too. */
 static inline uint32_t coboot_check_word(const void *record, size_t words)
 {
-    const unsigned char *byte = record;
+    const unsigned char *byte = (const unsigned char *)record;
     uint32_t fold = COBOOT_CHECK_SEED;
     for (size_t i = 0; i < words; i++, byte += 4) {
         uint32_t word = byte[0] | (uint32_t)byte[1] << 8 | (uint32_t)byte[2] << 16 | (uint32_t)byte[3] << 24;
@@ -29,6 +39,46 @@ static inline uint32_t coboot_check_word(const void *record, size_t words)
     }
     return ~fold;
 }
+
+/* The step of that function for one word, for constants. (The product has `fold` twice side by side, so that a shift
+ * rotates it.)
+ */
+#define COBOOT_FOLD(fold, word) \
+    (((uint32_t)((fold) * UINT64_C(0x100000001) >> (32 - COBOOT_CHECK_ROTATION)) ^ (uint32_t)(word)) \
+     * COBOOT_CHECK_FACTOR)
+
+/* ---- The label: whom the image is for, so that coflash and the bootloader refuse it for another device ---- */
+
+#define COBOOT_LABEL_MAGIC UINT32_C(0x314C4243)
+
+struct coboot_label {
+    uint32_t magic;
+    uint32_t vendor_id;
+    uint32_t product_code;
+    uint32_t version;
+    uint32_t reserved[3];
+    uint32_t check;
+};
+COBOOT_STATIC_ASSERT(sizeof(struct coboot_label) == 32, "coboot_label");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, magic) == 0, "coboot_label: magic");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, vendor_id) == 4, "coboot_label: vendor_id");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, product_code) == 8, "coboot_label: product_code");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, version) == 12, "coboot_label: version");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, reserved) == 16, "coboot_label: reserved");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, check) == 28, "coboot_label: check");
+
+/* The label of this image, once in a program: COBOOT_LABEL(vendor-ID, product code, version). The first two are those of
+ * 1018h; 0 is any. The linker script puts the section `.label` at the symbol __label, behind the vectors.
+ */
+#define COBOOT_LABEL(vendor_id, product_code, version) \
+    __attribute__((section(".label"), used)) const struct coboot_label coboot_label_of_image = { \
+        COBOOT_LABEL_MAGIC, (vendor_id), (product_code), (version), { 0, 0, 0 }, \
+        COBOOT_LABEL_CHECK(vendor_id, product_code, version) \
+    }
+#define COBOOT_LABEL_CHECK(vendor_id, product_code, version) \
+    (~COBOOT_FOLD(COBOOT_FOLD(COBOOT_FOLD(COBOOT_FOLD(COBOOT_FOLD(COBOOT_FOLD(COBOOT_FOLD( \
+        COBOOT_CHECK_SEED, COBOOT_LABEL_MAGIC), vendor_id), product_code), version), 0), 0), 0))
+extern const struct coboot_label coboot_label_of_image;
 
 /* ---- The warm-start cell: what the application asks of the bootloader across a reset ---- */
 
@@ -52,11 +102,11 @@ struct coboot_warm_start {
     uint32_t argument;
     uint32_t check;
 };
-_Static_assert(sizeof(struct coboot_warm_start) == 16, "coboot_warm_start");
-_Static_assert(offsetof(struct coboot_warm_start, magic) == 0, "coboot_warm_start: magic");
-_Static_assert(offsetof(struct coboot_warm_start, request) == 4, "coboot_warm_start: request");
-_Static_assert(offsetof(struct coboot_warm_start, argument) == 8, "coboot_warm_start: argument");
-_Static_assert(offsetof(struct coboot_warm_start, check) == 12, "coboot_warm_start: check");
+COBOOT_STATIC_ASSERT(sizeof(struct coboot_warm_start) == 16, "coboot_warm_start");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_warm_start, magic) == 0, "coboot_warm_start: magic");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_warm_start, request) == 4, "coboot_warm_start: request");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_warm_start, argument) == 8, "coboot_warm_start: argument");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_warm_start, check) == 12, "coboot_warm_start: check");
 
 /* The argument of COBOOT_REQUEST_OWED: node `node_id` was written `value` (0 STOP or 3 CLEAR) to 1F51h, sub-index `program`,
  * and has not answered. The bootloader serves the request behind its boot-up, if it comes up with this node-ID.
@@ -114,20 +164,20 @@ struct coboot_handoff {
     uint32_t reserved[4];
     uint32_t check;
 };
-_Static_assert(sizeof(struct coboot_handoff) == 48, "coboot_handoff");
-_Static_assert(offsetof(struct coboot_handoff, magic) == 0, "coboot_handoff: magic");
-_Static_assert(offsetof(struct coboot_handoff, version) == 4, "coboot_handoff: version");
-_Static_assert(offsetof(struct coboot_handoff, length) == 6, "coboot_handoff: length");
-_Static_assert(offsetof(struct coboot_handoff, node_id) == 8, "coboot_handoff: node_id");
-_Static_assert(offsetof(struct coboot_handoff, program) == 9, "coboot_handoff: program");
-_Static_assert(offsetof(struct coboot_handoff, reset_cause) == 10, "coboot_handoff: reset_cause");
-_Static_assert(offsetof(struct coboot_handoff, trial) == 11, "coboot_handoff: trial");
-_Static_assert(offsetof(struct coboot_handoff, bit_rate) == 12, "coboot_handoff: bit_rate");
-_Static_assert(offsetof(struct coboot_handoff, bootloader_version) == 16, "coboot_handoff: bootloader_version");
-_Static_assert(offsetof(struct coboot_handoff, serial_number) == 20, "coboot_handoff: serial_number");
-_Static_assert(offsetof(struct coboot_handoff, flags) == 24, "coboot_handoff: flags");
-_Static_assert(offsetof(struct coboot_handoff, reserved) == 28, "coboot_handoff: reserved");
-_Static_assert(offsetof(struct coboot_handoff, check) == 44, "coboot_handoff: check");
+COBOOT_STATIC_ASSERT(sizeof(struct coboot_handoff) == 48, "coboot_handoff");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, magic) == 0, "coboot_handoff: magic");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, version) == 4, "coboot_handoff: version");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, length) == 6, "coboot_handoff: length");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, node_id) == 8, "coboot_handoff: node_id");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, program) == 9, "coboot_handoff: program");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, reset_cause) == 10, "coboot_handoff: reset_cause");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, trial) == 11, "coboot_handoff: trial");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, bit_rate) == 12, "coboot_handoff: bit_rate");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, bootloader_version) == 16, "coboot_handoff: bootloader_version");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, serial_number) == 20, "coboot_handoff: serial_number");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, flags) == 24, "coboot_handoff: flags");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, reserved) == 28, "coboot_handoff: reserved");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, check) == 44, "coboot_handoff: check");
 
 /* Whether a bootloader wrote it, and it is whole. Later versions only give names to reserved words. */
 static inline bool coboot_handoff_is_sound(const struct coboot_handoff *handoff)
@@ -167,12 +217,12 @@ struct coboot_callgate {
     uint32_t bootloader_version;
     uint32_t entry;
 };
-_Static_assert(sizeof(struct coboot_callgate) == 16, "coboot_callgate");
-_Static_assert(offsetof(struct coboot_callgate, magic) == 0, "coboot_callgate: magic");
-_Static_assert(offsetof(struct coboot_callgate, abi_version) == 4, "coboot_callgate: abi_version");
-_Static_assert(offsetof(struct coboot_callgate, length) == 6, "coboot_callgate: length");
-_Static_assert(offsetof(struct coboot_callgate, bootloader_version) == 8, "coboot_callgate: bootloader_version");
-_Static_assert(offsetof(struct coboot_callgate, entry) == 12, "coboot_callgate: entry");
+COBOOT_STATIC_ASSERT(sizeof(struct coboot_callgate) == 16, "coboot_callgate");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_callgate, magic) == 0, "coboot_callgate: magic");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_callgate, abi_version) == 4, "coboot_callgate: abi_version");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_callgate, length) == 6, "coboot_callgate: length");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_callgate, bootloader_version) == 8, "coboot_callgate: bootloader_version");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_callgate, entry) == 12, "coboot_callgate: entry");
 
 /* What can be called. */
 #define COBOOT_SELECTOR_CRC32 UINT32_C(0x1)
@@ -188,10 +238,10 @@ struct coboot_crc32_args {
     uint32_t len;
     uint32_t crc;
 };
-_Static_assert(sizeof(struct coboot_crc32_args) == 12, "coboot_crc32_args");
-_Static_assert(offsetof(struct coboot_crc32_args, address) == 0, "coboot_crc32_args: address");
-_Static_assert(offsetof(struct coboot_crc32_args, len) == 4, "coboot_crc32_args: len");
-_Static_assert(offsetof(struct coboot_crc32_args, crc) == 8, "coboot_crc32_args: crc");
+COBOOT_STATIC_ASSERT(sizeof(struct coboot_crc32_args) == 12, "coboot_crc32_args");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_crc32_args, address) == 0, "coboot_crc32_args: address");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_crc32_args, len) == 4, "coboot_crc32_args: len");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_crc32_args, crc) == 8, "coboot_crc32_args: crc");
 
 /* COBOOT_SELECTOR_READ_NODE and _STORE_NODE: node-ID 1 to 127, or 255 for none; bit rate in bit/s, 0 for one to be found
  * out by listening. */
@@ -199,9 +249,9 @@ struct coboot_node_args {
     uint32_t node_id;
     uint32_t bit_rate;
 };
-_Static_assert(sizeof(struct coboot_node_args) == 8, "coboot_node_args");
-_Static_assert(offsetof(struct coboot_node_args, node_id) == 0, "coboot_node_args: node_id");
-_Static_assert(offsetof(struct coboot_node_args, bit_rate) == 4, "coboot_node_args: bit_rate");
+COBOOT_STATIC_ASSERT(sizeof(struct coboot_node_args) == 8, "coboot_node_args");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_node_args, node_id) == 0, "coboot_node_args: node_id");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_node_args, bit_rate) == 4, "coboot_node_args: bit_rate");
 
 /* COBOOT_SELECTOR_PROGRAM_INFO, _CONFIRM and _INVALIDATE: about program `number`; the first gives the rest. */
 struct coboot_program_args {
@@ -211,12 +261,12 @@ struct coboot_program_args {
     uint32_t version;
     uint32_t flags;
 };
-_Static_assert(sizeof(struct coboot_program_args) == 20, "coboot_program_args");
-_Static_assert(offsetof(struct coboot_program_args, number) == 0, "coboot_program_args: number");
-_Static_assert(offsetof(struct coboot_program_args, size) == 4, "coboot_program_args: size");
-_Static_assert(offsetof(struct coboot_program_args, crc) == 8, "coboot_program_args: crc");
-_Static_assert(offsetof(struct coboot_program_args, version) == 12, "coboot_program_args: version");
-_Static_assert(offsetof(struct coboot_program_args, flags) == 16, "coboot_program_args: flags");
+COBOOT_STATIC_ASSERT(sizeof(struct coboot_program_args) == 20, "coboot_program_args");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_program_args, number) == 0, "coboot_program_args: number");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_program_args, size) == 4, "coboot_program_args: size");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_program_args, crc) == 8, "coboot_program_args: crc");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_program_args, version) == 12, "coboot_program_args: version");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_program_args, flags) == 16, "coboot_program_args: flags");
 
 /* In `flags`: downloaded completely and right; signed, so that it starts by itself. */
 #define COBOOT_PROGRAM_INSTALLED UINT32_C(0x1)
@@ -282,7 +332,7 @@ static inline int32_t coboot_call(const struct coboot_callgate *gate, uint32_t s
 /* CRC-32/ISO-HDLC over flash: the function of 1F56h. */
 static inline int32_t coboot_crc32(const struct coboot_callgate *gate, uint32_t address, uint32_t len, uint32_t *crc)
 {
-    struct coboot_crc32_args args = { .address = address, .len = len };
+    struct coboot_crc32_args args = { address, len, 0 };
     int32_t status = coboot_call(gate, COBOOT_SELECTOR_CRC32, &args);
     *crc = args.crc;
     return status;
@@ -297,7 +347,7 @@ static inline int32_t coboot_read_node(const struct coboot_callgate *gate, struc
 /* Stores node-ID and bit rate; they are in force from the next reset on. */
 static inline int32_t coboot_store_node(const struct coboot_callgate *gate, uint32_t node_id, uint32_t bit_rate)
 {
-    struct coboot_node_args args = { .node_id = node_id, .bit_rate = bit_rate };
+    struct coboot_node_args args = { node_id, bit_rate };
     return coboot_call(gate, COBOOT_SELECTOR_STORE_NODE, &args);
 }
 
@@ -312,14 +362,14 @@ static inline int32_t coboot_program_info(const struct coboot_callgate *gate, ui
 /* Gives a program its signature: how a trial confirms itself. */
 static inline int32_t coboot_confirm(const struct coboot_callgate *gate, uint32_t number)
 {
-    struct coboot_program_args args = { .number = number };
+    struct coboot_program_args args = { number, 0, 0, 0, 0 };
     return coboot_call(gate, COBOOT_SELECTOR_CONFIRM, &args);
 }
 
 /* Takes a program's signature away: it does not start by itself any more. */
 static inline int32_t coboot_invalidate(const struct coboot_callgate *gate, uint32_t number)
 {
-    struct coboot_program_args args = { .number = number };
+    struct coboot_program_args args = { number, 0, 0, 0, 0 };
     return coboot_call(gate, COBOOT_SELECTOR_INVALIDATE, &args);
 }
 
@@ -327,7 +377,7 @@ static inline int32_t coboot_invalidate(const struct coboot_callgate *gate, uint
  * on the bus, then 10 ms in which requests are served. Who leaves with COBOOT_REQUEST_OWED does so
  * at once, and has not answered.
  */
-static inline _Noreturn void coboot_reset(uint32_t request, uint32_t argument)
+COBOOT_NORETURN static inline void coboot_reset(uint32_t request, uint32_t argument)
 {
     const struct coboot_warm_start cell = coboot_request(request, argument);
     __asm volatile("cpsid i" ::: "memory");
@@ -343,5 +393,9 @@ static inline _Noreturn void coboot_reset(uint32_t request, uint32_t argument)
     }
 }
 
+#endif
+
+#ifdef __cplusplus
+}
 #endif
 #endif

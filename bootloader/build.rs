@@ -1,57 +1,40 @@
-//! The build script of every image: hands the linker the numbers of the chosen board and the
-//! image's template. For the bootloader it builds the resident part first, which is a program of
-//! its own.
+//! Hands the linker the numbers of the chosen board and the image's template. For the bootloader it
+//! builds the resident part first, which is a program of its own.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, fs};
 
-include!("packs_well.rs");
+include!("../linker/packs_well.rs");
 
-use shared_abi::layout::{Image, BOARDS};
+use shared_abi::layout::Image;
 
 fn main() {
-    let layout = BOARDS
-        .iter()
-        .find(|layout| {
-            let feature = layout.board.to_uppercase().replace('-', "_");
-            env::var_os(format!("CARGO_FEATURE_BOARD_{feature}")).is_some()
-        })
-        .expect("choose a board by one of the features `board-…`");
+    let layout = coboot_linker::board_of_features().unwrap_or_else(|error| panic!("{error}"));
     let has = |feature: &str| env::var_os(format!("CARGO_FEATURE_{feature}")).is_some();
-    let (image, template) = match env::var("CARGO_PKG_NAME").as_deref() {
-        Ok("bootloader") if has("RESIDENT") => (Image::Bootloader, "resident.x"),
-        Ok("bootloader") => (Image::Bootloader, "bootloader.x"),
-        _ if has("PROGRAM_2") => (Image::Program(2), "application.x"),
-        _ => (Image::Program(1), "application.x"),
-    };
+    let template = if has("RESIDENT") { "resident.x" } else { "bootloader.x" };
     let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
-    fs::write(out.join("memory.x"), layout.linker_script(image).to_string()).expect("OUT_DIR is writable");
+    coboot_linker::write_memory(layout, Image::Bootloader, &out).unwrap_or_else(|error| panic!("{error}"));
 
     let package = PathBuf::from(env::var_os("CARGO_MANIFEST_DIR").expect("cargo sets it"));
     let templates = package.join("../linker");
     println!("cargo:rerun-if-changed={}", templates.display());
+    println!("cargo:rustc-link-search={}", templates.display());
     // The resident part is of the same product as the rest (bootloader/src/product.rs).
     println!("cargo:rerun-if-env-changed=COBOOT_PRODUCT");
-    println!("cargo:rustc-link-search={}", out.display());
-    println!("cargo:rustc-link-search={}", templates.display());
-    println!("cargo:rustc-link-arg-bins=-T{template}");
-    println!("cargo:rustc-link-arg-bins=--nmagic");
+    coboot_linker::link(&out, template);
     // Functions that compile to the same code are one.
     println!("cargo:rustc-link-arg-bins=--icf=all");
-    if image == Image::Bootloader {
-        // Functions that are alike stand near each other, so that copies come from near. (The image
-        // is packed, and copies from the resident part.)
-        println!("cargo:rustc-link-arg-bins=--bp-compression-sort=function");
-    }
+    // Functions that are alike stand near each other, so that copies come from near. (The image is
+    // packed, and copies from the resident part.)
+    println!("cargo:rustc-link-arg-bins=--bp-compression-sort=function");
     if template == "bootloader.x" && has("LOG_DEFMT") {
         // The words of `defmt`, which are in the ELF file and not on the chip.
         println!("cargo:rustc-link-arg-bins=-Tdefmt.x");
     }
     match template {
         "resident.x" => println!("cargo:rustc-link-arg-bins=--oformat=binary"),
-        "bootloader.x" => resident(&package, &out),
-        _ => {}
+        _ => resident(&package, &out),
     }
 }
 

@@ -4,7 +4,7 @@
 //! repository are held to when they are compiled.
 
 use serde::Deserialize;
-use shared_abi::geometry::{self, Geometry, SectorRun};
+use shared_abi::geometry::{self, Geometry, Line, SectorRun};
 use shared_abi::layout::Layout;
 
 /// The most bytes that such a file may have.
@@ -81,8 +81,13 @@ pub fn parse(text: &str) -> Result<&'static Layout, BoardError> {
         file.chip.sectors.iter().map(|run| SectorRun { count: run.count, size: run.size }).collect();
     let programs: Vec<geometry::Region> = file.programs.into_iter().map(Into::into).collect();
     // A layout refers to what is there for ever; a command has one board, of some hundred bytes.
+    let chip = name(file.chip.name)?;
+    let line = Line::of(chip).ok_or(BoardError::Rule(
+        "the chip's name begins with that of no STM32F4 with a CAN controller of the kind bxCAN",
+    ))?;
     let chip: &'static Geometry = Box::leak(Box::new(Geometry {
-        chip: name(file.chip.name)?,
+        chip,
+        line,
         flash: file.chip.flash.into(),
         sectors: runs.leak(),
         second_bank: file.chip.second_bank,
@@ -167,7 +172,8 @@ mod tests {
             ),
             ("count = 7", "count = 8", "no STM32F4 has more than 24 sectors"),
             ("size = 0x20000 }", "size = 0x20001 }", "16, 64 or 128 KiB"),
-            ("second-bank = 12", "second-bank = 11", "begins with sector 12"),
+            ("second-bank = 12", "second-bank = 11", "8 or 12 sectors each"),
+            ("name = \"stm32f429zi\"", "name = \"stm32f411re\"", "no STM32F4 with a CAN controller"),
             ("interrupts = 91", "interrupts = 65535", "112 interrupt lines"),
             ("sram = { base = 0x20000000", "sram = { base = 0x20000004", "whole pages of 4 KiB"),
             ("board = \"stm32f429i-disc1\"", "board = \"a\\u001bb\"", "printable ASCII"),

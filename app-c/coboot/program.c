@@ -1,0 +1,152 @@
+#include "program.h"
+
+/* Values of 1F51h (CiA 302-3 and the SYS TEC manual, 3.4.4). */
+enum {
+    STOP = 0,
+    START = 1,
+    RESET_STAT = 2,
+    CLEAR = 3,
+    START_BOOTLOADER = 0x80,
+    SET_SIGNATURE = 0x83,
+    CLR_SIGNATURE = 0x84,
+};
+/* What 1F51h reads of a program (CiA 302-3). */
+enum { STOPPED = 0, RUNNING = 1, ABSENT = 3 };
+
+/* How many programs the device has: the value of a symbol of the linker. */
+static uint8_t programs(void)
+{
+    extern const uint8_t __programs;
+    return (uint8_t)(uintptr_t)&__programs;
+}
+
+void coboot_program_init(struct coboot_program *program, uint8_t node_id, uint32_t bit_rate)
+{
+    struct coboot_handoff handoff;
+    struct coboot_program_args info;
+
+    program->node_id = node_id;
+    program->bit_rate = bit_rate;
+    program->serial_number = 0;
+    program->number = 1;
+    program->fresh = false;
+    program->bootloader_answers = false;
+    program->reentry.phase = COBOOT_STAYS;
+    program->reentry.silent = false;
+    if (coboot_read_handoff(&handoff)) {
+        program->node_id = handoff.node_id;
+        program->bit_rate = handoff.bit_rate;
+        program->serial_number = handoff.serial_number;
+        program->number = handoff.program;
+        program->fresh = coboot_is_fresh(&handoff);
+        /* One that listens for its bit rate first has no time to answer. */
+        program->bootloader_answers = handoff.bit_rate != 0;
+    }
+    program->gate = coboot_callgate();
+    /* What the bootloader has verified: the same number as in the bootloader. 0 where it knows of no download. */
+    const bool known =
+        program->gate != NULL && coboot_program_info(program->gate, program->number, &info) == COBOOT_STATUS_OK;
+    program->crc = known ? info.crc : 0;
+}
+
+uint32_t coboot_program_read(const struct coboot_program *program, uint16_t index, uint8_t sub, uint32_t *value,
+                             uint8_t *size)
+{
+    struct coboot_program_args info;
+
+    if (index != COBOOT_PROGRAM_CONTROL && index != COBOOT_PROGRAM_ID && index != COBOOT_FLASH_STATUS) {
+        return COBOOT_ABORT_NO_OBJECT;
+    }
+    if (sub > programs()) {
+        return COBOOT_ABORT_NO_SUB_INDEX;
+    }
+    if (sub == 0) {
+        *value = programs();
+        *size = 1;
+        return COBOOT_ABORT_NONE;
+    }
+    const bool own = sub == program->number;
+    const bool installed = !own && program->gate != NULL
+        && coboot_program_info(program->gate, sub, &info) == COBOOT_STATUS_OK
+        && (info.flags & COBOOT_PROGRAM_INSTALLED) != 0;
+    *size = index == COBOOT_PROGRAM_CONTROL ? 1 : 4;
+    if (index == COBOOT_PROGRAM_CONTROL) {
+        *value = own ? RUNNING : installed ? STOPPED : ABSENT;
+    } else if (index == COBOOT_PROGRAM_ID) {
+        *value = own ? program->crc : installed ? info.crc : 0;
+    } else {
+        *value = 0;
+    }
+    return COBOOT_ABORT_NONE;
+}
+
+static uint32_t leave(struct coboot_program *program, uint32_t request, uint32_t argument, uint32_t now_ms)
+{
+    const bool possible = coboot_reentry_begin(&program->reentry, request, argument, now_ms);
+    return possible ? COBOOT_ABORT_NONE : COBOOT_ABORT_DEVICE_STATE;
+}
+
+/* The first 80h right behind a download in one go: masters that do not know SYS TEC's commands confirm with it what they
+ * have just started.
+ */
+static uint32_t confirm(struct coboot_program *program, uint32_t now_ms)
+{
+    const int32_t status =
+        program->gate != NULL ? coboot_confirm(program->gate, program->number) : COBOOT_STATUS_FAILED;
+    if (status == COBOOT_STATUS_LOCKED) {
+        /* The bootloader stores it. Until then an 80h that comes again means the same. */
+        return leave(program, COBOOT_REQUEST_CONFIRM, program->number, now_ms);
+    }
+    program->fresh = false;
+    return status == COBOOT_STATUS_OK ? COBOOT_ABORT_NONE : COBOOT_ABORT_HARDWARE;
+}
+
+uint32_t coboot_program_write(struct coboot_program *program, uint16_t index, uint8_t sub, uint32_t value,
+                              uint32_t now_ms)
+{
+    uint32_t before;
+    uint8_t size;
+
+    const uint32_t abort_code = coboot_program_read(program, index, sub, &before, &size);
+    if (abort_code != COBOOT_ABORT_NONE) {
+        return abort_code;
+    }
+    if (index != COBOOT_PROGRAM_CONTROL || sub == 0) {
+        return COBOOT_ABORT_READ_ONLY;
+    }
+    const bool own = sub == program->number;
+    switch (value) {
+    case START_BOOTLOADER:
+        return own && program->fresh ? confirm(program, now_ms) : leave(program, COBOOT_REQUEST_STAY, 0, now_ms);
+    case STOP:  /* The bootloader runs instead. */
+    case CLEAR: /* The bootloader carries it out. */
+        /* Masters send the next request as soon as they see the answer, so that is the bootloader's, too. */
+        if (program->bootloader_answers) {
+            const uint32_t owed = coboot_owed(sub, (uint8_t)value, program->node_id);
+            return leave(program, COBOOT_REQUEST_OWED, owed, now_ms);
+        }
+        return value == STOP ? leave(program, COBOOT_REQUEST_STAY, 0, now_ms) : COBOOT_ABORT_DEVICE_STATE;
+    case RESET_STAT: /* CiA 302-3: reset program, which starts it anew. */
+        return own ? leave(program, COBOOT_REQUEST_START, sub, now_ms) : COBOOT_ABORT_DEVICE_STATE;
+    case START: /* It runs already; another one is the bootloader's to start. */
+        return own ? COBOOT_ABORT_NONE : COBOOT_ABORT_DEVICE_STATE;
+    case SET_SIGNATURE:
+    case CLR_SIGNATURE: /* The bootloader's to do. */
+        return COBOOT_ABORT_DEVICE_STATE;
+    default:
+        return COBOOT_ABORT_VALUE;
+    }
+}
+
+void coboot_program_restart(struct coboot_program *program, uint32_t now_ms)
+{
+    /* What a master was promised before comes first, and is a reset, too. */
+    (void)coboot_reentry_begin(&program->reentry, COBOOT_REQUEST_POWER_ON, 0, now_ms);
+}
+
+void coboot_program_proceed(struct coboot_program *program, bool quiet, uint32_t now_ms)
+{
+    if (coboot_reentry_proceed(&program->reentry, quiet, now_ms) == COBOOT_LEAVE) {
+        coboot_reset(program->reentry.request, program->reentry.argument);
+    }
+}

@@ -1,0 +1,90 @@
+/* A program under coboot: how it came up, its objects 1F51h, 1F56h and 1F57h, and its way back.
+ *
+ * It knows no CANopen stack: whichever it is, it asks coboot_program_read and coboot_program_write about the three objects.
+ */
+#ifndef COBOOT_PROGRAM_H
+#define COBOOT_PROGRAM_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "coboot.h"
+#include "reentry.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* Objects with an element for each program of the device (CiA 302-3; SYS TEC manual, 3.4.1). */
+#define COBOOT_PROGRAM_CONTROL 0x1F51
+#define COBOOT_PROGRAM_ID 0x1F56
+#define COBOOT_FLASH_STATUS 0x1F57
+
+/* SDO abort codes (CiA 301 table 22). */
+#define COBOOT_ABORT_NONE UINT32_C(0)
+#define COBOOT_ABORT_READ_ONLY UINT32_C(0x06010002)
+#define COBOOT_ABORT_NO_OBJECT UINT32_C(0x06020000)
+#define COBOOT_ABORT_HARDWARE UINT32_C(0x06060000)
+#define COBOOT_ABORT_NO_SUB_INDEX UINT32_C(0x06090011)
+#define COBOOT_ABORT_VALUE UINT32_C(0x06090030)
+#define COBOOT_ABORT_DEVICE_STATE UINT32_C(0x08000022)
+
+struct coboot_program {
+    /* How it came up: from the bootloader where it left a handoff, otherwise what coboot_program_init was given. Bit rate in
+     * bit/s, 0 for a device that finds it out by listening.
+     */
+    uint8_t node_id;
+    uint32_t bit_rate;
+    uint32_t serial_number;
+    /* Which of the device's programs it is, from 1 on. */
+    uint8_t number;
+    /* Services of the bootloader, or a null pointer. */
+    const struct coboot_callgate *gate;
+
+    /* The rest is program.c's own. */
+    uint32_t crc;
+    /* The next 80h to this program confirms it. */
+    bool fresh;
+    /* The bootloader comes up with this node-ID and bit rate, so that it can answer in this program's place. Set it to false
+     * where the program changes one of them.
+     */
+    bool bootloader_answers;
+    struct coboot_reentry reentry;
+};
+
+/* First of all, before CAN is set up: reads the handoff and finds the callgate. */
+void coboot_program_init(struct coboot_program *program, uint8_t node_id, uint32_t bit_rate);
+
+/* An element of the three objects, and its size in bytes: what an SDO upload gives. COBOOT_ABORT_NO_OBJECT for every other
+ * index.
+ */
+uint32_t coboot_program_read(const struct coboot_program *program, uint16_t index, uint8_t sub, uint32_t *value,
+                             uint8_t *size);
+
+/* An SDO download of the right size to one of the three objects: a command, if it is 1F51h. Call it before the download is
+ * answered, and answer unless coboot_program_is_silent says not to. COBOOT_ABORT_DEVICE_STATE: the bootloader has to be
+ * called first (80h).
+ *
+ * This is the place to refuse in front of: a machine that is moving answers with that code itself, and stays.
+ */
+uint32_t coboot_program_write(struct coboot_program *program, uint16_t index, uint8_t sub, uint32_t value,
+                              uint32_t now_ms);
+
+/* NMT reset node: a reset that is not counted as a crash. It comes as soon as everything is on the bus. */
+void coboot_program_restart(struct coboot_program *program, uint32_t now_ms);
+
+/* Call it in the main loop, in thread mode, once per millisecond at least. `quiet`: no answer waits to be sent, and all
+ * mailboxes are empty. It resets the chip when it is time.
+ */
+void coboot_program_proceed(struct coboot_program *program, bool quiet, uint32_t now_ms);
+
+/* The program takes no request and sends nothing any more; what it was asked last the bootloader answers. */
+static inline bool coboot_program_is_silent(const struct coboot_program *program)
+{
+    return program->reentry.silent;
+}
+
+#ifdef __cplusplus
+}
+#endif
+#endif

@@ -1,0 +1,73 @@
+#include "reentry.h"
+
+#include "coboot.h"
+
+/* How long the device stays when its answer is on the bus: at least 10 ms (SYS TEC manual L-1112d_10, 4.5), and one that
+ * may be almost over.
+ */
+#define ANSWER_TO_RESET_MS 11
+/* The longest that it stays behind its first answer: a bus on which nobody acknowledges keeps it no longer, and neither
+ * does a client that asks without end.
+ */
+#define ANSWERED_MOST_MS 500
+/* The longest that a command waits whose answer is owed, for a frame that is on its way. The client has its answer within
+ * 25 ms.
+ */
+#define OWED_MOST_MS 15
+
+static bool has_passed(uint32_t time_ms, uint32_t now_ms)
+{
+    return (int32_t)(now_ms - time_ms) >= 0;
+}
+
+/* What a master relies on: that the bootloader comes up, or that something is stored. */
+static bool is_promise(uint32_t request)
+{
+    return request != COBOOT_REQUEST_START && request != COBOOT_REQUEST_POWER_ON;
+}
+
+bool coboot_reentry_begin(struct coboot_reentry *reentry, uint32_t request, uint32_t argument, uint32_t now_ms)
+{
+    const bool first = reentry->phase == COBOOT_STAYS;
+
+    if (reentry->silent
+        || (!first && reentry->request == COBOOT_REQUEST_CONFIRM && request != COBOOT_REQUEST_CONFIRM)) {
+        return false;
+    }
+    if (first || is_promise(request) || !is_promise(reentry->request)) {
+        reentry->request = request;
+        reentry->argument = argument;
+    }
+    if (request == COBOOT_REQUEST_OWED) {
+        reentry->silent = true;
+        reentry->latest_ms = now_ms + OWED_MOST_MS;
+        if (first) {
+            /* Nothing was answered before, so there is no pause. */
+            reentry->phase = COBOOT_PAUSES;
+            reentry->pause_ends_ms = now_ms;
+        }
+        return true;
+    }
+    if (first) {
+        reentry->latest_ms = now_ms + ANSWERED_MOST_MS;
+    }
+    /* Behind each answer comes the pause. */
+    reentry->phase = COBOOT_ANSWERS;
+    return true;
+}
+
+enum coboot_next coboot_reentry_proceed(struct coboot_reentry *reentry, bool quiet, uint32_t now_ms)
+{
+    if (reentry->phase == COBOOT_STAYS) {
+        return COBOOT_SERVE;
+    }
+    if (reentry->phase == COBOOT_ANSWERS && quiet) {
+        reentry->phase = COBOOT_PAUSES;
+        reentry->pause_ends_ms = now_ms + ANSWER_TO_RESET_MS;
+    }
+    const bool over = reentry->phase == COBOOT_PAUSES && has_passed(reentry->pause_ends_ms, now_ms);
+    if ((quiet && over) || has_passed(reentry->latest_ms, now_ms)) {
+        return COBOOT_LEAVE;
+    }
+    return reentry->silent ? COBOOT_WAIT : COBOOT_SERVE;
+}

@@ -1,0 +1,259 @@
+//! The way back: when the device may leave, as a state machine over "is the bus idle?".
+//!
+//! Where the application has answered, the answer goes onto the bus first, and what is asked meanwhile
+//! is served ([`Departure::begin`]). Where it has left the answer to the bootloader, it says nothing
+//! any more ([`Departure::begin_silent`]).
+
+use crate::has_reached;
+
+/// How long the device stays when its answer is on the bus, in ms: at least 10 (SYS TEC manual
+/// L-1112d_10, 4.5), and one that may be almost over.
+pub const ANSWER_TO_RESET_MS: u32 = 11;
+/// The longest that it stays after a command, in ms: a bus on which nobody acknowledges the answer
+/// keeps it no longer, and neither does a client that asks without end.
+pub const ANSWERED_MOST_MS: u32 = 500;
+/// The longest that a command waits whose answer is left to the bootloader, in ms, for a frame that is
+/// on its way. The client is to have its answer within 25.
+pub const SILENT_MOST_MS: u32 = 15;
+
+/// Where the device is on its way out. `R` is what is asked of the bootloader.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Departure<R> {
+    /// It stays.
+    #[default]
+    Staying,
+    /// Its answer is on the way to the bus.
+    Answering {
+        /// What is asked of the bootloader.
+        request: R,
+        /// A master was promised it, whatever another one asks.
+        promised: bool,
+        /// The device leaves at this time, whatever waits to be sent.
+        latest: u32,
+    },
+    /// Its answer is on the bus. It serves requests in the pause behind it.
+    Pausing {
+        /// As for [`Answering`](Self::Answering).
+        request: R,
+        /// As for [`Answering`](Self::Answering).
+        promised: bool,
+        /// As for [`Answering`](Self::Answering).
+        latest: u32,
+        /// The pause is over then.
+        until: u32,
+    },
+    /// It takes and sends nothing any more; the frames that the controller has already go out.
+    Silent {
+        /// What is asked of the bootloader.
+        request: R,
+        /// How a command is treated that was answered before.
+        before: Before,
+        /// The device leaves at this time, whatever waits to be sent.
+        latest: u32,
+    },
+    /// It is to leave now.
+    Leaving {
+        /// What is asked of the bootloader.
+        request: R,
+    },
+}
+
+/// What a silent device owes to a command that it answered before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Before {
+    /// Nothing: there was none.
+    Nothing,
+    /// The pause, which begins when the answer is on the bus.
+    Pause,
+    /// The rest of the pause, until then.
+    Until(u32),
+}
+
+/// What the owner does next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Next<R> {
+    /// Serve as always.
+    Serve,
+    /// Take no request and send nothing; the frames in the mailboxes go out.
+    Wait,
+    /// Leave now, with this request.
+    Leave(R),
+}
+
+impl<R: Copy> Departure<R> {
+    /// A command was taken whose answer this program sends. `promised`: the device is to come up in
+    /// the bootloader, or something is to be stored. A master that was promised that is not let down
+    /// by another one, whose command starts the program anew.
+    pub fn begin(&mut self, request: R, promised: bool, now: u32) {
+        *self = match *self {
+            Self::Staying => {
+                Self::Answering { request, promised, latest: now.wrapping_add(ANSWERED_MOST_MS) }
+            }
+            // This answer, too, is followed by the pause.
+            Self::Answering { request: before, promised: was_promised, latest }
+            | Self::Pausing { request: before, promised: was_promised, latest, .. } => {
+                if promised || !was_promised {
+                    Self::Answering { request, promised, latest }
+                } else {
+                    Self::Answering { request: before, promised: was_promised, latest }
+                }
+            }
+            // Nothing is served any more, so nothing can be asked.
+            gone @ (Self::Silent { .. } | Self::Leaving { .. }) => gone,
+        };
+    }
+
+    /// A command was taken whose answer is left to the bootloader. One that was answered before still
+    /// has its pause.
+    pub fn begin_silent(&mut self, request: R, now: u32) {
+        let before = match *self {
+            Self::Staying => Before::Nothing,
+            Self::Answering { .. } => Before::Pause,
+            Self::Pausing { until, .. } => Before::Until(until),
+            Self::Silent { .. } | Self::Leaving { .. } => return,
+        };
+        *self = Self::Silent { request, before, latest: now.wrapping_add(SILENT_MOST_MS) };
+    }
+
+    /// Goes on with it. `bus_idle`: no answer waits to be sent, and everything is on the bus and was
+    /// acknowledged. To be asked behind every frame that was handled, and every few milliseconds.
+    pub fn proceed(&mut self, bus_idle: bool, now: u32) -> Next<R> {
+        *self = self.after(bus_idle, now);
+        match *self {
+            Self::Staying | Self::Answering { .. } | Self::Pausing { .. } => Next::Serve,
+            Self::Silent { .. } => Next::Wait,
+            Self::Leaving { request } => Next::Leave(request),
+        }
+    }
+
+    /// The state behind this one.
+    fn after(self, bus_idle: bool, now: u32) -> Self {
+        let pause_end = now.wrapping_add(ANSWER_TO_RESET_MS);
+        match self {
+            Self::Answering { request, latest, .. }
+            | Self::Pausing { request, latest, .. }
+            | Self::Silent { request, latest, .. }
+                if has_reached(now, latest) =>
+            {
+                Self::Leaving { request }
+            }
+            Self::Answering { request, promised, latest } if bus_idle => {
+                Self::Pausing { request, promised, latest, until: pause_end }
+            }
+            Self::Pausing { request, until, .. } if bus_idle && has_reached(now, until) => {
+                Self::Leaving { request }
+            }
+            Self::Silent { request, before: Before::Nothing, .. } if bus_idle => Self::Leaving { request },
+            Self::Silent { request, before: Before::Pause, latest } if bus_idle => {
+                Self::Silent { request, before: Before::Until(pause_end), latest }
+            }
+            Self::Silent { request, before: Before::Until(until), .. }
+                if bus_idle && has_reached(now, until) =>
+            {
+                Self::Leaving { request }
+            }
+            unchanged => unchanged,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_pause_begins_when_the_answer_is_on_the_bus_and_requests_are_served() {
+        let mut departure = Departure::Staying;
+        assert_eq!(departure.proceed(true, 0), Next::Serve);
+        departure.begin('b', true, 100);
+        for ms in 100..130 {
+            assert_eq!(departure.proceed(false, ms), Next::Serve);
+        }
+        assert_eq!(departure.proceed(true, 130), Next::Serve);
+        assert_eq!(departure.proceed(true, 140), Next::Serve, "10 ms at least");
+        assert_eq!(departure.proceed(false, 141), Next::Serve, "a frame is on its way");
+        assert_eq!(departure.proceed(true, 142), Next::Leave('b'));
+    }
+
+    #[test]
+    fn the_counter_of_milliseconds_may_wrap_in_between() {
+        let mut departure = Departure::Staying;
+        departure.begin('b', true, u32::MAX - 3);
+        assert_eq!(departure.proceed(true, u32::MAX - 3), Next::Serve);
+        assert_eq!(departure.proceed(true, u32::MAX), Next::Serve);
+        assert_eq!(departure.proceed(true, 6), Next::Serve);
+        assert_eq!(departure.proceed(true, 7), Next::Leave('b'));
+    }
+
+    /// Each answer is followed by the pause; somebody who asks without end is not waited for.
+    #[test]
+    fn a_command_in_quick_succession_prolongs_the_pause_and_not_for_ever() {
+        let mut departure = Departure::Staying;
+        let mut left = None;
+        for ms in 0..2000 {
+            if ms % 5 == 0 {
+                departure.begin('b', true, ms);
+            }
+            if departure.proceed(true, ms) == Next::Leave('b') {
+                left = Some(ms);
+                break;
+            }
+        }
+        assert_eq!(left, Some(500));
+    }
+
+    #[test]
+    fn who_was_promised_the_bootloader_gets_it() {
+        let mut departure = Departure::Staying;
+        departure.begin('b', true, 0);
+        departure.begin('p', false, 1);
+        assert_eq!(departure.proceed(true, 500), Next::Leave('b'));
+        let mut departure = Departure::Staying;
+        departure.begin('p', false, 0);
+        departure.begin('b', true, 1);
+        assert_eq!(departure.proceed(true, 500), Next::Leave('b'));
+    }
+
+    #[test]
+    fn who_leaves_the_answer_to_the_bootloader_is_silent_and_leaves_at_once() {
+        let mut departure = Departure::Staying;
+        departure.begin_silent('o', 7);
+        assert_eq!(departure.proceed(false, 7), Next::Wait, "a heartbeat is on its way");
+        assert_eq!(departure.proceed(true, 8), Next::Leave('o'));
+        // Nobody acknowledges the heartbeat.
+        let mut departure = Departure::Staying;
+        departure.begin_silent('o', 7);
+        assert_eq!(departure.proceed(false, 21), Next::Wait);
+        assert_eq!(departure.proceed(false, 22), Next::Leave('o'));
+    }
+
+    /// Two masters: the first was answered, and has its 10 ms; the second is answered by the
+    /// bootloader, within 25 ms still.
+    #[test]
+    fn a_command_that_is_handed_over_keeps_the_pause_of_the_one_before() {
+        let mut departure = Departure::Staying;
+        departure.begin('b', true, 0);
+        assert_eq!(departure.proceed(true, 0), Next::Serve);
+        departure.begin_silent('o', 3);
+        assert_eq!(departure.proceed(true, 10), Next::Wait);
+        assert_eq!(departure.proceed(true, 11), Next::Leave('o'));
+        // The answer before was not even on the bus.
+        let mut departure = Departure::Staying;
+        departure.begin('b', true, 0);
+        departure.begin_silent('o', 1);
+        assert_eq!(departure.proceed(true, 2), Next::Wait);
+        assert_eq!(departure.proceed(true, 12), Next::Wait);
+        assert_eq!(departure.proceed(true, 13), Next::Leave('o'));
+    }
+
+    #[test]
+    fn a_device_that_is_silent_takes_no_other_request() {
+        let mut departure = Departure::Staying;
+        departure.begin_silent('o', 0);
+        departure.begin('b', true, 1);
+        departure.begin_silent('p', 1);
+        assert_eq!(departure.proceed(true, 2), Next::Leave('o'));
+        departure.begin('b', true, 3);
+        assert_eq!(departure.proceed(false, 3), Next::Leave('o'));
+    }
+}

@@ -1,0 +1,26 @@
+//! The label: what a program image says of itself, so that the bootloader can refuse one that is for
+//! another device before it touches the program that is there.
+
+pub use shared_abi::label::{Label, OFFSET, SIZE};
+
+/// Puts the label of the program at its place in the image, behind the vector table: vendor-ID
+/// (1018h/1), product code (1018h/2) and the version of the program, a number of the maker's own.
+/// Once in a program, outside of functions.
+///
+/// ```
+/// coboot_app::label!(vendor_id: 0x0000_0001, product_code: 0x0000_0002, version: 3);
+/// # fn main() {}
+/// ```
+///
+/// The linker script `application.x` places it. The linker fails if a program has two.
+#[macro_export]
+macro_rules! label {
+    (vendor_id: $vendor_id:expr, product_code: $product_code:expr, version: $version:expr $(,)?) => {
+        const _: () = {
+            #[used]
+            #[cfg_attr(target_arch = "arm", link_section = ".label")]
+            static LABEL: $crate::label::Label =
+                $crate::label::Label::new($vendor_id, $product_code, $version);
+        };
+    };
+}

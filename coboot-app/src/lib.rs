@@ -1,0 +1,61 @@
+//! What an application needs to live on the coboot bootloader, whichever CANopen stack and whichever
+//! executor it has.
+//!
+//! | module | what it is |
+//! |---|---|
+//! | [`start`] | how the program came up: node-ID, bit rate, serial number (the handoff) |
+//! | [`program_control`] | objects 1F51h, 1F56h and 1F57h: what to answer and what to do |
+//! | [`departure`] | the way back to the bootloader: when the device may leave |
+//! | [`bootloader`] | the services of the bootloader underneath (the callgate), and the reset itself |
+//! | [`label!`](label) | whom the image is for, at its place in the image |
+//! | [`layout!`] | the memory map of the board, as the build script has written it |
+//! | `responder` | a small SDO server for applications without a CANopen stack (feature `responder`) |
+//!
+//! Nothing here waits, allocates or reads a clock. Time is passed in as the reading of a counter of
+//! milliseconds in 32 bits, which may wrap.
+//!
+//! In the order of use:
+//!
+//! 1. the build script calls `coboot_linker::Application::…::emit()`;
+//! 2. [`label!`](label) tells whom the image is for;
+//! 3. [`Start::read`] tells node-ID and bit rate before CAN is set up;
+//! 4. [`ProgramControl`] answers 1F51h, 1F56h and 1F57h;
+//! 5. [`ProgramControl::proceed`] is asked regularly, and behind every frame, and says when to leave;
+//! 6. `Bootloader::leave` leaves.
+#![no_std]
+
+mod abort;
+pub mod bootloader;
+pub mod departure;
+pub mod label;
+pub mod program_control;
+#[cfg(feature = "responder")]
+pub mod responder;
+pub mod rules;
+pub mod start;
+
+pub use abort::Abort;
+pub use bootloader::{Bootloader, Confirmed, Exit, ReentryPath, Services};
+pub use departure::Next;
+pub use program_control::{Answer, ProgramControl};
+pub use start::{Defaults, Start};
+
+pub use shared_abi::{callgate, geometry, handoff, layout, warm_start};
+
+/// The memory map of the board as the build script has written it
+/// (`coboot_linker::Application::emit`), for a `static` of the program:
+///
+/// ```ignore
+/// static LAYOUT: Layout = coboot_app::layout!();
+/// ```
+#[macro_export]
+macro_rules! layout {
+    () => {
+        include!(concat!(env!("OUT_DIR"), "/coboot_layout.rs"))
+    };
+}
+
+/// Whether `deadline` has come, of a counter of milliseconds that wraps.
+const fn has_reached(now: u32, deadline: u32) -> bool {
+    now.wrapping_sub(deadline) < 1 << 31
+}

@@ -1,0 +1,458 @@
+//! Objects 1F51h, 1F56h and 1F57h of an application (CiA 302-3), for any CANopen stack.
+//!
+//! [`ProgramControl`] says what to answer, and when to leave. What the stack does with it:
+//!
+//! | request | call | answer |
+//! |---|---|---|
+//! | upload of 1F51h/1F56h/1F57h, sub-index 0 | [`programs`](ProgramControl::programs) | 1 byte |
+//! | upload of 1F51h/n | [`state`](ProgramControl::state) | 1 byte |
+//! | upload of 1F56h/n | [`identification`](ProgramControl::identification) | 4 bytes, little-endian |
+//! | upload of 1F57h/n | [`flash_status`](ProgramControl::flash_status) | 4 bytes, little-endian |
+//! | download to 1F51h/n | [`write`](ProgramControl::write) | as [`Answer`] says |
+//! | NMT reset node | [`restart`](ProgramControl::restart) | |
+//!
+//! Behind each frame, and every few milliseconds, [`proceed`](ProgramControl::proceed).
+
+use shared_abi::callgate::PROGRAM_INSTALLED;
+use shared_abi::warm_start::{BootRequest, Owed};
+
+use crate::abort::Abort;
+use crate::bootloader::{Confirmed, Services};
+use crate::departure::{Departure, Next};
+use crate::rules::{react, Command, Reaction, Standing};
+use crate::start::Start;
+
+/// 1F51h: program control.
+pub const PROGRAM_CONTROL: u16 = 0x1F51;
+/// 1F56h: program software identification.
+pub const PROGRAM_ID: u16 = 0x1F56;
+/// 1F57h: flash status identification.
+pub const FLASH_STATUS: u16 = 0x1F57;
+
+/// What 1F51h reads for a program that is there and does not run.
+const STOPPED: u8 = 0;
+/// What 1F51h reads for the program that runs.
+const RUNNING: u8 = 1;
+/// What 1F51h reads where there is no program.
+const ABSENT: u8 = 3;
+
+/// How a download to 1F51h is answered that was taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[must_use]
+pub enum Answer {
+    /// The SDO server sends its positive answer, as always.
+    Send,
+    /// The SDO server sends **no** answer, and [`ProgramControl::leave_owed`] is called with this: the
+    /// bootloader answers in this program's place. A server that cannot withhold its answer calls
+    /// [`ProgramControl::write_answered`] instead, and does what that says.
+    Withhold(Owed),
+}
+
+/// Program control of a running application.
+#[derive(Clone, Debug)]
+pub struct ProgramControl {
+    /// The program that runs.
+    program: u8,
+    /// Programs of the device.
+    programs: u8,
+    /// 1F56h of the program that runs.
+    crc: u32,
+    /// The next 80h to this program confirms it.
+    fresh: bool,
+    /// The password came (lifts): 1F51h = 2 and NMT reset node lead into the bootloader.
+    armed: bool,
+    /// What a master was promised of the reset that is due: the bootloader, or that this program is
+    /// confirmed by it. Nobody else takes that away.
+    promised: Option<BootRequest>,
+    /// Node-ID in force.
+    node_id: Option<u8>,
+    /// The node-ID as which the bootloader can answer in this program's place.
+    bootloader_node: Option<u8>,
+    departure: Departure<BootRequest>,
+}
+
+impl ProgramControl {
+    /// Of a program that came up so, on a device with `programs` programs
+    /// (`LAYOUT.programs.len()`). `crc` is what 1F56h reads for this program
+    /// (`Bootloader::program_crc`).
+    #[must_use]
+    pub const fn new(start: &Start, programs: u8, crc: u32) -> Self {
+        Self {
+            program: start.program,
+            programs,
+            crc,
+            fresh: start.fresh,
+            armed: false,
+            promised: None,
+            node_id: start.node_id,
+            bootloader_node: start.bootloader_node(),
+            departure: Departure::Staying,
+        }
+    }
+
+    /// Of a device whose bootloader is another node than this program (a lift's is node 126), or whose
+    /// SDO server cannot withhold an answer: STOP is answered here, and CLEAR is refused.
+    #[must_use]
+    pub const fn answering_itself(self) -> Self {
+        Self { bootloader_node: None, ..self }
+    }
+
+    /// The program that runs, 1 to 254.
+    #[must_use]
+    pub const fn program(&self) -> u8 {
+        self.program
+    }
+
+    /// How many programs the device has: sub-index 0 of the three objects.
+    #[must_use]
+    pub const fn programs(&self) -> u8 {
+        self.programs
+    }
+
+    /// The device has this node-ID from now on; `None` for none.
+    pub fn node_id_changed(&mut self, node_id: Option<u8>) {
+        self.node_id = node_id;
+    }
+
+    /// The bootloader has stored this node-ID ([`Bootloader::store_node`](crate::Bootloader)), together
+    /// with the bit rate in force (`same_bit_rate`) or another one: it comes up with these from now on.
+    pub fn node_stored(&mut self, node_id: Option<u8>, same_bit_rate: bool) {
+        if self.bootloader_node.is_some() {
+            self.bootloader_node = if same_bit_rate { node_id } else { None };
+        }
+    }
+
+    /// The password of a lift came (6005h, CiA 814-1 clause 6.3): 1F51h = 2 and NMT reset node lead
+    /// into the bootloader.
+    pub fn arm(&mut self) {
+        self.armed = true;
+    }
+
+    /// What 1F51h/`sub` reads: 1 for the program that runs, 0 for another one that is installed, 3 for
+    /// none.
+    ///
+    /// # Errors
+    /// [`Abort::NO_SUB_INDEX`].
+    pub fn state(&self, sub: u8, services: &mut impl Services) -> Result<u8, Abort> {
+        self.check(sub)?;
+        if sub == self.program {
+            return Ok(RUNNING);
+        }
+        Ok(match services.program_info(sub) {
+            Ok(info) if info.flags & PROGRAM_INSTALLED != 0 => STOPPED,
+            _ => ABSENT,
+        })
+    }
+
+    /// What 1F56h/`sub` reads: the CRC of the program; 0 where there is none.
+    ///
+    /// # Errors
+    /// [`Abort::NO_SUB_INDEX`].
+    pub fn identification(&self, sub: u8, services: &mut impl Services) -> Result<u32, Abort> {
+        self.check(sub)?;
+        if sub == self.program {
+            return Ok(self.crc);
+        }
+        Ok(services.program_info(sub).map_or(0, |info| info.crc))
+    }
+
+    /// What 1F57h/`sub` reads: 0, no command is being carried out and none failed.
+    ///
+    /// # Errors
+    /// [`Abort::NO_SUB_INDEX`].
+    pub fn flash_status(&self, sub: u8) -> Result<u32, Abort> {
+        self.check(sub).map(|()| 0)
+    }
+
+    /// A download of `data` to 1F51h/`sub`. To be called before the SDO answer is sent.
+    ///
+    /// # Errors
+    /// The code of the SDO abort that is the answer; nothing has happened.
+    pub fn write(
+        &mut self,
+        sub: u8,
+        data: &[u8],
+        now: u32,
+        services: &mut impl Services,
+    ) -> Result<Answer, Abort> {
+        let answers = self.bootloader_node.filter(|node| self.node_id == Some(*node));
+        self.take(sub, data, now, answers, services)
+    }
+
+    /// As [`write`](Self::write), for a server that sends its answer whatever happens (the client has
+    /// written the byte in segments, say, whose end only this program can acknowledge).
+    ///
+    /// # Errors
+    /// As for [`write`](Self::write).
+    pub fn write_answered(
+        &mut self,
+        sub: u8,
+        data: &[u8],
+        now: u32,
+        services: &mut impl Services,
+    ) -> Result<(), Abort> {
+        self.take(sub, data, now, None, services).map(|_| ())
+    }
+
+    fn take(
+        &mut self,
+        sub: u8,
+        data: &[u8],
+        now: u32,
+        answers: Option<u8>,
+        services: &mut impl Services,
+    ) -> Result<Answer, Abort> {
+        if sub == 0 {
+            return Err(Abort::READ_ONLY);
+        }
+        self.check(sub)?;
+        let value = match data {
+            [value] => *value,
+            [] => return Err(Abort::LENGTH_TOO_LOW),
+            _ => return Err(Abort::LENGTH_TOO_HIGH),
+        };
+        let command = Command::from_value(value).ok_or(Abort::INVALID_VALUE)?;
+        let Self { fresh, armed, .. } = *self;
+        let standing = Standing { fresh, armed, can_hand_over: answers.is_some() };
+        match react(command, sub == self.program, standing)? {
+            Reaction::Nothing => {}
+            Reaction::Confirm => self.confirm(now, services)?,
+            Reaction::CallBack => self.promise(BootRequest::Stay, now)?,
+            _ if matches!(self.promised, Some(BootRequest::Confirm(_))) => return Err(Abort::DEVICE_STATE),
+            Reaction::Restart => self.leave(BootRequest::Start(sub), now),
+            Reaction::HandOver => {
+                let node_id = answers.unwrap_or(0);
+                return Ok(Answer::Withhold(Owed { program: sub, value, node_id }));
+            }
+        }
+        Ok(Answer::Send)
+    }
+
+    /// The answer was withheld ([`Answer::Withhold`]): from now on nothing is taken or sent.
+    pub fn leave_owed(&mut self, owed: Owed, now: u32) {
+        self.departure.begin_silent(BootRequest::Owed(owed), now);
+    }
+
+    /// This program is good: it has heard its master, say, or a master has said so. Where the flash is
+    /// locked (a sealed program) the device restarts to store it. Writes flash
+    /// ([`Bootloader::store_node`](crate::Bootloader::store_node) tells how long that takes).
+    ///
+    /// # Errors
+    /// [`Abort::HARDWARE`] where the bootloader did not store it, or there is none;
+    /// [`Abort::DEVICE_STATE`] where the device is about to leave for another reason.
+    pub fn confirm(&mut self, now: u32, services: &mut impl Services) -> Result<(), Abort> {
+        let confirmed = services.confirm(self.program);
+        // Until it is stored, an 80h that comes again means the same.
+        self.fresh &= confirmed == Ok(Confirmed::AtReset);
+        match confirmed {
+            Ok(Confirmed::Now) => Ok(()),
+            Ok(Confirmed::AtReset) => self.promise(BootRequest::Confirm(self.program), now),
+            Err(_) => Err(Abort::HARDWARE),
+        }
+    }
+
+    /// NMT reset node came: the device restarts as after a power-on, so that the bootloader counts no
+    /// crash. An armed lift goes into the bootloader.
+    pub fn restart(&mut self, now: u32) {
+        self.leave(if self.armed { BootRequest::Stay } else { BootRequest::PowerOn }, now);
+    }
+
+    /// Goes on with the way out. `bus_idle`: no answer waits to be sent, and everything is on the bus
+    /// and was acknowledged. To be asked behind every frame that was handled, and every few
+    /// milliseconds.
+    pub fn proceed(&mut self, bus_idle: bool, now: u32) -> Next<BootRequest> {
+        self.departure.proceed(bus_idle, now)
+    }
+
+    /// The device leaves with this request, unless it was promised to leave with another one.
+    fn promise(&mut self, request: BootRequest, now: u32) -> Result<(), Abort> {
+        if self.promised.is_some_and(|promised| promised != request) {
+            return Err(Abort::DEVICE_STATE);
+        }
+        self.promised = Some(request);
+        self.leave(request, now);
+        Ok(())
+    }
+
+    fn leave(&mut self, request: BootRequest, now: u32) {
+        let promised = !matches!(request, BootRequest::PowerOn | BootRequest::Start(_));
+        self.departure.begin(request, promised, now);
+    }
+
+    fn check(&self, sub: u8) -> Result<(), Abort> {
+        if (1..=self.programs).contains(&sub) {
+            Ok(())
+        } else {
+            Err(Abort::NO_SUB_INDEX)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shared_abi::callgate::{CallgateError, ProgramArgs};
+
+    use super::*;
+    use crate::start::Defaults;
+
+    const DEFAULTS: Defaults = Defaults { node_id: Some(32), bit_rate: 125_000, serial_number: 0 };
+    const STATE: Abort = Abort(0x0800_0022);
+
+    /// A bootloader that knows program 2, with what its callgate says to a confirmation.
+    struct Fake {
+        confirm: Result<Confirmed, CallgateError>,
+        confirmed: usize,
+    }
+
+    const STORES: Fake = Fake { confirm: Ok(Confirmed::Now), confirmed: 0 };
+
+    impl Services for Fake {
+        fn program_info(&mut self, number: u8) -> Result<ProgramArgs, CallgateError> {
+            match number {
+                2 => Ok(ProgramArgs { crc: 0x1122_3344, flags: 1, ..ProgramArgs::default() }),
+                _ => Err(CallgateError::Refused(-7)),
+            }
+        }
+
+        fn confirm(&mut self, number: u8) -> Result<Confirmed, CallgateError> {
+            assert_eq!(number, 1);
+            self.confirmed += 1;
+            self.confirm
+        }
+    }
+
+    /// Program 1 of three.
+    fn control(fresh: bool) -> ProgramControl {
+        ProgramControl::new(&Start { fresh, ..Start::new(None, DEFAULTS) }, 3, 0xCAFE)
+    }
+
+    fn request_behind(control: &mut ProgramControl) -> Next<BootRequest> {
+        control.proceed(true, 100);
+        control.proceed(true, 200)
+    }
+
+    #[test]
+    fn each_object_tells_of_every_program() {
+        let control = control(false);
+        let states: [_; 5] = core::array::from_fn(|sub| control.state(sub as u8, &mut { STORES }));
+        let none = Abort(0x0609_0011);
+        assert_eq!(states, [Err(none), Ok(1), Ok(0), Ok(3), Err(none)]);
+        let crcs: [_; 4] = core::array::from_fn(|sub| control.identification(sub as u8, &mut { STORES }));
+        assert_eq!(crcs, [Err(none), Ok(0xCAFE), Ok(0x1122_3344), Ok(0)]);
+        assert_eq!((control.flash_status(3), control.flash_status(4)), (Ok(0), Err(none)));
+    }
+
+    #[test]
+    fn what_is_no_command_is_refused_and_nothing_happens() {
+        let mut control = control(true);
+        for (sub, data, code) in [
+            (0, &[0x80][..], 0x0601_0002),
+            (4, &[0x80], 0x0609_0011),
+            (255, &[0x80], 0x0609_0011),
+            (1, &[], 0x0607_0013),
+            (1, &[0x80, 0], 0x0607_0012),
+            (1, &[4], 0x0609_0030),
+            (1, &[0xFF], 0x0609_0030),
+            (1, &[0x83], 0x0800_0022),
+            (2, &[1], 0x0800_0022),
+        ] {
+            let mut services = STORES;
+            assert_eq!(control.write(sub, data, 0, &mut services), Err(Abort(code)), "{sub} {data:X?}");
+            assert_eq!(services.confirmed, 0);
+            assert_eq!(request_behind(&mut control), Next::Serve);
+        }
+    }
+
+    #[test]
+    fn a_call_back_is_answered_and_the_device_leaves_behind_the_pause() {
+        let mut control = control(false);
+        assert_eq!(control.write(1, &[0x80], 0, &mut { STORES }), Ok(Answer::Send));
+        assert_eq!(control.proceed(true, 1), Next::Serve);
+        assert_eq!(control.proceed(true, 12), Next::Leave(BootRequest::Stay));
+    }
+
+    #[test]
+    fn stop_and_clear_are_left_to_the_bootloader() {
+        for (value, sub) in [(0, 1), (3, 2)] {
+            let mut control = control(false);
+            let owed = Owed { program: sub, value, node_id: 32 };
+            assert_eq!(control.write(sub, &[value], 0, &mut { STORES }), Ok(Answer::Withhold(owed)));
+            assert_eq!(control.proceed(true, 0), Next::Serve, "not before the answer was withheld");
+            control.leave_owed(owed, 0);
+            assert_eq!(control.proceed(false, 0), Next::Wait);
+            assert_eq!(control.proceed(true, 1), Next::Leave(BootRequest::Owed(owed)));
+        }
+    }
+
+    /// Where the answer cannot be withheld, and where the bootloader comes up as another node.
+    #[test]
+    fn a_bootloader_that_cannot_answer_is_not_asked_to() {
+        let mut in_segments = control(false);
+        assert_eq!(in_segments.write_answered(1, &[3], 0, &mut { STORES }), Err(STATE));
+        assert_eq!(in_segments.write_answered(1, &[0], 0, &mut { STORES }), Ok(()));
+        assert_eq!(request_behind(&mut in_segments), Next::Leave(BootRequest::Stay));
+        let mut changed = control(false);
+        changed.node_id_changed(Some(33));
+        let mut stored = control(false);
+        stored.node_stored(Some(32), false);
+        for mut control in [changed.clone(), stored, control(false).answering_itself()] {
+            assert_eq!(control.write(1, &[3], 0, &mut { STORES }), Err(STATE));
+            assert_eq!(control.write(1, &[0], 0, &mut { STORES }), Ok(Answer::Send));
+            assert_eq!(request_behind(&mut control), Next::Leave(BootRequest::Stay));
+        }
+        // Stored, the new node-ID is the bootloader's as well.
+        changed.node_stored(Some(33), true);
+        let owed = Owed { program: 1, value: 3, node_id: 33 };
+        assert_eq!(changed.write(1, &[3], 0, &mut { STORES }), Ok(Answer::Withhold(owed)));
+    }
+
+    #[test]
+    fn the_first_80h_to_a_fresh_program_confirms_it_and_the_second_calls_the_bootloader() {
+        let mut control = control(true);
+        let mut services = STORES;
+        assert_eq!(control.write(1, &[0x80], 0, &mut services), Ok(Answer::Send));
+        assert_eq!(services.confirmed, 1);
+        assert_eq!(request_behind(&mut control), Next::Serve);
+        assert_eq!(control.write(1, &[0x80], 300, &mut services), Ok(Answer::Send));
+        assert_eq!((services.confirmed, control.proceed(true, 900)), (1, Next::Leave(BootRequest::Stay)));
+    }
+
+    #[test]
+    fn a_confirmation_that_fails_is_told_and_the_next_80h_calls_the_bootloader() {
+        let mut control = control(true);
+        let mut fails = Fake { confirm: Err(CallgateError::Absent), confirmed: 0 };
+        assert_eq!(control.write(1, &[0x80], 0, &mut fails), Err(Abort(0x0606_0000)));
+        assert_eq!(request_behind(&mut control), Next::Serve);
+        assert_eq!(control.write(1, &[0x80], 300, &mut fails), Ok(Answer::Send));
+        assert_eq!(control.proceed(true, 900), Next::Leave(BootRequest::Stay));
+    }
+
+    /// In front of a sealed program the flash is locked: who was told that the program is confirmed is
+    /// not let down by another one.
+    #[test]
+    fn a_confirmation_at_the_reset_is_kept_against_other_commands() {
+        let mut control = control(true);
+        let mut locked = Fake { confirm: Ok(Confirmed::AtReset), confirmed: 0 };
+        assert_eq!(control.write(1, &[0x80], 0, &mut locked), Ok(Answer::Send));
+        assert_eq!(control.write(1, &[0x80], 1, &mut locked), Ok(Answer::Send), "the same again");
+        for value in [0, 2, 3] {
+            assert_eq!(control.write(1, &[value], 2, &mut locked), Err(STATE), "{value}");
+        }
+        control.restart(3);
+        assert_eq!(request_behind(&mut control), Next::Leave(BootRequest::Confirm(1)));
+    }
+
+    #[test]
+    fn a_restart_counts_as_no_crash_and_an_armed_lift_goes_to_the_bootloader() {
+        let mut control_of_lift = control(false).answering_itself();
+        control_of_lift.arm();
+        control_of_lift.restart(0);
+        assert_eq!(request_behind(&mut control_of_lift), Next::Leave(BootRequest::Stay));
+        let mut plain = control(false);
+        plain.restart(0);
+        assert_eq!(request_behind(&mut plain), Next::Leave(BootRequest::PowerOn));
+        let mut again = control(false);
+        assert_eq!(again.write(1, &[2], 0, &mut { STORES }), Ok(Answer::Send));
+        assert_eq!(request_behind(&mut again), Next::Leave(BootRequest::Start(1)));
+    }
+}

@@ -1,0 +1,571 @@
+//! A CANopen device as small as an update needs it, for applications without a CANopen stack: boot-up,
+//! heartbeat, NMT slave, and an SDO server with expedited transfers (CiA 301).
+//!
+//! | object | access | what it is |
+//! |---|---|---|
+//! | 1000h | ro | device type: anything but the bootloader's |
+//! | 1001h | ro | error register: 0 |
+//! | 1017h | rw | heartbeat time in ms, until the next reset |
+//! | 1018h/1–4 | ro | vendor-ID, product code, revision, serial number |
+//! | 1F51h/n | rw | program control |
+//! | 1F56h/n | ro | CRC of the program |
+//! | 1F57h/n | ro | flash status: 0 |
+//!
+//! Every other request gets the SDO abort that CiA 301 has for it, or nothing where it is no request.
+//!
+//! What the owner does:
+//!
+//! - each data frame with one of [`identifiers`](Responder::identifiers) into
+//!   [`handle`](Responder::handle), and its answer onto the bus;
+//! - behind that, and every few milliseconds, [`poll`](Responder::poll) until it gives no frame;
+//! - then [`proceed`](Responder::proceed), which says when to leave.
+
+use shared_abi::warm_start::BootRequest;
+
+use crate::abort::Abort;
+use crate::bootloader::Services;
+use crate::departure::Next;
+use crate::has_reached;
+use crate::program_control::{Answer, ProgramControl, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID};
+
+/// A CAN data frame with an identifier of 11 bits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Frame {
+    id: u16,
+    len: u8,
+    bytes: [u8; 8],
+}
+
+impl Frame {
+    /// A frame; `None` for an identifier of more than 11 bits or more than 8 bytes.
+    #[must_use]
+    pub fn new(id: u16, data: &[u8]) -> Option<Self> {
+        let mut bytes = [0; 8];
+        bytes.get_mut(..data.len())?.copy_from_slice(data);
+        (id < 0x800).then_some(Self { id, len: data.len() as u8, bytes })
+    }
+
+    /// The identifier, 0 to 7FFh.
+    #[must_use]
+    pub const fn id(&self) -> u16 {
+        self.id
+    }
+
+    /// Its 0 to 8 bytes.
+    #[must_use]
+    pub fn data(&self) -> &[u8] {
+        &self.bytes[..usize::from(self.len)]
+    }
+}
+
+/// What the device says of itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Device {
+    /// 1000h: 0 for a device without a standardised profile. Not 10000000h, by which a host recognises
+    /// the bootloader.
+    pub device_type: u32,
+    /// 1018h/1, assigned by CiA; that of the bootloader.
+    pub vendor_id: u32,
+    /// 1018h/2; that of the bootloader.
+    pub product_code: u32,
+    /// 1018h/3.
+    pub revision: u32,
+    /// 1018h/4: [`Start::serial_number`](crate::Start::serial_number).
+    pub serial_number: u32,
+    /// 1017h, in ms; 0 for no heartbeat.
+    pub heartbeat_ms: u16,
+}
+
+/// The state of a node (CiA 301 section 7.3.2.2); the values are the byte of a heartbeat.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+enum Nmt {
+    /// The boot-up has yet to be sent.
+    BootUp = 0,
+    /// Neither SDO nor PDO are served.
+    Stopped = 4,
+    /// All is served.
+    Operational = 5,
+    /// SDO is served.
+    PreOperational = 127,
+}
+
+/// The device on the bus.
+#[derive(Clone, Debug)]
+pub struct Responder {
+    device: Device,
+    node_id: u8,
+    control: ProgramControl,
+    nmt: Nmt,
+    /// The time of the last heartbeat.
+    beaten: u32,
+    /// The device says and takes nothing any more.
+    silent: bool,
+}
+
+/// A value of an object, 1 to 4 bytes, little-endian.
+struct Value {
+    bytes: [u8; 4],
+    len: u8,
+}
+
+impl Value {
+    const fn byte(value: u8) -> Self {
+        Self { bytes: [value, 0, 0, 0], len: 1 }
+    }
+
+    const fn word(value: u32) -> Self {
+        Self { bytes: value.to_le_bytes(), len: 4 }
+    }
+}
+
+impl Responder {
+    /// A device with this node-ID ([`Start::node_id`](crate::Start::node_id)) that has yet to send its
+    /// boot-up. `None` for a node-ID that is not 1 to 127.
+    #[must_use]
+    pub fn new(device: Device, node_id: u8, control: ProgramControl) -> Option<Self> {
+        (1..=127).contains(&node_id).then_some(Self {
+            device,
+            node_id,
+            control,
+            nmt: Nmt::BootUp,
+            beaten: 0,
+            silent: false,
+        })
+    }
+
+    /// The identifiers to let through: NMT and the SDO requests of this node.
+    #[must_use]
+    pub const fn identifiers(&self) -> [u16; 2] {
+        [0, 0x600 + self.node_id as u16]
+    }
+
+    /// Program control, to confirm this program with
+    /// ([`confirm`](ProgramControl::confirm)).
+    pub fn control(&mut self) -> &mut ProgramControl {
+        &mut self.control
+    }
+
+    /// Whether an NMT master has started the node: it is OPERATIONAL.
+    #[must_use]
+    pub fn is_operational(&self) -> bool {
+        self.nmt == Nmt::Operational
+    }
+
+    /// Takes any data frame received; gives the answer to it, if there is one.
+    pub fn handle(&mut self, frame: &Frame, now: u32, services: &mut impl Services) -> Option<Frame> {
+        // Before its boot-up a node serves nothing.
+        if self.silent || self.nmt == Nmt::BootUp {
+            return None;
+        }
+        match (frame.id, frame.data()) {
+            (0, &[command, node]) if node == 0 || node == self.node_id => {
+                self.command(command, now);
+                None
+            }
+            (id, &[a, b, c, d, e, f, g, h])
+                if id == 0x600 + u16::from(self.node_id) && self.nmt != Nmt::Stopped =>
+            {
+                let bytes = self.request([a, b, c, d, e, f, g, h], now, services)?;
+                Some(Frame { id: 0x580 + u16::from(self.node_id), len: 8, bytes })
+            }
+            _ => None,
+        }
+    }
+
+    /// The next frame to send of its own accord, boot-up or heartbeat, until there is none.
+    pub fn poll(&mut self, now: u32) -> Option<Frame> {
+        if self.silent {
+            return None;
+        }
+        let state = match self.nmt {
+            Nmt::BootUp => {
+                self.nmt = Nmt::PreOperational;
+                Nmt::BootUp
+            }
+            state => {
+                let period = u32::from(self.device.heartbeat_ms);
+                if period == 0 || !has_reached(now, self.beaten.wrapping_add(period)) {
+                    return None;
+                }
+                state
+            }
+        };
+        self.beaten = now;
+        Frame::new(0x700 + u16::from(self.node_id), &[state as u8])
+    }
+
+    /// Goes on with the way out ([`ProgramControl::proceed`]). `bus_idle`: all frames that the
+    /// responder gave are on the bus and were acknowledged.
+    pub fn proceed(&mut self, bus_idle: bool, now: u32) -> Next<BootRequest> {
+        let next = self.control.proceed(bus_idle, now);
+        self.silent = next != Next::Serve;
+        next
+    }
+
+    /// A command of the NMT master (CiA 301 section 7.2.8.3.1).
+    fn command(&mut self, command: u8, now: u32) {
+        self.nmt = match command {
+            0x01 => Nmt::Operational,
+            0x02 => Nmt::Stopped,
+            0x80 => Nmt::PreOperational,
+            0x81 => return self.control.restart(now),
+            0x82 => Nmt::BootUp,
+            _ => return,
+        };
+    }
+
+    /// The answer to an SDO request (CiA 301 section 7.2.4.3).
+    fn request(&mut self, bytes: [u8; 8], now: u32, services: &mut impl Services) -> Option<[u8; 8]> {
+        let [command, low, high, sub, data @ ..] = bytes;
+        let index = u16::from_le_bytes([low, high]);
+        let answered = match command >> 5 {
+            1 => self.download(command, index, sub, &data, now, services),
+            2 => self
+                .upload(index, sub, services)
+                .map(|Value { bytes, len }| Some((0x43 | (4 - len) << 2, bytes))),
+            // The client ends a transfer; there is none, and no answer to that.
+            4 => return None,
+            // No segmented and no block transfer.
+            _ => Err(Abort::COMMAND),
+        };
+        let (command, [a, b, c, d]) = match answered {
+            Ok(answer) => answer?,
+            Err(Abort(code)) => (0x80, code.to_le_bytes()),
+        };
+        // Only an initiate names an object: of the block transfers, that has a subcommand of 0.
+        let names_object = match bytes[0] >> 5 {
+            1 | 2 => true,
+            5 => bytes[0] & 3 == 0,
+            6 => bytes[0] & 1 == 0,
+            _ => false,
+        };
+        let [low, high, sub] = if names_object { [low, high, sub] } else { [0; 3] };
+        Some([command, low, high, sub, a, b, c, d])
+    }
+
+    /// An initiate download; the command and data of its answer, `None` where it is withheld.
+    fn download(
+        &mut self,
+        command: u8,
+        index: u16,
+        sub: u8,
+        data: &[u8; 4],
+        now: u32,
+        services: &mut impl Services,
+    ) -> Result<Option<(u8, [u8; 4])>, Abort> {
+        // An object that cannot be read does not exist.
+        let own_len = self.upload(index, sub, services)?.len;
+        if !matches!((index, sub), (0x1017, 0) | (PROGRAM_CONTROL, 1..)) {
+            return Err(Abort::READ_ONLY);
+        }
+        const EXPEDITED: u8 = 1 << 1;
+        const SIZE_TOLD: u8 = 1 << 0;
+        if command & EXPEDITED == 0 {
+            // Its data would come in segments.
+            return Err(Abort::COMMAND);
+        }
+        // A client that does not tell the size means that of the object.
+        let len = if command & SIZE_TOLD == 0 { own_len } else { 4 - (command >> 2 & 3) };
+        let data = &data[..usize::from(len)];
+        if index == PROGRAM_CONTROL {
+            match self.control.write(sub, data, now, services)? {
+                Answer::Send => {}
+                Answer::Withhold(owed) => {
+                    self.control.leave_owed(owed, now);
+                    self.silent = true;
+                    return Ok(None);
+                }
+            }
+        } else {
+            match data {
+                &[low, high] => self.device.heartbeat_ms = u16::from_le_bytes([low, high]),
+                [_] => return Err(Abort::LENGTH_TOO_LOW),
+                _ => return Err(Abort::LENGTH_TOO_HIGH),
+            }
+            self.beaten = now;
+        }
+        Ok(Some((0x60, [0; 4])))
+    }
+
+    /// The value of an object.
+    fn upload(&self, index: u16, sub: u8, services: &mut impl Services) -> Result<Value, Abort> {
+        let Device { device_type, vendor_id, product_code, revision, serial_number, heartbeat_ms } =
+            self.device;
+        Ok(match (index, sub) {
+            (0x1000, 0) => Value::word(device_type),
+            (0x1001, 0) => Value::byte(0),
+            (0x1017, 0) => Value { len: 2, ..Value::word(heartbeat_ms.into()) },
+            (0x1018, 0) => Value::byte(4),
+            (0x1018, 1) => Value::word(vendor_id),
+            (0x1018, 2) => Value::word(product_code),
+            (0x1018, 3) => Value::word(revision),
+            (0x1018, 4) => Value::word(serial_number),
+            (PROGRAM_CONTROL | PROGRAM_ID | FLASH_STATUS, 0) => Value::byte(self.control.programs()),
+            (PROGRAM_CONTROL, sub) => Value::byte(self.control.state(sub, services)?),
+            (PROGRAM_ID, sub) => Value::word(self.control.identification(sub, services)?),
+            (FLASH_STATUS, sub) => Value::word(self.control.flash_status(sub)?),
+            (0x1000 | 0x1001 | 0x1017 | 0x1018, _) => return Err(Abort::NO_SUB_INDEX),
+            _ => return Err(Abort::NO_OBJECT),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use shared_abi::callgate::{CallgateError, ProgramArgs};
+    use shared_abi::warm_start::Owed;
+
+    use super::*;
+    use crate::bootloader::Confirmed;
+    use crate::start::{Defaults, Start};
+
+    /// A bootloader that knows no other program and stores what it is asked to.
+    struct Fake;
+
+    impl Services for Fake {
+        fn program_info(&mut self, _: u8) -> Result<ProgramArgs, CallgateError> {
+            Err(CallgateError::Refused(-7))
+        }
+
+        fn confirm(&mut self, _: u8) -> Result<Confirmed, CallgateError> {
+            Ok(Confirmed::Now)
+        }
+    }
+
+    const DEVICE: Device = Device {
+        device_type: 0x0002_0192,
+        vendor_id: 0x11,
+        product_code: 0x22,
+        revision: 0x0001_0003,
+        serial_number: 0xDEAD_BEEF,
+        heartbeat_ms: 100,
+    };
+
+    /// Node 5, program 1 of two.
+    fn before_boot_up(fresh: bool) -> Responder {
+        let defaults = Defaults { node_id: Some(5), bit_rate: 125_000, serial_number: 0 };
+        let start = Start { fresh, ..Start::new(None, defaults) };
+        Responder::new(DEVICE, 5, ProgramControl::new(&start, 2, 0x1234_5678)).unwrap()
+    }
+
+    fn responder() -> Responder {
+        let mut responder = before_boot_up(false);
+        assert_eq!(responder.poll(0), Frame::new(0x705, &[0]));
+        responder
+    }
+
+    fn ask(responder: &mut Responder, request: [u8; 8]) -> Option<[u8; 8]> {
+        let answer = responder.handle(&Frame::new(0x605, &request).unwrap(), 0, &mut Fake)?;
+        assert_eq!(answer.id(), 0x585);
+        Some(answer.data().try_into().unwrap())
+    }
+
+    /// The requests and answers as CiA 301 section 7.2.4.3.3 and 7.2.4.3.6 lays the bytes out.
+    #[test]
+    fn each_object_is_read_by_an_expedited_upload() {
+        let mut responder = responder();
+        for (object, answer) in [
+            ([0x00, 0x10, 0], [0x43, 0x00, 0x10, 0, 0x92, 0x01, 0x02, 0x00]),
+            ([0x01, 0x10, 0], [0x4F, 0x01, 0x10, 0, 0, 0, 0, 0]),
+            ([0x17, 0x10, 0], [0x4B, 0x17, 0x10, 0, 100, 0, 0, 0]),
+            ([0x18, 0x10, 0], [0x4F, 0x18, 0x10, 0, 4, 0, 0, 0]),
+            ([0x18, 0x10, 1], [0x43, 0x18, 0x10, 1, 0x11, 0, 0, 0]),
+            ([0x18, 0x10, 2], [0x43, 0x18, 0x10, 2, 0x22, 0, 0, 0]),
+            ([0x18, 0x10, 3], [0x43, 0x18, 0x10, 3, 3, 0, 1, 0]),
+            ([0x18, 0x10, 4], [0x43, 0x18, 0x10, 4, 0xEF, 0xBE, 0xAD, 0xDE]),
+            ([0x51, 0x1F, 0], [0x4F, 0x51, 0x1F, 0, 2, 0, 0, 0]),
+            ([0x51, 0x1F, 1], [0x4F, 0x51, 0x1F, 1, 1, 0, 0, 0]),
+            ([0x51, 0x1F, 2], [0x4F, 0x51, 0x1F, 2, 3, 0, 0, 0]),
+            ([0x56, 0x1F, 1], [0x43, 0x56, 0x1F, 1, 0x78, 0x56, 0x34, 0x12]),
+            ([0x57, 0x1F, 1], [0x43, 0x57, 0x1F, 1, 0, 0, 0, 0]),
+        ] {
+            let [low, high, sub] = object;
+            assert_eq!(ask(&mut responder, [0x40, low, high, sub, 0, 0, 0, 0]), Some(answer), "{object:X?}");
+        }
+    }
+
+    /// The codes are those of CiA 301 table 22, least significant byte first.
+    #[test]
+    fn every_other_request_gets_the_abort_that_the_standard_has_for_it() {
+        for (request, code) in [
+            // 06020000h: the object does not exist.
+            ([0x40, 0x08, 0x10, 0, 0, 0, 0, 0], [0, 0, 2, 6]),
+            ([0x2F, 0x50, 0x1F, 1, 0, 0, 0, 0], [0, 0, 2, 6]),
+            // 06090011h: the sub-index does not exist.
+            ([0x40, 0x18, 0x10, 5, 0, 0, 0, 0], [0x11, 0, 9, 6]),
+            ([0x40, 0x51, 0x1F, 3, 0, 0, 0, 0], [0x11, 0, 9, 6]),
+            ([0x2F, 0x51, 0x1F, 3, 0x80, 0, 0, 0], [0x11, 0, 9, 6]),
+            // 06010002h: read-only.
+            ([0x23, 0x00, 0x10, 0, 1, 0, 0, 0], [2, 0, 1, 6]),
+            ([0x2F, 0x51, 0x1F, 0, 1, 0, 0, 0], [2, 0, 1, 6]),
+            ([0x23, 0x57, 0x1F, 1, 0, 0, 0, 0], [2, 0, 1, 6]),
+            // 06070012h and 06070013h: too long, too short.
+            ([0x2B, 0x51, 0x1F, 1, 0x80, 0, 0, 0], [0x12, 0, 7, 6]),
+            ([0x23, 0x17, 0x10, 0, 0, 0, 0, 0], [0x12, 0, 7, 6]),
+            ([0x2F, 0x17, 0x10, 0, 0, 0, 0, 0], [0x13, 0, 7, 6]),
+            // 06090030h: the value is none of the object's.
+            ([0x2F, 0x51, 0x1F, 1, 0x04, 0, 0, 0], [0x30, 0, 9, 6]),
+            // 08000022h: not in the present state.
+            ([0x2F, 0x51, 0x1F, 1, 0x83, 0, 0, 0], [0x22, 0, 0, 8]),
+            // 05040001h: a segmented download, and a block download and upload.
+            ([0x21, 0x51, 0x1F, 1, 1, 0, 0, 0], [1, 0, 4, 5]),
+            ([0xC6, 0x50, 0x1F, 1, 0, 1, 0, 0], [1, 0, 4, 5]),
+            ([0xA4, 0x00, 0x10, 0, 127, 0, 0, 0], [1, 0, 4, 5]),
+        ] {
+            let mut expected = request;
+            expected[0] = 0x80;
+            expected[4..].copy_from_slice(&code);
+            assert_eq!(ask(&mut responder(), request), Some(expected), "{request:X?}");
+        }
+        // Parts of a transfer name no object, and there is no transfer.
+        for command in [0x00, 0x10, 0x60, 0x70, 0xA1, 0xA2, 0xA3, 0xC1, 0xE0, 0xFF] {
+            let answer = ask(&mut responder(), [command, 1, 2, 3, 4, 5, 6, 7]);
+            assert_eq!(answer, Some([0x80, 0, 0, 0, 1, 0, 4, 5]), "{command:02X}h");
+        }
+    }
+
+    #[test]
+    fn what_is_no_request_to_this_node_is_not_answered() {
+        let mut responder = responder();
+        let silent = |responder: &mut Responder, id, data: &[u8]| {
+            assert_eq!(
+                responder.handle(&Frame::new(id, data).unwrap(), 0, &mut Fake),
+                None,
+                "{id:X} {data:X?}"
+            );
+        };
+        for (id, data) in [
+            (0x606, &[0x40, 0, 0x10, 0, 0, 0, 0, 0][..]),
+            (0x585, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]),
+            (0x605, &[0x40, 0, 0x10, 0, 0, 0, 0]),
+            (0x605, &[]),
+            // The client ends a transfer.
+            (0x605, &[0x80, 0, 0x10, 0, 0, 0, 4, 5]),
+            (0x000, &[0x02, 6]),
+            (0x000, &[0x02]),
+            (0x000, &[0x03, 5]),
+        ] {
+            silent(&mut responder, id, data);
+        }
+        assert!(ask(&mut responder, [0x40, 0, 0x10, 0, 0, 0, 0, 0]).is_some(), "nothing has stopped it");
+        // Stopped, a node serves no SDO; before its boot-up nothing.
+        silent(&mut responder, 0, &[0x02, 0]);
+        silent(&mut responder, 0x605, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]);
+        silent(&mut before_boot_up(false), 0x605, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]);
+        assert_eq!(Frame::new(0x800, &[]), None);
+        assert_eq!(Frame::new(0, &[0; 9]), None);
+    }
+
+    #[test]
+    fn boot_up_and_heartbeat_tell_the_state() {
+        let mut responder = responder();
+        assert_eq!(responder.poll(0), None);
+        assert_eq!(responder.poll(99), None);
+        assert_eq!(responder.poll(100), Frame::new(0x705, &[0x7F]));
+        for (command, state) in [(0x01, 0x05), (0x02, 0x04), (0x80, 0x7F)] {
+            responder.handle(&Frame::new(0, &[command, 5]).unwrap(), 100, &mut Fake);
+            assert_eq!(responder.is_operational(), command == 1);
+            assert_eq!(responder.poll(150), None);
+            assert_eq!(responder.poll(200), Frame::new(0x705, &[state]));
+            responder.beaten = 100;
+        }
+        // Reset communication, then a heartbeat of 500 ms, then none.
+        responder.handle(&Frame::new(0, &[0x82, 0]).unwrap(), 200, &mut Fake);
+        assert_eq!(responder.poll(200), Frame::new(0x705, &[0]));
+        let written = Some([0x60, 0x17, 0x10, 0, 0, 0, 0, 0]);
+        assert_eq!(ask(&mut responder, [0x2B, 0x17, 0x10, 0, 0xF4, 0x01, 0, 0]), written);
+        assert_eq!((responder.poll(499), responder.poll(500)), (None, Frame::new(0x705, &[0x7F])));
+        assert_eq!(ask(&mut responder, [0x2B, 0x17, 0x10, 0, 0, 0, 0, 0]), written);
+        assert_eq!(responder.poll(60_000), None);
+    }
+
+    /// The size may be told or not (CiA 301: the s bit).
+    #[test]
+    fn a_call_back_is_acknowledged_and_the_device_leaves_behind_the_pause() {
+        for command in [0x2F, 0x22] {
+            let mut responder = responder();
+            let answer = ask(&mut responder, [command, 0x51, 0x1F, 1, 0x80, 0, 0, 0]);
+            assert_eq!(answer, Some([0x60, 0x51, 0x1F, 1, 0, 0, 0, 0]));
+            assert_eq!(responder.proceed(false, 1), Next::Serve);
+            assert_eq!(responder.proceed(true, 2), Next::Serve);
+            assert!(ask(&mut responder, [0x40, 0, 0x10, 0, 0, 0, 0, 0]).is_some(), "served in the pause");
+            assert_eq!(responder.proceed(true, 13), Next::Leave(BootRequest::Stay));
+            assert_eq!(responder.poll(60_000), None);
+        }
+    }
+
+    #[test]
+    fn stop_is_left_to_the_bootloader_and_the_device_is_silent() {
+        let mut responder = responder();
+        assert_eq!(ask(&mut responder, [0x2F, 0x51, 0x1F, 1, 0, 0, 0, 0]), None);
+        assert_eq!(ask(&mut responder, [0x40, 0, 0x10, 0, 0, 0, 0, 0]), None);
+        assert_eq!(responder.poll(1000), None);
+        let owed = Owed { program: 1, value: 0, node_id: 5 };
+        assert_eq!(responder.proceed(true, 1), Next::Leave(BootRequest::Owed(owed)));
+    }
+
+    #[test]
+    fn nmt_reset_node_restarts_as_after_a_power_on() {
+        let mut responder = responder();
+        responder.handle(&Frame::new(0, &[0x81, 0]).unwrap(), 0, &mut Fake);
+        assert_eq!(responder.proceed(true, 0), Next::Serve);
+        assert_eq!(responder.proceed(true, 11), Next::Leave(BootRequest::PowerOn));
+    }
+
+    #[test]
+    fn a_fresh_program_is_confirmed_by_the_first_80h() {
+        let mut responder = before_boot_up(true);
+        responder.poll(0);
+        assert!(ask(&mut responder, [0x2F, 0x51, 0x1F, 1, 0x80, 0, 0, 0]).is_some());
+        assert_eq!((responder.proceed(true, 20), responder.proceed(true, 900)), (Next::Serve, Next::Serve));
+    }
+
+    #[test]
+    fn only_a_node_id_of_the_standard_makes_a_node() {
+        let control = responder().control().clone();
+        for (node_id, good) in [(0, false), (1, true), (127, true), (128, false), (255, false)] {
+            assert_eq!(Responder::new(DEVICE, node_id, control.clone()).is_some(), good, "{node_id}");
+        }
+    }
+
+    proptest! {
+        /// Whatever comes: a request that is no abort gets one answer on the server's identifier, with
+        /// the layout of the standard; everything else silence.
+        #[test]
+        fn any_frame_gets_an_answer_or_silence(
+            frames in prop::collection::vec(
+                (prop_oneof![Just(0x605_u16), Just(0), 0..0x800_u16], prop::collection::vec(any::<u8>(), 0..=8)),
+                1..40,
+            ),
+            on_objects: bool,
+        ) {
+            let mut responder = responder();
+            for (at, (id, mut data)) in frames.into_iter().enumerate() {
+                if let (true, [_, low, high, ..]) = (on_objects, &mut data[..]) {
+                    (*low, *high) = (0x51, 0x1F);
+                }
+                let frame = Frame::new(id, &data).unwrap();
+                let stopped = responder.nmt == Nmt::Stopped;
+                let booting = responder.nmt == Nmt::BootUp;
+                let silent = responder.silent;
+                let answer = responder.handle(&frame, at as u32, &mut Fake);
+                let is_request = id == 0x605 && data.len() == 8 && data[0] >> 5 != 4;
+                if !is_request || stopped || booting || silent {
+                    prop_assert_eq!(answer, None);
+                } else if let Some(answer) = answer {
+                    prop_assert_eq!((answer.id(), answer.data().len()), (0x585, 8));
+                    match (data[0] >> 5, answer.data()[0]) {
+                        (1, 0x60) | (2, 0x43 | 0x4B | 0x4F) | (_, 0x80) => {}
+                        other => prop_assert!(false, "{other:X?}"),
+                    }
+                } else {
+                    // An answer that is left to the bootloader: STOP or CLEAR.
+                    prop_assert!(data[0] >> 5 == 1 && data[1..3] == [0x51, 0x1F] && matches!(data[4], 0 | 3));
+                }
+                responder.poll(at as u32);
+            }
+        }
+    }
+}

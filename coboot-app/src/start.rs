@@ -1,0 +1,115 @@
+//! How the program came up.
+
+use shared_abi::handoff::{BootInfo, Handoff};
+use shared_abi::layout::Layout;
+
+/// What holds where no bootloader has started the program (a debugger did, say).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Defaults {
+    /// Node-ID, 1 to 127; `None` for a device that waits for layer setting services.
+    pub node_id: Option<u8>,
+    /// Bit rate in bit/s; 0 for a device that finds it out by listening.
+    pub bit_rate: u32,
+    /// 1018h/4.
+    pub serial_number: u32,
+}
+
+/// How the program came up: as the bootloader told, or by the defaults.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Start {
+    /// Node-ID to use, 1 to 127, unless there is none.
+    pub node_id: Option<u8>,
+    /// Bit rate to use, in bit/s; 0 for a device that finds it out by listening.
+    pub bit_rate: u32,
+    /// 1018h/4.
+    pub serial_number: u32,
+    /// The program that this is, 1 to 254: the sub-index of 1F51h that is its own.
+    pub program: u8,
+    /// It was started right behind its download in one go (raw image, Intel HEX or sealed image): the
+    /// first 1F51h = 80h confirms it.
+    pub fresh: bool,
+    /// All that the bootloader told; `None` where no bootloader started the program.
+    pub told: Option<BootInfo>,
+}
+
+impl Start {
+    /// Reads the handoff of the bootloader. Once, before CAN is set up.
+    #[must_use]
+    pub fn read(layout: &Layout, defaults: Defaults) -> Self {
+        // SAFETY: the layout's handoff region, which `Layout::checked` holds to be RAM of that size
+        // and which the linker scripts keep out of every image.
+        let told = unsafe { Handoff::read(layout.handoff.base as usize as *const Handoff) };
+        Self::new(told, defaults)
+    }
+
+    /// From what the bootloader told, if it did.
+    #[must_use]
+    pub const fn new(told: Option<BootInfo>, defaults: Defaults) -> Self {
+        match told {
+            Some(info) => Self {
+                node_id: Some(info.node_id),
+                bit_rate: info.bit_rate,
+                serial_number: info.serial_number,
+                program: info.program,
+                fresh: info.fresh,
+                told,
+            },
+            None => Self {
+                node_id: defaults.node_id,
+                bit_rate: defaults.bit_rate,
+                serial_number: defaults.serial_number,
+                program: 1,
+                fresh: false,
+                told,
+            },
+        }
+    }
+
+    /// The node-ID with which the bootloader comes up at the same bit rate, so that it can answer in
+    /// this program's place. `None` where it has to find the bit rate out first.
+    #[must_use]
+    pub const fn bootloader_node(&self) -> Option<u8> {
+        match self.bit_rate {
+            0 => None,
+            _ => self.node_id,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shared_abi::handoff::ResetCause;
+
+    use super::*;
+
+    const DEFAULTS: Defaults = Defaults { node_id: Some(32), bit_rate: 125_000, serial_number: 7 };
+    const TOLD: BootInfo = BootInfo {
+        node_id: 5,
+        bit_rate: 500_000,
+        program: 2,
+        reset_cause: ResetCause::PowerOn,
+        trial: true,
+        fresh: true,
+        bootloader_version: 0x0001_0000,
+        serial_number: 9,
+    };
+
+    #[test]
+    fn what_the_bootloader_told_comes_before_the_defaults() {
+        let Start { node_id, bit_rate, serial_number, program, fresh, told } =
+            Start::new(Some(TOLD), DEFAULTS);
+        assert_eq!((node_id, bit_rate, serial_number, program), (Some(5), 500_000, 9, 2));
+        assert!(fresh && told == Some(TOLD));
+        let start = Start::new(None, DEFAULTS);
+        assert_eq!((start.node_id, start.bit_rate, start.serial_number), (Some(32), 125_000, 7));
+        assert_eq!((start.program, start.fresh, start.told), (1, false, None));
+    }
+
+    #[test]
+    fn a_bootloader_that_has_to_listen_first_does_not_answer() {
+        assert_eq!(Start::new(Some(TOLD), DEFAULTS).bootloader_node(), Some(5));
+        let listens = BootInfo { bit_rate: 0, ..TOLD };
+        assert_eq!(Start::new(Some(listens), DEFAULTS).bootloader_node(), None);
+        assert_eq!(Start::new(None, Defaults { node_id: None, ..DEFAULTS }).bootloader_node(), None);
+    }
+}

@@ -1,0 +1,273 @@
+//! A build-script helper for applications that run under the coboot bootloader: it gives the linker
+//! the place of the program, and the program the memory map of its board.
+//!
+//! ```no_run
+//! // build.rs
+//! coboot_linker::Application::of_board("stm32f407g-disc1").emit();
+//! ```
+//!
+//! [`Application::emit`] writes three files into `OUT_DIR` and tells cargo to link with them:
+//!
+//! | file | what it is |
+//! |---|---|
+//! | `memory.x` | `MEMORY` and the border symbols of the board |
+//! | `application.x` | includes the `link.x` of cortex-m-rt, places the label, checks the borders |
+//! | `coboot_layout.rs` | the memory map as a Rust expression, for `coboot_app::layout!()` |
+//!
+//! `board` reads a memory map from a file, for host tools too (feature `file`, on by default).
+#![forbid(unsafe_code)]
+
+#[cfg(feature = "file")]
+pub mod board;
+mod rust;
+
+use std::path::{Path, PathBuf};
+use std::{env, fmt, fs};
+
+use shared_abi::layout::{self, Image, Layout, BOARDS};
+
+/// What cannot be done for an application.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Error {
+    /// No board has this name.
+    NoBoard {
+        /// The name.
+        name: String,
+    },
+    /// No feature `board-NAME` of the package names a board.
+    NoFeature,
+    /// The device has no program of this number.
+    NoProgram {
+        /// The board.
+        board: &'static str,
+        /// The number that was asked for.
+        number: u8,
+        /// How many there are.
+        programs: usize,
+    },
+    /// A file cannot be read or written, or says something wrong.
+    File {
+        /// The file.
+        path: String,
+        /// What is wrong with it.
+        error: String,
+    },
+    /// This is no build script: cargo has not set `OUT_DIR`.
+    NoBuildScript,
+}
+
+impl fmt::Display for Error {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let boards = || BOARDS.iter().map(|layout| layout.board).collect::<Vec<_>>().join(", ");
+        match self {
+            Self::NoBoard { name } => write!(
+                f,
+                "no board \"{name}\" is known; there is: {}. For another board write its memory map into a file \
+                 (`cargo xtask layout --toml`) and use `of_file`.",
+                boards()
+            ),
+            Self::NoFeature => {
+                write!(f, "choose a board by one of the features `board-NAME`; NAME is one of: {}.", boards())
+            }
+            Self::NoProgram { board, number, programs } => {
+                write!(f, "{board} has no program {number}: its programs are numbered from 1 to {programs}.")
+            }
+            Self::File { path, error } => write!(f, "{path}: {error}."),
+            Self::NoBuildScript => {
+                write!(f, "OUT_DIR is not set: this is to be called by a build script (build.rs).")
+            }
+        }
+    }
+}
+
+impl std::error::Error for Error {}
+
+impl Error {
+    fn file(path: &Path, error: &dyn fmt::Display) -> Self {
+        Self::File { path: path.display().to_string(), error: error.to_string() }
+    }
+}
+
+/// What stands in the file that `coboot_app::layout!()` includes.
+pub const LAYOUT_FILE: &str = "coboot_layout.rs";
+/// The linker script of an application.
+const TEMPLATE: &str = include_str!("../application.x");
+
+/// An application, and where it gets its place from.
+#[derive(Clone, Debug)]
+#[must_use = "`emit` does the work"]
+pub struct Application {
+    layout: Result<&'static Layout, Error>,
+    /// The file that the layout comes from.
+    file: Option<PathBuf>,
+    program: u8,
+}
+
+impl Application {
+    /// For a board with this memory map.
+    pub const fn new(layout: &'static Layout) -> Self {
+        Self { layout: Ok(layout), file: None, program: 1 }
+    }
+
+    /// For a board of the coboot repository, by its name.
+    pub fn of_board(name: &str) -> Self {
+        let layout = layout::by_name(name).ok_or_else(|| Error::NoBoard { name: name.to_owned() });
+        Self { layout, file: None, program: 1 }
+    }
+
+    /// For a board of the coboot repository that one of the features of the package names:
+    /// `board-stm32f407g-disc1`, say.
+    pub fn of_features() -> Self {
+        Self { layout: board_of_features(), file: None, program: 1 }
+    }
+
+    /// For a board whose memory map stands in this file, which `cargo xtask layout --toml` has written.
+    /// A relative path begins at the package.
+    #[cfg(feature = "file")]
+    pub fn of_file(path: impl AsRef<Path>) -> Self {
+        let path = path.as_ref();
+        let layout = fs::read_to_string(path)
+            .map_err(|error| Error::file(path, &error))
+            .and_then(|text| board::parse(&text).map_err(|error| Error::file(path, &error)));
+        Self { layout, file: Some(path.to_owned()), program: 1 }
+    }
+
+    /// Linked for the place of program `number`: 1 (the default) is the first.
+    pub const fn program(mut self, number: u8) -> Self {
+        self.program = number;
+        self
+    }
+
+    /// Writes the files into `OUT_DIR` and tells cargo to link with them. What cannot be done ends the
+    /// build with a message that says why.
+    pub fn emit(self) {
+        if let Err(error) = self.try_emit() {
+            println!("cargo::error={error}");
+            std::process::exit(1);
+        }
+    }
+
+    /// As [`emit`](Self::emit).
+    ///
+    /// # Errors
+    /// [`Error`] tells what is wrong.
+    pub fn try_emit(self) -> Result<(), Error> {
+        let out = env::var_os("OUT_DIR").map(PathBuf::from).ok_or(Error::NoBuildScript)?;
+        if let Some(file) = &self.file {
+            println!("cargo::rerun-if-changed={}", file.display());
+        }
+        self.write(&out)?;
+        println!("cargo::rerun-if-changed=build.rs");
+        link(&out, "application.x");
+        Ok(())
+    }
+
+    /// Writes the files into a folder.
+    ///
+    /// # Errors
+    /// [`Error`] tells what is wrong.
+    pub fn write(&self, folder: &Path) -> Result<(), Error> {
+        let layout = self.layout.clone()?;
+        if layout.program(self.program).is_none() {
+            return Err(Error::NoProgram {
+                board: layout.board,
+                number: self.program,
+                programs: layout.programs.len(),
+            });
+        }
+        write_memory(layout, Image::Program(self.program), folder)?;
+        for (name, text) in
+            [("application.x", TEMPLATE.to_owned()), (LAYOUT_FILE, rust::Expression(layout).to_string())]
+        {
+            write(&folder.join(name), &text)?;
+        }
+        Ok(())
+    }
+}
+
+/// The board of the coboot repository that one of the features of the package names. For build
+/// scripts.
+///
+/// # Errors
+/// [`Error::NoFeature`].
+pub fn board_of_features() -> Result<&'static Layout, Error> {
+    let is_on = |layout: &&Layout| {
+        let feature = layout.board.to_uppercase().replace('-', "_");
+        env::var_os(format!("CARGO_FEATURE_BOARD_{feature}")).is_some()
+    };
+    BOARDS.iter().copied().find(is_on).ok_or(Error::NoFeature)
+}
+
+/// Writes `memory.x` of an image into a folder.
+///
+/// # Errors
+/// [`Error::File`].
+pub fn write_memory(layout: &Layout, image: Image, folder: &Path) -> Result<(), Error> {
+    write(&folder.join("memory.x"), &layout.linker_script(image).to_string())
+}
+
+/// Tells cargo to link the binaries of this package with `script`, which is in `folder` like what it
+/// includes.
+pub fn link(folder: &Path, script: &str) {
+    println!("cargo::rustc-link-search={}", folder.display());
+    println!("cargo::rustc-link-arg-bins=-T{script}");
+    // Without it the linker aligns segments to pages of 64 KiB, and the file tells more flash than
+    // the program fills.
+    println!("cargo::rustc-link-arg-bins=--nmagic");
+}
+
+fn write(path: &Path, text: &str) -> Result<(), Error> {
+    fs::write(path, text).map_err(|error| Error::file(path, &error))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A folder that is this test's alone.
+    fn folder(name: &str) -> PathBuf {
+        let folder = env::temp_dir().join(format!("coboot-linker-{}-{name}", std::process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        folder
+    }
+
+    #[test]
+    fn a_map_from_a_file_places_a_program_as_the_map_of_the_repository_does() {
+        let folder = folder("file");
+        let map = folder.join("board.toml");
+        let board = &layout::stm32f407g_disc1_two::LAYOUT;
+        fs::write(&map, layout::toml::Toml(board).to_string()).unwrap();
+        let mut scripts = Vec::new();
+        for application in [Application::of_file(&map), Application::of_board(board.board)] {
+            application.program(2).write(&folder).unwrap();
+            scripts.push(fs::read_to_string(folder.join("memory.x")).unwrap());
+        }
+        assert_eq!(scripts[0], scripts[1]);
+        // Sectors 8 to 11 of an STM32F407 (RM0090 table 5).
+        assert!(scripts[0].contains("FLASH : ORIGIN = 0x08080000, LENGTH = 0x80000"), "{}", scripts[0]);
+        assert!(fs::read_to_string(folder.join("application.x")).unwrap().contains("INCLUDE link.x"));
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn what_cannot_be_is_told_in_words() {
+        let folder = folder("wrong");
+        let told = |application: Application| application.write(&folder).unwrap_err().to_string();
+        let text = told(Application::of_board("stm32f407g-disc2"));
+        assert!(
+            text.contains("no board \"stm32f407g-disc2\"") && text.contains("stm32f429i-disc1"),
+            "{text}"
+        );
+        for number in [0, 2, 255] {
+            let text = told(Application::of_board("stm32f407g-disc1").program(number));
+            assert!(text.contains(&format!("no program {number}")), "{text}");
+        }
+        let missing = folder.join("none.toml");
+        assert!(told(Application::of_file(&missing)).contains("none.toml"));
+        let rubbish = folder.join("rubbish.toml");
+        fs::write(&rubbish, "board = [").unwrap();
+        let text = told(Application::of_file(&rubbish));
+        assert!(text.contains("rubbish.toml: line 1"), "{text}");
+        fs::remove_dir_all(folder).unwrap();
+    }
+}

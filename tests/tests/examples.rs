@@ -1,0 +1,315 @@
+//! The programs of `examples/`, as their own tools built them (`cargo xtask examples`): they come up
+//! under the bootloader, go back into it and are updated. And what is said to those who build one of
+//! them with a mistake.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::{env, fs};
+
+use canopen::program::ProgramControl;
+use canopen::Address;
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::endpoint::Endpoint;
+use coboot_tests::{call_back, firmware};
+use coflash::update::{flash, FlashOptions};
+use coflash::Error;
+use shared_abi::label::{self, Label};
+use shared_abi::layout::{stm32f407g_disc1, stm32f407g_disc1_two, Image};
+
+const CRC: Address = Address::new(0x1F56, 1);
+
+/// Each as version 1, and as version 2, which another compiler may have made.
+const EXAMPLES: [[&str; 2]; 2] =
+    [["example-c-cmake.elf", "example-c-cmake-v2.elf"], ["example-cpp.elf", "example-cpp-v2.elf"]];
+
+/// Whether the tests are about the board that the examples are for.
+fn is_board_of_examples() -> bool {
+    firmware::board() == &stm32f407g_disc1::LAYOUT
+}
+
+/// A board with nothing but the bootloader.
+fn empty_board() -> Bench {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    bench
+}
+
+fn coflash() -> Command {
+    let coflash = env::var_os("COBOOT_COFLASH")
+        .unwrap_or_else(|| panic!("COBOOT_COFLASH is not set: run the tests by `cargo xtask test`"));
+    Command::new(coflash)
+}
+
+fn text(output: &Output) -> String {
+    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
+}
+
+/// The label of an image: at its place, and whole.
+fn label_of(image: &str) -> Label {
+    let bytes = firmware::raw_from(stm32f407g_disc1::LAYOUT.programs[0].base, image);
+    let place = label::OFFSET as usize;
+    Label::parse(bytes[place..place + label::SIZE].try_into().unwrap()).expect("a label")
+}
+
+/// The main job with each: installed, verified, started, called back, updated, and there again after
+/// a power-off.
+#[test]
+fn each_is_installed_and_updates_itself_over_socketcand() {
+    if !is_board_of_examples() {
+        return;
+    }
+    for versions in EXAMPLES {
+        let mut endpoint = Endpoint::new(empty_board());
+        let url = endpoint.url();
+        let mut crcs = Vec::new();
+        for (version, name) in (1..).zip(versions) {
+            assert_eq!(label_of(name), Label::new(0, 0x4007_D151, version), "{name}");
+            let board = ["--verify", "--board", stm32f407g_disc1::LAYOUT.board];
+            let mut command = coflash();
+            command.args(["--bus", &url, "flash"]).arg(firmware::dir().join(name)).args(board);
+            // The second time the program that runs is told to go back.
+            let output = endpoint.run(&mut command);
+            assert!(output.status.success(), "{name}: {}", text(&output));
+            let output = endpoint.run(coflash().args(["--bus", &url, "info"]));
+            assert!(output.status.success(), "{name}: {}", text(&output));
+            assert!(text(&output).contains("an application"), "{name}: {}", text(&output));
+            let mut session = endpoint.bench.session();
+            assert_eq!(session.read_number(Address::new(0x1F51, 1)).unwrap(), 1, "{name} runs");
+            crcs.push(session.read_number(CRC).unwrap());
+        }
+        assert_ne!(crcs[0], crcs[1], "another program");
+        let bench = &mut endpoint.bench;
+        bench.power_off();
+        bench.run_ms(500);
+        bench.power_on();
+        bench.await_program(1000);
+        assert!(!bench.is_bootloader(NODE), "it starts by itself");
+        assert_eq!(bench.session().read_number(CRC).unwrap(), crcs[1]);
+        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+        bench.await_boot_up(1000);
+        assert!(bench.is_bootloader(NODE));
+        assert_eq!(bench.session().read_number(CRC).unwrap(), crcs[1], "the bootloader says the same");
+        bench.assert_nothing_unmodelled();
+    }
+}
+
+/// The answer to 80h is whole on the bus, and 10 ms more have passed, when they leave.
+#[test]
+fn each_can_be_called_back_at_every_bit_rate() {
+    if is_board_of_examples() {
+        EXAMPLES.concat().into_iter().for_each(|name| call_back::at_every_bit_rate(name, |_, _| {}));
+    }
+}
+
+/// A copy of the example in C, to be built with a mistake in it.
+struct Project(PathBuf);
+
+impl Project {
+    fn new(name: &str) -> Self {
+        let root = Path::new(env!("CARGO_TARGET_TMPDIR")).join("c-mistakes").join(name);
+        let _ = fs::remove_dir_all(&root);
+        let house = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+        for folder in ["app-c", "examples/c-cmake"] {
+            copy(&house.join(folder), &root.join(folder));
+        }
+        Self(root)
+    }
+
+    /// Puts `new` in the place of `old`, which is there once.
+    fn edit(self, file: &str, old: &str, new: &str) -> Self {
+        let path = self.0.join(file);
+        let before = fs::read_to_string(&path).expect(file);
+        assert_eq!(before.matches(old).count(), 1, "{file}: {old:?}");
+        fs::write(&path, before.replace(old, new)).expect(file);
+        self
+    }
+
+    /// Builds it with options of CMake.
+    ///
+    /// # Errors
+    /// What the tools say when they refuse it.
+    fn build(&self, options: &[&str]) -> Result<PathBuf, String> {
+        let (source, build) = (self.0.join("examples/c-cmake"), self.0.join("build"));
+        let toolchain = self.0.join("app-c/cmake/arm-none-eabi-gcc.cmake");
+        let mut configure = Command::new("cmake");
+        configure.arg("-S").arg(source).arg("-B").arg(&build).args(options);
+        configure.arg(format!("-DCMAKE_TOOLCHAIN_FILE={}", toolchain.display()));
+        for command in [&mut configure, Command::new("cmake").arg("--build").arg(&build)] {
+            let output = command.output().expect("`cargo xtask setup` installs cmake");
+            if !output.status.success() {
+                return Err(text(&output));
+            }
+        }
+        Ok(build.join("app.elf"))
+    }
+}
+
+fn copy(from: &Path, to: &Path) {
+    fs::create_dir_all(to).expect("a folder below target");
+    for entry in fs::read_dir(from).expect("a folder") {
+        let entry = entry.expect("an entry");
+        let (from, to) = (entry.path(), to.join(entry.file_name()));
+        if from.is_dir() {
+            copy(&from, &to);
+        } else {
+            fs::copy(from, to).expect("a file below target");
+        }
+    }
+}
+
+/// What `coflash` says of a file without a bus; whether it takes it.
+fn judged(words: &[&str], file: &Path) -> (bool, String) {
+    let board = ["--board", stm32f407g_disc1::LAYOUT.board];
+    let output = coflash().args(words).arg(file).args(board).output().expect("coflash starts");
+    (output.status.success(), text(&output))
+}
+
+/// `flash` without a bus: what it refuses before it looks for one.
+const FLASH: [&str; 3] = ["--bus", "socketcand://127.0.0.1:1/can0", "flash"];
+
+/// The label stands behind the vectors of the chip. More of them would run into it, fewer would leave
+/// interrupts without a handler.
+#[test]
+fn another_number_of_vectors_than_the_chips_does_not_link() {
+    let project = Project::new("vectors");
+    for lines in [81, 83, 112] {
+        let refused = project.build(&[&format!("-DINTERRUPT_LINES={lines}")]).expect_err("it links");
+        assert!(
+            refused.contains("ERROR(coboot): the vector table is not as long as the chip's"),
+            "{lines}: {refused}"
+        );
+    }
+    project.build(&["-DINTERRUPT_LINES=82"]).unwrap_or_else(|refused| panic!("{refused}"));
+}
+
+/// A label is optional: the device takes the program, and nobody can tell whom it is for.
+#[test]
+fn a_program_without_a_label_is_taken_and_says_nothing_of_itself() {
+    let project =
+        Project::new("label").edit("app-c/main.c", "COBOOT_LABEL(VENDOR_ID, PRODUCT_CODE, VERSION);\n", "");
+    let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
+    let (good, told) = judged(&["inspect"], &elf);
+    assert!(good && told.contains("can be a program") && !told.contains("  label "), "{told}");
+    let blocks = firmware::blocks_of_file(&elf);
+    let mut bench = empty_board();
+    let options = FlashOptions::default().trial_run(false);
+    flash(&mut bench.session(), &blocks, &options, &mut |_| {}).unwrap();
+    assert!(!bench.is_bootloader(NODE));
+
+    // Two of them are one too many.
+    let again = "COBOOT_LABEL(VENDOR_ID, PRODUCT_CODE, VERSION);\n";
+    let project = Project::new("label").edit(
+        "app-c/board.c",
+        "#include \"registers.h\"\n",
+        &format!("#include \"registers.h\"\n#include \"coboot/coboot.h\"\n#define VERSION 1\n{again}"),
+    );
+    let refused = project.build(&[]).expect_err("it links");
+    assert!(refused.contains("multiple definition of `coboot_label_of_image'"), "{refused}");
+}
+
+/// Linked for the beginning of the flash, as every project begins, or for the place of another
+/// program.
+#[test]
+fn a_program_for_another_address_is_refused_by_linker_and_coflash() {
+    let layout = "examples/c-cmake/layout.x";
+    let at_the_beginning = |name: &str| {
+        Project::new(name).edit(layout, "0x08010000, LENGTH = 0xf0000", "0x08000000, LENGTH = 0x100000")
+    };
+    let refused = at_the_beginning("address").build(&[]).expect_err("it links");
+    assert!(refused.contains("ERROR(coboot): the program lies over the bootloader's callgate"), "{refused}");
+
+    // With a linker script that knows nothing of coboot.
+    let project = at_the_beginning("address").edit("app-c/app.x", "  INCLUDE coboot.x\n", "");
+    let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
+    for words in [&["convert"][..], &FLASH] {
+        let (good, told) = judged(words, &elf);
+        assert!(
+            !good
+                && told.contains("lies outside 0x08010000..=0x080fffff: link the program for this region")
+                && told.contains("0x60000015"),
+            "{told}"
+        );
+    }
+
+    let map = stm32f407g_disc1_two::LAYOUT.linker_script(Image::Program(2)).to_string();
+    let project = Project::new("address");
+    fs::write(project.0.join(layout), map).unwrap();
+    let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
+    let (good, told) = judged(&FLASH, &elf);
+    assert!(!good && told.contains("0x60000021"), "{told}");
+    assert!(told.contains("does not begin with an initial stack pointer and a reset vector"), "{told}");
+}
+
+/// `VTOR` is left at the bootloader's vectors, as the start-up of a project for the whole flash does:
+/// the first interrupt ends the program.
+#[test]
+fn a_program_that_sets_vtor_wrong_ends_in_the_bootloader() {
+    let project = Project::new("vtor").edit(
+        "app-c/startup.c",
+        "SCB_VTOR = (uint32_t)(uintptr_t)vectors;",
+        "SCB_VTOR = 0x08000000;",
+    );
+    let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
+    let blocks = firmware::blocks_of_file(&elf);
+    let mut bench = empty_board();
+    let refused = flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).unwrap_err();
+    let told = refused.to_string();
+    assert!(told.contains("the trial failed") && told.contains("it does not start"), "{told}");
+    // Started by START, and ended by itself; then the bootloader stays.
+    let resets = bench.events().len();
+    assert_eq!(resets, 2);
+    bench.run_ms(3000);
+    assert_eq!(bench.events(), []);
+    assert!(bench.is_bootloader(NODE));
+
+    // Without a trial it is started, and started again, until it has crashed too often.
+    let options = FlashOptions::default().trial_run(false);
+    let refused = flash(&mut bench.session(), &blocks, &options, &mut |_| {}).unwrap_err();
+    assert!(matches!(refused, Error::StartFailed { .. }), "{refused}");
+    bench.run_ms(3000);
+    assert!(bench.is_bootloader(NODE), "it has kept the device");
+    assert_eq!(bench.session().read_number(CRC).unwrap(), blocks.program_crc(), "it is still there");
+}
+
+/// The first block of a page in this language.
+fn block<'p>(page: &'p str, language: &str) -> &'p str {
+    let (_, behind) = page.split_once(&format!("```{language}\n")).expect("a block");
+    behind.split_once("```").expect("its end").0
+}
+
+/// The page for projects of CubeIDE: the sample links with the script that the page shows, and its code
+/// compiles beside as much of the HAL as it uses.
+#[test]
+fn the_blocks_of_the_page_for_cube_link_and_compile() {
+    let house = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let page = fs::read_to_string(house.join("docs/cube.md")).expect("the page");
+    let project = Project::new("cube")
+        .edit("app-c/startup.c", "section(\".vector_table\")", "section(\".isr_vector\")")
+        .edit("app-c/startup.c", "    [1] = reset,", "    [1] = Reset_Handler,")
+        .edit("app-c/startup.c", "void reset(void);", "void Reset_Handler(void);")
+        .edit("app-c/startup.c", "void reset(void)\n{", "void Reset_Handler(void)\n{")
+        .edit("app-c/startup.c", "extern uint32_t _stack_start,", "extern uint32_t _estack,")
+        .edit("app-c/startup.c", "&_stack_start", "&_estack");
+    let script = project.0.join("app-c/app.x");
+    let before = fs::read_to_string(&script).unwrap();
+    let (_, as_it_was) = before.split_once("  INCLUDE coboot.x\n").expect("the sample's script");
+    fs::write(&script, format!("{}{as_it_was}", block(&page, "ld"))).unwrap();
+    let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
+    let sample = Project::new("cube-sample").build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
+    assert_eq!(firmware::blocks_of_file(&elf), firmware::blocks_of_file(&sample), "the same program");
+
+    let hal = "#include <stdint.h>\ntypedef struct { int state; } CAN_HandleTypeDef;\n\
+               uint32_t HAL_CAN_GetTxMailboxesFreeLevel(const CAN_HandleTypeDef *can);\nuint32_t HAL_GetTick(void);\n\
+               void NVIC_SystemReset(void);\nvoid HardFault_Handler(void);\nvoid Error_Handler(void);\n\
+               void coboot_init(void);\nvoid coboot_poll(void);\n";
+    let folder = project.0.join("hal");
+    fs::create_dir_all(&folder).unwrap();
+    fs::write(folder.join("main.h"), hal).unwrap();
+    fs::write(folder.join("main.c"), block(&page, "c")).unwrap();
+    let mut gcc = Command::new("arm-none-eabi-gcc");
+    gcc.args(["-mcpu=cortex-m4", "-mthumb", "-std=gnu11", "-ffreestanding", "-Wall", "-Wextra", "-Werror"]);
+    gcc.arg("-I").arg(house.join("app-c")).arg("-c").arg(folder.join("main.c"));
+    let output = gcc.arg("-o").arg(folder.join("main.o")).output().expect("it can be started");
+    assert!(output.status.success(), "{}", text(&output));
+}

@@ -1,0 +1,164 @@
+//! `cargo xtask examples`: the programs in `examples/`, each built by its own tools as its page says,
+//! outside the workspace.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use shared_abi::layout::{stm32f407g_disc1, Layout};
+
+use crate::args::Args;
+use crate::build::report;
+use crate::setup::{Part, Setup};
+use crate::{process, workspace, Outcome};
+
+pub const HELP: &str = "\
+usage: cargo xtask examples [NAME...] [--yes]
+
+Builds the programs in examples/ for the STM32F407G-DISC1, each by its own tools, and puts them into
+target/firmware/stm32f407g-disc1/example-NAME.elf. Without a NAME it builds all of them:
+
+  c-cmake       C by CMake, with arm-none-eabi-gcc
+  c-cmake-v2    the same as version 2, with clang
+  cpp           C++17 by CMake, with arm-none-eabi-g++
+  cpp-v2        the same as version 2, with clang++
+
+  --yes         installs what is missing with sudo
+";
+
+/// The board of all examples: their pages name it.
+const BOARD: &Layout = &stm32f407g_disc1::LAYOUT;
+
+/// A program that is built from a folder of `examples/`.
+struct Example {
+    /// Behind `example-` in the name of its image.
+    name: &'static str,
+    /// Below `examples/`.
+    folder: &'static str,
+    tools: Tools,
+}
+
+/// What builds an example.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Tools {
+    /// CMake with a toolchain file of `app-c/cmake/`; the version goes into the program's label.
+    Cmake { toolchain: &'static str, version: u32 },
+}
+
+const EXAMPLES: &[Example] = &[
+    Example {
+        name: "c-cmake",
+        folder: "c-cmake",
+        tools: Tools::Cmake { toolchain: "arm-none-eabi-gcc", version: 1 },
+    },
+    Example { name: "c-cmake-v2", folder: "c-cmake", tools: Tools::Cmake { toolchain: "clang", version: 2 } },
+    Example {
+        name: "cpp",
+        folder: "cpp",
+        tools: Tools::Cmake { toolchain: "arm-none-eabi-gcc", version: 1 },
+    },
+    Example { name: "cpp-v2", folder: "cpp", tools: Tools::Cmake { toolchain: "clang", version: 2 } },
+];
+
+pub fn run(mut args: Args) -> Outcome {
+    let setup = Setup::from(&mut args);
+    let names = args.rest();
+    let chosen = names.iter().map(|name| by_name(name)).collect::<Outcome<Vec<_>>>()?;
+    setup.prepare(&[Part::Examples])?;
+    if chosen.is_empty() {
+        return all();
+    }
+    chosen.into_iter().try_for_each(build)
+}
+
+/// Builds all of them, and prints their sizes. What they need is there.
+///
+/// # Errors
+/// When one does not build, or is no image of its board.
+pub fn all() -> Outcome {
+    EXAMPLES.iter().try_for_each(build)
+}
+
+fn by_name(name: &str) -> Outcome<&'static Example> {
+    EXAMPLES.iter().find(|example| example.name == name).ok_or_else(|| {
+        let known: Vec<_> = EXAMPLES.iter().map(|example| example.name).collect();
+        format!("there is no example \"{name}\"; there are: {}.", known.join(", "))
+    })
+}
+
+fn build(example: &Example) -> Outcome {
+    let folder = workspace::root().join("examples").join(example.folder);
+    let work = workspace::target_dir().join("examples").join(example.name);
+    let built = match example.tools {
+        Tools::Cmake { toolchain, version } => cmake(&folder, &work, toolchain, version)?,
+    };
+    let images = workspace::firmware_dir(BOARD);
+    let image = images.join(format!("example-{}.elf", example.name));
+    fs::create_dir_all(&images)
+        .and_then(|()| fs::copy(&built, &image))
+        .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&image)))?;
+    report(&image, BOARD.programs[0])
+}
+
+/// Builds a folder by CMake; gives the program.
+fn cmake(folder: &Path, work: &Path, toolchain: &str, version: u32) -> Outcome<PathBuf> {
+    // Anew: CMake keeps the compiler and the folders of the run before.
+    if work.exists() {
+        fs::remove_dir_all(work)
+            .map_err(|error| format!("{} cannot be removed: {error}.", workspace::shown(work)))?;
+    }
+    let toolchain = workspace::root().join("app-c/cmake").join(toolchain).with_extension("cmake");
+    let mut configure = Command::new("cmake");
+    configure.arg("-S").arg(folder).arg("-B").arg(work);
+    configure.arg(format!("-DCMAKE_TOOLCHAIN_FILE={}", toolchain.display()));
+    configure.arg(format!("-DVERSION={version}"));
+    // What they print is for whoever looks for a mistake.
+    process::output(&mut configure)?;
+    process::output(Command::new("cmake").arg("--build").arg(work))?;
+    Ok(work.join("app.elf"))
+}
+
+#[cfg(test)]
+mod tests {
+    use shared_abi::layout::Image;
+
+    use super::*;
+
+    /// The numbers that are checked in are those of the board.
+    #[test]
+    fn the_memory_maps_of_the_examples_are_up_to_date() {
+        let map = BOARD.linker_script(Image::Program(1)).to_string();
+        for example in EXAMPLES {
+            let path = workspace::root().join("examples").join(example.folder).join("layout.x");
+            let line = format!(
+                "cargo xtask layout --ld program-1 --board {} > {}",
+                BOARD.board,
+                workspace::shown(&path)
+            );
+            assert!(fs::read_to_string(&path).unwrap() == map, "{} is old: {line}", path.display());
+        }
+    }
+
+    /// The interrupt lines that a CMakeLists.txt names are the chip's.
+    #[test]
+    fn the_examples_name_the_interrupt_lines_of_the_chip() {
+        for example in EXAMPLES {
+            let Tools::Cmake { .. } = example.tools;
+            let path = workspace::root().join("examples").join(example.folder).join("CMakeLists.txt");
+            let line = format!("set(INTERRUPT_LINES {} ", BOARD.chip.interrupts);
+            assert!(fs::read_to_string(&path).unwrap().contains(&line), "{}: {line}", path.display());
+        }
+    }
+
+    #[test]
+    fn the_help_lists_every_example_and_each_has_its_page() {
+        for example in EXAMPLES {
+            let listed = HELP.lines().any(|line| line.trim_start().split(' ').next() == Some(example.name));
+            assert!(listed, "{}", example.name);
+            let page = workspace::root().join("examples").join(example.folder).join("README.md");
+            assert!(page.exists(), "{}", page.display());
+            assert!(by_name(example.name).is_ok_and(|found| found.folder == example.folder));
+        }
+        assert!(by_name("rust").is_err_and(|problem| problem.ends_with("c-cmake, c-cmake-v2, cpp, cpp-v2.")));
+    }
+}
