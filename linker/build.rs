@@ -8,16 +8,11 @@ use std::{env, fs};
 
 include!("packs_well.rs");
 
-use shared_abi::layout::{Image, BOARDS};
+use shared_abi::layout::{self, Image, Layout};
 
 fn main() {
-    let layout = BOARDS
-        .iter()
-        .find(|layout| {
-            let feature = layout.board.to_uppercase().replace('-', "_");
-            env::var_os(format!("CARGO_FEATURE_BOARD_{feature}")).is_some()
-        })
-        .expect("choose a board by one of the features `board-…`");
+    println!("cargo:rerun-if-env-changed=COBOOT_BOARD");
+    let layout = layout::chosen(env::var("COBOOT_BOARD").ok().as_deref());
     let has = |feature: &str| env::var_os(format!("CARGO_FEATURE_{feature}")).is_some();
     let (image, template) = match env::var("CARGO_PKG_NAME").as_deref() {
         Ok("bootloader") if has("RESIDENT") => (Image::Bootloader, "resident.x"),
@@ -50,14 +45,14 @@ fn main() {
     }
     match template {
         "resident.x" => println!("cargo:rustc-link-arg-bins=--oformat=binary"),
-        "bootloader.x" => resident(&package, &out),
+        "bootloader.x" => resident(&package, &out, layout),
         _ => {}
     }
 }
 
 /// Builds the resident part with the features of the bootloader, and leaves its bytes as
 /// `OUT_DIR/resident.bin`.
-fn resident(package: &Path, out: &Path) {
+fn resident(package: &Path, out: &Path, layout: &Layout) {
     let workspace = package.join("..");
     for used in
         ["bootloader/src", "boot-core/src", "bsp/src", "canopen/src", "seal/src", "shared-abi/src", ".cargo"]
@@ -68,7 +63,8 @@ fn resident(package: &Path, out: &Path) {
         let feature = name.strip_prefix("CARGO_FEATURE_")?.to_lowercase().replace('_', "-");
         (feature != "default").then_some(feature)
     });
-    let features: Vec<String> = features.chain(["resident".to_owned()]).collect();
+    let features: Vec<String> =
+        features.chain(["resident".to_owned(), format!("bsp/chip-{}", layout.chip.line.name())]).collect();
     // The folder of the outer build's profile; a lock of its own.
     let target = out.ancestors().nth(3).expect("OUT_DIR lies deep in the target folder").join("resident");
     let triple = env::var("TARGET").expect("cargo sets it");
