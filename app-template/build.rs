@@ -5,7 +5,7 @@ use std::env;
 fn main() {
     let has = |feature: &str| env::var_os(format!("CARGO_FEATURE_{feature}")).is_some();
     let program = if has("PROGRAM_2") { 2 } else { 1 };
-    coboot_linker::Application::of_features().program(program).emit();
+    coboot_linker::Application::chosen().program(program).emit();
     // Functions that compile to the same code are one.
     println!("cargo::rustc-link-arg-bins=--icf=all");
 }

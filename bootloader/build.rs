@@ -7,10 +7,10 @@ use std::{env, fs};
 
 include!("../linker/packs_well.rs");
 
-use shared_abi::layout::Image;
+use shared_abi::layout::{Image, Layout};
 
 fn main() {
-    let layout = coboot_linker::board_of_features().unwrap_or_else(|error| panic!("{error}"));
+    let layout = coboot_linker::chosen_board().unwrap_or_else(|error| panic!("{error}"));
     let has = |feature: &str| env::var_os(format!("CARGO_FEATURE_{feature}")).is_some();
     let template = if has("RESIDENT") { "resident.x" } else { "bootloader.x" };
     let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
@@ -34,13 +34,13 @@ fn main() {
     }
     match template {
         "resident.x" => println!("cargo:rustc-link-arg-bins=--oformat=binary"),
-        _ => resident(&package, &out),
+        _ => resident(&package, &out, layout),
     }
 }
 
 /// Builds the resident part with the features of the bootloader, and leaves its bytes as
 /// `OUT_DIR/resident.bin`.
-fn resident(package: &Path, out: &Path) {
+fn resident(package: &Path, out: &Path, layout: &Layout) {
     let workspace = package.join("..");
     for used in
         ["bootloader/src", "boot-core/src", "bsp/src", "canopen/src", "seal/src", "shared-abi/src", ".cargo"]
@@ -51,7 +51,8 @@ fn resident(package: &Path, out: &Path) {
         let feature = name.strip_prefix("CARGO_FEATURE_")?.to_lowercase().replace('_', "-");
         (feature != "default").then_some(feature)
     });
-    let features: Vec<String> = features.chain(["resident".to_owned()]).collect();
+    let features: Vec<String> =
+        features.chain(["resident".to_owned(), format!("bsp/chip-{}", layout.chip.line.name())]).collect();
     // The folder of the outer build's profile; a lock of its own.
     let target = out.ancestors().nth(3).expect("OUT_DIR lies deep in the target folder").join("resident");
     let triple = env::var("TARGET").expect("cargo sets it");

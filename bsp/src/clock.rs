@@ -2,6 +2,8 @@
 //! 6 say the same), for code that has to be small, and to be able to leave it as a reset does. An
 //! application takes the HAL's way, [`crate::clocks`].
 
+use shared_abi::geometry::Limits;
+
 /// How a board makes its clocks out of its crystal.
 #[derive(Clone, Copy, Debug)]
 pub struct ClockTree {
@@ -19,7 +21,7 @@ pub struct ClockTree {
     pub apb1: u32,
     /// Divider of APB2.
     pub apb2: u32,
-    /// Wait states of the flash at this clock (table 10).
+    /// Wait states of the flash at this clock and 2.7 to 3.6 V (RM0090 table 10, RM0402, RM0430).
     pub wait_states: u32,
 }
 
@@ -48,57 +50,86 @@ impl ClockTree {
         self.sysclk() / self.apb1
     }
 
-    /// The tree, if the chip can run with it.
+    /// The tree, if the board's chip can run with it.
     ///
     /// # Panics
-    /// At compile time, with the rule that is broken (RM0090 sections 7.3.2 and 7.3.3, DS8626 table
-    /// 14).
+    /// At compile time, with the rule that is broken.
     #[must_use]
     pub const fn checked(self) -> Self {
+        match self.check(&crate::CHIP.line.limits()) {
+            Ok(()) => self,
+            Err(rule) => panic!("{}", rule),
+        }
+    }
+
+    /// Whether a chip with these limits can run with the tree.
+    ///
+    /// # Errors
+    /// The rule that is broken, in words (RM0090 sections 7.3.2 and 7.3.3;
+    /// [`Line::limits`](shared_abi::geometry::Line::limits)).
+    pub const fn check(&self, limits: &Limits) -> Result<(), &'static str> {
+        if self.pll_input == 0
+            || !self.hse.is_multiple_of(self.pll_input)
+            || !HSI.is_multiple_of(self.pll_input)
+        {
+            return Err("board: the PLL's input must be a divisor of the crystal and of 16 MHz");
+        }
+        if self.pll_input < 1_000_000 || self.pll_input > 2_000_000 {
+            return Err("board: the PLL's input must be 1 to 2 MHz");
+        }
+        if self.pll_n < 50 || self.pll_n > 432 {
+            return Err("board: the PLL's multiplier must be 50 to 432");
+        }
         let vco = self.pll_input * self.pll_n;
-        assert!(
-            self.hse.is_multiple_of(self.pll_input) && HSI.is_multiple_of(self.pll_input),
-            "board: the PLL's input must be a divisor of the crystal and of 16 MHz"
-        );
-        assert!(
-            self.pll_input >= 1_000_000 && self.pll_input <= 2_000_000,
-            "board: the PLL's input must be 1 to 2 MHz"
-        );
-        assert!(vco >= 100_000_000 && vco <= 432_000_000, "board: the PLL must run at 100 to 432 MHz");
-        // Chips that can do 180 MHz need over-drive for more than this, which nothing here switches
-        // on.
-        assert!(
-            self.sysclk() <= 168_000_000,
-            "board: the core is too fast: 168 MHz at most, without over-drive"
-        );
-        assert!(
-            self.apb1_clock() <= 42_000_000,
-            "board: APB1 is too fast: 42 MHz at most, without over-drive"
-        );
-        assert!(
-            self.sysclk() / self.apb2 <= 84_000_000,
-            "board: APB2 is too fast: 84 MHz at most, without over-drive"
-        );
-        assert!(
-            is_divider(self.apb1) && is_divider(self.apb2),
-            "board: APB1 and APB2 are divided by 1, 2, 4, 8 or 16"
-        );
-        assert!(
-            self.pll_p >= 2 && self.pll_p <= 8 && self.pll_p.is_multiple_of(2),
-            "board: behind the PLL, the divider is 2, 4, 6 or 8"
-        );
-        assert!(
-            self.wait_states >= (self.sysclk() - 1) / 30_000_000 && self.wait_states <= 15,
-            "board: the flash needs a wait state for every 30 MHz"
-        );
-        self
+        if vco < 100_000_000 || vco > 432_000_000 {
+            return Err("board: the PLL must run at 100 to 432 MHz");
+        }
+        if !is_divider(self.apb1) || !is_divider(self.apb2) {
+            return Err("board: APB1 and APB2 are divided by 1, 2, 4, 8 or 16");
+        }
+        if self.pll_p < 2 || self.pll_p > 8 || !self.pll_p.is_multiple_of(2) {
+            return Err("board: behind the PLL, the divider is 2, 4, 6 or 8");
+        }
+        let is_slow = limits.sysclk <= 100_000_000;
+        if self.sysclk() > limits.sysclk {
+            return Err(if is_slow {
+                "board: the core is too fast: 100 MHz at most on this chip"
+            } else {
+                "board: the core is too fast: 168 MHz at most, without over-drive"
+            });
+        }
+        if self.apb1_clock() > limits.apb1 {
+            return Err(if is_slow {
+                "board: APB1 is too fast: 50 MHz at most on this chip"
+            } else {
+                "board: APB1 is too fast: 42 MHz at most, without over-drive"
+            });
+        }
+        if self.sysclk() / self.apb2 > limits.apb2 {
+            return Err(if is_slow {
+                "board: APB2 is too fast: 100 MHz at most on this chip"
+            } else {
+                "board: APB2 is too fast: 84 MHz at most, without over-drive"
+            });
+        }
+        if self.wait_states < (self.sysclk() - 1) / limits.per_wait_state || self.wait_states > 15 {
+            return Err(if limits.per_wait_state == 25_000_000 {
+                "board: the flash of this chip needs a wait state for every 25 MHz"
+            } else {
+                "board: the flash needs a wait state for every 30 MHz"
+            });
+        }
+        Ok(())
     }
 }
 
 /// Whether a bus can be divided by this.
 const fn is_divider(value: u32) -> bool {
-    value <= 16 && value.is_power_of_two()
+    value >= 1 && value <= 16 && value.is_power_of_two()
 }
+
+#[cfg(target_arch = "arm")]
+pub(crate) use registers::raise_voltage;
 
 /// The same on the chip.
 #[cfg(target_arch = "arm")]
@@ -107,6 +138,7 @@ mod registers {
     use stm32f4xx_hal::pac;
 
     use super::{ClockTree, Source, HSI};
+    use crate::{CHIP, SYSCLK};
 
     const HSEON: u32 = 1 << 16;
     const HSERDY: u32 = 1 << 17;
@@ -147,6 +179,7 @@ mod registers {
             // SAFETY: a valid word of PLLCFGR, as `checked` has seen to; the reserved bits and Q
             // keep their reset values.
             rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR & 0xFF00_0000 | pll) });
+            raise_voltage(rcc);
             set(rcc, PLLON);
             latency(self.wait_states);
             while rcc.cr().read().bits() & PLLRDY == 0 {}
@@ -168,8 +201,41 @@ mod registers {
             while rcc.cr().read().bits() & PLLRDY != 0 {}
             // SAFETY: the reset value.
             rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR) });
+            lower_voltage(rcc);
             latency(0);
         }
+    }
+
+    /// Whether the board is faster than the regulator allows as a reset leaves it.
+    const NEEDS_SCALE_1: bool = SYSCLK > CHIP.line.limits().sysclk_after_reset;
+    /// PWR_CR.VOS of the STM32F412, F413 and F423: scale 1, and scale 2 as after a reset. It takes
+    /// effect with the PLL, which has to be off when it is written (RM0402 and RM0430, PWR_CR).
+    const VOS: u32 = 0b11 << 14;
+    const VOS_SCALE_2: u32 = 0b10 << 14;
+    const PWREN: u32 = 1 << 28;
+
+    /// Raises the regulator to scale 1, if the board needs that. While the PLL is off.
+    pub(crate) fn raise_voltage(rcc: &pac::RCC) {
+        if NEEDS_SCALE_1 {
+            voltage(rcc, VOS);
+        }
+    }
+
+    /// The regulator as after a reset. While the PLL is off.
+    fn lower_voltage(rcc: &pac::RCC) {
+        if NEEDS_SCALE_1 {
+            voltage(rcc, VOS_SCALE_2);
+            // SAFETY: the power controller's clock is off after a reset.
+            rcc.apb1enr().modify(|r, w| unsafe { w.bits(r.bits() & !PWREN) });
+        }
+    }
+
+    fn voltage(rcc: &pac::RCC, scale: u32) {
+        // SAFETY: the clock of the power controller in addition to those that are on.
+        rcc.apb1enr().modify(|r, w| unsafe { w.bits(r.bits() | PWREN) });
+        // SAFETY: nothing else uses it; of its register, the scale alone is written.
+        let pwr = unsafe { pac::PWR::steal() };
+        pwr.cr().modify(|r, w| unsafe { w.bits(r.bits() & !VOS | scale) });
     }
 
     fn set(rcc: &pac::RCC, bit: u32) {
@@ -196,6 +262,88 @@ mod registers {
             8 => 0b110,
             16 => 0b111,
             _ => 0,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shared_abi::geometry::Line;
+
+    use super::*;
+
+    /// 168 MHz from 8 MHz, APB1 at 42 and APB2 at 84 MHz.
+    const FAST: ClockTree = ClockTree {
+        hse: 8_000_000,
+        hse_bypass: false,
+        pll_input: 2_000_000,
+        pll_n: 168,
+        pll_p: 2,
+        apb1: 4,
+        apb2: 2,
+        wait_states: 5,
+    };
+    /// 100 MHz, APB1 at 50 and APB2 at 100 MHz.
+    const SLOW: ClockTree = ClockTree { pll_n: 100, apb1: 2, apb2: 1, wait_states: 3, ..FAST };
+
+    /// The general operating conditions of the datasheets, in MHz: core, APB1, APB2 (over-drive off,
+    /// regulator at scale 1), and wait states at the fastest clock (2.7 to 3.6 V).
+    #[test]
+    fn what_is_too_fast_for_a_line_is_refused() {
+        for (line, core, apb1, apb2, wait_states) in [
+            (Line::F405, 168, 42, 84, 5),
+            (Line::F407, 168, 42, 84, 5),
+            (Line::F412, 100, 50, 100, 3),
+            (Line::F413, 100, 50, 100, 3),
+            (Line::F415, 168, 42, 84, 5),
+            (Line::F417, 168, 42, 84, 5),
+            (Line::F423, 100, 50, 100, 3),
+            (Line::F427, 168, 42, 84, 5),
+            (Line::F429, 168, 42, 84, 5),
+            (Line::F437, 168, 42, 84, 5),
+            (Line::F439, 168, 42, 84, 5),
+            (Line::F446, 168, 42, 84, 5),
+            (Line::F469, 168, 42, 84, 5),
+            (Line::F479, 168, 42, 84, 5),
+        ] {
+            let limits = line.limits();
+            let says = |tree: ClockTree| tree.check(&limits).unwrap_err();
+            let fastest = if core == 100 { SLOW } else { FAST };
+            assert_eq!(fastest.sysclk(), core * 1_000_000);
+            assert_eq!(fastest.wait_states, wait_states);
+            assert_eq!(fastest.check(&limits), Ok(()), "{}", line.name());
+            let faster = says(ClockTree { pll_n: fastest.pll_n + 2, ..fastest });
+            assert!(faster.contains(&format!("core is too fast: {core} MHz")), "{faster}");
+            let faster = says(ClockTree { pll_n: 96, apb1: 1, apb2: 2, ..fastest });
+            assert!(faster.contains(&format!("APB1 is too fast: {apb1} MHz")), "{faster}");
+            if core == 168 {
+                let faster = says(ClockTree { apb2: 1, ..fastest });
+                assert!(faster.contains(&format!("APB2 is too fast: {apb2} MHz")), "{faster}");
+            }
+            let fewer = says(ClockTree { wait_states: wait_states - 1, ..fastest });
+            assert!(fewer.contains("needs a wait state for every"), "{fewer}");
+        }
+        // RM0430: two wait states to 75 MHz on the F413; RM0402: to 90 on the F412.
+        let tree = ClockTree { pll_n: 80, wait_states: 2, ..SLOW };
+        assert_eq!(tree.check(&Line::F412.limits()), Ok(()));
+        assert!(tree.check(&Line::F413.limits()).unwrap_err().contains("every 25 MHz"));
+    }
+
+    #[test]
+    fn numbers_that_no_tree_has_are_refused() {
+        for wrong in [
+            ClockTree { pll_input: 0, ..FAST },
+            ClockTree { pll_input: 3_000_000, ..FAST },
+            ClockTree { pll_input: 4_000_000, ..FAST },
+            ClockTree { pll_n: u32::MAX, ..FAST },
+            ClockTree { pll_n: 49, ..FAST },
+            ClockTree { pll_p: 0, ..FAST },
+            ClockTree { pll_p: 3, ..FAST },
+            ClockTree { apb1: 0, ..FAST },
+            ClockTree { apb2: 3, ..FAST },
+            ClockTree { wait_states: 16, ..FAST },
+        ] {
+            assert!(wrong.check(&Line::F407.limits()).is_err(), "{wrong:?}");
         }
     }
 }

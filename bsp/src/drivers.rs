@@ -4,7 +4,8 @@ use stm32f4xx_hal::pac;
 use stm32f4xx_hal::prelude::*;
 use stm32f4xx_hal::rcc::{Config, Rcc, RccExt};
 
-use crate::{CanController, Led, CAN_CLOCK, CLOCK_TREE, ENTRY_STRAP, LAYOUT, SYSCLK};
+use crate::clock::raise_voltage;
+use crate::{CanController, Led, Pull, Strap, CAN_CLOCK, CLOCK_TREE, ENTRY_STRAP, LAYOUT, SYSCLK};
 
 /// The board's parts, set up by its `init`.
 pub struct Board {
@@ -20,16 +21,50 @@ pub struct Board {
 /// The clocks as the HAL knows them, for the HAL's drivers. From the state after a reset.
 #[must_use]
 pub fn clocks(rcc: pac::RCC) -> Rcc {
+    raise_voltage(&rcc);
     let hse = Config::hse(CLOCK_TREE.hse.Hz());
     let hse = if CLOCK_TREE.hse_bypass { hse.bypass_hse_oscillator() } else { hse };
     rcc.freeze(hse.sysclk(SYSCLK.Hz()).pclk1(CAN_CLOCK.Hz()))
 }
 
-/// Whether the entry strap ([`ENTRY_STRAP`]) asks for the bootloader. Leaves its port as after a
-/// reset.
+/// Whether the entry strap ([`ENTRY_STRAP`]) asks for the bootloader; never on a board without one.
+/// Leaves its port as after a reset.
 #[must_use]
 pub fn entry_strap() -> bool {
-    (inputs(ENTRY_STRAP.0) & 1 << ENTRY_STRAP.1 != 0) == ENTRY_STRAP.2
+    let Some(Strap { port, pin, pressed, pull }) = ENTRY_STRAP else { return false };
+    let is_pressed = || (0..Strap::SAMPLES).all(|_| (inputs(port) & 1 << pin != 0) == pressed);
+    match pull {
+        Pull::None => is_pressed(),
+        Pull::Up => pulled(port, pin, 0b01, is_pressed),
+        Pull::Down => pulled(port, pin, 0b10, is_pressed),
+    }
+}
+
+/// Does something while a resistor of the chip is on at a pin, and has had the time to charge the
+/// wire.
+fn pulled<T>(port: char, pin: u8, resistor: u32, action: impl FnOnce() -> T) -> T {
+    /// 40 kΩ and 1 nF are 40 µs; five times that, at 16 MHz and after a reset.
+    const SETTLED: u32 = 3_200;
+    let pupdr = (0x4002_000C + 0x400 * (port as u32 - 'A' as u32)) as *mut u32;
+    // SAFETY: the boot stage runs alone; what is changed here is put back.
+    let rcc = unsafe { pac::RCC::steal() };
+    let clocks = rcc.ahb1enr();
+    let before = clocks.read().bits();
+    // SAFETY: the clock of the port in addition to those that are on.
+    clocks.write(|w| unsafe { w.bits(before | 1 << (port as u32 - 'A' as u32)) });
+    let _ = clocks.read();
+    // SAFETY: the register of a port that the chip has (`Strap::is_possible`), which has its clock.
+    let resistors = unsafe { pupdr.read_volatile() };
+    let at = 2 * u32::from(pin);
+    // SAFETY: as above; the other pins keep theirs.
+    unsafe { pupdr.write_volatile(resistors & !(0b11 << at) | resistor << at) };
+    cortex_m::asm::delay(SETTLED);
+    let done = action();
+    // SAFETY: what it was.
+    unsafe { pupdr.write_volatile(resistors) };
+    // SAFETY: what it was.
+    clocks.write(|w| unsafe { w.bits(before) });
+    done
 }
 
 /// The levels of the 16 pins of a port, `'A'` and on; of a port that the chip has not, all low. For

@@ -1,11 +1,11 @@
 //! Board support: everything that differs between two boards of one firmware.
 //!
-//! One file per board, chosen by the cargo feature `board-…`, beside its memory map in
-//! `shared-abi/src/layout/`. To port coboot, copy a board file and go through it from top to
-//! bottom. The rest of the crate is what all boards share.
+//! One file per board in `boards/`, chosen by the variable `COBOOT_BOARD` at build time, beside its
+//! memory map in `shared-abi/src/layout/boards/`. To port coboot, have both laid down with
+//! `cargo xtask new-board`. The rest of the crate is what all boards share.
 //!
 //! On the host there are the values of a board, without the drivers.
-#![no_std]
+#![cfg_attr(not(test), no_std)]
 
 pub mod can;
 #[cfg(target_arch = "arm")]
@@ -94,24 +94,59 @@ macro_rules! uart {
     };
 }
 
-#[cfg(target_arch = "arm")]
-use shared_abi::{geometry::Geometry, layout::Layout};
+use shared_abi::geometry::Geometry;
+use shared_abi::layout::Layout;
 
-#[cfg(any(feature = "board-stm32f407g-disc1", feature = "board-stm32f407g-disc1-two"))]
-#[path = "stm32f407g_disc1.rs"]
-mod board;
+// The board's file in `boards/`, and the name of its memory map (build.rs).
+include!(concat!(env!("OUT_DIR"), "/board.rs"));
 
-#[cfg(feature = "board-stm32f407g-disc1-can2")]
-#[path = "stm32f407g_disc1_can2.rs"]
-mod board;
+/// The chip on the board.
+const CHIP: &Geometry = BOARD.chip;
 
-#[cfg(feature = "board-nucleo-f446re")]
-#[path = "nucleo_f446re.rs"]
-mod board;
+/// The entry strap: a pin that asks for the bootloader after a reset.
+///
+/// It is read [`Strap::SAMPLES`] times, some microseconds apart, and asks only if it is pressed each
+/// time: a spike must not keep a device from its program, while whoever wants the bootloader holds
+/// the strap.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Strap {
+    /// Its port, `'A'` and on.
+    pub port: char,
+    /// Its number there, 0 to 15.
+    pub pin: u8,
+    /// The level that asks for the bootloader: high, or low.
+    pub pressed: bool,
+    /// The resistor of the chip (about 40 kΩ) that holds it at the other level. It is on while the
+    /// strap is read.
+    pub pull: Pull,
+}
 
-#[cfg(feature = "board-stm32f429i-disc1")]
-#[path = "stm32f429i_disc1.rs"]
-mod board;
+/// A resistor in the chip at a pin (`GPIOx_PUPDR`).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pull {
+    /// None: there is one on the board.
+    None,
+    /// To the supply.
+    Up,
+    /// To ground.
+    Down,
+}
+
+impl Strap {
+    /// How often it is read.
+    pub const SAMPLES: u32 = 4;
+
+    /// Whether a chip has such a pin, and the resistor does not hold it pressed.
+    const fn is_possible(&self, ports: u8) -> bool {
+        let port = (self.port as u32).wrapping_sub('A' as u32);
+        let holds = match self.pull {
+            Pull::None => !self.pressed,
+            Pull::Up => true,
+            Pull::Down => false,
+        };
+        port < ports as u32 && self.pin < 16 && holds != self.pressed
+    }
+}
 
 /// The core's clock, in Hz.
 pub const SYSCLK: u32 = CLOCK_TREE.sysclk();
@@ -122,23 +157,67 @@ pub const CAN_CLOCK: u32 = CLOCK_TREE.apb1_clock();
 /// for.
 #[cfg(target_arch = "arm")]
 pub const LAYOUT: &Layout = {
-    const CHIP: Geometry = Geometry { chip: "", ..*board::LAYOUT.chip };
-    const NAMELESS: Layout = Layout { board: "", chip: &CHIP, ..*board::LAYOUT };
+    const CHIP: Geometry = Geometry { chip: "", ..*BOARD.chip };
+    const NAMELESS: Layout = Layout { board: "", chip: &CHIP, ..*BOARD };
     &NAMELESS
 };
+/// Who owns which address on this board.
+#[cfg(not(target_arch = "arm"))]
+pub const LAYOUT: &Layout = BOARD;
 
-pub use board::*; // Not found, or found twice? Choose one board by its feature `board-…`.
+pub use board::*;
 
 const _: () = assert!(
     BIT_RATE == 0 || can::BitTiming::new(CAN_CLOCK, BIT_RATE).is_some(),
     "board: the clock of the CAN controller (APB1) cannot make BIT_RATE"
 );
 const _: () = assert!(
-    ENTRY_STRAP.0 >= 'A'
-        && (ENTRY_STRAP.0 as u32) < 'A' as u32 + LAYOUT.chip.ports as u32
-        && ENTRY_STRAP.1 < 16,
-    "board: the chip has no such pin as ENTRY_STRAP names"
+    match ENTRY_STRAP {
+        Some(strap) => strap.is_possible(CHIP.ports),
+        None => true,
+    },
+    "board: the chip has no such pin as ENTRY_STRAP names, or its resistor pulls it to `pressed`"
 );
+
+/// The chip that the HAL and its PAC are for, held against that of the board.
+#[cfg(target_arch = "arm")]
+mod chip_check {
+    use super::{pac, CHIP};
+
+    const fn len<T, const N: usize>(_: *const [T; N]) -> u16 {
+        N as u16
+    }
+
+    const PAC: u16 = len(&raw const pac::__INTERRUPTS);
+    const EXPECTED: u16 = CHIP.line.pac_interrupts();
+
+    const _: () = assert!(PAC == EXPECTED, "{}", MESSAGE);
+
+    const TEXT: [u8; 91] = with_numbers(
+        *b"board: the PAC has ### interrupt lines, the chip ###: the feature of bsp names another line",
+        [PAC, EXPECTED],
+    );
+    const MESSAGE: &str = match core::str::from_utf8(&TEXT) {
+        Ok(text) => text,
+        Err(_) => unreachable!(),
+    };
+
+    /// Puts a number of three digits into the place of each `###`.
+    const fn with_numbers<const N: usize>(mut text: [u8; N], numbers: [u16; 2]) -> [u8; N] {
+        let (mut at, mut next) = (0, 0);
+        while at < N {
+            if text[at] == b'#' {
+                text[at] = b'0' + (numbers[next] / 100 % 10) as u8;
+                text[at + 1] = b'0' + (numbers[next] / 10 % 10) as u8;
+                text[at + 2] = b'0' + (numbers[next] % 10) as u8;
+                next += 1;
+                at += 2;
+            }
+            at += 1;
+        }
+        text
+    }
+}
 
 #[cfg(target_arch = "arm")]
 pub use drivers::{clocks, entry_strap, inputs, Board};

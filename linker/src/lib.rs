@@ -34,8 +34,6 @@ pub enum Error {
         /// The name.
         name: String,
     },
-    /// No feature `board-NAME` of the package names a board.
-    NoFeature,
     /// The device has no program of this number.
     NoProgram {
         /// The board.
@@ -66,9 +64,6 @@ impl fmt::Display for Error {
                  (`cargo xtask layout --toml`) and use `of_file`.",
                 boards()
             ),
-            Self::NoFeature => {
-                write!(f, "choose a board by one of the features `board-NAME`; NAME is one of: {}.", boards())
-            }
             Self::NoProgram { board, number, programs } => {
                 write!(f, "{board} has no program {number}: its programs are numbered from 1 to {programs}.")
             }
@@ -115,10 +110,9 @@ impl Application {
         Self { layout, file: None, program: 1 }
     }
 
-    /// For a board of the coboot repository that one of the features of the package names:
-    /// `board-stm32f407g-disc1`, say.
-    pub fn of_features() -> Self {
-        Self { layout: board_of_features(), file: None, program: 1 }
+    /// For the board of the coboot repository that the variable `COBOOT_BOARD` names.
+    pub fn chosen() -> Self {
+        Self { layout: chosen_board(), file: None, program: 1 }
     }
 
     /// For a board whose memory map stands in this file, which `cargo xtask layout --toml` has written.
@@ -185,17 +179,17 @@ impl Application {
     }
 }
 
-/// The board of the coboot repository that one of the features of the package names. For build
-/// scripts.
+/// The board of the coboot repository that the variable `COBOOT_BOARD` names, or the first one where
+/// it is not set. For build scripts.
 ///
 /// # Errors
-/// [`Error::NoFeature`].
-pub fn board_of_features() -> Result<&'static Layout, Error> {
-    let is_on = |layout: &&Layout| {
-        let feature = layout.board.to_uppercase().replace('-', "_");
-        env::var_os(format!("CARGO_FEATURE_BOARD_{feature}")).is_some()
-    };
-    BOARDS.iter().copied().find(is_on).ok_or(Error::NoFeature)
+/// [`Error::NoBoard`].
+pub fn chosen_board() -> Result<&'static Layout, Error> {
+    println!("cargo::rerun-if-env-changed=COBOOT_BOARD");
+    match env::var("COBOOT_BOARD") {
+        Ok(name) => layout::by_name(&name).ok_or(Error::NoBoard { name }),
+        Err(_) => Ok(layout::DEFAULT),
+    }
 }
 
 /// Writes `memory.x` of an image into a folder.

@@ -65,7 +65,7 @@ struct Args {
     folder: PathBuf,
 
     /// The board, whose sectors and programs the nodes have
-    #[arg(long, default_value = layout::BOARDS[0].board, value_parser = board)]
+    #[arg(long, default_value = layout::DEFAULT.board, value_parser = board)]
     board: &'static Layout,
 
     /// Vendor-ID; with vendor-ID and product code both 0 the nodes take programs for any product

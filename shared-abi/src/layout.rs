@@ -1,6 +1,6 @@
 //! Who owns which address: the one source of truth.
 //!
-//! One file per board in `layout/` holds **the numbers**; linker scripts, firmware, host tool,
+//! One file per board in `layout/boards/` holds **the numbers**; linker scripts, firmware, host tool,
 //! tests and documentation derive theirs from it. [`Layout::checked`] runs when the crate is
 //! compiled, so a layout that breaks a rule does not build, and the compiler's message names the
 //! rule.
@@ -10,12 +10,13 @@ use core::fmt;
 use crate::geometry::{Geometry, Region, CORE_VECTORS_SIZE};
 use crate::{callgate, handoff, label, ram_image, warm_start};
 
-pub mod nucleo_f446re;
-pub mod stm32f407g_disc1;
-pub mod stm32f407g_disc1_can2;
-pub mod stm32f407g_disc1_two;
-pub mod stm32f429i_disc1;
 pub mod toml;
+
+// The boards, from the files in `boards/` (build.rs).
+include!(concat!(env!("OUT_DIR"), "/boards.rs"));
+
+/// The board that is meant where none is named.
+pub const DEFAULT: &Layout = &stm32f407g_disc1::LAYOUT;
 
 /// Bytes of [`Layout::key_block`].
 pub const KEY_BLOCK_SIZE: u32 = 256;
@@ -26,25 +27,39 @@ pub const MARK_OFFSET: u32 = 0x1C;
 /// See [`MARK_OFFSET`].
 pub const KNOWS_SEALED_IMAGES: u32 = u32::from_le_bytes(*b"CBS1");
 
-/// Every board that coboot knows, for tools that take a board by name.
-pub const BOARDS: &[&Layout] = &[
-    &stm32f407g_disc1::LAYOUT,
-    &stm32f407g_disc1_two::LAYOUT,
-    &stm32f407g_disc1_can2::LAYOUT,
-    &nucleo_f446re::LAYOUT,
-    &stm32f429i_disc1::LAYOUT,
-];
-
 /// The board of this name, as in `--board`.
 #[must_use]
 pub fn by_name(board: &str) -> Option<&'static Layout> {
     BOARDS.iter().copied().find(|layout| layout.board == board)
 }
 
+/// The board that a build is for, by the value of the variable `COBOOT_BOARD`: [`DEFAULT`] where it
+/// is not set. For build scripts.
+///
+/// # Panics
+/// If there is no such board; the message lists those that there are.
+#[must_use]
+pub fn chosen(variable: Option<&str>) -> &'static Layout {
+    let Some(name) = variable else { return DEFAULT };
+    by_name(name).unwrap_or_else(|| panic!("COBOOT_BOARD={name}: there is no such board; there is: {Names}."))
+}
+
+/// Prints the names of the boards.
+struct Names;
+
+impl fmt::Display for Names {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (number, layout) in BOARDS.iter().enumerate() {
+            write!(f, "{}{}", if number > 0 { ", " } else { "" }, layout.board)?;
+        }
+        Ok(())
+    }
+}
+
 /// The memory map of one board.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Layout {
-    /// The name that `--board` and the cargo feature `board-…` use.
+    /// The name that `--board` and the variable `COBOOT_BOARD` take: that of its file, with hyphens.
     pub board: &'static str,
     /// The silicon on it.
     pub chip: &'static Geometry,
@@ -250,7 +265,11 @@ impl fmt::Display for LinkerScript<'_> {
             Image::Bootloader => (layout.bootloader_image(), "bootloader"),
             Image::Program(number) => (layout.program(number).ok_or(fmt::Error)?, "program"),
         };
-        writeln!(f, "/* {name} of {}, made from shared-abi/src/layout: change it there. */", layout.board)?;
+        writeln!(
+            f,
+            "/* {name} of {}, made from shared-abi/src/layout/boards: change it there. */",
+            layout.board
+        )?;
         writeln!(f, "MEMORY\n{{")?;
         writeln!(f, "  FLASH : ORIGIN = {:#010x}, LENGTH = {:#x}", flash.base, flash.size)?;
         writeln!(f, "  RAM   : ORIGIN = {:#010x}, LENGTH = {:#x}", layout.ram.base, layout.ram.size)?;

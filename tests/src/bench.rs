@@ -21,6 +21,19 @@ use crate::firmware;
 /// How long a program that was never confirmed is held back (`bootloader/src/product.rs`), in ms.
 pub const RESCUE_WINDOW_MS: u64 = 300;
 
+/// Presses the entry strap of a board, or lets it go: a resistor pulls it the other way then, that of
+/// the board or the chip's own. Gives whether the board has one.
+pub fn press(machine: &mut Machine, pressed: bool) -> bool {
+    let Some(strap) = bsp::ENTRY_STRAP else { return false };
+    let level = match (pressed, strap.pull) {
+        (true, _) => Some(strap.pressed),
+        (false, bsp::Pull::None) => Some(!strap.pressed),
+        (false, _) => None,
+    };
+    machine.set_pin(strap.port, strap.pin, level);
+    true
+}
+
 /// The node-ID and bit rate of a board that was never told others (bsp's board file).
 pub const NODE: u8 = 1;
 /// See [`NODE`].
@@ -117,12 +130,14 @@ impl Bench {
         let boards: Vec<MachineId> = chips
             .into_iter()
             .map(|options| {
-                let options = Options { transceiver: usize::from(controller) - 1, ..options };
+                let options = Options {
+                    transceiver: usize::from(controller) - 1,
+                    hse_hz: bsp::CLOCK_TREE.hse,
+                    ..options
+                };
                 let mut machine = Machine::new(firmware::board().chip, options).expect("the emulator starts");
                 machine.load(&bootloader).expect("the bootloader's ELF fits the flash");
-                // Nobody presses the button; the board's resistor pulls the pin the other way.
-                let (port, pin, pressed) = bsp::ENTRY_STRAP;
-                machine.set_pin(port, pin, Some(!pressed));
+                press(&mut machine, false);
                 world.add_machine(machine)
             })
             .collect();

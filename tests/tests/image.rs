@@ -8,7 +8,7 @@ mod zx0;
 
 use canopen::program::ProgramControl;
 use canopen::Address;
-use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::bench::{press, Bench, NODE};
 use coboot_tests::firmware;
 use coflash::update::{flash, FlashOptions};
 use crc::{Crc, CRC_32_ISO_HDLC};
@@ -361,13 +361,12 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
     // Nor does the entry strap keep a program from starting that has no bootloader beside it.
     let (_, image, damage) = damages().swap_remove(0);
     load(&mut bench, &image.flash);
-    let (port, pin, pressed) = bsp::ENTRY_STRAP;
-    bench.machine().set_pin(port, pin, Some(pressed));
+    press(bench.machine(), true);
     bench.power_on();
     bench.await_boot_up(1000);
     assert!(!bench.is_bootloader(NODE));
     assert_eq!(cell(&bench), Some((DAMAGED, damage)));
-    bench.machine().set_pin(port, pin, Some(!pressed));
+    press(bench.machine(), false);
     bench.power_off();
     // The image itself, for comparison.
     load(&mut bench, &Packed::of(firmware::BOOTLOADER).flash);

@@ -29,29 +29,29 @@ impl Copy {
         let tmp = Path::new(env!("CARGO_TARGET_TMPDIR")).join("porting");
         let (root, target) = (tmp.join("copy"), tmp.join("target"));
         synchronise(&Path::new(env!("CARGO_MANIFEST_DIR")).join(".."), &root);
+        if !target.exists() {
+            for profile in ["debug", "fw/release", "fw/thumbv7em-none-eabihf/firmware"] {
+                share(profile, &target);
+            }
+        }
         Self { root, target, _alone: alone }
     }
 
     fn cargo(&self, words: &[&str]) -> Output {
-        self.cargo_for(None, words)
+        self.cargo_for("stm32f407g-disc1", None, words)
     }
 
-    /// The same for a product by name.
-    fn cargo_for(&self, product: Option<&str>, words: &[&str]) -> Output {
+    /// The same for a board, and for a product by name.
+    fn cargo_for(&self, board: &str, product: Option<&str>, words: &[&str]) -> Output {
         // Firmware goes where `cargo xtask build` has it built.
         let firmware = words.contains(&TARGET);
         let target = if firmware { self.target.join("fw") } else { self.target.clone() };
         let mut cargo = Command::new(env!("CARGO"));
-        cargo.current_dir(&self.root).args(words).env("CARGO_TARGET_DIR", target);
+        cargo.current_dir(&self.root).args(words).env("CARGO_TARGET_DIR", target).env("COBOOT_BOARD", board);
         if let Some(name) = product {
             cargo.env("COBOOT_PRODUCT", name);
         }
         cargo.output().expect("cargo can be started")
-    }
-
-    fn succeed(&self, words: &[&str]) {
-        let output = self.cargo(words);
-        assert!(output.status.success(), "cargo {}:\n{}", words.join(" "), text(&output));
     }
 
     /// Puts `new` in the place of `old`, which is there once; gives the file as it was.
@@ -66,6 +66,16 @@ impl Copy {
 
 fn text(output: &Output) -> String {
     format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
+}
+
+/// Gives the copy what was built of other people's crates: files that cargo replaces as a whole are
+/// the same files, those that it writes into are copied. Where that fails, the copy builds them.
+fn share(profile: &str, target: &Path) {
+    let (from, to) = (Path::new(env!("CARGO_TARGET_TMPDIR")).join("..").join(profile), target.join(profile));
+    fs::create_dir_all(&to).expect("the folder can be made");
+    for (how, folder) in [("-al", "deps"), ("-a", "build"), ("-a", ".fingerprint")] {
+        let _ = Command::new("cp").arg(how).arg(from.join(folder)).arg(&to).output();
+    }
 }
 
 /// Makes `to` what `from` is, but for version control and what was built.
@@ -96,72 +106,97 @@ fn synchronise(from: &Path, to: &Path) {
     }
 }
 
-/// From `new-board` to an update on the emulated board. The steps are filled in with the numbers of
-/// a NUCLEO-F446RE (but for the strap: this board has a button as it stands there at first); those
-/// laid down are of a board with another chip.
+/// From `new-board` to an update on the emulated board: the example of the guide, an STM32F405RG with
+/// CAN1 on PB8 and PB9, a crystal of 8 MHz, its LED on PC13 and no strap.
 #[test]
 fn a_board_is_made_as_the_guide_says() {
     let copy = Copy::new();
-    copy.succeed(&["run", "-q", "-p", "xtask", "--", "new-board", "my-board", "--chip", "stm32f446re"]);
+    let before = files(&copy.root);
+    copy.xtask(&["new-board", "my-board", "--chip", "STM32F405RGT6"]);
+    let new =
+        ["app-c/boards/my-board.h", "bsp/src/boards/my_board.rs", "shared-abi/src/layout/boards/my_board.rs"];
+    let after = files(&copy.root);
+    assert!(before.iter().all(|file| after.contains(file)), "a file changed");
+    let added: Vec<_> = after.iter().filter(|file| !before.contains(file)).map(|(name, _)| &**name).collect();
+    assert_eq!(added, new);
+    assert_formatted(&copy, &new[1..]);
 
-    // Steps 1 to 4: the memory map fits the chip as it is laid down.
-    let board = "bsp/src/my_board.rs";
+    // The memory map, clocks, pins and LED are those of the example as they are laid down.
+    let board = new[1];
     for (step, old, new) in [
-        (5, "product_code: 0x4007_D151", "product_code: 0x1234_5678"),
-        (5, "device_name: \"coboot STM32F407G-DISC1\"", "device_name: \"my board\""),
-        (8, "hse_bypass: false", "hse_bypass: true"),
-        (8, "pll_n: 168", "pll_n: 160"),
-        (10, "Pin<'D', 12, Output>", "Pin<'A', 5, Output>"),
-        (
-            10,
-            "let gpiod = take_port!(GPIOD, can1).split(rcc);",
-            "let gpioa = take_port!(GPIOA, can1).split(rcc);",
-        ),
-        (10, "gpiod.pd12.into_push_pull_output();", "gpioa.pa5.into_push_pull_output();"),
-        (
-            11,
-            "        #[cfg(feature = \"uart\")]\n        let gpioa = take_port!(GPIOA, can1).split(rcc);\n",
-            "",
-        ),
-        (
-            12,
-            "can1.can((gpiod.pd1, gpiod.pd0), rcc)",
-            "{\n            let gpiob = take_port!(GPIOB, can1).split(rcc);\n            \
-             can1.can((gpiob.pb9, gpiob.pb8), rcc)\n        }",
-        ),
+        (5, "product_code: 0,", "product_code: 0x1234_5678,"),
+        (5, "device_name: \"my-board\"", "device_name: \"a node of my own\""),
     ] {
         println!("step {step}: {new}");
         copy.edit(board, old, new);
     }
+    copy.edit(new[0], "PRODUCT_CODE UINT32_C(0)", "PRODUCT_CODE UINT32_C(0x12345678)");
 
-    let header = "app-c/boards/my-board.h";
-    for (step, old, new) in [
-        (12, "CAN_PORT 'D'", "CAN_PORT 'B'"),
-        (12, "CAN_RX_PIN 0", "CAN_RX_PIN 8"),
-        (12, "CAN_TX_PIN 1", "CAN_TX_PIN 9"),
-        (13, "LED_PORT 'D'", "LED_PORT 'A'"),
-        (13, "LED_PIN 12", "LED_PIN 5"),
-        (14, "HSE_BYPASS 0", "HSE_BYPASS 1"),
-        (15, "0x4007D151", "0x12345678"),
-    ] {
-        println!("step {step}: {new}");
-        copy.edit(header, old, new);
-    }
-
-    let images = copy.target.join("firmware").join("my-board");
-    let app_c = images.join("app-c.elf");
+    let app_c = copy.target.join("firmware/my-board/app-c.elf");
     // Of an earlier run.
     let _ = fs::remove_file(&app_c);
-    copy.succeed(&["run", "-q", "-p", "xtask", "--", "build", "--all", "--board", "my-board"]);
+    copy.xtask(&["build", "--all", "--board", "my-board"]);
     assert!(app_c.exists(), "no application in C");
-    // The main job, in the emulator: on a chip and a map that are those of another board.
-    let mut demo = Command::new(env!("CARGO_BIN_EXE_demo"));
-    demo.env("COBOOT_BOARD", "nucleo-f446re");
-    demo.env("COBOOT_FIRMWARE_DIR", &images);
-    let output = demo.output().expect("the demo can be started");
+    // The main job, in the emulator.
+    let told = copy.xtask(&["demo", "--board", "my-board"]);
+    assert!(told.contains("An emulated my-board"), "{told}");
+    assert!(told.contains("a node of my own"), "the device does not say its name:\n{told}");
+}
+
+/// A board for each chip that `COBOOT_CHIPS` names, from `new-board` to the update on the emulated
+/// board. Minutes for each: `cargo xtask chips` chooses them.
+#[test]
+#[ignore = "cargo xtask chips"]
+fn a_board_is_made_for_every_chip() {
+    let chips = std::env::var("COBOOT_CHIPS").expect("COBOOT_CHIPS names chips, with commas between them");
+    let copy = Copy::new();
+    // All of them first: tools that know the boards are built once.
+    for chip in chips.split(',') {
+        copy.xtask(&["new-board", chip, "--chip", chip]);
+        assert_formatted(&copy, &[&format!("bsp/src/boards/{chip}.rs")]);
+    }
+    for chip in chips.split(',') {
+        let started = std::time::Instant::now();
+        let told = copy.xtask(&["demo", "--board", chip]);
+        assert!(told.contains(&format!("An emulated {chip}")), "{told}");
+        println!("{chip}: {} s", started.elapsed().as_secs());
+    }
+}
+
+impl Copy {
+    /// Runs a job of the copy; gives what it printed.
+    fn xtask(&self, words: &[&str]) -> String {
+        let output = self.cargo(&[&["run", "-q", "-p", "xtask", "--"], words].concat());
+        assert!(output.status.success(), "cargo xtask {}:\n{}", words.join(" "), text(&output));
+        text(&output)
+    }
+}
+
+/// Every file below a folder and what is in it, by name.
+fn files(root: &Path) -> Vec<(String, Vec<u8>)> {
+    let mut found = Vec::new();
+    let mut folders = vec![root.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(folder).expect("a folder") {
+            let path = entry.expect("an entry").path();
+            if path.is_dir() {
+                folders.push(path);
+            } else {
+                let name = path.strip_prefix(root).expect("it lies below").display().to_string();
+                found.push((name, fs::read(&path).expect("a file")));
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+/// Whether files are formatted as the rest is.
+fn assert_formatted(copy: &Copy, files: &[&str]) {
+    let mut rustfmt = Command::new("rustfmt");
+    rustfmt.current_dir(&copy.root).args(["--check", "--edition", "2021"]).args(files);
+    let output = rustfmt.output().expect("rustfmt can be started");
     assert!(output.status.success(), "{}", text(&output));
-    let told = text(&output);
-    assert!(told.contains("my board"), "the device does not say its name:\n{told}");
 }
 
 /// One mistake in an otherwise good port, and what the build says.
@@ -181,17 +216,17 @@ enum By {
     Layout,
     /// `cargo check` of the board file, on the host.
     Board,
+    /// The same of this board.
+    BoardOf(&'static str),
     /// `cargo check` of the board file for the chip.
     Drivers,
     /// `cargo check` of the resident part, the smaller one of the two that the choices of a product
     /// are built into; for the product of this name, if one is named.
     Product(Option<&'static str>),
-    /// The linker.
-    Image,
 }
 
-const LAYOUT: &str = "shared-abi/src/layout/nucleo_f446re.rs";
-const BOARD: &str = "bsp/src/nucleo_f446re.rs";
+const LAYOUT: &str = "shared-abi/src/layout/boards/nucleo_f446re.rs";
+const BOARD: &str = "bsp/src/boards/nucleo_f446re.rs";
 
 /// A choice that a product makes in place of the default.
 const fn product(wrong: &'static str, says: &'static str) -> Mistake {
@@ -244,8 +279,8 @@ const MISTAKES: &[Mistake] = &[
     },
     Mistake {
         file: "shared-abi/src/geometry.rs",
-        right: "SectorRun { count: 3, size: 128 * KIB }",
-        wrong: "SectorRun { count: 4, size: 128 * KIB }",
+        right: "bank(3) }, None)",
+        wrong: "bank(4) }, None)",
         by: By::Layout,
         says: "the sectors do not add up to the flash",
     },
@@ -261,7 +296,43 @@ const MISTAKES: &[Mistake] = &[
         right: "pll_n: 160",
         wrong: "pll_n: 180",
         by: By::Board,
-        says: "board: the core is too fast",
+        says: "board: the core is too fast: 168 MHz at most, without over-drive",
+    },
+    Mistake {
+        file: BOARD,
+        right: "apb1: 4",
+        wrong: "apb1: 2",
+        by: By::Board,
+        says: "board: APB1 is too fast: 42 MHz at most, without over-drive",
+    },
+    Mistake {
+        file: BOARD,
+        right: "apb2: 2",
+        wrong: "apb2: 1",
+        by: By::Board,
+        says: "board: APB2 is too fast: 84 MHz at most, without over-drive",
+    },
+    // The other class: DS11139 and DS11581, general operating conditions.
+    Mistake {
+        file: "bsp/src/boards/an_f412.rs",
+        right: "pll_n: 96",
+        wrong: "pll_n: 104",
+        by: By::BoardOf("an-f412"),
+        says: "board: the core is too fast: 100 MHz at most on this chip",
+    },
+    Mistake {
+        file: "bsp/src/boards/an_f412.rs",
+        right: "apb1: 2",
+        wrong: "apb1: 1",
+        by: By::BoardOf("an-f412"),
+        says: "board: APB1 is too fast: 50 MHz at most on this chip",
+    },
+    Mistake {
+        file: "bsp/src/boards/an_f413.rs",
+        right: "wait_states: 3",
+        wrong: "wait_states: 2",
+        by: By::BoardOf("an-f413"),
+        says: "board: the flash of this chip needs a wait state for every 25 MHz",
     },
     Mistake {
         file: BOARD,
@@ -273,10 +344,17 @@ const MISTAKES: &[Mistake] = &[
     // RM0390, register boundary addresses: ports A to H.
     Mistake {
         file: BOARD,
-        right: "('C', 13, false)",
-        wrong: "('I', 13, false)",
+        right: "port: 'C'",
+        wrong: "port: 'I'",
         by: By::Board,
-        says: "board: the chip has no such pin as ENTRY_STRAP names",
+        says: "board: the chip has no such pin as ENTRY_STRAP names, or its resistor pulls it to `pressed`",
+    },
+    Mistake {
+        file: BOARD,
+        right: "Some(Strap { port: 'C', pin: 13, pressed: false, pull: Pull::None })",
+        wrong: "Some(Strap { port: 'C', pin: 13, pressed: false, pull: Pull::Down })",
+        by: By::Board,
+        says: "board: the chip has no such pin as ENTRY_STRAP names, or its resistor pulls it to `pressed`",
     },
     // DS10693 table 11: PB7 has no CAN1.
     Mistake {
@@ -382,35 +460,40 @@ const MISTAKES: &[Mistake] = &[
         file: "bsp/Cargo.toml",
         right: "stm32f4xx-hal/stm32f446",
         wrong: "stm32f4xx-hal/stm32f407",
-        by: By::Image,
-        says: "the PAC's vector table has not the size that the layout's chip has",
+        by: By::Drivers,
+        says: "board: the PAC has 082 interrupt lines, the chip 097",
     },
 ];
 
 #[test]
 fn a_mistake_in_a_port_fails_the_build_and_is_named() {
     let copy = Copy::new();
-    let board = "--features=board-nucleo-f446re";
+    for (name, chip) in [("an-f412", "STM32F412CEU6"), ("an-f413", "STM32F413RHT6")] {
+        copy.xtask(&["new-board", name, "--chip", chip]);
+    }
+    let refused = copy.cargo(&["run", "-q", "-p", "xtask", "--", "new-board", "x", "--chip", "STM32F411RE"]);
+    assert!(!refused.status.success());
+    assert!(text(&refused).contains("an STM32F411 has no CAN controller"), "{}", text(&refused));
+    let board = "nucleo-f446re";
     let triple = ["--target", TARGET, "--profile=firmware"];
     let look = |by: By| match by {
         By::Layout => copy.cargo(&["check", "-p", "coboot-abi"]),
-        By::Board => copy.cargo(&["check", "-p", "bsp", board]),
+        By::Board => copy.cargo_for(board, None, &["check", "-p", "bsp"]),
+        By::BoardOf(board) => copy.cargo_for(board, None, &["check", "-p", "bsp"]),
         By::Drivers => {
-            let features = format!("{board},uart");
-            copy.cargo(&[&["check", "-p", "bsp", &features][..], &triple].concat())
+            let words = ["check", "-p", "bsp", "--features=chip-stm32f446,uart"];
+            copy.cargo_for(board, None, &[&words[..], &triple].concat())
         }
         By::Product(name) => {
             let words = ["check", "-p", "bootloader", "--bin=resident", "--no-default-features"];
-            let features = format!("{board},resident");
-            copy.cargo_for(name, &[&words[..], &[&features], &triple].concat())
-        }
-        By::Image => {
-            let words = ["build", "-p", "bootloader", "--no-default-features", board];
-            copy.cargo(&[&words[..], &triple].concat())
+            let features = ["--features=bsp/chip-stm32f446,resident"];
+            copy.cargo_for(board, name, &[&words[..], &features, &triple].concat())
         }
     };
     // Without a mistake there is none.
-    for by in [By::Layout, By::Board, By::Drivers, By::Product(None), By::Product(Some("least")), By::Image] {
+    let slower = [By::BoardOf("an-f412"), By::BoardOf("an-f413")];
+    let good = [By::Layout, By::Board, By::Drivers, By::Product(None), By::Product(Some("least"))];
+    for by in good.into_iter().chain(slower) {
         let output = look(by);
         assert!(output.status.success(), "{}", text(&output));
     }

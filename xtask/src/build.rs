@@ -311,9 +311,33 @@ pub fn to_look_at(board: &Layout, features: &str, product: Option<&str>) -> Outc
     pack::pack(&built(board, "bootloader")?)
 }
 
+/// Where the files of the boards are.
+pub const BOARD_FOLDERS: [&str; 2] = ["shared-abi/src/layout/boards", "bsp/src/boards"];
+
+/// The files in such a folder.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn board_files(folder: &str) -> Outcome<Vec<PathBuf>> {
+    let unreadable = |error: std::io::Error| format!("{folder} cannot be read: {error}.");
+    let entries = fs::read_dir(workspace::root().join(folder)).map_err(unreadable)?;
+    entries.map(|entry| Ok(entry.map_err(unreadable)?.path())).collect()
+}
+
+/// The arguments that tell cargo which board is meant, whatever the variable `COBOOT_BOARD` says.
+pub fn board_args(board: &Layout) -> [String; 4] {
+    let value = format!("env.COBOOT_BOARD.value=\"{}\"", board.board);
+    ["--config", &value, "--config", "env.COBOOT_BOARD.force=true"].map(str::to_owned)
+}
+
+/// The feature that chooses the HAL of a board's chip.
+pub fn chip_feature(board: &Layout) -> String {
+    format!("bsp/chip-{}", board.chip.line.name())
+}
+
 /// The arguments that make cargo work on a firmware package for a board; for `cargo clippy`, too.
 pub fn firmware_args(package: &str, board: &Layout, features: &str) -> Vec<String> {
-    let features = format!("board-{},{features}", board.board);
+    let features = format!("{},{features}", chip_feature(board));
     let target_dir = target_dir(board).display().to_string();
     [
         ["--package", package],
@@ -326,13 +350,13 @@ pub fn firmware_args(package: &str, board: &Layout, features: &str) -> Vec<Strin
     .into_iter()
     .chain(["--no-default-features"])
     .map(str::to_owned)
+    .chain(board_args(board))
     .collect()
 }
 
 /// The arguments that make cargo build the crate of the emulated tests for a board.
 pub fn tests_args(board: &Layout) -> Vec<String> {
-    let features = format!("--features=board-{}", board.board);
-    ["--package=coboot-tests", "--no-default-features", &features].map(str::to_owned).to_vec()
+    board_args(board).into_iter().chain(["--package=coboot-tests".to_owned()]).collect()
 }
 
 /// Where cargo builds the firmware of a board. A folder for each chip: cargo locks its folder, so

@@ -2,9 +2,10 @@
 
 use std::fs;
 
+use shared_abi::layout;
+
 use crate::args::Args;
 use crate::setup::{Part, Setup};
-use crate::workspace::DEFAULT_BOARD;
 use crate::{build, process, workspace, Outcome};
 
 pub const HELP: &str = "\
@@ -29,7 +30,7 @@ pub fn run(mut args: Args) -> Outcome {
     setup.prepare(&[Part::Emulator])?;
     let folder = match out {
         Some(folder) => folder.into(),
-        None if board.board == DEFAULT_BOARD => workspace::root().join("docs/eds"),
+        None if board.board == layout::DEFAULT.board => workspace::root().join("docs/eds"),
         None => workspace::target_dir().join("eds").join(board.board),
     };
     fs::create_dir_all(&folder)

@@ -26,6 +26,14 @@ pub fn run(mut args: Args) -> Outcome {
     if process::run(process::cargo("fmt").args(["--all", "--check"])).is_err() {
         problems.push("some files are not formatted; `cargo fmt --all` does it.".to_owned());
     }
+    // The boards, which build scripts find and `cargo fmt` does not.
+    for folder in build::BOARD_FOLDERS {
+        let mut rustfmt = std::process::Command::new("rustfmt");
+        rustfmt.current_dir(workspace::root()).args(["--check", "--edition", "2021"]);
+        if process::run(rustfmt.args(build::board_files(folder)?)).is_err() {
+            problems.push(format!("a board in {folder} is not formatted; `rustfmt` on the file does it."));
+        }
+    }
     let mut clippy = |args: &[String]| {
         let mut clippy = process::cargo("clippy");
         clippy.current_dir(workspace::root()).args(args).args(["--", "--deny", "warnings"]);

@@ -93,7 +93,7 @@ const JOBS: &[Job] = &[
     },
     Job {
         name: "new-board",
-        about: "the two files of a port, with steps to go through",
+        about: "the three files of a port, with steps to go through",
         help: new_board::HELP,
         run: new_board::run,
     },

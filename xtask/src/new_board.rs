@@ -1,51 +1,45 @@
-//! `cargo xtask new-board`: lays down the files of a port, two and a header for programs in C, and
-//! registers them.
+//! `cargo xtask new-board`: lays down the three files of a port. No other file changes.
 
 use std::fs;
 use std::path::Path;
 
-use shared_abi::geometry::{Geometry, CHIPS};
-use shared_abi::layout;
+use shared_abi::geometry::{self, Geometry, Line, Region, CHIPS};
+use shared_abi::layout::{self, Layout};
 
 use crate::args::Args;
 use crate::{workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask new-board NAME --chip CHIP [--from BOARD]
+usage: cargo xtask new-board NAME --chip CHIP
 
-Lays down the two files of a port, and the header with the same numbers for the application in C, with numbered
-steps to go through, and registers the board in the crates that have to know of it. docs/porting.md goes on
-from there.
+Lays down the files of a port, with numbered steps to go through: the memory map, what is on the board, and
+the header with the same numbers for the application in C. Nothing else has to be changed. They compile as
+they are, with clocks that the chip can do and pins that each of its packages has; docs/porting.md goes on from there.
 
   NAME            of the board, as it will be given to --board: small letters, digits and hyphens
-  --chip CHIP     its chip, of those in shared-abi/src/geometry.rs, as it is ordered: STM32F407VGT6
-  --from BOARD    the board whose pins and clocks stand there at first (default: stm32f407g-disc1)
+  --chip CHIP     its chip as it is ordered, STM32F407VGT6: any STM32F4 with CAN controllers
 ";
 
 pub fn run(mut args: Args) -> Outcome {
     let chip = args.value("--chip")?.ok_or("--chip is needed: which chip is on the board?")?;
-    let from = args.value("--from")?.unwrap_or_else(|| workspace::DEFAULT_BOARD.to_owned());
     let mut words = args.rest().into_iter();
     let (Some(name), None) = (words.next(), words.next()) else {
         return Err("one NAME is needed, and nothing else; --help tells more.".into());
     };
     let chip = chip_by_name(&chip)?;
-    if layout::by_name(&name).is_some() {
-        return Err(format!("there is a board \"{name}\" already; choose another name."));
-    }
     let root = workspace::root();
-    // All or nothing: what cannot be done is found before the first file is written.
-    let changes = changes(&name, chip, &from, &|path| {
-        fs::read_to_string(root.join(path)).map_err(|error| format!("{path} cannot be read: {error}."))
-    })?;
-    for change in changes.iter().filter(|change| change.is_new) {
-        if root.join(&change.path).exists() {
-            return Err(format!("{} is there already; remove it, or choose another name.", change.path));
+    let files = files(&name, chip)?;
+    for (path, _) in &files {
+        if root.join(path).exists() {
+            return Err(format!("{path} is there already; remove it, or choose another name."));
         }
     }
-    for Change { path, text, is_new } in &changes {
+    for (path, text) in &files {
         write(&root.join(path), text)?;
-        println!("  {} {path}", if *is_new { "new     " } else { "changed " });
+        println!("  new      {path}");
+    }
+    if chip.line.can_controllers() > 2 {
+        println!("\nCAN3 of this chip is not supported: the transceiver has to be at CAN1 or CAN2.");
     }
     println!(
         "\nNow go through the steps in the new files; docs/porting.md tells which test proves each.\n\
@@ -60,110 +54,45 @@ fn write(path: &Path, text: &str) -> Outcome {
 
 fn chip_by_name(name: &str) -> Outcome<&'static Geometry> {
     const WITHOUT_CAN: [&str; 3] = ["stm32f401", "stm32f410", "stm32f411"];
-    CHIPS.iter().copied().find(|chip| chip.is_named(name)).ok_or_else(|| {
+    geometry::by_name(name).ok_or_else(|| {
         let line = name.get(..9).unwrap_or(name).to_ascii_lowercase();
         if WITHOUT_CAN.contains(&&*line) {
             return format!("an {} has no CAN controller.", line.to_ascii_uppercase());
         }
-        let known: Vec<_> = CHIPS.iter().map(|chip| chip.chip).collect();
-        format!(
-            "no chip \"{name}\" is known; there is: {}. Another one starts in shared-abi/src/geometry.rs, with the \
-             tables of its reference manual.",
-            known.join(", ")
-        )
+        let of_line: Vec<_> =
+            CHIPS.iter().map(|chip| chip.chip).filter(|chip| chip.starts_with(&line)).collect();
+        if Line::of(name).is_none() {
+            let lines: Vec<_> = Line::ALL.iter().map(|line| line.name()).collect();
+            format!("no chip \"{name}\" is known; there are those of the lines {}.", lines.join(", "))
+        } else {
+            format!("no chip \"{name}\" is known; of this line there is: {}.", of_line.join(", "))
+        }
     })
 }
 
-/// A file as it is to be.
-struct Change {
-    path: String,
-    text: String,
-    is_new: bool,
-}
-
-/// All that makes a board; `read` gives a file of the repository.
-fn changes(
-    name: &str,
-    chip: &Geometry,
-    from: &str,
-    read: &dyn Fn(&str) -> Outcome<String>,
-) -> Outcome<Vec<Change>> {
+/// The files that make a board: their paths, and what is in them.
+fn files(name: &str, chip: &'static Geometry) -> Outcome<[(String, String); 3]> {
     let good = name.starts_with(|c: char| c.is_ascii_lowercase())
         && !name.ends_with('-')
         && !name.contains("--")
+        && name.len() <= 40
         && name.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-');
     if !good {
         return Err(format!(
-            "\"{name}\" is no name for a board: small letters, digits and single hyphens, a letter first."
+            "\"{name}\" is no name for a board: small letters, digits and single hyphens, a letter first, \
+             40 at most."
         ));
     }
+    // Its file would be a module that is there.
+    if layout::by_name(name).is_some() || name == "toml" {
+        return Err(format!("there is a board \"{name}\" already; choose another name."));
+    }
     let module = name.replace('-', "_");
-    let from_module = from.replace('-', "_");
-    let board_file = read(&format!("bsp/src/{from_module}.rs")).map_err(|error| {
-        format!("--from {from}: {error} Name a board that has a file of its own in bsp/src.")
-    })?;
-
-    let c_header = read(&format!("app-c/boards/{from}.h"))?;
-
-    let mut changes = Vec::new();
-    let mut change = |path: &str, edit: &dyn Fn(&str) -> Option<String>| {
-        let text = edit(&read(path)?)
-            .ok_or_else(|| format!("{path} does not look as expected: the board must be put in by hand."))?;
-        changes.push(Change { path: path.to_owned(), text, is_new: false });
-        Ok::<_, String>(())
-    };
-    change("shared-abi/src/layout.rs", &|text| {
-        let text = after_last(text, "pub mod ", &format!("pub mod {module};\n"))?;
-        before(&text, "pub const BOARDS", "];", &format!("    &{module}::LAYOUT,\n"))
-    })?;
-    for package in ["bootloader", "app-template", "tests"] {
-        change(&format!("{package}/Cargo.toml"), &|text| {
-            after_last(text, "board-", &format!("board-{name} = [\"bsp/board-{name}\"]\n"))
-        })?;
-    }
-    let line = chip.chip.get(..9).unwrap_or(chip.chip);
-    change("bsp/Cargo.toml", &|text| {
-        after_last(text, "board-", &format!("board-{name} = [\"stm32f4xx-hal/{line}\"]\n"))
-    })?;
-    change("bsp/src/lib.rs", &|text| {
-        let module = format!("#[cfg(feature = \"board-{name}\")]\n#[path = \"{module}.rs\"]\nmod board;\n\n");
-        before(text, "mod board;", "pub use board::*;", &module)
-    })?;
-    change("emulator/src/bin/emulate/main.rs", &|text| {
-        let constant = constant(chip);
-        let line = format!(
-            "    Board {{ name: \"{name}\", chip: &{constant}, hse_hz: 8_000_000, pulled_up: &[], usart: \"USART2\", transceiver: 0 }},\n"
-        );
-        before(text, "const BOARDS", "];", &line)
-    })?;
-    for (path, text) in [
-        (format!("shared-abi/src/layout/{module}.rs"), layout_file(name, chip)),
-        (format!("bsp/src/{module}.rs"), with_steps(&board_file, name, from, &module)?),
-        (format!("app-c/boards/{name}.h"), c_with_steps(&c_header, name, from)?),
-    ] {
-        changes.push(Change { path, text, is_new: true });
-    }
-    Ok(changes)
-}
-
-/// Puts `new` behind the last line that begins with `prefix`.
-fn after_last(text: &str, prefix: &str, new: &str) -> Option<String> {
-    let mut at = 0;
-    let mut found = None;
-    for line in text.split_inclusive('\n') {
-        at += line.len();
-        if line.starts_with(prefix) {
-            found = Some(at);
-        }
-    }
-    found.map(|at| format!("{}{new}{}", &text[..at], &text[at..]))
-}
-
-/// Puts `new` before the line that begins with `line`, the first one behind `anchor`.
-fn before(text: &str, anchor: &str, line: &str, new: &str) -> Option<String> {
-    let anchor = text.find(anchor)?;
-    let at = anchor + text[anchor..].find(&format!("\n{line}"))? + 1;
-    Some(format!("{}{new}{}", &text[..at], &text[at..]))
+    Ok([
+        (format!("shared-abi/src/layout/boards/{module}.rs"), layout_file(name, chip)),
+        (format!("bsp/src/boards/{module}.rs"), board_file(name, chip)),
+        (format!("app-c/boards/{name}.h"), c_header(name, chip)),
+    ])
 }
 
 /// What the chip's geometry is called in `shared_abi::geometry`.
@@ -171,203 +100,285 @@ fn constant(chip: &Geometry) -> String {
     chip.chip.to_uppercase()
 }
 
-/// A map that fits the chip: the smallest sectors for bootloader and parameters, all the rest for
-/// one program.
-fn layout_file(name: &str, chip: &Geometry) -> String {
-    let address = |value: u32| format!("0x{:04X}_{:04X}", value >> 16, value & 0xFFFF);
-    let flash = chip.flash.base;
-    let (program, ram_end) = (flash + 64 * 1024, chip.sram.end());
+/// A map that fits the chip, but for the programs: the smallest sectors for bootloader and
+/// parameters, and the rest for one program.
+fn map(chip: &'static Geometry) -> (Layout, Region) {
+    let (flash, ram_end) = (chip.flash.base, chip.sram.end());
+    let program = flash + 64 * 1024;
+    let layout = Layout {
+        chip,
+        bootloader: Region::new(flash, 32 * 1024),
+        parameters: [Region::new(flash + 0x8000, 16 * 1024), Region::new(flash + 0xC000, 16 * 1024)],
+        ram: Region::new(chip.sram.base, chip.sram.size - 64),
+        handoff: Region::new(ram_end - 64, 48),
+        warm_start: Region::new(ram_end - 16, 16),
+        ..*layout::DEFAULT
+    };
+    (layout, Region::new(program, chip.flash.end() - program))
+}
+
+fn layout_file(name: &str, chip: &'static Geometry) -> String {
+    let region = |region: Region| {
+        let kib = match region.size {
+            size if size.is_multiple_of(1024) => format!("{} * 1024", size / 1024),
+            size if size > 1024 => format!("{} * 1024 - {}", size.div_ceil(1024), 1024 - size % 1024),
+            size => size.to_string(),
+        };
+        format!("Region::new(0x{:04X}_{:04X}, {kib})", region.base >> 16, region.base & 0xFFFF)
+    };
     let constant = constant(chip);
+    let (layout, program) = map(chip);
     format!(
         "//! {name} ({constant}: {} KiB flash, {} KiB SRAM).
 
-use super::Layout;
 use crate::geometry::{{Region, {constant}}};
+use crate::layout::Layout;
 
 /// The memory map of the {name}.
 pub const LAYOUT: Layout = Layout {{
     board: \"{name}\",
     chip: &{constant},
     // Step 1: the bootloader. 32 KiB are two sectors of 16 KiB on every chip of the family.
-    bootloader: Region::new({}, 32 * 1024),
+    bootloader: {},
     callgate_offset: 0x40,
     // Step 2: the two homes of the parameters, a sector each.
-    parameters: [Region::new({}, 16 * 1024), Region::new({}, 16 * 1024)],
+    parameters: [{}, {}],
     // Step 3: the programs, whole sectors each. One has all that is left.
-    programs: &[Region::new({}, {} * 1024)],
+    programs: &[{}],
     // Step 4: the RAM; the last 64 bytes of the chip's are for handoff and warm-start cell.
-    ram: Region::new({}, {} * 1024 - 64),
-    handoff: Region::new({}, 48),
-    warm_start: Region::new({}, 16),
+    ram: {},
+    handoff: {},
+    warm_start: {},
 }}
 .checked();
 ",
         chip.flash.size / 1024,
         chip.sram.size / 1024,
-        address(flash),
-        address(flash + 0x8000),
-        address(flash + 0xC000),
-        address(program),
-        (chip.flash.end() - program) / 1024,
-        address(chip.sram.base),
-        chip.sram.size / 1024,
-        address(ram_end - 64),
-        address(ram_end - 16),
+        region(layout.bootloader),
+        region(layout.parameters[0]),
+        region(layout.parameters[1]),
+        region(program),
+        region(layout.ram),
+        region(layout.handoff),
+        region(layout.warm_start),
     )
 }
 
-/// What stands in a board file, and the step that it belongs to.
-const STEPS: &[(&str, &str)] = &[
-    ("pub const IDENTITY", "Step 5: what the device says of itself. The product code tells your product from others."),
-    ("pub const NODE_ID", "Step 6: the node-ID of a new device."),
-    ("pub const BIT_RATE", "Step 7: the bit rate of a new device. The build fails if the clock below cannot make it."),
-    ("pub const CLOCK_TREE", "Step 8: crystal (or a clock, with hse_bypass) and PLL. APB1 at 40 MHz makes each bit rate of CiA 301."),
-    ("pub const ENTRY_STRAP", "Step 9: the pin that keeps the device in the bootloader, and the level that does."),
-    ("    pub type Led", "Step 10: the LED: its pin here and in `init`."),
-    ("    uart! {", "Step 11: the UART for words while you port: which it is here, its pins in `init`, where each port is taken once."),
-    ("        let can = can", "Step 12: the CAN pins, transmit and receive. The build fails for pins that the chip cannot use for its controller. CAN2 in the place of CAN1: docs/porting.md."),
-];
+/// What differs between the chips in the files that are laid down.
+struct Fit {
+    /// The core's clock in MHz, and the dividers of the buses.
+    mhz: u32,
+    apb1: u32,
+    apb2: u32,
+    wait_states: u32,
+    /// Port of the CAN pins, receive and transmit. The application in C knows alternate function 9
+    /// alone, which PB8 and PB9 have not on all chips.
+    can: (char, u8, u8),
+}
 
-/// What stands in a board's header for C, and the step that it belongs to.
-const C_STEPS: &[(&str, &str)] = &[
-    ("#define CAN_PORT", "Step 12: the CAN pins of step 11."),
-    ("#define LED_PORT", "Step 13: the LED of step 10."),
-    ("#define HSE_HZ", "Step 14: the crystal of step 8."),
-    ("#define VENDOR_ID", "Step 15: what the device says of itself, as in step 5."),
-];
-
-/// The header of another board for C, with the steps as comments in the place of its own.
-fn c_with_steps(source: &str, name: &str, from: &str) -> Outcome<String> {
-    let mut text = format!(
-        "/* {name}. Begun as a copy of {from}: go through the steps, and take their comments out. */\n"
-    );
-    let mut steps = 0;
-    for line in source.lines().filter(|line| line.starts_with("#define ")) {
-        if let Some((_, step)) = C_STEPS.iter().find(|(what, _)| line.starts_with(what)) {
-            text += &format!("/* {step} */\n");
-            steps += 1;
+impl Fit {
+    /// The fastest clocks that make each bit rate of CiA 301 from 8 MHz.
+    fn of(chip: &Geometry) -> Self {
+        match chip.line {
+            Line::F412 | Line::F413 | Line::F423 => {
+                Self { mhz: 96, apb1: 2, apb2: 1, wait_states: 3, can: ('A', 11, 12) }
+            }
+            _ => Self { mhz: 160, apb1: 4, apb2: 2, wait_states: 5, can: ('B', 8, 9) },
         }
-        text += line;
-        text.push('\n');
-    }
-    if steps == C_STEPS.len() {
-        Ok(text)
-    } else {
-        Err(format!("app-c/boards/{from}.h does not look as expected; take another board with --from."))
     }
 }
 
-/// A board file copied from another board's, with the steps as comments in front of what they are
-/// about.
-fn with_steps(source: &str, name: &str, from: &str, module: &str) -> Outcome<String> {
-    let mut text = String::new();
-    let mut steps = 0;
-    let (mut in_layout, mut in_header) = (false, true);
-    for line in source.lines() {
-        if in_header && line.starts_with("//!") {
-            continue;
-        }
-        if in_header {
-            in_header = false;
-            text += &format!(
-                "//! {name}. Begun as a copy of {from}: go through the steps, and take their comments out.\n"
-            );
-        }
-        if line.starts_with("pub const LAYOUT") {
-            text += &format!("pub const LAYOUT: &Layout = &layout::{module}::LAYOUT;\n");
-            in_layout = !line.ends_with(';');
-            continue;
-        }
-        if in_layout {
-            in_layout = !line.ends_with("};");
-            continue;
-        }
-        if let Some((_, step)) = STEPS.iter().find(|(what, _)| line.starts_with(what)) {
-            let indent = &line[..line.len() - line.trim_start().len()];
-            text += &format!("{indent}// {step}\n");
-            steps += 1;
-        }
-        text += line;
-        text.push('\n');
-    }
-    if steps == STEPS.len() {
-        Ok(text)
-    } else {
-        Err(format!(
-            "bsp/src/{}.rs does not look as expected; take another board with --from.",
-            from.replace('-', "_")
-        ))
-    }
+fn board_file(name: &str, chip: &Geometry) -> String {
+    let Fit { mhz, apb1, apb2, wait_states, can: (port, receive, transmit) } = Fit::of(chip);
+    let ports = match port {
+        'A' => "        let gpioa = take_port!(GPIOA, can1).split(rcc);\n".to_owned(),
+        port => format!(
+            "        #[cfg(feature = \"uart\")]
+        let gpioa = take_port!(GPIOA, can1).split(rcc);
+        let gpio{0} = take_port!(GPIO{port}, can1).split(rcc);\n",
+            port.to_ascii_lowercase()
+        ),
+    };
+    let can = port.to_ascii_lowercase();
+    format!(
+        "//! {name} ({}), with a CAN transceiver on P{port}{receive} and P{port}{transmit}.
+
+use crate::clock::ClockTree;
+use crate::{{Identity, Strap}};
+
+// Step 5: vendor-ID, product code and names. The product code tells your product from others.
+/// What the device says of itself.
+pub const IDENTITY: Identity = Identity {{
+    vendor_id: 0,
+    product_code: 0,
+    revision: 0x0001_0000,
+    device_name: \"{name}\",
+    hardware_version: \"1\",
+}};
+
+// Step 6: the node-ID of a new device.
+/// Node-ID of a device that was never told another one, 1 to 127; 255 for one that waits for layer
+/// setting services.
+pub const NODE_ID: u8 = 1;
+
+// Step 7: the bit rate of a new device.
+/// Bit rate of a device that was never told another one, in bit/s; 0 for one that finds it out by
+/// listening.
+pub const BIT_RATE: u32 = 125_000;
+
+// Step 8: the crystal, or the clock at OSC_IN with `hse_bypass`, and what the PLL makes of it.
+/// {mhz} MHz from a crystal of 8 MHz; {} MHz on APB1 make each bit rate of CiA 301.
+pub const CLOCK_TREE: ClockTree = ClockTree {{
+    hse: 8_000_000,
+    hse_bypass: false,
+    pll_input: 2_000_000,
+    pll_n: {mhz},
+    pll_p: 2,
+    apb1: {apb1},
+    apb2: {apb2},
+    wait_states: {wait_states},
+}}
+.checked();
+
+// Step 9: a pin that keeps the device in the bootloader, if the board has one:
+// `Some(Strap {{ port: 'A', pin: 0, pressed: false, pull: crate::Pull::Up }})`.
+/// The pin that asks for the bootloader after a reset.
+pub const ENTRY_STRAP: Option<Strap> = None;
+
+/// Bit rate of the UART, in bit/s.
+pub const UART_BIT_RATE: u32 = 115_200;
+
+// Step 10: the CAN controller, CAN1 or CAN2 (docs/porting.md).
+can_controller!(CAN1);
+
+#[cfg(target_arch = \"arm\")]
+pub use pins::*;
+
+/// LED, CAN controller and UART, by the types that the HAL has for pins.
+#[cfg(target_arch = \"arm\")]
+mod pins {{
+    use stm32f4xx_hal::can::CanExt;
+    use stm32f4xx_hal::gpio::{{GpioExt, Output, Pin}};
+    use stm32f4xx_hal::pac;
+    use stm32f4xx_hal::rcc::Rcc;
+
+    #[cfg(feature = \"uart\")]
+    use crate::uart::Port;
+    use crate::Board;
+
+    // Step 11: the LED, its pin here and in `init`.
+    /// The LED that shows life.
+    pub type Led = Pin<'C', 13, Output>;
+
+    // Step 12: the UART for words while you port, its pins in `init`.
+    uart! {{
+        /// The UART, on PA2 and PA3. It is set up with the feature `uart` alone.
+        USART2
+    }}
+
+    /// Sets the pins up.
+    #[must_use]
+    pub fn init(rcc: &mut Rcc, can1: pac::CAN1) -> Board {{
+        // Each port is taken once.
+{ports}        let gpioc = take_port!(GPIOC, can1).split(rcc);
+        let led = gpioc.pc13.into_push_pull_output();
+        #[cfg(feature = \"uart\")]
+        let uart = Port::new(take_port!(USART2, can1), (gpioa.pa2, gpioa.pa3), rcc);
+        // Step 13: the transceiver's standby pin, if it has one, before the controller is set up:
+        // `let _ = gpioc.pc14.into_push_pull_output_in_state(PinState::Low);` (`gpio::PinState`).
+        // Step 14: the CAN pins, transmit and receive.
+        let can = can1.can((gpio{can}.p{can}{transmit}, gpio{can}.p{can}{receive}), rcc);
+        Board {{
+            can,
+            led,
+            #[cfg(feature = \"uart\")]
+            uart,
+        }}
+    }}
+}}
+",
+        constant(chip),
+        mhz / apb1,
+    )
+}
+
+fn c_header(name: &str, chip: &Geometry) -> String {
+    let Fit { can: (port, receive, transmit), .. } = Fit::of(chip);
+    format!(
+        "/* {name}: the numbers of bsp/src/boards/{}.rs for the application in C. */
+/* Step 15: the CAN pins of step 14, by alternate function 9; CAN1 alone. */
+#define CAN_PORT '{port}'
+#define CAN_RX_PIN {receive}
+#define CAN_TX_PIN {transmit}
+/* Step 16: the LED of step 11. */
+#define LED_PORT 'C'
+#define LED_PIN 13
+/* Step 17: the crystal of step 8. */
+#define HSE_HZ UINT32_C(8000000)
+#define HSE_BYPASS 0
+/* Step 18: what the device says of itself, as in step 5. */
+#define VENDOR_ID UINT32_C(0)
+#define PRODUCT_CODE UINT32_C(0)
+#define REVISION UINT32_C(0x00010000)
+",
+        name.replace('-', "_")
+    )
 }
 
 #[cfg(test)]
 mod tests {
+    use shared_abi::geometry::{STM32F405RG, STM32F429ZI, STM32F446RE};
+
     use super::*;
-    use shared_abi::geometry::{STM32F429ZI, STM32F446RE};
 
     #[test]
-    fn chips_are_named_as_people_write_them() {
-        for name in ["stm32f429zi", "STM32F429ZI", "STM32F429ZIT6", "stm32f429zit6tr", "STM32F429ZIY7"] {
-            assert_eq!(chip_by_name(name), Ok(&STM32F429ZI), "{name}");
-        }
-        for name in
-            ["", "stm32f429z", "stm32f429zit", "stm32f429zi6t", "stm32f429zit6 x", "stm32f429zi\u{e9}6"]
-        {
-            assert!(chip_by_name(name).unwrap_err().contains("is known"), "{name}");
-        }
-        for name in ["STM32F401RE", "stm32f411ceu6"] {
+    fn a_chip_that_cannot_be_is_told_why() {
+        assert_eq!(chip_by_name("STM32F405RGT6"), Ok(&STM32F405RG));
+        for name in ["STM32F401RE", "stm32f411ceu6", "STM32F410RB"] {
             assert!(chip_by_name(name).unwrap_err().contains("has no CAN controller"), "{name}");
         }
+        for name in ["", "stm32f999", "stm32f103c8", "stm32f4\u{e9}6"] {
+            assert!(chip_by_name(name).unwrap_err().contains("those of the lines stm32f405, "), "{name}");
+        }
+        let other = chip_by_name("stm32f446rg").unwrap_err();
+        assert!(other.contains("of this line there is: ") && other.contains("stm32f446re"), "{other}");
     }
 
-    fn read(path: &str) -> Outcome<String> {
-        fs::read_to_string(workspace::root().join(path)).map_err(|error| error.to_string())
+    /// Every step once in all three files, in order.
+    #[test]
+    fn the_steps_are_numbered_once() {
+        for chip in CHIPS {
+            let all: String = files("my-board", chip).unwrap().into_iter().map(|(_, text)| text).collect();
+            let steps: Vec<u32> = all
+                .match_indices("Step ")
+                .filter_map(|(at, _)| all[at + 5..].split(':').next()?.parse().ok())
+                .collect();
+            assert_eq!(steps, (1..=18).collect::<Vec<u32>>(), "{}", chip.chip);
+        }
     }
 
     #[test]
-    fn new_files_and_the_board_where_boards_are_listed() {
-        for from in ["stm32f407g-disc1", "nucleo-f446re", "stm32f429i-disc1"] {
-            let changes = changes("my-board", &STM32F446RE, from, &read).unwrap();
-            let new: Vec<_> =
-                changes.iter().filter(|change| change.is_new).map(|change| &*change.path).collect();
-            let expected =
-                ["shared-abi/src/layout/my_board.rs", "bsp/src/my_board.rs", "app-c/boards/my-board.h"];
-            assert_eq!(new, expected);
-            assert_eq!(changes.len(), 10);
-            for change in &changes {
-                assert!(
-                    change.text.contains("my-board") || change.text.contains("my_board"),
-                    "{}",
-                    change.path
-                );
-            }
-            let board = &changes[8].text;
-            for step in 5..=12 {
-                assert_eq!(
-                    board.matches(&format!("// Step {step}: ")).count(),
-                    1,
-                    "step {step}, from {from}"
-                );
-            }
-            let header = &changes[9].text;
-            for step in 12..=15 {
-                assert_eq!(
-                    header.matches(&format!("/* Step {step}: ")).count(),
-                    1,
-                    "step {step}, from {from}"
-                );
-            }
-            assert!(
-                header.lines().all(|line| line.starts_with("/* ") || line.starts_with("#define ")),
-                "{header}"
-            );
-            assert!(board.contains("pub const LAYOUT: &Layout = &layout::my_board::LAYOUT;\n"), "{board}");
+    fn the_map_fits_every_chip() {
+        for chip in CHIPS {
+            let (layout, program) = map(chip);
+            let layout = Layout { programs: Box::leak(Box::new([program])), ..layout };
+            assert_eq!(layout.check(), Ok(()), "{}", chip.chip);
+        }
+    }
+
+    #[test]
+    fn the_clocks_are_within_the_limits_of_every_chip() {
+        for chip in CHIPS {
+            let (fit, limits) = (Fit::of(chip), chip.line.limits());
+            let hz = fit.mhz * 1_000_000;
+            assert!(hz <= limits.sysclk && hz / fit.apb1 <= limits.apb1 && hz / fit.apb2 <= limits.apb2);
+            assert!(fit.wait_states >= (hz - 1) / limits.per_wait_state, "{}", chip.chip);
         }
     }
 
     /// The map that was worked out by hand for a board with this chip.
     #[test]
-    fn the_map_fits_the_chip() {
+    fn the_map_is_the_one_that_people_make() {
         let file = layout_file("x", &STM32F429ZI);
         for line in [
             "programs: &[Region::new(0x0801_0000, 1984 * 1024)],",
@@ -381,15 +392,10 @@ mod tests {
 
     #[test]
     fn what_cannot_be_is_said() {
-        for name in ["", "My", "1a", "a_b", "a-", "a--b", "../x", "a b", "ä"] {
-            assert!(changes(name, &STM32F446RE, "nucleo-f446re", &read).is_err(), "{name}");
+        let long = "a".repeat(41);
+        for name in ["", "My", "1a", "a_b", "a-", "a--b", "../x", "a b", "ä", &long] {
+            assert!(files(name, &STM32F446RE).unwrap_err().contains("is no name"), "{name}");
         }
-        assert!(changes("good", &STM32F446RE, "nowhere", &read).err().unwrap().contains("--from nowhere"));
-        assert!(chip_by_name("stm32f999").unwrap_err().contains("stm32f446re"));
-        let odd = |path: &str| Ok(read(path)?.replace("pub use board::*;", ""));
-        assert!(changes("good", &STM32F446RE, "nucleo-f446re", &odd)
-            .err()
-            .unwrap()
-            .contains("bsp/src/lib.rs"));
+        assert!(files("nucleo-f446re", &STM32F446RE).unwrap_err().contains("already"));
     }
 }

@@ -14,7 +14,7 @@ use sha2::{Digest, Sha512_256};
 
 use crate::args::Args;
 use crate::json::Value;
-use crate::{process, setup, workspace, Outcome};
+use crate::{build, process, setup, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask sbom [--board BOARD]
@@ -46,12 +46,12 @@ pub fn run(mut args: Args) -> Outcome {
     let path = setup::tool("cargo-cyclonedx", VERSION)?;
     let folder = workspace::target_dir().join("sbom");
     fs::create_dir_all(&folder).map_err(|error| unwritable(&folder, &error))?;
-    let board_feature = format!("board-{}", board.board);
+    let chip_feature = build::chip_feature(board);
     let all = [
         Released {
             package: "bootloader",
             target: workspace::TARGET,
-            features: ["--no-default-features", "--features", &board_feature].map(str::to_owned).into(),
+            features: ["--no-default-features", "--features", &chip_feature].map(str::to_owned).into(),
         },
         Released { package: "coflash", target: "all", features: Vec::new() },
     ];
@@ -265,7 +265,7 @@ mod tests {
     /// what its tests use nor what the emulator links.
     #[test]
     fn cargo_tells_what_the_bootloader_is_built_from() {
-        let features = ["--no-default-features", "--features", "board-stm32f407g-disc1"];
+        let features = ["--no-default-features", "--features", "bsp/chip-stm32f407"];
         let released = Released {
             package: "bootloader",
             target: workspace::TARGET,

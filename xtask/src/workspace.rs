@@ -13,9 +13,6 @@ use crate::Outcome;
 pub const TARGET: &str = "thumbv7em-none-eabihf";
 /// Cargo's profile of everything that goes onto the chip.
 pub const PROFILE: &str = "firmware";
-/// The board taken where `--board` names none.
-pub const DEFAULT_BOARD: &str = "stm32f407g-disc1";
-
 /// The root of the repository: of the one that cargo runs this in. (A copy of it may hold a program
 /// that was built in the original.)
 pub fn root() -> &'static Path {
@@ -45,9 +42,8 @@ pub fn firmware_dir(board: &Layout) -> PathBuf {
 /// # Errors
 /// When there is no such board.
 pub fn board(args: &mut Args) -> Outcome<&'static Layout> {
-    let name = args.value("--board")?;
-    let name = name.as_deref().unwrap_or(DEFAULT_BOARD);
-    layout::by_name(name).ok_or_else(|| {
+    let Some(name) = args.value("--board")? else { return Ok(layout::DEFAULT) };
+    layout::by_name(&name).ok_or_else(|| {
         let known: Vec<_> = layout::BOARDS.iter().map(|layout| layout.board).collect();
         format!("there is no board \"{name}\"; there is: {}.", known.join(", "))
     })

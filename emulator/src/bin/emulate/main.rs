@@ -26,7 +26,8 @@ use emulator::serial::Serial;
 use emulator::socketcand::Server;
 use emulator::time::{Span, Time};
 use emulator::world::{MachineId, World};
-use shared_abi::geometry::{Geometry, Region, STM32F407VG, STM32F429ZI, STM32F446RE};
+use shared_abi::geometry::{Geometry, Region};
+use shared_abi::layout::{self, BOARDS};
 
 /// Runs boards on a virtual CAN bus and shows in words what happens.
 ///
@@ -38,7 +39,15 @@ use shared_abi::geometry::{Geometry, Region, STM32F407VG, STM32F429ZI, STM32F446
 struct Args {
     /// The board
     #[arg(long, default_value = "stm32f407g-disc1", value_parser = board)]
-    board: &'static Board,
+    board: Board,
+
+    /// The board's crystal or clock, in Hz
+    #[arg(long, value_name = "HZ", default_value_t = 8_000_000)]
+    hse: u32,
+
+    /// The CAN controller that the transceiver is at, 1 or 2, where it is not the one of the board
+    #[arg(long, value_name = "NUMBER", value_parser = clap::value_parser!(u8).range(1..=2))]
+    can: Option<u8>,
 
     /// The bootloader's image (ELF, Intel HEX, or FILE@ADDRESS for a raw binary)
     #[arg(long, value_name = "FILE")]
@@ -102,13 +111,10 @@ struct Args {
     run_for: Option<Time>,
 }
 
-/// What is known of a board here: its chip, its crystal, pins that a resistor pulls up, its serial
-/// port.
-#[derive(Debug)]
+/// What is known of a board here: its chip, pins that a resistor pulls up, its serial port.
+#[derive(Clone, Copy, Debug)]
 struct Board {
-    name: &'static str,
     chip: &'static Geometry,
-    hse_hz: u32,
     pulled_up: &'static [(char, u8)],
     /// The USART that is led out.
     usart: &'static str,
@@ -116,53 +122,19 @@ struct Board {
     transceiver: usize,
 }
 
-const BOARDS: &[Board] = &[
-    Board {
-        name: "stm32f407g-disc1",
-        chip: &STM32F407VG,
-        hse_hz: 8_000_000,
-        pulled_up: &[],
-        usart: "USART2",
-        transceiver: 0,
-    },
-    Board {
-        name: "stm32f407g-disc1-two",
-        chip: &STM32F407VG,
-        hse_hz: 8_000_000,
-        pulled_up: &[],
-        usart: "USART2",
-        transceiver: 0,
-    },
-    Board {
-        name: "stm32f407g-disc1-can2",
-        chip: &STM32F407VG,
-        hse_hz: 8_000_000,
-        pulled_up: &[],
-        usart: "USART2",
-        transceiver: 1,
-    },
-    // B1 (UM1724).
-    Board {
-        name: "nucleo-f446re",
-        chip: &STM32F446RE,
-        hse_hz: 8_000_000,
-        pulled_up: &[('C', 13)],
-        usart: "USART2",
-        transceiver: 0,
-    },
-    Board {
-        name: "stm32f429i-disc1",
-        chip: &STM32F429ZI,
-        hse_hz: 8_000_000,
-        pulled_up: &[],
-        usart: "USART1",
-        transceiver: 0,
-    },
-];
-
-fn board(name: &str) -> Result<&'static Board, String> {
-    let names = || BOARDS.iter().map(|board| board.name).collect::<Vec<_>>().join(", ");
-    BOARDS.iter().find(|board| board.name == name).ok_or_else(|| format!("known boards: {}", names()))
+/// A board has its serial port at USART2, its transceiver at CAN1 and no resistors at its pins, unless
+/// it stands here.
+fn board(name: &str) -> Result<Board, String> {
+    let names = || BOARDS.iter().map(|layout| layout.board).collect::<Vec<_>>().join(", ");
+    let layout = layout::by_name(name).ok_or_else(|| format!("known boards: {}", names()))?;
+    let plain = Board { chip: layout.chip, pulled_up: &[], usart: "USART2", transceiver: 0 };
+    Ok(match name {
+        "stm32f407g-disc1-can2" => Board { transceiver: 1, ..plain },
+        // B1 (UM1724).
+        "nucleo-f446re" => Board { pulled_up: &[('C', 13)], ..plain },
+        "stm32f429i-disc1" => Board { usart: "USART1", ..plain },
+        _ => plain,
+    })
 }
 
 /// The longest `--for`: 200 days.
@@ -355,10 +327,10 @@ impl Bench {
                 args.board.chip,
                 Options {
                     seed: args.seed.wrapping_add(u64::from(n)),
-                    hse_hz: args.board.hse_hz,
+                    hse_hz: args.hse,
                     flash_times: if args.worst_flash { FlashTimes::Worst } else { FlashTimes::Typical },
                     unique_id,
-                    transceiver: args.board.transceiver,
+                    transceiver: args.can.map_or(args.board.transceiver, |can| usize::from(can) - 1),
                 },
             );
             let mut machine = machine.context("setting up the board")?;

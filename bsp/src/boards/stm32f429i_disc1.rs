@@ -1,20 +1,19 @@
-//! NUCLEO-F446RE with a CAN transceiver on PB8 and PB9 (D15 and D14 of the Arduino connector).
-
-use shared_abi::layout::{self, Layout};
+//! STM32F429I-DISC1 with a CAN transceiver on PB8 and PB9.
+//!
+//! Every pin of CAN1 has another use on this board (UM1670): PD0 and PD1 are data lines of the
+//! SDRAM, PA11, PA12, PB8 and PB9 go to the display's parallel interface, where they end in inputs.
+//! So PB8 and PB9 are free as long as the display stays dark.
 
 use crate::clock::ClockTree;
-use crate::Identity;
-
-/// Who owns which address on this board.
-pub const LAYOUT: &Layout = &layout::nucleo_f446re::LAYOUT;
+use crate::{Identity, Pull, Strap};
 
 /// What the device says of itself.
 pub const IDENTITY: Identity = Identity {
     vendor_id: 0,
-    product_code: 0x446E_0064,
+    product_code: 0x4291_D151,
     revision: 0x0001_0000,
-    device_name: "coboot NUCLEO-F446RE",
-    hardware_version: "MB1136",
+    device_name: "coboot STM32F429I-DISC1",
+    hardware_version: "MB1075",
 };
 
 /// Node-ID of a device that was never told another one, 1 to 127; 255 for one that waits for layer
@@ -25,15 +24,11 @@ pub const NODE_ID: u8 = 1;
 /// listening.
 pub const BIT_RATE: u32 = 125_000;
 
-/// 8 MHz from the ST-LINK on OSC_IN (MCO; UM1724: as delivered). HSI alone would do for the core,
-/// but 1 % is too much for CAN above 125 kbit/s. Where the ST-LINK has been broken off and no
-/// crystal X3 is fitted, the bootloader falls back to HSI.
-///
-/// 160 MHz and not the 180 MHz that the chip could do with over-drive: APB1 at 40 MHz makes each
-/// bit rate of CiA 301, 45 MHz and 42 MHz do not make 800 kbit/s.
+/// A crystal of 8 MHz on OSC_IN and OSC_OUT (X3). 160 MHz and not 168 (180 with over-drive): APB1
+/// at 40 MHz makes each bit rate of CiA 301, 42 MHz and 45 MHz do not make 800 kbit/s.
 pub const CLOCK_TREE: ClockTree = ClockTree {
     hse: 8_000_000,
-    hse_bypass: true,
+    hse_bypass: false,
     pll_input: 2_000_000,
     pll_n: 160,
     pll_p: 2,
@@ -43,9 +38,8 @@ pub const CLOCK_TREE: ClockTree = ClockTree {
 }
 .checked();
 
-/// The pin that asks for the bootloader after a reset, as port and number, and the level that does.
-/// The blue button B1 on PC13, low when pressed; the board pulls it up (UM1724).
-pub const ENTRY_STRAP: (char, u8, bool) = ('C', 13, false);
+/// The pin that asks for the bootloader after a reset: the blue button B1 on PA0, high when pressed (UM1670).
+pub const ENTRY_STRAP: Option<Strap> = Some(Strap { port: 'A', pin: 0, pressed: true, pull: Pull::None });
 
 /// Bit rate of the UART, in bit/s.
 pub const UART_BIT_RATE: u32 = 115_200;
@@ -67,25 +61,27 @@ mod pins {
     use crate::uart::Port;
     use crate::Board;
 
-    /// The LED that shows life: LD2, green, high is on.
-    pub type Led = Pin<'A', 5, Output>;
+    /// The LED that shows life: LD3, green, high is on.
+    pub type Led = Pin<'G', 13, Output>;
 
     uart! {
-        /// The UART, on PA2 and PA3, which the ST-LINK makes a serial port of the host (UM1724).
+        /// The UART, on PA9 and PA10, which the ST-LINK makes a serial port of the host (UM1670).
         /// It is set up with the feature `uart` alone.
-        USART2
+        USART1
     }
 
     /// Sets the pins up.
     #[must_use]
     pub fn init(rcc: &mut Rcc, can1: pac::CAN1) -> Board {
-        let gpioa = take_port!(GPIOA, can1).split(rcc);
         let gpiob = take_port!(GPIOB, can1).split(rcc);
-        let led = gpioa.pa5.into_push_pull_output();
+        let gpiog = take_port!(GPIOG, can1).split(rcc);
+        let led = gpiog.pg13.into_push_pull_output();
         #[cfg(feature = "uart")]
-        let uart = Port::new(take_port!(USART2, can1), (gpioa.pa2, gpioa.pa3), rcc);
-        // AF9: CAN1_RX is PB8, CAN1_TX is PB9 (DS10693, alternate functions; the HAL's table has
-        // the same).
+        let gpioa = take_port!(GPIOA, can1).split(rcc);
+        #[cfg(feature = "uart")]
+        let uart = Port::new(take_port!(USART1, can1), (gpioa.pa9, gpioa.pa10), rcc);
+        // AF9: CAN1_RX is PB8, CAN1_TX is PB9 (DS9405, alternate functions; the HAL's table has the
+        // same).
         let can = can1.can((gpiob.pb9, gpiob.pb8), rcc);
         Board {
             can,

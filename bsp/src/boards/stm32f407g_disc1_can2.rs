@@ -1,12 +1,7 @@
 //! STM32F407G-DISC1 with a CAN transceiver on PB12 and PB13: CAN2 in the place of CAN1.
 
-use shared_abi::layout::{self, Layout};
-
 use crate::clock::ClockTree;
-use crate::Identity;
-
-/// Who owns which address on this board.
-pub const LAYOUT: &Layout = &layout::stm32f407g_disc1_can2::LAYOUT;
+use crate::{Identity, Pull, Strap};
 
 /// What the device says of itself.
 pub const IDENTITY: Identity = Identity {
@@ -39,9 +34,8 @@ pub const CLOCK_TREE: ClockTree = ClockTree {
 }
 .checked();
 
-/// The pin that asks for the bootloader after a reset, as port and number, and the level that does.
-/// The blue button B1 on PA0, high when pressed (UM1472 section 6.4).
-pub const ENTRY_STRAP: (char, u8, bool) = ('A', 0, true);
+/// The pin that asks for the bootloader after a reset: the blue button B1 on PA0, high when pressed (UM1472 section 6.4).
+pub const ENTRY_STRAP: Option<Strap> = Some(Strap { port: 'A', pin: 0, pressed: true, pull: Pull::None });
 
 /// Bit rate of the UART, in bit/s.
 pub const UART_BIT_RATE: u32 = 115_200;

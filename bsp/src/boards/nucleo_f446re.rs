@@ -1,24 +1,15 @@
-//! STM32F407G-DISC1 with a CAN transceiver on PD0 and PD1.
-
-use shared_abi::layout::{self, Layout};
+//! NUCLEO-F446RE with a CAN transceiver on PB8 and PB9 (D15 and D14 of the Arduino connector).
 
 use crate::clock::ClockTree;
-use crate::Identity;
-
-/// Who owns which address on this board.
-pub const LAYOUT: &Layout = if cfg!(feature = "board-stm32f407g-disc1-two") {
-    &layout::stm32f407g_disc1_two::LAYOUT
-} else {
-    &layout::stm32f407g_disc1::LAYOUT
-};
+use crate::{Identity, Pull, Strap};
 
 /// What the device says of itself.
 pub const IDENTITY: Identity = Identity {
     vendor_id: 0,
-    product_code: 0x4007_D151,
+    product_code: 0x446E_0064,
     revision: 0x0001_0000,
-    device_name: "coboot STM32F407G-DISC1",
-    hardware_version: "MB997",
+    device_name: "coboot NUCLEO-F446RE",
+    hardware_version: "MB1136",
 };
 
 /// Node-ID of a device that was never told another one, 1 to 127; 255 for one that waits for layer
@@ -29,13 +20,17 @@ pub const NODE_ID: u8 = 1;
 /// listening.
 pub const BIT_RATE: u32 = 125_000;
 
-/// A crystal of 8 MHz on OSC_IN and OSC_OUT; the fastest clocks that the chip allows at 3.3 V
-/// (datasheet DS8626, table 14).
+/// 8 MHz from the ST-LINK on OSC_IN (MCO; UM1724: as delivered). HSI alone would do for the core,
+/// but 1 % is too much for CAN above 125 kbit/s. Where the ST-LINK has been broken off and no
+/// crystal X3 is fitted, the bootloader falls back to HSI.
+///
+/// 160 MHz and not the 180 MHz that the chip could do with over-drive: APB1 at 40 MHz makes each
+/// bit rate of CiA 301, 45 MHz and 42 MHz do not make 800 kbit/s.
 pub const CLOCK_TREE: ClockTree = ClockTree {
     hse: 8_000_000,
-    hse_bypass: false,
+    hse_bypass: true,
     pll_input: 2_000_000,
-    pll_n: 168,
+    pll_n: 160,
     pll_p: 2,
     apb1: 4,
     apb2: 2,
@@ -43,9 +38,8 @@ pub const CLOCK_TREE: ClockTree = ClockTree {
 }
 .checked();
 
-/// The pin that asks for the bootloader after a reset, as port and number, and the level that does.
-/// The blue button B1 on PA0, high when pressed (UM1472 section 6.4).
-pub const ENTRY_STRAP: (char, u8, bool) = ('A', 0, true);
+/// The pin that asks for the bootloader after a reset: the blue button B1 on PC13, low when pressed; the board pulls it up (UM1724).
+pub const ENTRY_STRAP: Option<Strap> = Some(Strap { port: 'C', pin: 13, pressed: false, pull: Pull::None });
 
 /// Bit rate of the UART, in bit/s.
 pub const UART_BIT_RATE: u32 = 115_200;
@@ -67,25 +61,26 @@ mod pins {
     use crate::uart::Port;
     use crate::Board;
 
-    /// The LED that shows life: LD4, green, high is on.
-    pub type Led = Pin<'D', 12, Output>;
+    /// The LED that shows life: LD2, green, high is on.
+    pub type Led = Pin<'A', 5, Output>;
 
     uart! {
-        /// The UART, on PA2 and PA3, which are free on this board (UM1472). It is set up with the
-        /// feature `uart` alone.
+        /// The UART, on PA2 and PA3, which the ST-LINK makes a serial port of the host (UM1724).
+        /// It is set up with the feature `uart` alone.
         USART2
     }
 
     /// Sets the pins up.
     #[must_use]
     pub fn init(rcc: &mut Rcc, can1: pac::CAN1) -> Board {
-        let gpiod = take_port!(GPIOD, can1).split(rcc);
-        let led = gpiod.pd12.into_push_pull_output();
-        #[cfg(feature = "uart")]
         let gpioa = take_port!(GPIOA, can1).split(rcc);
+        let gpiob = take_port!(GPIOB, can1).split(rcc);
+        let led = gpioa.pa5.into_push_pull_output();
         #[cfg(feature = "uart")]
         let uart = Port::new(take_port!(USART2, can1), (gpioa.pa2, gpioa.pa3), rcc);
-        let can = can1.can((gpiod.pd1, gpiod.pd0), rcc);
+        // AF9: CAN1_RX is PB8, CAN1_TX is PB9 (DS10693, alternate functions; the HAL's table has
+        // the same).
+        let can = can1.can((gpiob.pb9, gpiob.pb8), rcc);
         Board {
             can,
             led,

@@ -1,16 +1,16 @@
-//! STM32F407G-DISC1 (STM32F407VG: 1 MiB flash in 4×16, 64 and 7×128 KiB; 128 KiB SRAM).
+//! NUCLEO-F446RE (STM32F446RE: 512 KiB flash in 4×16, 64 and 3×128 KiB; 128 KiB SRAM).
 
-use super::Layout;
-use crate::geometry::{Region, STM32F407VG};
+use crate::geometry::{Region, STM32F446RE};
+use crate::layout::Layout;
 
-/// The memory map of the STM32F407G-DISC1.
+/// The memory map of the NUCLEO-F446RE.
 pub const LAYOUT: Layout = Layout {
-    board: "stm32f407g-disc1",
-    chip: &STM32F407VG,
+    board: "nucleo-f446re",
+    chip: &STM32F446RE,
     bootloader: Region::new(0x0800_0000, 32 * 1024),
     callgate_offset: 0x40,
     parameters: [Region::new(0x0800_8000, 16 * 1024), Region::new(0x0800_C000, 16 * 1024)],
-    programs: &[Region::new(0x0801_0000, 960 * 1024)],
+    programs: &[Region::new(0x0801_0000, 448 * 1024)],
     ram: Region::new(0x2000_0000, 128 * 1024 - 64),
     handoff: Region::new(0x2001_FFC0, 48),
     warm_start: Region::new(0x2001_FFF0, 16),

@@ -7,8 +7,8 @@
 //!     and warm-start cell are at the end of the third. The CCM is nobody's: it is not cleared by
 //!     the bootloader, and the application may have it.
 
-use super::Layout;
 use crate::geometry::{Region, STM32F429ZI};
+use crate::layout::Layout;
 
 /// The memory map of the STM32F429I-DISC1.
 pub const LAYOUT: Layout = Layout {

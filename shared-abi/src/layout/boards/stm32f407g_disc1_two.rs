@@ -1,7 +1,7 @@
 //! The STM32F407G-DISC1 with room for two programs: one in sectors 4 to 7, one in sectors 8 to 11.
 
-use super::{stm32f407g_disc1, Layout};
 use crate::geometry::Region;
+use crate::layout::{stm32f407g_disc1, Layout};
 
 /// The memory map of the STM32F407G-DISC1 with two programs.
 pub const LAYOUT: Layout = Layout {
