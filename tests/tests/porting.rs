@@ -8,6 +8,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use shared_abi::layout;
+
 const TARGET: &str = "thumbv7em-none-eabihf";
 
 /// A copy of the repository.
@@ -30,8 +32,9 @@ impl Copy {
         let (root, target) = (tmp.join("copy"), tmp.join("target"));
         synchronise(&Path::new(env!("CARGO_MANIFEST_DIR")).join(".."), &root);
         if !target.exists() {
-            for profile in ["debug", "fw/release", "fw/thumbv7em-none-eabihf/firmware"] {
-                share(profile, &target);
+            share("debug", &target.join("debug"));
+            for profile in ["release", "thumbv7em-none-eabihf/firmware"] {
+                share(&format!("fw/stm32f407/{profile}"), &target.join("fw/stm32f405").join(profile));
             }
         }
         Self { root, target, _alone: alone }
@@ -45,7 +48,8 @@ impl Copy {
     fn cargo_for(&self, board: &str, product: Option<&str>, words: &[&str]) -> Output {
         // Firmware goes where `cargo xtask build` has it built.
         let firmware = words.contains(&TARGET);
-        let target = if firmware { self.target.join("fw") } else { self.target.clone() };
+        let chip = layout::by_name(board).map_or("stm32f405", |layout| layout.chip.line.name());
+        let target = if firmware { self.target.join("fw").join(chip) } else { self.target.clone() };
         let mut cargo = Command::new(env!("CARGO"));
         cargo.current_dir(&self.root).args(words).env("CARGO_TARGET_DIR", target).env("COBOOT_BOARD", board);
         if let Some(name) = product {
@@ -70,11 +74,11 @@ fn text(output: &Output) -> String {
 
 /// Gives the copy what was built of other people's crates: files that cargo replaces as a whole are
 /// the same files, those that it writes into are copied. Where that fails, the copy builds them.
-fn share(profile: &str, target: &Path) {
-    let (from, to) = (Path::new(env!("CARGO_TARGET_TMPDIR")).join("..").join(profile), target.join(profile));
-    fs::create_dir_all(&to).expect("the folder can be made");
+fn share(profile: &str, to: &Path) {
+    let from = Path::new(env!("CARGO_TARGET_TMPDIR")).join("..").join(profile);
+    fs::create_dir_all(to).expect("the folder can be made");
     for (how, folder) in [("-al", "deps"), ("-a", "build"), ("-a", ".fingerprint")] {
-        let _ = Command::new("cp").arg(how).arg(from.join(folder)).arg(&to).output();
+        let _ = Command::new("cp").arg(how).arg(from.join(folder)).arg(to).output();
     }
 }
 

@@ -218,7 +218,7 @@ fn notices_beside(release: &Release) -> Outcome {
 fn bills(release: &Release) -> Outcome {
     sbom::run(Args::new(std::iter::empty()))?;
     let folder = workspace::target_dir().join("sbom");
-    let board = workspace::DEFAULT_BOARD;
+    let board = shared_abi::layout::DEFAULT.board;
     copy(&folder.join("coflash-all-systems.cdx.json"), &release.file(".cdx.json"))?;
     let bootloader = release.dist.join(format!("bootloader-{VERSION}-{board}.cdx.json"));
     copy(&folder.join(format!("bootloader-{board}.cdx.json")), &bootloader)
