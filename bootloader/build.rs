@@ -1,5 +1,5 @@
-//! Hands the linker the numbers of the chosen board and the image's template. For the bootloader it
-//! builds the resident part first, which is a program of its own.
+//! Gives the linker the numbers of the chosen board and the template of the image. For the bootloader
+//! it first builds the resident part, which is a separate program.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -20,16 +20,16 @@ fn main() {
     let templates = package.join("../linker");
     println!("cargo:rerun-if-changed={}", templates.display());
     println!("cargo:rustc-link-search={}", templates.display());
-    // The resident part is of the same product as the rest (bootloader/src/product.rs).
+    // The resident part belongs to the same product as the rest (bootloader/src/product.rs).
     println!("cargo:rerun-if-env-changed=COBOOT_PRODUCT");
     coboot_linker::link(&out, template);
-    // Functions that compile to the same code are one.
+    // Functions with identical code are merged.
     println!("cargo:rustc-link-arg-bins=--icf=all");
-    // Functions that are alike stand near each other, so that copies come from near. (The image is
-    // packed, and copies from the resident part.)
+    // Similar functions are placed near each other, so that copies have short distances. (The image
+    // is compressed, and copies from the resident part.)
     println!("cargo:rustc-link-arg-bins=--bp-compression-sort=function");
     if template == "bootloader.x" && has("LOG_DEFMT") {
-        // The words of `defmt`, which are in the ELF file and not on the chip.
+        // The log strings of `defmt`, which are in the ELF file and not on the chip.
         println!("cargo:rustc-link-arg-bins=-Tdefmt.x");
     }
     match template {
@@ -38,7 +38,7 @@ fn main() {
     }
 }
 
-/// Builds the resident part with the features of the bootloader, and leaves its bytes as
+/// Builds the resident part with the features of the bootloader, and writes its bytes to
 /// `OUT_DIR/resident.bin`.
 fn resident(package: &Path, out: &Path, layout: &Layout) {
     let workspace = package.join("..");
@@ -53,7 +53,7 @@ fn resident(package: &Path, out: &Path, layout: &Layout) {
     });
     let features: Vec<String> =
         features.chain(["resident".to_owned(), format!("bsp/chip-{}", layout.chip.line.name())]).collect();
-    // The folder of the outer build's profile; a lock of its own.
+    // The folder of the outer build's profile; this build has its own lock.
     let target = out.ancestors().nth(3).expect("OUT_DIR lies deep in the target folder").join("resident");
     let triple = env::var("TARGET").expect("cargo sets it");
 
@@ -61,7 +61,7 @@ fn resident(package: &Path, out: &Path, layout: &Layout) {
     cargo.current_dir(&workspace).args(["rustc", "--quiet", "--package=bootloader", "--bin=resident"]);
     cargo.args(["--profile=firmware", "--no-default-features", "--target", &triple, "--features"]);
     cargo.arg(features.join(",")).arg("--target-dir").arg(&target).args(["--", PACKS_WELL]);
-    // What the outer build was told about itself.
+    // The settings that concern the outer build.
     let own = ["CARGO_HOME", "CARGO_MAKEFLAGS", "CARGO_NET_OFFLINE"];
     let told = env::vars_os().map(|(name, _)| name).filter(|name| {
         let name = name.to_string_lossy();

@@ -1,6 +1,7 @@
-/// What the compiler is told beside `.cargo/config.toml` about the bootloader, whose RAM image is
-/// packed: to write the same thing in the same way. No calls in the place of short pieces of code
-/// that stand several times, the first register that is free, and no reordering behind that. A
-/// bootloader gets larger by that as it runs from RAM, and smaller in flash (found by trial). The
-/// resident part, which is not packed, is told the same, since the packed image copies from it.
+/// Additional compiler options for the bootloader, which extend `.cargo/config.toml`. The RAM image
+/// of the bootloader is compressed, so the same operation should always give the same code: no
+/// outlining of repeated short pieces of code, a register allocator that takes the first free
+/// register, and no reordering after it. These options make the bootloader larger in RAM and
+/// smaller in flash (found by trial). The resident part is not compressed, but gets the same
+/// options, because the compressed image copies from it.
 const PACKS_WELL: &str = "-Cllvm-args=--enable-machine-outliner=never --regalloc=basic --disable-post-ra=1";

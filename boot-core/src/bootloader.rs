@@ -1,4 +1,4 @@
-//! The bootloader as a CANopen device: its object dictionary, with the download behind it.
+//! The bootloader as a CANopen device: its object dictionary and the download.
 
 use core::task::Poll;
 
@@ -28,35 +28,36 @@ use crate::store::{NodeParameters, Parameters};
 use crate::stored_version::StoredVersion;
 use crate::unseal::Unsealer;
 
-/// What dialects add to the object dictionary.
+/// The objects that a dialect adds to the object dictionary.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Extras {
-    /// Where the password is written that 1F50h waits for.
+    /// The object for the password that unlocks 1F50h.
     pub password: PasswordObject,
     /// Whether 1F50h can be read.
     pub read_back: bool,
-    /// Whether there are 2002h and 2003h, of a device that takes sealed images.
+    /// Whether 2002h and 2003h exist, which belong to devices with sealed images.
     pub sealed: bool,
 }
 
 impl Extras {
-    /// Nothing.
+    /// No additional objects.
     pub const NONE: Self = Self { password: PasswordObject::None, read_back: false, sealed: false };
 }
 
-/// Where a password is written.
+/// The object for a password.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PasswordObject {
-    /// There is none.
+    /// The device has no password.
     None,
-    /// 7F50h of a program, 32 bits: it voids the program and opens its 1F50h (ESAcademy).
+    /// 7F50h of a program, 32 bits: the password makes the program invalid and unlocks its 1F50h
+    /// (ESAcademy).
     EnableFlash,
-    /// 6005h/1, a text: it opens 1F50h of all programs (lifts; CiA 814-1 clause 6.3).
+    /// 6005h/1, a text: the password unlocks 1F50h of all programs (lifts; CiA 814-1 clause 6.3).
     Unlock,
 }
 
-/// The objects of a device with `programs` programs (1 to 254) and what a dialect adds, of which there
-/// are [`entry_count`] (SYS TEC manual L-1112d_10, table 1).
+/// The [`entry_count`] objects of a device with `programs` programs (1 to 254) and the objects of a
+/// dialect (SYS TEC manual L-1112d_10, table 1).
 #[must_use]
 pub const fn entries<const LEN: usize>(programs: u8, extras: Extras) -> Table<LEN> {
     let data_access = if extras.read_back { Access::Rw } else { Access::Wo };
@@ -75,7 +76,7 @@ pub const fn entries<const LEN: usize>(programs: u8, extras: Extras) -> Table<LE
     }
 }
 
-/// How many entries the object dictionary has.
+/// The number of entries in the object dictionary.
 #[must_use]
 pub const fn entry_count(programs: u8, extras: Extras) -> usize {
     let array = 1 + programs as usize;
@@ -91,54 +92,55 @@ pub const fn entry_count(programs: u8, extras: Extras) -> usize {
 /// 1018h/4.
 const SERIAL_NUMBER: u8 = 4;
 
-/// What can be chosen about a bootloader.
+/// The configuration of a bootloader.
 #[derive(Clone, Copy, Debug)]
 pub struct Config {
-    /// The object dictionary: [`entries`] of the layout's programs.
+    /// The object dictionary: [`entries`] for the programs of the layout.
     pub entries: &'static [Entry],
-    /// What it says of itself; but for the serial number, which every device has its own of.
+    /// The identity of the device. Each device replaces the serial number by its own.
     pub device: Device,
-    /// The node-ID while the bootloader runs; `None` for the device's own.
+    /// The node-ID while the bootloader runs; `None` for the device's stored node-ID.
     pub node_id: Option<NodeId>,
-    /// Who owns which address.
+    /// The memory layout: the owner of each address.
     pub layout: &'static Layout,
-    /// The bit rates that its controller can be set to.
+    /// Whether the CAN controller supports a bit rate.
     pub supports: fn(BitRate) -> bool,
-    /// An emergency behind each boot-up, which tells a master that this is the bootloader and not
-    /// the application: its code FF00h (device specific, CiA 301 table 26), "BOOT", and why the
-    /// device stayed ([`StayReason::code`](crate::decision::StayReason::code)).
+    /// Whether an emergency follows each boot-up message. It tells a master that this is the
+    /// bootloader and not the application. Its code is FF00h (device specific, CiA 301 table 26);
+    /// its data are "BOOT" and the reason why the device stayed
+    /// ([`StayReason::code`](crate::decision::StayReason::code)).
     pub boot_up_emergency: bool,
     /// Whether layer setting services may store node-ID and bit rate.
     pub lss_store: bool,
     /// How programs are downloaded.
     pub download: Policy,
-    /// What opens 1F50h where [`Policy::locked`] says that something has to; it is written where
-    /// [`Extras::password`] says.
+    /// The password that unlocks 1F50h if [`Policy::locked`] is set; the client writes it to the
+    /// object in [`Extras::password`].
     pub password: &'static [u8],
 }
 
-/// The objects of the bootloader and what is behind them.
+/// The objects of the bootloader and the state that they show.
 pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize> {
     config: &'static Config,
     serial_number: u32,
     /// Why the device stayed in the bootloader.
     reason: u8,
-    /// Node-ID and bit rate as they are stored.
+    /// Node-ID and bit rate as stored.
     node: NodeParameters,
-    /// Node-ID in force.
+    /// The active node-ID.
     id: Option<NodeId>,
     flash: F,
     download: Downloader<'b, P, PROGRAMS>,
     emcy: Emcy,
     lock: Lock,
-    /// The time that was told last.
+    /// The last time from [`set_time`](Self::set_time).
     now: Instant,
     stored_version: StoredVersion,
 }
 
 impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PROGRAMS> {
-    /// Starts from what the parameters tell, for a device that stayed in the bootloader for this
-    /// reason. The larger `buffer`, the further the flash may lag behind the bus.
+    /// Starts with the stored parameters, for a device that stayed in the bootloader for `reason`.
+    /// The larger the `buffer`, the further the flash may lag behind the bus.
     #[allow(clippy::too_many_arguments, reason = "each is a part of the device")]
     pub fn new(
         config: &'static Config,
@@ -170,19 +172,19 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         bootloader
     }
 
-    /// The node-ID in force.
+    /// The active node-ID.
     #[must_use]
     pub fn node_id(&self) -> Option<NodeId> {
         self.id
     }
 
-    /// Who the device is, for layer setting services.
+    /// The address of the device for layer setting services.
     #[must_use]
     pub fn lss_address(&self) -> LssAddress {
         LssAddress { serial_number: self.serial_number, ..self.config.device.lss_address() }
     }
 
-    /// Carries the work on the flash on: a bounded piece of it.
+    /// Continues the work on the flash with one bounded step.
     pub fn step(&mut self) -> Step {
         let step = self.download.step(&mut self.flash);
         self.report_outcome();
@@ -192,12 +194,12 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         step
     }
 
-    /// Tells the time: at least every few milliseconds.
+    /// Sets the current time; call this at least every few milliseconds.
     pub fn set_time(&mut self, now: Instant) {
         self.now = now;
     }
 
-    /// Tells by an emergency what became of work on the flash.
+    /// Reports the result of work on the flash by an emergency.
     fn report_outcome(&mut self) {
         match self.download.take_outcome() {
             None => {}
@@ -207,7 +209,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
                 self.emcy.clear(emcy::register::MANUFACTURER);
             }
             Some((program, Err(error))) => {
-                // A signature costs the device a tenth of a second.
+                // To check a signature takes the device a tenth of a second.
                 #[cfg(feature = "sealed")]
                 if error == FlashError::Signature {
                     self.lock.fail(self.now);
@@ -221,49 +223,49 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         }
     }
 
-    /// Whether there is work for [`Bootloader::step`].
+    /// Whether [`Bootloader::step`] has work to do.
     #[must_use]
     pub fn busy(&self) -> bool {
         self.download.busy()
     }
 
-    /// 1F51h: a command, as if it had been written.
+    /// 1F51h: carries out a command as if a client had written it.
     ///
     /// # Errors
-    /// The abort that would answer it.
+    /// The abort for the client.
     pub fn command(&mut self, program: u8, command: ProgramControl) -> Result<(), AbortCode> {
         self.download.command(program, command)
     }
 
-    /// The program (0 for none) has brought the device back to the bootloader: from now on it starts
+    /// The program (0 for none) has returned the device to the bootloader: from now on it starts
     /// without a rescue window.
     pub fn confirm(&mut self, program: u8) {
         self.download.confirm(program);
     }
 
-    /// Whether a reset now would take back what a host was told is done or under way.
+    /// Whether a reset now would undo work that a host believes to be done or in progress.
     #[must_use]
     pub fn is_finishing(&mut self) -> bool {
-        // A reset would let somebody try passwords faster.
+        // A reset would end the wait after a wrong password, and so speed up guessing.
         if self.lock.is_waiting(self.now) {
             return true;
         }
         self.download.is_finishing()
     }
 
-    /// The request to leave the bootloader, once; the answer to the command may still be on its
-    /// way.
+    /// Returns the request to leave the bootloader, once; the answer to the command may not have
+    /// been sent yet.
     pub fn take_boot_request(&mut self) -> Option<BootRequest> {
         self.download.take_boot_request()
     }
 
-    /// Ends here, whatever is being done, as a reset ends it: gives flash and buffer back, for
-    /// whoever resets a device without resetting itself.
+    /// Ends all work at once, as a reset does, and returns flash and buffer. For tests and
+    /// emulations that reset the device without resetting themselves.
     pub fn into_parts(self) -> (F, &'b mut [u8]) {
         (self.flash, self.download.into_buffer())
     }
 
-    /// The flash behind it.
+    /// The flash of the device.
     pub fn flash(&mut self) -> &mut F {
         &mut self.flash
     }
@@ -306,7 +308,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
         match (at.index, data) {
             #[cfg(feature = "sealed")]
             (ACCESS, request) => {
-                // One signature at a time is looked at, and that of an image comes first.
+                // One signature is checked at a time, and that of an image takes precedence.
                 let is_active = self.download.unsealer_mut().is_active();
                 if self.lock.is_waiting(self.now) || self.download.busy() || is_active {
                     return Err(AbortCode::DEVICE_STATE);

@@ -1,14 +1,15 @@
 //! The CRCs of block file, programs and journal.
 //!
-//! They go bit by bit, without a table: some 40 cycles a byte and 100 bytes of flash. A chip with a
-//! CRC unit does long ranges by that, see [`Flash::crc32`](crate::flash::Flash::crc32).
+//! They are computed bit by bit without a table: about 40 cycles for each byte, and 100 bytes of
+//! flash. A chip with a CRC unit uses it for long ranges, see
+//! [`Flash::crc32`](crate::flash::Flash::crc32).
 
 use crc::{Crc, NoTable, CRC_16_XMODEM, CRC_32_ISO_HDLC};
 
 static CRC32: Crc<u32, NoTable> = Crc::<u32, NoTable>::new(&CRC_32_ISO_HDLC);
 static CRC16: Crc<u16, NoTable> = Crc::<u16, NoTable>::new(&CRC_16_XMODEM);
 
-/// Which CRC the blocks and programs of a product carry (SYS TEC manual L-1112d_10, `BL_CRC`).
+/// The CRC of the blocks and programs of a product (SYS TEC manual L-1112d_10, `BL_CRC`).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum CrcKind {
     /// CRC-32/ISO-HDLC.
@@ -20,7 +21,8 @@ pub enum CrcKind {
 }
 
 impl CrcKind {
-    /// The CRC of these bytes behind others whose CRC is `crc`; 0 for none.
+    /// The CRC of earlier bytes followed by `bytes`; `crc` is the CRC of the earlier bytes, 0 if
+    /// there are none.
     #[must_use]
     pub fn resume(self, crc: u32, bytes: &[u8]) -> u32 {
         match self {
@@ -40,10 +42,11 @@ pub fn crc32(bytes: &[u8]) -> u32 {
     resume(0, bytes)
 }
 
-/// The CRC-32 of these bytes behind others whose CRC is `crc`; 0 for none.
+/// The CRC-32 of earlier bytes followed by `bytes`; `crc` is the CRC of the earlier bytes, 0 if
+/// there are none.
 #[must_use]
 pub fn resume(crc: u32, bytes: &[u8]) -> u32 {
-    // The crate takes the start value unreflected, and before the final inversion.
+    // The crate expects the start value unreflected and before the final inversion.
     let mut digest = CRC32.digest_with_initial((!crc).reverse_bits());
     digest.update(bytes);
     digest.finalize()

@@ -1,8 +1,8 @@
 //! The boot decision: bootloader or program, made once after every reset before any peripheral is
-//! touched.
+//! used.
 //!
-//! The order is the product's promise (docs/architecture.md): what asks for the bootloader comes
-//! first, so that no program, however broken, can keep a device from being reached.
+//! The order of the checks is a promise of the product (docs/architecture.md): requests for the
+//! bootloader come first, so that no program, however broken, can keep a device in the application.
 
 use core::ops::RangeInclusive;
 
@@ -11,41 +11,41 @@ use shared_abi::warm_start::BootRequest;
 
 use crate::program::{Invalid, VerifiedProgram};
 
-/// What a reset leaves to decide on.
+/// The inputs of the decision after a reset.
 #[derive(Clone, Copy, Debug)]
 pub struct Circumstances {
-    /// The request in the warm-start cell, consumed.
+    /// The request from the warm-start cell, which has been consumed.
     pub request: Option<BootRequest>,
     /// The entry strap asks for the bootloader.
     pub strap: bool,
     /// [`Policy::crash_resets`].
     pub crash_resets: u32,
-    /// Node-ID of the device; one outside 1 to 127 is no node-ID.
+    /// Node-ID of the device; a value outside 1 to 127 means that it has none.
     pub node_id: u8,
 }
 
-/// What the product is configured for.
+/// The product's configuration of the decision.
 #[derive(Clone, Debug)]
 pub struct Policy {
     /// The program that starts by itself after a reset, if any.
     pub autostart: Option<u8>,
-    /// This many crash resets in a row end in the bootloader.
+    /// After this many consecutive crash resets, the device stays in the bootloader.
     pub max_crash_resets: u32,
-    /// Node-IDs with which programs may be started.
+    /// The node-IDs with which a program may start.
     pub node_ids: RangeInclusive<u8>,
-    /// How long a program that was never confirmed is held back when it would start by itself, in
-    /// ms; 0 for one that starts at once.
+    /// The rescue window, in ms: how long a program that was never confirmed is held back when it
+    /// would start by itself; 0 for no window.
     pub rescue_window_ms: u16,
-    /// The same for a confirmed program.
+    /// The rescue window of a confirmed program, in ms.
     pub rescue_window_confirmed_ms: u16,
-    /// Whether a program may be started now, signed or on trial.
+    /// Whether a program may start now, released or on trial.
     pub start_allowed: fn(program: u8) -> bool,
 }
 
 impl Policy {
-    /// Resets in a row by which the application ended without being asked to, this one among them
-    /// if it is one; `before` were counted. A request is a new beginning, and so is a power-on or
-    /// the reset pin, but not for an application that was given up already.
+    /// The number of consecutive resets by which the application ended without a request, including
+    /// this one if it is one; `before` is the count up to now. A request resets the count. A
+    /// power-on or the reset pin resets it, too, unless the limit was already reached.
     #[must_use]
     pub fn crash_resets(&self, before: u32, cause: ResetCause, request: Option<BootRequest>) -> u32 {
         use ResetCause::{IndependentWatchdog, LowPower, Software, WindowWatchdog};
@@ -64,28 +64,28 @@ impl Policy {
 /// Why the device stays in the bootloader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StayReason {
-    /// The application (or a tool through it) asked for it.
+    /// The application (or a tool through it) has requested the bootloader.
     Requested,
     /// The entry strap is set.
     Strap,
-    /// Too many crash resets in a row.
+    /// There were too many consecutive crash resets.
     CrashLoop,
-    /// Autostart is off and nothing was asked for.
+    /// Autostart is off, and there is no request.
     NoAutostart,
-    /// The node-ID is not in the program's range.
+    /// The node-ID is outside the permitted range.
     NodeId,
-    /// The program was not signed, and this is no trial.
+    /// The program is not released for autostart, and this is not a trial.
     Unsigned,
     /// The program may not be started.
     Program(Invalid),
     /// The bootloader had a fault or a panic.
     Fault,
-    /// A program could start, and waits for the end of the rescue window.
+    /// A program could start, and waits until the rescue window ends.
     Rescue,
 }
 
 impl StayReason {
-    /// The number under which the bus is told.
+    /// The number that reports the reason on the bus.
     #[must_use]
     pub const fn code(self) -> u8 {
         match self {
@@ -101,36 +101,36 @@ impl StayReason {
         }
     }
 
-    /// Whether a code stands for a misfortune that an emergency should tell of.
+    /// Whether a code stands for a problem that an emergency must report.
     #[must_use]
     pub const fn is_trouble(code: u8) -> bool {
         code == Self::CrashLoop.code() || code == Self::Fault.code()
     }
 }
 
-/// What the bootloader does after a reset.
+/// The bootloader's action after a reset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BootDecision {
-    /// Bootloader mode.
+    /// Stay in the bootloader.
     Stay(StayReason),
-    /// Bootloader mode for a while: a client that asks meanwhile keeps the device there. Then the
-    /// program starts.
+    /// Stay in the bootloader for a limited time. If a client sends a request meanwhile, the device
+    /// stays there. Otherwise the program starts.
     Hold {
-        /// Its number.
+        /// The program's number.
         program: u8,
-        /// How long, in ms.
+        /// The time in ms.
         window_ms: u16,
     },
-    /// Jump.
+    /// Start a program.
     Start {
         /// The program, with the proof of its checks.
         program: VerifiedProgram,
-        /// Started without a signature, for once.
+        /// The program starts once without a release.
         trial: bool,
     },
 }
 
-/// Decides. `verify` checks a program completely and is asked at most once.
+/// Makes the decision. `verify` checks a program completely and is called at most once.
 pub fn decide(
     circumstances: &Circumstances,
     policy: &Policy,
@@ -147,7 +147,7 @@ pub fn decide(
         return Stay(StayReason::Strap);
     }
     let (number, trial) = match circumstances.request {
-        // A request is new: whoever makes it knows of the crashes before.
+        // A request is new: its sender knows about earlier crashes.
         Some(BootRequest::Trial(number) | BootRequest::Fresh(number)) => (number, true),
         Some(BootRequest::Start(number) | BootRequest::Resume(number) | BootRequest::Confirm(number)) => {
             (number, false)
@@ -173,8 +173,8 @@ pub fn decide(
         Ok(program) => {
             let window_ms =
                 if program.confirmed() { policy.rescue_window_confirmed_ms } else { policy.rescue_window_ms };
-            // A start that was asked for is not held back: the master that asked looks for the
-            // program at once, and would keep the device in the bootloader by that.
+            // A requested start is not delayed: the requesting master asks for the program at once,
+            // and this request would keep the device in the bootloader.
             if circumstances.request.is_none() && window_ms > 0 {
                 return Hold { program: program.number(), window_ms };
             }

@@ -1,4 +1,4 @@
-//! The seam to the flash: what the core asks of it, and nothing of how it is done.
+//! The interface between the core and the flash.
 
 use core::task::Poll;
 
@@ -6,7 +6,7 @@ use shared_abi::geometry::{Region, Sector};
 
 use crate::crc;
 
-/// Why a flash operation failed, as the controller tells it (RM0090 section 3.8.4, `FLASH_SR`).
+/// Why a flash operation failed, as the controller reports it (RM0090 section 3.8.4, `FLASH_SR`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum FlashFault {
@@ -14,7 +14,7 @@ pub enum FlashFault {
     Protected,
     /// The operation was refused or failed: sequence, alignment, width or supply.
     Failed,
-    /// The word reads back differently from what was programmed.
+    /// The word read back differs from the programmed word.
     Verify,
 }
 
@@ -26,29 +26,28 @@ pub enum Operation {
     Erase(Sector),
     /// Program a word: tens of microseconds.
     Program {
-        /// Where; word-aligned.
+        /// The address, a multiple of 4.
         address: u32,
-        /// What. Bits can only go from 1 to 0.
+        /// The word. Programming can only change bits from 1 to 0.
         word: u32,
     },
 }
 
-/// What a piece of work on the flash does next, told while no operation runs.
+/// The next action of a piece of work on the flash, queried while no operation runs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Next<E> {
-    /// This operation; its outcome is to be told.
+    /// Start this operation and report its result.
     Start(Operation),
-    /// A further bounded computation.
+    /// Call again: there is a further bounded computation.
     Again,
-    /// Nothing: the work is over.
+    /// The work has ended.
     Done(Result<(), E>),
 }
 
-/// A flash that erases by sectors and programs by words, one operation at a time and without
-/// waiting for it.
+/// A flash that erases sectors and programs words, one operation at a time and without waiting.
 ///
-/// Everything but [`poll`](Self::poll) may only be called while no operation runs, because on the
-/// F4 a read from busy flash stalls the core. The programmer sees to it.
+/// All functions except [`poll`](Self::poll) may only be called while no operation runs, because on
+/// the F4 a read from busy flash stalls the core. The programmer ensures this.
 pub trait Flash {
     /// Copies `buffer.len()` bytes from `address` on. Addresses outside the flash read FFh.
     fn read(&self, address: u32, buffer: &mut [u8]);
@@ -56,17 +55,17 @@ pub trait Flash {
     /// Starts an operation.
     ///
     /// # Errors
-    /// What the controller says at once; later faults come from [`Flash::poll`].
+    /// The controller's immediate refusal; [`Flash::poll`] reports later faults.
     fn start(&mut self, operation: Operation) -> Result<(), FlashFault>;
 
-    /// The outcome of the running operation, `Ready(Ok(()))` when none runs.
+    /// The result of the running operation; `Ready(Ok(()))` if none runs.
     fn poll(&mut self) -> Poll<Result<(), FlashFault>>;
 
-    /// The sector that holds this address.
+    /// The sector that contains this address.
     fn sector_at(&self, address: u32) -> Option<Sector>;
 
-    /// The CRC-32 of a region behind data whose CRC is `crc` (0 for none). A chip that has a unit
-    /// for it overrides this.
+    /// The CRC-32 of earlier data followed by a region; `crc` is the CRC of the earlier data (0 for
+    /// none). A chip with a CRC unit overrides this.
     fn crc32(&self, crc: u32, region: Region) -> u32 {
         crc32_by_software(self, crc, region)
     }
@@ -84,12 +83,12 @@ pub trait Flash {
     }
 }
 
-/// [`Flash::crc32`] for a chip without a unit, and for what its unit does not take.
+/// [`Flash::crc32`] for a chip without a CRC unit, and for data that the unit cannot process.
 pub fn crc32_by_software<F: Flash + ?Sized>(flash: &F, crc: u32, region: Region) -> u32 {
     fold(flash, crc, region, crc::resume)
 }
 
-/// A function over the bytes of a region, 64 at a time.
+/// Folds a function over the bytes of a region, 64 bytes at a time.
 pub(crate) fn fold<F: Flash + ?Sized, T>(
     flash: &F,
     start: T,
@@ -106,8 +105,8 @@ pub(crate) fn fold<F: Flash + ?Sized, T>(
     result
 }
 
-/// Carries a piece of work through and waits for each operation, for those who have nothing else to
-/// do: `next` tells what follows on the outcome of the operation before.
+/// Carries out a piece of work and waits for each operation, for callers with no other work. `next`
+/// gets the result of the previous operation and returns the next action.
 pub fn run<F: Flash, E>(
     flash: &mut F,
     mut next: impl FnMut(&F, Result<(), FlashFault>) -> Next<E>,
@@ -160,5 +159,5 @@ impl<F: Flash> Flash for &mut F {
     }
 }
 
-/// What an erased word reads as.
+/// The value of an erased word.
 pub const ERASED: u32 = u32::MAX;

@@ -1,4 +1,4 @@
-//! Whether the device has keys, which make it take and start sealed programs alone.
+//! Whether the device has keys and therefore accepts and starts only sealed programs.
 
 use shared_abi::layout::Layout;
 
@@ -7,16 +7,16 @@ use crate::flash::Flash;
 use crate::store::Key;
 use crate::store::Parameters;
 
-/// Whether anything stands in the key block's place (`seal::key_block`), unless the holder of a root
-/// key has opened the device for good. A key block that is damaged does not open it: then no image
-/// passes.
+/// Whether the place of the key block (`seal::key_block`) is not empty, unless the holder of a root
+/// key has opened the device permanently. A damaged key block does not open the device: no image
+/// passes the checks then.
 #[cfg(feature = "sealed")]
 pub fn is_sealed<F: Flash>(flash: &F, parameters: &impl Parameters, layout: &Layout) -> bool {
     let [_, opened, ..] = parameters.get(flash, Key::Grants).unwrap_or([0; 4]);
     opened == 0 && !flash.is_blank(layout.key_block())
 }
 
-/// Whether the key block there is sound.
+/// Whether the key block is valid.
 #[cfg(feature = "sealed")]
 pub fn is_sound<F: Flash>(flash: &F, key_block: u32) -> bool {
     use seal::key_block::{CHECK, MAGIC};
@@ -26,7 +26,7 @@ pub fn is_sound<F: Flash>(flash: &F, key_block: u32) -> bool {
         && flash.crc32(0, Region::new(key_block, CHECK as u32)) == flash.read_word(key_block + CHECK as u32)
 }
 
-/// No key means anything to a bootloader without sealed images.
+/// A bootloader without sealed images ignores keys.
 #[cfg(not(feature = "sealed"))]
 pub fn is_sealed<F: Flash>(_: &F, _: &impl Parameters, _: &Layout) -> bool {
     false

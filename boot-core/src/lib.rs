@@ -35,8 +35,8 @@ pub mod store;
 mod stored_version;
 pub mod unseal;
 
-/// Frames, node and transfers, in which the core speaks: a firmware that uses this crate needs no
-/// other for them.
+/// Frames, node and transfers, used in the interface of the core: firmware that uses this crate
+/// needs no further dependency for them.
 pub use canopen;
 pub use crc::crc32;
 

@@ -1,76 +1,77 @@
-//! What a product may choose about downloads.
+//! The product's choices about downloads.
 
 use canopen::program::FlashError;
 use shared_abi::block_file::Control;
 
 use crate::crc::CrcKind;
 
-/// When CLEAR erases.
+/// The time of the erase for CLEAR.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Erase {
-    /// With the first block that is for this device: until then the old program stays, and can be
-    /// started. Sectors are erased as the data need them. A second CLEAR, with no block in between,
-    /// erases all at once.
+    /// With the first block that is for this device: until then the old program stays and can be
+    /// started. Sectors are erased as the data need them. A second CLEAR without a block in between
+    /// erases everything at once.
     #[default]
     WithFirstBlock,
-    /// All sectors of the program, before anything else.
+    /// At once: all sectors of the program are erased before anything else.
     AtOnce,
 }
 
-/// What the integrator's own check says of a program that is about to be downloaded.
+/// The result of the integrator's own check of a program before its download.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
-    /// Nothing: vendor-ID and product code decide.
+    /// No decision: vendor-ID and product code decide.
     Standard,
-    /// It is for this device.
+    /// The program is for this device.
     Accept,
-    /// It is not.
+    /// The program is not for this device.
     Refuse(FlashError),
 }
 
-/// What can be chosen about the download.
+/// The product's choices about downloads.
 #[derive(Clone, Copy, Debug)]
 pub struct Policy {
-    /// Vendor-ID and product code of the device. A control block that tells others is refused; 0 in
-    /// it stands for any.
+    /// Vendor-ID and product code of the device. A control block with other values is refused; 0 in
+    /// a control block stands for any value.
     pub identity: Option<(u32, u32)>,
-    /// The integrator's own check, with all that the control block tells (`TgtProcessAppInfoData`
+    /// The integrator's own check, with the contents of the control block (`TgtProcessAppInfoData`
     /// of the manual).
     pub check: fn(program: u8, control: &Control) -> Verdict,
-    /// Whether programs may be changed now; where not, the status is `NO_ACCESS`.
+    /// Whether programs may be changed now; if not, the status is `NO_ACCESS`.
     pub allowed: fn() -> bool,
     /// When CLEAR of a program erases (`TgtCheckEraseApp` of the manual).
     pub erase: fn(program: u8) -> Erase,
-    /// Whether a complete raw image or Intel HEX download is valid without the signature (83h) that
-    /// those who send it know nothing of.
+    /// Whether a complete download of a raw image or Intel HEX is valid without the release (83h),
+    /// which hosts with these formats do not send.
     pub valid_without_signature: bool,
-    /// Whether 1F51h = 2 always starts the program, as CiA 302-3 has it; otherwise it does so right
-    /// behind a raw image or Intel HEX, and resets the status in all other cases.
+    /// Whether 1F51h = 2 always starts the program, as in CiA 302-3. Otherwise it starts the
+    /// program only directly after a raw image or Intel HEX, and resets the status in all other
+    /// cases.
     pub reset_starts: bool,
-    /// Whether a valid raw image or Intel HEX starts by itself when it is complete.
+    /// Whether a valid raw image or Intel HEX starts by itself after its download.
     pub starts_by_itself: bool,
-    /// Whether a program has to carry a label (`shared_abi::label`). A label that it
-    /// carries has to fit in any case.
+    /// Whether a program must contain a label (`shared_abi::label`). If a program contains a label,
+    /// the label must match in any case.
     pub wants_label: bool,
-    /// The number of a program that is none, but data of the application: any bytes, never started.
+    /// The number of a program that is data of the application: any bytes, never started.
     pub data: Option<u8>,
-    /// Whether 1F50h takes nothing before a password has come.
+    /// Whether 1F50h accepts data only after a password.
     pub locked: bool,
-    /// Whether 1F50h gives back what was stored.
+    /// Whether a client can read the stored program from 1F50h.
     pub read_back: bool,
-    /// Whether a download takes the place of what is there, without CLEAR.
+    /// Whether a download replaces the existing program without CLEAR.
     pub replaces: bool,
-    /// Which CRC blocks and programs carry.
+    /// The CRC of blocks and programs.
     pub crc: CrcKind,
-    /// Bytes of flash that one step of a CRC covers: the longest that other work of the same
-    /// priority is kept waiting.
+    /// The bytes of flash that one step of a CRC covers. One step is the longest time that other
+    /// work of the same priority must wait.
     pub crc_step: u32,
-    /// What a sealed image is judged by.
+    /// The values with which a sealed image is checked.
     #[cfg(feature = "sealed")]
     pub seal: SealPolicy,
 }
 
-/// What a sealed image is judged by, beside the keys in the device.
+/// The values with which a sealed image is checked, besides the keys in the device.
 #[cfg(feature = "sealed")]
 #[derive(Clone, Copy, Debug)]
 pub struct SealPolicy {
@@ -80,23 +81,23 @@ pub struct SealPolicy {
     pub product_code: u32,
     /// Its revision number (1018h/3); the five lowest bits are the hardware revision.
     pub revision: u32,
-    /// The number of the program that is data of the application.
+    /// The program number that is for data of the application.
     pub data: Option<u8>,
     /// The 96-bit unique ID of the chip.
     pub unique_id: fn() -> [u8; 12],
-    /// A number that nobody can foresee to the last bit, such as that of the clock cycles when it is
-    /// asked for.
+    /// Returns a number that cannot be predicted to the last bit, such as the count of clock cycles
+    /// at the time of the call.
     pub cycles: fn() -> u32,
-    /// The lowest security counter, whatever is stored.
+    /// The lowest security counter, whatever value is stored.
     pub counter: u32,
-    /// Whether the counter is raised when a program is confirmed, and not when it is installed: until
-    /// then the device takes older ones.
+    /// Whether the counter is raised at the confirmation of a program instead of its installation:
+    /// until then the device accepts older programs.
     pub counter_with_confirmation: bool,
 }
 
 #[cfg(feature = "sealed")]
 impl SealPolicy {
-    /// For no device.
+    /// Values that match no device.
     pub const NONE: Self = Self {
         vendor_id: 0,
         product_code: 0,
@@ -110,7 +111,7 @@ impl SealPolicy {
 }
 
 impl Policy {
-    /// Anybody's programs at any time; steps of 1 KiB.
+    /// Programs for any device at any time; steps of 1 KiB.
     pub const DEFAULT: Self = Self {
         identity: None,
         check: |_, _| Verdict::Standard,

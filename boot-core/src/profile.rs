@@ -1,7 +1,8 @@
-//! Dialects: what the tools of different worlds expect of a bootloader where they contradict each
+//! Dialects: what different tools expect of a bootloader where their expectations contradict each
 //! other (docs/dialects.md).
 //!
-//! Where they agree, or where a bootloader can tell them apart, one binary serves all; that is in
+//! Where they agree, or where the bootloader can tell them apart, one binary serves all of them:
+//! [`STANDARD`](Profile::STANDARD).
 //! [`STANDARD`](Profile::STANDARD).
 
 use canopen::program::{
@@ -18,17 +19,17 @@ use crate::policy::Policy;
 pub struct Profile {
     /// 1000h.
     pub device_type: u32,
-    /// The node-ID while the bootloader runs; `None` for the device's own.
+    /// The node-ID while the bootloader runs; `None` for the device's stored node-ID.
     pub node_id: Option<NodeId>,
-    /// Node-ID and bit rate of a device that was never told others, in place of the board's.
+    /// Node-ID and bit rate of a device without stored values, in place of the board's.
     pub default_node: Option<(NodeId, BitRate)>,
-    /// The objects that it adds.
+    /// The additional objects.
     pub extras: Extras,
-    /// What opens 1F50h, where something has to.
+    /// The password that unlocks 1F50h, if the dialect has one.
     pub password: &'static [u8],
-    /// The abort for an SDO request that is not known.
+    /// The abort for an unknown SDO request.
     pub unknown_request: AbortCode,
-    /// How programs are downloaded.
+    /// The choices about downloads.
     pub download: Policy,
 }
 
@@ -44,11 +45,11 @@ impl Profile {
         download: Policy::DEFAULT,
     };
 
-    /// port's Paulus: another abort for what it does not know (table 3).
+    /// port's Paulus: another abort for unknown requests (table 3).
     pub const PAULUS: Self = Self { unknown_request: AbortCode::GENERAL, ..Self::STANDARD };
 
-    /// The boot loader of ESAcademy: node-ID 64 at 125 kbit/s, a password that voids the program
-    /// and opens 1F50h, and the program starts by itself.
+    /// The boot loader of ESAcademy: node-ID 64 at 125 kbit/s; the password makes the old program
+    /// invalid and unlocks 1F50h; the program starts by itself.
     pub const ESACADEMY: Self = Self {
         device_type: ESACADEMY_DEVICE_TYPE,
         default_node: match NodeId::new(ESACADEMY_NODE_ID) {
@@ -63,8 +64,8 @@ impl Profile {
     /// The default password of ESAcademy's boot loader, "INIT".
     pub const INIT: u32 = 0x494E_4954;
 
-    /// The lift bootloader (CiA 417, CiA 814-1): node-ID 126, a password, reading back, and program
-    /// 2 is a set of parameters.
+    /// The lift bootloader (CiA 417, CiA 814-1): node-ID 126, a password, and reading of programs;
+    /// program 2 is a set of parameters.
     pub const LIFT: Self = Self {
         device_type: LIFT_DEVICE_TYPE,
         node_id: NodeId::new(LIFT_NODE_ID),

@@ -1,4 +1,4 @@
-//! Programs: what is known of one, and the proof that one may be started.
+//! Programs: the check before a start, and the proof that it was made.
 
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
@@ -9,7 +9,7 @@ use crate::flash::{fold, Flash};
 use crate::keys::is_sealed;
 use crate::store::{Parameters, ProgramRecord};
 
-/// A CRC over flash, computed in steps that the caller bounds.
+/// A CRC over flash, computed in steps of limited length.
 #[derive(Clone, Copy, Debug)]
 pub struct FlashCrc {
     crc: u32,
@@ -17,13 +17,13 @@ pub struct FlashCrc {
 }
 
 impl FlashCrc {
-    /// Over this region, which must be inside the flash.
+    /// A CRC over this region, which must lie inside the flash.
     #[must_use]
     pub const fn new(region: Region) -> Self {
         Self { crc: 0, rest: region }
     }
 
-    /// Goes on over at most `budget` bytes; whether the end is reached.
+    /// Continues over at most `budget` bytes; returns whether the end is reached.
     pub fn step<F: Flash>(&mut self, flash: &F, kind: CrcKind, budget: u32) -> bool {
         let len = self.rest.size.min(budget);
         let next = Region::new(self.rest.base, len);
@@ -42,31 +42,31 @@ impl FlashCrc {
     }
 }
 
-/// What a program has to be that was sent completely.
+/// The expected properties of a completely sent program.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Expected {
-    /// Bytes from the start of its region on.
+    /// Size in bytes, from the start of its region.
     pub size: u32,
-    /// `None`: what is in flash, word for word what was sent.
+    /// The CRC; `None` if the flash was already compared with the sent data word by word.
     pub crc: Option<u32>,
 }
 
 /// Why a program may not be started.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Invalid {
-    /// There is no such program in the layout.
+    /// The layout has no program with this number.
     NoSuchProgram,
-    /// Nothing was downloaded, or not completely.
+    /// No program was downloaded completely.
     Absent,
-    /// The stored size exceeds the region: the record cannot be of this layout.
+    /// The stored size exceeds the region: the record belongs to another layout.
     Size,
-    /// The flash does not hold what was downloaded.
+    /// The contents of the flash differ from the download.
     Crc,
     /// The vector table is implausible.
     Vectors(VectorFault),
 }
 
-/// A program that has passed every check of its contents. Only [`verify`] makes one.
+/// A program that has passed every check of its contents. Only [`verify`] makes this value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct VerifiedProgram {
     number: u8,
@@ -81,27 +81,27 @@ impl VerifiedProgram {
         self.number
     }
 
-    /// Whether it is released for autostart.
+    /// Whether the program is released for autostart.
     #[must_use]
     pub const fn signed(&self) -> bool {
         self.record.signed
     }
 
-    /// Whether it has proved that the bootloader can be reached from it, so that it starts without
-    /// a rescue window.
+    /// Whether the program has proved that it can return to the bootloader, so that it starts
+    /// without a rescue window.
     #[must_use]
     pub const fn confirmed(&self) -> bool {
         self.record.confirmed
     }
 
-    /// Whether the flash is locked in front of it until the next reset.
+    /// Whether the flash must be locked until the next reset before the program starts.
     #[cfg(feature = "sealed")]
     #[must_use]
     pub fn locks_flash(&self) -> bool {
         self.record.seal == Some(crate::store::record::Seal::Locked)
     }
 
-    /// What to jump to.
+    /// The vectors for the jump.
     #[must_use]
     pub const fn vectors(&self) -> VectorTable {
         self.vectors
@@ -111,7 +111,7 @@ impl VerifiedProgram {
 /// Checks the vector table at the start of a program's flash.
 ///
 /// # Errors
-/// The rule that it breaks.
+/// The broken rule.
 pub fn check_vectors<F: Flash>(
     flash: &F,
     region: Region,
@@ -124,7 +124,7 @@ pub fn check_vectors<F: Flash>(
 /// Checks program `number` from its record to its last byte.
 ///
 /// # Errors
-/// The first thing that is wrong with it.
+/// The first fault.
 pub fn verify<F: Flash>(
     flash: &F,
     parameters: &impl Parameters,

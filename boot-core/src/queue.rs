@@ -1,14 +1,14 @@
-//! The pieces of programs that were received and are not in flash yet: a ring of bytes, so that the
-//! flash may lag behind the bus.
+//! The pieces of programs that were received but are not in flash yet: a ring of bytes, which lets
+//! the flash lag behind the bus.
 //!
-//! A piece is *open* while its bytes arrive. A format judges it, and then it either joins the queue
-//! ([`Queue::commit`]) or goes ([`Queue::discard`]). In the ring each piece is its address, its
-//! size and its bytes.
+//! A piece is *open* while its bytes arrive. A format checks it, and then it either joins the queue
+//! ([`Queue::commit`]) or is dropped ([`Queue::discard`]). In the ring each piece is its address,
+//! its size and its bytes.
 
-/// Bytes in front of each piece's data.
+/// The bytes before each piece's data.
 pub(crate) const PIECE_HEADER: usize = 8;
 
-/// Where a piece goes.
+/// The place of a piece in flash.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Piece {
     /// Flash address of the first byte.
@@ -22,7 +22,7 @@ pub(crate) struct Queue<'b> {
     buffer: &'b mut [u8],
     front: usize,
     queued: usize,
-    /// Bytes of the open piece, header included; 0 without one.
+    /// The size of the open piece in bytes, including its header; 0 without one.
     open: usize,
 }
 
@@ -54,8 +54,8 @@ impl<'b> Queue<'b> {
         self.open.saturating_sub(PIECE_HEADER)
     }
 
-    /// Adds to the open piece, or opens one that goes to `address`. All or nothing; tells whether
-    /// there was room.
+    /// Adds to the open piece, or opens one with this address. Adds all bytes or none; returns
+    /// whether there was room.
     pub(crate) fn push(&mut self, address: u32, data: &[u8]) -> bool {
         if data.len() + PIECE_HEADER > self.free() {
             return false;
@@ -72,8 +72,8 @@ impl<'b> Queue<'b> {
         true
     }
 
-    /// Adds bytes that are no piece, of a sealed image ([`take`](Self::take)). All or nothing; tells
-    /// whether there was room.
+    /// Adds bytes of a sealed image, which are not a piece ([`take`](Self::take)). Adds all bytes
+    /// or none; returns whether there was room.
     #[cfg(feature = "sealed")]
     pub(crate) fn push_bytes(&mut self, data: &[u8]) -> bool {
         if data.len() > self.free() {
@@ -87,7 +87,7 @@ impl<'b> Queue<'b> {
         true
     }
 
-    /// Takes bytes out that are no piece, as many as there are and have room; how many.
+    /// Removes bytes of a sealed image, as many as there are and fit; returns their number.
     #[cfg(feature = "sealed")]
     pub(crate) fn take(&mut self, bytes: &mut [u8]) -> usize {
         let len = bytes.len().min(self.queued);
@@ -99,7 +99,7 @@ impl<'b> Queue<'b> {
         len
     }
 
-    /// Copies bytes of the open piece; whether there are as many.
+    /// Copies bytes of the open piece; returns whether there are enough.
     pub(crate) fn read_open(&self, offset: usize, bytes: &mut [u8]) -> bool {
         if self.open_size() < offset + bytes.len() {
             return false;
@@ -110,18 +110,18 @@ impl<'b> Queue<'b> {
         true
     }
 
-    /// Where the open piece goes.
+    /// The address of the open piece.
     pub(crate) fn open_address(&self) -> u32 {
         self.word(self.queued)
     }
 
-    /// The first four bytes of the open piece, if it has as many.
+    /// The first four bytes of the open piece, if it has that many.
     #[cfg(feature = "sealed")]
     pub(crate) fn open_word(&self) -> u32 {
         self.word(self.queued + PIECE_HEADER)
     }
 
-    /// The open piece is good: it joins the queue.
+    /// The open piece is good: adds it to the queue.
     pub(crate) fn commit(&mut self) {
         let size = self.open_size();
         if size > 0 {
@@ -131,8 +131,8 @@ impl<'b> Queue<'b> {
         self.open = 0;
     }
 
-    /// The bytes of the open piece are good, and part of a sealed image: they join the queue, and are
-    /// no piece.
+    /// The open bytes are good and belong to a sealed image: adds them to the queue, not as a
+    /// piece.
     #[cfg(feature = "sealed")]
     pub(crate) fn commit_bytes(&mut self) {
         for _ in 0..self.open_size() {
@@ -143,12 +143,12 @@ impl<'b> Queue<'b> {
         self.open = 0;
     }
 
-    /// The open piece goes.
+    /// Drops the open piece.
     pub(crate) fn discard(&mut self) {
         self.open = 0;
     }
 
-    /// All goes.
+    /// Drops everything.
     pub(crate) fn clear(&mut self) {
         self.queued = 0;
         self.open = 0;
@@ -164,7 +164,7 @@ impl<'b> Queue<'b> {
         self.byte(PIECE_HEADER + offset)
     }
 
-    /// The oldest piece is in flash.
+    /// Removes the oldest piece after it was written.
     pub(crate) fn pop(&mut self) {
         let len = (PIECE_HEADER + self.word(4) as usize).min(self.queued);
         self.front = self.place(len);
@@ -186,7 +186,7 @@ impl<'b> Queue<'b> {
         }
     }
 
-    /// Offsets are less than twice the ring.
+    /// Offsets are less than twice the size of the ring.
     #[inline(never)]
     fn place(&self, offset: usize) -> usize {
         let at = self.front + offset;

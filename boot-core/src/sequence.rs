@@ -1,11 +1,11 @@
-//! Rows of flash operations: sectors to erase, words to program. Each tells its next operation when
-//! the one before is over.
+//! Sequences of flash operations: sectors to erase, words to program. A sequence returns its next
+//! operation when the previous one has ended.
 
 use shared_abi::geometry::Region;
 
 use crate::flash::{Flash, FlashFault, Operation};
 
-/// Words being programmed one after the other, each read back.
+/// Words that are programmed one after another and read back.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ProgramWords {
     address: u32,
@@ -18,7 +18,7 @@ impl ProgramWords {
         Self { address, written: 0, running: false }
     }
 
-    /// The next operation, `None` when all words are there. `word(i)` gives the i-th of `count`.
+    /// The next operation, `None` after all words. `word(i)` returns word i of `count`.
     pub(crate) fn next<F: Flash>(
         &mut self,
         flash: &F,
@@ -44,7 +44,7 @@ impl ProgramWords {
     }
 }
 
-/// Whole sectors being erased one after the other.
+/// Whole sectors that are erased one after another.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct EraseSectors {
     next: u32,
@@ -56,12 +56,12 @@ impl EraseSectors {
         Self { next: region.base, end: region.end() }
     }
 
-    /// The next operation, `None` when all sectors are erased.
+    /// The next operation, `None` after all sectors.
     pub(crate) fn next<F: Flash>(&mut self, flash: &F) -> Result<Option<Operation>, FlashFault> {
         if self.next >= self.end {
             return Ok(None);
         }
-        // A checked layout ends at sector borders; a region outside the flash is refused.
+        // A checked layout ends at a sector border; a region outside the flash is refused.
         let sector = flash.sector_at(self.next).ok_or(FlashFault::Failed)?;
         self.next = sector.region.end();
         Ok(Some(Operation::Erase(sector)))

@@ -1,27 +1,27 @@
-//! How far the download of a program is.
+//! The state of a program's download.
 
 use canopen::program::FlashError;
 
 use crate::policy::Policy;
 use crate::refusal::Refusal;
 
-/// How far the download of a program is. It lasts from one SDO transfer to the next.
-// Not to be compared as a whole, which costs 140 bytes of flash: `matches!` looks at what is asked
-// for.
+/// The state of a program's download. It continues from one SDO transfer to the next.
+// No comparison of the whole value, which costs 140 bytes of flash: `matches!` only looks at the
+// necessary part.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Session {
-    /// No block was taken yet.
+    /// No block was accepted yet.
     Idle,
-    /// CLEAR was acknowledged; nothing is lost yet. `just`: no block was sent since.
+    /// CLEAR was acknowledged; nothing is lost yet. `just`: no block has arrived since.
     Cleared { just: bool },
-    /// Blocks are being taken; `next` is the number of the next one.
+    /// Blocks are being accepted; `next` is the number of the next one.
     Open { next: u32 },
-    /// Half a program is in flash: only CLEAR makes a new beginning.
+    /// The flash contains an incomplete program: only CLEAR allows a new download.
     Failed,
 }
 
 impl Session {
-    /// Whether a new download may begin. `installed`: there is a program.
+    /// Whether a new download may begin. `installed`: a program exists.
     pub(crate) fn may_begin(self, policy: &Policy, installed: bool) -> Result<(), Refusal> {
         match self {
             Self::Idle if installed && !policy.replaces => Err(Refusal::untimely(FlashError::NotCleared)),
@@ -32,8 +32,8 @@ impl Session {
         }
     }
 
-    /// Whether a download that begins now erases what is there first. Otherwise each piece has to
-    /// find its place blank.
+    /// Whether a download that begins now first erases the flash. Otherwise each piece must find
+    /// its place erased.
     pub(crate) fn erases(self, policy: &Policy) -> bool {
         matches!(self, Self::Cleared { .. }) || policy.replaces && !matches!(self, Self::Open { .. })
     }

@@ -1,7 +1,8 @@
-//! The version that a stored program tells of itself: the text behind `$CANopenSoftwareVersion` in
-//! its image (CiA 814-1 clause 6.5).
+//! The software version of a stored program: the text after `$CANopenSoftwareVersion` in its image
+//! (CiA 814-1 clause 6.5).
 //!
-//! The image is searched in steps while the flash has nothing to do, so that 100Ah is answered at
+//! The image is searched in steps while the flash is idle, so that 100Ah can be answered at once
+//! and without access to the flash.
 //! once and without the flash.
 
 use shared_abi::geometry::Region;
@@ -9,19 +10,19 @@ use shared_abi::geometry::Region;
 use crate::flash::Flash;
 use crate::programmer::Step;
 
-/// What stands in front of the version, its NUL included.
+/// The text before the version, including its NUL.
 const MARK: &[u8] = b"$CANopenSoftwareVersion\0";
 /// The longest version that is shown.
 const LONGEST: usize = 48;
-/// Bytes that a step looks at.
+/// The number of bytes that a step searches.
 const STEP: u32 = 512;
 
-/// The search, or what it found.
+/// The search, or its result.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct StoredVersion {
-    /// What was searched, or is being; of no bytes for nothing.
+    /// The image that was searched or is being searched; an empty region for none.
     image: Region,
-    /// Its CRC: an image that is stored anew is another one.
+    /// The CRC of the image: it detects that another image was stored.
     crc: u32,
     /// Offset of the next byte to look at.
     at: u32,
@@ -34,12 +35,12 @@ impl StoredVersion {
         Self { image: Region::new(0, 0), crc: 0, at: 0, text: [0; LONGEST], len: 0 }
     }
 
-    /// The version; `None` where none was found.
+    /// The version; `None` if none was found.
     pub(crate) fn text(&self) -> Option<&[u8]> {
         self.text.get(..self.len).filter(|text| !text.is_empty())
     }
 
-    /// Carries the search on. The flash must be idle.
+    /// Continues the search. The flash must be idle.
     pub(crate) fn step<F: Flash>(&mut self, flash: &F, (image, crc): (Region, u32)) -> Step {
         if self.image != image || self.crc != crc {
             (self.image, self.crc, self.at, self.len) = (image, crc, 0, 0);
@@ -50,7 +51,7 @@ impl StoredVersion {
         let end = (self.at + STEP).min(image.size);
         while self.at < end {
             let mut mark = [0; MARK.len()];
-            // Most bytes are no `$`.
+            // Most bytes are not `$`.
             flash.read(image.base + self.at, &mut mark[..1]);
             if mark[0] == MARK[0] {
                 flash.read(image.base + self.at, &mut mark);

@@ -1,4 +1,4 @@
-//! The bit rates of CANopen, and how a device finds out the one of its bus.
+//! The bit rates of CANopen, and how a device detects the bit rate of its bus.
 
 use crate::time::Instant;
 
@@ -16,7 +16,7 @@ pub enum BitRate {
     K250 = 3,
     /// 125 kbit/s.
     K125 = 4,
-    /// 100 kbit/s; later editions of the standard have it reserved.
+    /// 100 kbit/s; later editions of the standard mark it as reserved.
     K100 = 5,
     /// 50 kbit/s.
     K50 = 6,
@@ -24,19 +24,19 @@ pub enum BitRate {
     K20 = 7,
     /// 10 kbit/s.
     K10 = 8,
-    /// The device finds it out by listening.
+    /// The device detects the bit rate by listening.
     Auto = 9,
 }
 
 impl BitRate {
-    /// Whether a frame takes so long that pauses between frames have to be given more time:
-    /// 20 kbit/s and below, where eight bytes take 5 ms and more.
+    /// Whether frames take so long that pauses between frames need more time: 20 kbit/s and below,
+    /// where eight bytes take 5 ms and more.
     #[must_use]
     pub const fn is_slow(self) -> bool {
         matches!(self, Self::K20 | Self::K10)
     }
 
-    /// From the index in CiA 305 table 1; `None` for an index that it does not have.
+    /// From the index in CiA 305 table 1; `None` for an index that the table does not have.
     #[must_use]
     pub const fn from_index(index: u8) -> Option<Self> {
         Some(match index {
@@ -54,7 +54,7 @@ impl BitRate {
         })
     }
 
-    /// The next slower rate; behind the slowest one the fastest.
+    /// The next slower rate; after the slowest one the fastest.
     const fn next(self) -> Self {
         match Self::from_index(self as u8 + 1) {
             None | Some(Self::Auto) => Self::K1000,
@@ -78,7 +78,7 @@ impl BitRate {
         None
     }
 
-    /// The rates of [`FIXED`](Self::FIXED) in bit/s; the index of each is that of CiA 305.
+    /// The rates of [`FIXED`](Self::FIXED) in bit/s; the index of each is its index in CiA 305.
     pub const TABLE: [u32; 9] = {
         let mut table = [0; 9];
         let mut i = 0;
@@ -129,7 +129,7 @@ impl BitRate {
     }
 }
 
-/// What a controller that only listens received since it was last asked.
+/// What a listening controller has received since the last query.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Heard {
     /// Nothing.
@@ -137,9 +137,9 @@ pub enum Heard {
     Nothing,
     /// It did not synchronise: the bus was never idle for 11 bits (ISO 11898-1).
     NeverIdle,
-    /// Last of all, a good frame.
+    /// The last event was a good frame.
     Frame,
-    /// Last of all, an error.
+    /// The last event was an error.
     Error,
 }
 
@@ -152,15 +152,16 @@ pub enum Heard {
 #[derive(Clone, Copy, Debug)]
 pub struct Detector {
     rate: BitRate,
-    /// When it began to listen at this rate.
+    /// The time at which it began to listen at this rate.
     since: Instant,
 }
 
-/// After this time without idle bus the next rate is tried, in milliseconds. At the right rate the
-/// bus is idle behind each frame, and no frame takes longer than 14 ms at 10 kbit/s.
+/// Without idle bus for this time, in milliseconds, the next rate is tried. At the right rate the
+/// bus is idle after each frame, and no frame takes longer than 14 ms at 10 kbit/s.
 const NEVER_IDLE_MS: u32 = 50;
-/// After this time of silence the next rate is tried, in milliseconds: more than the period of a
-/// usual heartbeat. A controller that samples a fast bus slowly may receive nothing at all.
+/// After silence of this length, in milliseconds, the next rate is tried. It is longer than the
+/// period of a usual heartbeat. A controller that samples a fast bus slowly may receive nothing at
+/// all.
 const DWELL_MS: u32 = 1500;
 
 impl Detector {
@@ -178,8 +179,8 @@ impl Detector {
         self.rate
     }
 
-    /// Takes what was heard; gives whether it proves the rate. If not, [`rate`](Self::rate) may
-    /// have changed.
+    /// Processes what was heard; returns whether it proves the rate. If not, [`rate`](Self::rate)
+    /// may have changed.
     pub fn heard(&mut self, heard: Heard, now: Instant, supports: impl FnMut(BitRate) -> bool) -> bool {
         let go_on = match heard {
             Heard::Frame => return true,

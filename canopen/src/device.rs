@@ -1,7 +1,7 @@
 //! The objects that every device has: device type, names and versions, identity.
 //!
-//! A device puts [`ENTRIES`] into its [`Table`](crate::od::Table) and asks
-//! [`Device::read`] first.
+//! A device adds [`ENTRIES`] to its [`Table`](crate::od::Table) and calls [`Device::read`] before
+//! it looks at its other objects.
 
 use crate::abort::AbortCode;
 use crate::lss::LssAddress;

@@ -1,7 +1,7 @@
-//! Emergency producer (CiA 301 section 7.2.7) and the objects that go with it.
+//! Emergency producer (CiA 301 section 7.2.7) and its objects.
 //!
-//! A device keeps an [`Emcy`] beside its other values. It asks [`Emcy::read`] and [`Emcy::write`]
-//! before all others that know 1001h, and passes [`Emcy::next_message`] on as
+//! A device keeps an [`Emcy`] beside its other values. It calls [`Emcy::read`] and [`Emcy::write`]
+//! before other functions that handle 1001h, and returns [`Emcy::next_message`] from
 //! [`Objects::next_emergency`](crate::Objects::next_emergency).
 
 use crate::abort::AbortCode;
@@ -10,10 +10,10 @@ use crate::line::LineEvent;
 use crate::od::{put, Access, Address, DataType, Entry};
 use crate::program::{COB_ID_EMCY, ERROR_FIELD, ERROR_REGISTER};
 
-/// Errors that 1003h remembers.
+/// The number of errors in 1003h.
 pub const HISTORY: usize = 4;
 
-/// Emergencies that may wait to be sent.
+/// The most emergencies that wait to be sent.
 const QUEUE: usize = 4;
 
 /// 1003h and 1014h. (1001h, which every device has, is in
@@ -29,9 +29,9 @@ pub const ENTRIES: [Entry; HISTORY + 2] = [
 
 /// Emergency error codes (CiA 301 table 26).
 pub mod code {
-    /// No error any more.
+    /// The error has ended.
     pub const RESET: u16 = 0x0000;
-    /// An error that fits none of the others.
+    /// An error without a more specific code.
     pub const GENERIC: u16 = 0x1000;
     /// A fault of the device's hardware, such as its flash.
     pub const HARDWARE: u16 = 0x5000;
@@ -55,7 +55,7 @@ pub mod register {
     pub const GENERIC: u8 = 1 << 0;
     /// Communication error.
     pub const COMMUNICATION: u8 = 1 << 4;
-    /// Of the manufacturer.
+    /// Manufacturer-specific error.
     pub const MANUFACTURER: u8 = 1 << 7;
 }
 
@@ -71,7 +71,7 @@ pub struct Emergency {
 }
 
 impl Emergency {
-    /// Takes the data of the frame apart.
+    /// Parses the data of the frame.
     #[must_use]
     pub const fn parse(bytes: &[u8; 8]) -> Self {
         let [low, high, register, a, b, c, d, e] = *bytes;
@@ -87,7 +87,7 @@ impl Emergency {
     }
 }
 
-/// The driver's status as CAN overrun carries it: in bytes 5 and 6 of the frame, counted from 0
+/// The driver's status in the form of CAN overrun: in bytes 5 and 6 of the frame, counted from 0
 /// (SYS TEC manual L-1112d_10, section 3.4.9).
 #[must_use]
 pub const fn driver_status(status: u16) -> [u8; 5] {
@@ -99,10 +99,10 @@ pub const fn driver_status(status: u16) -> [u8; 5] {
 #[derive(Clone, Debug, Default)]
 pub struct Emcy {
     register: u8,
-    /// Newest first, as 1003h reads; as many as `remembered` says.
+    /// Newest first, as in 1003h; the first `remembered` entries are valid.
     history: [u32; HISTORY],
     remembered: u8,
-    /// Messages to be sent, oldest first; as many as `waiting` says.
+    /// Messages to send, oldest first; the first `waiting` entries are valid.
     queue: [[u8; 8]; QUEUE],
     waiting: u8,
 }
@@ -120,7 +120,7 @@ impl Emcy {
         self.register
     }
 
-    /// An error happened. It is sent and remembered once; its bits stay in the error register until
+    /// Reports an error. It is sent and recorded once; its bits stay in the error register until
     /// [`clear`](Self::clear).
     pub fn raise(&mut self, code: u16, bits: u8, detail: [u8; 5]) {
         self.register |= bits | register::GENERIC;
@@ -132,13 +132,13 @@ impl Emcy {
         self.send(code, detail);
     }
 
-    /// Sends a message that is no error: neither the error register nor 1003h change.
+    /// Sends a message that is not an error: neither the error register nor 1003h changes.
     pub fn announce(&mut self, code: u16, detail: [u8; 5]) {
         self.send(code, detail);
     }
 
-    /// The cause of these bits has gone. A message reports the bits that are left; none is sent if
-    /// no bit was set.
+    /// Reports that the cause of these bits has ended. A message contains the remaining bits; no
+    /// message is sent if none of the bits was set.
     pub fn clear(&mut self, bits: u8) {
         let bits = bits & self.register & !register::GENERIC;
         let only_generic = self.register == register::GENERIC;
@@ -152,7 +152,7 @@ impl Emcy {
         self.send(code::RESET, [0; 5]);
     }
 
-    /// Reports what happened on the line.
+    /// Reports an event of the line.
     pub fn line_event(&mut self, event: LineEvent) {
         let (code, status) = match event {
             LineEvent::Active => return self.clear(register::COMMUNICATION),
@@ -161,13 +161,13 @@ impl Emcy {
             LineEvent::Recovered => (code::BUS_OFF_RECOVERED, 0),
         };
         self.raise(code, register::COMMUNICATION, driver_status(status));
-        // Lost frames and bus-off are over when they are reported, error passive is not.
+        // Lost frames and bus-off have ended when they are reported; error passive has not.
         if event != LineEvent::Passive {
             self.clear(register::COMMUNICATION);
         }
     }
 
-    /// The data of the next emergency to send, until there is none.
+    /// The data of the next emergency to send, `None` if there is none.
     pub fn next_message(&mut self) -> Option<[u8; 8]> {
         self.waiting = self.waiting.checked_sub(1)?;
         let [oldest, a, b, c] = self.queue;
@@ -175,8 +175,8 @@ impl Emcy {
         Some(oldest)
     }
 
-    /// Queues a message. If the queue is full it is dropped: the first errors matter most, and
-    /// 1003h has the latest.
+    /// Queues a message. If the queue is full, the message is dropped: the first errors matter
+    /// most, and 1003h contains the latest.
     fn send(&mut self, code: u16, detail: [u8; 5]) {
         if let Some(free) = self.queue.get_mut(usize::from(self.waiting)) {
             *free = Emergency { code, register: self.register, detail }.emit();
@@ -187,7 +187,7 @@ impl Emcy {
     /// Reads 1001h, 1003h or 1014h of this node; `None` for every other address.
     ///
     /// # Errors
-    /// [`AbortCode::NO_DATA`] for a place of 1003h in which no error is.
+    /// [`AbortCode::NO_DATA`] for an empty entry of 1003h.
     pub fn read(&self, node: NodeId, at: Address, buf: &mut [u8]) -> Option<Result<usize, AbortCode>> {
         Some(match (at.index, at.sub) {
             (ERROR_REGISTER, 0) => put(buf, &[self.register]),
@@ -201,7 +201,7 @@ impl Emcy {
         })
     }
 
-    /// Writes 1003h/0, which takes 0 alone and forgets all errors; `None` for every other address.
+    /// Writes 1003h/0: the value 0 deletes all errors; `None` for every other address.
     ///
     /// # Errors
     /// [`AbortCode::INVALID_VALUE`] for another value.

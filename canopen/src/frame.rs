@@ -72,7 +72,7 @@ impl CobId {
         Self(0x080 + node.get() as u16)
     }
 
-    /// A COB-ID and the node-ID on top of it, as in the predefined connection set; `None` if that is
+    /// A base COB-ID plus the node-ID, as in the predefined connection set; `None` if the sum has
     /// more than 11 bits.
     #[must_use]
     pub const fn from_base(base: u16, node: NodeId) -> Option<Self> {
@@ -104,7 +104,7 @@ impl fmt::Display for CobId {
     }
 }
 
-/// A classic CAN frame. Data bytes behind its length are 0, so that equal frames compare equal.
+/// A classic CAN frame. Data bytes beyond its length are 0, so that equal frames compare equal.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Frame {
     /// The identifier with the flags [`EXTENDED`] and [`REMOTE`]. A data frame with an 11-bit
@@ -121,13 +121,13 @@ const REMOTE: u32 = 1 << 30;
 const FLAGS: u32 = EXTENDED | REMOTE;
 
 impl Frame {
-    /// A data frame of CANopen. Bytes behind the eighth are left out.
+    /// A data frame of CANopen. Bytes after the eighth are dropped.
     #[must_use]
     pub fn of(id: CobId, data: &[u8]) -> Self {
         Self::with_word(id.0.into(), &data[..data.len().min(8)])
     }
 
-    /// A data frame of eight bytes, as all of SDO, LSS and EMCY are.
+    /// A data frame of eight bytes, the length of all SDO, LSS and EMCY frames.
     #[must_use]
     pub const fn full(id: CobId, data: [u8; 8]) -> Self {
         Self { id: id.0 as u32, len: 8, data }
@@ -183,7 +183,7 @@ impl embedded_can::Frame for Frame {
     }
 
     fn id(&self) -> Id {
-        // Both identifiers fit, so the second choices are never taken.
+        // Both identifiers are in range, so the fallbacks are never used.
         let id = self.id & !FLAGS;
         if self.is_extended() {
             Id::Extended(ExtendedId::new(id).unwrap_or(ExtendedId::ZERO))
@@ -196,7 +196,7 @@ impl embedded_can::Frame for Frame {
         self.len.into()
     }
 
-    /// The data; of a remote frame none, whatever its DLC asks for.
+    /// The data; a remote frame has none, whatever its DLC.
     fn data(&self) -> &[u8] {
         let len = if self.is_remote_frame() { 0 } else { self.len };
         &self.data[..usize::from(len.min(8))]
@@ -211,7 +211,7 @@ fn word(id: Id) -> u32 {
     }
 }
 
-/// As candump writes it: `601#4000100000000000`.
+/// In the format of candump: `601#4000100000000000`.
 impl fmt::Display for Frame {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let id = self.id & !FLAGS;

@@ -23,24 +23,24 @@ impl Heartbeat {
         self.period_ms
     }
 
-    /// Takes a new period; the next heartbeat comes one new period after `now`. The old period
-    /// again changes nothing.
+    /// Sets the period; the next heartbeat comes one new period after `now`. The old value again
+    /// changes nothing.
     pub fn set_period(&mut self, period_ms: u16, now: Instant) {
         if self.period_ms != period_ms {
             *self = Self::new(period_ms, now);
         }
     }
 
-    /// When the next one is due; `None` when it is off.
+    /// The time of the next heartbeat; `None` if the heartbeat is off.
     #[must_use]
     pub fn deadline(&self) -> Option<Instant> {
         (self.period_ms != 0).then(|| self.last + u32::from(self.period_ms))
     }
 
-    /// Whether one is due; it counts as sent.
+    /// Returns whether a heartbeat is due, and counts it as sent.
     ///
-    /// The period runs from due time to due time, so a late call does not shift the heartbeats to
-    /// come. If the call is a whole period late or more, the heartbeats missed are not sent.
+    /// The period runs from due time to due time, so a late call does not shift later heartbeats.
+    /// If the call is at least a whole period late, the missed heartbeats are not sent.
     pub fn take_due(&mut self, now: Instant) -> bool {
         let Some(due) = self.deadline().filter(|due| now.has_reached(*due)) else { return false };
         let late = now.since(due) >= u32::from(self.period_ms);

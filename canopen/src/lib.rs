@@ -1,8 +1,8 @@
 //! A CANopen slave and an SDO client (CiA 301), sans-IO and without an allocator.
 //!
-//! Nothing in this crate waits, reads a clock or touches a controller. The owner passes frames and
-//! the time in and fetches the frames to send: `handle(&frame, now)` for each frame received, then
-//! `poll(now)` until it has nothing more to send, and again whenever time has passed.
+//! Nothing in this crate waits, reads a clock or accesses a controller. The owner passes in frames
+//! and the time, and fetches the frames to send: `handle(&frame, now)` for each received frame,
+//! then `poll(now)` until it returns nothing, and again after some time has passed.
 //!
 //! | module | what it is |
 //! |---|---|
@@ -16,7 +16,7 @@
 //! | `debugger` | the debugger interface, 1025h (feature `debugger`) |
 //! | [`emcy`] | emergency producer, 1001h, 1003h, 1014h |
 //! | [`lss`] | layer setting services: node-ID and bit rate over the bus |
-//! | [`bit_rate`] | the bit rates of CANopen, and how to find one out by listening |
+//! | [`bit_rate`] | the bit rates of CANopen, and their detection by listening |
 //! | [`line`](mod@line) | state of the CAN controller: error passive, bus-off, frames lost |
 //! | [`slave`] | a device on the bus: node, LSS and line together |
 //! | [`password`] | a password check that slows down guessing |

@@ -1,9 +1,9 @@
 //! State of the CAN controller: error passive, bus-off, frames lost (CiA 301 section 7.2.7.1, ISO
 //! 11898-1).
 //!
-//! A controller that went bus-off stays off until the owner brings it back. [`Monitor`] asks for
-//! that after a wait, which doubles each time the controller fails again soon. So a device that
-//! disturbs its bus does so rarely, and a device that was disturbed returns by itself.
+//! A controller in bus-off stays there until its owner starts the recovery. [`Monitor`] requests
+//! this after a wait, which doubles each time the controller soon fails again. A device that
+//! disturbs its bus therefore does so rarely, and a disturbed device returns by itself.
 
 use crate::bit_rate::Heard;
 use crate::time::Instant;
@@ -25,10 +25,10 @@ pub enum Confinement {
 pub struct Status {
     /// Its fault confinement.
     pub confinement: Confinement,
-    /// What it heard since it was last asked; used only while it listens.
+    /// What it has heard since the last query; used only while it listens.
     pub heard: Heard,
-    /// Whether frames were lost since it was last asked, as driver status bits
-    /// ([`CONTROLLER_OVERRUN`], [`QUEUE_OVERRUN`]); 0 for none.
+    /// The frames lost since the last query, as driver status bits ([`CONTROLLER_OVERRUN`],
+    /// [`QUEUE_OVERRUN`]); 0 for none.
     pub lost: u16,
 }
 
@@ -46,23 +46,23 @@ pub enum LineEvent {
     Passive,
     /// The controller is error active again.
     Active,
-    /// The controller was off the bus and is back.
+    /// The controller was bus-off and has recovered.
     Recovered,
 }
 
-/// First wait in bus-off, in milliseconds. Longer than the 128 × 11 bits that recovery takes at 10
+/// First wait in bus-off, in milliseconds. It is longer than the 128 × 11 bits of a recovery at 10
 /// kbit/s.
 const FIRST_WAIT_MS: u32 = 200;
 /// The longest wait, in milliseconds.
 const LONGEST_WAIT_MS: u32 = 5000;
-/// After this time on the bus, in milliseconds, the next wait is the first one again.
+/// After this time on the bus, in milliseconds, the wait is the first one again.
 const RECOVERED_MS: u32 = 10_000;
 
 /// Lost frames are reported at most once in this time, in milliseconds: a flood of frames must not
 /// cause a flood of emergencies.
 const LOST_INHIBIT_MS: u32 = 1000;
 
-/// Frames that were lost and are still to be reported.
+/// Lost frames that must still be reported.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Losses {
     status: u16,
@@ -71,7 +71,7 @@ pub struct Losses {
 }
 
 impl Losses {
-    /// Takes the driver status bits of frames lost, 0 for none; gives the bits to report now.
+    /// Adds the driver status bits of lost frames, 0 for none; returns the bits to report now.
     pub fn observe(&mut self, lost: u16, now: Instant) -> Option<u16> {
         self.status |= lost;
         let inhibited = self.reported.is_some_and(|reported| now.since(reported) < LOST_INHIBIT_MS);
@@ -83,7 +83,7 @@ impl Losses {
     }
 }
 
-/// Follows a controller that takes part in the bus.
+/// Monitors a controller that takes part in the bus.
 #[derive(Clone, Copy, Debug)]
 pub struct Monitor {
     state: State,
@@ -93,18 +93,18 @@ pub struct Monitor {
 
 #[derive(Clone, Copy, Debug)]
 enum State {
-    /// On the bus since then.
+    /// On the bus since `since`.
     On { passive: bool, since: Instant },
-    /// Bus-off; `recovering` once the owner was asked to bring the controller back.
+    /// Bus-off; `recovering`: the owner was asked to start the recovery.
     Off { recover_at: Instant, recovering: bool },
 }
 
-/// What follows from a status.
+/// The consequence of a status.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Consequence {
-    /// The device is to report this event.
+    /// The device must report this event.
     Tell(LineEvent),
-    /// The owner is to bring the controller back from bus-off.
+    /// The owner must start the recovery from bus-off.
     RecoverFromBusOff,
 }
 
@@ -115,7 +115,7 @@ impl Monitor {
         Self { state: State::On { passive: false, since: now }, wait_ms: FIRST_WAIT_MS }
     }
 
-    /// Takes the state of fault confinement; gives what follows from it.
+    /// Processes the state of fault confinement; returns the consequence.
     pub fn observe(&mut self, confinement: Confinement, now: Instant) -> Option<Consequence> {
         let is_passive = confinement == Confinement::Passive;
         match self.state {
@@ -135,8 +135,8 @@ impl Monitor {
                 self.state = State::On { passive: is_passive, since: now };
                 Some(Consequence::Tell(LineEvent::Recovered))
             }
-            // Asked again after a wait: the controller may have recovered and failed between two
-            // calls.
+            // The request is repeated after a wait: the controller may have recovered and failed
+            // again between two calls.
             State::Off { recover_at, .. } if now.has_reached(recover_at) => {
                 self.wait_ms = (self.wait_ms * 2).min(LONGEST_WAIT_MS);
                 self.state = State::Off { recover_at: now + self.wait_ms, recovering: true };

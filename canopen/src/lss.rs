@@ -1,12 +1,11 @@
 //! Layer setting services of a slave (CiA 305): node-ID and bit rate over the bus, for a device
 //! without switches.
 //!
-//! [`Lss::handle`] takes frames, [`Lss::poll`] gives what the owner has to do: answers to send, a
-//! node-ID or a bit rate that comes into force. [`LssDevice`] is what the services need of the
-//! device.
+//! [`Lss::handle`] takes frames, and [`Lss::poll`] returns what the owner must do: answers to send,
+//! a node-ID or a bit rate that takes effect. [`LssDevice`] is the interface to the device.
 //!
-//! Frames that are no LSS request, requests in a state that does not serve them and requests for
-//! other slaves are not answered, as the standard requires.
+//! Frames other than LSS requests, requests in the wrong state and requests for other slaves are
+//! not answered, as the standard requires.
 
 use core::task::Poll;
 
@@ -14,7 +13,7 @@ pub use crate::bit_rate::BitRate;
 use crate::frame::{CobId, Frame, NodeId};
 use crate::time::Instant;
 
-/// The LSS address of a device: its identity object 1018h, which no other device has.
+/// The LSS address of a device: its identity object 1018h, which is unique.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LssAddress {
     /// 1018h/1.
@@ -34,31 +33,31 @@ impl LssAddress {
     }
 }
 
-/// Why a device could not store; the values are the error codes of the answer.
+/// Why a device could not store; the values are the error codes in the answer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum StoreError {
-    /// It cannot store at all.
+    /// The device does not support storing.
     Unsupported = 1,
     /// Its memory failed.
     Failed = 2,
 }
 
-/// What LSS needs of the device.
+/// The interface between LSS and the device.
 pub trait LssDevice {
-    /// Whether the device can run at this bit rate; of [`BitRate::Auto`], whether it may find the
-    /// rate out by listening.
+    /// Whether the device supports this bit rate; for [`BitRate::Auto`], whether it may detect the
+    /// bit rate by listening.
     fn supports(&mut self, rate: BitRate) -> bool;
 
-    /// Stores node-ID and bit rate for the next start. `None` as node-ID makes it a device without
-    /// node-ID (FFh); `None` as bit rate leaves the stored one as it is. A device that needs time
-    /// gives `Pending` and is then asked by [`stored`](Self::stored).
+    /// Stores node-ID and bit rate for the next start. `None` as node-ID stores "no node-ID" (FFh);
+    /// `None` as bit rate leaves the stored value unchanged. A device that needs time returns
+    /// `Pending`, and [`stored`](Self::stored) is called then.
     ///
     /// # Errors
     /// Sent to the master as error code.
     fn store(&mut self, node: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>>;
 
-    /// The outcome of the last [`store`](Self::store); `Pending` while it goes on.
+    /// The result of the last [`store`](Self::store); `Pending` while it continues.
     ///
     /// # Errors
     /// Sent to the master as error code.
@@ -67,7 +66,7 @@ pub trait LssDevice {
     }
 }
 
-/// What can be chosen about an LSS slave.
+/// The configuration of an LSS slave.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Config {
     /// Start in LSS configuration state, for a bus with one device to configure. Not part of the
@@ -78,12 +77,12 @@ pub struct Config {
     pub announce: bool,
 }
 
-/// What the owner has to do.
+/// What the owner must do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Output {
     /// Send this frame.
     Send(Frame),
-    /// A device that had no node-ID has this one from now on: start the node, send its boot-up.
+    /// A device without a node-ID gets this one: start the node and send its boot-up message.
     NodeId(NodeId),
     /// Set the CAN controller to this bit rate now.
     BitRate(BitRate),
@@ -94,26 +93,26 @@ pub enum Output {
 pub struct Lss {
     /// Vendor-ID, product code, revision number, serial number.
     address: [u32; 4],
-    /// The state in which it starts.
+    /// The initial state.
     initial: State,
     state: State,
-    /// The node-ID in force.
+    /// The active node-ID.
     active: Option<NodeId>,
-    /// The node-ID that was configured: comes into force with the next start of the node.
+    /// The configured node-ID: it takes effect at the next start of the node.
     pending: Option<NodeId>,
-    /// The bit rate that was configured.
+    /// The configured bit rate.
     bit_rate: Option<BitRate>,
-    /// How many requests of a selective switch have matched in a row.
+    /// The number of matching requests of a selective switch in a row.
     selected: u8,
-    /// How many requests of an identification have matched in a row.
+    /// The number of matching requests of an identification in a row.
     identified: u8,
-    /// The part of the address that fastscan is at, 0 to 3.
+    /// The part of the address that fastscan compares, 0 to 3.
     position: u8,
     activation: Activation,
     /// The device is storing. The master waits for the answer; other requests are ignored.
     storing: bool,
     answer: Option<[u8; 8]>,
-    /// A node-ID that came into force, which the owner has yet to be told.
+    /// A node-ID that has taken effect and was not yet reported to the owner.
     assigned: Option<NodeId>,
 }
 
@@ -123,11 +122,11 @@ enum State {
     Configuration,
 }
 
-/// Activation of a bit rate: two delays, in which the node is silent.
+/// Activation of a bit rate: two delays in which the node is silent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Activation {
     None,
-    /// First delay: all nodes finish what they are sending.
+    /// First delay: all nodes finish their present transmissions.
     Before {
         rate: BitRate,
         switch_at: Instant,
@@ -161,7 +160,7 @@ const INQUIRE_NODE_ID: u8 = 0x5E;
 /// The node-ID of a device without one.
 const UNCONFIGURED: u8 = 0xFF;
 
-/// Fastscan: all slaves without node-ID answer, and start at the first part of the address.
+/// Fastscan: all slaves without a node-ID answer, and start with the first part of the address.
 const CONFIRM: u8 = 0x80;
 
 impl Lss {
@@ -187,18 +186,19 @@ impl Lss {
         }
     }
 
-    /// The node-ID in force.
+    /// The active node-ID.
     #[must_use]
     pub const fn node_id(&self) -> Option<NodeId> {
         self.active
     }
 
-    /// NMT Reset communication: the node-ID that was configured comes into force; gives it. Without
-    /// one the node is not started and waits for LSS again.
+    /// NMT Reset communication: the configured node-ID takes effect and is returned. Without one
+    /// the node is not started and waits for LSS again.
     ///
-    /// The state is that of the start again, LSS waiting: the node passes through INITIALISATION, and
-    /// the state machine is entered anew with PRE-OPERATIONAL, or with a reset of communication without
-    /// a node-ID (CiA 305, LSS FSA, transition 1). Other changes of the NMT state leave it alone.
+    /// The state becomes LSS waiting, as at the start: the node passes through INITIALISATION, and
+    /// the state machine is entered again with PRE-OPERATIONAL, or with a reset of communication
+    /// without a node-ID (CiA 305, LSS FSA, transition 1). Other changes of the NMT state do not
+    /// affect it.
     pub fn reset_communication(&mut self) -> Option<NodeId> {
         self.state = self.initial;
         self.active = self.pending;
@@ -215,7 +215,8 @@ impl Lss {
         }
     }
 
-    /// When [`poll`](Self::poll) has to be called although no frame came; `None` for never.
+    /// The time at which [`poll`](Self::poll) must be called even without a frame; `None` for
+    /// never.
     #[must_use]
     pub const fn next_deadline(&self) -> Option<Instant> {
         match self.activation {
@@ -225,7 +226,7 @@ impl Lss {
         }
     }
 
-    /// Takes any frame received; those that are no LSS request are ignored.
+    /// Processes any received frame; frames other than LSS requests are ignored.
     pub fn handle(&mut self, frame: &Frame, now: Instant, device: &mut impl LssDevice) {
         if !frame.has_cob_id(CobId::LSS_REQUEST) || self.is_silent(now) || self.storing {
             return;
@@ -236,8 +237,8 @@ impl Lss {
         }
     }
 
-    /// Asks a device that is storing for the outcome, so that the master gets its answer. To be
-    /// called before [`poll`](Self::poll) if the device needs time to store.
+    /// Asks a storing device for the result, so that the master gets its answer. Call it before
+    /// [`poll`](Self::poll) if the device needs time to store.
     pub fn follow_store(&mut self, device: &mut impl LssDevice) {
         if self.storing {
             if let Poll::Ready(outcome) = device.stored() {
@@ -247,7 +248,7 @@ impl Lss {
         }
     }
 
-    /// What to do next, until there is nothing.
+    /// Returns the next action of the owner; `None` if there is none.
     pub fn poll(&mut self, now: Instant) -> Option<Output> {
         match self.activation {
             Activation::Before { rate, switch_at, delay_ms } if now.has_reached(switch_at) => {
@@ -266,7 +267,7 @@ impl Lss {
         self.assigned.take().map(Output::NodeId)
     }
 
-    /// The answer to a request: its command specifier, and the number behind it.
+    /// The answer to a request: its command specifier and the following number.
     fn request(&mut self, bytes: &[u8; 8], now: Instant, device: &mut impl LssDevice) -> Option<(u8, u32)> {
         let [command, a, b, c, d, ..] = *bytes;
         let number = u32::from_le_bytes([a, b, c, d]);
@@ -317,7 +318,7 @@ impl Lss {
         Some((command, number))
     }
 
-    /// Whether it has no node-ID and is not about to get one.
+    /// Whether it has no node-ID and none is configured.
     fn is_unconfigured(&self) -> bool {
         self.active.is_none() && self.pending.is_none()
     }
@@ -326,7 +327,7 @@ impl Lss {
         match mode {
             0 => {
                 self.state = State::Waiting;
-                // A device without a node-ID takes the new one here, and boots.
+                // A device without a node-ID takes the new one here and boots.
                 if self.active.is_none() && self.pending.is_some() {
                     self.active = self.pending;
                     self.assigned = self.active;
@@ -337,7 +338,7 @@ impl Lss {
         }
     }
 
-    /// Four requests in a row name a device: whether this was the last of them.
+    /// Four matching requests in a row select a device; returns whether this was the last one.
     fn select(&mut self, step: u8, number: u32) -> bool {
         let matches = self.address[usize::from(step)] == number;
         let complete = advance(&mut self.selected, step, 3, matches);
@@ -347,8 +348,8 @@ impl Lss {
         complete
     }
 
-    /// Six requests in a row name vendor, product, and the bounds of revision and serial number:
-    /// whether this was the last of them.
+    /// Six matching requests in a row give vendor, product, and the bounds of revision and serial
+    /// number; returns whether this was the last one.
     fn identify(&mut self, step: u8, number: u32) -> bool {
         let [vendor_id, product_code, revision, serial_number] = self.address;
         let matches = match step {
@@ -362,8 +363,8 @@ impl Lss {
         advance(&mut self.identified, step, 5, matches)
     }
 
-    /// Compares one bit of the address after another: whether all up to this one are those of the
-    /// request. Slaves with a node-ID take no part.
+    /// Compares the bits of the address one after another; returns whether all bits up to this one
+    /// match the request. Slaves with a node-ID take no part.
     fn fastscan(&mut self, bytes: &[u8; 8]) -> bool {
         let [_, a, b, c, d, bit, part, next] = *bytes;
         if !self.is_unconfigured() {
@@ -376,7 +377,7 @@ impl Lss {
         if bit > 31 || next > 3 || part != self.position {
             return false;
         }
-        // Bits from 31 down to this one.
+        // The bits from 31 down to this one.
         let asked = u32::MAX << bit;
         let number = u32::from_le_bytes([a, b, c, d]);
         if (self.address[usize::from(part)] ^ number) & asked != 0 {
@@ -391,7 +392,7 @@ impl Lss {
     }
 }
 
-/// Counts a sequence of requests, each of which must match; gives whether this was the last one.
+/// Counts a sequence of requests that must all match; returns whether this was the last one.
 fn advance(done: &mut u8, step: u8, last: u8, matches: bool) -> bool {
     let in_order = step == 0 || step == *done;
     let good = in_order && matches;
@@ -405,7 +406,7 @@ fn error_code(outcome: Result<(), StoreError>) -> u32 {
     outcome.err().map_or(0, |error| error as u32)
 }
 
-/// An answer: a number, or an error code, behind the command specifier.
+/// An answer: a number or an error code after the command specifier.
 const fn answer(command: u8, number: u32) -> [u8; 8] {
     let [a, b, c, d] = number.to_le_bytes();
     [command, a, b, c, d, 0, 0, 0]

@@ -10,17 +10,17 @@ use crate::frame::{CobId, Frame, NodeId};
 pub enum NmtState {
     /// The node starts; on the bus it shows as the boot-up message.
     Initialisation = 0x00,
-    /// Neither SDO nor PDO are served.
+    /// Neither SDO nor PDO works.
     Stopped = 0x04,
-    /// All is served.
+    /// SDO and PDO work.
     Operational = 0x05,
-    /// SDO is served, PDO is not.
+    /// SDO works, PDO does not.
     PreOperational = 0x7F,
 }
 
 impl NmtState {
-    /// From the byte of a heartbeat; the toggle bit of node guarding is ignored. `None` for a value
-    /// that is no state.
+    /// From the byte of a heartbeat; the toggle bit of node guarding is ignored. `None` for an
+    /// invalid value.
     #[must_use]
     pub const fn from_byte(byte: u8) -> Option<Self> {
         match byte & 0x7F {
@@ -37,15 +37,15 @@ impl NmtState {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum NmtCommand {
-    /// Go OPERATIONAL.
+    /// Enter OPERATIONAL.
     Start = 0x01,
-    /// Go STOPPED.
+    /// Enter STOPPED.
     Stop = 0x02,
-    /// Go PRE-OPERATIONAL.
+    /// Enter PRE-OPERATIONAL.
     EnterPreOperational = 0x80,
     /// Restart the device.
     ResetNode = 0x81,
-    /// Restart communication: a node-ID that was configured comes into force.
+    /// Restart communication: a configured node-ID takes effect.
     ResetCommunication = 0x82,
 }
 
@@ -70,7 +70,7 @@ impl NmtCommand {
         }
     }
 
-    /// The frame that a master sends; without a node it addresses all of them.
+    /// The frame of a master; without a node it addresses all nodes.
     #[must_use]
     pub fn emit(self, node: Option<NodeId>) -> Frame {
         Frame::of(CobId::NMT, &[self as u8, node.map_or(0, NodeId::get)])

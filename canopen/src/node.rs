@@ -1,8 +1,8 @@
 //! A slave: NMT, boot-up, heartbeat and SDO server of one node-ID.
 //!
-//! The owner passes every frame received to [`Node::handle`], then fetches frames with
-//! [`Node::poll`] until there are none, and does the latter again at least once every few
-//! milliseconds (or at [`Node::next_deadline`]).
+//! The owner passes every received frame to [`Node::handle`], then fetches frames with
+//! [`Node::poll`] until there are none. It calls `poll` again at least every few milliseconds (or
+//! at [`Node::next_deadline`]).
 
 use crate::abort::AbortCode;
 use crate::frame::{CobId, Frame, NodeId};
@@ -12,26 +12,26 @@ use crate::od::Objects;
 use crate::sdo::server::{Config as SdoConfig, SdoServer};
 use crate::time::Instant;
 
-/// What Start, Stop and EnterPreOperational of the NMT master do to the node.
+/// The effect of the NMT master's Start, Stop and EnterPreOperational on the node.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum NmtPolicy {
-    /// It stays PRE-OPERATIONAL, as a bootloader does: SDO has to be served all the time.
+    /// The node stays PRE-OPERATIONAL, like a bootloader: SDO must always work.
     #[default]
     StayPreOperational,
-    /// It follows the master.
+    /// The node follows the master.
     Follow,
 }
 
-/// What can be chosen about a node.
+/// The configuration of a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Config {
-    /// Whether it says by a message that it is up (CiA 301 clause 7.3.2.2.3).
+    /// Whether it sends a boot-up message (CiA 301 clause 7.3.2.2.3).
     pub boot_up: bool,
     /// Period of the heartbeat in milliseconds, 0 for none.
     pub heartbeat_ms: u16,
-    /// Whether it follows the commands of the NMT master that change its state.
+    /// Whether it follows the NMT commands that change its state.
     pub nmt: NmtPolicy,
-    /// The SDO server's part.
+    /// The configuration of the SDO server.
     pub sdo: SdoConfig,
 }
 
@@ -45,8 +45,8 @@ impl Default for Config {
 /// A command of the NMT master to this node.
 ///
 /// The node itself has carried out Start, Stop and `EnterPreOperational`. The owner carries out the
-/// two resets: it restarts the device, or calls [`Node::restart`] with the node-ID that is now in
-/// force.
+/// two resets: it restarts the device, or calls [`Node::restart`] with the node-ID that is active
+/// now.
 pub type NmtEvent = NmtCommand;
 
 /// A slave on the bus.
@@ -61,7 +61,7 @@ pub struct Node {
 }
 
 impl Node {
-    /// A node that has yet to send its boot-up.
+    /// A node that has not sent its boot-up message yet.
     #[must_use]
     pub const fn new(id: NodeId, config: Config) -> Self {
         Self {
@@ -80,13 +80,13 @@ impl Node {
         self.id
     }
 
-    /// Its NMT state; [`NmtState::Initialisation`] until the boot-up is fetched.
+    /// Its NMT state; [`NmtState::Initialisation`] until the boot-up message is fetched.
     #[must_use]
     pub const fn state(&self) -> NmtState {
         self.state
     }
 
-    /// Whether no SDO transfer is going on and no SDO answer waits to be fetched.
+    /// Whether no SDO transfer runs and no SDO answer waits to be fetched.
     #[must_use]
     pub const fn is_sdo_idle(&self) -> bool {
         self.sdo.is_idle()
@@ -104,23 +104,23 @@ impl Node {
         self.sdo.set_slow_bus(slow_bus);
     }
 
-    /// Takes the SDO answer that waits back, if it is this one; tells whether it was.
+    /// Withdraws the waiting SDO answer if it is `answer`; returns whether it was.
     pub fn withdraw_answer(&mut self, answer: &[u8; 8]) -> bool {
         self.sdo.withdraw_answer(answer)
     }
 
-    /// Turns the SDO answer that waits into an abort of the object that it is about.
+    /// Replaces the waiting SDO answer by an abort for the same object.
     pub fn refuse(&mut self, code: AbortCode) {
         self.sdo.refuse(code);
     }
 
-    /// Ends an SDO transfer that is going on, without telling the client.
+    /// Ends a running SDO transfer without a message to the client.
     pub fn end_transfer(&mut self, objects: &mut impl Objects) {
         self.sdo.reset(objects);
     }
 
-    /// Starts anew under this node-ID, as after Reset communication: a transfer ends, the boot-up
-    /// is sent again.
+    /// Starts again with this node-ID, as after Reset communication: a transfer ends, and the
+    /// boot-up message is sent again.
     pub fn restart(&mut self, id: NodeId, objects: &mut impl Objects) {
         self.sdo.reset(objects);
         let config = Config {
@@ -132,15 +132,15 @@ impl Node {
         *self = Self::new(id, config);
     }
 
-    /// Takes the value of 1017h: the heartbeat's period in milliseconds, 0 for none. The same value
-    /// again changes nothing, so that it may be called after every frame.
+    /// Sets the value of 1017h: the heartbeat's period in milliseconds, 0 for none. The same value
+    /// again changes nothing, so the owner may call this after every frame.
     pub fn set_heartbeat_ms(&mut self, period_ms: u16, now: Instant) {
         self.heartbeat.set_period(period_ms, now);
     }
 
-    /// Takes any frame received; gives the command, if it is one of the NMT master to this node.
+    /// Processes any received frame; returns the NMT command if the frame is one for this node.
     pub fn handle(&mut self, frame: &Frame, now: Instant, objects: &mut impl Objects) -> Option<NmtEvent> {
-        // Before its boot-up a node serves nothing.
+        // A node accepts nothing before its boot-up message.
         if self.state == NmtState::Initialisation {
             return None;
         }
@@ -154,7 +154,7 @@ impl Node {
         None
     }
 
-    /// The next frame to send, until there is none.
+    /// The next frame to send; `None` if there is none.
     pub fn poll(&mut self, now: Instant, objects: &mut impl Objects) -> Option<Frame> {
         if self.state == NmtState::Initialisation {
             self.state = NmtState::PreOperational;
@@ -174,7 +174,8 @@ impl Node {
         self.heartbeat.take_due(now).then(|| nmt::state_message(self.id, self.state))
     }
 
-    /// When [`poll`](Self::poll) has to be called although no frame came; `None` for never.
+    /// The time at which [`poll`](Self::poll) must be called even without a frame; `None` for
+    /// never.
     #[must_use]
     pub fn next_deadline(&self) -> Option<Instant> {
         match (self.sdo.next_deadline(), self.heartbeat.deadline()) {
@@ -187,7 +188,7 @@ impl Node {
         let state = match (command, self.nmt) {
             (NmtCommand::Start, NmtPolicy::Follow) => NmtState::Operational,
             (NmtCommand::Stop, NmtPolicy::Follow) => {
-                // A stopped node serves no SDO, so no request could end the transfer.
+                // SDO does not work in state stopped, so no request could end the transfer.
                 self.sdo.reset(objects);
                 NmtState::Stopped
             }

@@ -27,8 +27,8 @@
 //! }
 //! ```
 //!
-//! The SDO server checks every access against the table before it asks for a value, so that an
-//! implementation sees only accesses that the table allows:
+//! The SDO server checks every access against the table before it calls the device, so an
+//! implementation gets only permitted accesses:
 //!
 //! | the client | abort |
 //! |---|---|
@@ -96,9 +96,9 @@ pub enum DataType {
 }
 
 impl DataType {
-    /// Bytes of a value; `None` for types of any length.
+    /// The size of a value in bytes; `None` for types of variable length.
     #[must_use]
-    // One table in the code: inlined it would be one for each caller.
+    // Not inlined: there would be a table for each caller.
     #[inline(never)]
     pub const fn size(self) -> Option<u32> {
         match self {
@@ -138,15 +138,14 @@ impl Access {
     }
 }
 
-/// The part of an object that an entry is.
+/// The role of an entry in its object.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
     /// An object of one value (VAR, or DOMAIN by its type).
     Var,
-    /// Sub-index 0 of an object whose values are all of one type; its value is the highest
-    /// sub-index.
+    /// Sub-index 0 of an object with values of one type; its value is the highest sub-index.
     Array(u8),
-    /// Sub-index 0 of an object of values of any type; its value is the highest sub-index.
+    /// Sub-index 0 of an object with values of different types; its value is the highest sub-index.
     Record(u8),
     /// A value of an array or record.
     Sub,
@@ -173,7 +172,7 @@ pub struct Entry {
     pub data_type: DataType,
     /// Access of a client to it.
     pub access: Access,
-    /// The part of an object that it is.
+    /// Its role in the object.
     pub kind: Kind,
     /// Name, of the whole object for [`Kind::Array`] and [`Kind::Record`].
     #[cfg(feature = "names")]
@@ -224,7 +223,7 @@ impl Entry {
         Self::new(Address::new(index, sub), name, data_type, access, Kind::Sub)
     }
 
-    /// With another access. A sub-index 0 that is not `const`, such as 1003h/0, is read from and
+    /// Sets another access. A sub-index 0 that is not `const`, such as 1003h/0, is read from and
     /// written to the implementation of [`Objects`].
     #[must_use]
     pub const fn access(mut self, access: Access) -> Self {
@@ -232,7 +231,7 @@ impl Entry {
         self
     }
 
-    /// With a number as default value.
+    /// Sets a number as default value.
     #[must_use]
     #[cfg_attr(not(feature = "names"), allow(unused_mut))]
     pub const fn default(mut self, value: u64) -> Self {
@@ -245,7 +244,7 @@ impl Entry {
         self
     }
 
-    /// With a text as default value.
+    /// Sets a text as default value.
     #[must_use]
     #[cfg_attr(not(feature = "names"), allow(unused_mut))]
     pub const fn default_text(mut self, value: &'static str) -> Self {
@@ -262,8 +261,8 @@ impl Entry {
 /// Finds the entry of a value.
 ///
 /// # Errors
-/// [`AbortCode::NO_OBJECT`] if no entry has the index, [`AbortCode::NO_SUB_INDEX`] if none of those
-/// has the sub-index.
+/// [`AbortCode::NO_OBJECT`] if no entry has the index, [`AbortCode::NO_SUB_INDEX`] if none of these
+/// entries has the sub-index.
 pub fn find(entries: &[Entry], at: Address) -> Result<&Entry, AbortCode> {
     let mut code = AbortCode::NO_OBJECT;
     for entry in entries {
@@ -277,8 +276,8 @@ pub fn find(entries: &[Entry], at: Address) -> Result<&Entry, AbortCode> {
     Err(code)
 }
 
-/// A table of `LEN` entries that is put together in a constant from the parts of a device. In a
-/// constant, whatever panics here fails the compilation.
+/// A table of `LEN` entries, assembled in a constant from the parts of a device. In a constant, a
+/// panic of these functions is a compile error.
 #[derive(Clone, Copy, Debug)]
 pub struct Table<const LEN: usize> {
     entries: [Entry; LEN],
@@ -286,13 +285,13 @@ pub struct Table<const LEN: usize> {
 }
 
 impl<const LEN: usize> Table<LEN> {
-    /// Of no part yet.
+    /// A table without entries yet.
     pub const EMPTY: Self = Self { entries: [Entry::array(0, "", 0); LEN], len: 0 };
 
-    /// With these behind.
+    /// Appends a part.
     ///
     /// # Panics
-    /// If they are too many.
+    /// If the table has too few entries left.
     #[must_use]
     pub const fn with(mut self, part: &[Entry]) -> Self {
         assert!(part.len() <= LEN - self.len, "od::Table: LEN is less than the parts have");
@@ -305,11 +304,10 @@ impl<const LEN: usize> Table<LEN> {
         self
     }
 
-    /// With an array behind whose elements, 1 to `highest`, are all like `element`: 1 + `highest`
-    /// entries.
+    /// Appends an array with elements 1 to `highest`, all like `element`: 1 + `highest` entries.
     ///
     /// # Panics
-    /// If they are too many.
+    /// If the table has too few entries left.
     #[must_use]
     pub const fn with_array(mut self, name: &'static str, element: Entry, highest: u8) -> Self {
         let index = element.at.index;
@@ -322,10 +320,10 @@ impl<const LEN: usize> Table<LEN> {
         self
     }
 
-    /// The table.
+    /// The complete table.
     ///
     /// # Panics
-    /// If the parts have fewer than `LEN`.
+    /// If the parts have fewer than `LEN` entries.
     #[must_use]
     pub const fn entries(self) -> [Entry; LEN] {
         assert!(self.len == LEN, "od::Table: LEN is more than the parts have");
@@ -333,7 +331,7 @@ impl<const LEN: usize> Table<LEN> {
     }
 }
 
-/// Copies a value to the start of `buf` and gives its length, as [`Objects::read`] has to.
+/// Copies a value to the start of `buf` and returns its length, as [`Objects::read`] must.
 ///
 /// # Errors
 /// [`AbortCode::OUT_OF_MEMORY`] if it does not fit.
@@ -342,26 +340,26 @@ pub fn put(buf: &mut [u8], value: &[u8]) -> Result<usize, AbortCode> {
     Ok(value.len())
 }
 
-/// The values behind the table.
+/// The values of the table.
 ///
-/// Variables and strings are read and written as a whole; **domains** are streamed and never held
-/// as a whole by the server. An error becomes the SDO abort that the client gets.
+/// Variables and strings are read and written as a whole. **Domains** are streamed, and the server
+/// never holds them as a whole. An error becomes the SDO abort for the client.
 ///
 /// A domain download is `download_start`, `download_data` any number of times, and then exactly one
-/// of `download_end` and `download_cancel`. `download_cancel` is called if the client aborts or
-/// starts another transfer, after a time-out, after an error of `download_data`, or if the sizes do
-/// not match. After an error of `download_start` neither is called.
+/// of `download_end` and `download_cancel`. The server calls `download_cancel` if the client aborts
+/// or starts another transfer, after a time-out, after an error of `download_data`, or if the sizes
+/// do not match. After an error of `download_start` it calls neither.
 pub trait Objects {
     /// The table.
     fn entries(&self) -> &'static [Entry];
 
-    /// Reads a variable (little-endian) or string into `buf` and gives its length.
+    /// Reads a variable (little-endian) or string into `buf` and returns its length.
     ///
     /// # Errors
     /// Sent to the client as abort.
     fn read(&mut self, at: Address, buf: &mut [u8]) -> Result<usize, AbortCode>;
 
-    /// Writes a variable (little-endian) or string. The length of a variable is that of its type.
+    /// Writes a variable (little-endian) or string. A variable has the length of its type.
     ///
     /// # Errors
     /// Sent to the client as abort.
@@ -379,10 +377,11 @@ pub trait Objects {
         Err(AbortCode::UNSUPPORTED_ACCESS)
     }
 
-    /// Bytes that [`download_data`](Self::download_data) could take at present. Until there is room
-    /// for a segment (7 bytes) the server holds its answer back, and with it the client. After
-    /// [`HOLD_MS`](crate::sdo::server::HOLD_MS) it asks with `held`: the implementation should then
-    /// give room from a reserve, so that the client is slowed down but still answered.
+    /// The number of bytes that [`download_data`](Self::download_data) can accept at present.
+    /// Without room for a segment (7 bytes) the server delays its answer, and so the client. After
+    /// [`HOLD_MS`](crate::sdo::server::HOLD_MS) it calls again with `held`: the implementation
+    /// should then give room from a reserve, so that the client is slowed down but still gets
+    /// answers.
     fn download_space(&mut self, at: Address, held: bool) -> usize {
         let _ = (at, held);
         usize::MAX
@@ -397,7 +396,7 @@ pub trait Objects {
         Err(AbortCode::UNSUPPORTED_ACCESS)
     }
 
-    /// The domain is complete. An error is sent as abort in place of the last acknowledgement.
+    /// The domain is complete. An error replaces the last acknowledgement.
     ///
     /// # Errors
     /// Sent to the client as abort.
@@ -411,13 +410,13 @@ pub trait Objects {
         let _ = at;
     }
 
-    /// The data of the next emergency to send, until there is none ([`Emcy`](crate::emcy::Emcy)
-    /// keeps them).
+    /// The data of the next emergency to send, `None` if there is none ([`Emcy`](crate::emcy::Emcy)
+    /// stores them).
     fn next_emergency(&mut self) -> Option<[u8; 8]> {
         None
     }
 
-    /// Starts an upload of a domain; gives its size in bytes if it is known.
+    /// Starts an upload of a domain; returns its size in bytes if it is known.
     ///
     /// # Errors
     /// Sent to the client as abort.
@@ -426,8 +425,8 @@ pub trait Objects {
         Err(AbortCode::UNSUPPORTED_ACCESS)
     }
 
-    /// Reads the domain from `offset` on. Fills `buf` unless the domain ends before, and gives the
-    /// number of bytes; 0 is the end. A block upload may ask for the same offset again.
+    /// Reads the domain from `offset` on. Fills `buf` unless the domain ends before, and returns
+    /// the number of bytes; 0 is the end. A block upload may read the same offset again.
     ///
     /// # Errors
     /// Sent to the client as abort.

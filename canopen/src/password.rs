@@ -3,24 +3,24 @@
 use crate::abort::AbortCode;
 use crate::time::Instant;
 
-/// How long no password is taken after the first wrong one, in milliseconds. It doubles with each
-/// further wrong one.
+/// How long the lock accepts no password after the first wrong one, in milliseconds. The time
+/// doubles with each further wrong password.
 pub const FIRST_DELAY_MS: u32 = 500;
-/// Wrong passwords after which the wait no longer grows; it is half a minute then.
+/// The number of wrong passwords after which the wait no longer grows; it is half a minute then.
 const MOST_FAILURES: u32 = 6;
 
-/// A lock with its password, and the attempts to open it.
+/// A lock with its password, and the state of the attempts.
 #[derive(Clone, Copy, Debug)]
 pub struct Lock {
     password: &'static [u8],
     /// Wrong passwords since the last right one.
     failures: u32,
-    /// No password is taken before this time.
+    /// The lock accepts no password before this time.
     closed_until: Option<Instant>,
 }
 
 impl Lock {
-    /// A lock that this password opens.
+    /// A lock with this password.
     #[must_use]
     pub const fn new(password: &'static [u8]) -> Self {
         Self { password, failures: 0, closed_until: None }
@@ -32,12 +32,12 @@ impl Lock {
         self.failures
     }
 
-    /// Whether no password is taken at present. To be called at least every three weeks, since
-    /// instants wrap. A device that is to restart waits until this is over: a restart would end the
-    /// wait.
+    /// Whether the lock accepts no password at present. Call it at least every three weeks, because
+    /// instants wrap. A device that is about to restart waits until this is over: a restart would
+    /// end the wait.
     #[must_use]
     pub fn is_waiting(&mut self, now: Instant) -> bool {
-        // Dropped when it is over, since instants wrap.
+        // Removed when the time is over, because instants wrap.
         self.closed_until = self.closed_until.filter(|until| !now.has_reached(*until));
         self.closed_until.is_some()
     }
@@ -46,13 +46,12 @@ impl Lock {
     ///
     /// # Errors
     /// [`AbortCode::INVALID_VALUE`] for a wrong password; [`AbortCode::DEVICE_STATE`] for any
-    /// password that comes too early.
+    /// password during a wait.
     pub fn open(&mut self, given: &[u8], now: Instant) -> Result<(), AbortCode> {
         if self.is_waiting(now) {
             return Err(AbortCode::DEVICE_STATE);
         }
-        // All bytes are compared, so that the time it takes does not depend on the first that
-        // differs.
+        // All bytes are compared, so that the time does not depend on the first different byte.
         let differs = given.iter().zip(self.password).fold(0, |sum, (a, b)| sum | (a ^ b));
         if differs == 0 && given.len() == self.password.len() {
             self.failures = 0;
@@ -62,14 +61,13 @@ impl Lock {
         Err(AbortCode::INVALID_VALUE)
     }
 
-    /// Somebody has failed by another way than a wrong password: the next wait is longer.
+    /// An attempt of another kind has failed: the next wait is longer.
     pub fn fail(&mut self, now: Instant) {
         self.closed_until = Some(now + (FIRST_DELAY_MS << self.failures.min(MOST_FAILURES)));
         self.failures = self.failures.saturating_add(1);
     }
 
-    /// Somebody has succeeded by another way than the password: the next wait is the first one
-    /// again.
+    /// An attempt of another kind was successful: the next wait is the first one again.
     pub fn succeed(&mut self) {
         self.failures = 0;
     }
@@ -94,7 +92,7 @@ mod tests {
         assert_eq!(Lock::new(b"INIT").open(b"INIT", Instant::from_millis(0)), Ok(()));
     }
 
-    /// Half a second, one, two … half a minute; within that even the right one is refused.
+    /// Half a second, one, two … half a minute; during the wait even the right password is refused.
     #[test]
     fn wrong_ones_are_slowed_down() {
         let mut lock = Lock::new(b"INIT");

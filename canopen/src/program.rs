@@ -34,14 +34,14 @@ pub const PROGRAM_ID: u16 = 0x1F56;
 /// Flash status identification: gives a [`FlashStatus`].
 pub const FLASH_STATUS: u16 = 0x1F57;
 
-/// What 1F51h, 1F56h, 1F57h, 2004h and 2005h are called, and what each of their elements is.
-/// Bootloader and application both have them, with an element for each program of the device,
-/// whichever runs (SYS TEC manual L-1112d_10, table 1 and 3.4.1).
+/// The names of 1F51h, 1F56h, 1F57h, 2004h and 2005h, and their elements. Bootloader and
+/// application both have them, with an element for each program of the device, whichever program
+/// runs (SYS TEC manual L-1112d_10, table 1 and 3.4.1).
 pub const CONTROL_ARRAYS: [(&str, Entry); 5] = [
     (
         "Program control",
-        // Without a default value, which a configuration tool might write: what is read is a state,
-        // what is written a command.
+        // No default value, because a configuration tool might write it: a read returns a state,
+        // but a write is a command.
         Entry::sub(PROGRAM_CONTROL, 1, "Program control of a program", DataType::Unsigned8, Access::Rw),
     ),
     (
@@ -62,17 +62,17 @@ pub const CONTROL_ARRAYS: [(&str, Entry); 5] = [
     ),
 ];
 
-/// How many entries [`CONTROL_ARRAYS`] are on a device with so many programs.
+/// The number of entries of [`CONTROL_ARRAYS`] on a device with this many programs.
 #[must_use]
 pub const fn control_count(programs: u8) -> usize {
     CONTROL_ARRAYS.len() * (1 + programs as usize)
 }
 
 impl<const LEN: usize> Table<LEN> {
-    /// With [`CONTROL_ARRAYS`] behind, of [`control_count`] entries.
+    /// Appends [`CONTROL_ARRAYS`], which have [`control_count`] entries.
     ///
     /// # Panics
-    /// If they are too many.
+    /// If the table has too few entries left.
     #[must_use]
     pub const fn with_program_control(mut self, programs: u8) -> Self {
         let mut array = 0;
@@ -85,16 +85,17 @@ impl<const LEN: usize> Table<LEN> {
     }
 }
 
-/// Where the programs lie, an object of coboot: the sub-index is the program's number. The lower 32
-/// bits are the first address of its flash, the upper 32 bits how many bytes it has.
+/// The regions of the programs, an object of coboot: the sub-index is the program's number. The
+/// lower 32 bits are the first address of its flash, the upper 32 bits its size in bytes.
 pub const PROGRAM_REGION: u16 = 0x2004;
 
 /// The versions of the stored programs, an object of coboot: the sub-index is the program's number.
-/// As in a control block: major in bits 0-7, minor in bits 8-15, release in bits 16-31 (SYS TEC
-/// manual L-1112d_10, figure 13); 0 for a program that came without one, or none.
+/// The format is that of a control block: major in bits 0-7, minor in bits 8-15, release in bits
+/// 16-31 (SYS TEC manual L-1112d_10, figure 13); 0 for a program without a version, or no program.
 pub const PROGRAM_VERSION: u16 = 0x2005;
 
-/// The value of [`PROGRAM_REGION`] for a program whose flash begins at `base` and has `size` bytes.
+/// The value of [`PROGRAM_REGION`] for a program with flash from `base` on and a size of `size`
+/// bytes.
 #[must_use]
 pub const fn region_value(base: u32, size: u32) -> [u8; 8] {
     ((size as u64) << 32 | base as u64).to_le_bytes()
@@ -112,16 +113,16 @@ pub const fn region_of(value: [u8; 8]) -> (u32, u32) {
 pub const UNLOCK: u16 = 0x6005;
 /// "Firmware update". CiA 814-1 names object and purpose but no sub-index; this one is coboot's.
 pub const UNLOCK_FIRMWARE: u8 = 1;
-/// What a lift device has of it, in bootloader and application.
+/// The object's entries in the bootloader and the application of a lift device.
 pub const UNLOCK_ENTRIES: [Entry; 2] = [
     Entry::record(UNLOCK, "Lock/unlock parameters", UNLOCK_FIRMWARE),
     Entry::sub(UNLOCK, UNLOCK_FIRMWARE, "Firmware update", DataType::VisibleString, Access::Wo),
 ];
 /// Access to a sealed device, an object of coboot (docs/security.md).
 pub const ACCESS: u16 = 0x2002;
-/// What a sealed device has recorded, an object of coboot: the last eight events.
+/// The event log of a sealed device, an object of coboot: the last eight events.
 pub const EVENTS: u16 = 0x2003;
-/// What a sealed device has of the two.
+/// The entries of both objects in a sealed device.
 pub const SEALED_ENTRIES: [Entry; 12] = [
     Entry::record(ACCESS, "Access", 2),
     Entry::sub(ACCESS, 1, "Unique ID, nonce, rights", DataType::OctetString, Access::Ro),
@@ -141,7 +142,7 @@ pub const SEALED_ENTRIES: [Entry; 12] = [
 /// number.
 pub const ENABLE_FLASH: u16 = 0x7F50;
 
-/// 1000h of the bootloader. An application has another value, so a host can distinguish them.
+/// 1000h of the bootloader. An application has another value, so a host can tell them apart.
 pub const BOOTLOADER_DEVICE_TYPE: u32 = 0x1000_0000;
 
 /// 1000h of a boot loader as ESAcademy describes it ("BOOT"), and of older lift bootloaders.
@@ -161,11 +162,11 @@ pub enum ProgramControl {
     Stop = 0x00,
     /// Start the program.
     Start = 0x01,
-    /// Set the flash status back to "no error".
+    /// Set the flash status to "no error".
     ResetStat = 0x02,
     /// Erase the program.
     Clear = 0x03,
-    /// Go back from the application to the bootloader.
+    /// Return from the application to the bootloader.
     StartBootloader = 0x80,
     /// Mark the program as valid, so that it starts by itself.
     SetSignature = 0x83,
@@ -210,7 +211,7 @@ pub enum ProgramState {
 pub struct FlashStatus {
     /// A command is being carried out.
     pub busy: bool,
-    /// How the last command ended; `None` if it succeeded.
+    /// The result of the last command; `None` if it succeeded.
     pub error: Option<FlashError>,
     /// More about the error, for the manufacturer.
     pub detail: u16,
@@ -228,7 +229,7 @@ impl FlashStatus {
         Self { busy: false, error: Some(error), detail }
     }
 
-    /// Takes the word of 1F57h apart.
+    /// Parses the word of 1F57h.
     #[must_use]
     pub const fn from_word(word: u32) -> Self {
         let error = FlashError::from_code(word as u8);
@@ -246,14 +247,14 @@ impl FlashStatus {
     }
 }
 
-/// Why a command to the bootloader failed: the error code of 1F57h where it stands in the word, so
-/// bit 0 is clear. A device may have codes that are none of the manual's.
+/// Why a command to the bootloader failed: the error code of 1F57h at its position in the word, so
+/// bit 0 is clear. A device may have codes that the manual does not define.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub struct FlashError(NonZeroU8);
 
 impl FlashError {
-    /// The error with the code in the lowest byte of the word, whose bit 0 is not looked at; `None`
-    /// for no error.
+    /// The error with the code in the lowest byte of the word; bit 0 is ignored. `None` for no
+    /// error.
     #[must_use]
     pub const fn from_code(byte: u8) -> Option<Self> {
         match NonZeroU8::new(byte & 0xFE) {
@@ -262,7 +263,7 @@ impl FlashError {
         }
     }
 
-    /// The error code where it stands in the word: 2 to FEh, bit 0 is clear.
+    /// The error code at its position in the word: 2 to FEh, bit 0 is clear.
     #[must_use]
     pub const fn code(self) -> u8 {
         self.0.get()

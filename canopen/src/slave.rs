@@ -5,9 +5,10 @@
 //!
 //! 1. passes every frame received to [`Slave::handle`],
 //! 2. passes the controller's state to [`Slave::observe`], every few milliseconds,
-//! 3. then carries out what [`Slave::poll`] gives, until it gives nothing.
+//! 3. then carries out each action that [`Slave::poll`] returns, until it returns none.
 //!
-//! The first outputs of a new slave set filters and bit rate, so the owner does that in one place.
+//! The first actions of a new slave set filters and bit rate, so the owner has a single place for
+//! them.
 
 use crate::abort::AbortCode;
 use crate::bit_rate::{BitRate, Detector};
@@ -19,27 +20,27 @@ use crate::node::{self, Node};
 use crate::od::Objects;
 use crate::time::Instant;
 
-/// What a slave needs of its device.
+/// The interface between a slave and its device.
 pub trait SlaveDevice: Objects + LssDevice {
-    /// Something happened on the line; the device may report it by an emergency.
+    /// Reports an event of the line; the device may send an emergency for it.
     fn line_event(&mut self, event: LineEvent) {
         let _ = event;
     }
 
-    /// The device has this node-ID from now on, or none; its node starts (anew). So it is told before
-    /// the first output, too.
+    /// Reports the device's new node-ID, or none; its node starts (again). The slave also calls
+    /// this before its first action.
     fn node_id_changed(&mut self, id: Option<NodeId>) {
         let _ = id;
     }
 }
 
-/// What can be chosen about a slave. Whether it may find out the bit rate by listening is chosen by
-/// [`LssDevice::supports`] of [`BitRate::Auto`].
+/// The configuration of a slave. [`LssDevice::supports`] for [`BitRate::Auto`] decides whether the
+/// slave may detect the bit rate by listening.
 #[derive(Clone, Copy, Debug)]
 pub struct Config {
-    /// The node's part.
+    /// The configuration of the node.
     pub node: node::Config,
-    /// The part of the layer setting services; `None` for a slave without.
+    /// The configuration of the layer setting services; `None` for a slave without them.
     pub lss: Option<lss::Config>,
 }
 
@@ -50,7 +51,7 @@ impl Default for Config {
     }
 }
 
-/// What the owner has to do.
+/// What the owner must do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Output {
     /// Send this frame.
@@ -60,9 +61,9 @@ pub enum Output {
     Join(BitRate),
     /// Set the controller to this bit rate and listen only.
     Listen(BitRate),
-    /// Bring the controller back from bus-off.
+    /// Start the controller's recovery from bus-off.
     RecoverFromBusOff,
-    /// Accept the frames of exactly these identifiers; one may be named twice.
+    /// Accept exactly the frames with these identifiers; the list may contain one twice.
     Accept([CobId; 3]),
 }
 
@@ -76,23 +77,23 @@ pub struct Slave {
     lss: Lss,
     line: Line,
     losses: Losses,
-    /// The node-ID changed, and the owner has yet to set the filters to it.
+    /// The node-ID has changed, and the owner must still set the filters for it.
     accept: bool,
 }
 
 #[derive(Debug)]
 enum Line {
-    /// The controller has to be set to this rate.
+    /// The controller must be set to this rate.
     Down(BitRate),
-    /// The bit rate is searched for; the controller is set to `set`.
+    /// The slave detects the bit rate; the controller is set to `set`.
     Listening { detector: Detector, set: Option<BitRate> },
     /// The controller takes part in the bus.
     Up { monitor: Monitor, recover_from_bus_off: bool },
 }
 
 impl Slave {
-    /// A device with this node-ID, or without one, on a bus of this bit rate. A device without
-    /// node-ID sends nothing but answers of layer setting services.
+    /// A device with this node-ID, or without one, on a bus with this bit rate. A device without a
+    /// node-ID only sends answers of layer setting services.
     #[must_use]
     pub fn new(address: LssAddress, id: Option<NodeId>, rate: BitRate, config: Config) -> Self {
         Self {
@@ -106,13 +107,13 @@ impl Slave {
         }
     }
 
-    /// Its node, from the first output on, unless it has no node-ID.
+    /// Its node, after the first action, unless it has no node-ID.
     #[must_use]
     pub const fn node(&self) -> Option<&Node> {
         self.node.as_ref()
     }
 
-    /// Takes the value of 1017h: the heartbeat's period in milliseconds, 0 for none.
+    /// Sets the value of 1017h: the heartbeat's period in milliseconds, 0 for none.
     pub fn set_heartbeat_ms(&mut self, period_ms: u16, now: Instant) {
         self.config.node.heartbeat_ms = period_ms;
         if let Some(node) = &mut self.node {
@@ -120,30 +121,31 @@ impl Slave {
         }
     }
 
-    /// Takes the SDO answer that waits to be sent back, if it is this one; tells whether it was. The
-    /// device owes it to the client from then on.
+    /// Withdraws the waiting SDO answer if it is `answer`; returns whether it was. The device then
+    /// owes this answer to the client.
     pub fn withdraw_answer(&mut self, answer: &[u8; 8]) -> bool {
         self.node.as_mut().is_some_and(|node| node.withdraw_answer(answer))
     }
 
-    /// Turns the SDO answer that waits to be sent into an abort of the object that it is about.
+    /// Replaces the waiting SDO answer by an abort for the same object.
     pub fn refuse(&mut self, code: AbortCode) {
         if let Some(node) = &mut self.node {
             node.refuse(code);
         }
     }
 
-    /// Whether no SDO answer waits to be sent: a device that is to restart owes nobody anything. It
-    /// does not wait for the end of a transfer, which is its client's to choose.
+    /// Whether no SDO answer waits to be sent: a device must have sent all its answers before a
+    /// restart. It does not wait for the end of a transfer, because only the client decides when
+    /// that comes.
     #[must_use]
     pub fn is_idle(&self) -> bool {
         self.node.as_ref().is_none_or(|node| !node.has_sdo_answer())
     }
 
-    /// Takes any frame received; gives whether the NMT master asked to restart the device. Then a
-    /// transfer that was going on has ended, and an answer that waited is gone.
+    /// Processes any received frame; returns whether the NMT master requested a restart of the
+    /// device. In this case a running transfer has ended, and a waiting answer was dropped.
     pub fn handle(&mut self, frame: &Frame, now: Instant, device: &mut impl SlaveDevice) -> bool {
-        // While the controller only listens, nothing could be answered.
+        // A controller that only listens cannot send answers.
         if !matches!(self.line, Line::Up { .. }) {
             return false;
         }
@@ -165,7 +167,7 @@ impl Slave {
         false
     }
 
-    /// Takes the state of the controller.
+    /// Processes the state of the controller.
     pub fn observe(&mut self, status: Status, now: Instant, device: &mut impl SlaveDevice) {
         if let Some(lost) = self.losses.observe(status.lost, now) {
             device.line_event(LineEvent::Lost(lost));
@@ -185,8 +187,8 @@ impl Slave {
         }
     }
 
-    /// What to do next, until there is nothing. Frames are given only while there is `room` for one
-    /// in the mailboxes.
+    /// Returns the owner's next action; `None` if there is none. Frames are returned only while
+    /// there is `room` for one in the mailboxes.
     pub fn poll(&mut self, now: Instant, room: bool, device: &mut impl SlaveDevice) -> Option<Output> {
         if !core::mem::replace(&mut self.started, true) {
             self.restart(self.lss.node_id(), device);
@@ -235,7 +237,7 @@ impl Slave {
         }
     }
 
-    /// The identifiers of the frames that it serves.
+    /// The identifiers of the frames that it accepts.
     fn identifiers(&self) -> [CobId; 3] {
         let lss = if self.config.lss.is_some() { CobId::LSS_REQUEST } else { CobId::NMT };
         match &self.node {
@@ -244,7 +246,8 @@ impl Slave {
         }
     }
 
-    /// Starts the node (anew) under this node-ID: a transfer ends, the boot-up is sent (again).
+    /// Starts the node (again) with this node-ID: a transfer ends, and the boot-up message is sent
+    /// (again).
     fn restart(&mut self, id: Option<NodeId>, device: &mut impl SlaveDevice) {
         if let Some(node) = &mut self.node {
             node.end_transfer(device);

@@ -2,10 +2,10 @@
 
 use core::ops::Add;
 
-/// A point in time, in milliseconds from an origin that the caller chose.
+/// A point in time, in milliseconds from an origin that the caller has chosen.
 ///
-/// It wraps. Two instants are compared by their difference, which is right as long as they lie less
-/// than 2³¹ ms (24 days) apart; hence there is no `Ord`.
+/// It wraps. Two instants are compared by their difference, which is correct if they are less than
+/// 2³¹ ms (24 days) apart; therefore there is no `Ord`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Instant(u32);
 
@@ -28,7 +28,7 @@ impl Instant {
         self.0.wrapping_sub(earlier.0)
     }
 
-    /// Whether `deadline` has come.
+    /// Whether `deadline` has passed.
     #[must_use]
     pub const fn has_reached(self, deadline: Self) -> bool {
         self.since(deadline) < 1 << 31

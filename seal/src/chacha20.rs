@@ -1,12 +1,12 @@
-//! ChaCha20 (RFC 8439, 2.4), small before fast.
+//! ChaCha20 (RFC 8439, 2.4), optimised for size.
 
 use crate::words::words;
 
-/// Encrypts or decrypts, which is the same: exclusive-or of `data` with the key stream that begins
-/// with block number `counter`.
+/// Encrypts or decrypts: exclusive-or of `data` with the key stream that begins with block number
+/// `counter`.
 ///
-/// A key, a nonce and a counter must not serve for two different data. The number of blocks wraps
-/// around after 2^32 - 1.
+/// The same key, nonce and counter must not be used for two different data. The block number wraps
+/// after 2^32 - 1.
 pub fn apply(key: &[u8; 32], nonce: &[u8; 12], counter: u32, data: &mut [u8]) {
     let mut start = [0; 16];
     words(b"expand 32-byte k", &mut start[..4]);
@@ -26,13 +26,13 @@ pub fn apply(key: &[u8; 32], nonce: &[u8; 12], counter: u32, data: &mut [u8]) {
     }
 }
 
-/// Quarter round `n` of 80: four down the columns, four down the diagonals, again and again.
+/// Quarter round `n` of 80: four down the columns, four down the diagonals, repeated.
 fn quarter(s: &mut [u32; 16], n: usize) {
     // A diagonal goes one column to the right with each row.
     let slope = n / 4 % 2;
     let place = |row: usize| row * 4 + (n + row * slope) % 4;
     let [mut a, mut b, mut c, mut d] = [place(0), place(1), place(2), place(3)];
-    // By how many bits the words are turned to the left: 16, 12, 8, 7.
+    // The rotations of the words to the left, in bits: 16, 12, 8, 7.
     let mut turns = 0x0708_0c10_u32;
     while turns != 0 {
         s[a % 16] = s[a % 16].wrapping_add(s[b % 16]);

@@ -1,19 +1,18 @@
-//! Whether an Ed25519 signature is good (RFC 8032, 5.1.7), small before fast, and in steps.
+//! Verification of an Ed25519 signature (RFC 8032, 5.1.7), optimised for size, and in steps.
 //!
-//! The verdict is that of strict libraries: S is less than L, the public key and R are canonical
-//! encodings of points that are not of small order, and R is what the equation without the cofactor
-//! gives, bit by bit. Nothing here is secret, so nothing needs to take the same time for all
-//! inputs.
+//! The rules are those of strict libraries: S is less than L, the public key and R are canonical
+//! encodings of points that are not of small order, and R equals the result of the equation without
+//! the cofactor, bit by bit. No input is secret, so the time may depend on the inputs.
 //!
-//! All arithmetic in the field is one operation, `a * b + c`, on sixteen registers, of which five
-//! are constants: to add is to multiply by one, to subtract is to multiply by minus one. So a
-//! formula is a list of half words (`PLUS` and others), where code would be five times as long.
-//! Time is what pays for that: a verification takes some 0.2 s at 168 MHz.
+//! All arithmetic in the field is one operation, `a * b + c`, on sixteen registers, five of which
+//! are constants: an addition multiplies by one, a subtraction by minus one. A formula is therefore
+//! a list of half words (`PLUS` and others); as code it would be five times as long. The cost is
+//! time: a verification takes about 0.2 s at 168 MHz.
 
 use crate::words::{add_product, words};
 
-/// A number of 256 bits, the lowest word first. As an element of the field with 2^255 - 19 elements
-/// any number stands for its remainder.
+/// A number of 256 bits, the lowest word first. As an element of the field with 2^255 - 19
+/// elements, any number stands for its remainder.
 type Number = [u32; 8];
 
 /// 2^255 - 19.
@@ -34,7 +33,7 @@ const BASE: Point = [
     ONE,
 ];
 
-// Formulas: lists of half words 0xDABC, each of which says D = A * B + C of the registers D, A, B
+// Formulas: lists of half words 0xDABC, each of which means D = A * B + C for the registers D, A, B
 // and C.
 //
 // | registers | |
@@ -46,10 +45,10 @@ const BASE: Point = [
 // | 8 to A | intermediate results, as all the others when they are free |
 // | B to F | 0, 1, -1, 121666, 121665 |
 //
-// The curve is y^2 - x^2 = 1 + d x^2 y^2 with d = -121665/121666; all that d is multiplied with is
-// multiplied by 121666 as a whole.
+// The curve is y^2 - x^2 = 1 + d x^2 y^2 with d = -121665/121666; a factor d is replaced by -121665
+// where the whole formula is multiplied by 121666.
 
-/// All formulas, each with a 0 behind it.
+/// All formulas, each terminated by a 0.
 const FORMULAS: [u16; 56] = [
     // FRACTION
     0x211b, 0x32cd, 0x33eb, 0x22fb, 0x22de, 0x62cb, 0, //
@@ -67,7 +66,7 @@ const FORMULAS: [u16; 56] = [
     0x777b, 0, //
     // TIMES
     0x776b, 0, //
-    // DOUBLE, which goes on with PLUS
+    // DOUBLE, which continues with PLUS
     0x30cb, 0x41cb, 0x52cb, //
     // PLUS
     0x625b, 0x76eb, 0x667b, 0x814b, 0x903b, 0xa98b, 0x99c8, 0x804b, 0x8138, 0xaafb, 0x0ac6, 0x1ad6, 0x201b,
@@ -75,33 +74,33 @@ const FORMULAS: [u16; 56] = [
     // NEUTRAL
     0x0bbb, 0x1ccb, 0x2ccb, 0,
 ];
-/// Of a point, y in register 1, to the fraction of which x is the square root: its numerator to
-/// register 3, its denominator to registers 2 and 6.
+/// For a point with y in register 1: the fraction whose square root is x, its numerator to register
+/// 3, its denominator to registers 2 and 6.
 const FRACTION: usize = 0;
-/// With the inverse of the denominator the fraction itself to register 4, twice that to 6.
+/// With the inverse of the denominator: the fraction itself to register 4, twice the fraction to 6.
 const QUOTIENT: usize = 7;
-/// Of these the root (Atkin; RFC 8032 has another way that needs one more constant) to register 0,
-/// and to register 4 what is zero if that is a root, and 1 to register 2.
+/// The square root of these (Atkin's method; the method of RFC 8032 needs one more constant) to
+/// register 0; to register 4 a value that is zero if it is a root; and 1 to register 2.
 const ROOT: usize = 10;
 /// Changes the sign of x.
 const MINUS: usize = 19;
-/// Z to where it is inverted.
+/// Z to the register for the inversion.
 const DIVISOR: usize = 21;
-/// With the inverse of Z the point with Z = 1.
+/// With the inverse of Z: the point with Z = 1.
 const DIVIDED: usize = 23;
 /// The power squared.
 const SQUARE: usize = 27;
-/// The power times what is raised.
+/// The power times the base.
 const TIMES: usize = 29;
-/// The point added to itself.
+/// The point plus itself.
 const DOUBLE: usize = 31;
-/// The sum of the two points, which may be the same ("add-2008-bbjlp" of the Explicit-Formulas
-/// Database: complete, since d is no square and -1 is one).
+/// The sum of the two points, which may be equal ("add-2008-bbjlp" of the Explicit-Formulas
+/// Database: complete, because d is not a square and -1 is one).
 const PLUS: usize = 34;
 /// The neutral point.
 const NEUTRAL: usize = 52;
 
-/// How far a [`Verification`] is: what the next step does.
+/// The progress of a [`Verification`]: the action of the next step.
 #[derive(Clone, Copy, Debug)]
 enum Phase {
     Fraction,
@@ -113,20 +112,20 @@ enum Phase {
     Done(bool),
 }
 
-/// A signature on its way to a verdict.
+/// A verification of a signature.
 #[derive(Clone, Debug)]
-// What is small first: that is within reach of short instructions.
+// Small fields come first, within reach of short instructions.
 #[repr(C)]
 pub struct Verification {
     phase: Phase,
-    /// Bits of an exponent that are left.
+    /// The number of remaining bits of an exponent.
     power: u8,
-    /// Which of the lowest bits of the exponent are zeros.
+    /// The lowest bits of the exponent that are zeros.
     zeros: u8,
-    /// Bits of the factors that are left.
+    /// The number of remaining bits of the factors.
     bits: u8,
     registers: [Number; 16],
-    /// What is summed up: points, times these factors.
+    /// The points of the sum, to be multiplied by these factors.
     points: [Point; 2],
     factors: [Number; 2],
     public: Number,
@@ -134,8 +133,8 @@ pub struct Verification {
 }
 
 impl Verification {
-    /// Room for a verification; [`new`](Self::new) begins one. This one is over, with a bad signature.
-    /// All zeros, so that it costs no flash.
+    /// Space for a verification; [`new`](Self::new) starts one. This value is a verification that
+    /// has ended with a bad signature. All zeros, so that it takes no flash.
     pub const IDLE: Self = Self {
         registers: [[0; 8]; 16],
         points: [[[0; 8]; 3]; 2],
@@ -148,7 +147,7 @@ impl Verification {
         bits: 0,
     };
 
-    /// A signature (R and S), the public key that it is to be good for (A), and SHA-512 over R, A
+    /// Starts with a signature (R and S), the public key to check it with (A), and SHA-512 of R, A
     /// and the message.
     #[must_use]
     pub fn new(public: &[u8; 32], signature: &[u8; 64], digest: &[u8; 64]) -> Self {
@@ -183,8 +182,8 @@ impl Verification {
         new
     }
 
-    /// Goes on for about a millisecond at 168 MHz, or less; the verdict if it is there, or `None` if
-    /// there is more to do.
+    /// Continues for at most about a millisecond at 168 MHz; returns the result, or `None` if there
+    /// is more to do.
     pub fn step(&mut self) -> Option<bool> {
         if self.power != 0 {
             self.go_on_with_power();
@@ -204,7 +203,7 @@ impl Verification {
             }
             Phase::Root => {
                 self.run(ROOT);
-                // A or -A, which is what is needed.
+                // A or -A, whichever is needed.
                 let mut encoding = self.encoding();
                 if encoding == self.public {
                     self.run(MINUS);
@@ -252,20 +251,20 @@ impl Verification {
         None
     }
 
-    /// The encoding (RFC 8032, 5.1.2) of the point, whose Z is 1.
+    /// The encoding (RFC 8032, 5.1.2) of a point with Z = 1.
     fn encoding(&self) -> Number {
         let mut encoding = self.value(1);
         encoding[7] |= self.value(0)[0] << 31;
         encoding
     }
 
-    /// The element of the field that a register stands for, below 2^255 - 19.
+    /// The element of the field in a register, below 2^255 - 19.
     fn value(&self, register: usize) -> Number {
         remainder(&self.registers[register % 16], &P)
     }
 
-    /// Whether the point times eight is the neutral one: the point times four is that or (0, -1).
-    /// Changes the point.
+    /// Whether the point times eight is the neutral one: the point times four is then the neutral
+    /// one or (0, -1). Changes the point.
     fn has_small_order(&mut self) -> bool {
         self.run(DOUBLE);
         self.run(DOUBLE);
@@ -277,8 +276,8 @@ impl Verification {
         self.start_power(254, 0b1_0100);
     }
 
-    /// Starts to raise register 6 to a power: bits of the exponent but the uppermost, and which of
-    /// the lowest ones are zeros.
+    /// Starts to raise register 6 to a power: `bits` is the number of exponent bits without the top
+    /// bit, and `zeros` marks the zeros among the lowest bits.
     fn start_power(&mut self, bits: u8, zeros: u8) {
         self.registers[7] = self.registers[6];
         self.power = bits;
@@ -297,7 +296,7 @@ impl Verification {
         }
     }
 
-    /// Works a formula out.
+    /// Computes a formula.
     #[inline(never)]
     fn run(&mut self, formula: usize) {
         for operation in FORMULAS.get(formula..).unwrap_or(&[]) {
@@ -312,7 +311,7 @@ impl Verification {
             }
             let Some((sum, rest)) = wide.split_first_chunk_mut::<8>() else { return };
             let Some(high) = rest.first_chunk() else { return };
-            // 2^256 is 38.
+            // 2^256 equals 38.
             let mut carry = add_product(sum, 38, high);
             for _ in 0..2 {
                 carry = add_product(sum, carry * 38, &self.registers[0xc]);
@@ -325,8 +324,8 @@ impl Verification {
 /// The sign of x in the last word of a point.
 const SIGN: u32 = 1 << 31;
 
-/// What is left of a number of at least seven words when it is divided by a modulus between 2^224
-/// and 2^255: bit by bit.
+/// The remainder of a number of at least seven words, divided by a modulus between 2^224 and 2^255,
+/// bit by bit.
 #[inline(never)]
 fn remainder(number: &[u32], modulus: &Number) -> Number {
     let mut rest = [0; 8];

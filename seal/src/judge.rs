@@ -1,7 +1,8 @@
-//! Whether a device may take an image, by everything but the signatures: those cost the device a
-//! tenth of a second, and this costs nothing.
+//! Whether a device may accept an image, by all rules except the signatures: to check a signature
+//! takes a device a tenth of a second, and these rules take almost no time.
 //!
-//! The order is that of the questions that a person would ask: is it a sealed image, is it for this
+//! The order of the questions: Is it a sealed image? Is it for this device? Is it recent enough?
+//! Does the device have the keys?
 //! device, is it recent enough, does the device have the keys?
 
 use crate::key_block::{self, FOR_TESTS, KEKS, KEK_COUNT, ROOTS, ROOT_COUNT};
@@ -9,7 +10,7 @@ use crate::wire::{
     flag, role, tag, word, Fault, Head, CERTIFICATE, ED25519, FIXED, FORMAT, MAX_CHUNK, MIN_CHUNK, RECIPIENT,
 };
 
-/// The device that an image came to.
+/// The device that has received the image.
 #[derive(Clone, Copy, Debug)]
 pub struct Device<'a> {
     /// 1018h/1.
@@ -20,37 +21,37 @@ pub struct Device<'a> {
     pub revision: u32,
     /// The 96-bit unique ID of the chip.
     pub unique_id: [u8; 12],
-    /// The program that is written: the sub-index of 1F50h.
+    /// The program to be written: the sub-index of 1F50h.
     pub program: u8,
-    /// Whether that is data of the application.
+    /// Whether this program number is for data of the application.
     pub is_data: bool,
     /// Bytes of the program's flash.
     pub room: u32,
-    /// The lowest security counter that the device takes.
+    /// The lowest security counter that the device accepts.
     pub counter: u32,
-    /// The lowest epoch of a certificate.
+    /// The lowest epoch of a certificate that the device accepts.
     pub epoch: u32,
     /// Its [`key_block`].
     pub keys: &'a [u8],
 }
 
-/// What an image needs that passed.
+/// The keys for an accepted image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Needs {
-    /// The root that has to have signed the certificate, or the image where there is none: where it
-    /// stands in the key block.
+    /// The root that must have signed the certificate, or the image if there is no certificate: its
+    /// offset in the key block.
     pub root: usize,
-    /// The epoch of the device when the image is installed.
+    /// The device's epoch after the installation.
     pub epoch: u32,
-    /// Of an encrypted image the key-encryption key, where it stands in the key block, and the
-    /// recipient's record, where it stands in the manifest.
+    /// For an encrypted image: the offset of the key-encryption key in the key block, and the
+    /// offset of the recipient's record in the manifest.
     pub recipient: Option<(usize, usize)>,
 }
 
-/// Judges the head of an image.
+/// Checks the head of an image.
 ///
 /// # Errors
-/// Why the device refuses it.
+/// The reason why the device refuses it.
 pub fn judge(head: Head<'_>, device: &Device<'_>) -> Result<Needs, Fault> {
     let flags = head.flags();
     let chunk = head.chunk();
@@ -122,7 +123,7 @@ pub fn judge(head: Head<'_>, device: &Device<'_>) -> Result<Needs, Fault> {
     }
     let mut root = key_block::find(device.keys, ROOTS, ROOT_COUNT, root_id);
     if head.certificate().is_none() {
-        // A root may sign a program itself.
+        // A root may sign a program directly.
         root = (ROOTS..KEKS).step_by(key_block::KEY).find(|at| {
             let id = word(device.keys, *at);
             id != 0 && head.signature(id).is_some()

@@ -1,8 +1,8 @@
-//! The key block: what makes a device a sealed one.
+//! The key block, which makes a device a sealed device.
 //!
-//! It is the last 256 bytes of the bootloader's flash region, written in production together with
-//! the bootloader (`coflash provision`), and never changed in the field. It is read where it lies
-//! and never copied to RAM as a whole.
+//! It occupies the last 256 bytes of the bootloader's flash region. Production writes it together
+//! with the bootloader (`coflash provision`), and it never changes in the field. The code reads it
+//! in place and never copies all of it to RAM.
 //!
 //! | offset | bytes | |
 //! |---|---|---|
@@ -19,31 +19,31 @@
 pub const SIZE: usize = 256;
 /// Its first word.
 pub const MAGIC: [u8; 4] = *b"CBKB";
-/// Where the flags stand.
+/// The offset of the flags.
 pub const FLAGS: usize = 4;
-/// Where the lowest security counter stands.
+/// The offset of the lowest security counter.
 pub const COUNTER: usize = 8;
-/// Where the lowest epoch stands.
+/// The offset of the lowest epoch.
 pub const EPOCH: usize = 12;
-/// Where the roots stand.
+/// The offset of the roots.
 pub const ROOTS: usize = 16;
-/// How many there are.
+/// The number of roots.
 pub const ROOT_COUNT: usize = 2;
-/// Where the key-encryption keys stand.
+/// The offset of the key-encryption keys.
 pub const KEKS: usize = ROOTS + ROOT_COUNT * KEY;
-/// How many there are.
+/// The number of key-encryption keys.
 pub const KEK_COUNT: usize = 3;
-/// Bytes of a key with its id in front of it.
+/// The size of a key with its id before it.
 pub const KEY: usize = 36;
-/// Where the CRC stands.
+/// The offset of the CRC.
 pub const CHECK: usize = SIZE - 4;
-/// In the flags: the device takes programs that are signed with a test key.
+/// In the flags: the device accepts programs signed with a test key.
 pub const FOR_TESTS: u32 = 1;
 
 use crate::wire::word;
 
-/// Where the key with this id stands, id included, among the roots (`ROOTS`, `ROOT_COUNT`) or the
-/// key-encryption keys (`KEKS`, `KEK_COUNT`). The id 0 is that of none.
+/// The offset of the key with this id, including its id, among the roots (`ROOTS`, `ROOT_COUNT`) or
+/// the key-encryption keys (`KEKS`, `KEK_COUNT`). The id 0 means "no key".
 #[must_use]
 pub fn find(block: &[u8], keys: usize, count: usize, id: u32) -> Option<usize> {
     let mut places = (keys..).step_by(KEY).take(count);

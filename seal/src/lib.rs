@@ -1,18 +1,18 @@
-//! Sealed images: programs that a device takes from nobody but the holder of a key.
+//! Sealed images: programs that a device accepts only from the holder of a key.
 //!
 //! | module | what it is |
 //! |---|---|
 //! | [`wire`] | the file `CBS1`, field by field |
-//! | [`judge`] | whether a device may take an image, before a signature is looked at |
+//! | [`judge`] | whether a device may accept an image, before the check of the signatures |
 //! | [`key_block`] | the keys in a device |
-//! | [`access`] | what a device does for the holder of a root key alone, and what it records |
+//! | [`access`] | the functions of a device that need a root key, and its event log |
 //! | [`sha512`] | SHA-512, SHA-512/256, HMAC-SHA-512 |
-//! | [`ed25519`] | whether an Ed25519 signature is good |
+//! | [`ed25519`] | verification of Ed25519 signatures |
 //! | [`chacha20`] | ChaCha20 |
-//! | [`lzma`] | raw LZMA, unpacked |
+//! | [`lzma`] | raw LZMA, decompression |
 //!
-//! Device and host tool use the same code. Nothing here signs: the host does that with a crate of
-//! its own, or a hardware security module does.
+//! Device and host tool use the same code. Nothing here signs: the host signs with another crate,
+//! or a hardware security module does.
 #![no_std]
 #![forbid(unsafe_code)]
 

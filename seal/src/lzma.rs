@@ -1,52 +1,52 @@
-//! Raw LZMA (lc = 0, lp = 1, pb = 1, neither header nor end marker), small before fast.
+//! Raw LZMA (lc = 0, lp = 1, pb = 1, neither header nor end marker), optimised for size.
 //!
-//! The format is that of the LZMA SDK's `LZMA specification`. What was unpacked before is not kept
-//! here: the caller has it, in flash for example, and gives it byte by byte.
+//! The format is that of the LZMA SDK's `LZMA specification`. The decoder does not keep
+//! decompressed bytes: the caller has them, for example in flash, and returns them byte by byte.
 
-/// The stream says something that no encoder does: it begins with another byte than 0, copies from
-/// in front of the first byte that there is, or ends too early.
+/// The stream is invalid: its first byte is not 0, it copies from before the first byte, or it ends
+/// too early.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Corrupt;
 
-/// Where the probabilities of each kind of bit begin. Those that depend on the position have two of
-/// each (pb = lp = 1), one after the other for the states of `MATCH` and `LONG`.
+/// The offsets of the probabilities for each kind of bit. Kinds that depend on the position have
+/// two of each (pb = lp = 1): `MATCH` and `LONG` have them one after the other for each state.
 const MATCH: u32 = 0;
-/// Whether a match has one of the last four distances, and whether that is not the last, not the
-/// one before, not the third: 12 states each.
+/// Whether a match has one of the last four distances, and whether it is not the last, not the
+/// second last, not the third last: 12 states each.
 const REPEATED: u32 = 24;
 const LONG: u32 = REPEATED + 4 * 12;
 const SLOT: u32 = LONG + 24;
 const SPECIAL: u32 = SLOT + 4 * 64;
 const ALIGN: u32 = SPECIAL + 128;
 const MATCH_LENGTH: u32 = ALIGN + 16;
-/// Two choices, two trees of three bits for two ranges, one of eight.
+/// Two choices, two trees of three bits for two ranges, and one tree of eight bits.
 const LENGTH: u32 = 2 + 2 * 8 + 2 * 8 + 256;
 const LITERAL: u32 = MATCH_LENGTH + 2 * LENGTH;
 const LITERALS: u32 = 0x300;
 const COUNT: usize = (LITERAL + 2 * LITERALS) as usize;
-/// A bit without a probability: as often 1 as 0.
+/// A bit without a probability: 0 and 1 are equally likely.
 const DIRECT: u32 = u32::MAX;
 
-/// More than the bytes of input that a symbol can take.
+/// More input than any symbol can take, in bytes.
 const SYMBOL: usize = 24;
 
-/// What is known of a stream behind its last byte so far.
+/// The state of a stream after its last byte so far.
 #[derive(Clone, Debug)]
-// What is small first: that is within reach of short instructions.
+// Small fields come first, within reach of short instructions.
 #[repr(C)]
 pub struct Decoder {
     /// 0 before the first byte.
     range: u32,
     code: u32,
-    /// Bytes taken from the input of this call.
+    /// Bytes consumed from the input of this call.
     at: usize,
-    /// Bytes unpacked, and the dictionary's.
+    /// Bytes decompressed, including the dictionary's.
     position: u32,
-    /// Bytes that are still to be copied.
+    /// Bytes that must still be copied.
     pending: u32,
-    /// What the last symbols were (0 to 11; below 7 the last was a literal).
+    /// The kinds of the last symbols (0 to 11; below 7 the last one was a literal).
     state: u32,
-    /// The last four distances, less one, the latest first.
+    /// The last four distances minus one, the latest first.
     distances: [u32; 4],
     probabilities: [u16; COUNT],
 }
@@ -58,7 +58,7 @@ impl Default for Decoder {
 }
 
 impl Decoder {
-    /// In front of a stream. All of it is zero.
+    /// The state before a stream. All of it is zero.
     #[must_use]
     pub const fn new() -> Self {
         Self {
@@ -73,30 +73,30 @@ impl Decoder {
         }
     }
 
-    /// Forgets the stream; what is decoded next is the beginning of another one.
+    /// Forgets the stream; the next data are the beginning of another one.
     pub fn reset(&mut self) {
         self.range = 0;
         self.pending = 0;
     }
 
-    /// Whether the stream may end here: so it ends when all of its input is consumed, what was
-    /// expected is unpacked and this says so.
+    /// Whether the stream may end here: it has ended if its whole input is consumed, the expected
+    /// bytes are decompressed, and this returns true.
     #[must_use]
     pub fn is_finished(&self) -> bool {
         self.code == 0 && self.pending == 0
     }
 
-    /// Unpacks as much as possible: until `out` is full, or until fewer than 24 bytes of input are
-    /// left and it is not the `last` one. What is not consumed has to be in front of the next
-    /// input.
+    /// Decompresses as much as possible: until `out` is full, or until fewer than 24 bytes of input
+    /// are left and it is not the `last` input. The caller must put the remaining bytes before the
+    /// next input.
     ///
-    /// `history(n)` is the byte `n` bytes before the first of `out`, for `n` from 1 to
+    /// `history(n)` is the byte `n` bytes before the first byte of `out`, for `n` from 1 to
     /// `history_len`. At the first call that is the dictionary.
     ///
-    /// The bytes consumed and the bytes unpacked.
+    /// Returns the number of consumed bytes and of decompressed bytes.
     ///
     /// # Errors
-    /// [`Corrupt`]. Also if with the `last` input there is not enough to fill `out`.
+    /// [`Corrupt`], also if the `last` input does not fill `out`.
     pub fn decode(
         &mut self,
         input: &[u8],
@@ -116,7 +116,7 @@ impl Decoder {
                     self.start(input, history_len)?;
                 }
             }
-            // What the last distance leads to.
+            // The byte at the last distance.
             let back = self.distances[0] as usize;
             let copied = match back.checked_sub(produced) {
                 None => out.get(produced - 1 - back).copied(),
@@ -160,12 +160,12 @@ impl Decoder {
         Ok(())
     }
 
-    /// A literal, or `None` for a match: `pending` and the distance say how long and from where.
+    /// A literal, or `None` for a match: `pending` and the first distance describe it.
     fn symbol(&mut self, input: &[u8], copied: Option<u8>) -> Result<Option<u8>, Corrupt> {
         let odd = self.position & 1;
         if self.bit(input, MATCH + self.state * 2 + odd) == 0 {
-            // Behind a match the byte that would have gone on with it tells about the literal, up
-            // to the first bit in which they differ.
+            // After a match, the byte that would have continued it predicts the literal, up to the
+            // first bit that differs.
             let mut hint = 0;
             let mut alike = 0;
             if self.state >= 7 {
@@ -211,7 +211,7 @@ impl Decoder {
         } else {
             self.distances[(which as usize - 1) % 4]
         };
-        // To the front, and those in front of it one place back.
+        // Moves the distance to the front, and the previous ones one place back.
         for place in self.distances.iter_mut().take(which as usize) {
             core::mem::swap(place, &mut distance);
         }
@@ -290,7 +290,8 @@ impl Decoder {
         bit
     }
 
-    /// The next byte of the input. Behind its end are zeros; the caller sees that by `at`.
+    /// The next byte of the input. After its end there are zeros; the caller detects that from
+    /// `at`.
     fn shift(&mut self, input: &[u8]) {
         self.code = self.code << 8 | u32::from(input.get(self.at).copied().unwrap_or(0));
         self.at += 1;

@@ -1,32 +1,32 @@
-//! SHA-512, SHA-512/256 (FIPS 180-4) and HMAC-SHA-512 (RFC 2104), small before fast.
+//! SHA-512, SHA-512/256 (FIPS 180-4) and HMAC-SHA-512 (RFC 2104), optimised for size.
 //!
-//! The block that is being filled is the message schedule, too: sixteen words, of which each round
-//! replaces one. So a hash needs 200 bytes of RAM whatever it is given.
+//! The current block is also the message schedule: sixteen words, one of which is replaced in each
+//! round. A hash therefore needs 200 bytes of RAM for any message.
 
 use core::sync::atomic::{AtomicU32, Ordering};
 
 use crate::words::add_product;
 
-/// The state that SHA-512 starts with (FIPS 180-4, 5.3.5) and the constants of the rounds (4.2.3),
-/// the lower half of each first: the first 64 bits of the fractional parts of the square roots of
-/// the first eight primes and of the cube roots of the first eighty. As bytes of a program they
-/// would be 704, which nothing packs. So they are worked out ([`prepare`]), which takes some 30 ms
-/// at 168 MHz.
+/// The initial state of SHA-512 (FIPS 180-4, 5.3.5) and the constants of the rounds (4.2.3), the
+/// lower half of each first: the first 64 bits of the fractional parts of the square roots of the
+/// first eight primes and of the cube roots of the first eighty. In the image they would take 704
+/// bytes, which cannot be compressed. They are therefore computed ([`prepare`]), which takes about
+/// 30 ms at 168 MHz.
 static CONSTANTS: [[AtomicU32; 2]; STATE + 80] = [const { [const { AtomicU32::new(0) }; 2] }; STATE + 80];
 
 /// Words of the state.
 const STATE: usize = 8;
 
-/// Constants that are there.
+/// All constants, computed if necessary.
 fn constants() -> &'static [[AtomicU32; 2]; STATE + 80] {
     while !prepare() {}
     &CONSTANTS
 }
 
-/// Works out the next constant, in about 0.4 ms at 168 MHz; whether all are there. A device calls it
-/// when it has nothing else to do, so that nobody waits for all of them.
+/// Computes the next constant, in about 0.4 ms at 168 MHz; returns whether all are there. A device
+/// calls it while it has no other work, so that no request waits for all of them.
 pub fn prepare() -> bool {
-    // No constant's upper half is zero. Two that do this at once write the same.
+    // The upper half of every constant is not zero. Two concurrent calls write the same value.
     let missing = |halves: &[AtomicU32; 2]| halves[1].load(Ordering::Acquire) == 0;
     let Some((n, constant)) = CONSTANTS.iter().enumerate().find(|(_, halves)| missing(halves)) else {
         return true;
@@ -40,9 +40,9 @@ pub fn prepare() -> bool {
     false
 }
 
-/// The first 64 bits of the fractional part of a square or cube root below 8, bit by bit: each is
-/// tried, and taken back where the power is not below the number any more. No root is a whole
-/// number, so none is hit.
+/// The first 64 bits of the fractional part of a square or cube root below 8, bit by bit: each bit
+/// is tried, and cleared again if the power is not below the number. No root is an integer, so the
+/// power never equals the number.
 #[inline(never)]
 fn root(number: u32, exponent: usize) -> u64 {
     // Times 2^64.
@@ -50,7 +50,7 @@ fn root(number: u32, exponent: usize) -> u64 {
     // Three bits are in front of the point.
     for bit in (0..3 + 64).rev() {
         root[bit / 32] ^= 1 << (bit % 32);
-        // Its powers, each times 2^64 once more.
+        // Its powers, each multiplied by 2^64 once more.
         let mut power = [1, 0, 0, 0, 0, 0, 0, 0];
         for _ in 0..exponent {
             let mut product = [0; 8 + 3];
@@ -72,12 +72,12 @@ fn constant(halves: &[AtomicU32; 2]) -> u64 {
     u64::from(high.load(Ordering::Relaxed)) << 32 | u64::from(low.load(Ordering::Relaxed))
 }
 
-/// A hash in the making.
+/// A hash that is being computed.
 #[derive(Clone, Debug)]
 pub struct Sha512 {
     state: [u64; STATE],
     block: [u64; 16],
-    /// Bytes so far.
+    /// The number of bytes so far.
     length: u32,
 }
 
@@ -88,10 +88,10 @@ impl Default for Sha512 {
 }
 
 impl Sha512 {
-    /// Room for a hash; [`new`](Self::new) begins one. All zeros, so that it costs no flash.
+    /// Space for a hash; [`new`](Self::new) starts one. All zeros, so that it takes no flash.
     pub const IDLE: Self = Self { state: [0; 8], block: [0; 16], length: 0 };
 
-    /// SHA-512 of nothing yet.
+    /// SHA-512 of an empty message.
     #[must_use]
     pub fn new() -> Self {
         let mut state = [0; STATE];
@@ -101,11 +101,11 @@ impl Sha512 {
         Self { state, block: [0; 16], length: 0 }
     }
 
-    /// SHA-512/256 of nothing yet. Its hash is the first 32 bytes that
-    /// [`finish`](Self::finish) gives.
+    /// SHA-512/256 of an empty message. Its hash is the first 32 bytes of the result of
+    /// [`finish`](Self::finish).
     #[must_use]
     pub fn new_256() -> Self {
-        // FIPS 180-4, 5.3.6: how the state that a truncated hash starts with is found.
+        // FIPS 180-4, 5.3.6: the computation of the initial state of a truncated hash.
         let mut hash = Self::new();
         hash.state.iter_mut().for_each(|word| *word ^= 0xa5a5_a5a5_a5a5_a5a5);
         hash.update(b"SHA-512/256");
@@ -114,15 +114,14 @@ impl Sha512 {
         hash
     }
 
-    /// Takes more of the message, which may have 2^32 - 1 bytes in sum.
+    /// Adds a part of the message, which may have 2^32 - 1 bytes in total.
     pub fn update(&mut self, data: &[u8]) {
         for byte in data {
             self.push(*byte);
         }
     }
 
-    /// The hash. Of SHA-512/256 it is the first 32 bytes. Nothing useful can be done with `self`
-    /// afterwards.
+    /// The hash. For SHA-512/256 it is the first 32 bytes. `self` must not be used afterwards.
     pub fn finish(&mut self) -> [u8; 64] {
         self.pad();
         let mut hash = [0; 64];
@@ -154,11 +153,11 @@ impl Sha512 {
         self.compress();
     }
 
-    /// Takes the block into the state (FIPS 180-4, 6.4.2).
+    /// Processes the block (FIPS 180-4, 6.4.2).
     #[inline(never)]
     fn compress(&mut self) {
-        // The eight working variables, a first, move one place down in each round: nothing is
-        // copied but what changes, until sixteen rounds are over.
+        // The eight working variables, a first, move down one place in each round: only the changed
+        // values are written, until sixteen rounds have ended.
         let mut moving = [0; 16 + 8];
         moving[..8].copy_from_slice(&self.state);
         for round in CONSTANTS[STATE..].chunks_exact(16) {
@@ -179,7 +178,7 @@ impl Sha512 {
                     .wrapping_add((*a & *b) | (*c & (*a | *b)));
                 let early = self.block[(t + 1) % 16];
                 let late = self.block[(t + 14) % 16];
-                // What this place of the block has sixteen rounds later.
+                // The value of this word of the block sixteen rounds later.
                 self.block[t % 16] = w
                     .wrapping_add(turns(early, 1, 8, early >> 7))
                     .wrapping_add(self.block[(t + 9) % 16])
@@ -192,13 +191,13 @@ impl Sha512 {
     }
 }
 
-/// The word turned to the right by two numbers of bits and a third word, added bit by bit.
+/// The word rotated right by two numbers of bits, and a third word, combined by exclusive-or.
 #[inline(always)]
 fn turns(word: u64, one: u32, two: u32, third: u64) -> u64 {
     word.rotate_right(one) ^ word.rotate_right(two) ^ third
 }
 
-/// SHA-512/256 of these parts, one behind the other.
+/// SHA-512/256 of these parts in sequence.
 #[must_use]
 pub fn hash_256(parts: &[&[u8]]) -> [u8; 32] {
     let mut hash = Sha512::new_256();
@@ -208,7 +207,7 @@ pub fn hash_256(parts: &[&[u8]]) -> [u8; 32] {
     first
 }
 
-/// HMAC-SHA-512 of these parts, one behind the other.
+/// HMAC-SHA-512 of these parts in sequence.
 #[must_use]
 pub fn hmac(key: &[u8; 32], parts: &[&[u8]]) -> [u8; 64] {
     let keyed = |pad: u8| {

@@ -5,19 +5,21 @@
 //! chunk   hash of the next chunk (32 bytes, 0 in the last one) · payload
 //! ```
 //!
-//! The manifest holds the hash of the first chunk, each chunk that of the next one: a chain, so that
-//! one signature covers every byte and 32 bytes of state are enough to check them as they come.
+//! The manifest contains the hash of the first chunk, and each chunk the hash of the next one. In
+//! this chain one signature covers every byte, and 32 bytes of state are enough to check the bytes
+//! as they arrive.
 
-/// The first word of a sealed image: no number of a block, no `:`, no address in RAM.
+/// The first word of a sealed image: it is neither the number of a block nor an address in RAM, and
+/// does not begin with `:`.
 pub const MAGIC: [u8; 4] = *b"CBS1";
 /// The first word of a certificate.
 pub const CERTIFICATE_MAGIC: [u8; 4] = *b"CBK1";
-/// What stands in front of the manifest in the signed message, so that no other message that a key
-/// signs is taken for a manifest.
+/// The prefix of the manifest in the signed message, so that no other signed message can be taken
+/// for a manifest.
 pub const DOMAIN: &[u8; 22] = b"coboot sealed image 1\0";
-/// What stands in front of the nonce when a key-encryption key makes the key stream for a recipient.
+/// The prefix of the nonce when the key stream for a recipient is made from a key-encryption key.
 pub const WRAP_DOMAIN: &[u8; 13] = b"coboot key 1\0";
-/// The version of this format: a manifest that wants a higher one is refused.
+/// The version of this format: a manifest that needs a higher one is refused.
 pub const FORMAT: u16 = 1;
 
 /// Bytes of the manifest's fixed fields.
@@ -28,11 +30,11 @@ pub const MAX_MANIFEST: usize = 1024;
 pub const CERTIFICATE: usize = 152;
 /// Bytes of a certificate that the root's signature covers.
 pub const CERTIFIED: usize = 88;
-/// Bytes in front of a signature: key id, algorithm, length.
+/// Bytes before a signature: key id, algorithm, length.
 pub const SIGNATURE_HEADER: usize = 8;
 /// Bytes of an Ed25519 signature (RFC 8032).
 pub const SIGNATURE: usize = 64;
-/// The largest head that a device holds.
+/// The largest head that a device accepts.
 pub const MAX_HEAD: usize = 2048;
 /// Bytes of a hash: SHA-512/256 (FIPS 180-4).
 pub const HASH: usize = 32;
@@ -54,19 +56,19 @@ pub mod flag {
     pub const DICTIONARY: u8 = 1 << 3;
     /// Data of the application, no program.
     pub const DATA: u8 = 1 << 4;
-    /// The application writes the flash itself, so that the flash is not locked in front of it.
+    /// The application writes to flash itself: the flash is not locked before it starts.
     pub const WRITES_FLASH: u8 = 1 << 5;
     /// Signed with a test key.
     pub const TEST: u8 = 1 << 6;
-    /// All that have a meaning; an image with another one is refused.
+    /// All defined flags; an image with another one is refused.
     pub const KNOWN: u8 = ENCRYPTED | COMPRESSED | DICTIONARY | DATA | WRITES_FLASH | TEST;
 }
 
 /// Tags of the manifest's records: u16 tag, u16 length, bytes.
 pub mod tag {
-    /// An unknown record with this bit makes the image be refused.
+    /// An image with an unknown record with this bit is refused.
     pub const CRITICAL: u16 = 0x8000;
-    /// For whom the image is encrypted: key id, key check, wrapped key ([`super::Recipient`]).
+    /// A recipient of the encryption: key id, key check, wrapped key ([`super::Recipient`]).
     pub const RECIPIENT: u16 = 0x8001;
     /// Text for people.
     pub const TEXT: u16 = 0x0002;
@@ -84,12 +86,11 @@ pub mod role {
     pub const TEST: u8 = 2;
 }
 
-/// Why a sealed image is refused. The numbers are those of the flash status (1F57h), which the
-/// device shows.
+/// Why a sealed image is refused. The numbers are those of the flash status (1F57h) of the device.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Fault {
-    /// A field has a value that it cannot have, or there is more or less than the manifest says.
+    /// A field has an impossible value, or the size does not match the manifest.
     Format = 0x04,
     /// The image is larger than the flash of its program.
     Address = 0x0C,
@@ -97,38 +98,38 @@ pub enum Fault {
     WrongVendor = 0x80,
     /// It is for another product, program, device or hardware revision.
     WrongProduct = 0x82,
-    /// Signature, certificate, chain or hash of the image.
+    /// Signature, certificate, chain or hash of the image is wrong.
     Signature = 0x8A,
-    /// Security counter or epoch are lower than those of the device.
+    /// Security counter or epoch is lower than the device's.
     Rollback = 0x8C,
-    /// The device has no key for it: no such root key, or none that opens the encryption.
+    /// The device has no key for it: neither the root key nor a key-encryption key.
     Key = 0x8E,
 }
 
-/// A word of a slice that is long enough.
+/// A word of a slice; the slice must be long enough.
 #[inline(never)]
 #[must_use]
 pub fn word(bytes: &[u8], at: usize) -> u32 {
     bytes.iter().skip(at).take(4).rev().fold(0, |word, byte| word << 8 | u32::from(*byte))
 }
 
-/// A half word of a slice that is long enough.
+/// A half word of a slice; the slice must be long enough.
 #[must_use]
 pub fn half(bytes: &[u8], at: usize) -> u16 {
     word(bytes, at) as u16
 }
 
-/// An array of a slice, zeros where that is too short.
+/// An array from a slice; zeros if the slice is too short.
 #[must_use]
 pub fn array<const N: usize>(bytes: &[u8], at: usize) -> [u8; N] {
     bytes.get(at..at + N).and_then(|bytes| bytes.try_into().ok()).unwrap_or([0; N])
 }
 
-/// How many bytes the head of an image has, as far as these first bytes tell: when it has no more
-/// than there are, it is complete.
+/// The size of an image's head, as far as these first bytes show it: the head is complete if the
+/// result is not larger than the number of bytes.
 ///
 /// # Errors
-/// [`Fault::Format`] as soon as the bytes cannot be a head.
+/// [`Fault::Format`] if the bytes cannot be a head.
 pub fn head_size(bytes: &[u8]) -> Result<usize, Fault> {
     let have = bytes.len();
     if have < 8 {
@@ -162,7 +163,7 @@ pub fn head_size(bytes: &[u8]) -> Result<usize, Fault> {
     Ok(at)
 }
 
-/// A complete head ([`head_size`] says so).
+/// A complete head (as [`head_size`] reports).
 #[derive(Clone, Copy, Debug)]
 pub struct Head<'a>(pub &'a [u8]);
 
@@ -185,7 +186,7 @@ impl<'a> Head<'a> {
         self.0[7]
     }
 
-    /// The vendor-ID of the devices that it is for.
+    /// The vendor-ID of the devices for which the image is.
     #[must_use]
     pub fn vendor_id(self) -> u32 {
         word(self.0, 8)
@@ -203,7 +204,7 @@ impl<'a> Head<'a> {
         word(self.0, 16)
     }
 
-    /// The security counter: a device takes none that is lower than its own.
+    /// The security counter: a device accepts none lower than its own.
     #[must_use]
     pub fn counter(self) -> u32 {
         word(self.0, 20)
@@ -239,7 +240,7 @@ impl<'a> Head<'a> {
         word(self.0, 32)
     }
 
-    /// Bytes of payload behind the signatures, without the hashes.
+    /// Size of the payload after the signatures in bytes, without the hashes.
     #[must_use]
     pub fn payload(self) -> u32 {
         word(self.0, 36)
@@ -257,26 +258,26 @@ impl<'a> Head<'a> {
         array(self.0, 72)
     }
 
-    /// What makes the encryption of this image differ from that of every other one.
+    /// The nonce, which makes the encryption of each image different.
     #[must_use]
     pub fn nonce(self) -> [u8; 16] {
         array(self.0, 104)
     }
 
-    /// The 96-bit unique ID of the only device that it is for, or zeros.
+    /// The 96-bit unique ID of the only device for which the image is, or zeros.
     #[must_use]
     pub fn unique_id(self) -> [u8; 12] {
         array(self.0, 120)
     }
 
-    /// Hardware revisions that it is for: bit n for those whose revision number (1018h/3) has n in
-    /// its five lowest bits; 0 for all.
+    /// The hardware revisions for which the image is: bit n for revision numbers (1018h/3) with n
+    /// in the five lowest bits; 0 for all revisions.
     #[must_use]
     pub fn hardware(self) -> u32 {
         word(self.0, 132)
     }
 
-    /// When it was made, in seconds since 1970.
+    /// The time of creation, in seconds since 1970.
     #[must_use]
     pub fn created(self) -> u64 {
         u64::from_le_bytes(array(self.0, 136))
@@ -288,14 +289,14 @@ impl<'a> Head<'a> {
         self.0.get(144..176).unwrap_or(&[])
     }
 
-    /// The records of the manifest: tag and bytes. A record that reaches over the end of the
-    /// manifest is told as tag FFFFh.
+    /// The records of the manifest: tag and bytes. A record that exceeds the manifest is returned
+    /// with the tag FFFFh.
     #[must_use]
     pub fn records(self) -> Records<'a> {
         Records(self.manifest().get(FIXED..).unwrap_or(&[]))
     }
 
-    /// The certificate of the key that signed, if there is one.
+    /// The certificate of the signing key, if there is one.
     #[must_use]
     pub fn certificate(self) -> Option<Certificate<'a>> {
         let behind = self.0.get(self.manifest().len()..)?;
@@ -338,7 +339,7 @@ impl<'a> Iterator for Records<'a> {
     }
 }
 
-/// For whom an image is encrypted: 44 bytes of a record.
+/// A recipient of the encryption: 44 bytes of a record.
 #[derive(Clone, Copy, Debug)]
 pub struct Recipient<'a>(pub &'a [u8; RECIPIENT]);
 
@@ -352,7 +353,8 @@ impl Recipient<'_> {
         word(self.0, 0)
     }
 
-    /// What tells a wrong key before anything is erased: bytes 32 to 39 of the key stream.
+    /// The check value that reveals a wrong key before anything is erased: bytes 32 to 39 of the
+    /// key stream.
     #[must_use]
     pub fn check(self) -> [u8; 8] {
         array(self.0, 4)
@@ -366,24 +368,24 @@ impl Recipient<'_> {
     }
 }
 
-/// What a root says of a key that signs programs.
+/// A root's statement about a key that signs programs.
 #[derive(Clone, Copy, Debug)]
 pub struct Certificate<'a>(pub &'a [u8]);
 
 impl<'a> Certificate<'a> {
-    /// What the root's signature covers.
+    /// The bytes that the root's signature covers.
     #[must_use]
     pub fn signed(self) -> &'a [u8] {
         self.0.get(..CERTIFIED).unwrap_or(&[])
     }
 
-    /// Bytes that it says it has: [`CERTIFICATE`].
+    /// Its announced size: [`CERTIFICATE`].
     #[must_use]
     pub fn len(self) -> u16 {
         half(self.0, 4)
     }
 
-    /// Never.
+    /// Always false.
     #[must_use]
     pub fn is_empty(self) -> bool {
         self.0.is_empty()
@@ -401,7 +403,8 @@ impl<'a> Certificate<'a> {
         self.0[7]
     }
 
-    /// A device takes no certificate of a lower epoch than its own; a higher one becomes its own.
+    /// A device accepts no certificate with an epoch lower than its own; a higher one becomes its
+    /// own.
     #[must_use]
     pub fn epoch(self) -> u32 {
         word(self.0, 8)
@@ -425,7 +428,7 @@ impl<'a> Certificate<'a> {
         word(self.0, 20)
     }
 
-    /// The highest one.
+    /// The highest security counter that it may sign.
     #[must_use]
     pub fn highest(self) -> u32 {
         word(self.0, 24)
@@ -437,7 +440,7 @@ impl<'a> Certificate<'a> {
         array(self.0, 28)
     }
 
-    /// The id of the root that signed.
+    /// The id of the signing root.
     #[must_use]
     pub fn root_id(self) -> u32 {
         word(self.0, 60)

@@ -1,8 +1,8 @@
-//! The block file: the container that object 1F50h takes (SYS TEC manual L-1112d_10, chapter 3
+//! The block file: the format of the data for object 1F50h (SYS TEC manual L-1112d_10, chapter 3
 //! figure 2 and chapter 5.1).
 //!
-//! A file is a row of blocks: number 0 (control), 1…N (program data, ascending), FFFFFFFFh (size
-//! and CRC of the program). Each block is one SDO download:
+//! A file is a sequence of blocks: number 0 (control), 1…N (program data, ascending), FFFFFFFFh
+//! (size and CRC of the program). Each block is one SDO download:
 //!
 //! ```text
 //! u32 number | u32 flash address | u32 size | size bytes | u32 CRC over all of the block before it
@@ -10,17 +10,17 @@
 //!
 //! All words are little-endian. The CRC is CRC-32/ISO-HDLC (polynomial EDB88320h reflected); the
 //! manual gives its start value once as 0 and once as FFFFFFFFh, which is one function called in
-//! two ways. It is computed by whoever uses this module, so that this crate needs none of its own.
+//! two ways. The users of this module compute the CRC, so this crate has no code for it.
 
 use core::fmt;
 
-/// Bytes in front of a block's data.
+/// The size of the header before a block's data in bytes.
 pub const HEADER_SIZE: usize = 12;
-/// Bytes of the CRC behind a block's data.
+/// The size of the CRC after a block's data in bytes.
 pub const CRC_SIZE: usize = 4;
-/// Bytes of a block that are not data; `--block-size` counts them.
+/// The bytes of a block that are not data; `--block-size` includes them.
 pub const FRAMING: usize = HEADER_SIZE + CRC_SIZE;
-/// The largest block the manual allows, framing included (table 1: "container of up to 16384
+/// The largest block that the manual allows, including framing (table 1: "container of up to 16384
 /// bytes").
 pub const MAX_BLOCK_SIZE: usize = 16384;
 
@@ -29,26 +29,26 @@ pub const NUMBER_CONTROL: u32 = 0;
 /// The number of the last block.
 pub const NUMBER_LAST: u32 = u32::MAX;
 
-/// The twelve bytes in front of a block's data.
+/// The twelve bytes before a block's data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header {
     /// 0, 1…N or FFFFFFFFh.
     pub number: u32,
-    /// Where the data goes; 0 in the control block, without meaning in the last one.
+    /// The flash address of the data; 0 in the control block, without meaning in the last one.
     pub flash_address: u32,
-    /// Number of data bytes.
+    /// The number of data bytes.
     pub size: u32,
 }
 
 impl Header {
-    /// Takes a header apart.
+    /// Parses a header.
     #[must_use]
     pub fn parse(bytes: &[u8; HEADER_SIZE]) -> Self {
         let [number, flash_address, size] = words(bytes);
         Self { number, flash_address, size }
     }
 
-    /// Puts a header together.
+    /// The bytes of the header.
     #[must_use]
     pub fn emit(&self) -> [u8; HEADER_SIZE] {
         let mut bytes = [0; HEADER_SIZE];
@@ -57,16 +57,16 @@ impl Header {
     }
 }
 
-/// The data of block 0: what the program is for. Each step of knowledge is one length.
+/// The data of block 0: the target of the program. Each variant has its own length.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Control {
     /// 8 bytes, all reserved.
     Plain,
-    /// 12 bytes: size of the program (0 where not told) and whom it is for.
+    /// 12 bytes: size of the program (0 if unknown) and its target.
     Identity(Identity),
-    /// 24 bytes: the same, with version and date.
+    /// 24 bytes: `Identity` with version and date.
     Dated {
-        /// Whom it is for.
+        /// The target of the program.
         identity: Identity,
         /// Version: major in bits 0–7, minor in bits 8–15, release in bits 16–31 (figure 13).
         version: u32,
@@ -75,10 +75,10 @@ pub enum Control {
     },
 }
 
-/// Whom a program is for.
+/// The target of a program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Identity {
-    /// Size of the program in bytes, 0 where not told.
+    /// Size of the program in bytes, 0 if unknown.
     pub app_size: u32,
     /// Vendor-ID, as in 1018h/1.
     pub vendor_id: u32,
@@ -90,7 +90,7 @@ pub struct Identity {
 pub const CONTROL_MAX: usize = 24;
 
 impl Control {
-    /// Takes the data of block 0 apart; `None` for a length that the manual does not know.
+    /// Parses the data of block 0; `None` for a length that the manual does not define.
     #[must_use]
     pub fn parse(data: &[u8]) -> Option<Self> {
         let identity =
@@ -107,7 +107,7 @@ impl Control {
         }
     }
 
-    /// Puts the data of block 0 together; gives the bytes and how many of them count.
+    /// The data of block 0; returns the bytes and the number of valid bytes.
     #[must_use]
     pub fn emit(&self) -> ([u8; CONTROL_MAX], usize) {
         let mut bytes = [0; CONTROL_MAX];
@@ -135,19 +135,19 @@ impl Control {
 pub struct Last {
     /// Size of the program in bytes, from its region's start.
     pub program_size: u32,
-    /// CRC over these bytes as they are to lie in flash, gaps read FFh.
+    /// CRC of these bytes as they will lie in flash; gaps read FFh.
     pub program_crc: u32,
 }
 
-/// Bytes of [`Last`].
+/// The size of [`Last`] in bytes.
 pub const LAST_SIZE: usize = 8;
-/// The same as the manual of 2008 has it (L-1112e_5, 5.1): 32 reserved bytes in front. The size in the
-/// block's header stays [`LAST_SIZE`].
+/// The size in the manual of 2008 (L-1112e_5, 5.1), with 32 reserved bytes at the beginning. The
+/// size in the block's header stays [`LAST_SIZE`].
 pub const LAST_SIZE_2008: usize = 32 + LAST_SIZE;
 
 impl Last {
-    /// Takes the data of the last block apart, with or without reserved bytes in front; `None` for a
-    /// wrong length.
+    /// Parses the data of the last block, with or without reserved bytes at the beginning; `None`
+    /// for a wrong length.
     #[must_use]
     pub fn parse(data: &[u8]) -> Option<Self> {
         if data.len() != LAST_SIZE && data.len() != LAST_SIZE_2008 {
@@ -158,7 +158,7 @@ impl Last {
         Some(Self { program_size, program_crc })
     }
 
-    /// Puts the data of the last block together.
+    /// The data of the last block.
     #[must_use]
     pub fn emit(&self) -> [u8; LAST_SIZE] {
         let mut bytes = [0; LAST_SIZE];
@@ -167,7 +167,7 @@ impl Last {
     }
 }
 
-/// The first `N` little-endian words; absent bytes read 0.
+/// The first `N` little-endian words; missing bytes read 0.
 fn words<const N: usize>(bytes: &[u8]) -> [u32; N] {
     let mut words = [0; N];
     for (word, chunk) in words.iter_mut().zip(bytes.chunks_exact(4)) {
@@ -182,9 +182,9 @@ fn put_words(bytes: &mut [u8], words: &[u32]) {
     }
 }
 
-/// The version of a program as control blocks and labels have it: major in bits 0-7, minor in bits
-/// 8-15, release in bits 16-31 (SYS TEC manual L-1112d_10, figure 13). `Display` writes it as the
-/// manual does: `V1.10r100`.
+/// The version of a program in control blocks and labels: major in bits 0-7, minor in bits 8-15,
+/// release in bits 16-31 (SYS TEC manual L-1112d_10, figure 13). `Display` writes it like the
+/// manual: `V1.10r100`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ProgramVersion(pub u32);
 
@@ -201,7 +201,7 @@ mod tests {
 
     use super::*;
 
-    /// The offsets of the tables of chapter 5.1, filled with telling bytes.
+    /// The offsets of the tables of chapter 5.1, filled with distinct bytes.
     #[test]
     fn fields_lie_where_the_manual_puts_them() {
         let header = [1, 0, 0, 0, 0x00, 0x00, 0x01, 0x08, 0x10, 0, 0, 0];

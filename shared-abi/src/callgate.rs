@@ -1,30 +1,28 @@
 //! The callgate: services of the bootloader that an application calls like a function.
 //!
 //! At a fixed address ([`Layout::callgate`]) lies a table with magic, ABI version, length and one
-//! entry point. The code behind it runs from flash and uses the caller's stack alone: the
-//! application owns all RAM.
-//!
-//! What it costs the caller: at most [`STACK`] bytes of stack.
+//! entry point. The code of the services runs from flash and uses only the caller's stack, because
+//! the application owns all RAM: a call needs at most [`STACK`] bytes of stack.
 
 use crate::layout::Layout;
 
-/// Tells a callgate table ("CBCG" read as little-endian bytes).
+/// Identifies a callgate table ("CBCG" read as little-endian bytes).
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBCG");
 
-/// Version of the ABI. A new selector keeps it; a changed meaning raises it.
+/// Version of the ABI. A new selector does not change it; a changed meaning increases it.
 pub const ABI_VERSION: u16 = 1;
 
-/// Bytes of the table in flash.
+/// The size of the table in flash in bytes.
 pub const TABLE_SIZE: u32 = 16;
 
-/// Bytes of the caller's stack that a call may use.
+/// The bytes of the caller's stack that a call may use.
 pub const STACK: u32 = 1024;
 
 /// The entry point: a [selector](Selector), its argument structure, and a [result code](Status).
 pub type Entry = unsafe extern "C" fn(selector: u32, args: *mut core::ffi::c_void) -> i32;
 
-/// The table in flash. `E` is the [`Entry`] in the bootloader that defines it and its 32-bit
-/// address for everyone else.
+/// The table in flash. `E` is [`Entry`] in the bootloader, which defines the table, and a 32-bit
+/// address in all other code.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Table<E = u32> {
@@ -32,7 +30,7 @@ pub struct Table<E = u32> {
     pub magic: u32,
     /// [`ABI_VERSION`].
     pub abi_version: u16,
-    /// Bytes of the table: an application finds out here whether a later field exists.
+    /// The size of the table in bytes: it shows an application whether a later field exists.
     pub length: u16,
     /// Version of the bootloader: major in the upper half, minor in the lower.
     pub bootloader_version: u32,
@@ -40,30 +38,30 @@ pub struct Table<E = u32> {
     pub entry: E,
 }
 
-/// What can be called: one service at a time, from one priority, with the flash controller left
-/// alone meanwhile. Every service that stores keeps the core from its flash for as long as that
-/// takes: some 100 us, and once in several hundred times a second, when a sector is erased.
+/// The services. Call one service at a time, from one priority, and do not use the flash
+/// controller meanwhile. A service that stores something blocks the core's access to its flash: for
+/// about 100 us, and in one of several hundred calls for a second, because a sector is erased.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Selector {
     /// CRC-32 over a range of flash; takes [`Crc32Args`].
     Crc32 = 1,
-    /// Node-ID and bit rate as they are stored; takes [`NodeArgs`].
+    /// Returns the stored node-ID and bit rate; takes [`NodeArgs`].
     ReadNode = 2,
-    /// Stores node-ID and bit rate, which are in force from the next reset on; takes [`NodeArgs`].
+    /// Stores node-ID and bit rate, which take effect at the next reset; takes [`NodeArgs`].
     StoreNode = 3,
-    /// What is known of a program; takes [`ProgramArgs`].
+    /// Returns the record of a program; takes [`ProgramArgs`].
     ProgramInfo = 4,
-    /// Gives a program its signature, as 1F51h = 83h does, and forgets its crashes: how a trial
-    /// confirms itself. Takes [`ProgramArgs`], of which only the number counts.
+    /// Releases a program for autostart, like 1F51h = 83h, and clears its crash count: a program on
+    /// trial confirms itself with this. Takes [`ProgramArgs`] and only uses the number.
     Confirm = 5,
-    /// Takes a program's signature away, as 1F51h = 84h does. Takes [`ProgramArgs`], of which only
-    /// the number counts.
+    /// Withdraws a program's release for autostart, like 1F51h = 84h. Takes [`ProgramArgs`] and
+    /// only uses the number.
     Invalidate = 6,
 }
 
 impl Selector {
-    /// The selector of this number.
+    /// The selector with this number.
     #[must_use]
     pub const fn from_number(number: u32) -> Option<Self> {
         Some(match number {
@@ -78,11 +76,11 @@ impl Selector {
     }
 }
 
-/// What a call returns.
+/// The result of a call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(i32)]
 pub enum Status {
-    /// Done; results are in the argument structure.
+    /// Successful; the results are in the argument structure.
     Ok = 0,
     /// This bootloader has no such selector.
     UnknownSelector = -1,
@@ -90,17 +88,18 @@ pub enum Status {
     BadPointer = -2,
     /// The range does not lie in flash, or is empty.
     BadRange = -3,
-    /// The flash controller is at work, or its control register is open: somebody uses it.
+    /// The flash controller is working, or its control register is unlocked: other code uses it.
     Busy = -4,
-    /// The flash did not take the value.
+    /// The flash did not accept the value.
     Failed = -5,
-    /// A node-ID, bit rate or program number that does not exist here.
+    /// The node-ID, bit rate or program number does not exist here.
     BadArgument = -6,
-    /// Nothing is installed under this number.
+    /// No program is installed under this number.
     NoProgram = -7,
-    /// Nothing can be stored before the next reset, because the flash is locked in front of a sealed
-    /// program: the same is to be asked through the warm-start cell
-    /// ([`BootRequest::Confirm`](crate::warm_start::BootRequest::Confirm) and the two behind it).
+    /// Storing is not possible before the next reset, because the flash is locked for a sealed
+    /// program. Put the same request into the warm-start cell instead
+    /// ([`BootRequest::Confirm`](crate::warm_start::BootRequest::Confirm) and the two requests
+    /// after it).
     Locked = -8,
 }
 
@@ -108,9 +107,9 @@ pub enum Status {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Crc32Args {
-    /// First byte; any alignment.
+    /// The address of the first byte; any alignment.
     pub address: u32,
-    /// Number of bytes, at least 1.
+    /// The number of bytes, at least 1.
     pub len: u32,
     /// Result: CRC-32/ISO-HDLC, the function of 1F56h.
     pub crc: u32,
@@ -120,53 +119,53 @@ pub struct Crc32Args {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct NodeArgs {
-    /// 1 to 127; 255 for a device that waits for layer setting services to give it one.
+    /// 1 to 127; 255 for a device that waits for a node-ID from layer setting services.
     pub node_id: u32,
-    /// In bit/s; 0 for a device that finds it out by listening.
+    /// The bit rate in bit/s; 0 for a device that detects it by listening.
     pub bit_rate: u32,
 }
 
-/// Arguments of the selectors about a program.
+/// Arguments of the selectors that concern a program.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ProgramArgs {
-    /// Which, 1 to 254.
+    /// The program's number, 1 to 254.
     pub number: u32,
-    /// Result: bytes from the start of its flash on.
+    /// Result: size in bytes, from the start of its flash.
     pub size: u32,
-    /// Result: CRC over them.
+    /// Result: CRC of these bytes.
     pub crc: u32,
-    /// Result: the version that its control block told, 0 for none (SYS TEC manual L-1112d_10,
-    /// figure 13).
+    /// Result: the version in its control block, 0 if unknown (SYS TEC manual L-1112d_10, figure
+    /// 13).
     pub version: u32,
     /// Result: [`PROGRAM_INSTALLED`], [`PROGRAM_SIGNED`].
     pub flags: u32,
 }
 
-/// In [`ProgramArgs::flags`]: it was downloaded completely, and its CRC was right then.
+/// In [`ProgramArgs::flags`]: the program was downloaded completely with a correct CRC.
 pub const PROGRAM_INSTALLED: u32 = 1 << 0;
-/// In [`ProgramArgs::flags`]: it carries the signature, so that it starts by itself.
+/// In [`ProgramArgs::flags`]: the program is released for autostart.
 pub const PROGRAM_SIGNED: u32 = 1 << 1;
 
 /// Why a call through the callgate failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CallgateError {
-    /// There is no callgate at the layout's address: another bootloader, or none.
+    /// There is no callgate at the layout's address: the device has another bootloader, or none.
     Absent,
-    /// The bootloader speaks another version of the ABI: this one.
+    /// The bootloader has this other version of the ABI.
     Version(u16),
-    /// The bootloader refused; its code. [`Status`] names the ones that this version knows.
+    /// The bootloader refused with this code. [`Status`] names the codes of this version.
     Refused(i32),
 }
 
-/// The callgate of the bootloader underneath, found and checked.
+/// The callgate of the device's bootloader, found and checked.
 #[derive(Clone, Copy, Debug)]
 pub struct Callgate {
     table: Table,
 }
 
 impl Callgate {
-    /// Judges a table.
+    /// Checks a table.
     ///
     /// # Errors
     /// [`CallgateError::Absent`] or [`CallgateError::Version`].
@@ -180,7 +179,7 @@ impl Callgate {
         Ok(Self { table })
     }
 
-    /// Version of the bootloader underneath.
+    /// Version of the device's bootloader.
     #[must_use]
     pub const fn bootloader_version(&self) -> u32 {
         self.table.bootloader_version
@@ -188,17 +187,17 @@ impl Callgate {
 }
 
 impl Callgate {
-    /// CRC-32/ISO-HDLC over `len` bytes of flash from `address` on.
+    /// CRC-32/ISO-HDLC of `len` bytes of flash from `address` on.
     ///
     /// # Errors
-    /// [`CallgateError::Refused`] with [`Status::BadRange`] where the range does not lie in flash.
+    /// [`CallgateError::Refused`] with [`Status::BadRange`] if the range does not lie in flash.
     pub fn crc32(&self, address: u32, len: u32) -> Result<u32, CallgateError> {
         let mut args = Crc32Args { address, len, crc: 0 };
         self.call(Selector::Crc32, (&raw mut args).cast())?;
         Ok(args.crc)
     }
 
-    /// Node-ID and bit rate as they are stored.
+    /// The stored node-ID and bit rate.
     ///
     /// # Errors
     /// [`CallgateError::Refused`] with [`Status::Busy`].
@@ -208,7 +207,7 @@ impl Callgate {
         Ok(args)
     }
 
-    /// Stores node-ID and bit rate; they are in force from the next reset on.
+    /// Stores node-ID and bit rate; they take effect at the next reset.
     ///
     /// # Errors
     /// [`CallgateError::Refused`] with [`Status::BadArgument`], [`Status::Busy`] or
@@ -217,7 +216,7 @@ impl Callgate {
         self.call(Selector::StoreNode, (&raw mut node).cast())
     }
 
-    /// What is known of a program.
+    /// The record of a program.
     ///
     /// # Errors
     /// [`CallgateError::Refused`] with [`Status::BadArgument`] or [`Status::Busy`].
@@ -227,7 +226,8 @@ impl Callgate {
         Ok(args)
     }
 
-    /// Gives a program its signature and forgets its crashes: how a trial confirms itself.
+    /// Releases a program for autostart and clears its crash count: a program on trial confirms
+    /// itself with this.
     ///
     /// # Errors
     /// [`CallgateError::Refused`] with [`Status::BadArgument`], [`Status::NoProgram`],
@@ -237,7 +237,7 @@ impl Callgate {
         self.call(Selector::Confirm, (&raw mut args).cast())
     }
 
-    /// Takes a program's signature away: it does not start by itself any more.
+    /// Withdraws a program's release: it no longer starts by itself.
     ///
     /// # Errors
     /// As for [`confirm`](Self::confirm).
@@ -249,20 +249,20 @@ impl Callgate {
 
 #[cfg(target_arch = "arm")]
 impl Callgate {
-    /// Finds the callgate of the bootloader underneath.
+    /// Finds the callgate of the device's bootloader.
     ///
     /// # Errors
     /// [`CallgateError::Absent`] or [`CallgateError::Version`].
     pub fn find(layout: &Layout) -> Result<Self, CallgateError> {
-        // SAFETY: a checked layout puts the table inside the flash, which is always readable; any
-        // bits make a `Table`.
+        // SAFETY: a checked layout puts the table inside the flash, which is always readable, and
+        // every bit pattern is a valid `Table`.
         Self::check(unsafe { (layout.callgate() as *const Table).read_volatile() })
     }
 
     fn call(&self, selector: Selector, args: *mut core::ffi::c_void) -> Result<(), CallgateError> {
-        // SAFETY: `check` found the magic and the version of a table that a bootloader of ours put
-        // there, so the word is the address of an `Entry`; every caller passes the argument
-        // structure of its selector.
+        // SAFETY: `check` found the magic and the version of a table written by this bootloader, so
+        // the word is the address of an `Entry`; every caller passes the argument structure of its
+        // selector.
         let status = unsafe {
             let entry: Entry = core::mem::transmute::<usize, Entry>(self.table.entry as usize);
             entry(selector as u32, args)
@@ -277,7 +277,7 @@ impl Callgate {
 
 #[cfg(not(target_arch = "arm"))]
 impl Callgate {
-    /// There is no bootloader underneath a host program.
+    /// A host program has no bootloader.
     ///
     /// # Errors
     /// Always [`CallgateError::Absent`].

@@ -1,18 +1,19 @@
-//! The handoff: what the bootloader tells the application about how the device came up.
+//! The handoff: a record in which the bootloader informs the application about the start of the
+//! device.
 //!
-//! Written by the bootloader right before the jump, at
-//! [`Layout::handoff`](crate::layout::Layout::handoff), in no image's RAM. An application reads it
-//! early and may read it again later.
+//! The bootloader writes it directly before the jump, at
+//! [`Layout::handoff`](crate::layout::Layout::handoff), outside the RAM of the images. An
+//! application reads it early and may read it again later.
 
 use crate::check_word;
 
-/// Tells a handoff ("CBHO" read as little-endian bytes).
+/// Identifies a handoff ("CBHO" read as little-endian bytes).
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBHO");
 
-/// The layout version of this page. Later versions only give names to reserved words, which are 0
+/// The version of this record's layout. Later versions only define reserved words, which were 0
 /// before, so a reader accepts every version from [`OLDEST`] on.
 ///
-/// | version | new in it |
+/// | version | new fields |
 /// |---|---|
 /// | 1 | |
 /// | 2 | [`Handoff::flags`] |
@@ -64,11 +65,11 @@ impl ResetCause {
 
     /// From the reset flags of `RCC_CSR` (RM0090 section 7.3.21).
     ///
-    /// Every reset also pulls NRST low, and a power-on sets the brown-out flag as well; the most
-    /// telling flag wins.
+    /// Every reset also pulls NRST low, and a power-on also sets the brown-out flag; the most
+    /// specific flag determines the result.
     #[must_use]
     pub const fn from_rcc_csr(csr: u32) -> Self {
-        /// By bit, the most telling one first.
+        /// The bits, the most specific one first.
         const FLAGS: [(u8, ResetCause); 7] = [
             (27, ResetCause::PowerOn),             // PORRSTF
             (25, ResetCause::BrownOut),            // BORRSTF
@@ -90,21 +91,22 @@ impl ResetCause {
     }
 }
 
-/// How the device came up.
+/// Information about the start of the device.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BootInfo {
-    /// Node-ID in use, 1 to 127.
+    /// The active node-ID, 1 to 127.
     pub node_id: u8,
-    /// Bit rate of the CAN bus in bit/s; 0 for a device that finds it out by listening.
+    /// Bit rate of the CAN bus in bit/s; 0 for a device that detects it by listening.
     pub bit_rate: u32,
     /// The program that was started, 1 to 254.
     pub program: u8,
     /// Why the chip left reset.
     pub reset_cause: ResetCause,
-    /// The program carries no signature yet: after the next reset the bootloader stays.
+    /// The program is not released for autostart yet: after the next reset the device stays in the
+    /// bootloader.
     pub trial: bool,
-    /// The program was started right behind its download as a raw image, Intel HEX or a sealed image:
-    /// the first 1F51h = 80h confirms it, and does not call the bootloader.
+    /// The program was started directly after its download as a raw image, Intel HEX or a sealed
+    /// image: the first 1F51h = 80h confirms it and does not call the bootloader.
     pub fresh: bool,
     /// Version of the bootloader as in 1018h/3: major in the upper half, minor in the lower.
     pub bootloader_version: u32,
@@ -112,7 +114,7 @@ pub struct BootInfo {
     pub serial_number: u32,
 }
 
-/// The handoff as it lies in RAM: 48 bytes, little-endian.
+/// The handoff in RAM: 48 bytes, little-endian.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Handoff {
@@ -120,9 +122,9 @@ pub struct Handoff {
     pub magic: u32,
     /// [`VERSION`] of the bootloader that wrote it.
     pub version: u16,
-    /// Bytes of the whole record.
+    /// Size of the whole record in bytes.
     pub length: u16,
-    /// Node-ID in use.
+    /// The active node-ID.
     pub node_id: u8,
     /// The program that was started.
     pub program: u8,
@@ -130,7 +132,7 @@ pub struct Handoff {
     pub reset_cause: u8,
     /// 1 for a trial, 0 otherwise.
     pub trial: u8,
-    /// Bit rate in bit/s, 0 for one to be found out.
+    /// Bit rate in bit/s, 0 if it must be detected.
     pub bit_rate: u32,
     /// Version of the bootloader.
     pub bootloader_version: u32,
@@ -138,14 +140,14 @@ pub struct Handoff {
     pub serial_number: u32,
     /// [`FLAG_FRESH`]; the other bits are 0. Since version 2.
     pub flags: u32,
-    /// 0; names for these words come with later versions.
+    /// 0; later versions may define these words.
     pub reserved: [u32; 4],
-    /// [`check_word`] over the eleven words before.
+    /// [`check_word`] of the eleven words before.
     pub check: u32,
 }
 
 impl Handoff {
-    /// The record that tells this.
+    /// The record with this information.
     #[must_use]
     pub const fn new(info: &BootInfo) -> Self {
         let mut words = [0; WORDS];
@@ -157,15 +159,15 @@ impl Handoff {
         words[5] = info.serial_number;
         words[6] = if info.fresh { FLAG_FRESH } else { 0 };
         words[WORDS - 1] = check_of(&words);
-        // SAFETY: both are 48 bytes, and any bits make a `Handoff`.
+        // SAFETY: both are 48 bytes, and every bit pattern is a valid `Handoff`.
         unsafe { core::mem::transmute(words) }
     }
 
-    /// What it tells, or `None` where no bootloader left a sound one (a debugger started the
-    /// application, say).
+    /// The information, or `None` if there is no valid record (for example because a debugger has
+    /// started the application).
     #[must_use]
     pub fn info(&self) -> Option<BootInfo> {
-        // SAFETY: both are 48 bytes, and any bits make words.
+        // SAFETY: both are 48 bytes, and every bit pattern is a valid array of words.
         let words = unsafe { core::mem::transmute::<Self, [u32; WORDS]>(*self) };
         let sound = is_sound(&words)
             && self.version >= OLDEST
@@ -183,25 +185,25 @@ impl Handoff {
         })
     }
 
-    /// Reads the handoff that the bootloader left.
+    /// Reads the handoff of the bootloader.
     ///
     /// # Safety
     /// `address` must be the layout's handoff region (word-aligned RAM of 48 bytes).
     #[must_use]
     pub unsafe fn read(address: *const Self) -> Option<BootInfo> {
-        // SAFETY: the caller vouches for the address; any bits make a valid `Handoff`, `info`
-        // judges them.
+        // SAFETY: the caller guarantees the address; every bit pattern is a valid `Handoff`, and
+        // `info` checks it.
         unsafe { address.read_volatile() }.info()
     }
 
-    /// The program that the handoff names, for the bootloader, which needs no more of what it has
-    /// left itself; 0 where there is no sound one.
+    /// The program number in the handoff, for the bootloader, which needs no other part of its own
+    /// record; 0 if there is no valid record.
     ///
     /// # Safety
     /// As for [`read`](Self::read).
     #[must_use]
     pub unsafe fn read_program(address: *const Self) -> u8 {
-        // SAFETY: the caller vouches for the address; nothing writes there while this reads.
+        // SAFETY: the caller guarantees the address; nothing writes there during the read.
         let words = unsafe { &*address.cast::<[u32; WORDS]>() };
         if is_sound(words) {
             words[2].to_le_bytes()[1]
@@ -210,22 +212,22 @@ impl Handoff {
         }
     }
 
-    /// Takes it away: no program was started.
+    /// Makes the record invalid: no program was started.
     ///
     /// # Safety
     /// As for [`write`](Self::write).
     pub unsafe fn erase(address: *mut Self) {
-        // SAFETY: the caller vouches for the address. Without its magic no record is sound.
+        // SAFETY: the caller guarantees the address. Without its magic a record is invalid.
         unsafe { address.cast::<u32>().write_volatile(0) };
     }
 
-    /// Leaves the handoff for the application.
+    /// Writes the handoff for the application.
     ///
     /// # Safety
     /// `address` must be the layout's handoff region (word-aligned RAM of 48 bytes that nothing
     /// else uses).
     pub unsafe fn write(self, address: *mut Self) {
-        // SAFETY: the caller vouches for the address.
+        // SAFETY: the caller guarantees the address.
         unsafe { address.write_volatile(self) };
     }
 }
@@ -233,7 +235,7 @@ impl Handoff {
 /// Words of the record.
 const WORDS: usize = size_of::<Handoff>() / 4;
 
-/// The check word of a record: over all words but the last.
+/// The check word of a record: the fold of all words but the last.
 const fn check_of(words: &[u32; WORDS]) -> u32 {
     let (rest, _) = words.split_at(WORDS - 1);
     check_word(rest)
@@ -263,8 +265,7 @@ mod tests {
         assert_eq!(Handoff::new(&INFO).info(), Some(INFO));
     }
 
-    /// A bootloader of version 1 tells nothing about it, and so does a newer one with bits that
-    /// nobody knows yet.
+    /// A bootloader of version 1 does not set this flag; a newer bootloader may set unknown bits.
     #[test]
     fn an_older_version_is_read_and_is_never_fresh() {
         let mut words = [0; WORDS];

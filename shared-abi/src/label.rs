@@ -1,35 +1,35 @@
-//! What a program image says of itself, so that the bootloader can refuse one that is for another
-//! device before it touches the one that is there: vendor-ID, product code and version at a fixed
-//! place behind the vector table.
+//! The label in a program image: vendor-ID, product code and version at a fixed place after the
+//! vector table. It lets the bootloader refuse an image for another device before it changes the
+//! installed program.
 //!
-//! A block file tells the same in its control block; this is for a raw image and Intel HEX, which
-//! have none.
+//! The control block of a block file contains the same data; the label serves raw images and Intel
+//! HEX, which have no control block.
 
 use crate::check_word;
 
-/// Tells a label, layout version 1 ("CBL1" read as little-endian bytes).
+/// Identifies a label, layout version 1 ("CBL1" read as little-endian bytes).
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBL1");
-/// Where it lies, from the start of the program: the last 32 bytes of the first 512, behind the
-/// vectors of every STM32F4.
+/// Its offset from the start of the program: the last 32 bytes of the first 512, after the vectors
+/// of every STM32F4.
 pub const OFFSET: u32 = 0x1E0;
-/// Bytes of a label.
+/// The size of a label in bytes.
 pub const SIZE: usize = 32;
 
-/// The label as it lies in flash: 32 bytes, little-endian.
+/// The label in flash: 32 bytes, little-endian.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Label {
     /// [`MAGIC`].
     pub magic: u32,
-    /// Vendor-ID of the devices that it is for (1018h/1).
+    /// Vendor-ID of the devices for which the program is (1018h/1).
     pub vendor_id: u32,
-    /// Product code of the devices that it is for (1018h/2).
+    /// Product code of the devices for which the program is (1018h/2).
     pub product_code: u32,
-    /// Version of the program, its maker's.
+    /// Version of the program, chosen by its manufacturer.
     pub version: u32,
     /// 0.
     pub reserved: [u32; 3],
-    /// [`check_word`] over the seven words before.
+    /// [`check_word`] of the seven words before.
     pub check: u32,
 }
 
@@ -41,7 +41,7 @@ impl Label {
         Self { magic: MAGIC, vendor_id, product_code, version, reserved: [0; 3], check }
     }
 
-    /// The label in these bytes; `None` where there is none, or one that is damaged.
+    /// The label in these bytes; `None` if it is missing or damaged.
     #[must_use]
     pub fn parse(bytes: &[u8; SIZE]) -> Option<Self> {
         let word = |i: usize| {

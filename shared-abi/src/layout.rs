@@ -1,8 +1,8 @@
-//! Who owns which address: the one source of truth.
+//! The memory layout: the owner of each address, and the only source of these numbers.
 //!
-//! One file per board in `layout/boards/` holds **the numbers**; linker scripts, firmware, host tool,
+//! One file for each board in `layout/boards/` holds **the numbers**; linker scripts, firmware, host tool,
 //! tests and documentation derive theirs from it. [`Layout::checked`] runs when the crate is
-//! compiled, so a layout that breaks a rule does not build, and the compiler's message names the
+//! compiled: a layout that breaks a rule does not compile, and the compiler's message contains the
 //! rule.
 
 use core::fmt;
@@ -15,19 +15,19 @@ pub mod toml;
 // The boards, from the files in `boards/` (build.rs).
 include!(concat!(env!("OUT_DIR"), "/boards.rs"));
 
-/// The board that is meant where none is named.
+/// The board for builds that name none.
 pub const DEFAULT: &Layout = &stm32f407g_disc1::LAYOUT;
 
-/// Bytes of [`Layout::key_block`].
+/// The size of [`Layout::key_block`] in bytes.
 pub const KEY_BLOCK_SIZE: u32 = 256;
 
-/// Where in the bootloader's vector table a word stands that is no vector (PM0214 section 2.3.4:
-/// reserved): [`KNOWS_SEALED_IMAGES`] in a bootloader for which a key block means something.
+/// The offset of a word in the bootloader's vector table that is not a vector (PM0214 section
+/// 2.3.4: reserved). It contains [`KNOWS_SEALED_IMAGES`] in a bootloader that uses a key block.
 pub const MARK_OFFSET: u32 = 0x1C;
 /// See [`MARK_OFFSET`].
 pub const KNOWS_SEALED_IMAGES: u32 = u32::from_le_bytes(*b"CBS1");
 
-/// The board of this name, as in `--board`.
+/// The board with this name, as in `--board`.
 #[must_use]
 pub fn by_name(board: &str) -> Option<&'static Layout> {
     BOARDS.iter().copied().find(|layout| layout.board == board)
@@ -63,26 +63,27 @@ pub struct Layout {
     pub board: &'static str,
     /// The silicon on it.
     pub chip: &'static Geometry,
-    /// The bootloader's flash. Its vector table is at the base, where the core looks after a reset.
+    /// The bootloader's flash. Its vector table is at the base, where the core reads it after a
+    /// reset.
     pub bootloader: Region,
-    /// Where the [`callgate`] table begins, from the base on: behind the vectors of the core. (Those
-    /// of interrupts are in RAM alone.)
+    /// The offset of the [`callgate`] table from the base: after the vectors of the core. (The
+    /// vectors of interrupts are only in RAM.)
     pub callgate_offset: u32,
-    /// The two homes of the non-volatile parameters, one sector or more each.
+    /// The two regions of the non-volatile parameters, at least one sector each.
     pub parameters: [Region; 2],
     /// Flash of program 1, 2, … (sub-index of 1F50h, 1F51h, 1F56h, 1F57h).
     pub programs: &'static [Region],
-    /// RAM for code and data. The bootloader and the application each have all of it.
+    /// RAM for code and data. Bootloader and application each use all of it.
     pub ram: Region,
-    /// Where the bootloader leaves the [`handoff`].
+    /// The place of the [`handoff`].
     pub handoff: Region,
     /// The [`warm_start`] cell: the last RAM cell of the chip.
     pub warm_start: Region,
 }
 
 impl Layout {
-    /// Gives the layout back if every rule holds; fails the build with the broken rule's words if
-    /// not.
+    /// Returns the layout if every rule holds; otherwise the build fails with the broken rule as
+    /// message.
     #[must_use]
     pub const fn checked(self) -> Self {
         match self.check() {
@@ -91,8 +92,8 @@ impl Layout {
         }
     }
 
-    /// Whether every rule holds; otherwise the first one that is broken, in words. No number makes it
-    /// panic: a layout may come from a file.
+    /// Checks every rule; the error is the text of the first broken rule. No number causes a panic:
+    /// a layout may come from a file.
     ///
     /// # Errors
     /// The broken rule.
@@ -222,7 +223,7 @@ impl Layout {
         Region::new(self.bootloader.end() - KEY_BLOCK_SIZE, KEY_BLOCK_SIZE)
     }
 
-    /// What the bootloader itself may fill of its flash: all but the key block.
+    /// The part of its flash that the bootloader itself may fill: everything except the key block.
     #[must_use]
     pub const fn bootloader_image(&self) -> Region {
         Region::new(self.bootloader.base, self.bootloader.size - KEY_BLOCK_SIZE)
@@ -235,14 +236,14 @@ impl Layout {
         self.programs.get(index).copied()
     }
 
-    /// The linker's view of this layout: what `build.rs` writes to `layout.x`.
+    /// The linker script of this layout, which `build.rs` writes to `layout.x`.
     #[must_use]
     pub const fn linker_script(&self, image: Image) -> LinkerScript<'_> {
         LinkerScript { layout: self, image }
     }
 }
 
-/// Which image a linker script is for.
+/// The image of a linker script.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Image {
     /// The bootloader.
@@ -251,7 +252,7 @@ pub enum Image {
     Program(u8),
 }
 
-/// Prints the `MEMORY` command and the border symbols that the templates in `linker/` refer to.
+/// Prints the `MEMORY` command and the border symbols for the templates in `linker/`.
 #[derive(Clone, Copy, Debug)]
 pub struct LinkerScript<'a> {
     layout: &'a Layout,
@@ -327,7 +328,7 @@ impl fmt::Display for Layout {
     }
 }
 
-/// An address as the manuals print it: `0800_0000`.
+/// An address in the format of the manuals: `0800_0000`.
 struct Address(u32);
 
 impl fmt::Display for Address {
@@ -336,7 +337,7 @@ impl fmt::Display for Address {
     }
 }
 
-/// Names for the printed map; a layout with more programs prints the first ones.
+/// Names in the printed map; of a layout with more programs, only the first ones are printed.
 const PROGRAM_NAMES: [&str; 4] = ["program 1", "program 2", "program 3", "program 4"];
 
 impl Layout {

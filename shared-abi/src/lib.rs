@@ -1,23 +1,24 @@
-//! What the bootloader, the application, the host tool and the emulator must agree on.
+//! The definitions on which bootloader, application, host tool and emulator must agree.
 //!
-//! | module | what it fixes |
+//! | module | definition |
 //! |---|---|
 //! | [`geometry`] | the silicon: flash sectors, RAM, number of interrupts |
 //! | [`layout`] | **the numbers** of each board: who owns which address |
-//! | [`memory_map`] | which addresses of a chip may be touched blindly |
-//! | [`warm_start`] | the last RAM cell: what the application asks of the bootloader across a reset |
-//! | [`handoff`] | what the bootloader tells the application about how it came up |
-//! | [`label`] | what a program image says of itself: whom it is for |
+//! | [`memory_map`] | the addresses of a chip that may be read without side effects |
+//! | [`warm_start`] | the last RAM cell: requests of the application to the bootloader across a
+//! reset |
+//! | [`handoff`] | information from the bootloader to the application about the start |
+//! | [`label`] | the target and version in a program image |
 //! | [`vectors`] | the proof that a vector table may be jumped to, and the jump |
 //! | [`callgate`] | the bootloader's services for the application, at a fixed address |
-//! | [`ram_image`] | the part of the bootloader that runs from RAM, as it lies in flash |
-//! | `reentry` | the way back from an application into its bootloader (on the target) |
-//! | `reset` | registers after a reset, for those who leave the chip so (on the target) |
-//! | [`block_file`] | the container that object 1F50h takes |
+//! | [`ram_image`] | the part of the bootloader that runs from RAM, in the form stored in flash |
+//! | `reentry` | the return from an application to its bootloader (on the target) |
+//! | `reset` | register values after a reset, for code that restores them (on the target) |
+//! | [`block_file`] | the format of the data for object 1F50h |
 //!
-//! Everything that crosses a border between two images is `repr(C)`, little-endian and versioned.
-//! This crate has no dependencies, so that a C or foreign application can be held against it
-//! easily.
+//! Everything that two images exchange is `repr(C)`, little-endian and versioned. This crate has no
+//! dependencies, so that an application in C or with a foreign tool chain can easily be compared
+//! with it.
 #![no_std]
 
 pub mod block_file;
@@ -35,15 +36,15 @@ pub mod reset;
 pub mod vectors;
 pub mod warm_start;
 
-/// The password of a lift device (6005h), which arms the way into the bootloader in the application
-/// and opens 1F50h in the bootloader: choose your own.
+/// The password of a lift device (6005h), which permits the call to the bootloader in the
+/// application and unlocks 1F50h in the bootloader: choose your own.
 pub const LIFT_PASSWORD: &[u8] = b"coboot";
 
-/// The check word that guards a record in RAM: a rotating fold over its other words.
+/// The check word that protects a record in RAM: a rotating fold over its other words.
 ///
-/// It tells a record from the noise of an unpowered RAM; it is no protection against an attacker
-/// who can write RAM. All-zero and all-one records never check (the seed sees to that), and the
-/// fold is simple enough to be written again in C in three lines.
+/// It distinguishes a record from the noise in RAM after power-on. It does not protect against an
+/// attacker who can write to RAM. Records of only zeros or only ones never pass (the seed ensures
+/// this), and the fold is simple enough to be implemented in three lines of C.
 #[must_use]
 pub const fn check_word(words: &[u32]) -> u32 {
     let mut fold = CHECK_SEED;
@@ -56,11 +57,11 @@ pub const fn check_word(words: &[u32]) -> u32 {
     !fold
 }
 
-/// Where the fold of [`check_word`] begins.
+/// The start value of the fold of [`check_word`].
 pub const CHECK_SEED: u32 = 0xC0B0_07A5;
-/// By how many bits it is rotated to the left before each word.
+/// The number of bits by which it is rotated left before each word.
 pub const CHECK_ROTATION: u32 = 5;
-/// What it is multiplied with after each word.
+/// The factor by which it is multiplied after each word.
 pub const CHECK_FACTOR: u32 = 0x9E37_79B1;
 
 /// The example on the crate's page compiles and runs.

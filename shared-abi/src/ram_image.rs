@@ -1,54 +1,54 @@
-//! The RAM image: the part of the bootloader that runs from RAM, as it lies in flash.
+//! The RAM image: the part of the bootloader that runs from RAM, in the form stored in flash.
 //!
-//! A [`Header`], and right behind it the stored bytes. The linker lays both down with the bytes as
-//! they are ([`Method::Raw`], without a CRC); `cargo xtask build` packs them and computes the CRC.
-//! The boot stage checks the image before it unpacks it, and tells what is wrong by a
-//! [`Damage`] in the warm-start cell.
+//! It consists of a [`Header`] and directly after it the stored bytes. The linker writes both with
+//! the bytes uncompressed ([`Method::Raw`], without a CRC); `cargo xtask build` compresses them and
+//! computes the CRC. The boot stage checks the image before it decompresses it, and reports an
+//! error by a [`Damage`] in the warm-start cell.
 
-/// Tells a RAM image, format version 1 ("CBI1" read as little-endian bytes).
+/// Identifies a RAM image, format version 1 ("CBI1" read as little-endian bytes).
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBI1");
 
-/// Version of what the resident part and the RAM part of the bootloader tell each other in RAM and
-/// by calls. A change of that raises it.
+/// Version of the interface between the resident part and the RAM part of the bootloader, in RAM
+/// and by calls. A change of the interface increases it.
 pub const SERVICES_VERSION: u32 = 3;
 
-/// Bytes of RAM behind the bootloader's variables that are left for its stack, at least. The boot
-/// stage, which unpacks the image, is at home there.
+/// The least number of bytes of RAM after the bootloader's variables that remain for its stack. The
+/// boot stage, which decompresses the image, uses this RAM, too.
 pub const LEAST_STACK: u32 = 4096;
 
-/// What stands in front of the stored bytes.
+/// The header before the stored bytes.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header {
     /// [`MAGIC`].
     pub magic: u32,
-    /// CRC-32/ISO-HDLC over the bootloader's flash in front of the header, the rest of the header
-    /// behind this word, and the stored bytes. 0 for not checked, with [`Method::Raw`] alone.
+    /// CRC-32/ISO-HDLC of the bootloader's flash before the header, the rest of the header after
+    /// this word, and the stored bytes. 0 means unchecked, only with [`Method::Raw`].
     pub crc: u32,
     /// [`SERVICES_VERSION`].
     pub services: u32,
     /// The number of a [`Method`].
     pub method: u32,
-    /// Bytes in flash behind the header.
+    /// Bytes in flash after the header.
     pub stored: u32,
-    /// Bytes in RAM, from the start of the image's RAM on.
+    /// Bytes in RAM, from the start of the image's RAM.
     pub unpacked: u32,
 }
 
-/// How the bytes are stored.
+/// The method by which the bytes are stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Method {
-    /// As they are in RAM.
+    /// Uncompressed, as in RAM.
     Raw = 0,
-    /// As a ZX0 stream, format version 2 (Einar Saukas), with three changes. Offsets count half-words.
-    /// Their lower part has eight bits, and the length behind it all of its own. A copy that comes
-    /// from in front of the output comes from the end of the bootloader's flash in front of the
-    /// header, and ends there at the latest.
+    /// As a ZX0 stream, format version 2 (Einar Saukas), with three changes. Offsets count
+    /// half-words. Their lower part has eight bits, and the length after it has all its own bits. A
+    /// copy from before the output reads from the end of the bootloader's flash before the header,
+    /// and ends there at the latest.
     ///
-    /// It unpacks to the image with absolute calls: in each pair of half-words 11110… 11111… (`BL`)
-    /// the 22 bits that are left of both are the distance in half-words, to which half the address of
-    /// the second half-word was added.
+    /// The stream decompresses to the image with absolute calls: in each pair of half-words 11110…
+    /// 11111… (`BL`), the remaining 22 bits of both are the distance in half-words plus half the
+    /// address of the second half-word.
     Zx0 = 1,
 }
 
@@ -56,18 +56,18 @@ pub enum Method {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Damage {
-    /// The header is none, or tells of an unknown method or of a size that cannot be.
+    /// The header is missing, or contains an unknown method or an impossible size.
     Header = 1,
     /// The image is for another [`SERVICES_VERSION`].
     Services = 2,
-    /// The CRC is another.
+    /// The CRC is wrong.
     Crc = 3,
-    /// The stream does not unpack to the size that the header tells.
+    /// The stream does not decompress to the size in the header.
     Stream = 4,
 }
 
 impl Damage {
-    /// The damage of this number.
+    /// The damage with this number.
     #[must_use]
     pub const fn from_number(number: u8) -> Option<Self> {
         Some(match number {
@@ -81,13 +81,13 @@ impl Damage {
 }
 
 impl Header {
-    /// Bytes of it in flash.
+    /// Its size in flash in bytes.
     pub const SIZE: u32 = size_of::<Self>() as u32;
-    /// Offset of the first byte of the header that the CRC runs over.
+    /// The offset of the first byte of the header that the CRC covers.
     pub const CRC_FROM: u32 = 8;
 
-    /// Judges a header: `flash` bytes are behind it in the bootloader's region, and `ram` bytes are
-    /// there to unpack to.
+    /// Checks a header: `flash` bytes follow it in the bootloader's region, and `ram` bytes are
+    /// available for the decompressed image.
     ///
     /// # Errors
     /// [`Damage::Header`] or [`Damage::Services`].
@@ -110,7 +110,7 @@ impl Header {
         }
     }
 
-    /// Whether the CRC has to be right.
+    /// Whether the CRC must be checked.
     #[must_use]
     pub const fn has_crc(&self) -> bool {
         self.crc != 0 || self.method != Method::Raw as u32
@@ -147,7 +147,7 @@ mod tests {
         }
     }
 
-    /// Only what the linker laid down goes without.
+    /// Only the image from the linker has no CRC.
     #[test]
     fn a_packed_image_has_a_crc() {
         assert!(SOUND.has_crc());

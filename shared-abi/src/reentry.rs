@@ -1,45 +1,45 @@
-//! The way from an application back into its bootloader, three ways.
+//! The return from an application to its bootloader, by one of three ways.
 //!
-//! | way | what it costs | what it is for |
+//! | way | cost | use |
 //! |---|---|---|
-//! | [`system_reset`] | nothing: the chip is as after any reset | the usual one |
+//! | [`system_reset`] | none: the chip is as after any reset | the usual way |
 //! | [`watchdog_reset`] | a millisecond | code that may not write the system control block |
-//! | [`jump`] | the list below | a chip whose reset would switch something off that must stay on |
+//! | [`jump`] | the list below | a device on which a reset would switch off something that must
+//! stay on |
 //!
-//! Each leaves a request in the warm-start cell. The answer to the command that asked for it has to
-//! be on the bus before: wait for the transmit mailboxes to be empty, then 10 ms (SYS TEC manual
-//! L-1112d_10, 4.5), and let nothing else be sent.
+//! Each way writes a request into the warm-start cell. The answer to the command that caused it
+//! must be on the bus before: wait until the transmit mailboxes are empty, then 10 ms (SYS TEC
+//! manual L-1112d_10, 4.5), and send nothing else meanwhile.
 
 use crate::layout::Layout;
 use crate::reset;
 use crate::warm_start::{BootRequest, Cell};
 
-/// Leaves the request where the bootloader looks for it.
+/// Writes the request to the place where the bootloader reads it.
 fn put_request(layout: &Layout, request: BootRequest) {
-    // SAFETY: the layout's warm-start region, checked to be RAM of that size that the linker
-    // scripts keep out of every image.
+    // SAFETY: this is the layout's warm-start region, checked to be RAM of the right size, which
+    // the linker scripts keep out of every image.
     unsafe { Cell::at(layout.warm_start.base as *mut _) }.put(request);
 }
 
 fn read(register: u32) -> u32 {
-    // SAFETY: every caller in this file names a register of the core or of an STM32F4 that can be
+    // SAFETY: every caller in this file passes a register of the core or of an STM32F4 that can be
     // read without side effects.
     unsafe { (register as *const u32).read_volatile() }
 }
 
 fn write(register: u32, value: u32) {
-    // SAFETY: every caller in this file names a register of the core or of an STM32F4. Interrupts
-    // are off, and nobody comes back to what was set up before.
+    // SAFETY: every caller in this file passes a register of the core or of an STM32F4. Interrupts
+    // are disabled, and the code that set up the registers does not run again.
     unsafe { (register as *mut u32).write_volatile(value) }
 }
 
 fn interrupts_off() {
-    // SAFETY: interrupts that are off harm nobody; the functions of this file do not return.
+    // SAFETY: disabled interrupts do no harm here; the functions of this file do not return.
     unsafe { core::arch::asm!("cpsid i", options(nostack)) };
 }
 
-/// Application interrupt and reset control register (ARMv7-M B3.2.6), and the key that its writes
-/// need.
+/// Application interrupt and reset control register (ARMv7-M B3.2.6), and the key for writes to it.
 const AIRCR: u32 = 0xE000_ED0C;
 const VECTKEY: u32 = 0x05FA_0000;
 
@@ -54,8 +54,8 @@ pub fn system_reset(layout: &Layout, request: BootRequest) -> ! {
     }
 }
 
-/// Lets the independent watchdog reset the chip: within a millisecond if it is not running yet,
-/// else when it runs out.
+/// Makes the independent watchdog reset the chip: within a millisecond if it is not running yet,
+/// otherwise when it runs out.
 pub fn watchdog_reset(layout: &Layout, request: BootRequest) -> ! {
     // RM0090 section 21.4.
     const KR: u32 = 0x4000_3000;
@@ -71,19 +71,19 @@ pub fn watchdog_reset(layout: &Layout, request: BootRequest) -> ! {
     }
 }
 
-/// Jumps into the bootloader, which finds the chip as after a reset:
+/// Jumps into the bootloader with the chip in the state after a reset:
 ///
-/// - interrupts are off, and none is pending; priorities, fault handlers and vector table are those
-///   of a reset;
-/// - every peripheral of the buses, DMA among them, has been reset and is without clock;
+/// - interrupts are disabled, and none is pending; priorities, fault handlers and vector table are
+///   those after a reset;
+/// - every peripheral of the buses, including DMA, was reset and has no clock;
 /// - the core runs from HSI, without wait states, caches or prefetch;
-/// - FPU and MPU are off; the stack is the bootloader's.
+/// - FPU and MPU are disabled; the stack is the bootloader's.
 ///
-/// What only a real reset can do: a running independent watchdog goes on, and the backup domain
-/// stays what it is.
+/// Only a real reset can do the rest: a running independent watchdog continues, and the backup
+/// domain is unchanged.
 ///
-/// Call it in thread mode. In a handler, whose exception would stay active, it is a
-/// [`system_reset`].
+/// Call it in thread mode. In a handler, whose exception would stay active, it does a
+/// [`system_reset`] instead.
 pub fn jump(layout: &Layout, request: BootRequest) -> ! {
     let ipsr: u32;
     // SAFETY: reads a register.
@@ -96,9 +96,9 @@ pub fn jump(layout: &Layout, request: BootRequest) -> ! {
     release_core();
     put_request(layout, request);
     let table = layout.bootloader.base;
-    // SAFETY: the layout's bootloader begins with its vector table: first stack pointer and Reset.
-    // Nothing can interrupt any more, and nobody comes back. All operands are in registers when the
-    // stack changes.
+    // SAFETY: the layout's bootloader begins with its vector table: initial stack pointer and
+    // Reset. Interrupts are disabled, and this code does not continue. All operands are in
+    // registers when the stack changes.
     unsafe {
         core::arch::asm!(
             "msr BASEPRI, {zero}",
@@ -125,8 +125,8 @@ fn release_peripherals() {
     const PLLCFGR: u32 = RCC + 0x04;
     const CFGR: u32 = RCC + 0x08;
     const CIR: u32 = RCC + 0x0C;
-    /// AHB1, AHB2, AHB3, APB1, APB2: offset of the reset register, that of the clock register
-    /// behind it, and what that is after a reset.
+    /// AHB1, AHB2, AHB3, APB1, APB2: offset of the reset register, offset of the clock register
+    /// from it, and the clock register's value after a reset.
     const BUSES: [(u32, u32, u32); 5] = [
         (0x10, 0x30, reset::RCC_AHB1ENR),
         (0x14, 0x34, 0),
@@ -140,7 +140,7 @@ fn release_peripherals() {
     const PLLRDY: u32 = 1 << 25;
     const SWS: u32 = 0b11 << 2;
 
-    // The core has to run from HSI before what it ran from is switched off.
+    // The core must run from HSI before its previous clock source is switched off.
     write(CR, read(CR) | HSION);
     while read(CR) & HSIRDY == 0 {}
     write(CFGR, 0);
@@ -154,7 +154,7 @@ fn release_peripherals() {
         write(RCC + resets, 0);
         write(RCC + clocks, after);
     }
-    // The caches forget only while they are off.
+    // The caches can only be cleared while they are disabled.
     write(FLASH_ACR, 0);
     write(FLASH_ACR, 0b11 << 11);
     write(FLASH_ACR, 0);
@@ -174,7 +174,8 @@ fn release_core() {
     const VTOR: u32 = 0xE000_ED08;
     const CPACR: u32 = 0xE000_ED88;
     const MPU_CTRL: u32 = 0xE000_ED94;
-    /// Words of the registers with a bit for each interrupt: an F4 has up to 112.
+    /// The number of register words with one bit for each interrupt: an F4 has up to 112
+    /// interrupts.
     const WORDS: u32 = 4;
 
     write(SYST_CSR, 0);
@@ -185,7 +186,7 @@ fn release_core() {
     for word in 0..8 * WORDS {
         write(NVIC_IPR + 4 * word, 0);
     }
-    // SysTick and PendSV are not pending any more.
+    // SysTick and PendSV are no longer pending.
     write(ICSR, 1 << 25 | 1 << 27);
     for register in [SHPR, SHPR + 4, SHPR + 8, SHCSR, SCR, MPU_CTRL, CPACR, VTOR] {
         write(register, 0);

@@ -1,4 +1,4 @@
-//! Vector tables: the proof that one may be jumped to, and the jump.
+//! Vector tables: the proof that a table was checked, and the jump to it.
 
 use crate::geometry::Region;
 use crate::layout::Layout;
@@ -6,7 +6,7 @@ use crate::layout::Layout;
 /// Why a vector table is refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum VectorFault {
-    /// The table's address is not aligned as VTOR demands.
+    /// The table's address is not aligned as VTOR requires.
     Misaligned,
     /// The initial stack pointer is not in RAM, or not a multiple of 8.
     StackPointer,
@@ -16,8 +16,8 @@ pub enum VectorFault {
     NotThumb,
 }
 
-/// A vector table that has passed its checks. Only [`VectorTable::check`] makes one, and only one
-/// of these can be jumped to (`VectorTable::jump`).
+/// A vector table that has passed its checks. Only [`VectorTable::check`] makes this value, and
+/// only such a table can be jumped to (`VectorTable::jump`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct VectorTable {
     address: u32,
@@ -29,7 +29,7 @@ impl VectorTable {
     /// Checks the first two words of the table at the start of `program`.
     ///
     /// # Errors
-    /// The first rule that it breaks.
+    /// The first broken rule.
     pub fn check(words: [u32; 2], program: Region, layout: &Layout) -> Result<Self, VectorFault> {
         let [initial_sp, reset] = words;
         let chip = layout.chip;
@@ -53,43 +53,43 @@ impl VectorTable {
     /// Whether a word may be the first one of a table: a pointer to the end of a stack in RAM.
     #[must_use]
     pub fn is_stack_pointer(word: u32, layout: &Layout) -> bool {
-        // A full descending stack: the pointer may stand right behind the last byte, and needs room
-        // below.
+        // A full descending stack: the pointer may point directly after the last byte, and needs
+        // room below.
         let on_stack = |ram: &Region| ram.size > 0 && word > ram.base && word <= ram.end();
         word.is_multiple_of(8) && (on_stack(&layout.ram) || on_stack(&layout.chip.ccm))
     }
 
-    /// Address of the table: what `VTOR` takes.
+    /// Address of the table, the value for `VTOR`.
     #[must_use]
     pub const fn address(&self) -> u32 {
         self.address
     }
 
-    /// First stack pointer.
+    /// The initial stack pointer.
     #[must_use]
     pub const fn initial_sp(&self) -> u32 {
         self.initial_sp
     }
 
-    /// First instruction, with the Thumb bit.
+    /// The address of the first instruction, with the Thumb bit.
     #[must_use]
     pub const fn reset(&self) -> u32 {
         self.reset
     }
 
-    /// Starts the image: FPU off and privileged thread mode on the main stack as after a reset,
-    /// `VTOR`, `MSP`, branch.
+    /// Starts the image: disables the FPU and returns to privileged thread mode on the main stack,
+    /// as after a reset; then sets `VTOR` and `MSP` and branches.
     ///
     /// # Safety
-    /// No interrupt may be enabled or pending and no bus master active: what they would do next
-    /// belongs to an image that is no more.
+    /// No interrupt may be enabled or pending, and no bus master may be active: they would act for
+    /// an image that no longer runs.
     #[cfg(target_arch = "arm")]
     pub unsafe fn jump(self) -> ! {
         const VTOR: u32 = 0xE000_ED08;
         const CPACR: u32 = 0xE000_ED88;
         // SAFETY: the addresses are those of ARMv7-M (B3.2.2); the table was checked; the caller
-        // vouches for the rest. Nothing after the write to MSP touches the stack: all operands are
-        // in registers.
+        // guarantees the rest. Nothing after the write to MSP uses the stack: all operands are in
+        // registers.
         unsafe {
             core::arch::asm!(
                 "str {table}, [{vtor}]",

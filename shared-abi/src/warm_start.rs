@@ -1,52 +1,54 @@
-//! The warm-start cell: what the application asks of the bootloader across a reset.
+//! The warm-start cell: requests of the application to the bootloader across a reset.
 //!
 //! The cell is the last RAM cell of the chip
-//! ([`Layout::warm_start`](crate::layout::Layout::warm_start)), in no image's RAM. It survives a
-//! warm reset and holds noise after a power-on; whatever it holds is treated as hostile input, and
-//! it is read once: [`Cell::take`] consumes it.
+//! ([`Layout::warm_start`](crate::layout::Layout::warm_start)), outside the RAM of the images. It
+//! survives a warm reset and holds noise after a power-on. Its contents are not trusted, and they
+//! are read once: [`Cell::take`] consumes them.
 
 use crate::check_word;
 use crate::ram_image::Damage;
 
-/// Tells a warm-start cell, layout version 1 ("CBW1" read as little-endian bytes).
+/// Identifies a warm-start cell, layout version 1 ("CBW1" read as little-endian bytes).
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBW1");
 
-/// What the next start of the bootloader is asked to do.
+/// A request for the next start of the bootloader.
 ///
 /// The discriminants are the numbers in the cell.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum BootRequest {
-    /// Stay in the bootloader, whatever program is valid (1F51h = 80h, START_BOOTLOADER).
+    /// Stay in the bootloader, even if a valid program exists (1F51h = 80h, START_BOOTLOADER).
     Stay = 1,
-    /// Start program `n` once although it may carry no signature; the next reset ends in the
-    /// bootloader.
+    /// Start program `n` once, even if it is not released for autostart; after the next reset the
+    /// device stays in the bootloader.
     Trial(u8) = 2,
-    /// Start program `n` as the autostart would.
+    /// Start program `n` like the autostart.
     Start(u8) = 3,
-    /// Stay, because the bootloader itself had a fault or a panic; it asks this of itself.
+    /// Stay, because the bootloader itself had a fault or a panic; the bootloader writes this
+    /// request itself.
     Fault = 4,
-    /// Start as after a power-on: what an NMT reset asks for. Whoever asks has not crashed.
+    /// Start as after a power-on: the request of an NMT reset. It does not count as a crash.
     PowerOn = 5,
-    /// Go on with the start of program `n`, which was held back for a rescue window; the bootloader
-    /// asks this of itself.
+    /// Continue with the start of program `n`, which was delayed for a rescue window; the
+    /// bootloader writes this request itself.
     Resume(u8) = 6,
-    /// Stay, and answer: a command was written to 1F51h of the application, which left the SDO answer
-    /// owed. The bootloader serves the request behind its boot-up as if it had just come.
+    /// Stay and answer: a command was written to 1F51h of the application, which left the SDO
+    /// answer to the bootloader. After its boot-up message the bootloader carries out the command
+    /// as if it had just arrived.
     Owed(Owed) = 7,
     /// The bootloader mode cannot run, because its part of the flash is damaged. The boot stage
-    /// leaves this for a debugger to see, and starts as after a power-on.
+    /// leaves this request for a debugger, and starts as after a power-on.
     Damaged(Damage) = 8,
-    /// Start program `n`, which has just been downloaded as a raw image, Intel HEX or a sealed image:
-    /// as a [`Trial`](Self::Trial), and the handoff tells the program that it is fresh. The
-    /// bootloader asks this of itself.
+    /// Start program `n`, which was just downloaded as a raw image, Intel HEX or a sealed image:
+    /// like a [`Trial`](Self::Trial), but the handoff marks the program as fresh. The bootloader
+    /// writes this request itself.
     Fresh(u8) = 9,
-    /// Confirm program `n`, then start it. This and the next two are what the callgate could not
-    /// store, because the flash is locked in front of a sealed program
+    /// Confirm program `n`, then start it. The callgate uses this and the next two requests when it
+    /// cannot store, because the flash is locked for a sealed program
     /// ([`Status::Locked`](crate::callgate::Status::Locked)). A bootloader without sealed images
     /// stores nothing.
     Confirm(u8) = 10,
-    /// Take the signature of program `n` away, then start as after a power-on.
+    /// Withdraw the release of program `n`, then start as after a power-on.
     Invalidate(u8) = 11,
     /// Store node parameters, then start as after a power-on.
     StoreNode(StoredNode) = 12,
@@ -58,13 +60,14 @@ pub enum BootRequest {
 pub struct StoredNode {
     /// 1 to 127; 255 for none.
     pub node_id: u8,
-    /// In units of 5 kbit/s, which all of CANopen's are multiples of; 0 for a bit rate that is found
-    /// out by listening.
+    /// In units of 5 kbit/s, a divisor of all bit rates of CANopen; 0 for a bit rate that is
+    /// detected by listening.
     pub bit_rate: u8,
 }
 
 impl StoredNode {
-    /// Node-ID, and bit rate in bit/s, up to 1 275 000; what is in between is rounded down.
+    /// From a node-ID and a bit rate in bit/s, up to 1 275 000; the bit rate is rounded down to a
+    /// multiple of 5 kbit/s.
     #[must_use]
     pub const fn new(node_id: u8, bit_rate: u32) -> Self {
         Self { node_id, bit_rate: (bit_rate / 5000) as u8 }
@@ -77,16 +80,15 @@ impl StoredNode {
     }
 }
 
-/// A write of 1F51h whose SDO answer is owed.
+/// A write to 1F51h with an SDO answer that the bootloader must send.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(C)]
 pub struct Owed {
     /// The sub-index, 1 to 254.
     pub program: u8,
-    /// What was written: 0 STOP or 3 CLEAR.
+    /// The written value: 0 STOP or 3 CLEAR.
     pub value: u8,
-    /// The node that was asked, 1 to 127. A bootloader that comes up with another node-ID does not
-    /// answer in its place.
+    /// The addressed node, 1 to 127. A bootloader with another node-ID does not send the answer.
     pub node_id: u8,
 }
 
@@ -95,7 +97,7 @@ impl Owed {
     pub const NOTHING: Self = Self { program: 0, value: 0, node_id: 0 };
 }
 
-/// The cell as it lies in RAM: 16 bytes, little-endian.
+/// The cell in RAM: 16 bytes, little-endian.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct WarmStart {
@@ -104,20 +106,20 @@ pub struct WarmStart {
     /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume, 7 owed, 8 damaged,
     /// 9 fresh, 10 confirm, 11 invalidate, 12 store node parameters.
     pub request: u32,
-    /// The program number (1 to 254) of a trial, start, resume or fresh start, and of what is
-    /// confirmed or invalidated; the number of a [`Damage`]; of an owed answer the program number in
-    /// bits 0 to 7, the value in bits 8 to 15 and the node-ID in bits 16 to 22; of node parameters the
-    /// node-ID in bits 0 to 7 and the bit rate in bits 8 to 15; 0 otherwise.
+    /// The program number (1 to 254) for a trial, start, resume, fresh start, confirm or invalidate
+    /// request; the number of a [`Damage`]; for an owed answer, the program number in bits 0 to 7,
+    /// the value in bits 8 to 15 and the node-ID in bits 16 to 22; for node parameters, the node-ID
+    /// in bits 0 to 7 and the bit rate in bits 8 to 15; otherwise 0.
     pub argument: u32,
-    /// [`check_word`] over the three words before.
+    /// [`check_word`] of the three words before.
     pub check: u32,
 }
 
 impl WarmStart {
-    /// A cell that asks for nothing.
+    /// A cell without a request.
     pub const EMPTY: Self = Self { magic: 0, request: 0, argument: 0, check: 0 };
 
-    /// The cell that carries this request.
+    /// The cell with this request.
     #[must_use]
     pub const fn new(request: BootRequest) -> Self {
         let (request, argument) = match request {
@@ -141,15 +143,15 @@ impl WarmStart {
         Self::encode(request, argument)
     }
 
-    /// The cell with these words, whatever they ask for.
+    /// The cell with these words, valid or not.
     #[must_use]
     pub const fn encode(request: u32, argument: u32) -> Self {
         let check = check_word(&[MAGIC, request, argument]);
         Self { magic: MAGIC, request, argument, check }
     }
 
-    /// The request in it, or `None` for noise, another version, a wrong check word, an unknown
-    /// request or an argument out of its range.
+    /// The request in the cell, or `None` for noise, another version, a wrong check word, an
+    /// unknown request or an argument out of range.
     #[must_use]
     pub fn request(&self) -> Option<BootRequest> {
         if *self != Self::encode(self.request, self.argument) {
@@ -191,24 +193,25 @@ impl Cell {
         Self(address)
     }
 
-    /// Reads the request and empties the cell, so that no later reset finds it again.
+    /// Reads the request and empties the cell, so that no later reset reads it again.
     #[inline(never)]
     pub fn take(&mut self) -> Option<BootRequest> {
-        // SAFETY: `at` vouches for the address; volatile, because another image wrote the cell.
+        // SAFETY: the caller of `at` guarantees the address; volatile, because another image wrote
+        // the cell.
         let found = unsafe { self.0.read_volatile() };
         self.write(WarmStart::EMPTY);
         found.request()
     }
 
-    /// Leaves a request for the bootloader. The write is complete when this returns; reset may
+    /// Writes a request for the bootloader. The write is complete when this returns, so a reset may
     /// follow at once.
     pub fn put(&mut self, request: BootRequest) {
         self.write(WarmStart::new(request));
     }
 
     fn write(&mut self, value: WarmStart) {
-        // SAFETY: `at` vouches for the address; volatile, because only another image reads the
-        // cell.
+        // SAFETY: the caller of `at` guarantees the address; volatile, because only another image
+        // reads the cell.
         unsafe { self.0.write_volatile(value) };
         #[cfg(target_arch = "arm")]
         // SAFETY: `dsb` has no operands; it waits until the store above has reached the RAM.
@@ -244,7 +247,7 @@ mod tests {
         ];
         for request in requests {
             let mut ram = WarmStart::EMPTY;
-            // SAFETY: `ram` is ours and outlives the cell.
+            // SAFETY: `ram` belongs to this test and outlives the cell.
             let mut cell = unsafe { Cell::at(&raw mut ram) };
             cell.put(request);
             assert_eq!(cell.take(), Some(request));

@@ -1,7 +1,7 @@
-//! Every rule of the layout: a layout that breaks it is refused, with a message that names it.
+//! Every rule of the layout: a layout that breaks it is refused with a message that names the rule.
 //!
-//! `checked` is a `const fn` that the board files call in a constant, so what panics here does not
-//! compile there.
+//! `checked` is a `const fn` that the board files call in a constant, so a panic here is a compile
+//! error there.
 
 use std::panic::catch_unwind;
 
@@ -18,7 +18,7 @@ fn broken(change: impl FnOnce(&mut Layout)) -> String {
         .map_or_else(|| panic.downcast_ref::<String>().cloned().unwrap_or_default(), |s| (*s).to_owned())
 }
 
-/// A layout file lives as long as the program; so do the regions made up here.
+/// A layout file lives as long as the program, and so do the regions made here.
 fn programs(regions: &[(u32, u32)]) -> &'static [Region] {
     regions.iter().map(|&(base, size)| Region::new(base, size)).collect::<Vec<_>>().leak()
 }
@@ -74,7 +74,7 @@ fn each_broken_rule_is_named() {
     }
 }
 
-/// What the check is for: the same values, each with one mistake.
+/// The purpose of the check: the same values with one mistake each.
 #[test]
 fn a_geometry_that_no_chip_has_is_refused() {
     let wrong: [(&str, Geometry); 6] = [

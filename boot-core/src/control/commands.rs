@@ -1,5 +1,5 @@
-//! 1F51h: what its commands do, and when they are refused. Passwords stand beside them: they give
-//! the right to a download, and one of them takes the place of CLEAR.
+//! 1F51h: the effects of its commands, and the reasons to refuse them. Passwords are here, too:
+//! they permit a download, and one of them replaces CLEAR.
 
 use canopen::program::{FlashError, ProgramControl};
 use canopen::AbortCode;
@@ -14,21 +14,21 @@ use crate::session::Session;
 use crate::store::{Parameters, ProgramRecord};
 
 impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
-    /// 1F51h: a command. It is judged and acknowledged now and carried out by
-    /// [`step`](Self::step).
+    /// 1F51h: a command. It is checked and acknowledged now, and [`step`](Self::step) carries it
+    /// out.
     ///
     /// # Errors
-    /// The abort that answers it.
+    /// The abort for the client.
     pub fn command(&mut self, program: u8, command: ProgramControl) -> Result<(), AbortCode> {
         use ProgramControl::{Clear, ClrSignature, ResetStat, SetSignature, Start, StartBootloader, Stop};
 
         let state = find(&mut self.programs, program).ok_or(AbortCode::NO_SUB_INDEX)?;
         if matches!(command, Stop | StartBootloader) {
-            // No program runs, and the bootloader does: both are so already.
+            // No program runs, but the bootloader: the requested state already exists.
             return Ok(());
         }
-        // Who sends a program in one go means by 2 what CiA 302-3 says: reset the program, which
-        // starts it.
+        // A host that sends a program in one transfer uses 2 as in CiA 302-3: reset the program,
+        // which starts it.
         let command = match command {
             ResetStat if state.streamed || self.policy.reset_starts => Start,
             command => command,
@@ -40,11 +40,11 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             state.start_when_verified = true;
             return Ok(());
         }
-        // A new beginning does not wait for the end of the old one.
+        // A new download does not wait for the end of the old one.
         let own = self.programmer.program().is_none_or(|of| of == program);
         let restarts = command == Clear && own && self.programmer.is_abortable();
         let busy = match command {
-            // Nor while a sealed image comes: the record is its business then.
+            // Also not during the download of a sealed image, which changes the record itself.
             SetSignature | ClrSignature => {
                 self.programmer.is_busy() || self.programmer.unsealer().is_active()
             }
@@ -76,9 +76,10 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             (Clear, _) => {
                 let region = state.region;
                 let again = matches!(state.session, Session::Cleared { just: true });
-                // Before the transfer is broken off, which fails a session that is open.
+                // Before the transfer is aborted, because the abort marks an open session as
+                // failed.
                 state.session = Session::Cleared { just: true };
-                // A sector that is still being erased for the old download is waited for.
+                // The erase of a sector for the old download must end first.
                 let at_once = (again || (self.policy.erase)(program) == Erase::AtOnce) && !busy;
                 self.download_cancel();
                 self.programmer.abort();
@@ -89,8 +90,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             (Start, Some(_)) if fresh => self.boot_request = Some(BootRequest::Fresh(program)),
             (Start, Some(record)) => self.boot_request = Some(start_request(program, record.signed)),
             (SetSignature | ClrSignature, Some(record)) => {
-                // Also where it is so already: after a power cut it may read so now and otherwise
-                // later.
+                // Write the record even if it already has this value: after a power cut it may read
+                // this way now and differently later.
                 let signed = command == SetSignature;
                 let record = ProgramRecord { signed, ..record };
                 self.programmer.record(&mut self.parameters, program, record, false);
@@ -101,11 +102,10 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         Ok(())
     }
 
-    /// The program has brought the device back to the bootloader, so it can do that: it needs no
-    /// rescue window any more.
+    /// The program has returned the device to the bootloader: it no longer needs a rescue window.
     pub fn confirm(&mut self, program: u8) {
-        // Not by `program`: this is called before the bootloader is at its place, and what is called
-        // there alone is shorter by that.
+        // Does not use `program()`: this function runs before the bootloader is at its final
+        // address, and functions that are only called from there are shorter without it.
         let state = self.programs.get(usize::from(program).wrapping_sub(1));
         let Some(record) = state.and_then(|state| state.record) else { return };
         if !record.confirmed && !self.busy() {
@@ -114,12 +114,13 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
     }
 
-    /// A password came: 1F50h takes data from now on, and CLEAR is as good as given. `at_once`: the
-    /// old program is void now, and not only when there is another one. What was being downloaded
-    /// before, of this program or another one, is broken off.
+    /// A correct password arrived: from now on 1F50h accepts data, as after CLEAR. With `at_once`,
+    /// the old program becomes invalid now; otherwise only when a new one replaces it. A previous
+    /// download, of this program or another one, is aborted.
+    ///
     ///
     /// # Errors
-    /// If other work goes on.
+    /// The device is busy with other work.
     pub fn unlock(&mut self, program: u8, at_once: bool) -> Result<(), AbortCode> {
         let Some(state) = find(&mut self.programs, program) else { return Err(AbortCode::NO_SUB_INDEX) };
         if self.boot_request.is_some() || !self.programmer.is_abortable() {
@@ -133,7 +134,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             state.streamed = false;
             state.session = Session::Cleared { just: false };
         }
-        // A password crosses the bus as it is: in a sealed device it costs no program.
+        // A password crosses the bus in plain text: in a sealed device it must not make a program
+        // invalid.
         #[cfg(feature = "sealed")]
         let at_once = at_once && self.programmer.unsealer().permits(right::ERASE);
         if at_once {
@@ -143,7 +145,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     }
 }
 
-/// The request that starts a program; unsigned, on trial.
+/// The request that starts a program; a program without the release is started on trial.
 fn start_request(program: u8, signed: bool) -> BootRequest {
     if signed {
         BootRequest::Start(program)

@@ -1,14 +1,14 @@
-//! Program download: 1F50h takes the data, 1F51h the commands, 1F57h tells what became of them.
+//! Program download: 1F50h takes the data, 1F51h the commands, and 1F57h shows the result.
 //!
-//! Here stand the rules that tie the rooms together. The `intake` judges what comes
-//! in: it is refused at once, with an abort and a status, or accepted. The
-//! `programmer` carries through what was accepted ([`Downloader::step`]). The two
-//! never wait for each other; between them lies a queue. While it has room for another block the
-//! status is not busy, although the flash works: a host that looks at the status between blocks
-//! sends the next one while those before are being programmed.
+//! This module connects the other modules. The `intake` checks incoming data: it refuses them at
+//! once, with an abort and a status, or accepts them. The `programmer` carries out the accepted
+//! work ([`Downloader::step`]). The two never wait for each other; a queue lies between them. While
+//! the queue has room for another block, the status is not busy, even if the flash works: a host
+//! that reads the status between blocks sends the next block while the previous ones are being
+//! programmed.
 //!
-//! Nothing of an installed program is lost before the first data of another one were judged good:
-//! CLEAR is carried out with it (SYS TEC manual L-1112d_10, figure 12), see
+//! An installed program is lost only after the first data of a new one were found good: the device
+//! carries out CLEAR together with these data (SYS TEC manual L-1112d_10, figure 12), see
 //! [`Erase`].
 
 mod commands;
@@ -37,29 +37,29 @@ use crate::unseal::Unsealer;
 pub use crate::policy::{Erase, Policy, Verdict};
 pub use crate::programmer::Step;
 
-/// One program as the objects 1F50h–1F57h show it.
+/// One program in the form of the objects 1F50h–1F57h.
 #[derive(Clone, Copy, Debug)]
 struct Program {
     /// Its flash.
     region: Region,
-    /// What the store holds; kept here because the flash cannot be read while it is busy.
+    /// The stored record; a copy, because the flash cannot be read while it is busy.
     record: Option<ProgramRecord>,
     /// 1F56h: the CRC that was computed last, or the stored one.
     identification: u32,
-    /// How the last block or command ended.
+    /// The result of the last block or command.
     error: Option<FlashError>,
     session: Session,
-    /// The version that the last control block told.
+    /// The version in the last control block.
     version: u32,
-    /// A raw image or Intel HEX came last, completely, and no command since.
+    /// The last complete transfer was a raw image or Intel HEX, and no command followed.
     streamed: bool,
-    /// It is to start when it is verified: its host did not wait for that.
+    /// The program must start after its verification, because its host did not wait for that.
     start_when_verified: bool,
-    /// A password is missing.
+    /// The client has not sent the password.
     locked: bool,
 }
 
-/// The SDO transfer to 1F50h that is open.
+/// The open SDO transfer to 1F50h.
 struct Transfer {
     program: u8,
     intake: Intake,
@@ -73,19 +73,19 @@ pub struct Downloader<'b, P, const PROGRAMS: usize> {
     programs: [Program; PROGRAMS],
     programmer: Programmer<'b>,
     transfer: Option<Transfer>,
-    /// The abort for a client that goes on sending when the flash has failed.
+    /// The abort for a client that continues to send after the flash has failed.
     fault: AbortCode,
-    /// A request that waits for the device to leave the bootloader.
+    /// A request to leave the bootloader, not yet carried out.
     boot_request: Option<BootRequest>,
-    /// How a piece of work on a program ended, or a block that was damaged; to be reported.
+    /// The result of work on a program, or of a damaged block, not yet reported.
     outcome: Option<(u8, Result<(), FlashError>)>,
-    /// How the last storing of node-ID and bit rate ended.
+    /// The result of the last storing of node-ID and bit rate.
     node_stored: Result<(), FlashError>,
 }
 
 impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
-    /// Starts from what the parameters tell. The larger `buffer`, the further the flash may lag
-    /// behind the bus; blocks larger than it, or than 16 KiB, are refused.
+    /// Starts with the stored parameters. The larger the `buffer`, the further the flash may lag
+    /// behind the bus; blocks larger than the buffer, or than 16 KiB, are refused.
     pub fn new<F: Flash>(
         layout: &'static Layout,
         policy: &'static Policy,
@@ -125,12 +125,12 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         }
     }
 
-    /// Ends here, whatever is being done; gives the buffer back.
+    /// Ends all work at once, and returns the buffer.
     pub fn into_buffer(self) -> &'b mut [u8] {
         self.programmer.into_buffer()
     }
 
-    /// What there is of sealed images.
+    /// The state of sealed images.
     #[cfg(feature = "sealed")]
     pub(crate) fn unsealer_mut(&mut self) -> &mut Unsealer<'b> {
         self.programmer.unsealer_mut()
@@ -142,15 +142,15 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         self.program(program).is_some()
     }
 
-    /// 1F57h. Busy while a command of this program is carried out, or while no further block can be
-    /// taken.
+    /// 1F57h. It is busy while a command of this program is carried out, or while no further block
+    /// can be accepted.
     #[must_use]
     pub fn status(&self, program: u8) -> FlashStatus {
         let error = self.program(program).and_then(|state| state.error);
         FlashStatus { busy: self.programmer.is_busy_with(program), error, detail: 0 }
     }
 
-    /// 1F51h: no program runs, whether or not there is one.
+    /// 1F51h: no program runs. The value shows whether a program exists.
     #[must_use]
     pub fn control(&self, program: u8) -> ProgramState {
         match self.program(program).and_then(|state| state.record) {
@@ -159,13 +159,13 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         }
     }
 
-    /// 1F56h: the CRC over the program, 0 where there is none.
+    /// 1F56h: the CRC of the program, 0 if there is none.
     #[must_use]
     pub fn identification(&self, program: u8) -> u32 {
         self.program(program).map_or(0, |state| state.identification)
     }
 
-    /// 2005h: the version that the program in flash came with, 0 for none.
+    /// 2005h: the version of the program in flash, 0 if unknown.
     #[must_use]
     pub fn version(&self, program: u8) -> u32 {
         self.program(program).and_then(|state| state.record).map_or(0, |record| record.version)
@@ -177,25 +177,25 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         self.program(program).map_or([0; 8], |state| region_value(state.region.base, state.region.size))
     }
 
-    /// Whether there is work for [`Downloader::step`].
+    /// Whether [`Downloader::step`] has work to do.
     #[must_use]
     pub fn busy(&self) -> bool {
         self.programmer.is_busy()
     }
 
-    /// The request to leave the bootloader, once: the answer to the command may still be on its
-    /// way.
+    /// Returns the request to leave the bootloader, once; the answer to the command may not have
+    /// been sent yet.
     pub fn take_boot_request(&mut self) -> Option<BootRequest> {
         self.boot_request.take()
     }
 
-    /// How a piece of work on a program ended, or a block that was damaged, once.
+    /// Returns the result of work on a program, or of a damaged block, once.
     pub fn take_outcome(&mut self) -> Option<(u8, Result<(), FlashError>)> {
         self.outcome.take()
     }
 
-    /// Whether a program was sent completely, or a command acknowledged, and it is not carried
-    /// through yet: a reset now would take that back.
+    /// Whether a complete program or an acknowledged command is not yet carried out: a reset now
+    /// would undo it.
     #[must_use]
     #[inline(never)]
     pub fn is_finishing(&self) -> bool {
@@ -205,7 +205,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// Stores node-ID and bit rate in the background.
     ///
     /// # Errors
-    /// If other work goes on.
+    /// The device is busy with other work.
     pub fn store_node(&mut self, node: NodeParameters) -> Result<(), FlashError> {
         if self.busy() || self.boot_request.is_some() {
             return Err(FlashError::Busy);
@@ -214,7 +214,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         Ok(())
     }
 
-    /// How the last [`store_node`](Self::store_node) ended.
+    /// The result of the last [`store_node`](Self::store_node).
     pub fn node_stored(&self) -> Poll<Result<(), FlashError>> {
         if self.programmer.is_storing_node() {
             Poll::Pending
@@ -223,10 +223,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         }
     }
 
-    /// 1F50h is about to be read back: gives the place of what is stored.
+    /// Prepares to read 1F50h; returns the region of the stored program.
     ///
     /// # Errors
-    /// The abort that answers it.
+    /// The abort for the client.
     pub fn stored(&self, program: u8) -> Result<Region, AbortCode> {
         let state = self.program(program).ok_or(AbortCode::NO_SUB_INDEX)?;
         if !self.policy.read_back {
@@ -236,7 +236,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         if !self.programmer.unsealer().permits(right::READ_BACK) {
             return Err(AbortCode::DEVICE_STATE);
         }
-        // While it works the flash cannot be read.
+        // The flash cannot be read while it works.
         if state.locked || self.busy() {
             return Err(AbortCode::DEVICE_STATE);
         }
@@ -246,7 +246,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         }
     }
 
-    /// Where a program is stored, and its CRC; no bytes for none.
+    /// The region of the stored program, and its CRC; an empty region if there is none.
     pub(crate) fn installed(&self, program: u8) -> (Region, u32) {
         match self.program(program) {
             Some(Program { region, record: Some(record), .. }) => {
@@ -256,7 +256,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         }
     }
 
-    /// Carries the work on.
+    /// Continues the work with one step.
     pub fn step<F: Flash>(&mut self, flash: &mut F) -> Step {
         let (step, event) = self.programmer.step(&mut self.parameters, flash);
         match event {
@@ -309,7 +309,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             Some(Event::Failed { program, error, erasing }) => {
                 self.fault = match error {
                     _ if erasing => AbortCode::GENERAL,
-                    // What a sealed image is refused for.
+                    // The errors for which a sealed image is refused.
                     #[cfg(feature = "sealed")]
                     error if !matches!(error, FlashError::Write | FlashError::NvData) => AbortCode::STORE,
                     _ => AbortCode::HARDWARE,
@@ -320,7 +320,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         step
     }
 
-    /// What is in flash, against what it should be; gives its version.
+    /// Compares the flash with the expected program; returns the program's version.
     fn check_stored<F: Flash>(
         &self,
         flash: &F,
@@ -338,7 +338,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             return Err(FlashError::NoValidProgram);
         }
         let mut label = [0; label::SIZE];
-        // Behind the program's end is nothing of it.
+        // The label must lie inside the program.
         if expected.size >= label::OFFSET + label::SIZE as u32 {
             flash.read(region.base + label::OFFSET, &mut label);
         }
@@ -352,13 +352,14 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             #[cfg(feature = "sealed")]
             sealed_only: false,
         };
-        // A control block's version comes first. (In one expression: it is 190 bytes shorter.)
+        // The version of a control block takes precedence. (As one expression this is 190 bytes
+        // shorter.)
         let told = state.version;
         let checked = judge.check_label(&label).map(|version| if told == 0 { version } else { told });
         checked.map_err(|Refusal(error, _)| error)
     }
 
-    /// A piece of work on a program is over.
+    /// Ends a piece of work on a program.
     fn end(&mut self, program: u8, outcome: Result<(), FlashError>) {
         let current = self.transfer.as_ref().is_some_and(|transfer| transfer.program == program);
         if outcome.is_err() && current {
@@ -379,12 +380,12 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         }
     }
 
-    /// Whether the queue takes another transfer.
+    /// Whether the queue has room for another transfer.
     fn has_room(&self) -> bool {
         self.programmer.has_room()
     }
 
-    /// A program, if there is one of this number.
+    /// The program with this number, if it exists.
     fn program(&self, program: u8) -> Option<&Program> {
         if PROGRAMS == 1 {
             self.programs.first().filter(|_| program == 1)
@@ -394,7 +395,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     }
 }
 
-/// The record of a program, where the device may start it.
+/// The record of a program, if the device may start it.
 fn load<F: Flash>(
     parameters: &impl Parameters,
     flash: &F,
@@ -405,9 +406,10 @@ fn load<F: Flash>(
     (record.is_sealed() || !unsealer.takes_no_other()).then_some(record)
 }
 
-/// A program, if there is one of this number.
+/// The program with this number, if it exists.
 fn find<const PROGRAMS: usize>(programs: &mut [Program; PROGRAMS], number: u8) -> Option<&mut Program> {
-    // To look at one is shorter than a call; to compute the place of one of many is not.
+    // For one program the comparison is shorter than a call; for several, the computation of its
+    // place is not.
     if PROGRAMS == 1 {
         programs.first_mut().filter(|_| number == 1)
     } else {
@@ -426,7 +428,7 @@ fn find_of_many(programs: &mut [Program], number: u8) -> Option<&mut Program> {
 }
 
 impl Program {
-    /// Shows why something was refused. The error that ended a session stays to be seen.
+    /// Records the reason of a refusal. The error that ended a session stays visible.
     fn refuse(&mut self, Refusal(error, abort): Refusal) -> AbortCode {
         if !matches!(self.session, Session::Failed) || self.error.is_none() {
             self.error = Some(error);

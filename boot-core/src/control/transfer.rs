@@ -1,4 +1,4 @@
-//! 1F50h: an SDO transfer goes to the intake, and what it leads to is carried out.
+//! 1F50h: passes an SDO transfer to the intake, and carries out the results.
 
 use canopen::program::FlashError;
 use canopen::AbortCode;
@@ -11,10 +11,10 @@ use crate::session::Session;
 use crate::store::Parameters;
 
 impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
-    /// 1F50h: the client announces a transfer, and its size if it knows it.
+    /// 1F50h: the client starts a transfer, with its size if it is known.
     ///
     /// # Errors
-    /// The abort that answers it.
+    /// The abort for the client.
     pub fn download_start(&mut self, program: u8, size: Option<u32>) -> Result<(), AbortCode> {
         self.download_cancel();
         let room = self.has_room();
@@ -23,8 +23,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             && matches!(state.session, Session::Open { .. })
             && self.programmer.program() != Some(program)
         {
-            // The programmer knows how far the flash is of one program at a time. The download of
-            // another one that began meanwhile has ended this one.
+            // The programmer tracks the flash of one program at a time. The download of another
+            // program, which began meanwhile, has ended this one.
             state.session = Session::Failed;
         }
         let others = self.programmer.is_busy() && self.programmer.program().is_some_and(|of| of != program);
@@ -40,8 +40,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         if let Some(refusal) = refusal {
             return Err(state.refuse(refusal));
         }
-        // A second CLEAR erases all, but not behind a block: it may come from a host that tries the
-        // same wrong file again.
+        // A second CLEAR erases everything, but not after a block: then it may come from a host
+        // that repeats the same wrong file.
         if let Session::Cleared { just } = &mut state.session {
             *just = false;
         }
@@ -50,8 +50,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         Ok(())
     }
 
-    /// Bytes that [`download_data`](Self::download_data) takes at present. `held` for a client whose
-    /// answer is already being held back, which may use a reserve.
+    /// The number of bytes that [`download_data`](Self::download_data) accepts at present. With
+    /// `held`, the answer to the client is already delayed, and the client may use a reserve.
     #[must_use]
     #[inline(never)]
     pub fn space(&self, held: bool) -> usize {
@@ -67,10 +67,10 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         self.take(Some(data)).map(drop)
     }
 
-    /// 1F50h: the transfer is complete. Judges it in full and leaves the work behind.
+    /// 1F50h: the transfer is complete. Checks it completely and leaves the flash work for later.
     ///
     /// # Errors
-    /// The abort that answers instead of the last acknowledgement.
+    /// The abort in place of the last acknowledgement.
     pub fn download_end(&mut self) -> Result<(), AbortCode> {
         let program = self.take(None)?;
         self.transfer = None;
@@ -80,8 +80,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         Ok(())
     }
 
-    /// 1F50h: the transfer ended before its end. A block may be sent again; of a stream half a
-    /// program is left, if any.
+    /// 1F50h: the transfer was aborted. A block may be sent again; an aborted stream may leave an
+    /// incomplete program.
     pub fn download_cancel(&mut self) {
         let Some(Transfer { program, intake }) = self.transfer.take() else { return };
         self.programmer.queue_mut().discard();
@@ -93,8 +93,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
     }
 
-    /// Hands the next bytes to the format of the open transfer, or the end (`None`), and carries out
-    /// what it leads to; gives the program that it is about.
+    /// Passes the next bytes, or the end (`None`), to the format of the open transfer, and carries
+    /// out the results; returns the program's number.
     fn take(&mut self, data: Option<&[u8]>) -> Result<u8, AbortCode> {
         let Some(Transfer { program, intake }) = &mut self.transfer else { return Err(self.fault) };
         let program = *program;
@@ -124,7 +124,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             }
             Err(refusal) => {
                 if progress.begins.is_some() && !matches!(judge.session, Session::Open { .. }) {
-                    // Its pieces are of a download that does not begin.
+                    // Its pieces belong to a download that does not start.
                     self.programmer.queue_mut().clear();
                 }
                 if refusal.0 == FlashError::Crc || streaming {
@@ -137,12 +137,12 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
     }
 
-    /// What accepted bytes lead to.
+    /// Carries out the results of accepted bytes.
     fn proceed(&mut self, program: u8, is_stream: bool, progress: Progress) {
         let Some(state) = find(&mut self.programs, program) else { return };
         if let Some(begin) = progress.begins {
             state.version = begin.version;
-            // A sequence of blocks that begins anew goes on over what is there.
+            // A sequence of blocks that begins again continues over the existing pieces.
             if !matches!(state.session, Session::Open { .. }) {
                 self.programmer.open(program, state.region, state.session.erases(self.policy), begin.size);
                 #[cfg(feature = "sealed")]

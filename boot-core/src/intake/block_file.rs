@@ -1,9 +1,9 @@
 //! The block file: each SDO transfer is one block (SYS TEC manual L-1112d_10, chapter 5.1;
 //! `shared_abi::block_file`).
 //!
-//! A block is judged three times: by its length where the client tells it, by its header as soon as
-//! that is there, and as a whole by its CRC. The one with the program's start is judged by what it
-//! holds, too: nothing of the old program is lost before it is good.
+//! A block is checked three times: its length when the client announces it, its header when it has
+//! arrived, and the whole block by its CRC. The block with the start of the program is also checked
+//! by its contents: nothing of the old program is lost before this block is good.
 
 use canopen::program::FlashError;
 use canopen::AbortCode;
@@ -24,19 +24,19 @@ use crate::session::Session;
 
 const TOO_LONG: Refusal = Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH);
 
-/// One block, as far as it came.
+/// One block, as far as it has arrived.
 pub(super) struct BlockFile {
-    /// Bytes that came.
+    /// The number of bytes that have arrived.
     len: usize,
-    /// Known when its bytes are there; zeros before.
+    /// The header; zeros until it has arrived.
     header: Header,
     /// The first bytes: the header, and all data of the first and of the last block.
     start: [u8; HEADER_SIZE + LAST_SIZE_2008],
-    /// Bytes that the client announced.
+    /// The number of bytes that the client announced.
     announced: Option<u32>,
-    /// The last four bytes behind the data: the CRC as the block tells it.
+    /// The last four bytes after the data: the CRC in the block.
     told: u32,
-    /// Over what came of header and data.
+    /// The CRC of header and data that have arrived.
     crc: u32,
 }
 
@@ -49,7 +49,7 @@ impl Format for BlockFile {
         }
         let Some(word) = first.first_chunk() else { return Recognition::More };
         let number = u32::from_le_bytes(*word);
-        // Blocks are counted, and no flash holds as many as that.
+        // No flash holds that many blocks.
         if number > 0xFFFF && number != NUMBER_LAST {
             return Recognition::No;
         }
@@ -108,7 +108,7 @@ impl Format for BlockFile {
             }
             #[cfg(feature = "sealed")]
             NUMBER_LAST if to.judge.sealed_only => {
-                // What the program has to be stands in its manifest.
+                // The manifest of the sealed image describes the program.
                 to.progress.complete = Some(Expected { size: 0, crc: None });
             }
             #[cfg(feature = "sealed")]
@@ -146,7 +146,7 @@ impl BlockFile {
         let at = self.len;
         self.len += 1;
         if at >= HEADER_SIZE + self.header.size as usize {
-            // The CRC; what is more than that is told by its length.
+            // The CRC. Further bytes are detected by the length.
             self.told = self.told >> 8 | u32::from(byte) << 24;
             return Ok(());
         }
@@ -165,7 +165,7 @@ impl BlockFile {
                     && self.header.size == LAST_SIZE as u32
                     && self.announced == Some((FRAMING + LAST_SIZE_2008) as u32)
                 {
-                    // The manual of 2008 does not count the reserved bytes.
+                    // The size field of the manual of 2008 does not include the reserved bytes.
                     self.header.size = LAST_SIZE_2008 as u32;
                 }
                 judge_header(self.header, to)
@@ -180,19 +180,19 @@ fn is_data(header: &Header) -> bool {
     header.number != NUMBER_CONTROL && header.number != NUMBER_LAST
 }
 
-/// The largest block that can be taken.
+/// The largest acceptable block.
 fn largest(queue: &Queue<'_>) -> usize {
     queue.capacity().min(MAX_BLOCK_SIZE)
 }
 
-/// What the first twelve bytes tell: refuses before the rest is sent.
+/// Checks the first twelve bytes, so that a refusal comes before the rest is sent.
 fn judge_header(header: Header, to: &Destination<'_, '_>) -> Result<(), Refusal> {
     if header.size as usize > largest(to.queue).saturating_sub(FRAMING) {
         return Err(TOO_LONG);
     }
     match (header.number, to.judge.session) {
-        // The sequence begins anew, over what is there. (What is there of a sealed image has gone
-        // another way.)
+        // The sequence begins again over the existing pieces. (The pieces of a sealed image were
+        // processed in another way.)
         #[cfg(feature = "sealed")]
         (NUMBER_CONTROL, Session::Open { .. }) if to.judge.sealed_only => {
             return Err(Refusal::untimely(FlashError::Sequence));

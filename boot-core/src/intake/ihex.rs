@@ -1,9 +1,8 @@
-//! Intel HEX as it comes over the bus: a byte at a time, whatever the transfer's segments are
+//! Intel HEX from the bus: processed byte by byte, independent of the segments of the transfer
 //! (Intel, "Hexadecimal Object File Format Specification", revision A, 1988).
 //!
-//! Between records stand line ends of any kind and blanks. Nothing is held of a record but its
-//! header: the owner takes the data as they come, and must not use them before the record was
-//! [`Event::Good`].
+//! Between records there may be line ends of any kind and blanks. Only the header of a record is
+//! stored: the owner takes the data as they arrive, and must not use them before [`Event::Good`].
 
 use canopen::program::FlashError;
 use canopen::AbortCode;
@@ -38,7 +37,7 @@ impl Format for IntelHex {
         for character in bytes {
             match self.reader.push(*character)? {
                 Event::Nothing => {}
-                // A record has to be there as a whole, beside the piece that it belongs to.
+                // The queue must have room for a whole record beside the piece that it belongs to.
                 Event::Data { size, .. } if size as usize + 4 * PIECE_HEADER > to.queue.capacity() / 2 => {
                     return Err(Refusal(FlashError::Format, AbortCode::OUT_OF_MEMORY));
                 }
@@ -61,27 +60,27 @@ impl Format for IntelHex {
     }
 }
 
-/// What a byte brought.
+/// The result of a byte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Event {
     Nothing,
-    /// A data record begins: where its data go, and how many there are.
+    /// A data record begins: the address and the number of its data.
     Data {
         address: u32,
         size: u32,
     },
     /// A byte of the data.
     Byte(u8),
-    /// The data record is complete, and its checksum right.
+    /// The data record is complete, and its checksum is right.
     Good,
 }
 
-/// What has been read so far.
+/// The state of the parser.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Hex {
-    /// What the 16-bit offsets of data records count from.
+    /// The base of the 16-bit offsets of data records.
     base: u32,
-    /// A base of record type 02: an offset may not leave its 64 KiB.
+    /// The base comes from record type 02: data must stay inside its 64 KiB.
     segment: bool,
     place: Place,
 }
@@ -90,18 +89,18 @@ struct Hex {
 enum Place {
     Between,
     Within(Record),
-    /// Behind the EOF record.
+    /// After the EOF record.
     End,
 }
 
-/// A record, as far as it came.
+/// A record, as far as it has arrived.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Record {
     /// The first digit of a byte.
     digit: Option<u8>,
-    /// Bytes that came.
+    /// The number of bytes that have arrived.
     len: u16,
-    /// Of all of them, modulo 256; 0 behind the checksum.
+    /// The sum of all bytes, modulo 256; 0 after the checksum.
     sum: u8,
     /// Length of the data, offset (2), type.
     header: [u8; HEADER],
@@ -124,7 +123,7 @@ impl Hex {
         Self { base: 0, segment: true, place: Place::Between }
     }
 
-    /// Whether the EOF record came.
+    /// Whether the EOF record has arrived.
     fn has_ended(&self) -> bool {
         self.place == Place::End
     }
@@ -166,7 +165,7 @@ impl Hex {
                 DATA => !self.segment || offset + size <= 0x1_0000,
                 END_OF_FILE => size == 0,
                 SEGMENT_BASE | LINEAR_BASE => size == 2,
-                // Where to start: that stands in the vector table.
+                // Start addresses are not used: the vector table contains the start.
                 SEGMENT_START | LINEAR_START => size == 4,
                 _ => false,
             };
@@ -203,7 +202,7 @@ mod tests {
 
     type Records = Vec<(u32, Vec<u8>)>;
 
-    /// What the records of a text say: the data by address, and whether it ended.
+    /// The contents of a text: the data by address, and whether the EOF record was there.
     fn read(text: &str) -> Result<(Records, bool), FlashError> {
         let mut hex = Hex::new();
         let mut records = Records::new();
@@ -220,7 +219,7 @@ mod tests {
         Ok((records, hex.has_ended()))
     }
 
-    /// The best-known example (Wikipedia "Intel HEX", after the specification).
+    /// The best-known example (Wikipedia "Intel HEX", from the specification).
     const EXAMPLE: &str = ":10010000214601360121470136007EFE09D2190140";
 
     #[test]
@@ -230,7 +229,8 @@ mod tests {
         assert_eq!(read(&EXAMPLE.to_lowercase()), read(EXAMPLE));
     }
 
-    /// Checksums by hand: two's complement of 02+02+12+34 = 4A, 02+04+08+01 = 0F, and so on.
+    /// Checksums computed by hand: two's complement of 02+02+12+34 = 4A, 02+04+08+01 = 0F, and so
+    /// on.
     #[test]
     fn base_records_move_what_follows_and_start_records_do_nothing() {
         let text = ":020000021234B6\r\n:0100100001EE\r:020000040801F1 \n\n:0100200002DD\n\
@@ -245,15 +245,15 @@ mod tests {
             (":0G", FlashError::Format),
             (":01 0", FlashError::Format),
             (&EXAMPLE.replace("40", "41"), FlashError::Crc),
-            // Types that do not exist, and lengths that types do not have.
+            // Unknown types, and lengths that do not belong to the type.
             (":00000006FA", FlashError::Format),
             (":000000FF01", FlashError::Format),
             (":0100000100FE", FlashError::Format),
             (":0100000408F3", FlashError::Format),
             (":0300000500010203", FlashError::Format),
-            // Over the end of its segment: FFFFh and two bytes.
+            // Beyond the end of its segment: FFFFh and two bytes.
             (":02FFFF0000", FlashError::Format),
-            // Behind the end.
+            // After the end.
             (":00000001FF\n:", FlashError::Format),
             (":00000001FFF", FlashError::Format),
         ];

@@ -1,4 +1,4 @@
-//! The rules that every format is judged by: where data may go, and whom a program is for.
+//! The rules for all formats: the permitted addresses, and the target device of a program.
 
 use canopen::program::FlashError;
 use shared_abi::block_file::{Control, Identity};
@@ -11,34 +11,34 @@ use crate::policy::{Policy, Verdict};
 use crate::refusal::Refusal;
 use crate::session::Session;
 
-/// Judges what arrives for one program.
+/// Checks the data for one program.
 #[derive(Clone, Copy)]
 pub(crate) struct Judge<'a> {
-    /// Who owns which address.
+    /// The memory layout: the owner of each address.
     pub layout: &'a Layout,
-    /// What the product chose.
+    /// The product's choices.
     pub policy: &'a Policy,
     /// The program, 1 to 254.
     pub program: u8,
     /// The program's flash.
     pub region: Region,
-    /// How far its download is.
+    /// The state of its download.
     pub session: Session,
-    /// Whether there is a program.
+    /// Whether a program is installed.
     pub installed: bool,
-    /// Whether the device takes sealed images alone.
+    /// Whether the device accepts only sealed images.
     #[cfg(feature = "sealed")]
     pub sealed_only: bool,
 }
 
 impl Judge<'_> {
-    /// Whether the program is none, but data of the application.
+    /// Whether the program number is for data of the application.
     #[inline(never)]
     pub(crate) fn is_data(&self) -> bool {
         self.policy.data == Some(self.program)
     }
 
-    /// Whether the download has begun: the old program is given up then.
+    /// Whether the download has begun: from then on the old program is given up.
     pub(crate) fn has_begun(&self) -> bool {
         matches!(self.session, Session::Open { .. })
     }
@@ -48,7 +48,7 @@ impl Judge<'_> {
         self.session.may_begin(self.policy, self.installed)
     }
 
-    /// Why first bytes that no format knows are refused.
+    /// The refusal of first bytes in no known format.
     pub(crate) fn unknown_format(&self) -> Refusal {
         if self.has_begun() {
             Refusal::untimely(FlashError::Sequence)
@@ -57,28 +57,28 @@ impl Judge<'_> {
         }
     }
 
-    /// Whether data of this program may go there.
+    /// Whether data of this program may have this address.
     pub(crate) fn check_place(&self, place: Region) -> Result<(), Refusal> {
         if self.region.contains(place.base, place.size) {
             return Ok(());
         }
         let secured = [self.layout.bootloader, self.layout.parameters[0], self.layout.parameters[1]];
         let touches = |region: &Region| {
-            // No sum: an address near the end of the address space must not wrap.
+            // Written without a sum: an address near the end of the address space must not wrap.
             place.base < region.end() && (place.base >= region.base || region.base - place.base < place.size)
         };
         let secured = secured.iter().any(touches);
         Err(Refusal::unfit(if secured { FlashError::Secured } else { FlashError::Address }))
     }
 
-    /// Whether the first two vectors are those of a program at this place.
+    /// Whether the first two vectors are valid for a program in this region.
     pub(crate) fn check_vectors(&self, words: [u32; 2]) -> Result<(), Refusal> {
         VectorTable::check(words, self.region, self.layout)
             .map(drop)
             .map_err(|_| Refusal::unfit(FlashError::Format))
     }
 
-    /// Whether a program is for this device, by its control block.
+    /// Whether a program is for this device, from its control block.
     pub(crate) fn check_identity(&self, control: &Control) -> Result<(), Refusal> {
         let identity = match control {
             Control::Plain => None,
@@ -99,7 +99,7 @@ impl Judge<'_> {
         Ok(())
     }
 
-    /// Whether a program is for this device, by its label; gives its version, 0 where there is no
+    /// Whether a program is for this device, from its label; returns its version, 0 without a
     /// label.
     pub(crate) fn check_label(&self, bytes: &[u8; label::SIZE]) -> Result<u32, Refusal> {
         let Some(label) = Label::parse(bytes) else {

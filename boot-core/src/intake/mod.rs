@@ -1,15 +1,15 @@
-//! What arrives in 1F50h: the bytes of an SDO transfer become pieces, judged and placed.
+//! The data of 1F50h: turns the bytes of an SDO transfer into checked pieces with addresses.
 //!
-//! | format | told by |
+//! | format | recognised by |
 //! |---|---|
 //! | [`block_file`] | the number of a block |
 //! | [`ihex`] | `:` |
 //! | `sealed` | `CBS1` (feature `sealed`) |
-//! | [`raw`] | an initial stack pointer; any bytes where the program is data |
+//! | [`raw`] | an initial stack pointer; any bytes if the program is data |
 //!
-//! A format sees its bytes, the rules that it is judged by ([`Judge`]) and the queue of the pieces.
-//! It cannot reach the flash. What its bytes lead to it leaves in a [`Progress`]. A new format is a
-//! file with an implementation of [`Format`], and a line in the list below.
+//! A format gets its bytes, the rules ([`Judge`]) and the queue for the pieces. It has no access to
+//! the flash. It reports its results in a [`Progress`]. To add a format, add a file with an
+//! implementation of [`Format`] and a line in the list below.
 
 mod block_file;
 mod ihex;
@@ -40,72 +40,72 @@ formats! {
     Raw(raw::Raw),
 }
 
-/// The first two vectors at least: a program without them under its CRC cannot be started.
+/// At least the first two vectors: a program whose CRC does not cover them cannot start.
 pub(crate) const SMALLEST_PROGRAM: u32 = 8;
 
-/// Bytes that tell every format.
+/// This many bytes identify every format.
 const FIRST: usize = 4;
 
-/// What a format makes of its first bytes.
+/// The result of looking at the first bytes.
 pub(crate) enum Recognition<T> {
-    /// They are not in this format.
+    /// The bytes are not in this format.
     No,
-    /// There are too few to tell.
+    /// There are too few bytes to decide.
     More,
-    /// They are.
+    /// The bytes are in this format.
     Yes(T),
 }
 
-/// A form in which programs come.
+/// A format of programs.
 pub(crate) trait Format: Sized {
-    /// Whether it brings a whole program in one transfer. Such a client is slowed down when the
-    /// flash is slower than the bus, and half a program is left when its transfer breaks off.
+    /// Whether it carries a whole program in one transfer. Such a client is slowed down if the
+    /// flash is slower than the bus, and an aborted transfer leaves an incomplete program.
     const IS_STREAM: bool;
 
-    /// Looks at the first bytes of a transfer, up to four.
+    /// Looks at the first bytes of a transfer, at most four.
     fn recognise(first: &[u8], judge: &Judge<'_>) -> Recognition<Self>;
 
-    /// The transfer begins, with this many bytes where the client told.
+    /// The transfer begins, with this size if the client announced it.
     fn begin(&mut self, size: Option<u32>, judge: &Judge<'_>, queue: &Queue<'_>) -> Result<(), Refusal>;
 
     /// Takes the next bytes.
     fn data(&mut self, bytes: &[u8], to: &mut Destination<'_, '_>) -> Result<(), Refusal>;
 
-    /// The client has sent all.
+    /// The client has sent all data.
     fn end(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal>;
 }
 
-/// Where a format's pieces go, and who judges them.
+/// The destination of a format's pieces, and the rules for them.
 pub(crate) struct Destination<'a, 'b> {
     /// The rules.
     pub judge: Judge<'a>,
     /// The pieces.
     pub queue: &'a mut Queue<'b>,
-    /// What the bytes have led to.
+    /// The results so far.
     pub progress: Progress,
 }
 
-/// What the bytes of a transfer have led to.
+/// The results of the bytes of a transfer.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Progress {
-    /// The download begins: what came so far is for this device.
+    /// The download begins: the data so far are for this device.
     pub begins: Option<Begin>,
     /// A block of data joined the queue.
     pub block: bool,
     /// The program is complete.
     pub complete: Option<crate::program::Expected>,
-    /// What begins is a sealed image.
+    /// The download is a sealed image.
     #[cfg(feature = "sealed")]
     pub sealed: bool,
 }
 
-/// What is known of a program when its download begins.
+/// What is known about a program when its download begins.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Begin {
-    /// Bytes of the program, 0 where that is not known: its flash may be erased that far before
-    /// there are data.
+    /// Size of the program in bytes, 0 if unknown: its flash may be erased up to this size before
+    /// data arrive.
     pub size: u32,
-    /// Its version, 0 where that is not known.
+    /// Its version, 0 if unknown.
     pub version: u32,
 }
 
@@ -116,7 +116,7 @@ pub(crate) struct Intake {
 }
 
 enum State {
-    /// Too few bytes came to tell the format.
+    /// Too few bytes have arrived to identify the format.
     Unknown {
         bytes: [u8; FIRST],
         len: usize,
@@ -125,7 +125,7 @@ enum State {
 }
 
 impl Intake {
-    /// A transfer, with this many bytes where the client told.
+    /// A transfer, with its size if the client announced it.
     pub(crate) const fn new(size: Option<u32>) -> Self {
         Self { size, state: State::Unknown { bytes: [0; FIRST], len: 0 } }
     }
@@ -153,7 +153,7 @@ impl Intake {
         }
     }
 
-    /// The client has sent all.
+    /// The client has sent all data.
     pub(crate) fn end(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
         match &mut self.state {
             State::Known(known) => known.end(to),
@@ -161,7 +161,7 @@ impl Intake {
         }
     }
 
-    /// Whether what was told is a whole program in one transfer, or may turn out to be.
+    /// Whether the transfer is a whole program, or may turn out to be one.
     pub(crate) fn may_be_stream(&self) -> bool {
         match &self.state {
             State::Known(known) => known.is_stream(),
@@ -169,13 +169,13 @@ impl Intake {
         }
     }
 
-    /// Whether it is a whole program in one transfer.
+    /// Whether the transfer is a whole program.
     pub(crate) fn is_stream(&self) -> bool {
         matches!(&self.state, State::Known(known) if known.is_stream())
     }
 
-    /// Bytes that it takes at present. Blocks have their room before they begin, so this is about
-    /// streams; `held` for a client whose answer is already being held back, see
+    /// The number of bytes that it accepts at present. There is room for a block before it begins,
+    /// so this only concerns streams. With `held`, the answer to the client is already delayed, see
     /// [`stream::room`].
     pub(crate) fn room(&self, queue: &Queue<'_>, held: bool) -> usize {
         if self.may_be_stream() {
@@ -186,7 +186,7 @@ impl Intake {
     }
 }
 
-/// Makes [`Known`], the transfer whose format is known, of the list of the formats.
+/// Makes [`Known`], the transfer with a known format, from the list of the formats.
 macro_rules! formats {
     ($($name:ident($format:ty)),* $(,)?) => {
         enum Known {
@@ -194,7 +194,7 @@ macro_rules! formats {
         }
 
         impl Known {
-            /// `None` while there are too few bytes to tell.
+            /// `None` if there are too few bytes to decide.
             fn recognise(first: &[u8], judge: &Judge<'_>) -> Result<Option<Self>, Refusal> {
                 let mut more = false;
                 $(match <$format>::recognise(first, judge) {

@@ -1,4 +1,4 @@
-//! A raw image: the program's bytes from the start of its flash on, and nothing else.
+//! A raw image: the program's bytes from the start of its flash.
 
 use canopen::program::FlashError;
 use canopen::AbortCode;

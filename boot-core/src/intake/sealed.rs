@@ -1,5 +1,5 @@
-//! A sealed image: its bytes go through the queue as they come. They are judged in the flash half
-//! (`unseal`), because a signature takes longer than a client waits for an answer.
+//! A sealed image: its bytes go through the queue unchanged. The flash half (`unseal`) checks them,
+//! because to check a signature takes longer than a client waits for an answer.
 
 use canopen::program::FlashError;
 use canopen::AbortCode;
@@ -29,7 +29,7 @@ impl Format for Sealed {
 
     fn data(&mut self, bytes: &[u8], to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
         if !to.queue.push_bytes(bytes) {
-            // A client that waits for the answers does not get here.
+            // A client that waits for the answers never causes this.
             return Err(Refusal(FlashError::Busy, AbortCode::OUT_OF_MEMORY));
         }
         if !to.judge.has_begun() {
@@ -40,7 +40,7 @@ impl Format for Sealed {
     }
 
     fn end(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
-        // What it has to be stands in its manifest.
+        // The manifest describes the program.
         to.progress.complete = Some(Expected { size: 0, crc: None });
         Ok(())
     }

@@ -1,5 +1,5 @@
-//! What the formats share that bring a whole program in one transfer: the bytes are cut into pieces,
-//! and the first piece is judged before anything is lost.
+//! Common code of the formats with a whole program in one transfer: it cuts the bytes into pieces,
+//! and checks the first piece before the old program is lost.
 
 use canopen::program::FlashError;
 use canopen::AbortCode;
@@ -11,30 +11,31 @@ use crate::program::Expected;
 use crate::queue::{Queue, PIECE_HEADER};
 use crate::refusal::Refusal;
 
-/// Data of a piece: so long that the flash is kept busy, so short that a small queue holds some.
+/// Data of a piece: long enough to keep the flash busy, short enough that a small queue holds
+/// several.
 const PIECE: usize = 1024;
-/// Part of the queue that is filled slowly, so that a client whose data find the flash erasing
-/// still gets its answers in time. An erasure of 2 s at 7 bytes every
+/// The part of the queue that is filled slowly, so that a client still gets its answers in time
+/// while the flash erases. An erase of 2 s at 7 bytes every
 /// [`HOLD_MS`](canopen::sdo::server::HOLD_MS) needs 7 KiB.
 const RESERVE: usize = 8 * 1024;
 
-/// Bytes that a stream may send at present. `held`: for a client whose answer is already being held
-/// back, which may use the reserve. (Data that are scattered byte by byte take 9 bytes of the queue
-/// each, and at least 13 characters of Intel HEX.)
+/// The number of bytes that a stream may send at present. With `held`, the answer to the client is
+/// already delayed, and the client may use the reserve. (Data scattered byte by byte take 9 bytes
+/// of the queue each, and at least 13 characters of Intel HEX.)
 pub(super) fn room(queue: &Queue<'_>, held: bool) -> usize {
     let reserve = RESERVE.min(queue.capacity() / 4);
-    // The open piece has its header already; another one may begin.
+    // The open piece already has its header; another piece may begin.
     let keep = 2 * PIECE_HEADER + if held { 0 } else { reserve };
     queue.free().saturating_sub(keep)
 }
 
-/// A program on its way in.
+/// An incoming program.
 pub(super) struct Stream {
-    /// Where the next byte goes.
+    /// The address of the next byte.
     next: u32,
-    /// Behind the highest byte so far.
+    /// The address after the highest byte so far.
     end: u32,
-    /// Bytes of the image, 0 where that is not known.
+    /// Size of the image in bytes, 0 if unknown.
     size: u32,
 }
 
@@ -44,12 +45,12 @@ impl Stream {
         Self { next: base, end: base, size: 0 }
     }
 
-    /// The image has this many bytes.
+    /// Sets the size of the image.
     pub(super) fn set_size(&mut self, size: u32) {
         self.size = size;
     }
 
-    /// The next bytes go there: what does not follow on the piece before begins another one.
+    /// Sets the address of the next bytes: a gap begins a new piece.
     pub(super) fn seek(&mut self, address: u32, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
         if address != self.next {
             self.close(to)?;
@@ -58,7 +59,7 @@ impl Stream {
         Ok(())
     }
 
-    /// Whether so many bytes may stand where the next one goes.
+    /// Whether `size` bytes may have the next address.
     pub(super) fn check_place(&mut self, size: u32, judge: &Judge<'_>) -> Result<(), Refusal> {
         judge.check_place(Region::new(self.next, size))?;
         self.end = self.end.max(self.next + size);
@@ -75,7 +76,7 @@ impl Stream {
         Ok(())
     }
 
-    /// The open piece joins the queue if it is long enough. All that it holds must be judged.
+    /// Adds the open piece to the queue if it is long enough. All of it must have been checked.
     pub(super) fn close_if_full(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
         if to.queue.open_size() >= PIECE.min(to.queue.capacity() / 8) {
             self.close(to)?;
@@ -83,7 +84,7 @@ impl Stream {
         Ok(())
     }
 
-    /// All is sent.
+    /// The client has sent all data.
     pub(super) fn end(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
         let size = self.end - to.judge.region.base;
         if size < if to.judge.is_data() { 1 } else { SMALLEST_PROGRAM } {
@@ -104,9 +105,9 @@ impl Stream {
     }
 }
 
-/// Judges the open piece, where it is the start of the program: its vectors and its label, as far as
-/// it holds them. A HEX file may begin anywhere, and a small block ends in front of the label; they
-/// are looked at once more when all is in flash.
+/// Checks the open piece if it is the start of the program: its vectors and its label, as far as
+/// the piece holds them. A HEX file may begin anywhere, and a small block may end before the label;
+/// vectors and label are checked again when everything is in flash.
 pub(super) fn judge_start(to: &Destination<'_, '_>) -> Result<(), Refusal> {
     if to.judge.is_data() || to.queue.open_address() != to.judge.region.base {
         return Ok(());

@@ -1,15 +1,15 @@
-//! The flash half of a download: what was accepted is carried through, an operation or a bounded
+//! The flash half of a download: carries out the accepted work, one operation or one bounded
 //! computation at a time.
 //!
-//! Pieces wait in a queue. Sectors are erased ahead of them, each piece is written and read back,
-//! and when all is there the CRC over the program is computed. Beside that it carries through what
-//! the store wants written. It knows pieces, addresses and program numbers; no format, no object
-//! and no command.
+//! Pieces wait in a queue. The programmer erases sectors before the pieces need them, writes each
+//! piece and reads it back, and computes the CRC of the program at the end. It also writes what the
+//! store needs. It knows pieces, addresses and program numbers, but no formats, objects or
+//! commands.
 //!
-//! **No data are touched while their record stands**: [`Programmer::open`] and
-//! [`Programmer::void`] only note that a record has to go, and as long as one has to, nothing is
-//! erased or written. The record of an opened program goes with the first piece, not before: what is
-//! refused until then, or broken off, has cost nothing.
+//! **Data are not changed while a record for them is valid**: [`Programmer::open`] and
+//! [`Programmer::void`] only note that a record must be removed, and until it is removed, nothing
+//! is erased or written. The record of an opened program is removed with the first piece and not
+//! before: a refusal or an abort until then has no effect on the old program.
 
 mod write;
 
@@ -27,110 +27,110 @@ use crate::store::{Key, NodeParameters, Parameters, ProgramRecord, Value};
 use crate::unseal::Unsealer;
 use write::WritePiece;
 
-/// What came of a step.
+/// The result of a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Step {
     /// There is no work.
     Idle,
-    /// The flash programs a word, which takes it tens of microseconds.
+    /// The flash is programming a word, which takes tens of microseconds.
     Programming,
-    /// The flash erases a sector, which takes it hundreds of milliseconds.
+    /// The flash is erasing a sector, which takes hundreds of milliseconds.
     Erasing,
-    /// There is more to compute; step again soon.
+    /// There is more to compute; call again soon.
     Again,
 }
 
-/// Bytes that are looked at in one step for whether they are erased; each sector has a multiple of it.
-/// A CRC over as many takes about as long.
+/// The number of bytes that one step checks for the erased state; the size of each sector is a
+/// multiple of it. A CRC over as many bytes takes about as long.
 const BLANK_STEP: u32 = 1024;
 
-/// A piece of work that is over.
+/// The end of a piece of work.
 pub(crate) enum Event {
-    /// The record of a program is stored, or gone; whether that ends a piece of work.
+    /// The record of a program is stored or removed; `ends`: this ends a piece of work.
     Stored { program: u8, ends: bool },
-    /// A program was written completely; its CRC over flash.
+    /// A program was written completely; with its CRC in flash.
     Written { program: u8, expected: Expected, crc: u32 },
-    /// Node-ID and bit rate are stored, or not.
+    /// The storing of node-ID and bit rate has ended.
     NodeStored(Result<(), FlashError>),
-    /// The work on a program failed. `erasing`: an erasure did.
+    /// The work on a program failed. `erasing`: an erase failed.
     Failed { program: u8, error: FlashError, erasing: bool },
 }
 
-/// The program whose pieces are taken, and how far its flash is.
+/// The program that is being downloaded, and the state of its flash.
 #[derive(Clone, Copy, Debug)]
 struct Target {
     program: u8,
     region: Region,
-    /// Up to here the flash is erased.
+    /// The flash is erased up to this address.
     erased: u32,
-    /// Up to here it may be erased before there are data.
+    /// The flash may be erased up to this address before data arrive.
     ahead: u32,
-    /// While nothing is lost yet, because there was no piece and no command to erase: what `ahead`
-    /// becomes then.
+    /// `Some` while nothing is lost yet, because neither a piece nor a command to erase has come:
+    /// the later value of `ahead`.
     untouched: Option<u32>,
     /// All of it is being erased for a command.
     clearing: bool,
-    /// See [`ProgramRecord::half_erased`]; without what is being done now.
+    /// See [`ProgramRecord::half_erased`]; not including the present work.
     half_erased: bool,
-    /// To be verified when the queue is empty.
+    /// The program to verify when the queue is empty.
     expected: Option<Expected>,
 }
 
-/// What is being done.
+/// The present work.
 enum Job {
-    /// A value is on its way into the store; the program that it is about.
+    /// A value is being stored; with the program that it concerns.
     Store(Change, u8),
-    /// A sector, until its erasure was started, and its end; or none, and how far the flash was looked
-    /// at and found to be erased.
+    /// A sector until its erase was started, and its end; or no sector, and the address up to which
+    /// the flash was found to be erased.
     Erase { sector: Option<Sector>, until: u32 },
-    /// The piece at the front of the queue.
+    /// The piece at the front of the queue is being written.
     Write(WritePiece),
-    /// The sealed image goes on.
+    /// The sealed image is being processed.
     #[cfg(feature = "sealed")]
     Unseal,
-    /// Is the flash what the host meant?
+    /// The flash is compared with the sent program.
     Verify { expected: Expected, crc: FlashCrc },
 }
 
-/// What changes in the store.
+/// The kind of change in the store.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Change {
-    /// The record of a program goes.
+    /// The record of a program is removed.
     Void,
-    /// It becomes another one.
+    /// The record of a program is replaced.
     Record,
-    /// As `Record`, but nobody waits for it.
+    /// The same as `Record`, but no host waits for it.
     Confirm,
     /// Node-ID and bit rate.
     Node,
     /// The security counter of a sealed image.
     #[cfg(feature = "sealed")]
     Counter,
-    /// An event, or how often rights were granted; nobody waits for it.
+    /// An event, or the number of grants; no host waits for it.
     #[cfg(feature = "sealed")]
     Note,
 }
 
-/// The flash half. It starts operations and polls them, and never waits for one.
+/// The flash half. It starts operations and polls them, but never waits for them.
 pub(crate) struct Programmer<'b> {
     queue: Queue<'b>,
     unsealer: Unsealer<'b>,
     crc_kind: CrcKind,
     crc_step: u32,
     target: Option<Target>,
-    /// Bit n: the record of program n has to go before anything is erased or written.
+    /// Bit n: the record of program n must be removed before anything is erased or written.
     voids: u32,
-    /// What the next one of them has proved is stored as its counter.
+    /// Whether the counter proved by the next of these programs is already stored.
     #[cfg(feature = "sealed")]
     kept: bool,
     job: Option<Job>,
-    /// What the flash is doing. Without a job nobody wants its outcome any more.
+    /// The present operation of the flash. Without a job its result is ignored.
     running: Option<Step>,
 }
 
 impl<'b> Programmer<'b> {
-    /// The larger `buffer`, the further the flash may lag behind the bus. One step of a CRC covers
-    /// `crc_step` bytes.
+    /// The larger the `buffer`, the further the flash may lag behind the bus. One step of a CRC
+    /// covers `crc_step` bytes.
     pub(crate) fn new(
         buffer: &'b mut [u8],
         crc_kind: CrcKind,
@@ -155,7 +155,7 @@ impl<'b> Programmer<'b> {
         self.queue.into_buffer()
     }
 
-    /// Where the pieces wait.
+    /// The queue of pieces.
     pub(crate) fn queue(&self) -> &Queue<'b> {
         &self.queue
     }
@@ -165,9 +165,9 @@ impl<'b> Programmer<'b> {
         &mut self.queue
     }
 
-    /// Pieces of this program will come, and of no other. With the first one its record goes.
-    /// `erase`: its sectors are erased, those of the first `size` bytes before there are data for
-    /// them; otherwise each piece has to find its place blank.
+    /// Prepares for pieces of this program, and of no other. The first piece removes its record.
+    /// With `erase`, its sectors are erased, those of the first `size` bytes before data arrive;
+    /// otherwise each piece must find its place erased.
     pub(crate) fn open(&mut self, program: u8, region: Region, erase: bool, size: u32) {
         let (erased, ahead) = if erase {
             (region.base, region.base + size.min(region.size))
@@ -181,7 +181,7 @@ impl<'b> Programmer<'b> {
             Some(Target { program, region, erased, ahead, untouched, clearing, half_erased, expected });
     }
 
-    /// What was [opened](Self::open) comes as a sealed image.
+    /// The [opened](Self::open) program arrives as a sealed image.
     #[cfg(feature = "sealed")]
     pub(crate) fn unseal(&mut self) {
         if let Some(Target { program, region, .. }) = self.target {
@@ -200,7 +200,7 @@ impl<'b> Programmer<'b> {
         &mut self.unsealer
     }
 
-    /// The record of a program goes, then all its sectors are erased that are not.
+    /// Removes the record of a program, then erases all its sectors that are not erased.
     pub(crate) fn erase_all(&mut self, program: u8, region: Region) {
         self.open(program, region, true, region.size);
         if let Some(target) = &mut self.target {
@@ -208,8 +208,8 @@ impl<'b> Programmer<'b> {
         }
     }
 
-    /// The record of a program goes. That of the target says that it is half erased, until the work on
-    /// it has come to its end.
+    /// Removes the record of a program. The record of the target marks it as half erased until the
+    /// work on it has ended.
     pub(crate) fn void(&mut self, program: u8) {
         self.voids |= bit(program);
     }
@@ -218,14 +218,14 @@ impl<'b> Programmer<'b> {
     pub(crate) fn complete(&mut self, expected: Expected) {
         if let Some(target) = &mut self.target {
             target.expected = Some(expected);
-            // What no piece has written belongs to the program all the same, and reads FFh.
+            // Bytes without a piece belong to the program, too, and must read FFh.
             target.ahead = target.ahead.max(target.region.base + expected.size);
         }
     }
 
-    /// The record of a program becomes this. `confirms`: it says so of a program that brought the
-    /// device back; nobody waits for it, and other work is accepted meanwhile. Nothing may be on its
-    /// way into the store.
+    /// Replaces the record of a program. With `confirms`, the change marks a program that has
+    /// returned the device; no host waits for it, and other work is accepted meanwhile. No value
+    /// may be in the process of being stored.
     pub(crate) fn record(
         &mut self,
         parameters: &mut impl Parameters,
@@ -237,13 +237,13 @@ impl<'b> Programmer<'b> {
         self.job = Some(store(parameters, change, program, record.value()));
     }
 
-    /// Node-ID and bit rate become these.
+    /// Stores node-ID and bit rate.
     pub(crate) fn store_node(&mut self, parameters: &mut impl Parameters, node: NodeParameters) {
         parameters.store(Key::Node, node.value());
         self.job = Some(Job::Store(Change::Node, 0));
     }
 
-    /// What was received is not wanted any more. What is on its way into the store goes on.
+    /// Discards the received data. A value that is being stored is still completed.
     pub(crate) fn abort(&mut self) {
         self.queue.clear();
         self.unsealer.rest();
@@ -258,22 +258,22 @@ impl<'b> Programmer<'b> {
         self.target.as_ref().is_none_or(|target| target.half_erased)
     }
 
-    /// The program whose pieces are taken.
+    /// The program that is being downloaded.
     pub(crate) fn program(&self) -> Option<u8> {
         self.target.map(|target| target.program)
     }
 
-    /// Whether there is work for [`step`](Self::step). The flash cannot be read meanwhile.
+    /// Whether [`step`](Self::step) has work to do. The flash cannot be read meanwhile.
     pub(crate) fn is_busy(&self) -> bool {
         self.has_work() || self.is_storing()
     }
 
-    /// Whether a value is on its way into the store.
+    /// Whether a value is being stored.
     pub(crate) fn is_storing(&self) -> bool {
         matches!(self.job, Some(Job::Store(..)))
     }
 
-    /// Whether there is work that a command has to wait for.
+    /// Whether there is work that a command must wait for.
     pub(crate) fn has_work(&self) -> bool {
         let confirming = matches!(self.job, Some(Job::Store(Change::Confirm, _)));
         #[cfg(feature = "sealed")]
@@ -288,7 +288,7 @@ impl<'b> Programmer<'b> {
     }
 
     /// Whether it works on a command or on the end of a program, so that no further block of that
-    /// program can be taken; or for nobody any more, so that no command can.
+    /// program is accepted; or on discarded work, so that no command is accepted.
     pub(crate) fn is_busy_with(&self, program: u8) -> bool {
         let current = self.program() == Some(program);
         let ending = match self.job {
@@ -300,8 +300,8 @@ impl<'b> Programmer<'b> {
         ending || self.target.as_ref().map_or(self.has_work(), |target| current && waiting(target))
     }
 
-    /// The program that was sent completely, or whose record is being stored: what its host was
-    /// told is done, and a reset now would take back.
+    /// The program that was sent completely, or whose record is being stored: its host believes
+    /// that this is done, and a reset now would undo it.
     pub(crate) fn finishing(&self) -> Option<u8> {
         match self.job {
             Some(Job::Store(Change::Record, of)) => Some(of),
@@ -312,25 +312,25 @@ impl<'b> Programmer<'b> {
         }
     }
 
-    /// Whether [`abort`](Self::abort) takes nothing back that a host was told is done.
+    /// Whether [`abort`](Self::abort) undoes nothing that a host believes to be done.
     pub(crate) fn is_abortable(&self) -> bool {
         let clearing = self.target.as_ref().is_some_and(|target| target.clearing);
         !clearing && self.finishing().is_none() && !self.is_storing_node()
     }
 
-    /// Whether node-ID and bit rate are on their way.
+    /// Whether node-ID and bit rate are being stored.
     pub(crate) fn is_storing_node(&self) -> bool {
         matches!(self.job, Some(Job::Store(Change::Node, _)))
     }
 
-    /// Whether the queue takes a block of the largest size. (One that is not even as large takes
-    /// one at a time.)
+    /// Whether the queue has room for a block of the largest size. (A smaller queue takes one block
+    /// at a time.)
     #[inline(never)]
     pub(crate) fn has_room(&self) -> bool {
         self.queue.is_empty() || self.queue.free() >= MAX_BLOCK_SIZE
     }
 
-    /// Carries the work on.
+    /// Continues the work with one step.
     pub(crate) fn step<F: Flash>(
         &mut self,
         parameters: &mut impl Parameters,
@@ -370,7 +370,7 @@ impl<'b> Programmer<'b> {
         }
     }
 
-    /// What the job does next.
+    /// The next action of the job.
     fn next<F: Flash>(
         &mut self,
         parameters: &mut impl Parameters,
@@ -415,7 +415,7 @@ impl<'b> Programmer<'b> {
         }
     }
 
-    /// The job is over.
+    /// Ends the job.
     fn done(&mut self, result: Result<(), FlashError>) -> Option<Event> {
         match (self.job.take()?, result) {
             (Job::Store(Change::Node, _), result) => Some(Event::NodeStored(result)),
@@ -435,10 +435,10 @@ impl<'b> Programmer<'b> {
                 }
                 match result {
                     Ok(()) => Some(Event::Stored { program, ends: change == Change::Record }),
-                    // It costs a rescue window, no more.
+                    // The consequence is only another rescue window.
                     Err(_) if change == Change::Confirm => None,
                     Err(error) => {
-                        // A record that does not go protects its data: nothing of them is touched.
+                        // If the record cannot be removed, its data must not be changed.
                         if self.program() == Some(program) {
                             self.abort();
                         }
@@ -465,7 +465,7 @@ impl<'b> Programmer<'b> {
         }
     }
 
-    // A call is shorter: three ways lead here.
+    // A separate function because a call is shorter: there are three callers.
     #[inline(never)]
     fn fail(&mut self, error: FlashError, erasing: bool) -> Option<Event> {
         #[cfg(feature = "sealed")]
@@ -478,7 +478,7 @@ impl<'b> Programmer<'b> {
         Some(Event::Failed { program, error, erasing })
     }
 
-    /// Chooses what to do to an idle flash.
+    /// Chooses the next work for an idle flash.
     fn choose<F: Flash>(
         &mut self,
         parameters: &mut impl Parameters,
@@ -496,7 +496,7 @@ impl<'b> Programmer<'b> {
         }
         let piece = if self.unsealer.is_active() { self.unsealer.piece() } else { self.queue.first() };
         if let Some(target) = &mut self.target {
-            // Of a sealed image nothing is known before there is an authentic piece of it.
+            // The size of a sealed image is not known before an authentic piece.
             if piece.is_some() || target.clearing || (target.expected.is_some() && !self.unsealer.is_active())
             {
                 if let Some(ahead) = target.untouched.take() {
@@ -508,7 +508,7 @@ impl<'b> Programmer<'b> {
         }
         if self.voids != 0 {
             let program = self.voids.trailing_zeros() as u8;
-            // What a program has proved outlives its record.
+            // The counter that a program has proved must survive its record.
             #[cfg(feature = "sealed")]
             if !core::mem::replace(&mut self.kept, true) {
                 if let Some(counter) = crate::unseal::proved(flash, parameters, program) {
@@ -552,7 +552,7 @@ impl<'b> Programmer<'b> {
                 (true, true) => target.expected = Some(self.unsealer.expected()),
             }
             let program = target.program;
-            // Of the same image, too: its certificate may be of a higher epoch.
+            // Also for the same image: its certificate may have a higher epoch.
             if let Some(counter) = self.unsealer.take_counter() {
                 parameters.store(Key::Counter(program), counter);
                 return Ok(Some(Job::Store(Change::Counter, program)));
@@ -570,12 +570,12 @@ impl<'b> Programmer<'b> {
     }
 }
 
-/// The bit of a program.
+/// The bit of a program in `voids`.
 fn bit(program: u8) -> u32 {
     1_u32.wrapping_shl(program.into())
 }
 
-/// A value of a program is on its way into the store from now on.
+/// Starts to store a value of a program.
 fn store(parameters: &mut impl Parameters, change: Change, program: u8, value: Value) -> Job {
     parameters.store(Key::Program(program), value);
     Job::Store(change, program)

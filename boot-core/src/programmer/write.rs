@@ -1,4 +1,4 @@
-//! A piece on its way from the queue into flash.
+//! Writes a piece from the queue into flash.
 
 use shared_abi::geometry::Region;
 
@@ -6,17 +6,17 @@ use crate::flash::{Flash, FlashFault, Operation};
 use crate::queue::Piece;
 use crate::sequence::ProgramWords;
 
-/// The words of a piece being programmed. Flash is programmed by words: the first and the last one
-/// are filled up with what is there already.
+/// The words of a piece that is being programmed. Flash is programmed in words: the first and the
+/// last one are completed with the existing bytes.
 pub(super) struct WritePiece {
     piece: Piece,
-    /// What was there in the first and in the last word.
+    /// The existing first and last word.
     edges: [u32; 2],
     words: ProgramWords,
 }
 
 impl WritePiece {
-    /// `None` if its place is not blank.
+    /// `None` if its place is not erased.
     pub(super) fn new<F: Flash>(flash: &F, piece: Piece) -> Option<Self> {
         let place = Region::new(piece.address, piece.size);
         if !flash.is_blank(place) {
@@ -27,7 +27,7 @@ impl WritePiece {
         Some(Self { piece, edges, words: ProgramWords::new(first) })
     }
 
-    /// The next operation, `None` when all of the piece is in flash and was read back.
+    /// The next operation, `None` when the whole piece is in flash and was read back.
     pub(super) fn next<F: Flash>(
         &mut self,
         flash: &F,

@@ -1,14 +1,14 @@
 //! A journal over two flash regions that survives a power cut at every operation.
 //!
 //! A region holds slots of six words. Slot 0 is the header; every other slot is one record, written
-//! once. The latest sound record of a key is its value. When the region is full, the living records
-//! are copied to the other region, whose header is written **last**: until then the old region is
-//! the valid one, afterwards the new one is, and a cut leaves one of the two whole. Each slot
-//! carries a CRC, so a torn one reads as absent.
+//! once. The value of a key is its latest valid record. When the region is full, the current
+//! records are copied to the other region, and its header is written **last**: until then the old
+//! region is the valid one, and afterwards the new one, so a power cut always leaves one complete
+//! region. Each slot has a CRC, so an incomplete slot counts as absent.
 //!
-//! A cut can leave bits between 0 and 1, which read well now and badly later. A header that reads
-//! well is therefore written once more before anything is added behind it: what was stored must not
-//! vanish with its region.
+//! A power cut can leave bits between 0 and 1, which may read correctly now and wrongly later. A
+//! header that reads correctly is therefore written again before anything is added to its region:
+//! stored values must not be lost with their region.
 
 use shared_abi::geometry::Region;
 
@@ -21,84 +21,84 @@ const SLOT_WORDS: usize = 6;
 const SLOT_SIZE: u32 = SLOT_WORDS as u32 * 4;
 type Slot = [u32; SLOT_WORDS];
 
-/// Tells a region's header ("CBNV" read as little-endian bytes).
+/// Identifies a region's header ("CBNV" read as little-endian bytes).
 const HEADER_MAGIC: u32 = u32::from_le_bytes(*b"CBNV");
-/// Version of the journal's format: what the values of the keys mean. A journal of an older one is
-/// read, and moves to this one with the next value that is stored; one of a newer version belongs
-/// to a newer bootloader and is left alone.
+/// Version of the journal's format: the meaning of the keys' values. A journal of an older version
+/// is read, and converted to this one when the next value is stored. A journal of a newer version
+/// belongs to a newer bootloader and is not changed.
 const FORMAT: u32 = 1;
-/// How often a store goes to a further slot or region before it gives up.
+/// How many times a store tries a further slot or region before it gives up.
 const ATTEMPTS: u8 = 8;
 
-/// The journal. Holds where to read and write; the values stay in flash. Slots are told by their
-/// addresses.
+/// The journal. It holds the addresses for reading and writing; the values stay in flash. A slot is
+/// identified by its address.
 #[derive(Debug)]
 pub struct Journal {
     valid: Region,
-    /// The region that is not.
+    /// The region that is not valid.
     other: Region,
     header: Header,
-    /// A region has a header of a newer format: nothing is stored.
+    /// A region has a header of a newer format: storing is refused.
     newer: bool,
     sequence: u32,
-    /// The first slot of the valid region behind the last one that is not blank.
+    /// The first slot of the valid region after the last one that is not blank.
     free: u32,
     storing: Storing,
 }
 
-/// A value on its way into the journal.
+/// A value that is being stored.
 #[derive(Debug, Default)]
 struct Storing {
     step: Step,
     attempts: u8,
     /// The new record.
     record: Slot,
-    /// What is being written, and where.
+    /// The slot that is being written, and its address.
     slot: Slot,
     words: ProgramWords,
     sectors: EraseSectors,
-    /// The next slot of the valid region to copy, and the next free one of the other region.
+    /// The next slot of the valid region to copy, and the next free slot of the other region.
     from: u32,
     to: u32,
 }
 
-/// What is known of the valid region's header.
+/// The state of the valid region's header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Header {
-    /// There is none: no region is valid.
+    /// No region is valid.
     Absent,
-    /// Of an older format.
+    /// The header has an older format.
     Older,
-    /// It reads well, but may be left between 0 and 1 by a power cut.
+    /// The header reads correctly, but a power cut may have left bits between 0 and 1.
     Found,
-    /// It was written, or written once more, since the power came.
+    /// The header was written, or written again, since power-on.
     Firm,
 }
 
-/// What a store is at.
+/// The progress of a store.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 enum Step {
-    /// Nothing is stored.
+    /// Nothing is being stored.
     #[default]
     Idle,
-    /// Nothing was done yet.
+    /// The store has not begun yet.
     Begin,
-    /// The header of the valid region is written once more.
+    /// The header of the valid region is being written again.
     Refresh,
-    /// The other region is made blank.
+    /// The other region is being erased.
     Erase,
-    /// A living record is written to the other region.
+    /// A current record is being copied to the other region.
     Copy,
-    /// The header is written, which makes the other region the valid one.
+    /// The header is being written, which makes the other region the valid one.
     Commit,
-    /// The new record is written into the first free slot.
+    /// The new record is being written into the first free slot.
     Append,
 }
 
 impl Journal {
     /// Finds the valid region and its end.
     pub fn open<F: Flash>(flash: &F, regions: [Region; 2]) -> Self {
-        // While no region is valid, the first one is the one to write to.
+        // While no region is valid, the first one is the next to write.
         let [mut other, mut valid] = regions;
         let (mut header, mut newer, mut sequence) = (Header::Absent, false, 0);
         for region in regions {
@@ -125,7 +125,7 @@ impl Journal {
         Self { valid, other, header, newer, sequence, free, storing: Storing::default() }
     }
 
-    /// The latest sound record of a tag.
+    /// The latest valid record of a tag.
     fn latest<F: Flash>(&self, flash: &F, tag: u32) -> Option<Slot> {
         let first = first_slot(&self.valid);
         let mut at = self.free;
@@ -199,8 +199,8 @@ impl Journal {
                     self.free += SLOT_SIZE;
                     self.storing.step = Step::Idle;
                 }
-                // A slot does not read back: left between 0 and 1 by a power cut, or worn. Another
-                // slot, another region, or this one erased.
+                // A slot does not read back correctly: a power cut left it between 0 and 1, or it
+                // is worn out. Try another slot, the other region, or erase this region.
                 (Err(FlashFault::Verify), Step::Append) => {
                     self.free += SLOT_SIZE;
                     self.attempt()?;
@@ -222,7 +222,7 @@ impl Journal {
                 let header = header_slot(self.sequence);
                 self.write(Step::Refresh, self.valid.base, header);
             }
-            // A new device: its master shall not wait for an erase that changes nothing.
+            // A new device: its master must not wait for an unnecessary erase.
             Header::Absent if flash.is_blank(self.other) => {
                 self.rewind();
                 self.collect(flash);
@@ -232,12 +232,12 @@ impl Journal {
         Ok(())
     }
 
-    /// Copies the next living record; behind the last one the other region gets its header.
+    /// Copies the next current record; after the last one, writes the header of the other region.
     ///
-    /// Whether a tag has its copy is asked of the copies, which were just written and read back. A slot
-    /// that a power cut left between 0 and 1 may be the latest of its tag when it is looked at once,
-    /// and none when it is looked at again: by comparing places, neither it nor the one before it would
-    /// be copied.
+    /// Whether a tag has a copy is decided from the copies, which were just written and read back.
+    /// A slot with bits between 0 and 1 after a power cut may read as the latest of its tag the
+    /// first time and as invalid the next time: if places were compared, neither this slot nor the
+    /// previous one might be copied.
     fn collect<F: Flash>(&mut self, flash: &F) {
         while self.storing.from < self.free {
             let tag = flash.read_word(self.storing.from);
@@ -256,7 +256,7 @@ impl Journal {
         self.write(Step::Commit, self.other.base, header);
     }
 
-    /// To the first free slot, or to a region that has some.
+    /// Continues with the first free slot, or with a region that has free slots.
     fn append(&mut self) -> Result<(), StoreError> {
         if self.free + SLOT_SIZE > self.valid.end() {
             return self.change_over();
@@ -265,7 +265,7 @@ impl Journal {
         Ok(())
     }
 
-    /// To the other region.
+    /// Continues with the other region.
     fn change_over(&mut self) -> Result<(), StoreError> {
         self.attempt()?;
         self.rewind();
@@ -274,7 +274,7 @@ impl Journal {
         Ok(())
     }
 
-    /// To the first record that may have to be copied.
+    /// Goes to the first record that may have to be copied.
     fn rewind(&mut self) {
         self.storing.from = first_slot(&self.valid);
         self.storing.to = first_slot(&self.other);
@@ -286,7 +286,7 @@ impl Journal {
         self.storing.slot = slot;
     }
 
-    /// Counts the tries of one store, so that it comes to an end.
+    /// Counts the attempts of one store, so that it ends.
     fn attempt(&mut self) -> Result<(), StoreError> {
         self.storing.attempts += 1;
         if self.storing.attempts > ATTEMPTS {
@@ -296,8 +296,8 @@ impl Journal {
     }
 }
 
-/// The slot at an address, if it is a sound record of this tag. It is read once: what a power cut
-/// left between 0 and 1 may read otherwise the next time.
+/// The slot at an address, if it is a valid record of this tag. It is read once: bits left between
+/// 0 and 1 by a power cut may read differently the next time.
 fn sound_slot<F: Flash>(flash: &F, at: u32, tag: u32) -> Option<Slot> {
     let mut found = [0; SLOT_WORDS];
     for (word, address) in found.iter_mut().zip((at..).step_by(4)) {
@@ -311,14 +311,13 @@ const fn first_slot(region: &Region) -> u32 {
     region.base + SLOT_SIZE
 }
 
-/// The slot behind the last one that is not blank, found by halves: this is on the way of every
-/// start.
+/// The slot after the last one that is not blank, by binary search, because every start needs it.
 fn end_of<F: Flash>(flash: &F, region: &Region) -> u32 {
     let end = region.end() - region.size % SLOT_SIZE;
     let (mut used, mut free) = (first_slot(region), end);
     while used < free {
         let middle = used + (free - used) / SLOT_SIZE / 2 * SLOT_SIZE;
-        // Behind `free` all is known to be blank.
+        // Everything after `free` is known to be blank.
         if flash.is_blank(Region::new(middle, free - middle)) {
             free = middle;
         } else {

@@ -1,14 +1,14 @@
-//! Everything that outlives a power-off: what is stored, under which key, and how.
+//! The non-volatile data: what is stored, under which key, and how.
 //!
 //! | module | what it holds |
 //! |---|---|
 //! | [`journal`] | the power-fail-safe journal over two flash regions |
-//! | [`record`] | what is known of a program |
+//! | [`record`] | the record of a program |
 //! | [`node`] | node-ID and bit rate |
 //!
-//! Who stores does not touch the flash: it tells the next operation, and its caller carries it out.
-//! So the code of the store can stand in the resident part while the flash operations are started
-//! and polled from RAM.
+//! The code of the store does not access the flash: it returns the next operation, and its caller
+//! carries the operation out. The store can therefore stay in the resident part, while the flash
+//! operations are started and polled from RAM.
 
 pub mod journal;
 pub mod node;
@@ -20,30 +20,30 @@ pub use record::ProgramRecord;
 
 use crate::flash::{Flash, FlashFault, Next};
 
-/// What a stored value is about.
+/// The key of a stored value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Key {
     /// The record of a program (1 to 254), see [`ProgramRecord`].
     Program(u8),
-    /// How often in a row the application ended without being asked to.
+    /// The number of consecutive times that the application ended without a request.
     CrashCount,
     /// Node-ID and bit rate, see [`NodeParameters`].
     Node,
-    /// Of a program (1 to 254) the lowest security counter and the lowest epoch that the device
-    /// takes, and the counter of what is installed. It outlives the program's record.
+    /// Of a program (1 to 254): the lowest security counter and the lowest epoch that the device
+    /// accepts, and the counter of the installed program. This value survives the program's record.
     #[cfg(feature = "sealed")]
     Counter(u8),
     /// An event (0 to 7), see `seal::access`.
     #[cfg(feature = "sealed")]
     Event(u8),
-    /// How often rights were granted, and whether one of them has opened the device for good.
+    /// The number of grants of rights, and whether one of them has opened the device permanently.
     #[cfg(feature = "sealed")]
     Grants,
 }
 
 impl Key {
-    /// The word that stands for the key. FFFFFFFFh (erased flash) stands for none.
+    /// The word for the key. FFFFFFFFh (erased flash) means no key.
     #[must_use]
     pub const fn tag(self) -> u32 {
         match self {
@@ -60,37 +60,37 @@ impl Key {
     }
 }
 
-/// The words of a value; what they mean is the key's.
+/// The words of a value; their meaning depends on the key.
 pub type Value = [u32; 4];
 
-/// Why a value could not be stored. 1F57h says NVDATA.
+/// Why a value could not be stored. 1F57h then shows NVDATA.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StoreError {
     /// The flash refused or failed.
     Flash(FlashFault),
-    /// No slot took the record: the region is worn out.
+    /// No slot accepted the record: the region is worn out.
     WornOut,
-    /// The journal is of a newer format. It belongs to a newer bootloader, and nothing is changed;
-    /// to go on with this one, erase the two parameter sectors with a debugger.
+    /// The journal has a newer format. It belongs to a newer bootloader and is not changed. To use
+    /// this bootloader, erase the two parameter sectors with a debugger.
     NewerFormat,
     /// A store outside the flash failed.
     Device,
 }
 
-/// Where parameters are kept: the [`Journal`] in flash, or what a board has for them (an EEPROM),
-/// which may leave the flash that it is handed alone.
+/// A place for parameters: the [`Journal`] in flash, or a part of the board (an EEPROM), which may
+/// ignore the flash.
 ///
-/// An implementation owes this: after a power cut at any moment [`get`](Self::get) gives the value
-/// from before the store or the new one, of every key; and every store comes to an end, a store
-/// that is full or worn out with an error.
+/// An implementation must guarantee two properties: after a power cut at any time,
+/// [`get`](Self::get) returns for every key the value before the store or the new one; and every
+/// store ends, with an error if the memory is full or worn out.
 pub trait Parameters {
-    /// The value of a key, `None` where it was never stored.
+    /// The value of a key, `None` if it was never stored.
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value>;
 
-    /// Begins to store a value, one at a time; [`next`](Self::next) carries it through.
+    /// Starts to store one value; [`next`](Self::next) carries it out.
     fn store(&mut self, key: Key, value: Value);
 
-    /// The next operation of the store, told the outcome of the one before (`Ok` at first). On an
-    /// error the old value is still there.
+    /// The next operation of the store. `outcome` is the result of the previous one (`Ok` at
+    /// first). After an error the old value still exists.
     fn next<F: Flash>(&mut self, flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError>;
 }

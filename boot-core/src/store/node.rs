@@ -1,5 +1,4 @@
-//! Node-ID and bit rate as the layer setting services store them, for bootloader and application
-//! alike.
+//! Node-ID and bit rate as the layer setting services store them, for bootloader and application.
 
 use canopen::bit_rate::BitRate;
 use canopen::NodeId;
@@ -7,10 +6,10 @@ use canopen::NodeId;
 use super::{Key, Parameters, Value};
 use crate::flash::Flash;
 
-/// What a device is called on its bus, and how fast that is.
+/// The node-ID and the bit rate of a device.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NodeParameters {
-    /// `None` for a device that waits for layer setting services to give it one.
+    /// `None` for a device that waits for a node-ID from layer setting services.
     pub id: Option<NodeId>,
     /// May be [`BitRate::Auto`].
     pub bit_rate: BitRate,
@@ -20,8 +19,8 @@ pub struct NodeParameters {
 const NO_NODE_ID: u32 = 0xFF;
 
 impl NodeParameters {
-    /// What was stored, or the board's own values where nothing was, or nothing that this firmware
-    /// can run with.
+    /// The stored values; the board's own values if nothing is stored, or nothing that this
+    /// firmware supports.
     pub fn load<F: Flash>(
         parameters: &impl Parameters,
         flash: &F,

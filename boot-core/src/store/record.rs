@@ -1,26 +1,26 @@
-//! What is known of a program.
+//! The record of a program.
 
 use super::{Key, Parameters, Value};
 use crate::flash::Flash;
 
-/// What the store tells of a program that was downloaded completely and whose CRC was right then.
+/// The stored record of a program that was downloaded completely with a correct CRC.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ProgramRecord {
-    /// Bytes from the start of its region on.
+    /// Size in bytes, from the start of its region.
     pub size: u32,
-    /// CRC over them.
+    /// CRC of these bytes.
     pub crc: u32,
     /// Whether it is released for autostart (1F51h = 83h, SET_SIGNATURE).
     pub signed: bool,
-    /// Whether it has proved that the bootloader can be reached from it: it was confirmed, or has
-    /// brought the device back to the bootloader once. It then starts without a rescue window.
+    /// Whether the program has proved that it can return to the bootloader: it was confirmed, or it
+    /// has returned the device to the bootloader once. It then starts without a rescue window.
     pub confirmed: bool,
-    /// The version that its control block told, 0 for none.
+    /// The version in its control block, 0 if unknown.
     pub version: u32,
-    /// Since all of the program's flash was last erased, work on it was begun that did not come to its
-    /// end: a sector that reads as erased may be so badly.
+    /// Whether work on the program was started but not finished since all of its flash was last
+    /// erased: a sector that reads as erased may be only partly erased.
     pub half_erased: bool,
-    /// How it came where it came as a sealed image; `None` where it did not.
+    /// The kind of sealed image; `None` for a program that was not sealed.
     #[cfg(feature = "sealed")]
     pub seal: Option<Seal>,
 }
@@ -29,26 +29,27 @@ pub struct ProgramRecord {
 #[cfg(feature = "sealed")]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Seal {
-    /// Nothing: the flash is locked in front of it until the next reset.
+    /// Nothing: the flash is locked until the next reset before the program starts.
     Locked,
-    /// It writes the flash itself, and its manifest says so.
+    /// It writes to flash itself; its manifest says so.
     WritesFlash,
 }
 
-/// The words of the two flags: signed or not, confirmed or not. Magic numbers, so that few wrong
-/// bits never make one of another.
+/// The words for the two flags: released or not, confirmed or not. They are magic numbers, so that
+/// a few wrong bits never turn one into another.
 const SIGNED: u32 = u32::from_le_bytes(*b"APP1");
 const CONFIRMED: u32 = u32::from_le_bytes(*b"RUN0");
 const SIGNED_CONFIRMED: u32 = u32::from_le_bytes(*b"RUN1");
 
-/// In the first word of the stored form, above the size: [`half_erased`](ProgramRecord::half_erased).
+/// The flag of [`half_erased`](ProgramRecord::half_erased) in the first word of the stored form,
+/// above the size.
 const HALF_ERASED: u32 = 1 << 31;
-/// There, too: the two kinds of [`Seal`].
+/// The flags of the two kinds of [`Seal`], in the same word.
 #[cfg(feature = "sealed")]
 const SEALED: u32 = 1 << 30;
 #[cfg(feature = "sealed")]
 const WRITES_FLASH: u32 = 1 << 29;
-/// Where the size stands in the first word.
+/// The mask of the size in the first word.
 #[cfg(feature = "sealed")]
 const SIZE: u32 = !(HALF_ERASED | SEALED | WRITES_FLASH);
 #[cfg(not(feature = "sealed"))]
@@ -61,12 +62,12 @@ impl ProgramRecord {
         [if half_erased { HALF_ERASED } else { 0 }, 0, 0, 0]
     }
 
-    /// [`half_erased`](Self::half_erased), whether or not there is a program.
+    /// [`half_erased`](Self::half_erased), also if there is no program.
     pub fn load_half_erased<F: Flash>(parameters: &impl Parameters, flash: &F, number: u8) -> bool {
         parameters.get(flash, Key::Program(number)).is_some_and(|[first, ..]| first & HALF_ERASED != 0)
     }
 
-    /// Whether it came as a sealed image.
+    /// Whether it was installed as a sealed image.
     #[must_use]
     pub const fn is_sealed(&self) -> bool {
         #[cfg(feature = "sealed")]
@@ -75,12 +76,12 @@ impl ProgramRecord {
         false
     }
 
-    /// From the store; `None` where there is no program.
+    /// Loads the record from the store; `None` if there is no program.
     pub fn load<F: Flash>(parameters: &impl Parameters, flash: &F, number: u8) -> Option<Self> {
         Self::from_value(parameters.get(flash, Key::Program(number))?)
     }
 
-    /// From its stored form; `None` for [`none`](Self::none).
+    /// Decodes the stored form; `None` for [`none`](Self::none).
     #[must_use]
     pub const fn from_value([first, crc, flags, version]: Value) -> Option<Self> {
         let half_erased = first & HALF_ERASED != 0;

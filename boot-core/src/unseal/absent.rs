@@ -1,4 +1,4 @@
-//! A device that knows no sealed images.
+//! The replacement of `image` in a device without sealed images.
 
 use shared_abi::layout::Layout;
 
@@ -7,24 +7,24 @@ use crate::policy::Policy;
 use crate::queue::Piece;
 use crate::store::{Parameters, ProgramRecord};
 
-/// Room for nothing.
+/// An empty state.
 #[derive(Debug, Default)]
 pub struct Room;
 
 impl Room {
-    /// Room for nothing.
+    /// An empty state.
     #[must_use]
     pub const fn new() -> Self {
         Self
     }
 
-    /// What is behind it.
+    /// The interface to it.
     pub fn unsealer(&mut self) -> Unsealer<'_> {
         Unsealer(core::marker::PhantomData)
     }
 }
 
-/// No sealed image.
+/// The interface without sealed images.
 #[derive(Debug)]
 pub struct Unsealer<'b>(core::marker::PhantomData<&'b mut Room>);
 

@@ -1,4 +1,4 @@
-//! What a sealed device does for the holder of a root key alone (2002h), and what it records (2003h).
+//! The functions of a sealed device that need a root key (2002h), and its event log (2003h).
 
 use canopen::od::{put, Address};
 use canopen::program::{FlashError, ACCESS, EVENTS};
@@ -12,10 +12,10 @@ use super::image::{start, Room, Stage, Unsealer};
 use crate::flash::Flash;
 use crate::store::{Key, Value};
 
-/// Events that are remembered.
+/// The number of events in the log.
 const LAST: usize = seal::access::EVENTS;
 
-// What `seal`, `canopen` and `shared-abi` each have to say of the same thing.
+// The constants that `seal`, `canopen` and `shared-abi` each define must agree.
 const _: () = {
     assert!(canopen::program::SEALED_ENTRIES.len() == 4 + LAST);
     assert!(REQUEST <= canopen::sdo::server::VALUE_MAX);
@@ -26,7 +26,7 @@ const _: () = {
 };
 
 impl Unsealer<'_> {
-    /// Whether something is allowed that needs a right in a sealed device.
+    /// Whether an action is permitted that needs a right in a sealed device.
     pub(crate) fn permits(&self, right: u32) -> bool {
         !self.0.takes_no_other || self.0.granted & right != 0
     }
@@ -37,7 +37,7 @@ impl Unsealer<'_> {
         match at.index {
             ACCESS => Some(put(buf, &room.challenge())),
             EVENTS => {
-                // The last one first.
+                // The latest event comes first.
                 let event = room.events[room.event.wrapping_sub(u32::from(at.sub) - 1) as usize % LAST];
                 let mut bytes = [0; 16];
                 for (bytes, word) in bytes.chunks_exact_mut(4).zip(event) {
@@ -49,10 +49,10 @@ impl Unsealer<'_> {
         }
     }
 
-    /// Somebody asks for rights (2002h/2). The signature is looked at in steps.
+    /// A client asks for rights (2002h/2). The signature is checked in steps.
     ///
     /// # Errors
-    /// A request that is none, or one for a key that is no root of the device.
+    /// An invalid request, or a key that is not a root of the device.
     pub(crate) fn ask<F: Flash>(&mut self, flash: &F, request: &[u8]) -> Result<(), AbortCode> {
         let room = &mut *self.0;
         if request.len() != REQUEST {
@@ -73,7 +73,7 @@ impl Unsealer<'_> {
         Ok(())
     }
 
-    /// What is to be stored, once.
+    /// Returns the next value to store, once.
     pub(crate) fn take_store(&mut self) -> Option<(Key, Value)> {
         let room = &mut *self.0;
         if core::mem::take(&mut room.stores.1) {
@@ -83,12 +83,12 @@ impl Unsealer<'_> {
         core::mem::take(&mut room.stores.0).then(|| (Key::Event(place as u8), room.events[place]))
     }
 
-    /// Whether a signature is looked at that asks for rights.
+    /// Whether the signature of a request for rights is being checked.
     pub(crate) fn is_asked(&self) -> bool {
         self.0.stage == Stage::Access
     }
 
-    /// The sealed image is installed, or it is not: that is recorded.
+    /// Records the result of the installation of a sealed image.
     pub(crate) fn end(&mut self, outcome: Result<(), FlashError>) {
         if self.0.active {
             let program = u32::from(self.0.program);
@@ -102,7 +102,7 @@ impl Unsealer<'_> {
 }
 
 impl Room {
-    /// 2002h/1. Its nonce lasts until rights are granted for it, or to the next reset.
+    /// 2002h/1. Its nonce is valid until rights are granted for it, or until the next reset.
     fn challenge(&mut self) -> [u8; CHALLENGE] {
         let Some(policy) = self.policy else { return [0; CHALLENGE] };
         let unique_id = (policy.unique_id)();
@@ -118,7 +118,7 @@ impl Room {
         challenge
     }
 
-    /// The signature is good.
+    /// Grants the rights after the signature was found good.
     pub(super) fn grant(&mut self) {
         let (rights, argument) = self.asked;
         self.granted |= rights;
@@ -133,11 +133,11 @@ impl Room {
         self.record(event::UNLOCKED | rights & 0xFFFF);
     }
 
-    /// An event.
+    /// Records an event.
     fn record(&mut self, what: u32) {
         let head = Head(&self.head);
         let last = self.events[self.event as usize % LAST];
-        // Somebody who is refused again and again does not wear the flash out.
+        // Repeated refusals must not wear out the flash.
         if what >> 16 == event::REFUSED >> 16 && last[1] == what {
             return;
         }

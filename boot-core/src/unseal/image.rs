@@ -1,9 +1,9 @@
-//! Sealed images on their way from the queue to the flash: judged, authenticated, deciphered,
-//! unpacked (`seal::wire` has the format, docs/security.md what it is good for).
+//! Processes sealed images between the queue and the flash: checks, authenticates, decrypts and
+//! decompresses them (`seal::wire` has the format, docs/security.md the purpose).
 //!
-//! The order is the point: nothing is deciphered, unpacked or written before it is authentic. The
-//! head is held until its signatures are good; each chunk is held until its hash is the one that
-//! the authentic chunk before it told.
+//! The order is essential: nothing is decrypted, decompressed or written before it is authentic.
+//! The head is held until its signatures are found good; each chunk is held until its hash matches
+//! the one in the previous authentic chunk.
 
 use canopen::program::FlashError;
 use seal::access::{right, EVENTS};
@@ -27,98 +27,97 @@ use crate::queue::{Piece, Queue};
 use crate::store::record::Seal;
 use crate::store::{Key, Parameters, ProgramRecord, Value};
 
-/// Bytes that are hashed in one step.
+/// The number of bytes that one step hashes.
 const STEP: usize = 1024;
-/// Bytes that the decoder may leave for the next chunk.
+/// The most bytes that the decoder leaves for the next chunk.
 const CARRY: usize = 24;
-/// Where the payload of a chunk begins in the buffer: behind what the chunk before has left, and
-/// behind the hash of the next one.
+/// The offset of a chunk's payload in the buffer: after the rest of the previous chunk, and after
+/// the hash of the next one.
 const PAYLOAD: usize = CARRY + HASH;
-/// Where unpacked bytes wait for the flash, behind the largest chunk.
+/// The offset of the decompressed bytes for the flash: after the largest chunk.
 const UNPACKED: usize = PAYLOAD + (1 << MAX_CHUNK);
-/// Bytes that are unpacked at a time.
+/// The number of bytes that are decompressed at a time.
 const UNPACK: usize = 512;
 
-/// How far an image is.
+/// The progress of an image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Stage {
-    /// Its head comes.
+    /// The head is being received.
     Head,
-    /// The signature of a root over the certificate is looked at.
+    /// The root's signature over the certificate is being checked.
     Certificate,
-    /// The signature over the manifest is.
+    /// The signature over the manifest is being checked.
     Manifest,
-    /// The signature of somebody who asks for rights is looked at; there is no image.
+    /// The signature of a request for rights is being checked; there is no image.
     Access,
-    /// The other program is hashed, which is the dictionary.
+    /// The other program, which is the dictionary, is being hashed.
     Dictionary,
-    /// A chunk comes.
+    /// A chunk is being received.
     Chunk,
-    /// It is authentic and on its way into the flash.
+    /// The chunk is authentic and is being written to flash.
     Payload,
-    /// All is written, and hashed once more where it stands.
+    /// Everything is written, and is hashed again in flash.
     Image,
-    /// The flash holds the image.
+    /// The flash contains the image.
     Installed,
 }
 
-/// The sealed image that comes.
+/// The processing of a sealed image.
 pub struct Unsealer<'b>(pub(super) &'b mut Room);
 
-/// What there is of it. It is large, and stands outside the structure of the bootloader.
+/// Its state. The state is large, and therefore not a part of the bootloader's structure.
 pub struct Room {
     pub(super) policy: Option<&'static SealPolicy>,
     layout: Option<&'static Layout>,
     /// Address of the key block.
     pub(super) key_block: u32,
     pub(super) takes_no_other: bool,
-    /// Rights that were granted since the reset, and the argument of the last ones.
+    /// Rights granted since the reset, and the argument of the last grant.
     pub(super) granted: u32,
     pub(super) argument: u32,
-    /// How often rights were granted in the device's life.
+    /// The number of grants in the device's life.
     pub(super) grants: u32,
     /// Not 0: the device is open from the next reset on.
     pub(super) opened: u32,
-    /// What is signed with a request; zeros until somebody asks for it.
+    /// The nonce that is signed with a request; zeros until a client reads it.
     pub(super) nonce: [u8; HASH],
-    /// Rights that a signature is looked at for, and their argument.
+    /// The requested rights while their signature is being checked, and their argument.
     pub(super) asked: (u32, u32),
-    /// The last event's number, and the events.
+    /// The number of the last event, and the events.
     pub(super) event: u32,
     pub(super) events: [Value; EVENTS],
-    /// What is to be stored as soon as the flash is idle: the last event, how often rights were
-    /// granted.
+    /// What must be stored when the flash is idle: the last event, the number of grants.
     pub(super) stores: (bool, bool),
     pub(super) active: bool,
     pub(super) stage: Stage,
     pub(super) program: u8,
-    /// The same image is installed: it is looked at and thrown away.
+    /// The same image is already installed: the new one is checked and discarded.
     same: bool,
-    /// The record that says so.
+    /// The record of the installed image.
     record: Value,
-    /// What the counter becomes is not stored yet.
+    /// The new counter is not stored yet.
     raises: bool,
     /// The program's flash.
     region: Region,
-    /// The other program, if it is the dictionary; else no bytes.
+    /// The other program, if it is the dictionary; otherwise an empty region.
     dictionary: Region,
-    /// Bytes of the head or of the chunk that are here, and that there have to be.
+    /// The bytes of the head or of the chunk that have arrived, and the required number.
     have: usize,
     want: usize,
-    /// Payload that is still to come, this chunk's not counted.
+    /// The payload that is still to come, without this chunk.
     left: u32,
-    /// Bytes of the image that are in flash, or of the flash that are hashed.
+    /// The bytes of the image that are in flash, or the bytes of the flash that are hashed.
     done: u32,
-    /// Where in the buffer the next bytes are that go into the flash, and how many.
+    /// The offset in the buffer of the next bytes for the flash, and their number.
     out: (usize, usize),
-    /// Up to where in the buffer the payload is deciphered.
+    /// The payload in the buffer is decrypted up to this offset.
     clear: usize,
-    /// Where in the buffer the bytes stand that are not unpacked yet.
+    /// The offset in the buffer of the bytes that are not decompressed yet.
     packed: usize,
-    /// What the counter becomes.
+    /// The new counter.
     counter: Value,
     needs: Needs,
-    /// What the hash of the next chunk has to be.
+    /// The expected hash of the next chunk.
     next: [u8; HASH],
     key: [u8; 32],
     hash: Sha512,
@@ -135,7 +134,7 @@ impl Default for Room {
 }
 
 impl Room {
-    /// Room for one image at a time.
+    /// The state for one image at a time.
     #[must_use]
     pub const fn new() -> Self {
         Self {
@@ -179,25 +178,25 @@ impl Room {
         }
     }
 
-    /// What works in it.
+    /// The interface to this state.
     pub fn unsealer(&mut self) -> Unsealer<'_> {
         Unsealer(self)
     }
 }
 
 impl Unsealer<'_> {
-    /// Whether the download is that of a sealed image.
+    /// Whether the present download is a sealed image.
     pub(crate) fn is_active(&self) -> bool {
         self.0.active
     }
 
-    /// It is not, or not any more.
+    /// Ends the processing of a sealed image.
     pub(crate) fn rest(&mut self) {
         self.0.active = false;
         self.0.stage = Stage::Head;
     }
 
-    /// What the device is.
+    /// Sets the properties of the device.
     pub(crate) fn attach<F: Flash>(
         &mut self,
         flash: &F,
@@ -217,17 +216,18 @@ impl Unsealer<'_> {
         self.0.takes_no_other = is_sealed(flash, parameters, layout);
     }
 
-    /// Works ahead while there is nothing else to do; whether there is nothing left.
+    /// Prepares constants while there is no other work; returns whether there is nothing left to
+    /// prepare.
     pub(crate) fn prepare(&mut self) -> bool {
         prepare()
     }
 
-    /// Whether the device has keys: then it takes and starts sealed programs alone.
+    /// Whether the device has keys and therefore accepts and starts only sealed programs.
     pub(crate) fn takes_no_other(&self) -> bool {
         self.0.takes_no_other
     }
 
-    /// An image for this program comes.
+    /// Starts an image for this program.
     pub(crate) fn begin(&mut self, program: u8, region: Region) {
         self.0.active = true;
         self.0.stage = Stage::Head;
@@ -240,55 +240,56 @@ impl Unsealer<'_> {
         self.0.same = false;
     }
 
-    /// Whether there is nothing to do before more bytes come.
+    /// Whether there is nothing to do before more bytes arrive.
     pub(crate) fn waits(&self) -> bool {
         matches!(self.0.stage, Stage::Head | Stage::Chunk | Stage::Installed)
     }
 
-    /// Whether the flash holds the image.
+    /// Whether the flash contains the image.
     pub(crate) fn is_installed(&self) -> bool {
         self.0.stage == Stage::Installed
     }
 
-    /// Whether it was there before.
+    /// Whether it was already installed before.
     pub(crate) fn is_same(&self) -> bool {
         self.0.same
     }
 
-    /// The record of it, as it was read then: after a power cut it may read so once and otherwise later.
+    /// Its record as it was read at that time: after a power cut it may read differently the next
+    /// time.
     pub(crate) fn same_record(&self) -> Value {
         self.0.record
     }
 
-    /// What goes into the flash next.
+    /// The next bytes for the flash.
     pub(crate) fn piece(&self) -> Option<Piece> {
         let size = self.0.out.1 as u32;
         (size > 0).then(|| Piece { address: self.0.region.base + self.0.done, size })
     }
 
-    /// A byte of it.
+    /// A byte of these bytes.
     pub(crate) fn data(&self, offset: usize) -> u8 {
         self.0.bytes.get(self.0.out.0 + offset).copied().unwrap_or(0)
     }
 
-    /// It is in the flash.
+    /// These bytes are in flash.
     pub(crate) fn written(&mut self) {
         self.0.done += self.0.out.1 as u32;
         self.0.out.1 = 0;
     }
 
-    /// What the program has to be.
+    /// The expected properties of the program.
     pub(crate) fn expected(&self) -> Expected {
         let head = Head(&self.0.head);
         Expected { size: head.size(), crc: Some(head.crc()) }
     }
 
-    /// What the counter becomes, once.
+    /// Returns the new counter, once.
     pub(crate) fn take_counter(&mut self) -> Option<Value> {
         core::mem::take(&mut self.0.raises).then_some(self.0.counter)
     }
 
-    /// The record of a program that came as a sealed image.
+    /// Marks the record of a program that was installed as a sealed image.
     pub(crate) fn mark(&self, record: ProgramRecord) -> ProgramRecord {
         if !self.0.active {
             return record;
@@ -299,7 +300,7 @@ impl Unsealer<'_> {
         ProgramRecord { version: head.version(), seal: Some(seal), ..record }
     }
 
-    /// Carries it on by a bounded piece of work.
+    /// Continues with one bounded step.
     pub(crate) fn step<F: Flash>(
         &mut self,
         flash: &F,
@@ -379,11 +380,11 @@ impl Room {
         Ok(())
     }
 
-    /// The head is complete.
+    /// Checks the complete head.
     fn judge<F: Flash>(&mut self, flash: &F, parameters: &impl Parameters) -> Result<(), Fault> {
         let block = self.key_block;
         let policy = self.policy.ok_or(Fault::Key)?;
-        // All of the key block but the secret keys, of which the ids.
+        // The key block without the secret keys; only the ids of these are read.
         let mut keys = [0; KEKS + KEK_COUNT * KEY];
         if is_sound(flash, block) {
             flash.read(block, &mut keys[..KEKS]);
@@ -395,7 +396,8 @@ impl Room {
         let record = ProgramRecord::load(parameters, flash, self.program);
         let [mut counter, mut epoch, installed, _] =
             parameters.get(flash, Key::Counter(self.program)).unwrap_or([0; 4]);
-        // A program that has proved itself has raised the counter, wherever that is due then.
+        // A program that has proved itself has raised the counter, if the policy raises it at
+        // confirmation.
         if record.is_some_and(|record| record.confirmed) {
             counter = counter.max(installed);
         }
@@ -440,7 +442,8 @@ impl Room {
         }
     }
 
-    /// The key is good that has to have signed the manifest: this root, or that of the certificate.
+    /// Starts to check the signature over the manifest, with this root or with the key in the
+    /// certificate.
     fn check_manifest(&mut self, root: Option<&[u8; 32]>) -> Result<(), Fault> {
         let head = Head(&self.head);
         let certified = head.certificate().map(|certificate| certificate.key());
@@ -451,7 +454,7 @@ impl Room {
         Ok(())
     }
 
-    /// The manifest is authentic.
+    /// Continues after the manifest was found authentic.
     fn open<F: Flash>(&mut self, flash: &F, parameters: &impl Parameters) -> Result<(), Fault> {
         let head = Head(&self.head);
         if let Some((at, recipient)) = &self.needs.recipient {
@@ -460,7 +463,7 @@ impl Room {
             let mut secret = [0; 32];
             flash.read(self.key_block + *at as u32 + 4, &mut secret);
             let stream = hmac(&secret, &[WRAP_DOMAIN, &head.nonce()]);
-            // It lies nowhere in RAM from here on.
+            // From here on no copy of it is left in RAM.
             secret = [0; 32];
             core::hint::black_box(&secret);
             if stream[32..40] != recipient.check() {
@@ -470,14 +473,14 @@ impl Room {
                 *key = wrapped ^ stream;
             }
         }
-        // Once.
+        // The right is valid for one image.
         self.granted &= !right::LOWER_COUNTER;
         self.dictionary = Region::new(0, 0);
         if head.flags() & flag::DICTIONARY == 0 {
             self.begin_chunks();
             return Ok(());
         }
-        // Of two programs the other one.
+        // The other one of two programs.
         let other = 3_u8.wrapping_sub(self.program);
         let place = self.layout.and_then(|layout| layout.program(other));
         let record = ProgramRecord::load(parameters, flash, other);
@@ -489,7 +492,7 @@ impl Room {
         Ok(())
     }
 
-    /// All is known of the image but its chunks.
+    /// Continues when everything but the chunks is known.
     fn begin_chunks(&mut self) {
         let head = Head(&self.head);
         self.next = head.chain();
@@ -512,7 +515,7 @@ impl Room {
         }
     }
 
-    /// A chunk is here.
+    /// Checks a complete chunk.
     fn check_chunk(&mut self) -> Result<(), Fault> {
         if self.hash.finish()[..HASH] != self.next {
             return Err(Fault::Signature);
@@ -524,14 +527,14 @@ impl Room {
         }
         self.stage = Stage::Payload;
         self.clear = PAYLOAD;
-        // What the chunk before has left of compressed bytes stands in front of it.
+        // The compressed bytes that the previous chunk left over are moved in front of this one.
         let left = CARRY - self.packed;
         self.bytes.copy_within(self.packed..CARRY, PAYLOAD - left);
         self.packed = PAYLOAD - left;
         Ok(())
     }
 
-    /// The payload goes into the flash.
+    /// Writes the payload to flash.
     fn unpack<F: Flash>(&mut self, flash: &F) -> Result<(), Fault> {
         let head = Head(&self.head);
         let size = head.size();
@@ -552,13 +555,14 @@ impl Room {
         let last = self.left == 0;
         let done = self.done;
         let room = (size - done).min(UNPACK as u32) as usize;
-        // The last symbol may lead to more bytes than are unpacked at a time, with no input left.
+        // The last symbol may give more bytes than are decompressed at a time, without any input
+        // left.
         if (self.packed < self.want || last) && room > 0 {
             let (base, dictionary) = (self.region.base, self.dictionary);
             let before = |distance: u32| {
                 let mut byte = [0];
-                // Behind the dictionary the image begins. (Of one of odd length the first byte is left
-                // out, so that positions are odd where those of the image are.)
+                // The image follows the dictionary. (The first byte of a dictionary with an odd
+                // size is left out, so that odd positions stay odd positions of the image.)
                 let from = if distance > done { dictionary.end() } else { base };
                 flash.read(from.wrapping_add(done).wrapping_sub(distance), &mut byte);
                 byte[0]
@@ -574,7 +578,7 @@ impl Room {
                 return Ok(());
             }
         }
-        // No more comes out of this chunk.
+        // This chunk gives no more bytes.
         let rest = self.want - self.packed;
         if last && done < size || rest > CARRY {
             return Err(Fault::Format);
@@ -586,15 +590,16 @@ impl Room {
     }
 }
 
-/// What the counter of a program becomes before its record goes: that of a program which has proved
-/// itself. Also where it reads so already: after a power cut it may read so now and otherwise later.
+/// The new counter of a program before its record is removed: the counter of a program that has
+/// proved itself. It is written even if it already has this value: after a power cut it may read
+/// this way now and differently later.
 pub(crate) fn proved<F: Flash>(flash: &F, parameters: &impl Parameters, program: u8) -> Option<Value> {
     let record = ProgramRecord::load(parameters, flash, program)?;
     let [counter, epoch, installed, _] = parameters.get(flash, Key::Counter(program))?;
     (record.confirmed && installed >= counter).then_some([installed, epoch, installed, 0])
 }
 
-/// A signature is about to be looked at.
+/// Starts to check a signature.
 pub(super) fn start(
     verification: &mut Verification,
     key: &[u8; 32],

@@ -1,5 +1,6 @@
-//! Sealed images, between the queue and the flash: the one seam of the feature `sealed`. Without it
-//! nothing of them is there, and every question is answered by no.
+//! The interface between the queue, the flash and sealed images: the only place that depends on the
+//! feature `sealed`. Without the feature, there is no code for sealed images, and every question is
+//! answered with no.
 
 #[cfg(not(feature = "sealed"))]
 mod absent;

@@ -9,16 +9,16 @@ pub const USER_SOFTWARE: u16 = 0x6200;
 pub enum Stop {
     /// A code breakpoint: the instruction at the address is the next one.
     Breakpoint = 1,
-    /// A single step is done; the instruction at the address is the next one. (From 80h on, the
-    /// types are our own.)
+    /// A single step has ended; the instruction at the address is the next one. (The types from 80h
+    /// on are coboot's own.)
     Step = 0x80,
-    /// The breakpoint at the address lies in code that cannot be stopped: breakpoints are off, and
-    /// the program runs on.
+    /// The breakpoint at the address lies in code that cannot be stopped: breakpoints are disabled,
+    /// and the program continues.
     OutOfReach = 0x81,
 }
 
 impl Stop {
-    /// The stop of this number.
+    /// The stop with this number.
     #[must_use]
     pub const fn from_number(number: u8) -> Option<Self> {
         match number {
@@ -51,7 +51,7 @@ pub struct Command {
 }
 
 impl Command {
-    /// Takes the eight bytes apart; `None` for what is neither a read nor a write.
+    /// Parses the eight bytes; `None` for anything but a read or a write.
     #[must_use]
     pub const fn parse(bytes: [u8; 8]) -> Option<Self> {
         let [kind, _reserved, len_low, len_high, a, b, c, d] = bytes;

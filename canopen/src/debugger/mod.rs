@@ -10,21 +10,22 @@
 //! | 2 | status: 0 done, 1 done and there are data, 2 refused or failed, FFh waits for data (CiA 301, 1025h) |
 //! | 4 | data: a domain of exactly that number of bytes |
 //!
-//! Sub-index 3, the reply of CiA 301, does not exist, as in that document. A command is good for
-//! any number of reads or writes of its data, until the next one.
+//! Sub-index 3, the reply of CiA 301, does not exist, as in that document. A command permits any
+//! number of reads or writes of its data, until the next command.
 //!
 //! | the client | abort |
 //! |---|---|
-//! | sends a command that has not 8 bytes | 06070012h, 06070013h |
-//! | sends an unknown one, one for no bytes, or one for bytes that must not be touched | 06090030h |
+//! | sends a command that does not have 8 bytes | 06070012h, 06070013h |
+//! | sends an unknown command, a command for no bytes, or a command for bytes without permission |
+//! 06090030h |
 //! | sends more or fewer data than its command said | 06070012h, 06070013h |
-//! | asks for data without a command to read | 08000024h |
-//! | sends data without a command to write | 08000022h |
-//! | does anything of it to a device whose memory is locked | 08000022h |
+//! | reads data without a command to read | 08000024h |
+//! | writes data without a command to write | 08000022h |
+//! | sends any request to a device with locked memory | 08000022h |
 //!
-//! A device composes [`ENTRIES`] into its table, keeps a [`Debugger`] beside its own state and
-//! hands [`Debugger::attach`] to its slave in place of itself. When the program stops, it reports
-//! that by [`Debugger::stopped`].
+//! A device adds [`ENTRIES`] to its table, keeps a [`Debugger`] beside its own state and passes
+//! [`Debugger::attach`] to its slave instead of itself. When the program stops, the device calls
+//! [`Debugger::stopped`].
 
 mod command;
 
@@ -62,7 +63,7 @@ pub const ENTRIES: [Entry; 4] = [
 pub mod status {
     /// The last command ended without an error.
     pub const DONE: u8 = 0;
-    /// The same, and there are data.
+    /// The last command ended without an error, and there are data.
     pub const REPLY: u8 = 1;
     /// The last command or its data were refused.
     pub const ERROR: u8 = 2;
@@ -70,10 +71,10 @@ pub mod status {
     pub const EXECUTING: u8 = 0xFF;
 }
 
-/// The memory behind the interface.
+/// The memory that the interface accesses.
 ///
-/// It is read and written in pieces of at most [`PIECE`] bytes within a command that it has
-/// allowed. Each piece starts at a multiple of `PIECE` behind the command's address.
+/// It is read and written in pieces of at most [`PIECE`] bytes, within a command that it has
+/// permitted. Each piece starts at a multiple of `PIECE` from the command's address.
 pub trait Memory {
     /// Whether the device refuses all access to its memory.
     fn is_locked(&mut self) -> bool;
@@ -94,8 +95,8 @@ pub trait Memory {
     fn write(&mut self, address: u32, bytes: &[u8]) -> Result<(), AbortCode>;
 }
 
-/// Bytes that are read or written at once. A longer read or write is carried out piece by piece
-/// while it is transferred; a shorter write is carried out when all of its data have come.
+/// The most bytes of one read or write. A longer read or write is carried out piece by piece during
+/// the transfer; a shorter write is carried out when all its data have arrived.
 pub const PIECE: usize = 128;
 
 /// The state of the interface.
@@ -108,7 +109,7 @@ pub struct Debugger<M> {
     stop: Option<(Stop, u32)>,
 }
 
-/// The last command, and how much of its data is transferred.
+/// The last command, and the number of its bytes that were transferred.
 #[derive(Clone, Copy, Debug)]
 enum State {
     Idle,
@@ -131,18 +132,18 @@ impl<M: Memory> Debugger<M> {
         Self { memory, state: State::Idle, status: status::DONE, piece: [0; PIECE], stop: None }
     }
 
-    /// The memory behind it.
+    /// The memory.
     pub fn memory(&mut self) -> &mut M {
         &mut self.memory
     }
 
-    /// The program has stopped at this address. This is reported by an emergency, of the latest
-    /// stop only.
+    /// Reports that the program has stopped at this address. An emergency reports only the latest
+    /// stop.
     pub fn stopped(&mut self, stop: Stop, address: u32) {
         self.stop = Some((stop, address));
     }
 
-    /// The device with this interface in front of it, for its slave.
+    /// The device combined with this interface, for its slave.
     pub fn attach<'a, D>(&'a mut self, device: &'a mut D) -> Debugged<'a, D, M> {
         Debugged { device, debugger: self }
     }
@@ -155,7 +156,7 @@ impl<M: Memory> Debugger<M> {
         }
     }
 
-    /// Takes note of an error in the status.
+    /// Records an error in the status.
     fn noted<T>(&mut self, outcome: Result<T, AbortCode>) -> Result<T, AbortCode> {
         if outcome.is_err() {
             self.status = status::ERROR;
@@ -242,7 +243,8 @@ impl<M: Memory> Debugger<M> {
             if received == len {
                 return Err(AbortCode::LENGTH_TOO_HIGH);
             }
-            // The last piece is written by `download_end`, so this one only when more follows.
+            // `download_end` writes the last piece, so this piece is written only if more data
+            // follow.
             if received > 0 && received.is_multiple_of(PIECE as u32) {
                 self.flush()?;
             }
@@ -281,7 +283,7 @@ fn matches(size: u32, len: u32) -> Result<(), AbortCode> {
     }
 }
 
-/// A device with the debugger interface in front of it.
+/// A device combined with the debugger interface.
 #[derive(Debug)]
 pub struct Debugged<'a, D, M> {
     device: &'a mut D,
@@ -289,7 +291,7 @@ pub struct Debugged<'a, D, M> {
 }
 
 impl<D: Objects, M: Memory> Objects for Debugged<'_, D, M> {
-    /// The device's, which [`ENTRIES`] are part of.
+    /// The device's entries, which include [`ENTRIES`].
     fn entries(&self) -> &'static [Entry] {
         self.device.entries()
     }
@@ -352,7 +354,7 @@ impl<D: Objects, M: Memory> Objects for Debugged<'_, D, M> {
 
     fn next_emergency(&mut self) -> Option<[u8; 8]> {
         let Some((stop, address)) = self.debugger.stop.take() else { return self.device.next_emergency() };
-        // A stop is no error of the device: the message has the error register as it is.
+        // A stop is not an error of the device: the message contains the unchanged error register.
         let mut register = [0];
         let _ = self.device.read(Address::new(ERROR_REGISTER, 0), &mut register);
         let [low, high] = USER_SOFTWARE.to_le_bytes();

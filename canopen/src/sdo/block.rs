@@ -23,8 +23,8 @@ impl Crc16 {
         Self(0)
     }
 
-    /// Adds data. Bit by bit: this takes 88 bytes of code where a table takes 512, and a CAN bus
-    /// brings at most 60 kB/s.
+    /// Adds data, bit by bit: this takes 88 bytes of code where a table takes 512, and a CAN bus
+    /// carries at most 60 kB/s.
     pub fn update(&mut self, data: &[u8]) {
         for byte in data {
             self.0 ^= u16::from(*byte) << 8;
@@ -59,33 +59,34 @@ pub(super) fn check_blksize(blksize: u8) -> Result<u8, AbortCode> {
 /// send it again.
 #[derive(Debug)]
 pub(super) struct Receiver {
-    /// Segments of the sub-block that is open; 0 while none is, because an acknowledgement is still
-    /// to be sent.
+    /// The number of segments of the open sub-block; 0 while none is open, because an
+    /// acknowledgement must be sent first.
     blksize: u8,
-    /// The number of the last segment that came in order.
+    /// The number of the last segment received in order.
     ackseq: u8,
-    /// The number of the last segment of this sub-block that came at all; 0 before the first one.
+    /// The number of the last received segment of this sub-block; 0 before the first one.
     seen: u8,
-    /// Numbers, the first and the last, that until the first segment of this sub-block has come
-    /// belong to the sub-block before: its last segment once more; or its rest, if it was
-    /// acknowledged early and the other side does not look at that before it has sent all.
+    /// Until the first segment of this sub-block has arrived, numbers in this range (first and last)
+    /// belong to the previous sub-block: its last segment again; or its rest, if it was acknowledged
+    /// early and the other side reads the acknowledgement only after it has sent everything.
     old: (u8, u8),
-    /// The frame that came last.
+    /// The last received frame.
     pub frame: [u8; 8],
-    /// It may be no segment at all.
+    /// That frame may not be a segment.
     pub is_doubtful: bool,
-    /// It is the last segment of all. The end of the transfer has the number of its data bytes.
+    /// That frame is the last segment of the transfer. The end of the transfer contains the number
+    /// of its data bytes.
     is_complete: bool,
-    /// `None` if one side cannot make a CRC.
+    /// `None` if one side does not support the CRC.
     crc: Option<Crc16>,
 }
 
-/// What follows from a segment.
+/// The consequence of a segment.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct Received {
-    /// It came in order and is not the last: its seven bytes are data.
+    /// The segment is in order and not the last one: its seven bytes are data.
     pub is_data: bool,
-    /// The sub-block is over: acknowledge up to this segment.
+    /// The sub-block has ended: acknowledge up to this segment.
     pub ackseq: Option<u8>,
 }
 
@@ -94,7 +95,7 @@ impl Received {
 }
 
 impl Receiver {
-    /// A receiver without an open sub-block. It computes a CRC if both sides can.
+    /// A receiver without an open sub-block. It computes the CRC if both sides support it.
     pub fn new(crc: bool) -> Self {
         Self {
             blksize: 0,
@@ -108,24 +109,24 @@ impl Receiver {
         }
     }
 
-    /// Opens the next sub-block, of 1 to 127 segments, once the frame that grants it is on its way.
+    /// Opens the next sub-block of 1 to 127 segments, after the frame that grants it was sent.
     pub fn open(&mut self, blksize: u8) {
         self.blksize = blksize;
         self.ackseq = 0;
         self.seen = 0;
     }
 
-    /// Whether the last segment of all has come, so that only the end is missing.
+    /// Whether the last segment has arrived, so that only the end is missing.
     pub fn is_complete(&self) -> bool {
         self.is_complete
     }
 
-    /// Whether a sub-block has begun and not ended. If no more segments come, its end was lost.
+    /// Whether a sub-block has begun and not ended. If no more segments arrive, its end was lost.
     pub fn is_within(&self) -> bool {
         self.seen != 0 && self.blksize != 0
     }
 
-    /// Ends the sub-block before its end; gives the number of the segment to acknowledge.
+    /// Ends the sub-block early; returns the number of the segment to acknowledge.
     pub fn close(&mut self) -> u8 {
         self.old = (self.seen + 1, self.blksize);
         self.blksize = 0;
@@ -133,13 +134,13 @@ impl Receiver {
         self.ackseq
     }
 
-    /// Takes the frame of a segment.
+    /// Processes the frame of a segment.
     ///
-    /// The other side sends the segments of a sub-block in a row: the next one to be taken, the one
-    /// behind the last one that came, or the last one of the sub-block. (Before the first one it may
-    /// still be at the sub-block before.) For a server, which has to expect an initiate, another frame
-    /// that reads as one is `doubtful`; if it is a segment after all, the next one follows it in the
-    /// row.
+    /// The other side sends the segments of a sub-block in a row: the next one in order, the
+    /// successor of the last received one, or the last one of the sub-block. (Before the first one
+    /// it may still be sending the previous sub-block.) A server must also expect an initiate: for
+    /// it, any other frame that reads as an initiate is `doubtful`. If such a frame is a segment
+    /// after all, its successor follows it.
     ///
     /// # Errors
     /// [`AbortCode::SEQUENCE_NUMBER`] for number 0 and for a number above the block size.
@@ -150,7 +151,7 @@ impl Receiver {
             return Err(AbortCode::SEQUENCE_NUMBER);
         }
         let in_order = seqno == self.ackseq + 1;
-        // CAN sends a frame once more if the end of it was disturbed.
+        // CAN repeats a frame if its end was disturbed.
         if !in_order && self.frame == *frame {
             return Ok(Received::NOTHING);
         }
@@ -199,13 +200,13 @@ impl Receiver {
         }
     }
 
-    /// Whether a frame is the last segment of all once more, where the end is expected.
+    /// Whether a frame repeats the last segment of the transfer, where the end is expected.
     pub fn is_last_segment(&self, frame: &[u8; 8]) -> bool {
         self.is_complete && self.frame == *frame
     }
 
-    /// Takes the end, with the number of bytes of the last segment that are no data, and the CRC.
-    /// Gives the data of the last segment.
+    /// Processes the end, with the number of bytes of the last segment that are not data, and the
+    /// CRC. Returns the data of the last segment.
     ///
     /// # Errors
     /// [`AbortCode::COMMAND`] before the last segment, [`AbortCode::CRC`] for a wrong CRC.
@@ -251,10 +252,10 @@ mod tests {
         assert_eq!(receiver.take(&segment(false, 1), true), Ok(DATA));
         assert_eq!(receiver.take(&segment(false, 3), true), Ok(NOTHING));
         assert_eq!(receiver.take(&segment(false, 4), true), Ok(Received { is_data: false, ackseq: Some(1) }));
-        // Between acknowledgement and the next sub-block nothing counts.
+        // Between the acknowledgement and the next sub-block, segments do not count.
         assert_eq!(receiver.take(&segment(false, 1), true), Ok(NOTHING));
         receiver.open(4);
-        // The end of the old sub-block once more.
+        // The end of the old sub-block again.
         assert_eq!(receiver.take(&segment(false, 4), true), Ok(NOTHING));
         assert!(!receiver.is_within());
         assert_eq!(receiver.take(&segment(false, 1), true), Ok(DATA));

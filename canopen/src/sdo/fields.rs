@@ -42,7 +42,7 @@ pub const EXPEDITED: u8 = 0x02;
 pub const SIZE_TOLD: u8 = 0x01;
 /// Initiate of a block transfer, "s": the frame has the size. It is another bit than elsewhere.
 pub const BLOCK_SIZE_TOLD: u8 = 0x02;
-/// Initiate of a block transfer: this side can make a CRC.
+/// Initiate of a block transfer: this side supports the CRC.
 pub const CRC: u8 = 0x04;
 /// Segment, "t": alternates, starting with 0.
 pub const TOGGLE: u8 = 0x10;
@@ -51,8 +51,8 @@ pub const LAST: u8 = 0x01;
 /// Segment of a block transfer, "c": no more follow. The other bits of byte 0 are its number.
 pub const LAST_OF_BLOCKS: u8 = 0x80;
 
-/// The command specifier in byte 0 without the other fields: of a request one of [`ccs`], of an
-/// answer one of [`scs`], of either [`ABORT`], and another value for a command that does not exist.
+/// The command specifier in byte 0 without the other fields: one of [`ccs`] for a request, one of
+/// [`scs`] for an answer, [`ABORT`] for either, and another value for an unknown command.
 #[must_use]
 pub const fn specifier(command: u8) -> u8 {
     match command >> 5 {
@@ -62,8 +62,8 @@ pub const fn specifier(command: u8) -> u8 {
     }
 }
 
-/// Whether byte 0 may be that of a request with an address, an initiate: 1, 2, 5 or 6 in the top three
-/// bits. (5 and 6 have other requests as well.)
+/// Whether byte 0 may belong to a request with an address, an initiate: 1, 2, 5 or 6 in the top
+/// three bits. (5 and 6 have other requests, too.)
 #[must_use]
 pub const fn may_initiate(command: u8) -> bool {
     0b0110_0110 >> (command >> 5) & 1 != 0
@@ -87,19 +87,19 @@ pub const fn number(bytes: &[u8; 8]) -> u32 {
     u32::from_le_bytes(data(bytes))
 }
 
-/// How many of the four bytes of an expedited initiate are no data ("n").
+/// How many of the four bytes of an expedited initiate are not data ("n").
 #[must_use]
 pub const fn unused_of_4(command: u8) -> u8 {
     command >> 2 & 0x03
 }
 
-/// How many of the seven bytes of a segment are no data ("n").
+/// How many of the seven bytes of a segment are not data ("n").
 #[must_use]
 pub const fn unused_of_7(command: u8) -> u8 {
     command >> 1 & 0x07
 }
 
-/// How many of the seven bytes of the last segment of a block transfer are no data ("n" of its
+/// How many of the seven bytes of the last segment of a block transfer are not data ("n" of its
 /// end).
 #[must_use]
 pub const fn unused_of_blocks(command: u8) -> u8 {

@@ -1,11 +1,10 @@
 //! The eight bytes of an SDO frame as named fields (CiA 301 section 7.2.4.3).
 //!
-//! [`Request`] is what a client sends, [`Response`] what a server sends. The top three bits of byte
-//! 0 are the command specifier; reserved bits are sent as 0 and not looked at when received.
-//! Multi-byte fields are little-endian.
+//! [`Request`] is a frame of a client, [`Response`] a frame of a server. The top three bits of byte
+//! 0 are the command specifier. Reserved bits are sent as 0 and ignored when received. Multi-byte
+//! fields are little-endian.
 //!
-//! Segments of a block transfer have no command specifier and are a type of their own:
-//! [`BlockSegment`].
+//! Segments of a block transfer have no command specifier and a separate type: [`BlockSegment`].
 
 use core::ops::Deref;
 
@@ -30,7 +29,7 @@ impl<const N: usize> Chunk<N> {
         Self { bytes, len: len as u8 }
     }
 
-    /// How many of the `N` bytes are no data: the field "n" of the standard.
+    /// How many of the `N` bytes are not data: the field "n" of the standard.
     const fn unused(&self) -> u8 {
         N as u8 - self.len
     }
@@ -49,12 +48,13 @@ impl<const N: usize> Deref for Chunk<N> {
     }
 }
 
-/// The data of an initiate, or how they follow.
+/// The data of an initiate, or the announcement of segments.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Payload {
     /// All of the data, 1 to 4 bytes (e = 1, s = 1).
     Expedited(Chunk<4>),
-    /// All of the data; how many of the four bytes count is not given (e = 1, s = 0).
+    /// All of the data; the frame does not give the number of data bytes among the four (e = 1, s =
+    /// 0).
     Unsized([u8; 4]),
     /// Segments follow (e = 0), of this many bytes altogether if the size is given (s = 1).
     Segmented(Option<u32>),
@@ -110,8 +110,8 @@ impl Segment {
     }
 }
 
-/// One segment of a block transfer, in either direction. How many of the seven bytes of the last
-/// one count is in the end of the transfer.
+/// One segment of a block transfer, in either direction. The end of the transfer gives the number
+/// of data bytes in the last segment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BlockSegment {
     /// No more segments follow ("c").
@@ -123,7 +123,7 @@ pub struct BlockSegment {
 }
 
 impl BlockSegment {
-    /// `None` for sequence number 0, which no segment has, so that an abort (80h) differs from all
+    /// `None` for sequence number 0: no segment has it, so an abort (80h) differs from all
     /// segments.
     #[must_use]
     pub fn parse(bytes: &[u8; 8]) -> Option<Self> {
@@ -145,9 +145,9 @@ impl BlockSegment {
 /// The end of a block transfer, from the side that sent the data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BlockEnd {
-    /// Bytes of the last segment that are no data, 0 to 7 ("n").
+    /// Bytes of the last segment that are not data, 0 to 7 ("n").
     pub unused: u8,
-    /// CRC over all data, 0 if one side cannot make it.
+    /// CRC of all data, 0 if one side does not support it.
     pub crc: u16,
 }
 
@@ -165,7 +165,7 @@ impl BlockEnd {
 /// The acknowledgement of a sub-block, and the size of the next one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BlockAck {
-    /// Number of the last segment of the sub-block that arrived in order; 0 for none.
+    /// The number of the last segment of the sub-block received in order; 0 for none.
     pub ackseq: u8,
     /// Segments of the next sub-block, 1 to 127.
     pub blksize: u8,
@@ -196,20 +196,20 @@ pub enum Request {
     Abort(Address, AbortCode),
     /// Initiate block download (ccs 6, cs 0).
     InitiateBlockDownload {
-        /// What is written.
+        /// The object to write.
         at: Address,
-        /// The client can make a CRC.
+        /// The client supports the CRC.
         crc: bool,
-        /// Bytes to come, if given.
+        /// Size in bytes, if given.
         size: Option<u32>,
     },
     /// End block download (ccs 6, cs 1).
     EndBlockDownload(BlockEnd),
     /// Initiate block upload (ccs 5, cs 0).
     InitiateBlockUpload {
-        /// What is read.
+        /// The object to read.
         at: Address,
-        /// The client can check a CRC.
+        /// The client supports the CRC.
         crc: bool,
         /// Segments per sub-block, 1 to 127.
         blksize: u8,
@@ -293,7 +293,7 @@ pub enum Response {
     Abort(Address, AbortCode),
     /// Initiate block download (scs 5, ss 0).
     InitiateBlockDownload {
-        /// What is written.
+        /// The object to write.
         at: Address,
         /// The server checks a CRC.
         crc: bool,
@@ -306,11 +306,11 @@ pub enum Response {
     AckBlockDownload(BlockAck),
     /// Initiate block upload (scs 6, ss 0).
     InitiateBlockUpload {
-        /// What is read.
+        /// The object to read.
         at: Address,
-        /// The server makes a CRC.
+        /// The server supports the CRC.
         crc: bool,
-        /// Bytes to come, if given.
+        /// Size in bytes, if given.
         size: Option<u32>,
     },
     /// End block upload (scs 6, ss 1).

@@ -1,4 +1,4 @@
-//! A layout as a text for the host tool (`coflash --layout FILE`), for boards that a tool was not
+//! A layout as text for the host tool (`coflash --layout FILE`), for boards that the tool was not
 //! built with.
 
 use core::fmt;

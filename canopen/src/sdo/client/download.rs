@@ -8,10 +8,10 @@ use crate::sdo::client::{means_unknown, Block, Config, Link, Next, SdoError, Ste
 use crate::sdo::wire::{BlockAck, BlockEnd, BlockSegment, Chunk, Payload, Request, Response, Segment};
 use crate::time::Instant;
 
-/// After this many sub-blocks in a row of which no segment arrived, the transfer is aborted.
+/// After this many consecutive sub-blocks without any received segment, the transfer is aborted.
 const HOPELESS: u8 = 10;
 
-/// Writes a value: expedited up to four bytes, else segmented or as blocks.
+/// Writes a value: expedited up to four bytes, otherwise segmented or as blocks.
 #[derive(Debug)]
 pub struct Download<D> {
     link: Link,
@@ -32,11 +32,11 @@ enum State {
         fallback: bool,
     },
     Blocks(SubBlock),
-    /// All data have arrived; the server has to confirm the end.
+    /// All data have arrived; the server must confirm the end.
     EndingBlock,
 }
 
-/// A sub-block on its way.
+/// A sub-block that is being sent.
 #[derive(Clone, Copy, Debug)]
 struct SubBlock {
     /// The server checks a CRC.
@@ -46,7 +46,7 @@ struct SubBlock {
     base: usize,
     /// Number of the last segment sent, 0 before the first one.
     seqno: u8,
-    /// Sub-blocks in a row before this one of which no segment arrived.
+    /// Consecutive sub-blocks before this one of which no segment arrived.
     in_vain: u8,
 }
 
@@ -57,7 +57,7 @@ impl<D: AsRef<[u8]>> Download<D> {
         Self { link, data, state: State::Initiating }
     }
 
-    /// The same as blocks. Up to four bytes still go expedited.
+    /// Writes `data` by block transfer. Up to four bytes are still sent expedited.
     pub fn as_blocks(node: NodeId, at: Address, data: D, config: Config, block: Block) -> Self {
         let mut download = Self::new(node, at, data, config);
         let len = download.data.as_ref().len();
@@ -115,7 +115,7 @@ impl<D: AsRef<[u8]>> Download<D> {
                 self.state = State::EndingBlock;
                 Ok(Next::Send(Request::EndBlockDownload(BlockEnd { unused: unused as u8, crc })))
             }
-            // The server's acknowledgement once more.
+            // The server repeats its acknowledgement.
             (Some(Response::AckBlockDownload(_)), State::EndingBlock) => Ok(Next::Ignore),
             (Some(Response::EndBlockDownload), State::EndingBlock) => Ok(Next::Done(None)),
             (response, _) => self.link.unexpected(response),
@@ -132,7 +132,7 @@ fn initiate(at: Address, data: &[u8]) -> Request {
     let payload = if is_expedited(data.len()) {
         Payload::Expedited(Chunk::new(data))
     } else {
-        // What does not fit into 32 bits is announced as being of unknown size.
+        // A size of more than 32 bits is announced as unknown.
         Payload::Segmented(u32::try_from(data.len()).ok())
     };
     Request::InitiateDownload(at, payload)
@@ -146,12 +146,12 @@ fn segment(data: &[u8], start: usize, toggle: bool) -> (Segment, usize) {
 }
 
 impl SubBlock {
-    /// The offset where the data end that were sent.
+    /// The offset of the end of the sent data.
     fn sent(&self, data: &[u8]) -> usize {
         (self.base + usize::from(self.seqno) * SEGMENT).min(data.len())
     }
 
-    /// Whether all of it is sent. Empty data have one segment, too.
+    /// Whether everything is sent. Empty data have one segment, too.
     fn is_sent(&self, data: &[u8]) -> bool {
         self.seqno == self.blksize || (self.seqno > 0 && self.sent(data) == data.len())
     }
@@ -164,12 +164,12 @@ impl SubBlock {
         BlockSegment { last: self.sent(data) == data.len(), seqno: self.seqno, data: bytes }
     }
 
-    /// Goes on with the next sub-block, behind the last segment that arrived. If that was the last
-    /// of all, gives the CRC over all data, 0 if the server does not check it.
+    /// Continues with the next sub-block after the last segment that arrived. If that was the last
+    /// segment of the transfer, returns the CRC of all data, 0 if the server does not check it.
     fn acknowledged(&mut self, ack: BlockAck, data: &[u8]) -> Result<Option<u16>, AbortCode> {
         let blksize = check_blksize(ack.blksize)?;
         if ack.ackseq > self.seqno {
-            // Before all is sent: the acknowledgement of the sub-block before, once more.
+            // Before everything is sent: the acknowledgement of the previous sub-block again.
             return if self.is_sent(data) { Err(AbortCode::SEQUENCE_NUMBER) } else { Ok(None) };
         }
         let all = self.is_sent(data) && ack.ackseq == self.seqno && self.sent(data) == data.len();

@@ -1,9 +1,9 @@
 //! The SDO client: one value per transfer, [`Download`] or [`Upload`].
 //!
-//! A transfer is driven through [`Transfer`]: [`handle`](Transfer::handle) takes any frame
-//! received, and [`poll`](Transfer::poll) gives what to do next. A blocking caller loops over one
-//! transfer, a caller with many nodes keeps one transfer per node and passes every frame to all of
-//! them.
+//! A transfer is driven through [`Transfer`]: [`handle`](Transfer::handle) processes any received
+//! frame, and [`poll`](Transfer::poll) returns the next action. A blocking caller loops over one
+//! transfer; a caller with many nodes keeps one transfer for each node and passes every frame to
+//! all of them.
 //!
 //! ```
 //! use canopen::sdo::client::{Config, Step, Transfer, Upload};
@@ -30,8 +30,8 @@
 //! # assert_eq!(result, Err(canopen::sdo::SdoError::NoAnswer));
 //! ```
 //!
-//! A block transfer sends, or receives, many frames between two answers. Between two [`Step::Send`]
-//! a caller should take the frames that have arrived, so that an abort in the middle ends the
+//! A block transfer sends or receives many frames between two answers. Between two [`Step::Send`] a
+//! caller should process the frames that have arrived, so that an abort in the middle ends the
 //! transfer at once.
 
 use core::fmt;
@@ -49,7 +49,7 @@ mod upload;
 pub use download::Download;
 pub use upload::{Buffer, Sink, Upload};
 
-/// What can be chosen about a transfer.
+/// The configuration of a transfer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Config {
     /// How long to wait for an answer of the server, in milliseconds.
@@ -63,7 +63,7 @@ impl Default for Config {
     }
 }
 
-/// What can be chosen about a block transfer.
+/// The configuration of a block transfer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Block {
     /// Whether to start again segmented if the server does not support block transfer.
@@ -73,8 +73,8 @@ pub struct Block {
     /// Upload: protocol switch threshold. Up to this many bytes the server may answer without
     /// blocks; 0 for never.
     pub pst: u8,
-    /// Upload: how long a sub-block may pause before it is acknowledged as far as it came, in
-    /// milliseconds. Less than the server's time-out.
+    /// Upload: how long a sub-block may pause before the received part is acknowledged, in
+    /// milliseconds. It must be less than the server's time-out.
     pub repeat_ms: u32,
 }
 
@@ -109,54 +109,54 @@ impl fmt::Display for SdoError {
 
 impl core::error::Error for SdoError {}
 
-/// What to do next about a transfer.
+/// The next action for a transfer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Step {
     /// Send this frame, and ask again.
     Send(Frame),
-    /// Wait for frames, until then at the latest.
+    /// Wait for frames, at most until this time.
     Wait(Instant),
-    /// It is over; from now on this is the answer to each call.
+    /// The transfer has ended; every later call returns this, too.
     Done(Result<(), SdoError>),
 }
 
-/// A transfer that is going on.
+/// A running transfer.
 pub trait Transfer {
-    /// Takes any frame received; those that are no answer to this transfer are ignored.
+    /// Processes any received frame; frames that do not answer this transfer are ignored.
     fn handle(&mut self, frame: &Frame, now: Instant);
 
-    /// Gives what to do next.
+    /// Returns the next action.
     fn poll(&mut self, now: Instant) -> Step;
 
-    /// Bytes of data that the server has acknowledged, or that have arrived here.
+    /// The number of data bytes that the server has acknowledged, or that have arrived here.
     fn progress(&self) -> u32;
 
-    /// Ends the transfer: the server is sent this abort.
+    /// Ends the transfer: the server gets this abort.
     fn abort(&mut self, code: AbortCode);
 }
 
-/// What download and upload share: the server, the time-out, and the request to be sent.
+/// Common data of download and upload: the server, the time-out, and the next request.
 #[derive(Debug)]
 struct Link {
     node: NodeId,
     at: Address,
     timeout_ms: u32,
-    /// Waits to be sent by `poll`.
+    /// The request that `poll` sends next.
     request: Option<Request>,
-    /// When a frame was last sent or received.
+    /// The time of the last sent or received frame.
     moved: Instant,
     result: Option<Result<(), SdoError>>,
     progress: u32,
 }
 
-/// What follows from an answer.
+/// The consequence of an answer.
 enum Next {
     Send(Request),
     Wait,
-    /// The frame is ignored. It does not restart the time-out, or answers to another client could
-    /// keep this transfer waiting for ever.
+    /// The frame is ignored. It does not restart the time-out, because answers to another client
+    /// could otherwise keep this transfer waiting forever.
     Ignore,
-    /// The transfer succeeded; with a last request to the server, if the protocol has one.
+    /// The transfer was successful; with a last request to the server, if the protocol has one.
     Done(Option<Request>),
 }
 
@@ -205,7 +205,7 @@ impl Link {
         Step::Send(Frame::full(CobId::sdo_request(self.node), bytes))
     }
 
-    /// Carries out what follows from an answer.
+    /// Carries out the consequence of an answer.
     fn advance(&mut self, next: Result<Next, SdoError>, now: Instant) {
         if !matches!(next, Ok(Next::Ignore)) {
             self.moved = now;
@@ -229,7 +229,7 @@ impl Link {
         }
     }
 
-    /// An answer that has no place here. A late answer to the initiate of an earlier transfer is
+    /// An answer that does not fit here. A late answer to the initiate of an earlier transfer is
     /// ignored.
     fn unexpected(&self, response: Option<Response>) -> Result<Next, SdoError> {
         match response {

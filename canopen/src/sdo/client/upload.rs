@@ -73,7 +73,7 @@ impl Sink for Buffer<'_> {
     }
 }
 
-/// It grows with the data that arrive; a size that a server announces takes no memory.
+/// The vector grows with the data that arrive; an announced size reserves no memory.
 #[cfg(feature = "alloc")]
 impl Sink for alloc::vec::Vec<u8> {
     fn write(&mut self, data: &[u8]) -> Result<(), AbortCode> {
@@ -111,7 +111,7 @@ impl<S: Sink> Upload<S> {
         Self { link, sink, announced: None, state: State::Initiating, block: Block::default() }
     }
 
-    /// The same, as blocks.
+    /// Reads the value by block transfer.
     pub fn as_blocks(node: NodeId, at: Address, sink: S, config: Config, block: Block) -> Self {
         let mut upload = Self::new(node, at, sink, config);
         let blksize = block.blksize.clamp(1, BLKSIZE_MAX);
@@ -121,12 +121,12 @@ impl<S: Sink> Upload<S> {
         upload
     }
 
-    /// The target: all data are in it once the transfer is done without an error.
+    /// The target: it contains all data after the transfer has ended without an error.
     pub fn sink(&self) -> &S {
         &self.sink
     }
 
-    /// Gives the target back.
+    /// Returns the target.
     pub fn into_sink(self) -> S {
         self.sink
     }
@@ -141,7 +141,7 @@ impl<S: Sink> Upload<S> {
             }
             (
                 Some(Response::InitiateUpload(at, payload)),
-                // A server may answer a block upload without blocks: that is what pst is for.
+                // A server may answer a block upload without blocks: this is the purpose of pst.
                 State::Initiating | State::InitiatingBlock,
             ) if at == self.link.at => match payload {
                 Payload::Expedited(data) => self.take(&data).map(|()| Next::Done(None)),
@@ -187,7 +187,7 @@ impl<S: Sink> Upload<S> {
     /// A frame within a sub-block.
     fn block_segment(&mut self, bytes: &[u8; 8]) -> Result<Next, SdoError> {
         let State::Blocks(receiver) = &mut self.state else { return Ok(Next::Ignore) };
-        // No segment has the number 0, so an abort differs from all segments. No other answer does.
+        // No segment has the number 0, so an abort differs from all segments. Other answers do not.
         if bytes[0] == fields::ABORT {
             return Err(SdoError::Server(AbortCode(fields::number(bytes))));
         }
@@ -202,7 +202,7 @@ impl<S: Sink> Upload<S> {
         Ok(next)
     }
 
-    /// A frame behind the last segment.
+    /// A frame after the last segment.
     fn end_of_blocks(&mut self, bytes: &[u8; 8], response: Option<Response>) -> Result<Next, SdoError> {
         let State::Blocks(receiver) = &mut self.state else { return Ok(Next::Ignore) };
         if receiver.is_last_segment(bytes) {
@@ -223,7 +223,7 @@ impl<S: Sink> Upload<S> {
         }
     }
 
-    /// Passes data on. More bytes than were announced are refused.
+    /// Passes data on. More bytes than announced are refused.
     fn take(&mut self, data: &[u8]) -> Result<(), SdoError> {
         let total = self.link.progress.checked_add(data.len() as u32);
         let total = total.filter(|total| *total <= self.announced.unwrap_or(u32::MAX));
@@ -256,7 +256,7 @@ impl<S: Sink> Transfer for Upload<S> {
     }
 
     fn poll(&mut self, now: Instant) -> Step {
-        // A sub-block that stopped short: its end was lost.
+        // A sub-block that stopped early: its end was lost.
         if let State::Blocks(receiver) = &mut self.state {
             let idle = self.link.result.is_none() && self.link.request.is_none();
             if idle && receiver.is_within() {

@@ -2,24 +2,24 @@
 //!
 //! # Requests between segments
 //!
-//! Byte 0 of a segment is its number, 1 to 127, with bit 7 in the last one of all. The command
-//! specifiers of the initiates (20h, 40h, A0h, C0h with their flags) are such numbers as well, and
-//! CiA 301 gives no rule to tell the two apart. Yet a client that was switched off in the middle of a
-//! download must not keep others from the device until the time-out is over. So a frame is taken for a
-//! request if
+//! Byte 0 of a segment is its number, 1 to 127, with bit 7 set in the last segment of the transfer.
+//! The command specifiers of the initiates (20h, 40h, A0h, C0h with their flags) are also such
+//! numbers, and CiA 301 has no rule to tell the two apart. A client that is switched off in the
+//! middle of a download must however not block other clients until the time-out. A frame is
+//! therefore taken for a request if
 //!
-//! 1. it does not come in its turn: a client sends the segments of a sub-block in a row, and CAN
-//!    neither lets one overtake another nor repeats one behind a later one ([`Receiver::take`]),
-//! 2. it has the command specifier of an initiate, and index and sub-index of an object that this
+//! 1. it is out of order: a client sends the segments of a sub-block in a row, and CAN neither
+//!    changes the order of frames nor repeats one after a later one ([`Receiver::take`]),
 //!    device has, and
-//! 3. for as long as a sub-block may pause no segment follows it.
+//! 3. no segment follows it for as long as a sub-block may pause.
 //!
-//! Then it ends the download and is carried out. A segment is mistaken for a request if the segment
-//! before it was lost, nothing follows it (it is the last of all, or the rest of the sub-block was
-//! lost, too), and three bytes of its data are the address of an object by chance. A request is
-//! mistaken for a segment if it comes when just its number is due: then the CRC of the transfer, or of
-//! the block, does not match, and the request is answered when it is made once more. A client that goes
-//! on with its download is not disturbed by one that asks between its segments.
+//! The request then ends the download and is carried out. A segment is mistaken for a request if
+//! the previous segment was lost, nothing follows it (it is the last of the transfer, or the rest
+//! of the sub-block was lost, too), and three bytes of its data happen to be the address of an
+//! object. A request is mistaken for a segment if it arrives when exactly its number is due: then
+//! the CRC of the transfer, or of the block, does not match, and the request is answered when it is
+//! repeated. A client that continues its download is not disturbed by a client that sends requests
+//! between its segments.
 
 use crate::abort::AbortCode;
 use crate::od::{self, Objects};
@@ -61,7 +61,7 @@ impl SdoServer {
         let State::BlockDownload { receiver, .. } = &mut self.state else { return Err(AbortCode::COMMAND) };
         let doubted = receiver.is_doubtful;
         let received = receiver.take(bytes, true)?;
-        // Who asks again and again is not put off by that.
+        // A client that repeats its request does not delay its own answer.
         if !(doubted && receiver.is_doubtful) {
             self.heard = now;
         }
@@ -75,19 +75,19 @@ impl SdoServer {
         Ok(())
     }
 
-    /// Whether it waits for more segments of a sub-block that has begun, or for none behind what may
-    /// be a request.
+    /// Whether it waits for more segments of a sub-block that has begun, or for the absence of
+    /// segments after a possible request.
     pub(super) fn is_within(&self) -> bool {
         matches!(&self.state, State::BlockDownload { receiver, .. }
             if receiver.is_within() || receiver.is_doubtful)
     }
 
-    /// How long.
+    /// The length of this wait in milliseconds.
     pub(super) fn repeat_ms(&self) -> u32 {
         self.config.repeat_ms << u32::from(self.config.slow_bus)
     }
 
-    /// It has waited long enough: no segment will come.
+    /// The wait has ended: no segment will arrive.
     pub(super) fn pause(&mut self, now: Instant, objects: &mut impl Objects) {
         let State::BlockDownload { receiver, .. } = &mut self.state else { return };
         let frame = receiver.frame;
@@ -101,7 +101,7 @@ impl SdoServer {
         }
     }
 
-    /// Whether this is the last segment once more, where the end is expected.
+    /// Whether this frame repeats the last segment, where the end is expected.
     pub(super) fn repeats_last_segment(&self, bytes: &[u8; 8]) -> bool {
         matches!(&self.state, State::BlockDownload { receiver, .. } if receiver.is_last_segment(bytes))
     }
@@ -123,9 +123,9 @@ impl SdoServer {
 }
 
 impl Receiver {
-    /// Puts the block size into the answer that opens the next sub-block, and opens it, if there is
-    /// room for a segment. Behind the last segment no sub-block follows; the answer then carries
-    /// the largest block size, as the field must not be 0.
+    /// Writes the block size into the answer that opens the next sub-block, and opens the
+    /// sub-block, if there is room for a segment. After the last segment no sub-block follows; the
+    /// answer then contains the largest block size, because the field must not be 0.
     pub(super) fn grant(&mut self, answer: &mut [u8; 8], granted: u8, most: u8) -> bool {
         let blksize = if self.is_complete() { most } else { granted };
         if !self.is_complete() {

@@ -17,19 +17,19 @@ pub(super) struct Sender {
     seqno: u8,
     /// The offset of this sub-block in the data.
     base: u32,
-    /// Bytes of the last segment of all, once it has been sent.
+    /// The number of bytes in the last segment of the transfer, after it was sent.
     last: Option<u8>,
-    /// Over the data up to `hashed`: a segment that is sent again is not counted again.
+    /// The CRC of the data up to `hashed`: a repeated segment is not counted again.
     crc: Crc16,
     hashed: u32,
 }
 
 #[derive(Debug, PartialEq, Eq)]
 enum Phase {
-    /// The client has yet to say "start".
+    /// The client has not sent "start" yet.
     Initiated,
     Sending,
-    /// All of the sub-block is sent.
+    /// The whole sub-block is sent.
     Sent,
     /// All data have arrived, and the end is sent.
     Ended,
@@ -89,7 +89,7 @@ impl SdoServer {
         }
     }
 
-    /// Makes the next segment, if a block upload is going on and it is the server's turn.
+    /// Makes the next segment, if a block upload runs and it is the server's turn.
     pub(super) fn next_block_segment(&mut self, objects: &mut impl Objects) -> Result<(), AbortCode> {
         let State::BlockUpload { outgoing, sender } = &mut self.state else { return Ok(()) };
         if sender.phase != Phase::Sending {
@@ -109,7 +109,7 @@ impl Sender {
         Self { phase: Phase::Initiated, blksize, seqno: 0, base: 0, last: None, crc: Crc16::new(), hashed: 0 }
     }
 
-    /// Takes note of the next segment, whose data start at this offset; gives its byte 0.
+    /// Records the next segment, with data from this offset on; returns its byte 0.
     fn count(&mut self, start: u32, data: &[u8], last: bool) -> u8 {
         if start == self.hashed {
             self.crc.update(data);
@@ -127,9 +127,9 @@ impl Sender {
         }
     }
 
-    /// Goes on with the next sub-block, behind the last segment that arrived; or gives the end.
+    /// Continues with the next sub-block after the last segment that arrived, or sends the end.
     ///
-    /// A client that misses a segment may say so before the sub-block is over.
+    /// A client that misses a segment may report it before the end of the sub-block.
     fn acknowledged(
         &mut self,
         ackseq: u8,
@@ -137,13 +137,13 @@ impl Sender {
         outgoing: &mut Outgoing,
     ) -> Result<Option<[u8; 8]>, AbortCode> {
         if self.phase == Phase::Ended {
-            // The client's acknowledgement once more.
+            // The client repeats its acknowledgement.
             return Ok(None);
         }
         let blksize = check_blksize(blksize)?;
         if ackseq > self.seqno {
             return match self.phase {
-                // More than was sent: the acknowledgement of the sub-block before, once more.
+                // More than was sent: the acknowledgement of the previous sub-block again.
                 Phase::Sending => Ok(None),
                 _ => Err(AbortCode::SEQUENCE_NUMBER),
             };

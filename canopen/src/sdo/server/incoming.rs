@@ -1,21 +1,21 @@
-//! Data on their way into the device.
+//! Data from the client to the device.
 
 use crate::abort::AbortCode;
 use crate::od::{Address, DataType, Objects};
 
 use super::VALUE_MAX;
 
-/// A download, however it is transferred: how many bytes have come and how many may.
+/// A download by any kind of transfer: the number of bytes received, and the permitted number.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Incoming {
     data_type: DataType,
-    /// Bytes that the client announced.
+    /// The number of bytes that the client announced.
     announced: Option<u32>,
     received: u32,
 }
 
 impl Incoming {
-    /// Starts a download. A size that does not fit the type is refused at once.
+    /// Starts a download. A size that does not match the type is refused at once.
     pub fn start(
         at: Address,
         data_type: DataType,
@@ -31,12 +31,13 @@ impl Incoming {
         Ok(incoming)
     }
 
-    /// Whether the data are passed on as they come, and not kept until they are complete.
+    /// Whether the data are passed on as they arrive, instead of being kept until they are
+    /// complete.
     pub fn is_domain(&self) -> bool {
         self.data_type == DataType::Domain
     }
 
-    /// Takes the next bytes: a domain's go to the object, those of a value into `value`.
+    /// Processes the next bytes: data of a domain go to the object, data of a value into `value`.
     pub fn take(
         &mut self,
         at: Address,
@@ -53,8 +54,8 @@ impl Incoming {
             let place = value.get_mut(before as usize..after as usize);
             place.ok_or(AbortCode::LENGTH_TOO_HIGH)?.copy_from_slice(data);
         } else if !data.is_empty() {
-            // The server slows a client down by its answers. A client that does not wait for them,
-            // or that sends expedited, is refused.
+            // The server slows a client down by delaying its answers. A client that does not wait
+            // for them, or that sends expedited, is refused.
             if objects.download_space(at, true) < data.len() {
                 return Err(AbortCode::OUT_OF_MEMORY);
             }
@@ -64,7 +65,7 @@ impl Incoming {
         Ok(())
     }
 
-    /// Whether this many bytes make a value of the type.
+    /// Whether a value of the type can have this length.
     fn check_length(&self, len: u32) -> Result<(), AbortCode> {
         let (least, most) = match self.data_type.size() {
             Some(size) => (size, size),
@@ -79,7 +80,7 @@ impl Incoming {
         }
     }
 
-    /// Whether as many bytes have come as were announced and as the type has.
+    /// Whether the number of bytes matches the announced size and the type.
     pub fn check(&self) -> Result<(), AbortCode> {
         if self.announced.is_some_and(|size| self.received != size) {
             Err(AbortCode::LENGTH)
@@ -90,7 +91,7 @@ impl Incoming {
         }
     }
 
-    /// All bytes have come: tells the object, which may refuse them.
+    /// All bytes have arrived: informs the object, which may refuse them.
     pub fn finish(
         &self,
         at: Address,

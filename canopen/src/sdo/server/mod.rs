@@ -1,13 +1,13 @@
 //! The SDO server: one transfer at a time, for one client.
 //!
-//! - A frame of another identifier, a remote or extended frame and a frame of other than 8 bytes
-//!   are no SDO requests (CiA 301 section 7.2.4.3: all have 8 bytes) and are ignored.
+//! - Frames with another identifier, remote and extended frames, and frames with another length
+//!   than 8 bytes are not SDO requests (CiA 301 section 7.2.4.3: all have 8 bytes) and are ignored.
 //! - Every request is answered or aborted, except for an abort.
-//! - An initiate ends the transfer before. Within a sub-block of a block download it has to be told
-//!   from a segment first, see `block_download.rs`.
-//! - If the client does not go on for the time-out, the transfer is aborted with 05040000h. In a block
-//!   download that counts from the last segment that was taken, whatever else comes.
-//! - If a sub-block of a block download stops short, the segments that came are acknowledged, and
+//! - An initiate ends the previous transfer. Within a sub-block of a block download it must first
+//!   be told apart from a segment, see `block_download.rs`.
+//! - If the client is silent for the time-out, the transfer is aborted with 05040000h. In a block
+//!   download the time-out counts from the last accepted segment, whatever else arrives.
+//! - If a sub-block of a block download stops early, the received segments are acknowledged, and
 //!   the client repeats the rest.
 
 use crate::abort::AbortCode;
@@ -27,37 +27,41 @@ use block_upload::Sender;
 use incoming::Incoming;
 use outgoing::Outgoing;
 
-/// The longest variable or string, in bytes. A longer value has to be a domain. (A signature with
-/// what it signs, 2002h, has 76.)
+/// The longest variable or string, in bytes. A longer value must be a domain. (A signature with the
+/// signed data, 2002h, has 76 bytes.)
 pub const VALUE_MAX: usize = if cfg!(feature = "sealed") { 80 } else { 64 };
 
-/// How long an answer is held back for want of room before the device is asked for room in its
+/// How long an answer is delayed for lack of room before the device is asked for room in its
 /// reserve, in milliseconds.
 pub const HOLD_MS: u32 = 2;
 
-/// What can be chosen about a server.
+/// The configuration of a server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Config {
-    /// How long the client may be silent within a transfer, in milliseconds; then it is aborted.
+    /// How long the client may be silent within a transfer, in milliseconds; then the transfer is
+    /// aborted.
     pub timeout_ms: u32,
-    /// How long a sub-block of a block download may pause before it is acknowledged as far as it
-    /// came, in milliseconds. Longer than a client pauses between two segments, shorter than it
-    /// waits for an answer: 300 to 500 ms by default in most clients.
+    /// How long a sub-block of a block download may pause before the received part is acknowledged,
+    /// in milliseconds. It must be longer than a client's pause between two segments, and shorter
+    /// than a client's time-out: 300 to 500 ms by default in most clients.
     pub repeat_ms: u32,
-    /// The bus is slow (20 kbit/s and below): a frame takes so long that `repeat_ms` is doubled. A
-    /// [`Slave`](crate::slave::Slave) sets it when it joins the bus.
+    /// The bus is slow (20 kbit/s and below): frames take so long that `repeat_ms` is doubled. A
+    /// [`Slave`](crate::slave::Slave) sets this when it joins the bus.
     pub slow_bus: bool,
     /// Segments of a sub-block of a block download: 1 to 127, and no more than the receive queue
-    /// takes.
+    /// can hold.
     pub blksize: u8,
-    /// Whether block upload is served. If not, its requests are unknown ones.
+    /// Whether block upload is supported. If not, its requests are unknown requests.
     pub block_upload: bool,
-    /// The abort for a request that CiA 301 does not have, or that has no place in the transfer.
+    /// The abort for a request that CiA 301 does not define, or that does not fit into the
+    /// transfer.
     pub unknown_request: AbortCode,
-    /// Requests come on this COB-ID and the node-ID on top: 600h in the predefined connection set.
-    /// With the largest node-ID it must be a COB-ID, at most 7FFh; so must the next one.
+    /// The base COB-ID of requests, to which the node-ID is added: 600h in the predefined
+    /// connection set. With the largest node-ID the sum must be a COB-ID, at most 7FFh; the same
+    /// applies to the next field.
     pub request_base: u16,
-    /// Answers go to this one and the node-ID on top: 580h in the predefined connection set.
+    /// The base COB-ID of answers, to which the node-ID is added: 580h in the predefined connection
+    /// set.
     pub response_base: u16,
 }
 
@@ -74,20 +78,20 @@ impl Config {
         response_base: 0x580,
     };
 
-    /// Where the requests to a node come.
+    /// The COB-ID of the requests to a node.
     #[must_use]
     pub const fn request(&self, node: NodeId) -> CobId {
         from_base(self.request_base, node)
     }
 
-    /// Where the answers of a node go.
+    /// The COB-ID of the answers of a node.
     #[must_use]
     pub const fn response(&self, node: NodeId) -> CobId {
         from_base(self.response_base, node)
     }
 }
 
-/// What cannot be a COB-ID is NMT's, which no server has.
+/// An impossible COB-ID becomes that of NMT, which no server uses.
 const fn from_base(base: u16, node: NodeId) -> CobId {
     match CobId::from_base(base, node) {
         Some(id) => id,
@@ -106,17 +110,17 @@ impl Default for Config {
 pub struct SdoServer {
     node: NodeId,
     config: Config,
-    /// The object of the transfer that is going on, or of the last one.
+    /// The object of the running transfer, or of the last one.
     at: Address,
     state: State,
-    /// When the transfer last made progress: the time-out counts from here.
+    /// The time of the transfer's last progress: the time-out counts from here.
     moved: Instant,
-    /// When a segment of a block download was last received, or something sent: the pause of a
-    /// sub-block counts from here.
+    /// The time at which a segment of a block download was last received, or something was sent:
+    /// the pause of a sub-block counts from here.
     heard: Instant,
     /// The answer that waits to be fetched by [`SdoServer::poll`].
     answer: Option<[u8; 8]>,
-    /// The variable or string that is transferred.
+    /// The value of the transferred variable or string.
     value: [u8; VALUE_MAX],
 }
 
@@ -154,13 +158,13 @@ impl SdoServer {
         }
     }
 
-    /// The choices that it was made with.
+    /// The configuration.
     #[must_use]
     pub const fn config(&self) -> Config {
         self.config
     }
 
-    /// Whether no transfer is going on and no answer waits to be fetched.
+    /// Whether no transfer runs and no answer waits to be fetched.
     #[must_use]
     pub const fn is_idle(&self) -> bool {
         matches!(self.state, State::Idle) && self.answer.is_none()
@@ -172,12 +176,13 @@ impl SdoServer {
         self.answer.is_some()
     }
 
-    /// Takes the value of [`Config::slow_bus`].
+    /// Sets the value of [`Config::slow_bus`].
     pub fn set_slow_bus(&mut self, slow_bus: bool) {
         self.config.slow_bus = slow_bus;
     }
 
-    /// When [`poll`](Self::poll) has to be called although no frame came; `None` for never.
+    /// The time at which [`poll`](Self::poll) must be called even without a frame; `None` for
+    /// never.
     #[must_use]
     pub fn next_deadline(&self) -> Option<Instant> {
         let timeout = self.moved + self.config.timeout_ms;
@@ -188,26 +193,26 @@ impl SdoServer {
         }
     }
 
-    /// Takes the answer that waits back, if it is this one; tells whether it was. Who does that owes
-    /// it to the client.
+    /// Withdraws the waiting answer if it is `answer`; returns whether it was. The caller then owes
+    /// this answer to the client.
     pub fn withdraw_answer(&mut self, answer: &[u8; 8]) -> bool {
         self.answer.take_if(|waiting| waiting == answer).is_some()
     }
 
-    /// Turns the answer that waits into an abort of the object that it is about.
+    /// Replaces the waiting answer by an abort for the same object.
     pub fn refuse(&mut self, code: AbortCode) {
         if self.answer.is_some() {
             self.answer_initiate(fields::ABORT, code.0);
         }
     }
 
-    /// Ends the transfer without telling the client, and drops an answer that waits.
+    /// Ends the transfer without a message to the client, and drops a waiting answer.
     pub fn reset(&mut self, objects: &mut impl Objects) {
         self.end(objects);
         self.answer = None;
     }
 
-    /// Takes any frame received; those that are no SDO request to this server are ignored.
+    /// Processes any received frame; frames that are not SDO requests to this server are ignored.
     pub fn handle(&mut self, frame: &Frame, now: Instant, objects: &mut impl Objects) {
         if !frame.has_cob_id(self.config.request(self.node)) {
             return;
@@ -223,7 +228,7 @@ impl SdoServer {
         }
     }
 
-    /// Carries a request out.
+    /// Carries out a request.
     fn serve(&mut self, bytes: &[u8; 8], now: Instant, objects: &mut impl Objects) {
         if self.repeats_last_segment(bytes) {
             return;
@@ -234,8 +239,8 @@ impl SdoServer {
         }
     }
 
-    /// The next frame to send, until there is none. A caller whose transmit queue is full asks
-    /// again when it is not.
+    /// The next frame to send; `None` if there is none. If the caller's transmit queue is full, it
+    /// calls again later.
     pub fn poll(&mut self, now: Instant, objects: &mut impl Objects) -> Option<Frame> {
         self.check_time(now, objects);
         if self.answer.is_none() {
@@ -248,14 +253,14 @@ impl SdoServer {
         }
         let answer = self.answer.take()?;
         self.heard = now;
-        // To ask for all of a sub-block once more is no progress.
+        // A request to repeat a whole sub-block is not progress.
         if answer[..2] != [scs::ACK_BLOCK_DOWNLOAD, 0] {
             self.moved = now;
         }
         Some(Frame::full(self.config.response(self.node), answer))
     }
 
-    /// Ends a transfer whose client does not go on, and acknowledges a sub-block that stopped short.
+    /// Aborts a transfer with a silent client, and acknowledges a sub-block that stopped early.
     fn check_time(&mut self, now: Instant, objects: &mut impl Objects) {
         if matches!(self.state, State::Idle) {
             return;
@@ -267,8 +272,9 @@ impl SdoServer {
         }
     }
 
-    /// Whether the answer that waits may be sent. An answer after which the client sends data waits
-    /// until there is room for a segment. If it opens a sub-block, its block size is set here.
+    /// Whether the waiting answer may be sent. An answer after which the client sends data waits
+    /// until there is room for a segment. If the answer opens a sub-block, its block size is set
+    /// here.
     fn may_answer(&mut self, now: Instant, objects: &mut impl Objects) -> bool {
         let Some(answer) = &mut self.answer else { return false };
         let Some(incoming) = self.state.incoming() else { return true };
@@ -285,7 +291,7 @@ impl SdoServer {
         }
     }
 
-    /// A request outside of the sub-blocks of a block download.
+    /// A request outside the sub-blocks of a block download.
     fn request(&mut self, bytes: &[u8; 8], objects: &mut impl Objects) -> Result<(), AbortCode> {
         match fields::specifier(bytes[0]) {
             ccs::INITIATE_DOWNLOAD => self.initiate_download(bytes, objects),
@@ -308,7 +314,7 @@ impl SdoServer {
         }
     }
 
-    /// Starts a transfer, and ends the one before. An abort from here on names this object.
+    /// Starts a transfer and ends the previous one. An abort from here on names this object.
     fn begin(&mut self, at: Address, objects: &mut impl Objects) -> Result<&'static Entry, AbortCode> {
         self.end(objects);
         self.at = at;
@@ -320,7 +326,7 @@ impl SdoServer {
         self.answer_initiate(fields::ABORT, code.0);
     }
 
-    /// An answer that names the object: to an initiate, or an abort.
+    /// An answer that contains the object: to an initiate, or an abort.
     fn answer_initiate(&mut self, command: u8, number: u32) {
         self.answer = Some(fields::with_address(command, self.at, number.to_le_bytes()));
     }
@@ -330,7 +336,7 @@ impl SdoServer {
         self.answer = Some(fields::without_address(command, a, b));
     }
 
-    /// Back to idle. The consumer of an unfinished domain is told.
+    /// Returns to idle, and informs the receiver of an unfinished domain.
     fn end(&mut self, objects: &mut impl Objects) {
         if self.state.incoming().is_some_and(|incoming| incoming.is_domain()) {
             objects.download_cancel(self.at);

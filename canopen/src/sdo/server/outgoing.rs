@@ -1,4 +1,4 @@
-//! Data on their way out of the device.
+//! Data from the device to the client.
 
 use crate::abort::AbortCode;
 use crate::od::{Address, Objects};
@@ -6,38 +6,38 @@ use crate::sdo::block::SEGMENT;
 
 use super::VALUE_MAX;
 
-/// An upload, however it is transferred: how many bytes there are and how many have been sent.
+/// An upload by any kind of transfer: the number of bytes, and the number of sent bytes.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Outgoing {
     domain: bool,
     size: Option<u32>,
-    /// Bytes sent. A block upload sets it back to send a sub-block again.
+    /// The number of sent bytes. A block upload sets it back to send a sub-block again.
     pub offset: u32,
 }
 
 impl Outgoing {
-    /// A domain, of this size where it is known.
+    /// A domain, with its size if it is known.
     pub const fn domain(size: Option<u32>) -> Self {
         Self { domain: true, size, offset: 0 }
     }
 
-    /// A variable or string that has been read.
+    /// A variable or string that was read.
     pub const fn value(size: u32) -> Self {
         Self { domain: false, size: Some(size), offset: 0 }
     }
 
-    /// Whether the object is asked for the data as they are sent.
+    /// Whether the data are read from the object as they are sent.
     pub const fn is_domain(&self) -> bool {
         self.domain
     }
 
-    /// All bytes of it, where that is known.
+    /// Its size in bytes, if it is known.
     pub const fn size(&self) -> Option<u32> {
         self.size
     }
 
-    /// Puts the next segment's data into bytes 1 to 7 of a frame. Gives how many they are, and
-    /// whether they are the last.
+    /// Writes the data of the next segment into bytes 1 to 7 of a frame. Returns their number, and
+    /// whether they are the last data.
     pub fn next(
         &mut self,
         at: Address,
@@ -57,7 +57,7 @@ impl Outgoing {
             data.copy_from_slice(&value[offset..offset + wanted]);
             wanted
         };
-        // A domain that ends before its own size is a mistake of the device.
+        // A domain that ends before its own size is an error of the device.
         if len < wanted && self.size.is_some() {
             return Err(AbortCode::INTERNAL);
         }

@@ -19,7 +19,7 @@ impl SdoServer {
         let expedited = command & fields::EXPEDITED != 0;
         let size = match (expedited, size_told) {
             (true, true) => Some(4 - u32::from(fields::unused_of_4(command))),
-            // The frame does not tell how many of the four bytes are data; the type does.
+            // The frame does not give the number of data bytes among the four; the type does.
             (true, false) => Some(data_type.size().unwrap_or(4).min(4)),
             (false, true) => Some(fields::number(bytes)),
             (false, false) => None,
@@ -62,8 +62,8 @@ impl SdoServer {
         Ok(())
     }
 
-    /// The answer to an initiate of an upload: all of a variable of up to four bytes, or how many
-    /// bytes follow in segments.
+    /// The answer to an initiate of an upload: a whole variable of up to four bytes, or the number
+    /// of bytes that follow in segments.
     pub(super) fn answer_upload(&mut self, outgoing: Outgoing) {
         let mut data = [0; 4];
         let command = match outgoing.size() {
@@ -99,7 +99,7 @@ impl SdoServer {
         Ok(())
     }
 
-    /// Begins a download of an object that may be written.
+    /// Begins a download of a writable object.
     pub(super) fn writable(
         &mut self,
         at: Address,
@@ -113,7 +113,7 @@ impl SdoServer {
         }
     }
 
-    /// Begins an upload of an object that may be read. A variable or string is read at once.
+    /// Begins an upload of a readable object. A variable or string is read at once.
     pub(super) fn readable(
         &mut self,
         at: Address,
@@ -132,24 +132,24 @@ impl SdoServer {
             }
             _ => objects.read(at, &mut self.value)?,
         };
-        // A value of another length than its type is a mistake of the device.
+        // A value with another length than its type is an error of the device.
         if len > VALUE_MAX || entry.data_type.size().is_some_and(|size| size as usize != len) {
             return Err(AbortCode::INTERNAL);
         }
         Ok(Outgoing::value(len as u32))
     }
 
-    /// Passes data on to the object, or to the value until it is complete.
+    /// Passes data to the object, or collects the value until it is complete.
     pub(super) fn take(&mut self, data: &[u8], objects: &mut impl Objects) -> Result<(), AbortCode> {
         let incoming = self.state.incoming().ok_or(AbortCode::COMMAND)?;
         incoming.take(self.at, data, &mut self.value, objects)
     }
 
-    /// All data have come: the object accepts or refuses them.
+    /// All data have arrived: the object accepts or refuses them.
     pub(super) fn finish_download(&mut self, objects: &mut impl Objects) -> Result<(), AbortCode> {
         let incoming = *self.state.incoming().ok_or(AbortCode::COMMAND)?;
         incoming.check()?;
-        // The object is told the end, so it must not be told a cancellation any more.
+        // The object gets the end, so it must not get a cancellation after it.
         self.state = State::Idle;
         incoming.finish(self.at, &self.value, objects)
     }

@@ -1,11 +1,10 @@
 //! STM32F429I-DISC1 (STM32F429ZI: 2 MiB flash in two banks of 4×16, 64 and 7×128 KiB; 192 KiB
 //! SRAM).
 //!
-//! The program reaches across the border of the banks: sectors 4 to 11 of the first and all of the
-//! second, 12 to
-//! 23. The three SRAMs (112, 16 and 64 KiB) follow one another and are one to a program; handoff
-//!     and warm-start cell are at the end of the third. The CCM is nobody's: it is not cleared by
-//!     the bootloader, and the application may have it.
+//! The program extends over both banks: sectors 4 to 11 of the first bank and all of the second
+//! one, sectors 12 to 23. The three SRAMs (112, 16 and 64 KiB) are contiguous and form one region
+//! for a program; handoff and warm-start cell are at the end of the third one. The CCM is not
+//! assigned: the bootloader does not clear it, and the application may use it.
 
 use crate::geometry::{Region, STM32F429ZI};
 use crate::layout::Layout;
