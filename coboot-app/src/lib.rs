@@ -7,8 +7,8 @@
 //! | [`program_control`] | objects 1F51h, 1F56h and 1F57h: what to answer and what to do |
 //! | [`departure`] | the way back to the bootloader: when the device may leave |
 //! | [`bootloader`] | the services of the bootloader underneath (the callgate), and the reset itself |
-//! | [`label!`](label) | whom the image is for, at its place in the image |
-//! | [`layout!`] | the memory map of the board, as the build script has written it |
+//! | [`label!`](label!) | whom the image is for, at its place in the image |
+//! | [`layout!`](layout!) | the memory map of the board, as the build script has written it |
 //! | `responder` | a small SDO server for applications without a CANopen stack (feature `responder`) |
 //!
 //! Nothing here waits, allocates or reads a clock. Time is passed in as the reading of a counter of
@@ -17,7 +17,7 @@
 //! In the order of use:
 //!
 //! 1. the build script calls `coboot_linker::Application::…::emit()`;
-//! 2. [`label!`](label) tells whom the image is for;
+//! 2. [`label!`](label!) tells whom the image is for;
 //! 3. [`Start::read`] tells node-ID and bit rate before CAN is set up;
 //! 4. [`ProgramControl`] answers 1F51h, 1F56h and 1F57h;
 //! 5. [`ProgramControl::proceed`] is asked regularly, and behind every frame, and says when to leave;
