@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::io::{BufRead as _, BufReader};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
 use super::{
@@ -283,7 +283,7 @@ fn unpack(archive: &Path, into: &Path) -> Outcome {
     process::run(Command::new("tar").arg("--extract").arg("--file").arg(archive).arg("--directory").arg(into))
 }
 
-fn there(file: &PathBuf) -> Outcome {
+fn there(file: &Path) -> Outcome {
     file.is_file().then_some(()).ok_or_else(|| format!("the archive has no {}.", file.display()))
 }
 
