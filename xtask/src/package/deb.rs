@@ -2,11 +2,10 @@
 
 use std::fmt::Write as _;
 use std::fs;
-use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use super::{build, remove, unreadable, unwritable, write, Release, VERSION};
+use super::{build, remove, unreadable, write, Release, VERSION};
 use crate::{process, workspace, Outcome};
 
 /// Where the parts go: from a file or folder beside the program to a file or folder of the system.
@@ -46,15 +45,9 @@ pub fn make(release: &Release) -> Outcome {
     let mut bytes = 0;
     for file in files(&root)? {
         let name = file.strip_prefix(&root).unwrap_or(&file);
-        let mode = if name == Path::new("usr/bin/coflash") { 0o755 } else { 0o644 };
-        let set = fs::set_permissions(&file, fs::Permissions::from_mode(mode));
-        bytes += set.and_then(|()| file.metadata()).map_err(|error| unwritable(&file, &error))?.len();
+        bytes += file.metadata().map_err(|error| unreadable(&file, &error))?.len();
         let sum = process::output(Command::new("md5sum").current_dir(&root).arg(name))?;
         sums += &sum;
-    }
-    for folder in folders(&root)? {
-        let set = fs::set_permissions(&folder, fs::Permissions::from_mode(0o755));
-        set.map_err(|error| unwritable(&folder, &error))?;
     }
     write(&root.join("DEBIAN/md5sums"), &sums)?;
     write(&root.join("DEBIAN/control"), &control(bytes.div_ceil(1024)))?;
@@ -62,6 +55,8 @@ pub fn make(release: &Release) -> Outcome {
     dpkg.args(["--root-owner-group", "-Zxz", "--build"]).arg(&root).arg(release.deb());
     // Times are clamped to that of the commit; with several threads the packed bytes may differ.
     dpkg.env("SOURCE_DATE_EPOCH", &release.epoch).env("DPKG_DEB_THREADS_MAX", "1");
+    // The program is the one file that may be run; it is so by its build.
+    process::run(Command::new("chmod").args(["--recursive", "u=rwX,go=rX"]).arg(&root))?;
     set_times(&root, &release.epoch)?;
     process::run(&mut dpkg)?;
     remove(&parts)?;
