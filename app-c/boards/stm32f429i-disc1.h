@@ -7,7 +7,7 @@
 #define LED_PIN 13
 #define HSE_HZ UINT32_C(8000000)
 #define HSE_BYPASS 0
-/* What the device says of itself: the bootloader's words, too (bsp/src/stm32f429i_disc1.rs). */
+/* What the device says of itself: the bootloader's words, too (bsp/src/boards/stm32f429i_disc1.rs). */
 #define VENDOR_ID UINT32_C(0)
 #define PRODUCT_CODE UINT32_C(0x4291D151)
 #define REVISION UINT32_C(0x00010000)

@@ -94,7 +94,7 @@ const FOREIGN: [&str; 17] = [
     "west",
 ];
 /// Cargo's own jobs that pages call; what is behind them names packages of the workspace.
-const CARGO: [&str; 4] = ["build", "install", "run", "test"];
+const CARGO: [&str; 5] = ["build", "check", "install", "run", "test"];
 
 /// Every command of every page: a job of this crate with options that it has, a program of the
 /// workspace (whose own tests read the rest: `coflash` and `coboot-node`), a file that is there, or

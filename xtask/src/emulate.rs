@@ -20,6 +20,8 @@ Sets the machine up, builds a bootloader and runs the emulated board with it in 
                   --app FILE                      an application in flash, as a debug probe puts it there
                   --serial pty                    where other programs reach the board's UART
                   --trace FILE                    the bus as a candump log
+                  --hse HZ                        the crystal, if it has not 8 MHz
+                  --can NUMBER                    the CAN controller that the transceiver is at
                   --bootloader FILE               another bootloader than the one built here
 ";
 

@@ -12,6 +12,7 @@ mod arrows;
 mod bench;
 mod book;
 mod build;
+mod chips;
 mod demo;
 mod diagrams;
 #[cfg(test)]
@@ -96,6 +97,12 @@ const JOBS: &[Job] = &[
         about: "the three files of a port, with steps to go through",
         help: new_board::HELP,
         run: new_board::run,
+    },
+    Job {
+        name: "chips",
+        about: "a board for every chip, built and updated in the emulator",
+        help: chips::HELP,
+        run: chips::run,
     },
     Job {
         name: "header",
