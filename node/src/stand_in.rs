@@ -1,6 +1,6 @@
-//! A program that is none: there is no CPU here that could run the one in the file. It answers what
-//! a host asks a running application for, as CiA 302-3 has it: which program runs (1F51h) and which
-//! one it is (1F56h); and it takes the commands of 1F51h as the application template does.
+//! The replacement of a program: no CPU can run the program in the file. The stand-in answers the
+//! requests that a host sends to a running application (CiA 302-3): which program runs (1F51h) and
+//! its identification (1F56h). It accepts the commands of 1F51h like the application template.
 
 use std::task::Poll;
 
@@ -24,43 +24,45 @@ use crate::file_flash::FileFlash;
 
 /// 1000h: no standardised profile, and not the bootloader's value.
 const DEVICE_TYPE: u32 = 0;
-/// 100Ah. Nobody shall take it for the program itself.
+/// 100Ah. It must not look like the program itself.
 const SOFTWARE_VERSION: &str = "coboot-node stand-in";
 
-/// How the device leaves for a command.
+/// How the device leaves after a command.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Leave {
-    /// The program answers, and the bootloader finds this request.
+    /// The program has answered, and the bootloader gets this request.
     Answered(BootRequest),
-    /// The bootloader answers.
+    /// The bootloader must answer.
     Owed(Owed),
 }
 
-/// Which program it stands for, and how that came up.
+/// The program that it replaces, and the circumstances of its start.
 #[derive(Clone, Copy, Debug)]
 pub struct Started {
     /// Its number.
     pub program: u8,
-    /// It was started right behind its download in one go: the first 80h confirms it.
+    /// It was started directly after a download in one transfer: the first 80h confirms it.
     pub fresh: bool,
-    /// The node-ID in force, if the bootloader has the same one and can answer in its place.
+    /// The active node-ID, if the bootloader has the same one and can answer in the program's
+    /// place.
     pub bootloader_answers: Option<NodeId>,
 }
 
-/// The stand-in of a program.
+/// The stand-in for a program.
 #[derive(Debug)]
 pub struct StandIn {
     entries: &'static [Entry],
     device: Device,
     started: Started,
     flash: FileFlash,
-    /// Where programs and journal are.
+    /// The places of programs and journal.
     layout: &'static Layout,
     leave: Option<Leave>,
 }
 
 impl StandIn {
-    /// Of this program, on a device with this flash that says this of itself as a bootloader.
+    /// The stand-in for this program, on a device with this flash and this identity of the
+    /// bootloader.
     #[must_use]
     pub fn new(
         entries: &'static [Entry],
@@ -73,7 +75,7 @@ impl StandIn {
         Self { entries, device, started, flash, layout, leave: None }
     }
 
-    /// Its object dictionary on a device with so many programs.
+    /// Its object dictionary on a device with this many programs.
     #[must_use]
     pub fn entries(programs: u8) -> Vec<Entry> {
         let mut entries = device::ENTRIES.to_vec();
@@ -85,34 +87,35 @@ impl StandIn {
         entries
     }
 
-    /// Who the device is, for layer setting services.
+    /// The address of the device for layer setting services.
     #[must_use]
     pub fn lss_address(&self) -> LssAddress {
         self.device.lss_address()
     }
 
-    /// Whether and how the device shall leave, once.
+    /// Returns once how the device must leave, if it must.
     pub fn take_leave(&mut self) -> Option<Leave> {
         self.leave.take()
     }
 
-    /// The flash behind it.
+    /// The flash of the device.
     pub fn flash(&mut self) -> &mut FileFlash {
         &mut self.flash
     }
 
-    /// Ends; gives the flash back.
+    /// Ends the stand-in, and returns the flash.
     #[must_use]
     pub fn into_flash(self) -> FileFlash {
         self.flash
     }
 
-    /// What is known of a program.
+    /// The record of a program.
     fn record(&self, program: u8) -> Option<ProgramRecord> {
         ProgramRecord::load(&Journal::open(&self.flash, self.layout.parameters), &self.flash, program)
     }
 
-    /// What a program does through the callgate: it is signed, and needs no rescue window.
+    /// The effect of the callgate's confirmation: the program is released, and needs no rescue
+    /// window.
     fn confirm(&mut self, program: u8) -> Result<(), AbortCode> {
         let record = self.record(program).ok_or(AbortCode::HARDWARE)?;
         let mut journal = Journal::open(&self.flash, self.layout.parameters);
@@ -188,7 +191,7 @@ impl LssDevice for StandIn {
         crate::supports(rate)
     }
 
-    /// Storing is the bootloader's.
+    /// Only the bootloader stores.
     fn store(&mut self, _: Option<NodeId>, _: Option<BitRate>) -> Poll<Result<(), StoreError>> {
         Poll::Ready(Err(StoreError::Unsupported))
     }
@@ -196,7 +199,7 @@ impl LssDevice for StandIn {
 
 impl SlaveDevice for StandIn {
     fn node_id_changed(&mut self, id: Option<NodeId>) {
-        // It is not stored: the bootloader comes up with the one that was in force before.
+        // The node-ID is not stored: the bootloader starts with the previous one.
         self.started.bootloader_answers = self.started.bootloader_answers.filter(|own| id == Some(*own));
     }
 }
