@@ -1,10 +1,10 @@
-//! A seeded attacker: random downloads, broken off anywhere, commands, passwords, resets, power cuts
+//! A seeded attacker: random downloads, aborted anywhere, commands, passwords, resets, power cuts
 //! and flash faults in any order, on every profile with one and two programs. After every action
-//! the rules of [`Rule`] are looked at, and in the end each program has to go in as into a new
+//! the rules of [`Rule`] are checked, and at the end each program must be installable as in a new
 //! device.
 //!
-//! The same seed plays the same attack. One that breaks a rule is shortened and told with its
-//! actions:
+//! The same seed gives the same attack. An attack that breaks a rule is shortened and printed with
+//! its actions:
 //!
 //! ```sh
 //! COBOOT_ATTACKS=20000 cargo test --release -p coboot-core --test attacker    # seeds per setup
@@ -38,26 +38,27 @@ use shared_abi::warm_start::BootRequest;
 
 // --- rules
 
-/// What must hold whatever is done.
+/// The rules that must hold after any action.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Rule {
-    /// A program whose record stands has the CRC that 1F56h tells, and was sent with it.
+    /// A program with a record has the CRC in 1F56h, and was sent with it.
     RecordIsTrue,
-    /// Nothing is erased or written but the journal and the program that was named.
+    /// Only the journal and the addressed program are erased or written.
     OnlyTheNamedProgram,
-    /// What is started is the program that was asked for, as its signature says.
+    /// The started program is the requested one, released or on trial as requested.
     StartsWhatWasAsked,
-    /// In the end each program can be installed and started.
+    /// At the end each program can be installed and started.
     CanBeRepaired,
-    /// Nothing panics, and all work comes to an end.
+    /// Nothing panics, and all work ends.
     Ends,
-    /// The record of a program that was not addressed stays as it is, and so does what LSS stored.
+    /// The record of a program that was not addressed does not change, nor do the values that LSS
+    /// stored.
     OthersStay,
-    /// 1F51h, 1F57h and aborts tell what the documents define.
+    /// 1F51h, 1F57h and aborts have only documented values.
     DefinedValues,
 }
 
-/// A rule that was broken, and how.
+/// A broken rule, with details.
 #[derive(Clone, Debug)]
 struct Broken(Rule, String);
 
@@ -107,12 +108,12 @@ const ABORTS: [u32; 31] = [
     0x0800_0024,
 ];
 
-// --- what can be sent
+// --- the data that can be sent
 
-/// A program to be sent.
+/// A program to send.
 #[derive(Clone, Copy, Debug)]
 struct Image {
-    /// The program that it is linked for.
+    /// The program number for which it is linked.
     place: u8,
     len: usize,
     seed: u8,
@@ -123,29 +124,30 @@ struct Image {
 enum Sent {
     /// Block 0.
     Control(Image),
-    /// The n-th data block, from 0 on.
+    /// Data block n, counted from 0.
     Data(Image, usize),
     /// Block FFFFFFFFh.
     Last(Image),
     Raw(Image),
     Hex(Image),
-    /// These many random bytes behind the first 4 of something good.
+    /// This many random bytes after the first 4 bytes of valid data.
     Noise(u64, usize),
 }
 
-/// What is wrong with it.
+/// The fault in a download.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Flaw {
     None,
-    /// A bit in the n-th byte, counted modulo the length.
+    /// A flipped bit in byte n, modulo the length.
     Bit(usize),
-    /// The CRC of the block, or the checksum of a record; the program's CRC in the last block.
+    /// A wrong CRC of the block, or a wrong checksum of a record; in the last block, a wrong CRC of
+    /// the program.
     Crc,
-    /// It goes to this address.
+    /// This address.
     Address(u32),
-    /// For another product.
+    /// The identity of another product.
     Product,
-    /// It ends early, by so many thousandths.
+    /// A truncation after this many thousandths.
     Short(usize),
 }
 
@@ -219,18 +221,18 @@ impl Sent {
 }
 
 impl Sent {
-    /// The CRC that a program has which it makes or completes, where it may be taken.
+    /// The CRC of the program that the download makes or completes, if it is acceptable.
     fn crc(self, setup: &Setup, program: u8, flaw: Flaw) -> Option<u32> {
         match self {
-            // Data are any bytes.
+            // Data may be any bytes.
             _ if setup.is_data(program) => Some(crc32(&self.bytes(setup, flaw))),
-            // What its label says is for somebody else, if it is there.
+            // The label, if there is one, names another device.
             Self::Raw(image) | Self::Hex(image)
                 if flaw == Flaw::Product && image.len >= label::OFFSET as usize + label::SIZE =>
             {
                 None
             }
-            // Any beginning of it is an image as well.
+            // Any beginning of an image is an image, too.
             Self::Raw(_) => Some(crc32(&self.bytes(setup, flaw))),
             Self::Hex(image) => Some(crc32(&image.bytes(setup, flaw))),
             Self::Last(image) => Some(crc32(&image.bytes(setup, Flaw::None)) ^ u32::from(flaw == Flaw::Crc)),
@@ -241,19 +243,19 @@ impl Sent {
 
 // --- actions
 
-/// What the attacker does next.
+/// The next action of the attacker.
 #[derive(Clone, Copy, Debug)]
 enum Action {
-    /// Begins a download; one that is open is cancelled, as the SDO server does it.
+    /// Begins a download; an open one is cancelled first, as the SDO server does.
     Begin {
         program: u8,
         sent: Sent,
         flaw: Flaw,
         announced: bool,
     },
-    /// So many segments of it, as far as there is room.
+    /// Sends this many segments of it, as far as there is room.
     Send(usize),
-    /// The rest of it, and its end.
+    /// Sends the rest of it and its end.
     End,
     Cancel,
     /// 1F51h.
@@ -261,7 +263,7 @@ enum Action {
         program: u8,
         value: u8,
     },
-    /// The object that takes passwords.
+    /// Writes to the object for passwords.
     Password {
         program: u8,
         right: bool,
@@ -274,26 +276,26 @@ enum Action {
         index: u16,
         sub: u8,
     },
-    /// 1F50h is read back.
+    /// Reads 1F50h.
     Upload {
         program: u8,
     },
     Steps(u32),
     Settle,
-    /// Time goes on, in ms.
+    /// Advances the time, in ms.
     Wait(u32),
     Reset,
-    /// The power goes so many flash operations later.
+    /// Cuts the power after this many flash operations.
     Cut {
         after: u32,
         cut: Cut,
     },
-    /// A flash operation fails then.
+    /// Makes a flash operation fail after this many operations.
     Fail {
         after: u32,
         fault: FlashFault,
     },
-    /// A flash operation does a part, and says that all is well.
+    /// Makes a flash operation do only a part and report success.
     Weak {
         after: u32,
         seed: u64,
@@ -303,20 +305,20 @@ enum Action {
 const COMMANDS: [u8; 9] = [0x00, 0x01, 0x01, 0x02, 0x03, 0x03, 0x80, 0x83, 0x84];
 const INDICES: [u16; 9] = [0x1000, 0x1001, 0x1008, 0x100A, 0x1018, 0x1F51, 0x1F56, 0x1F57, 0x1F50];
 
-/// Writes the list of actions of a seed.
+/// Writes the list of actions for a seed.
 struct Script {
     setup: &'static Setup,
     random: Random,
     actions: Vec<Action>,
-    /// How often something gets in between, in percent.
+    /// The probability of a disturbance, in percent.
     disturbed: usize,
-    /// Faults of the flash and cuts among it.
+    /// Whether flash faults and cuts are included.
     hostile_flash: bool,
 }
 
 impl Script {
     fn of(setup: &'static Setup, seed: u64) -> Vec<Action> {
-        // Every setup has attacks of its own.
+        // Every setup has its own attacks.
         let mut random = Random(seed ^ u64::from(crc32(setup.name.as_bytes())) << 32);
         let disturbed = random.pick(&[0, 1, 3, 10, 40]);
         let hostile_flash = random.chance(50);
@@ -343,7 +345,7 @@ impl Script {
     }
 
     fn image(&mut self, program: u8) -> Image {
-        // Now and then one for another program.
+        // Sometimes for another program.
         let place = if self.random.chance(5) { self.program() } else { program };
         Image { place, len: 8 + self.random.below(1400), seed: self.random.below(256) as u8 }
     }
@@ -370,11 +372,11 @@ impl Script {
         }
     }
 
-    /// A download from its beginning, whole, flawed or broken off.
+    /// A download from its beginning: complete, faulty or aborted.
     fn download(&mut self) {
         let program = self.program();
         let mut image = self.image(program);
-        // A lift takes no program without a label.
+        // A lift accepts no program without a label.
         if self.random.chance(80) {
             image.len = image.len.max(label::OFFSET as usize + label::SIZE);
         }
@@ -399,7 +401,7 @@ impl Script {
             _ => vec![Sent::Hex(image)],
         };
         let by_blocks = downloads.len() > 1;
-        // Half of them are flawless.
+        // Half of them are correct.
         let flawed = if self.random.chance(50) { self.random.below(downloads.len()) } else { usize::MAX };
         if by_blocks && self.random.chance(15) {
             downloads.truncate(self.random.below(downloads.len()));
@@ -432,7 +434,7 @@ impl Script {
         }
     }
 
-    /// Anything at all.
+    /// Any action.
     fn disturb(&mut self) {
         let random = &mut self.random;
         let program = random.below(usize::from(self.setup.programs()) + 1) as u8;
@@ -485,7 +487,7 @@ impl Script {
 
 // --- the attack
 
-/// A download that is open: its program, its bytes, and how many of them were sent.
+/// An open download: its program, its bytes, and the number of sent bytes.
 struct Open {
     program: u8,
     bytes: Vec<u8>,
@@ -512,22 +514,22 @@ struct Attack {
     device: Rig,
     open: Option<Open>,
     now: u32,
-    /// Whose flash may be changed: named by an action since the last time that there was no work.
+    /// The programs that may be changed: those named by an action since the last time without work.
     named: Programs,
-    /// Programs of which a start was asked for.
+    /// Programs for which a start was requested.
     asked: Programs,
-    /// START of this program was acknowledged, and nothing else was done since.
+    /// START of this program was acknowledged, and no action followed.
     acknowledged: Option<u8>,
     /// Programs that were sent, and their CRCs.
     sent: Vec<(u8, u32)>,
-    /// What was stored when it was looked at last.
+    /// The stored values at the last check.
     stored: Stored,
-    /// What LSS may have stored: what stands, and what was acknowledged last.
+    /// The values that LSS may have stored: the present ones, and the last acknowledged ones.
     nodes: Vec<NodeParameters>,
     storing: bool,
-    /// What became of requests to start, for the last settling.
+    /// The results of requests to start, at the last settling.
     requests: Vec<BootRequest>,
-    /// There was no work at the last step, and nothing was done since.
+    /// The last step had no work, and no action followed.
     idle: bool,
 }
 
@@ -554,7 +556,7 @@ impl Attack {
         }
     }
 
-    /// Carries an action out and looks at the rules.
+    /// Carries out an action and checks the rules.
     fn act(&mut self, action: Action) -> Result<(), Broken> {
         let looking =
             matches!(action, Action::Steps(_) | Action::Settle | Action::Read { .. } | Action::Wait(_));
@@ -627,7 +629,8 @@ impl Attack {
                 if taken && matches!(value, 0x03 | 0x83 | 0x84) {
                     self.named.add(program);
                 }
-                // CiA 302-3 has 2 for reset, which starts where a profile or a stream says so.
+                // In CiA 302-3, 2 means reset, which starts the program for some profiles and after
+                // a stream.
                 if taken && matches!(value, 0x01 | 0x02) {
                     self.asked.add(program);
                 }
@@ -708,7 +711,7 @@ impl Attack {
         Ok(())
     }
 
-    /// The next segment of the open download; whether it was sent.
+    /// Sends the next segment of the open download; returns whether it was sent.
     fn segment(&mut self) -> Result<bool, Broken> {
         let Some(open) = &mut self.open else { return Ok(false) };
         let at = Address::new(0x1F50, open.program);
@@ -736,7 +739,7 @@ impl Attack {
         self.idle
     }
 
-    /// Until there is no work; what was acknowledged has come about then.
+    /// Runs until there is no work; acknowledged commands must have taken effect then.
     fn settle(&mut self) -> Result<(), Broken> {
         let mut steps = 0;
         while !self.step() {
@@ -760,7 +763,7 @@ impl Attack {
         Ok(())
     }
 
-    /// A reset, or the power comes back.
+    /// A reset, or the return of the power.
     fn restart(&mut self) {
         {
             let mut flash = self.device.chip.model();
@@ -774,7 +777,7 @@ impl Attack {
         self.requests.clear();
     }
 
-    /// All rules that can be looked at at any time.
+    /// Checks all rules that can be checked at any time.
     fn look(&mut self) -> Result<(), Broken> {
         let setup = self.device.setup;
         let touched = std::mem::take(&mut self.device.chip.model().touched);
@@ -803,7 +806,7 @@ impl Attack {
         for request in self.requests.clone() {
             self.look_at_request(request)?;
         }
-        // A program that is running is called back sooner or later.
+        // A running program is called back sooner or later.
         if !self.requests.is_empty() && self.acknowledged.is_none() {
             if self.device.node.is_finishing() {
                 self.settle()?;
@@ -813,7 +816,7 @@ impl Attack {
         Ok(())
     }
 
-    /// Bits between 0 and 1 read differently each time: it is looked at more than once.
+    /// Bits between 0 and 1 read differently each time: check more than once.
     fn look_at_what_is_stored(&mut self) -> Result<(), Broken> {
         let setup = self.device.setup;
         if self.storing && self.device.node.stored() == Poll::Ready(Ok(())) {
@@ -858,14 +861,14 @@ impl Attack {
         let record = self.stored.records[usize::from(program) - 1];
         let signed = record.map(|(_, _, signed, _)| signed);
         let fits = match request {
-            // Behind a download in one go, signed or on trial.
+            // After a download in one transfer, released or on trial.
             BootRequest::Fresh(_) => signed.is_some(),
             _ => signed == Some(matches!(request, BootRequest::Start(_))),
         };
         rule(fits, Rule::StartsWhatWasAsked, || format!("{request:?}, and its record is {record:?}"))
     }
 
-    /// A host that knows nothing of what happened installs each program and starts it.
+    /// A host without knowledge of the history installs each program and starts it.
     fn repair(&mut self, random: &mut Random) -> Result<(), Broken> {
         let setup = self.device.setup;
         {
@@ -879,7 +882,7 @@ impl Attack {
             let image = Image { place: program, len: 512 + random.below(900), seed: random.below(256) as u8 };
             self.act(Action::Cancel)?;
             self.act(Action::Settle)?;
-            // Whoever tried wrong passwords has had to wait.
+            // A host with wrong passwords must wait.
             self.act(Action::Wait(60_000))?;
             let steps = |attack: &mut Self, what: &str, taken: Result<(), AbortCode>| {
                 rule(taken.is_ok(), Rule::CanBeRepaired, || {
@@ -954,7 +957,7 @@ impl Setup {
     }
 }
 
-/// The program that is to be started.
+/// The program to start.
 fn number(request: BootRequest) -> Option<u8> {
     match request {
         BootRequest::Start(program) | BootRequest::Trial(program) | BootRequest::Fresh(program) => {
@@ -964,7 +967,7 @@ fn number(request: BootRequest) -> Option<u8> {
     }
 }
 
-/// Whether an abort is one that there is.
+/// Whether an abort code is documented.
 fn defined<T>(outcome: Result<T, AbortCode>) -> Result<Result<T, AbortCode>, Broken> {
     if let Err(abort) = &outcome {
         rule(ABORTS.contains(&abort.0), Rule::DefinedValues, || format!("{abort:?}"))?;
@@ -980,7 +983,7 @@ fn panic_text(cause: &(dyn std::any::Any + Send)) -> String {
 // --- runs
 
 thread_local! {
-    /// A panic, of a power cut or of the bootloader, is caught and need not be printed.
+    /// A panic, of a power cut or of the bootloader, is caught and not printed.
     static CAUGHT: Cell<bool> = const { Cell::new(false) };
 }
 
@@ -991,7 +994,8 @@ fn caught<T>(act: impl FnOnce() -> T) -> std::thread::Result<T> {
     outcome
 }
 
-/// Plays a list of actions; the number of the one that broke a rule, or of all for the repair.
+/// Runs a list of actions; returns the number of the action that broke a rule, or of all actions if
+/// the repair failed.
 fn play(setup: &'static Setup, seed: u64, actions: &[Action]) -> Result<(), (usize, Broken)> {
     let mut random = Random(!seed);
     let mut attack = Attack::new(setup, random.pick(&[256, 1024]));
@@ -1003,7 +1007,7 @@ fn play(setup: &'static Setup, seed: u64, actions: &[Action]) -> Result<(), (usi
     repaired.map_err(|broken| (actions.len(), broken))
 }
 
-/// Leaves out of a list that breaks a rule what is not needed for it to break that rule.
+/// Removes the actions that are not necessary to break the rule.
 fn shortened(setup: &'static Setup, seed: u64, mut actions: Vec<Action>, rule: Rule) -> Vec<Action> {
     let breaks = |actions: &[Action]| match play(setup, seed, actions) {
         Err((n, Broken(broken, _))) if broken == rule => Some(n),
@@ -1055,10 +1059,10 @@ fn environment(name: &str) -> Option<u64> {
     std::env::var(name).ok().map(|value| value.parse().unwrap_or_else(|_| panic!("{name} is no number")))
 }
 
-/// So many seeds of each setup.
+/// The number of seeds for each setup.
 const ATTACKS: u64 = 300;
 
-/// Plays the attacks on a setup; fails with the first ones that break each rule.
+/// Runs the attacks on a setup; fails with the first attack on each rule.
 fn attacks(setup: &'static Setup) {
     static QUIET: Once = Once::new();
     QUIET.call_once(|| {

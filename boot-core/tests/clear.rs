@@ -1,5 +1,4 @@
-//! What CLEAR erases, and what 1F57h says while the flash still works for something that nobody wants
-//! any more.
+//! The effect of CLEAR, and the value of 1F57h while the flash still does discarded work.
 
 #[path = "../../tests/src/ihex.rs"]
 #[allow(dead_code, reason = "the rig needs its records")]
@@ -20,7 +19,7 @@ fn raw(setup: &'static Setup, number: u8, len: usize) -> Vec<u8> {
     program(setup.region(number), PRODUCT_CODE, len, number)
 }
 
-/// The sectors of a program that were erased since the last look, by their addresses; each once.
+/// The sectors of a program that were erased since the last call, by their addresses, each once.
 fn erased(rig: &Rig, number: u8) -> Vec<u32> {
     let region = rig.setup.region(number);
     let touched = std::mem::take(&mut rig.chip.model().touched);
@@ -30,15 +29,15 @@ fn erased(rig: &Rig, number: u8) -> Vec<u32> {
     sectors
 }
 
-/// The sectors of the first so many bytes of program 1 of the model: one of 400h bytes at 800h below
-/// the rest, each 800h (of the F407's 64 and 128 KiB).
+/// The sectors of the first `bytes` bytes of program 1 of the model: one of 400h bytes at 800h,
+/// then sectors of 800h bytes (from the F407's 64 and 128 KiB).
 fn sectors(bytes: u32) -> Vec<u32> {
     let all = [0x0800_0800, 0x0800_0C00, 0x0800_1400, 0x0800_1C00, 0x0800_2400, 0x0800_2C00, 0x0800_3400];
     let all = all.into_iter().chain([0x0800_3C00]);
     all.filter(|base| *base < 0x0800_0800 + bytes).collect()
 }
 
-/// CLEAR twice; the sectors that were erased.
+/// CLEAR twice; returns the erased sectors.
 fn clear(rig: &mut Rig, number: u8) -> Vec<u32> {
     rig.chip.model().touched.clear();
     for _ in 0..2 {
@@ -63,23 +62,24 @@ fn a_second_clear_erases_what_was_written_since_the_last_one() {
     assert_eq!(clear(&mut rig, 1), sectors(3000));
     rig.reset();
     assert_eq!(clear(&mut rig, 1), []);
-    // Behind a smaller program lies what the larger one has left; signed, and confirmed.
+    // After a smaller program, the rest of the larger one is still in flash; released and
+    // confirmed.
     rig.install(1, &raw(&STANDARD_1, 1, 5000));
     rig.install(1, &raw(&STANDARD_1, 1, 600));
     rig.command(1, 0x83).unwrap();
     rig.settle();
     rig.reset();
     assert_eq!(clear(&mut rig, 1), sectors(5000));
-    // Sectors that were erased for the program, and in which it wrote nothing, are so still.
+    // Sectors that were erased for the program, but not written, are still erased.
     let mut holey = raw(&STANDARD_1, 1, 9000);
     holey[1000..].fill(0xFF);
     rig.install(1, &holey);
     assert_eq!(clear(&mut rig, 1), sectors(1000));
     assert_eq!(clear(&mut rig, 1), []);
-    // A debugger has left something in the last sector.
+    // A debugger has written something to the last sector.
     rig.chip.model().poke(0x0800_43FC, &[0x7F]);
     assert_eq!(clear(&mut rig, 1), [0x0800_3C00]);
-    // A download that broke off may have left more than shows.
+    // An aborted download may have left more than the contents show.
     let image = raw(&STANDARD_1, 1, 3000);
     rig.command(1, CLEAR).unwrap();
     rig.settle();
@@ -90,7 +90,7 @@ fn a_second_clear_erases_what_was_written_since_the_last_one() {
     assert_eq!(clear(&mut rig, 1), []);
 }
 
-/// The same where CLEAR erases at once, and where there is a second program, which stays.
+/// The same if CLEAR erases at once, and with a second program, which stays.
 #[test]
 fn every_clear_that_erases_does_so() {
     let mut rig = Rig::new(&STANDARD_2, 1024);
@@ -130,8 +130,8 @@ fn to_look_for_what_is_written_takes_many_small_steps() {
     }
 }
 
-/// The power goes in any operation of a download of a large program. Then a small one is installed,
-/// or not, and taken away by two CLEARs: all of the flash is erased, and erased well.
+/// The power is cut in any operation of a large program's download. Then a small program is
+/// installed or not, and removed by two CLEARs: all of the flash is erased completely.
 #[test]
 fn after_a_power_cut_a_second_clear_leaves_nothing_half_erased() {
     quiet_power_cuts();
@@ -139,7 +139,7 @@ fn after_a_power_cut_a_second_clear_leaves_nothing_half_erased() {
     for small in [false, true] {
         for seed in 0..12 {
             let cut = if seed % 2 == 0 { Cut::Unstable(seed / 2) } else { Cut::Torn(seed / 2) };
-            // Erasures come in between some hundred words.
+            // Erase operations occur between some hundred words.
             for number in (1..).step_by(7) {
                 let mut rig = Rig::new(&STANDARD_1, 1024);
                 rig.install(1, &raw(&STANDARD_1, 1, 9000));
@@ -175,8 +175,8 @@ fn after_a_power_cut_a_second_clear_leaves_nothing_half_erased() {
     assert!(cuts > 200, "{cuts}");
 }
 
-/// A raw image that is cut off leaves a sector that is being erased, and records that are being
-/// stored. As long as a command is refused for that, the status says busy.
+/// An aborted raw image leaves a running erase, and records that are being stored. While a command
+/// is refused for this reason, the status is busy.
 #[test]
 fn a_command_is_refused_as_untimely_only_while_the_status_says_busy() {
     for setup in [&STANDARD_1, &STANDARD_2] {
@@ -190,7 +190,7 @@ fn a_command_is_refused_as_untimely_only_while_the_status_says_busy() {
                     rig.begin(1, Some(3000), &raw(setup, 1, 3000)[..sent]).unwrap();
                     rig.steps(steps);
                     rig.cancel(1);
-                    // Program 2 has to wait for the same flash.
+                    // Program 2 must wait for the same flash.
                     let number = setup.programs();
                     let busy = rig.status(number) & BUSY != 0;
                     let taken = rig.command(number, command);

@@ -1,4 +1,4 @@
-//! The boot decision: the order of the product's promise.
+//! The boot decision: the promised order of its checks.
 
 mod model;
 
@@ -25,7 +25,7 @@ fn policy() -> Policy {
     }
 }
 
-/// A program of 64 bytes as a download leaves it, and its verdict.
+/// A program of 64 bytes as a download leaves it, and its check.
 fn check(signed: bool, damage: impl FnOnce(&mut ModelFlash)) -> Result<VerifiedProgram, Invalid> {
     let mut flash = ModelFlash::new(LAYOUT.chip);
     let mut bytes = vec![0xA5; 64];
@@ -66,8 +66,8 @@ fn a_signed_program_starts_by_itself() {
     assert_eq!(decision, BootDecision::Start { program: signed().unwrap(), trial: false });
 }
 
-/// Whatever asks for the bootloader comes before whatever asks for a program, and then no program
-/// is even looked at.
+/// Requests for the bootloader come before requests for a program, and then the program is not even
+/// checked.
 #[test]
 fn what_asks_for_the_bootloader_wins() {
     let stay = |circumstances: Circumstances, policy: Policy| match decide(&circumstances, &policy, |_| {

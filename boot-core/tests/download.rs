@@ -66,8 +66,8 @@ fn starts(flash: &ModelFlash, kind: CrcKind) -> Result<bool, Invalid> {
     verify(flash, &journal, LAYOUT_REF, kind, 1).map(|program| program.signed())
 }
 
-/// CRC-16 of the digits 1 to 9, from the CRC catalogue (CRC-16/XMODEM, "check"): by the code of the
-/// device and by that of these tests.
+/// CRC-16 of the digits 1 to 9, from the CRC catalogue (CRC-16/XMODEM, "check"): computed by the
+/// device's code and by the code of these tests.
 #[test]
 fn the_crc_16_is_the_one_of_the_catalogue() {
     assert_eq!(CrcKind::Crc16.resume(0, b"123456789"), 0x31C3);
@@ -78,13 +78,13 @@ fn the_crc_16_is_the_one_of_the_catalogue() {
 #[test]
 fn a_product_with_crc_16_takes_blocks_and_programs_that_carry_it() {
     let image = program(1000, 0x11);
-    // Also where the CRC over the program is computed in many steps.
+    // Also if the CRC of the program is computed in many steps.
     for crc_step in [64, 1024] {
         let mut flash = ModelFlash::new(&CHIP);
         let mut bench = Bench::with(&mut flash, Policy { crc_step, ..CRC_16 });
         assert_eq!(bench.command(CLEAR), 0);
         let good = file_with_crc16(&image, 96);
-        // The other CRC, and one with something in the upper half.
+        // The other CRC, and one with a non-zero upper half.
         let mut upper = good[0].clone();
         *upper.last_mut().unwrap() = 1;
         for wrong in [&block_file(&image, 96)[0], &upper] {
@@ -102,7 +102,7 @@ fn a_product_with_crc_16_takes_blocks_and_programs_that_carry_it() {
     }
 }
 
-/// The last block tells another CRC than the program has: the right one of the wrong kind.
+/// The last block contains another CRC than the program's: the correct value of the other kind.
 #[test]
 fn a_product_with_crc_16_finds_no_program_where_the_crc_over_it_is_wrong() {
     let image = program(96, 0x22);
@@ -117,7 +117,7 @@ fn a_product_with_crc_16_finds_no_program_where_the_crc_over_it_is_wrong() {
     assert_eq!(starts(&flash, CrcKind::Crc16), Err(Invalid::Absent));
 }
 
-/// What carries no CRC gets the product's own.
+/// A format without a CRC gets the product's own kind.
 #[test]
 fn a_product_with_crc_16_takes_raw_images_and_keeps_their_crc_16() {
     let image = program(3001, 0x33);
@@ -146,7 +146,7 @@ fn blocks_may_begin_and_end_at_any_byte() {
     }
 }
 
-/// A flash in which all of the program's sectors have to be erased.
+/// A flash in which all sectors of the program must be erased.
 fn full() -> ModelFlash {
     let mut flash = ModelFlash::new(&CHIP);
     flash.poke(PROGRAM.base, &vec![0; PROGRAM.size as usize]);
@@ -169,7 +169,7 @@ fn status_is_busy_from_the_acknowledgement_to_the_end_of_the_work() {
         assert_eq!(bench.status(), 1);
     }
     assert!(steps.contains(&Step::Programming), "{steps:?}");
-    // Whoever writes now is told to wait, and harms nothing.
+    // A write at this time is refused with "wait", and does no harm.
     assert_eq!(bench.node.download_start(DATA, Some(24)), Err(AbortCode(0x0800_0022)));
     assert_eq!(bench.status(), 0x87, "busy, and MAN_BUSY");
     assert_eq!(bench.node.write(CONTROL, &[CLEAR]), Err(AbortCode(0x0800_0022)));
@@ -177,8 +177,8 @@ fn status_is_busy_from_the_acknowledgement_to_the_end_of_the_work() {
     assert_eq!(bench.status(), 0);
 }
 
-/// Each wrong block: the abort, the status of table 3, an untouched flash, and the right block
-/// right behind it.
+/// Each wrong block: the abort, the status of table 3, an unchanged flash, and then the right
+/// block.
 #[test]
 fn every_wrong_block_is_refused_and_the_next_attempt_works() {
     let image = program(192, 0x33);
@@ -258,8 +258,8 @@ fn a_program_whose_crc_or_vectors_are_wrong_is_no_program() {
     other[50] ^= 1;
     let mut nowhere = image.clone();
     nowhere[4..8].copy_from_slice(&0x0800_0101_u32.to_le_bytes());
-    // Where the first block has the vectors, they are judged with it, and it is refused. Here it has the
-    // first one alone.
+    // If the first block contains the vectors, they are checked with it, and it is refused. Here it
+    // contains only the first vector.
     for (stored, told) in [(&image, &other), (&nowhere, &nowhere)] {
         let mut flash = ModelFlash::new(&CHIP);
         let mut bench = Bench::new(&mut flash);
@@ -276,7 +276,7 @@ fn a_program_whose_crc_or_vectors_are_wrong_is_no_program() {
     }
 }
 
-/// What the first block shows costs nothing: a vector table that is none.
+/// A fault in the first block has no effect on the old program: an invalid vector table.
 #[test]
 fn a_program_that_cannot_start_is_refused_before_anything_is_lost() {
     let mut flash = ModelFlash::new(&CHIP);
@@ -314,7 +314,7 @@ fn an_installed_program_must_be_cleared_first_and_what_is_not_blank_is_not_writt
     flash.poke(LAYOUT.parameters[0].base, &[0; 0x200]);
     let mut bench = Bench::new(&mut flash);
     bench.good(&good[0]);
-    // Whether a place is blank is found out when the flash is free to be read.
+    // Whether a place is blank is checked when the flash can be read.
     assert_eq!(bench.block(&good[1]), (Ok(()), 0x08));
     assert_eq!(bench.block(&good[1]), (Err(AbortCode(0x0800_0022)), 0x08));
     bench.install(&image);
@@ -346,7 +346,7 @@ fn signature_and_start() {
     for unknown in [0x04, 0x05, 0x7F, 0x81, 0x82, 0x85, 0xFF] {
         assert_eq!(bench.node.write(CONTROL, &[unknown]), Err(AbortCode(0x0609_0030)), "{unknown:#x}");
     }
-    // CLEAR alone loses nothing; a second one does.
+    // One CLEAR loses nothing; a second one does.
     assert_eq!(bench.command(CLEAR), 0);
     assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
     assert_eq!(bench.command(CLEAR), 0);
@@ -378,7 +378,7 @@ fn a_transfer_cut_off_in_the_middle_leaves_no_trace() {
 fn faults_of_the_flash_are_told_and_clear_begins_anew() {
     let image = program(192, 0x99);
     let good = block_file(&image, 96);
-    // The first block makes the record go, and its sector; its last operation writes data.
+    // The first block removes the record and erases its sector; its last operation writes data.
     let of_the_block = {
         let mut flash = full();
         let mut bench = Bench::new(&mut flash);
@@ -391,7 +391,7 @@ fn faults_of_the_flash_are_told_and_clear_begins_anew() {
     for (fault, status) in
         [(FlashFault::Failed, 0x0A), (FlashFault::Verify, 0x0A), (FlashFault::Protected, 0x0E)]
     {
-        // Two CLEARs take the record away, and erase then.
+        // Two CLEARs remove the record and then erase.
         let mut flash = full();
         let mut bench = Bench::new(&mut flash);
         assert_eq!((bench.command(CLEAR), bench.command(CLEAR)), (0, 0));
@@ -406,7 +406,7 @@ fn faults_of_the_flash_are_told_and_clear_begins_anew() {
         let operations = bench.node.flash().operations;
         bench.node.flash().fail = Some((operations + of_the_block, fault));
         assert_eq!(bench.block(&good[1]), (Ok(()), status));
-        // Half a block is in flash: only CLEAR helps, and until then the cause stays to be seen.
+        // Half a block is in flash: only CLEAR helps, and until then the cause stays visible.
         assert_eq!(bench.block(&good[1]), (Err(AbortCode(0x0800_0022)), status));
         bench.install(&image);
         let operations = bench.node.flash().operations;
@@ -417,8 +417,8 @@ fn faults_of_the_flash_are_told_and_clear_begins_anew() {
     }
 }
 
-/// An update, cut at every operation: what starts afterwards is the old program or the new one,
-/// whole, or nothing; and the update then completes.
+/// An update, cut at every operation: afterwards the old program or the new one starts, complete,
+/// or none; and the update then completes.
 #[test]
 fn an_update_cut_anywhere_leaves_the_old_the_new_or_no_program() {
     let (old, new) = (program(200, 0xA0), program(300, 0xB0));
@@ -440,7 +440,7 @@ fn control(app_size: u32, vendor_id: u32, product_code: u32) -> Vec<u8> {
     block(0, 0, &words.iter().flat_map(|word| word.to_le_bytes()).collect::<Vec<_>>())
 }
 
-/// A wrong file costs nothing: the program that is installed stays, and starts.
+/// A wrong file has no effect: the installed program stays and starts.
 #[test]
 fn a_file_for_another_product_is_refused_before_anything_is_lost() {
     fn no_downgrade(program: u8, control: &Control) -> Verdict {
@@ -475,7 +475,7 @@ fn a_file_for_another_product_is_refused_before_anything_is_lost() {
         assert_eq!(bench.command(START), 0, "{what}");
         assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)), "{what}");
     }
-    // 0 stands for any; and what the integrator accepts needs no identity.
+    // 0 stands for any value; and if the integrator accepts a program, it needs no identity.
     for file in [control(0, 0, 0), control(0, DEVICE.0, DEVICE.1), control(0x600D, 7, 7)] {
         assert_eq!(bench.command(CLEAR), 0);
         bench.good(&file);
@@ -503,7 +503,7 @@ fn while_programming_is_not_allowed_nothing_is_changed() {
         assert_eq!(bench.status(), 0x84, "NO_ACCESS");
     }
     assert_eq!(bench.node.flash().touched, []);
-    // Reading, and starting what is there, is no programming.
+    // To read a program or to start the existing one is not programming.
     assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
     assert_eq!(bench.command(START), 0);
     assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Trial(1)));
@@ -552,7 +552,7 @@ fn repeated_and_overlapping_blocks_are_refused_and_the_program_goes_on() {
     bench.good(&good[1]);
     assert_eq!(bench.block(&good[1]), (Err(AbortCode(0x0800_0022)), 0x88), "repeated: SEQUENCE");
     bench.good(&good[2]);
-    // In order by its number, but over what is there: found out by looking at the flash.
+    // Correct by its number, but over existing data: the check of the flash detects it.
     let over = block(3, PROGRAM.base + 100, &[0; 16]);
     assert_eq!(bench.block(&over), (Ok(()), 0x08), "NOTCLEARED");
     assert_eq!(bench.block(&good[3]).0, Err(AbortCode(0x0800_0022)), "half a program is none");
@@ -580,8 +580,8 @@ fn programs_that_do_not_exist_have_no_objects() {
     assert_eq!(bench.node.flash().touched, []);
 }
 
-/// Every operation of an update fails once, in each way: the status says so or the engine got over
-/// it; what would start is whole; and the next attempt succeeds.
+/// Every operation of an update fails once, in each way: the status reports it, or the engine
+/// recovers; a program that would start is complete; and the next attempt succeeds.
 #[test]
 fn a_fault_at_any_operation_costs_no_more_than_another_attempt() {
     let (old, new) = (program(200, 0xA0), program(300, 0xB0));
@@ -591,7 +591,7 @@ fn a_fault_at_any_operation_costs_no_more_than_another_attempt() {
     assert_eq!(bench.command(SET_SIGNATURE), 0);
     let cells = installed.cells(CHIP.flash).to_vec();
 
-    /// As far as it goes: the first status that is not 0.
+    /// The first status that is not 0.
     fn update(flash: &mut ModelFlash, new: &[u8]) -> u32 {
         let mut bench = Bench::new(flash);
         let mut status = bench.command(CLEAR);
@@ -643,11 +643,10 @@ fn a_fault_at_any_operation_costs_no_more_than_another_attempt() {
     assert!(failed > 80, "{failed}");
 }
 
-/// A store outside the flash takes the journal's place.
+/// A store outside the flash replaces the journal.
 #[test]
 fn parameters_may_be_kept_in_an_eeprom() {
-    /// Holds what it is told after a while, as one that is written byte by byte; fails when told
-    /// to.
+    /// Stores a value after a delay, like a memory that is written byte by byte; fails if told to.
     #[derive(Default)]
     struct Eeprom {
         values: Vec<(Key, Value)>,
@@ -724,8 +723,8 @@ fn parameters_may_be_kept_in_an_eeprom() {
     );
 }
 
-/// The last block of the older manual (L-1112e_5, chapter 5.1): data size 8, which does not count the
-/// 32 reserved bytes in front of size and CRC. Also with a size that counts them.
+/// The last block of the older manual (L-1112e_5, chapter 5.1): data size 8, which does not include
+/// the 32 reserved bytes before size and CRC. Also with a size that includes them.
 #[test]
 fn the_last_block_of_2008_is_taken() {
     let image = program(1000, 0x22);
@@ -743,7 +742,7 @@ fn the_last_block_of_2008_is_taken() {
         last.extend(1000_u32.to_le_bytes());
         last.extend(block_crc(&image).to_le_bytes());
         last.extend(block_crc(&last).to_le_bytes());
-        // Cut off it is no block.
+        // A truncated one is not a block.
         let (refused, status) = bench.block(&last[..55]);
         assert_eq!((refused, status), (Err(AbortCode::LENGTH), 0x04), "size {size}");
         bench.good(&last);

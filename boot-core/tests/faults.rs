@@ -1,4 +1,4 @@
-//! Faults that were found by reading: work on one program that reaches another one, and a journal
+//! Faults that were found by review: work on one program that affects another one, and the journal
 //! of a newer bootloader.
 
 #[path = "../../tests/src/ihex.rs"]
@@ -21,7 +21,7 @@ const RESET_STAT: u8 = 2;
 const CLEAR: u8 = 3;
 const BUFFER: usize = 1024;
 
-/// A program, or data where the setup has data in its place.
+/// A program, or data if the setup has data there.
 fn image(setup: &Setup, number: u8, len: usize, seed: u8) -> Vec<u8> {
     if setup.is_data(number) {
         return (0..len).map(|i| (i as u8).wrapping_mul(29) ^ seed).collect();
@@ -29,14 +29,14 @@ fn image(setup: &Setup, number: u8, len: usize, seed: u8) -> Vec<u8> {
     program(setup.region(number), PRODUCT_CODE, len, seed)
 }
 
-/// So many moments of the work on one program are tried.
+/// The number of moments during the work on one program that are tried.
 const MOMENTS: u32 = 400;
-/// Steps in which a sector is erased and some words are programmed.
+/// The number of steps in which a sector is erased and some words are programmed.
 const WORK: u32 = 100;
 
-/// A download to program 1 is broken off, the password comes again at any moment of the work that
-/// is left, and a download to program 2 is broken off too: program 2 is what its record says, or has
-/// none. Promise 3 of docs/powercut.md, without a power cut.
+/// A download to program 1 is aborted, the password arrives again at any moment of the remaining
+/// work, and a download to program 2 is aborted, too: program 2 matches its record, or has none.
+/// Promise 3 of docs/powercut.md, without a power cut.
 #[test]
 fn a_record_never_outlives_its_program_whenever_the_password_comes() {
     let mut wrong = Vec::new();
@@ -68,7 +68,7 @@ fn a_record_never_outlives_its_program_whenever_the_password_comes() {
     assert!(wrong.is_empty(), "{} of {} moments; the first is {:?}", wrong.len(), 2 * MOMENTS, wrong[0]);
 }
 
-/// The same with CLEAR, and with the second program sent in full.
+/// The same with CLEAR, and with a complete second program.
 #[test]
 fn a_record_never_outlives_its_program_whenever_clear_comes() {
     for setup in [&STANDARD_2, &AT_ONCE_2] {
@@ -97,8 +97,8 @@ fn a_record_never_outlives_its_program_whenever_clear_comes() {
     }
 }
 
-/// The manual of ESAcademy: the password of a program voids it. Also while the flash still works on
-/// what was broken off of another one.
+/// The manual of ESAcademy: the password of a program makes it invalid, also while the flash still
+/// works on an aborted download of another program.
 #[test]
 fn a_password_that_is_taken_voids_its_program_whatever_is_going_on() {
     let setup = &ESACADEMY_2;
@@ -123,7 +123,7 @@ fn a_password_that_is_taken_voids_its_program_whatever_is_going_on() {
     assert!(wrong.is_empty(), "{} of {MOMENTS} moments; the first is {:?}", wrong.len(), wrong.first());
 }
 
-/// The program that a request starts, whichever way; 0 for another request.
+/// The program that a request starts in any way; 0 for another request.
 fn program_of(request: BootRequest) -> u8 {
     match request {
         BootRequest::Start(program) | BootRequest::Fresh(program) => program,
@@ -131,8 +131,9 @@ fn program_of(request: BootRequest) -> u8 {
     }
 }
 
-/// A stream to program 2 is complete, one to program 1 is being finished: START and CiA 302-3's
-/// RESET of program 2 start program 2, or are refused. The other one was not asked for.
+/// A stream to program 2 is complete, a stream to program 1 is being finished: START and the RESET
+/// of CiA 302-3 for program 2 start program 2, or are refused. No request was made for the other
+/// program.
 #[test]
 fn start_behind_a_stream_starts_the_program_that_it_names() {
     let setup = &STANDARD_2;
@@ -168,8 +169,8 @@ fn start_behind_a_stream_starts_the_program_that_it_names() {
     assert!(wrong.is_empty(), "{} times; the first is {:?}", wrong.len(), wrong.first());
 }
 
-/// The same while a record of the other program is being stored, in place of a stream: whose work is
-/// being finished has to be asked there too.
+/// The same while a record of the other program is being stored, instead of a stream: the device
+/// must also check there whose work is being finished.
 #[test]
 fn start_behind_a_signature_of_another_program_starts_the_program_that_it_names() {
     let setup = &STANDARD_2;
@@ -192,8 +193,7 @@ fn start_behind_a_signature_of_another_program_starts_the_program_that_it_names(
     assert!(wrong.is_empty(), "{} times; the first is {:?}", wrong.len(), wrong.first());
 }
 
-/// A set of parameters is data: nothing that is said of it starts it, at any moment behind its
-/// download.
+/// A set of parameters is data: no command starts it, at any moment after its download.
 #[test]
 fn data_are_never_started() {
     let setup = &LIFT_2;
@@ -211,12 +211,12 @@ fn data_are_never_started() {
     }
 }
 
-/// Layer setting services ask nobody whether a download is going on, and a second SDO server does
-/// not either: what they store must not take the place of the record that has to go first.
+/// Layer setting services do not check whether a download is running, and neither does a second SDO
+/// server: the values that they store must not replace the record that must be removed first.
 #[test]
 fn a_record_never_outlives_its_program_whatever_is_stored_during_a_download() {
     type Between = fn(&mut Rig) -> bool;
-    // Whether it is taken is the device's choice.
+    // The device decides whether to accept it.
     const BETWEEN: [(&str, Between); 3] = [
         ("LSS", |device| device.node.store(NodeId::new(9), Some(BitRate::K250)).is_pending()),
         ("SET_SIGNATURE", |device| device.command(1, 0x83).is_ok()),
@@ -260,8 +260,8 @@ fn a_record_never_outlives_its_program_whatever_is_stored_during_a_download() {
     assert!(wrong.is_empty(), "{} times; the first is {:?}", wrong.len(), wrong.first());
 }
 
-/// One download at a time: what begins ends what is open of another program, of which the next block
-/// is refused and writes nothing. What is refused ends nothing.
+/// One download at a time: a new one ends the open one of another program; the next block of that
+/// one is refused and writes nothing. A refused one ends nothing.
 #[test]
 fn a_download_that_begins_ends_one_of_another_program() {
     let setup = &STANDARD_2;
@@ -279,7 +279,7 @@ fn a_download_that_begins_ends_one_of_another_program() {
         device.send(one, &data(one, 0)).unwrap();
         device.settle();
 
-        // Of the other program, without its CLEAR: refused.
+        // A block of the other program, without its CLEAR: refused.
         device.send(other, &data(other, 0)).unwrap_err();
         device.settle();
         device.send(one, &data(one, 1)).unwrap();
@@ -295,7 +295,7 @@ fn a_download_that_begins_ends_one_of_another_program() {
         assert_eq!((device.status(one), device.status(other)), (0x88, 0), "{one}: SEQUENCE");
         assert!(device.cells(one) == before, "{one}: a block of what was ended was written");
 
-        // That refusal ended nothing, and the one that was ended can begin anew.
+        // This refusal ended nothing, and the ended download can begin again.
         for n in 0..7 {
             device.send(other, &data(other, n)).unwrap();
             device.settle();
@@ -315,16 +315,16 @@ fn slot(five: [u32; 5]) -> Vec<u8> {
     bytes
 }
 
-/// A journal of a newer bootloader is not erased by an older one that cannot read it: whatever has
-/// to be stored is refused, and nothing changes. The device stays in the bootloader and can take
-/// the newer bootloader back.
+/// An older bootloader does not erase the journal of a newer one, which it cannot read: every store
+/// is refused, and nothing changes. The device stays in the bootloader and can get the newer
+/// bootloader back.
 #[test]
 fn a_journal_of_a_newer_format_refuses_what_has_to_be_stored_and_is_left_alone() {
     const NEWER: u32 = 0xFF;
     let magic = u32::from_le_bytes(*b"CBNV");
     let header = |sequence: u32, format| slot([magic, sequence, !sequence, format, u32::MAX]);
     let regions = STANDARD_1.layout.parameters;
-    // By the region that holds the newer journal, and what the other one holds.
+    // By the region of the newer journal, and the contents of the other region.
     let cases = [(0, None), (1, None), (0, Some(header(6, 0))), (1, Some(header(6, 1)))];
     for (newer, other) in cases {
         let mut flash = ModelFlash::new(&CHIP);

@@ -1,5 +1,6 @@
-//! The label of a program that comes as a block file: another product's is refused before anything is
-//! lost where the first block has the label, and never becomes a program where a later one has it.
+//! The label of a program in a block file: the program of another product is refused before
+//! anything is lost if the label is in the first block, and never becomes valid if it is in a later
+//! one.
 
 mod bench;
 mod model;
@@ -35,7 +36,7 @@ fn labelled(seed: u8, label: &Label) -> Vec<u8> {
     bytes
 }
 
-/// A device with a queue for large blocks, and the old program in it.
+/// A device with a queue for large blocks, and the old program in flash.
 fn updated(flash: &mut ModelFlash) -> Bench<'_> {
     let mut bench = Bench::with_buffer(flash, POLICY, 2048);
     bench.install(&program(200, OLD));
@@ -44,7 +45,7 @@ fn updated(flash: &mut ModelFlash) -> Bench<'_> {
     bench
 }
 
-/// The programs of other products, and what 1F57h reads for them.
+/// The programs of other products, and the value of 1F57h for them.
 fn others() -> [(Vec<u8>, u32); 2] {
     [
         (labelled(NEW, &Label::new(DEVICE.0 ^ 1, DEVICE.1, 7)), 0x80),
@@ -57,13 +58,13 @@ fn a_label_in_the_first_block_is_judged_before_anything_is_lost() {
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = updated(&mut flash);
     for (other, status) in others() {
-        // What block 0 tells does not help, not even as much as it may erase ahead.
+        // The data in block 0 do not help, not even the size that may be erased ahead.
         for control in [vec![0; 8], [700, DEVICE.0, DEVICE.1].map(u32::to_le_bytes).concat()] {
             assert_eq!(bench.command(CLEAR), 0);
             bench.good(&block(0, 0, &control));
             assert_eq!(bench.block(&block_file(&other, 512)[1]), (Err(UNFIT), status));
             assert_eq!(bench.node.flash().touched, [], "nothing is lost");
-            // The next one is refused, too: there is no way past the first.
+            // The next block is refused, too: there is no way around the first.
             assert_eq!(bench.block(&block_file(&other, 512)[2]).0, Err(AbortCode(0x0800_0022)));
             assert_eq!(bench.command(START), 0);
             assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
@@ -105,10 +106,10 @@ fn a_label_that_fits_is_taken_and_tells_the_version() {
         (labelled(NEW, &Label::new(DEVICE.0, DEVICE.1, 7)), vec![0; 8], 7),
         (labelled(NEW, &Label::new(0, 0, 7)), vec![0; 8], 7),
         (labelled(NEW, &Label::new(0, DEVICE.1, 7)), dated(9), 9),
-        // One that is damaged is none.
+        // A damaged label counts as missing.
         (damaged, vec![0; 8], 0),
         (program(700, NEW), dated(9), 9),
-        // Behind the end of a program is none of its label, whatever is left there.
+        // Data after the end of a program are not its label, whatever was left there.
         (program(200, NEW), vec![0; 8], 0),
     ] {
         for chunk in [512, 96] {
@@ -125,7 +126,7 @@ fn a_label_that_fits_is_taken_and_tells_the_version() {
     }
 }
 
-/// The product's own check is asked about the label, too: block 0 cannot tell it another version.
+/// The product's own check also gets the label: block 0 cannot claim another version.
 #[test]
 fn a_products_own_check_sees_the_label() {
     fn no_downgrade(_: u8, control: &Control) -> Verdict {
@@ -144,8 +145,7 @@ fn a_products_own_check_sees_the_label() {
     }
 }
 
-/// Block 0 alone loses nothing, however much it tells of the program: a reset behind it finds the old
-/// one.
+/// Block 0 alone loses nothing, whatever it contains: after a reset the old program is found.
 #[test]
 fn a_control_block_alone_loses_nothing() {
     let mut flash = ModelFlash::new(&CHIP);
@@ -153,15 +153,15 @@ fn a_control_block_alone_loses_nothing() {
     assert_eq!(bench.command(CLEAR), 0);
     bench.good(&block(0, 0, &[700, DEVICE.0, DEVICE.1].map(u32::to_le_bytes).concat()));
     assert_eq!(bench.node.flash().touched, []);
-    // Broken off and begun anew, it still loses nothing.
+    // Aborted and begun again, it still loses nothing.
     assert_eq!(bench.command(CLEAR), 0);
     bench.good(&block(0, 0, &[0; 8]));
     assert_eq!(bench.node.flash().touched, []);
     assert_eq!(autostart(&flash), Ok(OLD));
 }
 
-/// An update to another product's program in small blocks, cut at every operation: what starts is the
-/// old program or none.
+/// An update to the program of another product in small blocks, cut at every operation: the old
+/// program starts, or none.
 #[test]
 fn no_power_cut_makes_a_program_of_another_products() {
     quiet_power_cuts();
@@ -202,7 +202,7 @@ fn no_power_cut_makes_a_program_of_another_products() {
     assert!(operations > 150 && seen.iter().all(|count| *count > 0), "{operations}: {seen:?}");
 }
 
-/// The same to a program of this product: it may be cut anywhere, and completes.
+/// The same for a program of this product: it may be cut anywhere, and completes.
 #[test]
 fn a_labelled_update_cut_anywhere_leaves_the_old_the_new_or_none() {
     let new = labelled(NEW, &Label::new(DEVICE.0, DEVICE.1, 7));

@@ -1,7 +1,7 @@
-//! Two masters at one device, in virtual time: the first updates it, the second sends requests, aborts,
-//! segments of nothing, NMT commands and noise at any moment, and both pause and vanish. Whatever they
-//! do, the device answers who asks it when the others are silent, resets when it is told to, and never
-//! vouches for a program that is not there. The same seed plays the same attack:
+//! Two masters at one device, in virtual time: the first one updates it; the second one sends
+//! requests, aborts, meaningless segments, NMT commands and noise at any moment; and both pause and
+//! disappear. The device must answer a request when the others are silent, reset when it is
+//! commanded to, and never have a record of a missing program. The same seed gives the same attack:
 //!
 //! ```sh
 //! COBOOT_ATTACKS=20000 cargo test --release -p coboot-core --test masters
@@ -24,7 +24,7 @@ use random::Random;
 const NODE: u8 = 5;
 const READ_1000: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
 const IS_1000: [u8; 8] = [0x43, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x10];
-/// Longer than a sub-block may pause, and the time that a device takes for two looks at its clock.
+/// Longer than the pause of a sub-block plus two checks of the clock.
 const ANSWER_MS: u32 = 54;
 /// A client's time-out in an abandoned transfer.
 const TIMEOUT_MS: u32 = 2000;
@@ -34,9 +34,9 @@ struct World<'f> {
     device: Device<'f>,
     slave: Slave,
     now: u32,
-    /// SDO answers that nobody has looked at.
+    /// SDO answers that were not read yet.
     answers: Vec<[u8; 8]>,
-    /// It was told to reset.
+    /// A reset was commanded.
     resets: bool,
 }
 
@@ -63,7 +63,7 @@ impl<'f> World<'f> {
         self.turn();
     }
 
-    /// What the device has to say, and a bit of its work.
+    /// Sends the device's frames, and runs a part of its work.
     fn turn(&mut self) {
         self.device.node.set_time(self.at());
         while let Some(output) = self.slave.poll(Instant::from_millis(self.now), true, &mut self.device.node)
@@ -88,7 +88,7 @@ impl<'f> World<'f> {
         }
     }
 
-    /// The answer to a request, within the time; it is asked once.
+    /// The answer to a request within the time; the request is sent once.
     fn ask(&mut self, bytes: [u8; 8], within: u32) -> Option<[u8; 8]> {
         self.answers.clear();
         self.put(&sdo(bytes));
@@ -102,7 +102,7 @@ impl<'f> World<'f> {
     }
 }
 
-/// The one who updates.
+/// The master that updates.
 struct Updater {
     files: Vec<(Address, Vec<u8>)>,
     at: usize,
@@ -121,7 +121,7 @@ impl Updater {
         Self { files, at: 0, transfer: None }
     }
 
-    /// Sends its next frame, if it is its turn; whether it goes on.
+    /// Sends its next frame if it is its turn; returns whether it continues.
     fn turn(&mut self, world: &mut World<'_>, random: &mut Random) -> bool {
         let Some((at, data)) = self.files.get(self.at) else { return false };
         let transfer = self.transfer.get_or_insert_with(|| {
@@ -133,21 +133,21 @@ impl Updater {
                 Download::new(node, *at, data.clone(), ClientConfig::default())
             }
         });
-        // All that the device says goes to both masters: there is one identifier.
+        // Both masters get all frames of the device: there is only one identifier.
         for answer in std::mem::take(&mut world.answers) {
             let frame = Frame::of(CobId::sdo_response(NodeId::new(NODE).unwrap()), &answer);
             transfer.handle(&frame, world.at());
         }
         match transfer.poll(world.at()) {
             Step::Send(frame) => {
-                // Now and then a frame is lost, or comes twice.
+                // Sometimes a frame is lost or repeated.
                 let times = if random.chance(2) { 2 * random.below(2) } else { 1 };
                 (0..times).for_each(|_| world.put(&frame));
             }
             Step::Wait(_) => world.wait(1),
             Step::Done(result) => {
                 self.transfer = None;
-                // It tries again what was refused or broken off; a wrong order it begins anew.
+                // It repeats what was refused or aborted; after a wrong order it begins again.
                 match result {
                     Ok(()) => self.at += 1,
                     Err(SdoError::Server(_)) => self.at = 0,
@@ -160,7 +160,7 @@ impl Updater {
     }
 }
 
-/// What the other one sends.
+/// The frames of the other master.
 fn meddle(world: &mut World<'_>, random: &mut Random) {
     let objects = [(0x1000, 0), (0x1008, 0), (0x1018, 1), (0x1F50, 1), (0x1F51, 1), (0x1F57, 1), (0x1234, 0)];
     let (index, sub): (u16, u8) = random.pick(&objects);
@@ -173,7 +173,7 @@ fn meddle(world: &mut World<'_>, random: &mut Random) {
         4 => sdo([random.pick(&[0xA0, 0xA4]), low, high, sub, 1 + value[0] % 127, value[1] % 32, 0, 0]),
         5 => sdo(request(random.pick(&[0xC0, 0xC2, 0xC4, 0xC6]))),
         6 => sdo(request(0x80)),
-        // Segments, acknowledgements and ends of transfers that there may be.
+        // Segments, acknowledgements and ends of possible transfers.
         7 => sdo(request(random.pick(&[0x00, 0x10, 0x60, 0x70, 0xA1, 0xA2, 0xA3, 0xC1]))),
         8 => sdo(request(random.below(256) as u8)),
         9 => Frame::of(CobId::NMT, &[random.pick(&[0x01, 0x02, 0x80, 0x82]), random.pick(&[0, NODE, 9])]),
@@ -189,29 +189,29 @@ fn meddle(world: &mut World<'_>, random: &mut Random) {
     world.put(&frame);
 }
 
-/// What there is to look at when both are silent.
+/// The checks when both masters are silent.
 fn look(world: &mut World<'_>, seed: u64, random: &mut Random) {
     match random.below(4) {
-        // Who gives up what was going on is answered at once.
+        // A client that aborts the open transfer gets an answer at once.
         0 => {
             world.put(&sdo([0x80, 0, 0, 0, 0, 0, 0, 8]));
             assert_eq!(world.ask(READ_1000, 1), Some(IS_1000), "seed {seed}, behind an abort");
         }
-        // Who does not is answered within the pause of a sub-block; one request may be taken for the
-        // segment whose number is due, or for the rest of the answer to the one before.
+        // Other clients get an answer after the pause of a sub-block; one request may be taken for
+        // the segment that is due, or for the rest of the previous answer.
         1 => {
             world.wait(60);
             let first = world.ask(READ_1000, ANSWER_MS);
             let answer = if first == Some(IS_1000) { first } else { world.ask(READ_1000, ANSWER_MS) };
             assert_eq!(answer, Some(IS_1000), "seed {seed}, asked twice; the first time {first:02X?}");
         }
-        // A reset needs no end of anything.
+        // A reset does not wait for the end of anything.
         2 => {
             world.resets = false;
             world.put(&Frame::of(CobId::NMT, &[0x81, NODE]));
             assert!(world.resets && world.slave.is_idle(), "seed {seed}: it owes an answer");
         }
-        // In the end nothing is left of a transfer.
+        // At the end, nothing is left of a transfer.
         _ => {
             world.wait(2 * TIMEOUT_MS + 200);
             assert!(world.slave.is_idle());
@@ -220,7 +220,7 @@ fn look(world: &mut World<'_>, seed: u64, random: &mut Random) {
     }
 }
 
-/// Whether the record of program 1, if there is one, is true.
+/// Whether the record of program 1, if there is one, matches the flash.
 fn record_is_true(flash: &ModelFlash) -> bool {
     let journal = Journal::open(flash, bench::LAYOUT.parameters);
     let Some(record) = ProgramRecord::load(&journal, flash, 1) else { return true };
@@ -247,7 +247,7 @@ fn two_masters_at_once_and_whatever_else_comes() {
             }
             look(&mut world, seed, &mut random);
         }
-        // A master that has the device for itself.
+        // A master that is alone with the device.
         world.put(&Frame::of(CobId::LSS_REQUEST, &[0x04, 0, 0, 0, 0, 0, 0, 0]));
         world.put(&sdo([0x80, 0, 0, 0, 0, 0, 0, 8]));
         world.wait(200);

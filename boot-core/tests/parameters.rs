@@ -1,4 +1,4 @@
-//! The journal: what was stored is read, whenever the power goes.
+//! The journal: stored values are read back, whenever the power is cut.
 
 mod model;
 
@@ -43,8 +43,7 @@ fn values_survive_a_restart_and_any_number_of_compactions() {
     assert_eq!(outside, None, "the journal wrote outside its regions");
 }
 
-/// Cuts the power at every operation of a long history, in every way, and once more in the
-/// recovery.
+/// Cuts the power at every operation of a long history, in every way, and again in the recovery.
 #[test]
 fn after_any_cut_the_old_or_the_new_value_is_read_and_the_neighbour_is_untouched() {
     quiet_power_cuts();
@@ -138,7 +137,7 @@ fn the_real_regions_hold_hundreds_of_records_between_two_erases() {
     assert!(slots > 600, "{slots}");
 }
 
-/// A slot as docs/adr/0004 has it: five words and their CRC.
+/// A slot as in docs/adr/0004: five words and their CRC.
 fn slot(words: [u32; 5]) -> Vec<u8> {
     let mut bytes: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
     bytes.extend(boot_core::crc32(&bytes).to_le_bytes());
@@ -165,8 +164,8 @@ fn a_journal_of_an_older_version_is_read_and_moves_to_this_one_and_a_newer_one_i
     }
 }
 
-/// Its owner is a newer bootloader, which may come back: what has to be stored is refused, and not a
-/// bit changes. Wherever the newer journal lies, and whatever it has left in the other region.
+/// The journal belongs to a newer bootloader, which may return: every store is refused, and no bit
+/// changes. This holds for each region of the newer journal, and any contents of the other region.
 #[test]
 fn a_journal_of_a_newer_version_refuses_every_store_and_stays_as_it_is() {
     let header = |sequence: u32, version| {
@@ -192,8 +191,8 @@ fn a_journal_of_a_newer_version_refuses_every_store_and_stays_as_it_is() {
     }
 }
 
-/// On the chip the core would stall, and every interrupt with it: the model does not allow it, so that
-/// no test can pass over such a call.
+/// On the chip the core would stall, and every interrupt with it: the model does not allow this
+/// call, so that every test detects it.
 #[test]
 #[should_panic(expected = "flash was read while it is busy")]
 fn a_store_that_is_asked_while_the_flash_works_is_caught() {

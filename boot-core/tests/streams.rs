@@ -23,7 +23,7 @@ const STATE: AbortCode = AbortCode(0x0800_0022);
 const TOO_LONG: AbortCode = AbortCode(0x0607_0012);
 const RESET_STAT: u8 = 0x02;
 
-/// A program as HEX in records of `len` bytes, from its base on.
+/// A program as HEX in records of `len` bytes, from its base.
 fn hex(program: &[u8], len: usize, end: &str) -> String {
     let base = PROGRAM.base;
     let mut text = record(0, 4, &((base >> 16) as u16).to_be_bytes()) + end;
@@ -74,7 +74,7 @@ fn hex_is_stored_whatever_its_records_and_line_ends_are() {
     }
 }
 
-/// A record that the device has no room for, whatever it does: refused, not waited for.
+/// A record for which the device can never have room: refused without a wait.
 #[test]
 fn a_record_that_is_larger_than_half_the_queue_is_refused() {
     let mut flash = ModelFlash::new(&CHIP);
@@ -105,9 +105,9 @@ fn hex_may_have_gaps_and_any_order() {
     assert_eq!(autostart(&flash), Ok(0x33));
 }
 
-/// CiA 302-3: 2 resets the program, which starts it; for block files it is RESET_STAT.
-/// Fresh is what is started right behind its download: a signature in between is a master that does
-/// not confirm by 80h, and a program that came in blocks has one that signs.
+/// CiA 302-3: 2 resets the program, which starts it; for block files it means RESET_STAT. A program
+/// is fresh if it is started directly after its download: a release in between shows a master that
+/// does not confirm by 80h, and hosts that send blocks release the program themselves.
 #[test]
 fn a_program_is_fresh_only_right_behind_a_stream() {
     let image = program(500, 0x45);
@@ -117,7 +117,7 @@ fn a_program_is_fresh_only_right_behind_a_stream() {
     assert_eq!(bench.command(SET_SIGNATURE), 0);
     assert_eq!(bench.command(START), 0);
     assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)));
-    // What is read in between changes nothing, and neither does a second START.
+    // Reads in between change nothing, and neither does a second START.
     assert_eq!(bench.command(CLEAR), 0);
     assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
     assert_eq!((bench.status(), bench.read_state()), (0, 0));
@@ -147,7 +147,7 @@ fn command_2_starts_behind_a_stream_alone() {
     bench.install(&image);
     assert_eq!(bench.command(RESET_STAT), 0);
     assert_eq!(bench.node.take_boot_request(), None, "a block file");
-    // A refused stream is none.
+    // A refused stream does not count.
     assert_eq!(bench.command(CLEAR), 0);
     assert_eq!(bench.stream(b"nonsense that is long enough", None, 7), (Err(STORE), 4));
     assert_eq!(bench.command(RESET_STAT), 0);
@@ -177,7 +177,7 @@ fn a_profile_may_start_always_or_by_itself_or_want_a_signature() {
     assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)));
 }
 
-/// Hosts that poll nothing: START right behind the last segment waits for the verification.
+/// Hosts without polling: START directly after the last segment waits for the verification.
 #[test]
 fn start_right_behind_the_last_segment_waits_for_the_verification() {
     let image = program(2000, 0x66);
@@ -193,7 +193,7 @@ fn start_right_behind_the_last_segment_waits_for_the_verification() {
         assert!(!bench.node.is_finishing());
         assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)));
     }
-    // What cannot be verified does not start.
+    // A program that fails the verification does not start.
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = cleared(&mut flash);
     assert_eq!(bench.pour(&image, None, 7), Ok(()));
@@ -204,8 +204,8 @@ fn start_right_behind_the_last_segment_waits_for_the_verification() {
     assert_eq!((bench.status(), bench.node.take_boot_request()), (0x0A, None));
 }
 
-/// What can be known before the first piece is complete costs the old program nothing, and the next
-/// attempt works. What is sent, what is announced, and the abort and status that answer.
+/// A fault in the first piece has no effect on the old program, and the next attempt works. The
+/// sent data, the announced size, and the resulting abort and status.
 type Case<'a> = (&'a str, Vec<u8>, Option<u32>, AbortCode, u32);
 
 #[test]
@@ -286,7 +286,7 @@ fn what_is_seen_later_leaves_no_program_and_the_next_attempt_works() {
         assert_eq!(bench.read_state(), 3, "{what}");
         assert_eq!(bench.command(START), 2, "{what}: NOVALPROG");
         assert_eq!(bench.stream(&image, None, 7).0, Err(STATE), "{what}: CLEAR comes first");
-        // Nor do blocks go on where the stream ended.
+        // Blocks cannot continue a stream either.
         assert_eq!(bench.block(&block(0, 0, &[0; 8])).0, Err(STATE), "{what}: CLEAR comes first");
         assert_eq!(bench.command(CLEAR), 0);
         assert_eq!(bench.stream(text.as_bytes(), None, 7), (Ok(()), 0), "{what}");
@@ -294,7 +294,7 @@ fn what_is_seen_later_leaves_no_program_and_the_next_attempt_works() {
     }
 }
 
-/// Two records for one place: found out when the second one comes to be programmed.
+/// Two records for one address: detected when the second one is programmed.
 #[test]
 fn a_place_that_is_written_twice_is_not_blank() {
     let image = program(600, 0xA0);
@@ -312,7 +312,7 @@ fn a_client_that_breaks_off_leaves_no_program() {
     let image = program(3000, 0xA1);
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = cleared(&mut flash);
-    // Before a piece is complete nothing is lost, and it may begin again at once.
+    // Before a piece is complete nothing is lost, and the download may begin again at once.
     bench.begin(&image[..14]);
     bench.node.download_cancel(DATA);
     bench.settle();
@@ -346,8 +346,8 @@ fn two_formats_in_one_session_are_refused() {
     assert_eq!(bench.stream(&image, None, 7), (Err(STATE), 0x08), "there is a program");
 }
 
-/// An error of the flash ends the transfer with the abort that says so: 06060000h for programming,
-/// 08000000h for erasing (table 3 of Paulus).
+/// An error of the flash ends the transfer with its abort: 06060000h for programming, 08000000h for
+/// erasing (table 3 of Paulus).
 #[test]
 fn the_flash_fails_under_a_stream() {
     let image = program(3000, 0xC3);
@@ -383,8 +383,8 @@ fn a_stream_cut_anywhere_leaves_the_old_the_new_or_no_program() {
     }
 }
 
-/// The ESAcademy profile: closed until the password came, and who is wrong waits, whatever he
-/// tries.
+/// The ESAcademy profile: locked until the password arrives; after a wrong password the device
+/// refuses every attempt for a time.
 #[test]
 fn a_password_opens_1f50_and_a_wrong_one_is_slowed_down() {
     const ENABLE: Address = Address::new(0x7F50, 1);
@@ -402,11 +402,11 @@ fn a_password_opens_1f50_and_a_wrong_one_is_slowed_down() {
         assert_eq!(bench.node.write(CONTROL, &[command]), Err(STATE));
     }
     assert_eq!(bench.stream(&image, None, 7), (Err(STATE), 0x84));
-    // "INIT" the wrong way round, half a second of silence, twice that after the second one.
+    // "INIT" in reversed order, half a second of refusal, twice that after the second one.
     let mut at = |ms: u32, password: &[u8; 4]| {
         bench.node.set_time(Instant::from_millis(ms));
         let answer = bench.node.write(ENABLE, password);
-        // A reset would let him try again at once.
+        // A reset would permit another attempt at once.
         (answer, bench.node.is_finishing())
     };
     assert_eq!(at(1000, b"INIT"), (Err(AbortCode(0x0609_0030)), true));
@@ -416,7 +416,7 @@ fn a_password_opens_1f50_and_a_wrong_one_is_slowed_down() {
     assert_eq!(at(2500, b"TINI"), (Ok(()), false));
     assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
     assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)), "by itself");
-    // The next password voids it at once.
+    // The next password makes it invalid at once.
     let mut bench = Bench::with_config(
         &mut flash,
         Config { entries: &ENTRIES, download: policy, password: Profile::ESACADEMY.password, ..CONFIG },
@@ -429,7 +429,7 @@ fn a_password_opens_1f50_and_a_wrong_one_is_slowed_down() {
 }
 
 proptest! {
-    /// Any bytes behind a beginning that may be good: refused or not, nothing outside is written,
+    /// Any bytes after a possibly valid beginning: accepted or refused, nothing outside is written,
     /// nothing hangs, and the next attempt works.
     #[test]
     fn any_stream_is_answered_and_the_next_attempt_works(

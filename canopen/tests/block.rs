@@ -11,7 +11,7 @@ use common::{at, node, request, response, Bench, Event};
 /// `python3 -c "import binascii; print(hex(binascii.crc_hqx(bytes(range(1, 10)), 0)))"`.
 const CRC_9: [u8; 2] = [CRC_1_TO_9 as u8, (CRC_1_TO_9 >> 8) as u8];
 const CRC_1_TO_9: u16 = 0x2378;
-/// The same of the bytes 1 to 14.
+/// The CRC of the bytes 1 to 14, computed in the same way.
 const CRC_14: [u8; 2] = [CRC_1_TO_14 as u8, (CRC_1_TO_14 >> 8) as u8];
 const CRC_1_TO_14: u16 = 0x9B92;
 
@@ -70,7 +70,7 @@ fn server_takes_a_block_download() {
     ]);
     assert_eq!(bench.device.events, [Event::Start(Some(9)), Event::End(nine())]);
     bench.still_serves();
-    // Size not told, and no CRC on the client's side.
+    // Unknown size, and no CRC on the client's side.
     bench.device.events.clear();
     bench.expect(&[
         ([0xC0, 0x50, 0x1F, 1, 0, 0, 0, 0], &[granted(127)]),
@@ -78,7 +78,7 @@ fn server_takes_a_block_download() {
         ([0xC1, 0, 0, 0, 0, 0, 0, 0], &[ENDED]),
     ]);
     assert_eq!(bench.device.events, [Event::Start(None), Event::End((1..=7).collect())]);
-    // A variable and a string go this way, too.
+    // A variable and a string can also be transferred this way.
     bench.expect(&[
         ([0xC2, 0x17, 0x10, 0, 2, 0, 0, 0], &[[0xA4, 0x17, 0x10, 0, 127, 0, 0, 0]]),
         ([0x81, 0xE8, 0x03, 0, 0, 0, 0, 0], &[acked(1, 127)]),
@@ -108,11 +108,11 @@ fn server_asks_again_for_what_was_lost() {
         // Number 2 is lost.
         (segment(3, 15), &[acked(1, 3)]),
         (segment(1, 8), &[]),
-        // A duplicate changes nothing.
+        // A duplicate has no effect.
         (segment(1, 8), &[]),
         (segment(2, 15), &[]),
         (segment(0x83, 22), &[acked(3, 3)]),
-        // The last one twice, where the end is expected.
+        // The last segment twice, where the end is expected.
         (segment(0x83, 22), &[]),
         ([0xC1, 0, 0, 0, 0, 0, 0, 0], &[ENDED]),
     ]);
@@ -123,7 +123,7 @@ fn server_asks_again_for_what_was_lost() {
 fn server_acknowledges_a_sub_block_that_stops_short() {
     let mut bench = bench(127);
     bench.expect(&[(INITIATE_9, &[granted(127)])]);
-    // Nothing at all came: the client has its reasons, or its own time-out.
+    // No segment arrived: the client has its reasons, or its own time-out.
     bench.now += 900;
     assert_eq!(bench.sent(), []);
     bench.expect(&[(FIRST, &[])]);
@@ -132,12 +132,12 @@ fn server_acknowledges_a_sub_block_that_stops_short() {
     assert_eq!(bench.sent(), []);
     bench.now += 1;
     assert_eq!(bench.sent(), [response(acked(1, 127))]);
-    // Once; then the time-out counts from there.
+    // Only once; then the time-out counts from there.
     bench.now += 999;
     assert_eq!(bench.sent(), []);
     bench.expect(&[([0x81, 8, 9, 0, 0, 0, 0, 0], &[acked(1, 127)]), (END_OF_9, &[ENDED])]);
     assert_eq!(bench.device.domain, nine());
-    // A client that stays away.
+    // A client that does not return.
     bench.expect(&[(INITIATE_9, &[granted(127)]), (FIRST, &[])]);
     bench.now += 300;
     assert_eq!(bench.sent(), [response(acked(1, 127))]);
@@ -152,21 +152,21 @@ fn server_grants_what_the_consumer_has_room_for() {
     let mut bench = bench(127);
     bench.device.space = Some(6);
     bench.expect(&[(INITIATE_9, &[])]);
-    // A segment before the grant is none of this sub-block.
+    // A segment before the grant does not belong to this sub-block.
     bench.expect(&[(FIRST, &[])]);
     bench.device.space = Some(13);
     assert_eq!(bench.sent(), [response(granted(1))]);
     bench.expect(&[(FIRST, &[])]);
     bench.device.space = Some(20);
     assert_eq!(bench.sent(), [response(acked(1, 2))]);
-    // With the last segment no room is needed beyond its own.
+    // The last segment needs room only for itself.
     bench.expect(&[([0x81, 8, 9, 0, 0, 0, 0, 0], &[acked(1, 127)])]);
     bench.expect(&[(END_OF_9, &[ENDED])]);
     assert_eq!(bench.device.domain, nine());
     assert_eq!(bench.device.space, Some(18));
 }
 
-/// A dialogue that ends in an abort after the domain had begun.
+/// A dialogue that ends in an abort after the domain has begun.
 #[track_caller]
 fn breaks(dialogue: &[([u8; 8], &[[u8; 8]])]) {
     let mut bench = bench(4);
@@ -200,14 +200,14 @@ fn server_aborts_a_block_download_that_is_wrong() {
     breaks(&[start, (FIRST, &[]), last, ([0xD9, low, high, 0, 0, 0, 0, 0], &[abort(0x0607_0010)])]);
     let [low, high] = crc(&[1, 2, 3, 4, 5, 6, 7, 8, 9, 0]);
     breaks(&[start, (FIRST, &[]), last, ([0xD1, low, high, 0, 0, 0, 0, 0], &[abort(0x0607_0010)])]);
-    // Something else where the end is expected.
+    // Another frame where the end is expected.
     breaks(&[start, (FIRST, &[]), last, ([0x60, 0, 0, 0, 0, 0, 0, 0], &[abort(0x0504_0001)])]);
-    // The client gives up: no answer.
+    // The client aborts: no answer.
     let give_up: ([u8; 8], &[[u8; 8]]) = ([0x80, 0x50, 0x1F, 1, 0, 0, 0, 8], &[]);
     breaks(&[start, give_up]);
     breaks(&[start, (FIRST, &[]), give_up]);
     breaks(&[start, (FIRST, &[]), last, give_up]);
-    // A new initiate where one can be told.
+    // A new initiate where it can be recognised.
     let read: ([u8; 8], &[[u8; 8]]) =
         ([0x40, 0x00, 0x10, 0, 0, 0, 0, 0], &[[0x43, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x10]]);
     breaks(&[start, (FIRST, &[]), last, read]);
@@ -219,7 +219,7 @@ fn server_aborts_a_block_download_that_is_wrong() {
         ([0xC6, 0x17, 0x10, 0, 4, 0, 0, 0], &[[0x80, 0x17, 0x10, 0, 0x12, 0x00, 0x07, 0x06]]),
         (END_OF_9, &[[0x80, 0x17, 0x10, 0, 0x01, 0x00, 0x04, 0x05]]),
     ]);
-    // The consumer's last word.
+    // The refusal of the receiver at the end.
     bench.device.refuse_end = Some(AbortCode::STORE);
     bench.expect(&[
         (INITIATE_9, &[granted(4)]),
@@ -230,8 +230,8 @@ fn server_aborts_a_block_download_that_is_wrong() {
     bench.still_serves();
 }
 
-/// CRC-16 by the book (CiA 301 section 7.2.4.3.16), written once more: x^16 + x^12 + x^5 + 1, start
-/// 0.
+/// CRC-16 from its definition (CiA 301 section 7.2.4.3.16), implemented again: x^16 + x^12 + x^5 +
+/// 1, start 0.
 fn crc_hqx(bytes: &[u8]) -> u16 {
     bytes.iter().fold(0_u16, |crc, byte| {
         (0..8).fold(
@@ -258,8 +258,8 @@ fn server_gives_a_block_upload() {
         (ENDED, &[]),
     ]);
     assert!(bench.server.is_idle());
-    // Size not told: the end shows only when nothing more comes. Sub-blocks of one segment, then of
-    // two.
+    // Unknown size: the end is known only when no more data come. Sub-blocks of one segment, then
+    // of two.
     bench.device.tells_size = false;
     bench.expect(&[
         ([0xA4, 0x00, 0x20, 0, 1, 0, 0, 0], &[[0xC4, 0x00, 0x20, 0, 0, 0, 0, 0]]),
@@ -295,19 +295,19 @@ fn server_repeats_what_the_client_did_not_get() {
         (START, &[FIRST, LAST_OF_14]),
         (acked(0, 127), &[FIRST, LAST_OF_14]),
         (acked(1, 127), &[[0x81, 8, 9, 10, 11, 12, 13, 14]]),
-        // What was sent three times counts once in the CRC.
+        // A segment that was sent three times counts once in the CRC.
         (acked(1, 127), &[END_OF_14]),
         (acked(1, 127), &[]),
         (ENDED, &[]),
     ]);
     assert!(bench.server.is_idle());
-    // A client that notices before the sub-block is over: segment by segment.
+    // A client that reports a gap before the end of the sub-block: segment by segment.
     bench.expect(&[(READ_14, &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]])]);
     bench.server.handle(&request(START), at(0), &mut bench.device);
     assert_eq!(bench.server.poll(at(0), &mut bench.device), Some(response(FIRST)));
     bench.expect(&[(acked(0, 127), &[FIRST, LAST_OF_14])]);
-    // The acknowledgement of the sub-block before, twice: while the next one has not begun, and
-    // when it has.
+    // The acknowledgement of the previous sub-block, twice: before the next one has begun, and
+    // after.
     bench.expect(&[(READ_14, &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]), (START, &[FIRST, LAST_OF_14])]);
     for _ in 0..2 {
         bench.server.handle(&request(acked(0, 127)), at(0), &mut bench.device);
@@ -327,7 +327,7 @@ fn server_switches_the_protocol_below_the_threshold() {
         ([0x60, 0, 0, 0, 0, 0, 0, 0], &[[0x00, 1, 2, 3, 4, 5, 6, 7]]),
         ([0x70, 0, 0, 0, 0, 0, 0, 0], &[[0x11, 8, 9, 10, 11, 12, 13, 14]]),
         ([0xA4, 0x00, 0x10, 0, 127, 4, 0, 0], &[[0x43, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x10]]),
-        // Nothing to read, and no switch wanted.
+        // An empty value, without a protocol switch.
         ([0xA4, 0x01, 0x20, 0, 127, 0, 0, 0], &[[0xC6, 0x01, 0x20, 0, 0, 0, 0, 0]]),
         (START, &[[0x81, 0, 0, 0, 0, 0, 0, 0]]),
         (acked(1, 127), &[[0xDD, 0, 0, 0, 0, 0, 0, 0]]),
@@ -335,7 +335,7 @@ fn server_switches_the_protocol_below_the_threshold() {
     ]);
 }
 
-/// A product may turn block upload off: such a request is an unknown one then.
+/// A product may disable block upload: such a request is then an unknown request.
 #[test]
 fn server_without_block_upload_refuses_it() {
     let unknown_request = AbortCode(0x0800_0000);
@@ -364,12 +364,12 @@ fn server_aborts_a_block_upload_that_is_wrong() {
     };
     let read: ([u8; 8], &[[u8; 8]]) = (READ_14, &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]);
     let start: ([u8; 8], &[[u8; 8]]) = (START, &[FIRST, LAST_OF_14]);
-    // Block sizes that are none, at the beginning and later.
+    // Invalid block sizes, at the beginning and later.
     breaks(&[([0xA4, 0x00, 0x20, 0, 0, 0, 0, 0], &[abort(0x0504_0002)])]);
     breaks(&[([0xA4, 0x00, 0x20, 0, 128, 0, 0, 0], &[abort(0x0504_0002)])]);
     breaks(&[read, start, (acked(2, 0), &[abort(0x0504_0002)])]);
     breaks(&[read, start, (acked(2, 128), &[abort(0x0504_0002)])]);
-    // More acknowledged than sent.
+    // An acknowledgement of more than was sent.
     breaks(&[read, start, (acked(3, 127), &[abort(0x0504_0003)])]);
     // Commands in the wrong place.
     breaks(&[read, (acked(0, 127), &[abort(0x0504_0001)])]);
@@ -378,7 +378,7 @@ fn server_aborts_a_block_upload_that_is_wrong() {
     breaks(&[read, start, (ENDED, &[abort(0x0504_0001)])]);
     breaks(&[read, start, (FIRST, &[abort(0x0504_0001)])]);
     breaks(&[(START, &[[0x80, 0, 0, 0, 0x01, 0x00, 0x04, 0x05]])]);
-    // The client gives up.
+    // The client aborts.
     let give_up: ([u8; 8], &[[u8; 8]]) = ([0x80, 0x00, 0x20, 0, 0, 0, 0, 8], &[]);
     breaks(&[read, give_up]);
     breaks(&[read, start, give_up]);
@@ -393,7 +393,7 @@ fn server_aborts_a_block_upload_that_is_wrong() {
         assert_eq!(bench.sent(), [response(abort(0x0504_0000))]);
         bench.still_serves();
     }
-    // Not readable.
+    // An object that cannot be read.
     let mut bench = bench(127);
     bench.expect(&[([0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0], &[[0x80, 0x50, 0x1F, 1, 0x01, 0x00, 0x01, 0x06]])]);
 }
@@ -405,7 +405,7 @@ const BLOCK: Block = Block { fallback: true, blksize: 127, pst: 0, repeat_ms: 30
 const PROGRAM: Address = Address::new(0x1F50, 1);
 const DOMAIN: Address = Address::new(0x2000, 0);
 
-/// The frames that it sends now, and that it then waits.
+/// The frames that it sends now, before it waits.
 #[track_caller]
 fn sends(client: &mut impl Transfer, now: u32, frames: &[[u8; 8]]) {
     for bytes in frames {
@@ -452,7 +452,7 @@ fn client_makes_a_block_download() {
     sends(&mut client, 0, &[[0xD5, 0, 0, 0, 0, 0, 0, 0]]);
     hears(&mut client, 0, &[ENDED]);
     ends(&mut client, 0, &[], Ok(()));
-    // Four bytes go without, none go as one empty segment.
+    // Four bytes need no segment, an empty value one empty segment.
     let mut client = Download::as_blocks(node(), PROGRAM, [1, 2, 3, 4], CONFIG, BLOCK);
     sends(&mut client, 0, &[[0x23, 0x50, 0x1F, 1, 1, 2, 3, 4]]);
     let mut client = Download::as_blocks(node(), PROGRAM, [0; 0], CONFIG, BLOCK);
@@ -477,7 +477,8 @@ fn client_repeats_what_the_server_did_not_get() {
     sends(&mut client, 0, &[[0x81, 8, 9, 0, 0, 0, 0, 0]]);
     hears(&mut client, 0, &[acked(1, 2)]);
     sends(&mut client, 0, &[END_OF_9]);
-    // An acknowledgement twice: behind the last, in the middle, and before the first segment.
+    // A repeated acknowledgement: after the last segment, in the middle, and before the first
+    // segment.
     hears(&mut client, 0, &[acked(1, 2), ENDED]);
     ends(&mut client, 0, &[], Ok(()));
     let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
@@ -490,7 +491,7 @@ fn client_repeats_what_the_server_did_not_get() {
     sends(&mut client, 0, &[[0xC6, 0x50, 0x1F, 1, 0, 0, 0, 0]]);
     hears(&mut client, 0, &[granted(127), acked(0, 127)]);
     sends(&mut client, 0, &[[0x81, 0, 0, 0, 0, 0, 0, 0]]);
-    // A server that never gets anything is given up.
+    // A server that never receives anything is given up.
     let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
     sends(&mut client, 0, &[INITIATE_9]);
     hears(&mut client, 0, &[granted(127)]);
@@ -515,7 +516,7 @@ fn client_falls_back_to_segments_where_it_may() {
     sends(&mut client, 0, &[[0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0]]);
     hears(&mut client, 0, &[unknown]);
     sends(&mut client, 0, &[[0x40, 0x50, 0x1F, 1, 0, 0, 0, 0]]);
-    // Not where the caller forbids it, and not for other reasons.
+    // Not if the caller forbids it, and not for other reasons.
     let strict = Block { fallback: false, ..BLOCK };
     let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, strict);
     sends(&mut client, 0, &[INITIATE_9]);
@@ -560,7 +561,7 @@ fn client_makes_a_block_upload() {
     hears(&mut client, 0, &[[0xD5, 0, 0, 0, 0, 0, 0, 0]]);
     ends(&mut client, 0, &[ENDED], Ok(()));
     assert_eq!(client.into_sink(), nine());
-    // A server that prefers to answer without blocks.
+    // A server that answers without blocks.
     let mut client = Upload::as_blocks(node(), DOMAIN, Vec::new(), CONFIG, BLOCK);
     sends(&mut client, 0, &[READ_14]);
     hears(&mut client, 0, &[[0x4B, 0x00, 0x20, 0, 1, 2, 0, 0]]);
@@ -595,7 +596,7 @@ fn client_asks_again_for_what_was_lost() {
     hears(&mut client, 400, &[END_OF_14]);
     ends(&mut client, 400, &[ENDED], Ok(()));
     assert_eq!(client.into_sink(), (1..=14).collect::<Vec<u8>>());
-    // All of it is lost, or the server is gone.
+    // Everything is lost, or the server is gone.
     let mut client = upload();
     assert_eq!(client.poll(at(999)), Step::Wait(at(1000)));
     let timeout = [0x80, 0x00, 0x20, 0, 0x00, 0x00, 0x04, 0x05];
@@ -625,7 +626,7 @@ fn client_aborts_a_block_transfer_that_is_wrong() {
         }
         client
     };
-    // Block sizes that are none; more acknowledged than sent; an answer out of place.
+    // Invalid block sizes; an acknowledgement of too much; an answer in the wrong place.
     for (before, wrong, code) in [
         (&[][..], granted(0), 0x0504_0002),
         (&[], granted(128), 0x0504_0002),
@@ -638,7 +639,7 @@ fn client_aborts_a_block_transfer_that_is_wrong() {
         hears(&mut client, 0, &[wrong]);
         refused(&mut client, PROGRAM, code);
     }
-    // An abort in the middle of a sub-block is heard there.
+    // An abort in the middle of a sub-block is recognised.
     let mut client = download(&[]);
     hears(&mut client, 0, &[granted(127)]);
     assert_eq!(client.poll(at(0)), Step::Send(request(FIRST)));
@@ -670,7 +671,7 @@ fn client_aborts_a_block_transfer_that_is_wrong() {
     let mut client = upload(&[FIRST]);
     hears(&mut client, 0, &[[0x80, 0x00, 0x20, 0, 0x00, 0x00, 0x06, 0x06]]);
     ends(&mut client, 0, &[], Err(SdoError::Server(AbortCode(0x0606_0000))));
-    // A number above the block size that was asked for.
+    // A number above the requested block size.
     let small = Block { blksize: 2, ..BLOCK };
     let mut client = Upload::as_blocks(node(), DOMAIN, Vec::new(), CONFIG, small);
     sends(&mut client, 0, &[[0xA4, 0x00, 0x20, 0, 2, 0, 0, 0]]);

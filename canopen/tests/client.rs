@@ -8,7 +8,7 @@ use common::{at, node, request, response};
 
 const CONFIG: Config = Config { timeout_ms: 1000 };
 
-/// A client and the bytes that it has to send next, or how it ended.
+/// A client and the bytes that it must send next, or its end.
 #[track_caller]
 fn sends(client: &mut impl Transfer, now: u32, bytes: [u8; 8]) {
     assert_eq!(client.poll(at(now)), Step::Send(request(bytes)));
@@ -18,7 +18,7 @@ fn sends(client: &mut impl Transfer, now: u32, bytes: [u8; 8]) {
 #[track_caller]
 fn ends(client: &mut impl Transfer, now: u32, result: Result<(), SdoError>) {
     assert_eq!(client.poll(at(now)), Step::Done(result));
-    // Nothing brings it back.
+    // It does not continue after its end.
     client.handle(&response([0x60, 0, 0x20, 0, 0, 0, 0, 0]), at(now));
     client.handle(&response([0x80, 0, 0x20, 3, 0, 0, 0, 8]), at(now));
     client.abort(AbortCode::GENERAL);
@@ -93,7 +93,7 @@ fn uploads_expedited() {
         ([0x4B, 0x00, 0x20, 3, 1, 2, 9, 9], &[1, 2]),
         ([0x47, 0x00, 0x20, 3, 1, 2, 3, 9], &[1, 2, 3]),
         ([0x43, 0x00, 0x20, 3, 1, 2, 3, 4], &[1, 2, 3, 4]),
-        // The size is not told.
+        // Unknown size.
         ([0x42, 0x00, 0x20, 3, 1, 2, 3, 4], &[1, 2, 3, 4]),
     ];
     for (bytes, data) in table {
@@ -232,7 +232,7 @@ fn answers_that_break_the_protocol_abort() {
 #[test]
 fn frames_of_others_and_late_answers_change_nothing() {
     let mut client = upload();
-    // Before it asked, nothing is an answer.
+    // Before the first request, no frame is an answer.
     client.handle(&response([0x43, 0x00, 0x20, 3, 9, 9, 9, 9]), at(0));
     sends(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
     let other_node = canopen::NodeId::new(6).unwrap();
@@ -240,7 +240,7 @@ fn frames_of_others_and_late_answers_change_nothing() {
         Frame::of(CobId::sdo_response(other_node), &[0x43, 0x00, 0x20, 3, 9, 9, 9, 9]),
         Frame::of(CobId::sdo_response(node()), &[0x43, 0x00, 0x20, 3, 9, 9, 9]),
         Frame::of(CobId::heartbeat(node()), &[0x7F]),
-        // The answer to an earlier transfer that had timed out.
+        // The answer to an earlier transfer that timed out.
         response([0x43, 0x00, 0x10, 0, 9, 9, 9, 9]),
         response([0x60, 0x00, 0x10, 0, 0, 0, 0, 0]),
     ] {

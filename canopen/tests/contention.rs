@@ -1,5 +1,5 @@
-//! What comes between the segments of a block download: requests of another client or of one that
-//! has given up, silence, a reset. Frames written by hand from CiA 301 sections 7.2.4.3 and 7.2.8.3.
+//! Events between the segments of a block download: requests of another client or of a client that
+//! has aborted, silence, a reset. Frames written by hand from CiA 301 sections 7.2.4.3 and 7.2.8.3.
 
 mod common;
 #[path = "../../tests/src/random.rs"]
@@ -13,14 +13,15 @@ use canopen::{Address, Frame};
 use common::{at, node, response, Bench, Device, Event};
 use random::Random;
 
-/// How time goes on, and a download to begin with.
+/// The clock, and the beginning of a download.
 trait Scene {
     fn wait(&mut self, ms: u32) -> Vec<(u32, Frame)>;
     fn begin(&mut self, segments: u8);
 }
 
 impl Scene for Bench {
-    /// Time goes on, a millisecond after the other; what is sent meanwhile, and when.
+    /// Advances the time by one millisecond after another; returns the frames sent meanwhile, and
+    /// their times.
     fn wait(&mut self, ms: u32) -> Vec<(u32, Frame)> {
         let mut sent = Vec::new();
         for _ in 0..ms {
@@ -31,7 +32,7 @@ impl Scene for Bench {
         sent
     }
 
-    /// Opens a block download of 1F50h/1 and sends the first segments of it.
+    /// Opens a block download of 1F50h/1 and sends its first segments.
     #[track_caller]
     fn begin(&mut self, segments: u8) {
         assert_eq!(self.ask([0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0]), [response(GRANTED)]);
@@ -50,25 +51,25 @@ fn acked(ackseq: u8) -> [u8; 8] {
     [0xA2, ackseq, 127, 0, 0, 0, 0, 0]
 }
 
-/// Clients give up after 0.3 s (python-canopen) to 0.5 s.
+/// Time-outs of clients: 0.3 s (python-canopen) to 0.5 s.
 #[test]
 fn a_lost_last_segment_is_acknowledged_after_50_ms() {
     let mut bench = Bench::with(Config::DEFAULT);
     bench.begin(126);
     assert_eq!(bench.server.next_deadline(), Some(at(50)));
     assert_eq!(bench.wait(300), [(50, response(acked(126)))]);
-    // The client repeats what is missing. The end of the transfer may be lost as well.
+    // The client repeats the missing part. The end of the transfer may be lost as well.
     assert_eq!(bench.ask([1, 1, 2, 3, 4, 5, 6, 7]), []);
     assert_eq!(bench.wait(300), [(350, response(acked(1)))]);
-    // A bus at 10 or 20 kbit/s is given twice the time.
+    // On a bus at 10 or 20 kbit/s the time is doubled.
     let mut bench = Bench::with(Config { slow_bus: true, ..Config::DEFAULT });
     bench.begin(3);
     assert_eq!(bench.wait(300), [(100, response(acked(3)))]);
 }
 
-/// A client whose pause was longer than the server's patience goes on, and looks at the
-/// acknowledgement when its sub-block is over: what it sent in between is neither data nor a reason
-/// for another acknowledgement.
+/// A client with a pause longer than the server's limit continues, and reads the acknowledgement
+/// after its sub-block: the segments in between are neither data nor a reason for another
+/// acknowledgement.
 #[test]
 fn the_rest_of_a_sub_block_that_was_acknowledged_early_is_passed_over() {
     let mut bench = Bench::with(Config::DEFAULT);
@@ -77,7 +78,7 @@ fn the_rest_of_a_sub_block_that_was_acknowledged_early_is_passed_over() {
     for seqno in 41..=127 {
         assert_eq!(bench.ask([seqno, 9, 9, 9, 9, 9, 9, 9]), [], "{seqno}");
     }
-    // The same twice, as CAN may have it.
+    // The same with every frame twice, as CAN may deliver it.
     assert_eq!(bench.ask([127, 9, 9, 9, 9, 9, 9, 9]), []);
     assert_eq!(bench.wait(60), []);
     assert_eq!(bench.ask([1, 8, 8, 8, 8, 8, 8, 8]), []);
@@ -89,7 +90,7 @@ fn the_rest_of_a_sub_block_that_was_acknowledged_early_is_passed_over() {
     let mut expected = [1, 2, 3, 4, 5, 6, 7].repeat(40);
     expected.extend([[8; 7], [7; 7]].concat());
     assert_eq!(bench.device.taken, expected);
-    // A client that begins anew at the acknowledgement, and whose first segment is lost.
+    // A client that begins again at the acknowledgement, and loses its first segment.
     let mut bench = Bench::with(Config::DEFAULT);
     bench.begin(40);
     assert_eq!(bench.wait(60), [(50, response(acked(40)))]);
@@ -99,8 +100,8 @@ fn the_rest_of_a_sub_block_that_was_acknowledged_early_is_passed_over() {
     assert_eq!(bench.ask([127, 9, 9, 9, 9, 9, 9, 9]), [response(acked(0))]);
 }
 
-/// The client of a download was switched off. Another one asks, again and again: it is answered the
-/// first time, when nothing was heard of the download for 50 ms.
+/// The client of a download was switched off. Another client repeats its request: it gets the first
+/// answer after 50 ms without a frame of the download.
 #[test]
 fn a_request_ends_a_download_that_stands_still() {
     for (segments, every) in [(0, 100), (0, 2200), (3, 100), (3, 2200), (3, 20), (126, 300)] {
@@ -143,7 +144,7 @@ fn each_kind_of_request_ends_a_download() {
             assert_eq!(bench.wait(50), [(50, response(answered))], "{asked:02X?} behind {segments}");
             assert_eq!(bench.device.events[..2], [Event::Start(Some(4096)), Event::Cancel]);
         }
-        // The server holds its acknowledgement back, because there is no room.
+        // The server delays its acknowledgement, because there is no room.
         let mut bench = Bench::with(Config { blksize: 2, ..Config::DEFAULT });
         bench.device.space = Some(14);
         let granted = [0xA4, 0x50, 0x1F, 1, 2, 0, 0, 0];
@@ -154,20 +155,20 @@ fn each_kind_of_request_ends_a_download() {
         assert_eq!(bench.ask(asked), []);
         bench.device.space = Some(0);
         let sent = bench.wait(60);
-        // Another download finds no room either; it is granted when there is some.
+        // Another download finds no room either; it is granted when there is room.
         let held = matches!(asked[0], 0x20 | 0xC0 | 0xC6) && asked[1] == 0x50;
         assert_eq!(sent.is_empty(), held, "{asked:02X?}: {sent:?}");
         assert_eq!(bench.device.events[..2], [Event::Start(Some(4096)), Event::Cancel]);
     }
-    // An abort does so at once, and is not answered.
+    // An abort takes effect at once, and is not answered.
     let mut bench = Bench::with(Config::DEFAULT);
     bench.begin(3);
     assert_eq!(bench.ask([0x80, 0, 0, 0, 0, 0, 0, 8]), []);
     assert_eq!(bench.ask(READ_1000), [response(IS_1000)]);
 }
 
-/// Data that read as a request are data where they come in their turn, twice, or behind a gap as long
-/// as the client goes on.
+/// Data that read as a request are data if they are in order, repeated, or after a gap while the
+/// client continues.
 #[test]
 fn segments_that_read_as_requests_are_data() {
     let mut data = vec![[9; 7]; 127];
@@ -201,10 +202,10 @@ fn segments_that_read_as_requests_are_data() {
     }
 }
 
-/// Time counts from the last segment that was taken, whatever else comes.
+/// The time counts from the last accepted segment, whatever else arrives.
 #[test]
 fn a_download_that_makes_no_progress_times_out() {
-    // A segment that is not its turn, and one of an object that the device does not have.
+    // A segment out of order, and a request for an object that the device does not have.
     for noise in [[0x7E, 0, 0, 0, 0, 0, 0, 0], [0x40, 0x34, 0x12, 0, 0, 0, 0, 0]] {
         for (segments, every) in [(0, 10), (0, 100), (2, 10), (2, 100), (2, 700)] {
             let mut bench = Bench::with(Config::DEFAULT);
@@ -215,18 +216,18 @@ fn a_download_that_makes_no_progress_times_out() {
                 sent.extend(bench.wait(every));
                 noise[7] ^= 1;
                 bench.ask(noise);
-                // What was looked at is not looked at again and again.
+                // A frame that was examined is not examined again.
                 let wakes = bench.server.next_deadline();
                 assert!(wakes.is_none_or(|wakes| !at(bench.now).has_reached(wakes)), "{noise:02X?}");
             }
             let (when, last) = sent.last().unwrap();
             assert_eq!(*last, response(TIMED_OUT));
-            // 2 s behind the last segment; or behind its acknowledgement, where that came later.
+            // 2 s after the last segment, or after its acknowledgement if that came later.
             assert!((2000..=2200).contains(when), "{when} ms, every {every} ms, {noise:02X?}");
             assert_eq!(bench.device.events, [Event::Start(Some(4096)), Event::Cancel]);
         }
     }
-    // The last segment again and again, where the end is expected.
+    // The last segment repeated, where the end is expected.
     let mut bench = Bench::with(Config::DEFAULT);
     bench.begin(0);
     let mut sent =
@@ -238,9 +239,8 @@ fn a_download_that_makes_no_progress_times_out() {
     assert_eq!(sent[..2], [(0, response(acked(1))), (2000, response(TIMED_OUT))]);
 }
 
-/// Downloads whose segments are lost and doubled, of data of which many segments read as requests
-/// for objects that there are: none is disturbed. The client has its pauses, as one on a busy
-/// machine.
+/// Downloads with lost and repeated segments, and with data in which many segments read as requests
+/// for existing objects: none is disturbed. The client makes pauses like one on a busy machine.
 #[test]
 fn no_lost_or_doubled_segment_makes_a_request_of_data() {
     let device = Device::default();
@@ -261,7 +261,7 @@ fn no_lost_or_doubled_segment_makes_a_request_of_data() {
             }
             data.extend(bytes);
         }
-        // The last segment of all reads as no request: see below.
+        // The last segment of the transfer does not read as a request: see below.
         let len = data.len();
         data[len - 7..].fill(0xEE);
         let per_mille = random.pick(&[0, 5, 50]);
@@ -274,9 +274,9 @@ fn no_lost_or_doubled_segment_makes_a_request_of_data() {
             match client.poll(at(bench.now)) {
                 Step::Send(frame) => {
                     let [first, rest @ ..] = *frame.exactly::<8>().unwrap();
-                    // Of a sub-block of which nothing comes nobody knows that it has begun.
+                    // If no segment of a sub-block arrives, its beginning is unknown.
                     let is_segment = (first < 0x80 || rest == [0xEE; 7]) && first & 0x7F != 1;
-                    // Two segments come behind each that does not: see the server's rule.
+                    // Two segments follow each missing one: see the server's rule.
                     let lost = is_segment && good >= 2 && random.below(1000) < per_mille;
                     good = if lost { 0 } else { good + 1 };
                     let doubled = is_segment && random.below(1000) < per_mille;

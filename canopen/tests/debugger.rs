@@ -1,4 +1,4 @@
-//! The debugger interface, frame by frame and against anybody.
+//! The debugger interface, frame by frame and with hostile input.
 
 mod memory;
 
@@ -54,8 +54,8 @@ fn status(target: &mut Target) -> u8 {
     answer[4]
 }
 
-/// The bytes of a read command as the document lays them out, in the frames of a segmented download
-/// (CiA 301 section 7.2.4.3); then its data.
+/// The bytes of a read command as in the document, in the frames of a segmented download (CiA 301
+/// section 7.2.4.3); then its data.
 #[test]
 fn a_read_frame_by_frame() {
     let mut target = Target::new();
@@ -81,7 +81,7 @@ fn a_read_frame_by_frame() {
 fn a_write_frame_by_frame() {
     let mut target = Target::new();
     for (said, answered) in [
-        // Write 2 bytes at 20000FFEh, the last two there are: 01, reserved, 02 00, FE 0F 00 20.
+        // Write 2 bytes at 20000FFEh, the last two of the memory: 01, reserved, 02 00, FE 0F 00 20.
         ([0x21, 0x25, 0x10, 0x01, 8, 0, 0, 0], [0x60, 0x25, 0x10, 0x01, 0, 0, 0, 0]),
         ([0x00, 0x01, 0x00, 0x02, 0x00, 0xFE, 0x0F, 0x00], [0x20, 0, 0, 0, 0, 0, 0, 0]),
         ([0x1D, 0x20, 0, 0, 0, 0, 0, 0], [0x30, 0, 0, 0, 0, 0, 0, 0]),
@@ -114,7 +114,8 @@ fn data_of_another_length_are_refused_and_nothing_is_written() {
         assert_eq!(target.ask([last, 9, 9, 9, 9, 9, 9, 0]), abort);
         assert_eq!(status(&mut target), 2);
     }
-    // Too much, told by nobody: what was a whole piece before it is not written either.
+    // Too many bytes, without an announced size: the complete piece before them is not written
+    // either.
     command(&mut target, Kind::Write, RAM, PIECE as u16).unwrap();
     assert_eq!(target.ask([0x20, 0x25, 0x10, 0x04, 0, 0, 0, 0])[0], 0x60);
     let answers: Vec<u8> = (0..19).map(|n| target.ask([(n % 2) << 4, 9, 9, 9, 9, 9, 9, 9])[0]).collect();
@@ -124,7 +125,7 @@ fn data_of_another_length_are_refused_and_nothing_is_written() {
     );
     assert_eq!(target.model().ram, before);
     assert_eq!(target.model().touched, []);
-    // A command still stands.
+    // A command is still valid.
     command(&mut target, Kind::Write, RAM, 5).unwrap();
     assert_eq!(write(&mut target, DATA, &[1; 6]), Err(AbortCode(0x0607_0012)));
     write(&mut target, DATA, &[7; 5]).unwrap();
@@ -148,7 +149,7 @@ fn commands_that_cannot_be_carried_out_are_refused() {
         command(&mut target, Kind::Read, RAM, 4).unwrap();
         assert_eq!(write(&mut target, COMMAND, &bytes), Err(AbortCode(abort)), "{what}");
         assert_eq!(status(&mut target), 2, "{what}");
-        // The command before it is over, too: 08000024h, no data; 08000022h, state.
+        // The previous command has ended, too: 08000024h, no data; 08000022h, state.
         assert_eq!(read(&mut target), Err(AbortCode(0x0800_0024)), "{what}");
         assert_eq!(write(&mut target, DATA, &[0; 4]), Err(AbortCode(0x0800_0022)), "{what}");
         assert_eq!(target.model().touched, [], "{what}");
@@ -171,7 +172,7 @@ fn a_locked_device_refuses_everything_also_what_was_allowed_before() {
     assert_eq!(target.model().touched, []);
 }
 
-/// A variable that changes can be looked at again and again; what the memory refuses is told.
+/// A changing variable can be read repeatedly; a refusal of the memory is reported.
 #[test]
 fn a_command_is_good_for_many_reads() {
     let mut target = Target::new();
@@ -200,14 +201,14 @@ fn a_stop_is_told_by_an_emergency() {
     let frame = target.poll(0).unwrap();
     assert_eq!(frame.cob_id().unwrap().get(), 0x85);
     assert_eq!(frame.data(), [0x00, 0x62, 0x81, 0x01, 0x44, 0x23, 0x01, 0x08]);
-    // The device's own come through.
+    // The device's own emergencies are passed on.
     assert_eq!(target.poll(0).unwrap().data(), [0, 0xFF, 0, 1, 2, 3, 4, 5]);
     assert_eq!(target.poll(0), None);
 }
 
 proptest! {
-    /// Whatever is written is there, and nothing else; whatever is read is what was there. By
-    /// segments and by blocks.
+    /// A write changes exactly the written bytes; a read returns the contents. By segments and by
+    /// blocks.
     #[test]
     fn what_is_written_is_read_and_the_rest_stays(
         data in vec(any::<u8>(), 1..4 * PIECE),
@@ -243,8 +244,8 @@ proptest! {
         }
     }
 
-    /// Any commands and any data in any order, whole or broken off: the memory is touched by leave
-    /// alone (the model asserts it), and the next one is served.
+    /// Any commands and any data in any order, complete or aborted: the memory is only accessed
+    /// with permission (the model asserts it), and the next command works.
     #[test]
     fn anybody_may_send_anything(
         frames in vec(
@@ -260,7 +261,7 @@ proptest! {
             let frame = if sub < 5 {
                 [command, 0x25, 0x10, sub, a, b, c, d]
             } else {
-                // A segment, more often than not one of a command that could be carried out.
+                // A segment, usually of a command that could be carried out.
                 [command & 0x1F, noise[0] & 1, 0, noise[2], noise[3] & 1, noise[4], noise[5] & 0x1F, 0]
             };
             target.model().locked = locked && lock;

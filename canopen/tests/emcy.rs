@@ -1,5 +1,5 @@
-//! Emergencies as the bus sees them, and the objects 1001h, 1003h and 1014h (CiA 301 sections 7.2.7
-//! and 7.5.2).
+//! Emergencies on the bus, and the objects 1001h, 1003h and 1014h (CiA 301 sections 7.2.7 and
+//! 7.5.2).
 
 mod common;
 
@@ -101,7 +101,7 @@ fn an_error_is_sent_behind_the_boot_up_and_remembered() {
         // No third error: 08000024h.
         (read(0x1003, 3), [0x80, 0x03, 0x10, 3, 0x24, 0x00, 0x00, 0x08]),
         (read(0x1014, 0), [0x43, 0x14, 0x10, 0, 0x85, 0, 0, 0]),
-        // The rest of the device is still there.
+        // The other objects of the device still work.
         (read(0x1017, 0), [0x4B, 0x17, 0x10, 0, 0xF4, 0x01, 0, 0]),
     ]);
 }
@@ -118,7 +118,7 @@ fn the_history_keeps_the_latest_and_can_be_forgotten() {
         (read(0x1003, 0), [0x4F, 0x03, 0x10, 0, 4, 0, 0, 0]),
         (read(0x1003, 1), [0x43, 0x03, 0x10, 1, 0x05, 0x10, 0, 0]),
         (read(0x1003, 4), [0x43, 0x03, 0x10, 4, 0x02, 0x10, 0, 0]),
-        // Only 0 may be written, and only to the number.
+        // Only 0 may be written, and only to sub-index 0.
         ([0x2F, 0x03, 0x10, 0, 1, 0, 0, 0], [0x80, 0x03, 0x10, 0, 0x30, 0x00, 0x09, 0x06]),
         ([0x23, 0x03, 0x10, 1, 0, 0, 0, 0], [0x80, 0x03, 0x10, 1, 0x02, 0x00, 0x01, 0x06]),
         (read(0x1003, 0), [0x4F, 0x03, 0x10, 0, 4, 0, 0, 0]),
@@ -148,7 +148,7 @@ fn errors_go_as_they_came() {
     let errors = &mut bench.application.0;
     errors.clear(register::MANUFACTURER);
     assert_eq!(errors.register(), 0);
-    // An error of no particular kind.
+    // A generic error.
     errors.raise(code::GENERIC, 0, [0; 5]);
     errors.clear(register::GENERIC);
     assert_eq!(
@@ -188,7 +188,7 @@ fn a_stopped_node_keeps_its_emergencies() {
     assert_eq!(bench.sent(), []);
     let start = NmtCommand::Start.emit(None);
     bench.node.handle(&start, at(0), &mut bench.application);
-    // The first four, in their order; the latest are in 1003h.
+    // The first four, in their order; 1003h contains the latest.
     let first_four: Vec<_> = (1..=4).map(|number| emergency([number, 0x10, 0x01, 0, 0, 0, 0, 0])).collect();
     assert_eq!(bench.sent(), first_four);
 }

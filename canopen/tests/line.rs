@@ -1,4 +1,4 @@
-//! Bus-off, error passive, lost frames; and the search for a bit rate.
+//! Bus-off, error passive, lost frames; and the detection of the bit rate.
 
 mod common;
 
@@ -10,7 +10,7 @@ use common::at;
 
 use Confinement::{Active, BusOff, Passive};
 
-/// When a controller that never recovers is told to come back, within a time.
+/// The times at which a controller that never recovers is asked to recover.
 fn told_to_come_back(monitor: &mut Monitor, from: u32, until: u32) -> Vec<u32> {
     (from..until)
         .filter(|now| monitor.observe(BusOff, at(*now)) == Some(Consequence::RecoverFromBusOff))
@@ -30,10 +30,10 @@ fn a_return_is_told_and_one_that_lasts_restores_patience() {
     assert_eq!(told_to_come_back(&mut monitor, 0, 1000), [200, 600]);
     assert_eq!(monitor.observe(Active, at(1000)), Some(Consequence::Tell(LineEvent::Recovered)));
     assert_eq!(monitor.observe(Active, at(1001)), None);
-    // Off again at once: the patience goes on growing.
+    // Bus-off again at once: the wait keeps growing.
     assert_eq!(told_to_come_back(&mut monitor, 2000, 3000), [2800]);
     assert_eq!(monitor.observe(Active, at(3000)), Some(Consequence::Tell(LineEvent::Recovered)));
-    // Ten seconds later it is forgotten.
+    // After ten seconds the wait is the first one again.
     assert_eq!(told_to_come_back(&mut monitor, 13_000, 13_300), [13_200]);
 }
 
@@ -69,7 +69,7 @@ fn losses_are_told_at_once_and_then_once_a_second() {
     assert_eq!(losses.observe(0, at(9000)), None);
 }
 
-/// All but 800 kbit/s, as 42 MHz has it.
+/// All bit rates but 800 kbit/s, as with 42 MHz.
 fn supports(rate: BitRate) -> bool {
     rate != BitRate::K800
 }

@@ -84,7 +84,7 @@ impl Bench {
         }
     }
 
-    /// Whether it is in configuration state: there it answers an inquiry.
+    /// Whether it is in configuration state, where it answers an inquiry.
     fn is_in_configuration(&mut self) -> bool {
         !self.ask([0x5E, 0, 0, 0, 0, 0, 0, 0]).is_empty()
     }
@@ -115,7 +115,7 @@ fn switches_state_selective() {
     bench.silent(&SELECT[..3]);
     bench.expect(&[(SELECT[3], [0x44, 0, 0, 0, 0, 0, 0, 0])]);
     assert!(bench.is_in_configuration());
-    // There it is not selected once more.
+    // In this state it is not selected again.
     bench.silent(&SELECT);
 
     // One number wrong, one left out, the order wrong.
@@ -134,7 +134,7 @@ fn switches_state_selective() {
         requests.swap(wrong, (wrong + 1) % 4);
         bench.silent(&requests);
         assert!(!bench.is_in_configuration(), "{wrong}");
-        // Nothing of that stays behind.
+        // This leaves no state behind.
         bench.silent(&SELECT[..3]);
         bench.expect(&[(SELECT[3], [0x44, 0, 0, 0, 0, 0, 0, 0])]);
     }
@@ -161,7 +161,7 @@ fn a_device_without_node_id_takes_one_and_starts() {
     assert_eq!(bench.lss.node_id(), None);
     assert_eq!(bench.ask([0x04, 0, 0, 0, 0, 0, 0, 0]), [Output::NodeId(NodeId::new(42).unwrap())]);
     assert_eq!(bench.lss.node_id(), NodeId::new(42));
-    // Once.
+    // Only once.
     bench.silent(&[[0x04, 1, 0, 0, 0, 0, 0, 0], [0x04, 0, 0, 0, 0, 0, 0, 0]]);
 }
 
@@ -170,18 +170,18 @@ fn a_device_with_node_id_takes_a_new_one_at_reset_communication() {
     let mut bench = Bench::in_configuration(5);
     bench.expect(&[
         ([0x11, 42, 0, 0, 0, 0, 0, 0], [0x11, 0, 0, 0, 0, 0, 0, 0]),
-        // What is no node-ID is refused and changes nothing.
+        // An invalid node-ID is refused and changes nothing.
         ([0x11, 0, 0, 0, 0, 0, 0, 0], [0x11, 1, 0, 0, 0, 0, 0, 0]),
         ([0x11, 128, 0, 0, 0, 0, 0, 0], [0x11, 1, 0, 0, 0, 0, 0, 0]),
         ([0x11, 0xFE, 0, 0, 0, 0, 0, 0], [0x11, 1, 0, 0, 0, 0, 0, 0]),
-        // The one in force is told.
+        // The active node-ID is reported.
         ([0x5E, 0, 0, 0, 0, 0, 0, 0], [0x5E, 5, 0, 0, 0, 0, 0, 0]),
     ]);
     bench.silent(&[[0x04, 0, 0, 0, 0, 0, 0, 0]]);
     assert_eq!(bench.lss.node_id(), NodeId::new(5));
     assert_eq!(bench.lss.reset_communication(), NodeId::new(42));
     assert_eq!(bench.lss.node_id(), NodeId::new(42));
-    // FFh takes the node-ID away.
+    // FFh removes the node-ID.
     bench.silent(&[[0x04, 1, 0, 0, 0, 0, 0, 0]]);
     bench.expect(&[([0x11, 0xFF, 0, 0, 0, 0, 0, 0], [0x11, 0, 0, 0, 0, 0, 0, 0])]);
     assert_eq!(bench.lss.reset_communication(), None);
@@ -189,7 +189,7 @@ fn a_device_with_node_id_takes_a_new_one_at_reset_communication() {
 
 #[test]
 fn configures_bit_timing() {
-    // Table 0 of CiA 305, and which of them this device has (all but 800 kbit/s).
+    // Table 0 of CiA 305, and the rates that this device supports (all but 800 kbit/s).
     let table = [
         (0, Some(1_000_000)),
         (1, Some(800_000)),
@@ -213,7 +213,7 @@ fn configures_bit_timing() {
         ([0x13, 0, 10, 0, 0, 0, 0, 0], [0x13, 1, 0, 0, 0, 0, 0, 0]),
         ([0x13, 1, 2, 0, 0, 0, 0, 0], [0x13, 1, 0, 0, 0, 0, 0, 0]),
         ([0x13, 0, 2, 0, 0, 0, 0, 0], [0x13, 0, 0, 0, 0, 0, 0, 0]),
-        // A refusal does not take back what was configured.
+        // A refusal does not remove the configured values.
         ([0x13, 0, 1, 0, 0, 0, 0, 0], [0x13, 1, 0, 0, 0, 0, 0, 0]),
         ([0x17, 0, 0, 0, 0, 0, 0, 0], [0x17, 0, 0, 0, 0, 0, 0, 0]),
     ]);
@@ -223,7 +223,7 @@ fn configures_bit_timing() {
 #[test]
 fn activates_bit_timing_after_one_delay_and_speaks_after_two() {
     let mut bench = Bench::in_configuration(5);
-    // Nothing configured: nothing to activate.
+    // Without a configured rate there is nothing to activate.
     bench.silent(&[[0x15, 100, 0, 0, 0, 0, 0, 0]]);
     assert!(!bench.lss.is_silent(at(0)));
     bench.expect(&[([0x13, 0, 3, 0, 0, 0, 0, 0], [0x13, 0, 0, 0, 0, 0, 0, 0])]);
@@ -235,7 +235,7 @@ fn activates_bit_timing_after_one_delay_and_speaks_after_two() {
     assert_eq!(bench.lss.next_deadline(), Some(at(300)));
     bench.now = 305;
     assert_eq!(bench.outputs(), [Output::BitRate(BitRate::K250)]);
-    // Deaf and mute in between.
+    // In between it neither receives nor sends.
     bench.silent(&[[0x5E, 0, 0, 0, 0, 0, 0, 0]]);
     assert!(bench.lss.is_silent(at(599)));
     bench.now = 600;
@@ -317,11 +317,11 @@ fn says_that_it_has_no_node_id() {
     let mut bench = Bench::new(0xFF);
     bench.expect(&[(asked, [0x50, 0, 0, 0, 0, 0, 0, 0])]);
     Bench::new(5).silent(&[asked]);
-    // Having been given one it is configured.
+    // With a node-ID it counts as configured.
     bench.silent(&[[0x04, 1, 0, 0, 0, 0, 0, 0]]);
     bench.expect(&[([0x11, 42, 0, 0, 0, 0, 0, 0], [0x11, 0, 0, 0, 0, 0, 0, 0])]);
     bench.silent(&[asked]);
-    // By itself, where that is configured.
+    // Without a request, if it is configured to announce itself.
     let config = Config { announce: true, start_in_configuration: true };
     let mut bench = Bench::new(0xFF);
     bench.lss = Lss::new(ADDRESS, None, config);
@@ -347,7 +347,7 @@ fn fastscan_asks_bit_by_bit() {
         (fastscan(0x0000_0100, 8, 0, 0), yes),
     ]);
     bench.silent(&[fastscan(0, 8, 0, 0), fastscan(0x8000_0000, 31, 0, 0)]);
-    // A part that it is not at; fields out of range.
+    // Another part than the current one; fields out of range.
     bench.silent(&[
         fastscan(0x1122_3344, 0, 1, 2),
         fastscan(0, 32, 0, 0),
@@ -361,7 +361,7 @@ fn fastscan_asks_bit_by_bit() {
         (fastscan(0x0001_0002, 0, 2, 3), yes),
     ]);
     assert!(!bench.is_in_configuration());
-    // All but the last bit of the last part is not all, whatever comes next.
+    // A match of all but the last bit is not enough, whatever follows.
     bench.expect(&[(fastscan(0xDEAD_BEEE, 1, 3, 2), yes), (fastscan(0x0001_0002, 0, 2, 3), yes)]);
     assert!(!bench.is_in_configuration());
     bench.expect(&[(fastscan(0xDEAD_BEEF, 0, 3, 0), yes)]);
@@ -374,7 +374,7 @@ fn fastscan_asks_bit_by_bit() {
 #[test]
 fn what_is_not_asked_of_it_gets_silence() {
     let mut bench = Bench::new(5);
-    // Of the configuration state, while waiting.
+    // Requests of the configuration state, in waiting state.
     bench.silent(&[
         [0x11, 42, 0, 0, 0, 0, 0, 0],
         [0x13, 0, 2, 0, 0, 0, 0, 0],
@@ -385,7 +385,7 @@ fn what_is_not_asked_of_it_gets_silence() {
     ]);
     assert!(bench.device.stored.is_empty());
     assert_eq!(bench.lss.reset_communication(), NodeId::new(5));
-    // What is no LSS request of a master.
+    // Frames other than a master's LSS requests.
     bench.silent(&[[0x04, 1, 0, 0, 0, 0, 0, 0]]);
     bench.silent(&[[0; 8], [0xFF; 8], [0x44, 0, 0, 0, 0, 0, 0, 0], [0x45, 0, 0, 0, 0, 0, 0, 0]]);
     let good = [0x5E, 0, 0, 0, 0, 0, 0, 0];
@@ -403,8 +403,7 @@ fn what_is_not_asked_of_it_gets_silence() {
     assert!(bench.is_in_configuration());
 }
 
-/// A master's fastscan over a bus with several slaves, by CiA 305: an answer of any of them is a
-/// yes.
+/// A master's fastscan on a bus with several slaves, by CiA 305: an answer of any slave means yes.
 fn scan(slaves: &mut [(Lss, Device)]) -> Option<[u32; 4]> {
     let mut ask = |bytes: [u8; 8]| {
         let mut yes = false;
@@ -433,7 +432,7 @@ fn scan(slaves: &mut [(Lss, Device)]) -> Option<[u32; 4]> {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, rng_seed: RngSeed::Fixed(305), ..ProptestConfig::default() })]
 
-    /// Every slave without a node-ID is found, one after the other, and gets its own.
+    /// Every slave without a node-ID is found, one after another, and gets its own node-ID.
     #[test]
     fn fastscan_finds_all(addresses in proptest::collection::hash_set(prop::array::uniform4(prop_oneof![0..3_u32, any::<u32>()]), 1..5)) {
         let mut slaves: Vec<_> = addresses
@@ -464,7 +463,7 @@ proptest! {
         prop_assert_eq!(ids, (1..=addresses.len() as u8).collect::<Vec<_>>());
     }
 
-    /// Whatever came before: selected by its address it serves.
+    /// After any previous events, a slave works when it is selected by its address.
     #[test]
     fn any_frames_leave_a_slave_that_serves(
         frames in proptest::collection::vec((prop_oneof![Just(0x04_u8), 0x11..0x18_u8, 0x40..0x5F_u8, any::<u8>()], any::<[u8; 7]>()), 0..60),

@@ -1,4 +1,4 @@
-//! A slave as its bus sees it; frames from CiA 301 sections 7.2.8.2 and 7.2.8.3.
+//! A slave on the bus; frames from CiA 301 sections 7.2.8.2 and 7.2.8.3.
 
 mod common;
 
@@ -22,7 +22,7 @@ impl Bench {
         self.node.handle(frame, at(now), &mut self.device)
     }
 
-    /// All that the node sends at this time.
+    /// All frames that the node sends at this time.
     fn sent(&mut self, now: u32) -> Vec<Frame> {
         core::iter::from_fn(|| self.node.poll(at(now), &mut self.device)).collect()
     }
@@ -43,7 +43,7 @@ const IS_1000: [u8; 8] = [0x43, 0x00, 0x10, 0, 0, 0, 0, 0x10];
 fn says_its_boot_up_once_and_then_its_heartbeat() {
     let mut bench = Bench::new(Config { heartbeat_ms: 100, ..Config::default() });
     assert_eq!(bench.node.state(), NmtState::Initialisation);
-    // Before the boot-up it is not there.
+    // Before the boot-up message the node does not answer.
     assert_eq!(bench.handle(&nmt(&[0x81, 0]), 0), None);
     assert_eq!(bench.handle(&request(READ_1000), 0), None);
     assert_eq!(bench.sent(50), [state(0x00)]);
@@ -90,7 +90,7 @@ fn an_application_follows_its_master() {
     assert_eq!(bench.sent(0), [state(0x00)]);
     bench.handle(&nmt(&[0x01, 5]), 1);
     assert_eq!(bench.sent(100), [state(0x05)]);
-    // Stop ends a transfer, and SDO is not served any more.
+    // Stop ends a transfer, and SDO no longer works.
     bench.handle(&request([0x21, 0x50, 0x1F, 1, 9, 0, 0, 0]), 101);
     bench.handle(&nmt(&[0x02, 0]), 102);
     assert_eq!(bench.device.events, [Event::Start(Some(9)), Event::Cancel]);
@@ -110,7 +110,7 @@ fn reset_communication_takes_a_new_node_id() {
     let id = NodeId::new(6).unwrap();
     bench.node.restart(id, &mut bench.device);
     assert_eq!(bench.device.events, [Event::Start(Some(9)), Event::Cancel]);
-    // The answer that waited is gone with the old node-ID.
+    // The waiting answer was dropped with the old node-ID.
     assert_eq!(bench.sent(50), [Frame::of(CobId::new(0x706).unwrap(), &[0x00])]);
     assert_eq!(bench.sent(150), [Frame::of(CobId::new(0x706).unwrap(), &[0x7F])]);
     bench.handle(&request(READ_1000), 160);

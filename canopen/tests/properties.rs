@@ -1,4 +1,4 @@
-//! What holds for every sequence of frames and every content.
+//! Properties of every sequence of frames and every content.
 
 mod common;
 
@@ -14,8 +14,8 @@ use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 
-/// Frames as an unkind bus brings them: SDO requests of every command to objects that exist and
-/// that do not, noise, other lengths, and NMT.
+/// Frames of a hostile bus: SDO requests of every command to existing and missing objects, noise,
+/// other lengths, and NMT.
 fn any_frame() -> impl Strategy<Value = Frame> {
     let index = prop_oneof![
         Just(0x1000_u16),
@@ -48,7 +48,7 @@ fn slave() -> (Node, Device) {
     (slave, device)
 }
 
-/// Runs a transfer to its end over a wire that loses nothing.
+/// Runs a transfer to its end over a wire without losses.
 fn run(
     transfer: &mut impl Transfer,
     slave: &mut Node,
@@ -70,13 +70,13 @@ fn run(
 
 const AT: Address = Address::new(0x2000, 0);
 
-/// What the wire does to a frame.
+/// The effect of the wire on a frame.
 #[derive(Clone, Copy, Debug)]
 enum Fate {
     Well,
     Lost,
     Doubled,
-    /// It arrives behind this many later ones.
+    /// It arrives after this many later frames.
     Late(u8),
 }
 
@@ -120,14 +120,14 @@ impl Wire {
     }
 }
 
-/// Runs a transfer to its end over a wire that treats the frames like this, and then well.
+/// Runs a transfer to its end over a wire with these effects, and without effects afterwards.
 fn run_lossy(
     transfer: &mut impl Transfer,
     slave: &mut Node,
     device: &mut Device,
     fates: &[Fate],
 ) -> Result<(), SdoError> {
-    // Both directions take the next one of the same row.
+    // Both directions take the next effect from the same list.
     let fates = RefCell::new(fates.iter().copied());
     let mut next = |_: &Frame| fates.borrow_mut().next().unwrap_or(Fate::Well);
     let mut next_down = |_: &Frame| fates.borrow_mut().next().unwrap_or(Fate::Well);
@@ -146,7 +146,7 @@ fn run_with(
     let mut quiet = false;
     let mut outcome = None;
     for _ in 0..100_000 {
-        // What stayed behind arrives when nothing else moves.
+        // Delayed frames arrive when nothing else moves.
         let flush = core::mem::replace(&mut quiet, true);
         match transfer.poll(at(now)) {
             Step::Send(frame) => {
@@ -168,13 +168,13 @@ fn run_with(
             transfer.handle(&frame, at(now));
             quiet = false;
         }
-        // Both sides are at rest, and nothing is on its way.
+        // Both sides are idle, and no frame is in transit.
         if let (Some(result), true, true) = (outcome, quiet && flush, slave.is_sdo_idle()) {
             return result;
         }
         if quiet {
             now += 10;
-            // A consumer gets done with what it took in.
+            // The receiver processes the accepted data.
             device.space = device.space.map(|space| space + 50);
         }
     }
@@ -184,7 +184,7 @@ fn run_with(
 proptest! {
     #![proptest_config(ProptestConfig { cases: 400, failure_persistence: None, rng_seed: RngSeed::Fixed(301), ..ProptestConfig::default() })]
 
-    /// Whatever came before, with answers fetched or not: the next correct transfers are served.
+    /// After any previous events, with answers fetched or not, the next correct transfers work.
     #[test]
     fn any_frames_leave_a_server_that_serves(frames in vec((any_frame(), any::<bool>(), 0_u32..400), 0..60)) {
         let (mut slave, mut device) = slave();
@@ -196,7 +196,7 @@ proptest! {
                 while slave.poll(at(now), &mut device).is_some() {}
             }
         }
-        // Left alone it comes to rest by itself.
+        // Without further frames it becomes idle by itself.
         let later = now + 10_000;
         while slave.poll(at(later), &mut device).is_some() {}
         prop_assert!(slave.is_sdo_idle());
@@ -208,8 +208,8 @@ proptest! {
         prop_assert_eq!(&device.domain, &data);
     }
 
-    /// A transfer need not wait for the old one to time out, if the client says that it gave that
-    /// one up. (Without a word from it an initiate might be a segment of a block download.)
+    /// A transfer need not wait for the time-out of the old one, if the client has aborted that
+    /// one. (Without an abort, an initiate might be a segment of a block download.)
     #[test]
     fn any_frames_do_not_delay_the_next_transfer(frames in vec(any_frame(), 0..20)) {
         let (mut slave, mut device) = slave();
@@ -236,7 +236,7 @@ proptest! {
         prop_assert_eq!(upload.into_sink(), data);
     }
 
-    /// The same as blocks, of every size, into a consumer of any speed.
+    /// The same as blocks, of every size, with a receiver of any speed.
     #[test]
     fn any_content_goes_there_and_back_as_blocks(
         data in vec(any::<u8>(), 0..3000),
@@ -258,8 +258,8 @@ proptest! {
         prop_assert_eq!(upload.into_sink(), data);
     }
 
-    /// Whatever the wire loses, doubles or delays: a transfer that both sides call done is right.
-    /// And what comes late changes nothing any more.
+    /// Whatever the wire loses, repeats or delays: a transfer that both sides report as successful
+    /// is correct, and late frames change nothing.
     #[test]
     fn no_block_transfer_is_acknowledged_and_wrong(
         data in vec(any::<u8>(), 0..800),
@@ -288,8 +288,8 @@ proptest! {
         prop_assert!(device.incoming.is_none(), "the server is stuck");
     }
 
-    /// The same without blocks. There the wire does not delay beyond an answer: CAN never does, and
-    /// the toggle bit of the segmented transfer could not tell.
+    /// The same without blocks. The wire does not delay a frame beyond an answer: CAN never does,
+    /// and the toggle bit of the segmented transfer could not detect it.
     #[test]
     fn no_segmented_transfer_is_acknowledged_and_wrong(
         data in vec(any::<u8>(), 0..300),
@@ -315,8 +315,8 @@ proptest! {
         prop_assert!(device.incoming.is_none(), "the server is stuck");
     }
 
-    /// A segment of a block transfer may be lost anywhere, but for a sub-block of which all is
-    /// lost: the transfer goes on.
+    /// Any segment of a block transfer may be lost, except all segments of a sub-block: the
+    /// transfer continues.
     #[test]
     fn lost_segments_are_repeated(data in vec(any::<u8>(), 100..800), lost in vec(2_usize..100, 1..6), up: bool) {
         let (mut slave, mut device) = slave();
@@ -325,8 +325,8 @@ proptest! {
         let sdo = canopen::sdo::server::Config { blksize: 20, ..Default::default() };
         slave = Node::new(slave.id(), Config { sdo, ..Config::default() });
         let _ = slave.poll(at(0), &mut device);
-        // Segments have a number and come in a row; the rest of the protocol starts at 80h. The
-        // first of a sub-block always comes.
+        // Segments have a number and come in sequence; the other frames of the protocol start at
+        // 80h. The first segment of a sub-block always arrives.
         let mut fate = |frame: &Frame| {
             let number = frame.exactly::<8>().unwrap()[0] & 0x7F;
             segments += 1;
@@ -346,7 +346,7 @@ proptest! {
         prop_assert_eq!(device.domain, data);
     }
 
-    /// A client survives every answer, and ends when its time is up at the latest.
+    /// A client survives every answer, and ends at its time-out at the latest.
     #[test]
     fn any_answers_leave_a_client_that_ends(answers in vec((any::<[u8; 8]>(), 0_u32..300), 0..40), up: bool, blocks: bool) {
         let mut now = 0;
@@ -356,7 +356,7 @@ proptest! {
                 now += pause;
                 transfer.handle(&common::response(*bytes), at(now));
             }
-            // One pause for the repetition that a sub-block may ask for, one for the time-out.
+            // One pause for the repetition of a sub-block, one for the time-out.
             now += 1000;
             while let Step::Send(_) = transfer.poll(at(now)) {}
             now += 1000;

@@ -18,7 +18,7 @@ trait Dialogue {
 }
 
 impl Dialogue for Bench {
-    /// The one answer to a request, or that there is none.
+    /// The single answer to a request, or none.
     fn answer(&mut self, bytes: [u8; 8]) -> Option<[u8; 8]> {
         self.send(&request(bytes));
         let answer = self.poll();
@@ -37,7 +37,8 @@ impl Dialogue for Bench {
     }
 }
 
-/// The two are the ends of a service that works, so that a test can show that the server is still
+/// These two frames are the ends of a service that works: a test shows with them that the server
+/// still works.
 /// well.
 #[track_caller]
 fn still_serves(bench: &mut Bench) {
@@ -73,7 +74,7 @@ fn downloads_expedited() {
         ([0x23, 0x02, 0x20, 0, 1, 2, 3, 4], [0x60, 0x02, 0x20, 0, 0, 0, 0, 0]),
     ]);
     assert_eq!((bench.device.control, bench.device.heartbeat), (0x83, 1000));
-    // Size not told (s = 0): the type's size counts, 1 and 2 bytes here.
+    // Unknown size (s = 0): the type's size is used, here 1 and 2 bytes.
     bench.expect(&[
         ([0x22, 0x51, 0x1F, 1, 0x02, 9, 9, 9], [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0]),
         ([0x22, 0x17, 0x10, 0, 0x0A, 0x00, 9, 9], [0x60, 0x17, 0x10, 0, 0, 0, 0, 0]),
@@ -117,7 +118,7 @@ fn uploads_a_domain_with_and_without_its_size() {
         ([0x70, 0, 0, 0, 0, 0, 0, 0], [0x11, 8, 9, 10, 11, 12, 13, 14]),
     ]);
     assert!(bench.server.is_idle());
-    // Without a size the end shows only when no more bytes come: an empty last segment.
+    // Without a size the end is known only when no more bytes come: an empty last segment.
     bench.device.tells_size = false;
     bench.expect(&[
         ([0x40, 0x00, 0x20, 0, 0, 0, 0, 0], [0x40, 0x00, 0x20, 0, 0, 0, 0, 0]),
@@ -138,14 +139,14 @@ fn downloads_segmented() {
     ]);
     assert_eq!(bench.device.events, [Event::Start(Some(9)), Event::End((1..=9).collect())]);
     assert!(bench.server.is_idle());
-    // Size not told.
+    // Unknown size.
     bench.device.events.clear();
     bench.expect(&[
         ([0x20, 0x50, 0x1F, 1, 0, 0, 0, 0], [0x60, 0x50, 0x1F, 1, 0, 0, 0, 0]),
         ([0x01, 1, 2, 3, 4, 5, 6, 7], [0x20, 0, 0, 0, 0, 0, 0, 0]),
     ]);
     assert_eq!(bench.device.events, [Event::Start(None), Event::End((1..=7).collect())]);
-    // A string and a long number go through the same service.
+    // A string and a long number use the same service.
     bench.expect(&[
         ([0x21, 0x01, 0x20, 0, 8, 0, 0, 0], [0x60, 0x01, 0x20, 0, 0, 0, 0, 0]),
         ([0x00, b'a', b'b', b'c', b'd', b'e', b'f', b'g'], [0x20, 0, 0, 0, 0, 0, 0, 0]),
@@ -158,7 +159,7 @@ fn downloads_segmented() {
     assert_eq!(bench.device.long, 0x0102_0304_0506_0708);
 }
 
-/// Every access that the table forbids, with the code of CiA 301 table 22.
+/// Every access that the table forbids, with its code from CiA 301 table 22.
 #[test]
 fn refuses_what_the_table_does_not_allow() {
     #[rustfmt::skip]
@@ -194,7 +195,7 @@ fn refuses_what_the_table_does_not_allow() {
     }
 }
 
-/// A dialogue that ends in an abort, and what the consumer of the domain hears.
+/// A dialogue that ends in an abort, and the calls to the domain's receiver.
 #[track_caller]
 fn breaks(dialogue: &[([u8; 8], [u8; 8])], events: &[Event]) {
     let mut bench = bench();
@@ -203,7 +204,7 @@ fn breaks(dialogue: &[([u8; 8], [u8; 8])], events: &[Event]) {
     still_serves(&mut bench);
 }
 
-/// Bytes of a string that is too long (the feature `sealed` makes the longest one longer).
+/// The bytes of a string that is too long (the feature `sealed` increases the limit).
 const TOO_LONG: u8 = canopen::sdo::server::VALUE_MAX as u8 + 1;
 
 const START_9: ([u8; 8], [u8; 8]) = ([0x21, 0x50, 0x1F, 1, 9, 0, 0, 0], [0x60, 0x50, 0x1F, 1, 0, 0, 0, 0]);
@@ -231,13 +232,13 @@ fn sizes_that_do_not_match_abort() {
     // 8 of 9 bytes, then the end; 10 of 9 bytes.
     breaks(&[START_9, FIRST, ([0x1D, 8, 0, 0, 0, 0, 0, 0], length)], &cancelled);
     breaks(&[START_9, FIRST, ([0x18, 8, 9, 10, 0, 0, 0, 0], length)], &cancelled);
-    // Not announced, and the wrong number for the type.
+    // Without an announced size, and with the wrong size for the type.
     let start_long = ([0x20, 0x03, 0x20, 0, 0, 0, 0, 0], [0x60, 0x03, 0x20, 0, 0, 0, 0, 0]);
     let too_low = [0x80, 0x03, 0x20, 0, 0x13, 0x00, 0x07, 0x06];
     let too_high = [0x80, 0x03, 0x20, 0, 0x12, 0x00, 0x07, 0x06];
     breaks(&[start_long, ([0x01, 1, 2, 3, 4, 5, 6, 7], too_low)], &[]);
     breaks(&[start_long, FIRST, ([0x1B, 8, 9, 0, 0, 0, 0, 0], too_high)], &[]);
-    // A string that is never announced and grows past every bound.
+    // A string without an announced size that grows beyond every limit.
     let start = ([0x20, 0x01, 0x20, 0, 0, 0, 0, 0], [0x60, 0x01, 0x20, 0, 0, 0, 0, 0]);
     let mut dialogue = vec![start];
     let fits = TOO_LONG / 7;
@@ -255,11 +256,11 @@ fn commands_out_of_place_or_unknown_abort() {
         let [low, high] = index.to_le_bytes();
         [0x80, low, high, sub, 0x01, 0x00, 0x04, 0x05]
     };
-    // ccs 7 is nothing; segments without a transfer.
+    // ccs 7 is undefined; segments without a transfer.
     breaks(&[([0xE0, 1, 2, 3, 4, 5, 6, 7], unknown(0, 0))], &[]);
     breaks(&[([0x00, 1, 2, 3, 4, 5, 6, 7], unknown(0, 0))], &[]);
     breaks(&[([0x60, 0, 0, 0, 0, 0, 0, 0], unknown(0, 0))], &[]);
-    // The other direction's segment.
+    // The segment of the other direction.
     let cancelled = [Event::Start(Some(9)), Event::Cancel];
     breaks(&[START_9, ([0x60, 0, 0, 0, 0, 0, 0, 0], unknown(0x1F50, 1))], &cancelled);
     breaks(&[START_9, ([0xFF, 0, 0, 0, 0, 0, 0, 0], unknown(0x1F50, 1))], &cancelled);
@@ -331,7 +332,7 @@ fn the_consumer_has_the_last_word() {
     bench.device.refuse_end = Some(AbortCode::HARDWARE);
     let hardware = [0x80, 0x50, 0x1F, 1, 0x00, 0x00, 0x06, 0x06];
     bench.expect(&[START_9, FIRST, ([0x1B, 8, 9, 0, 0, 0, 0, 0], hardware)]);
-    // It refused, so it need not be told.
+    // The receiver has refused, so it needs no cancellation.
     assert_eq!(bench.device.events, [Event::Start(Some(9))]);
     still_serves(&mut bench);
 }
@@ -345,10 +346,10 @@ fn a_full_consumer_holds_the_answer_back() {
     bench.now = 900;
     bench.device.space = Some(7);
     assert_eq!(bench.poll(), Some(response(FIRST.1)));
-    // The client's time runs from the answer on.
+    // The client's time starts with the answer.
     bench.now = 1899;
     bench.expect(&[([0x1B, 8, 9, 0, 0, 0, 0, 0], [0x30, 0, 0, 0, 0, 0, 0, 0])]);
-    // A consumer that never gets done costs the client its transfer, not the server its life.
+    // A receiver that never finishes ends the client's transfer, but does not block the server.
     bench.device.space = Some(0);
     assert_eq!(bench.answer(START_9.0), None);
     bench.now += 1000;
@@ -356,7 +357,7 @@ fn a_full_consumer_holds_the_answer_back() {
     still_serves(&mut bench);
 }
 
-/// Slowed down, but not left alone: a segment every 2 ms, until there is really no room.
+/// Slowed down, but not abandoned: a segment every 2 ms, until there is really no room.
 #[test]
 fn a_client_that_is_held_back_is_served_from_the_reserve() {
     let mut bench = bench();
@@ -371,7 +372,7 @@ fn a_client_that_is_held_back_is_served_from_the_reserve() {
     bench.now += 2;
     assert_eq!(bench.poll(), Some(response(FIRST.1)), "8 bytes of the reserve are left");
     bench.expect(&[([0x1B, 8, 9, 0, 0, 0, 0, 0], [0x30, 0, 0, 0, 0, 0, 0, 0])]);
-    // A sub-block from the reserve is one segment long.
+    // A sub-block from the reserve has one segment.
     bench.device.space = Some(100);
     bench.device.reserve = 100;
     assert_eq!(bench.answer([0xC0, 0x50, 0x1F, 1, 0, 0, 0, 0]), None);
@@ -379,7 +380,7 @@ fn a_client_that_is_held_back_is_served_from_the_reserve() {
     assert_eq!(bench.poll(), Some(response([0xA4, 0x50, 0x1F, 1, 1, 0, 0, 0])));
 }
 
-/// Found by fuzzing: such a client was not held back by the answer that it did not wait for.
+/// Found by fuzzing: the delayed answer did not slow down a client that did not wait for it.
 #[test]
 fn a_client_that_sends_regardless_of_room_is_refused() {
     let out_of_memory = [0x80, 0x50, 0x1F, 1, 0x05, 0x00, 0x04, 0x05];
@@ -415,7 +416,7 @@ fn what_is_no_sdo_gets_silence() {
         bench.send(frame);
         assert_eq!(bench.poll(), None, "{frame}");
     }
-    // The transfer never noticed.
+    // The transfer was not affected.
     bench.expect(&[FIRST, ([0x1B, 8, 9, 0, 0, 0, 0, 0], [0x30, 0, 0, 0, 0, 0, 0, 0])]);
 }
 
@@ -429,7 +430,7 @@ fn reserved_bits_are_not_looked_at() {
     assert_eq!(bench.device.control, 1);
 }
 
-/// A device whose values are not what its table says.
+/// A device with values that contradict its table.
 #[test]
 fn a_value_of_the_wrong_length_is_the_devices_fault() {
     struct Wrong(Device, usize);
@@ -469,7 +470,7 @@ fn a_value_of_the_wrong_length_is_the_devices_fault() {
     assert_eq!(ask(&mut device, [0x40, 0x00, 0x20, 0, 0, 0, 0, 0]), [0x41, 0x00, 0x20, 0, 8, 0, 0, 0]);
     assert_eq!(ask(&mut device, [0x60, 0, 0, 0, 0, 0, 0, 0]), [0x00; 8]);
     assert_eq!(ask(&mut device, [0x70, 0, 0, 0, 0, 0, 0, 0]), [0x1D, 0, 0, 0, 0, 0, 0, 0]);
-    // Three bytes of an Unsigned32; a domain that ends before the size that it told.
+    // Three bytes of an Unsigned32; a domain that ends before its announced size.
     device.1 = 3;
     assert_eq!(
         ask(&mut device, [0x40, 0x00, 0x10, 0, 0, 0, 0, 0]),

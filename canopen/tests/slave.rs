@@ -18,7 +18,7 @@ static ENTRIES: [Entry; 2] = [
     Entry::var(0x2000, "Domain", DataType::Domain, Access::Rw),
 ];
 
-/// A device whose memory takes its time.
+/// A device with slow memory.
 #[derive(Default)]
 struct Device {
     events: Vec<LineEvent>,
@@ -171,7 +171,7 @@ fn a_device_without_node_id_lets_lss_in_alone_and_boots_when_it_gets_one() {
     assert_eq!(bench.device.ids, [None, Some(9)]);
 }
 
-/// A product may turn layer setting services off.
+/// A product may disable layer setting services.
 #[test]
 fn a_slave_without_lss_neither_accepts_nor_answers_its_requests() {
     let config = Config { lss: None, ..Config::default() };
@@ -202,8 +202,8 @@ fn reset_communication_takes_over_what_lss_configured() {
     assert_eq!(bench.device.ids, [Some(5), Some(9), None]);
 }
 
-/// CiA 305: the state machine is entered anew, in LSS waiting, when communication was reset; the
-/// change between PRE-OPERATIONAL and STOPPED is none of its transitions.
+/// CiA 305: after a reset of communication the state machine is entered again, in LSS waiting; a
+/// change between PRE-OPERATIONAL and STOPPED is not one of its transitions.
 #[test]
 fn reset_communication_ends_the_configuration_state() {
     let inquire = [0x5E, 0, 0, 0, 0, 0, 0, 0];
@@ -218,7 +218,7 @@ fn reset_communication_ends_the_configuration_state() {
     assert_eq!(bench.ask(0x7E5, &inquire).len(), 1);
     bench.ask(0x000, &[0x82, 5]);
     assert_eq!(bench.ask(0x7E5, &inquire), [], "inquire node-ID is not served in LSS waiting");
-    // A device that starts in configuration (which the standard does not know) is there again.
+    // A device that starts in configuration state (not in the standard) is in that state again.
     let lss = Some(canopen::lss::Config { start_in_configuration: true, ..Default::default() });
     let slave = Slave::new(ADDRESS, NodeId::new(5), BitRate::K125, Config { lss, ..Config::default() });
     let mut bench = Bench { slave, device: Device::default(), now: 0 };
@@ -229,8 +229,8 @@ fn reset_communication_ends_the_configuration_state() {
     assert_eq!(bench.ask(0x7E5, &inquire).len(), 1);
 }
 
-/// What an open transfer looks like: block download, in a sub-block and with its acknowledgement held
-/// back; segmented download; segmented and block upload.
+/// The kinds of open transfers: block download, within a sub-block and with a delayed
+/// acknowledgement; segmented download; segmented and block upload.
 #[test]
 fn reset_node_ends_a_transfer_at_once() {
     const INITIATE: [u8; 8] = [0xC2, 0x00, 0x20, 0, 0, 1, 0, 0];
@@ -256,19 +256,19 @@ fn reset_node_ends_a_transfer_at_once() {
         assert_eq!(bench.outputs(), []);
         let download = matches!(requests[0][0], 0x20 | 0xC2);
         assert_eq!(bench.device.cancelled, u32::from(download), "{requests:02X?}");
-        // Who waits for the restart is served until then.
+        // A client that sends requests before the restart gets answers until then.
         let answer = bench.ask(0x605, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]);
         assert_eq!(answer, [send(0x585, &[0x43, 0, 0x10, 0, 1, 2, 3, 4])]);
     }
 }
 
-/// Frames of eight bytes take some 5 ms at 20 kbit/s.
+/// Frames of eight bytes take about 5 ms at 20 kbit/s.
 #[test]
 fn a_sub_block_may_pause_for_longer_on_a_slow_bus() {
     for (index, rate, pause) in
         [(0, BitRate::K1000, 50), (6, BitRate::K50, 50), (7, BitRate::K20, 100), (8, BitRate::K10, 100)]
     {
-        // Where it starts so, and where layer setting services change over to it.
+        // At the start, and after a change by layer setting services.
         for (from, anew) in [
             (rate, false),
             (rate, true),
@@ -353,6 +353,6 @@ fn activates_a_bit_rate_and_keeps_silent_meanwhile() {
     bench.now = 199;
     assert_eq!(bench.outputs(), []);
     bench.now = 200;
-    // The answer that waited.
+    // The answer that was waiting.
     assert_eq!(bench.outputs(), [send(0x585, &[0x43, 0, 0x10, 0, 1, 2, 3, 4])]);
 }

@@ -1,5 +1,5 @@
 //! Frames of every SDO service, written by hand from the figures of CiA 301 section 7.2.4.3: each
-//! is taken apart and put together.
+//! is parsed and emitted again.
 
 use canopen::sdo::wire::{BlockAck, BlockEnd, BlockSegment, Chunk, Payload, Request, Response, Segment};
 use canopen::AbortCode;
@@ -115,7 +115,7 @@ fn block_segments() {
     assert_eq!(segment.emit(), [0xFF, 1, 2, 3, 4, 5, 6, 7]);
     let segment = BlockSegment { last: false, seqno: 1, data: [0; 7] };
     assert_eq!(BlockSegment::parse(&[0x01, 0, 0, 0, 0, 0, 0, 0]), Some(segment));
-    // An abort is no segment.
+    // An abort is not a segment.
     assert_eq!(BlockSegment::parse(&[0x80, 0x50, 0x1F, 2, 0x11, 0x00, 0x09, 0x06]), None);
     assert_eq!(BlockSegment::parse(&[0x00; 8]), None);
 }

@@ -1,4 +1,4 @@
-//! How values look for programs: the names and forms that `--json` and the events share.
+//! The JSON forms of values, with the names and formats that `--json` and the events share.
 
 use std::time::Duration;
 
@@ -12,17 +12,17 @@ pub(crate) fn node<S: Serializer>(node: &NodeId, serializer: S) -> Result<S::Ok,
     serializer.serialize_u8(node.get())
 }
 
-/// A time as seconds, to the millisecond.
+/// A time in seconds, with milliseconds.
 pub(crate) fn seconds<S: Serializer>(time: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_f64((time.as_secs_f64() * 1000.0).round() / 1000.0)
 }
 
-/// An error's number as the messages have it: `0x60000013`.
+/// An error number in the form of the messages: `0x60000013`.
 pub(crate) fn hex<S: Serializer>(number: &u32, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_str(&format_args!("{number:#010x}"))
 }
 
-/// What 1F57h says.
+/// The status in 1F57h.
 pub(crate) fn status<S: Serializer>(status: &Option<FlashStatus>, serializer: S) -> Result<S::Ok, S::Error> {
     let Some(status) = status else { return None::<()>.serialize(serializer) };
     let mut fields = serializer.serialize_struct("FlashStatus", 5)?;
@@ -34,7 +34,7 @@ pub(crate) fn status<S: Serializer>(status: &Option<FlashStatus>, serializer: S)
     fields.end()
 }
 
-/// What has words for people, in these words.
+/// A value as its text for people.
 pub(crate) fn words<T: std::fmt::Display, S: Serializer>(
     value: &T,
     serializer: S,

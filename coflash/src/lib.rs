@@ -8,10 +8,10 @@
 //! | [`update`] | the procedure, a file for each dialect, many devices at once, job files | `bus`, `device`, `file` |
 //! | `ui` (feature `ui`) | a local web server and its page in the browser | `bus`, `device`, `file`, `update` |
 //!
-//! The command line (`src/cli`, feature `cli`) is a user of this library like any other: what
-//! decides is here, and what prints is there.
+//! The command line (`src/cli`, feature `cli`) is an ordinary user of this library: decisions are
+//! made here, and output is printed there.
 //!
-//! Flashing a file takes these lines:
+//! These lines flash a file:
 //!
 //! ```no_run
 //! use coflash::device::{Session, Timing};

@@ -1,9 +1,10 @@
 //! Setters for option structs.
 //!
-//! Such a struct is `#[non_exhaustive]`, so that an option more breaks nobody; its user starts from
-//! the default and says what is different: `FlashOptions::default().program(2).start(false)`.
+//! Such a struct is `#[non_exhaustive]`, so that a new option does not break its users. A user
+//! starts from the default and sets the options that differ:
+//! `FlashOptions::default().program(2).start(false)`.
 
-/// Within an `impl` block: for each field a method of its name that sets it.
+/// Within an `impl` block: defines for each field a method with the field's name that sets it.
 macro_rules! setters {
     ($($field:ident: $type:ty,)+) => {
         $(

@@ -147,11 +147,11 @@ fn what_can_be_no_program_is_refused_in_every_dialect() {
     };
     for (bytes, at, words) in [
         (labelled(VENDOR, PRODUCT), 0x0800_0000, "the image begins at the start of the flash"),
-        (vec![0; 1024], START, "the image is no program: all of its bytes are 00h"),
-        (vec![0xFF; 1024], START, "the image is no program: all of its bytes are FFh"),
-        (with(0, 0x2001_FFC4), START, "the image is no program: its first word is 2001FFC4h"),
-        (with(4, START + 0x200), START, "the image is no program: its reset vector is 08010200h, without"),
-        (with(4, START - 0xFFF), START, "the image is no program: its reset vector is 0800F001h, outside"),
+        (vec![0; 1024], START, "the image is not a program: all its bytes are 00h"),
+        (vec![0xFF; 1024], START, "the image is not a program: all its bytes are FFh"),
+        (with(0, 0x2001_FFC4), START, "the image is not a program: its first word, 2001FFC4h"),
+        (with(4, START + 0x200), START, "the image is not a program: its reset vector is 08010200h, without"),
+        (with(4, START - 0xFFF), START, "the image is not a program: its reset vector is 0800F001h, outside"),
     ] {
         let file = file(&bytes, at, Told::default());
         for dialect in DIALECTS {
@@ -244,7 +244,8 @@ fn an_image_without_addresses_is_judged_by_the_devices_place() {
     let file = file(&labelled(VENDOR, PRODUCT), 0, Told::default());
     for dialect in [Dialect::Raw, Dialect::Lift] {
         let error = refused(&mut at(START + 0x1_0000, 0x1_0000, APPLICATION, &BOTH), &file, speaks(dialect));
-        let words = "the image is no program: its reset vector is 08010201h, outside 0x08020000..=0x0802ffff";
+        let words =
+            "the image is not a program: its reset vector is 08010201h, outside 0x08020000..=0x0802ffff";
         assert_eq!(error.to_string(), words);
     }
     let mut fake = at(START, 1024, BOOTLOADER, &BOTH);

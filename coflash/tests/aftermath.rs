@@ -53,7 +53,7 @@ const STANDARD: [Dialect; 3] = [Dialect::Block, Dialect::Raw, Dialect::Hex];
 fn nobody_there_and_nothing_done() {
     let nobody = left(BOOTLOADER, &|fake| fake.running = None, FlashOptions::default());
     assert_eq!((nobody.state, nobody.look), (DeviceState::Untouched, Look::NotAsked));
-    assert_eq!(nobody.to_string(), "nothing was changed in it");
+    assert_eq!(nobody.to_string(), "it was not changed");
     // A run that goes well leaves nothing to tell.
     let (_, events) = run(&mut Fake::new(BOOTLOADER), &FlashOptions::default());
     assert!(events.iter().all(|event| event.left().is_none()));
@@ -66,7 +66,7 @@ fn a_call_that_fails_has_changed_nothing() {
         let stays = left(APPLICATION, &on_command(CALL, outcome), FlashOptions::default());
         assert_eq!(stays.state, DeviceState::Untouched, "{outcome:?}");
         let words = stays.to_string();
-        assert!(words.starts_with("its application is running; nothing was changed in it"), "{words}");
+        assert!(words.starts_with("its application is running; it was not changed"), "{words}");
     }
 }
 
@@ -79,14 +79,14 @@ fn a_refusal_before_the_erasure_leaves_the_old_program() {
             let there = left(BOOTLOADER, &on_command(CLEAR, outcome), options);
             assert_eq!(there.state, DeviceState::Untouched, "{its}, {outcome:?}");
             let words = there.to_string();
-            assert!(words.starts_with("its bootloader is running; nothing was changed in it"), "{words}");
+            assert!(words.starts_with("its bootloader is running; it was not changed"), "{words}");
         }
     }
     let called = left(APPLICATION, &on_command(CLEAR, Outcome::Abort(0x0800_0022)), FlashOptions::default());
     assert_eq!(called.state, DeviceState::Called);
     assert_eq!(
         called.to_string(),
-        "its bootloader is running; it was called back to the bootloader, and its program is as it was"
+        "its bootloader is running; it was called back to the bootloader, and its program is unchanged"
     );
 }
 
@@ -110,12 +110,12 @@ fn what_the_device_still_has_is_told() {
         assert_eq!(there.state, DeviceState::Untouched, "{its}");
         assert_eq!(
             there.to_string(),
-            "its bootloader is running; nothing was changed in it (CRC 0BADCAFEh)",
+            "its bootloader is running; it was not changed (CRC 0BADCAFEh)",
             "{its}"
         );
         let gone = left(BOOTLOADER, &refuses(None), dialect(its));
         assert_eq!(gone.state, DeviceState::Erased, "{its}");
-        assert_eq!(gone.to_string(), "its bootloader is running; there is no complete program in it");
+        assert_eq!(gone.to_string(), "its bootloader is running; it contains no complete program");
     }
     // In the middle of the program the CRC of before says nothing any more.
     let later = |fake: &mut Fake| {
@@ -137,17 +137,14 @@ fn a_device_that_is_gone_is_not_said_to_wait_in_its_bootloader() {
         };
         let gone = left(BOOTLOADER, &dies, dialect(its));
         assert_eq!((gone.state, gone.look), (DeviceState::Erased, Look::Silent), "{its}");
-        assert_eq!(gone.to_string(), "it does not answer; last known: there is no complete program in it");
+        assert_eq!(gone.to_string(), "it does not answer; last known: it contains no complete program");
     }
     let mut fake = Fake::new(BOOTLOADER);
     run(&mut fake, &FlashOptions::default()).0.unwrap();
     let frames = fake.sent.len() / 2;
     let lost = left(BOOTLOADER, &|fake| fake.frames_left = frames, FlashOptions::default());
     assert_eq!(lost.look, Look::NotAsked);
-    assert_eq!(
-        lost.to_string(),
-        "it cannot be asked any more; last known: there is no complete program in it"
-    );
+    assert_eq!(lost.to_string(), "it cannot be asked any more; last known: it contains no complete program");
 }
 
 #[test]
@@ -157,7 +154,7 @@ fn a_program_that_does_not_answer_is_told_with_its_release() {
     assert_eq!((tried.state, tried.look), (DeviceState::Unreleased, Look::Silent));
     assert_eq!(
         tried.to_string(),
-        "it does not answer; last known: the new program is in it, not released for autostart: after a reset the \
+        "it does not answer; last known: it contains the new program, not released for autostart: after a reset the \
          bootloader waits for the next attempt"
     );
     let released = left(BOOTLOADER, &silent, FlashOptions::default().trial_run(false));
@@ -188,7 +185,7 @@ fn somebody_elses_requests_end_an_update_before_anything_is_done() {
         assert_eq!(error.number(), 0x6000_0012);
         assert_eq!(
             error.to_string(),
-            "another tool is at work on node 5: its SDO requests are heard, the last one for 1F57h/1"
+            "another tool is using node 5: it sends SDO requests, the last one for 1F57h/1"
         );
         assert!(fake.writes().is_empty(), "{:?}", fake.log);
         assert_eq!(events.last().and_then(Event::left).map(|left| left.state), Some(DeviceState::Untouched));

@@ -98,7 +98,7 @@ fn a_damaged_block_file_is_named_with_its_offset() {
     doubled.extend_from_slice(good);
     assert!(meaning(&doubled, None)
         .unwrap_err()
-        .starts_with("offset 0x373: there is more behind the last block"));
+        .starts_with("offset 0x373: there are more bytes after the last block"));
     let no_program = [&good[..0x18], &good[0x35B..]].concat();
     assert_eq!(meaning(&no_program, None).unwrap_err(), "the file: holds no data");
     let mut wrong_crc = good.to_vec();
@@ -106,7 +106,7 @@ fn a_damaged_block_file_is_named_with_its_offset() {
     let crc = crc_of(&wrong_crc[0x35B..0x36F]);
     wrong_crc[0x36F..].copy_from_slice(&crc);
     let error = meaning(&wrong_crc, None).unwrap_err();
-    assert!(error.starts_with("offset 0x35b: the last block says 4001 bytes"), "{error}");
+    assert!(error.starts_with("offset 0x35b: the last block gives 4001 bytes"), "{error}");
 }
 
 /// An ELF file for Arm (System V ABI, chapters 4 and 5) with so many load segments, each of which

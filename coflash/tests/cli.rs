@@ -103,9 +103,9 @@ fn convert_of_a_block_file_says_which_crc_it_keeps() {
         let input = data(name);
         let done = coflash(&[&["convert", "-I", "block", &input, &out][..], options].concat());
         assert_eq!(done.exit, 0, "{}", done.err);
-        let words = format!("{input}: a block file already, which keeps its {kept}\n");
+        let words = format!("{input}: this is already a block file; it keeps its {kept}\n");
         assert!(done.out.starts_with(&words), "{}", done.out);
-        assert_eq!(done.err.contains("change nothing in blocks"), warns, "{options:?}: {}", done.err);
+        assert_eq!(done.err.contains("cannot change a block file"), warns, "{options:?}: {}", done.err);
         assert!(fs::read(&out).unwrap() == fs::read(&input).unwrap());
     }
 }
@@ -165,7 +165,7 @@ fn what_is_no_file_or_too_large_is_not_read() {
         ("/dev/zero", "/dev/zero: is a device, pipe or socket and no file"),
         (&fifo, "fifo: is a device, pipe or socket and no file"),
         (folder.0.to_str().unwrap(), "endless: is a folder and no file"),
-        (&large, "large.elf: has 67108865 bytes, and no firmware file has more than 67108864"),
+        (&large, "large.elf: has 67108865 bytes, and a firmware file has at most 67108864"),
     ] {
         for command in [&["inspect"][..], &["convert"], &["--bus", NOWHERE, "flash"]] {
             let done = coflash(&[command, &[file]].concat());
@@ -198,7 +198,7 @@ fn what_can_be_no_program_is_refused_without_a_bus() {
         ),
         (&bootloader, &["--dialect", "raw"], "bootloader.bin: begins at the start of the flash"),
         (&bootloader, &["--board", "stm32f407g-disc1"], "its reset vector is 08000189h, outside 0x08010000"),
-        (&zeros, &["--board", "stm32f407g-disc1"], "zeros.bin: is no program: all of its bytes are 00h"),
+        (&zeros, &["--board", "stm32f407g-disc1"], "zeros.bin: is not a program: all its bytes are 00h"),
         (&zeros, &["--dialect", "lift", "--unlock", "x"], "zeros.bin: is no program"),
     ] {
         let done = flash(file, options);
@@ -372,14 +372,14 @@ fn wrong_usage_is_explained() {
     let hex = data("program.hex");
     for (arguments, words) in [
         (&["flash", &hex][..], "give --bus URL or set COFLASH_BUS"),
-        (&["--bus", "can0", "flash", &hex], "it has no ':' behind the adapter's name"),
+        (&["--bus", "can0", "flash", &hex], "it has no ':' after the adapter's name"),
         (&["flash", &hex, "--node", "128"], "node-IDs are 1 to 127"),
         (&["flash", &hex, "--board", "arduino"], "known boards: stm32f407g-disc1"),
         (&["flash", &hex, "--board", "stm32f407g-disc1", "--program", "2"], "its programs are 1 to 1"),
         (&["convert", &hex, "out", "--vid", "1"], "--pid"),
         (&["convert", &hex, "out", "--block-size", "16"], "must be 24 to 16384"),
-        (&["convert", &hex, "out", "--start-address", "08"], "no number in C notation"),
-        (&["convert", &hex, &hex], "overwritten by its own conversion"),
+        (&["convert", &hex, "out", "--start-address", "08"], "not a number in C notation"),
+        (&["convert", &hex, &hex], "overwrite its own input"),
         (&["convert", &hex, "out", "-O", "elf"], "binary"),
         (
             &["convert", &hex, "out", "--key", "cf7a7fe196f64c6b8f19e58361d2397e", "--add", "0xA5"],
@@ -429,7 +429,7 @@ fn flash_and_info_over_a_socket() {
         "calling the application back",
         "the bootloader is running",
         "100 %  883 of 883 bytes",
-        "the trial went well",
+        "the trial was successful",
         "released for autostart",
         "running: an application",
         "done in ",
@@ -463,7 +463,7 @@ fn a_script_for_the_manuals_download_tools_works() {
         let (bus, server) = serve(fake);
         let done = coflash(&[&["--bus", &bus, "flash"][..], &options].concat());
         assert_eq!(done.exit, 0, "{}", done.err);
-        assert_eq!(done.err.contains("--vxd_type is passed over"), dot_net, "{}", done.err);
+        assert_eq!(done.err.contains("--vxd_type is ignored"), dot_net, "{}", done.err);
         let fake = server.join().unwrap();
         assert_eq!(fake.blocks.concat(), fs::read(&file).unwrap());
         assert_eq!(fake.count("command 80"), 1, "a trial in both, asked for or not");
@@ -485,7 +485,7 @@ fn the_target_is_checked_before_anything_is_erased() {
         assert_eq!(
             done.err,
             "error: the program is for vendor-ID 00000000h, and node 5 has 0000003Fh [0x60000180]\n  \
-             the device: nothing was changed in it\n  what to do: check that file and device belong together \
+             the device: it was not changed\n  what to do: check that file and device belong together \
              (coflash info shows the device's identity)\n"
         );
         assert_eq!(server.join().unwrap().writes().len(), 0);
@@ -552,7 +552,7 @@ fn a_device_that_fails_has_the_exit_code_of_its_failure() {
         (
             refusing,
             6,
-            "[0x60000006]\n  the device: its bootloader is running; there is no complete program in it",
+            "[0x60000006]\n  the device: its bootloader is running; it contains no complete program",
         ),
         (absent, 5, "node 5 does not answer (reading 1000h/0) [0x60000013]"),
         (dead, 7, "the trial failed, and the program is not released for autostart: it does not start"),

@@ -60,10 +60,10 @@ fn the_steps_of_an_update_one_by_one() {
     assert_eq!(fake.writes(), ["command 03"; 2]);
 
     let (said, _, fake) = on(|| quick(BOOTLOADER), &["release"]);
-    assert_eq!(said.out, "node 5: program 1 is released for autostart: it starts by itself from now on\n");
+    assert_eq!(said.out, "node 5: program 1 is released for autostart: it starts by itself after a reset\n");
     assert_eq!(fake.writes(), ["command 83"]);
     let (said, _, fake) = on(|| quick(BOOTLOADER), &["withdraw"]);
-    assert!(said.out.contains("is not released for autostart any more"), "{}", said.out);
+    assert!(said.out.contains("is no longer released for autostart"), "{}", said.out);
     assert_eq!(fake.writes(), ["command 84"]);
 
     let (said, json, fake) = on(|| quick(BOOTLOADER), &["start"]);
@@ -241,7 +241,7 @@ fn scan_finds_who_answers_and_who_is_heard() {
     assert_eq!(frames[..2], ["609#8000100000000008", "609#4000100000000000"]);
     let (bus, server) = serve(Bus(vec![]));
     let done = coflash(&["scan", "--bus", &bus, "--listen", "10", "--sdo-timeout", "10"]);
-    assert!(done.exit == 0 && done.out.starts_with("nobody answers, and nobody is heard"), "{}", done.out);
+    assert!(done.exit == 0 && done.out.starts_with("no node answers, and no node was heard"), "{}", done.out);
     server.join().unwrap();
 }
 
@@ -272,7 +272,7 @@ fn a_trace_that_cannot_be_written_is_a_warning() {
     let (bus, server) = serve(quick(BOOTLOADER));
     let done = coflash(&["read", "1018/2", "-N", "5", "--bus", &bus, "--trace", "/dev/full"]);
     assert_eq!((done.exit, done.out.as_str()), (0, "node 5, 1018h/2: 1234 (000004D2h)\n"));
-    assert!(done.err.starts_with("warning: /dev/full: cannot be written any more: "), "{}", done.err);
+    assert!(done.err.starts_with("warning: /dev/full: writing failed: "), "{}", done.err);
     server.join().unwrap();
     let (bus, server) = serve(quick(BOOTLOADER));
     let done = coflash(&["read", "1018/2", "-N", "5", "--bus", &bus, "--trace", "/there/is/none"]);
@@ -301,7 +301,7 @@ fn monitor_shows_a_log() {
     let bad = folder.file("bad", b"(1.0) can0 705#00\n(1.0) can0 705#0\n");
     let done = coflash(&["monitor", "--replay", &bad]);
     assert_eq!(done.exit, 3);
-    assert!(done.err.contains("bad, line 2: its data are no pairs"), "{}", done.err);
+    assert!(done.err.contains("bad, line 2: its data are not pairs"), "{}", done.err);
     let binary = folder.file("binary", &[0xFF, 0xFE, 0]);
     assert_eq!(coflash(&["monitor", "--replay", &binary]).exit, 3);
     assert_eq!(coflash(&["monitor", "--replay", &folder.path("none")]).exit, 3);
@@ -380,7 +380,7 @@ fn lss_says_what_it_does() {
         ("the device has node-ID 9 from now on\n", vec![[0x11, 9, 0], [0x17, 0, 0]])
     );
     let (done, device) = lss(&["bit-rate", "250", "--activate"]);
-    assert_eq!(done.out, "the device is given 250 kbit/s and changes over after 500 ms\n");
+    assert_eq!(done.out, "the device is given 250 kbit/s and switches to it after 500 ms\n");
     assert_eq!(device.orders, [[0x13, 0, 3], [0x15, 0xF4, 1]]);
     let (done, device) = lss(&["--json", "bit-rate", "1000", "--store"]);
     let json: Value = serde_json::from_str(&done.out).unwrap();
@@ -498,7 +498,7 @@ fn the_shell_runs_one_command_after_the_other() {
     let done = shell(&[], &format!("inspect {file}x\ninspect {file}\n"));
     assert_eq!((done.exit, done.out.as_str()), (3, ""));
     for (line, words) in
-        [("nonsense", "unrecognized subcommand"), ("shell", "the shell already"), ("info 'x", "not closed")]
+        [("nonsense", "unrecognized subcommand"), ("shell", "already the shell"), ("info 'x", "not closed")]
     {
         let done = shell(&[], line);
         assert!(done.exit == 2 && done.err.contains(words), "{}", done.err);

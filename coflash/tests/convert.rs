@@ -198,7 +198,7 @@ fn gaps_inside_a_block_take_the_fill_and_count_in_the_crc() {
 }
 
 /// The 2008 manual's `FT_BLOCK_MAX_GAP`: so many bytes in a row may a block have that are not the
-/// program's; with one more the program goes on in a new block.
+/// program's; with one more the program continues in a new block.
 #[test]
 fn a_gap_that_is_too_long_starts_a_new_block() {
     // 01 at 08010000h, 02 at 08010010h (a gap of 15), 03 at 08010013h (of 2, within a word).
@@ -255,7 +255,7 @@ fn a_block_file_for_another_place_is_refused() {
     assert!(error.starts_with("offset 0x2ee: the data at 0x08010f44..=0x08010fa0 lies outside"), "{error}");
     // The device would count size and CRC from its region's start.
     let error = file.check_region(range(0x0800_0000, 0x080F_FFFF)).unwrap_err().to_string();
-    assert!(error.contains("does not fit the blocks"), "{error}");
+    assert!(error.contains("does not match the blocks"), "{error}");
 }
 
 #[test]

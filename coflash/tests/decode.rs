@@ -75,7 +75,7 @@ fn sdo_expedited_and_in_segments() {
         ("605#21501F010A000000", "to node 5: write 1F50h/1 (program data), 10 bytes in segments"),
         ("605#0001020304050607", "to node 5: write segment of 1F50h/1 (program data): 01 02 03 04 05 06 07"),
         ("585#2000000000000000", "node 5: segment of 1F50h/1 (program data) is taken"),
-        ("606#0001020304050607", "to node 6: write segment of an object unknown: 01 02 03 04 05 06 07"),
+        ("606#0001020304050607", "to node 6: write segment of an unknown object: 01 02 03 04 05 06 07"),
         ("605#E000000000000000", "to node 5: SDO request with unknown command E0h"),
         ("605#40", "to node 5: SDO request of 1 bytes, not 8"),
     ]);

@@ -148,7 +148,7 @@ fn a_question_mark_lists_interfaces_and_bit_rates() {
     let done = coflash(&["flash", "--vxd_type", "17"]);
     assert!(done.exit == 2 && done.err.contains("interfaces are 1 to 16"), "{}", done.err);
     let done = coflash(&["flash", "--vxd_type", "4"]);
-    assert!(done.exit == 2 && done.err.contains("no file is named"), "{}", done.err);
+    assert!(done.exit == 2 && done.err.contains("no firmware file is named"), "{}", done.err);
 }
 
 /// The manual's example with CAN over a serial line: its bit rate is 115200 bit/s.
@@ -159,7 +159,7 @@ fn a_serial_line_has_115200_bits_a_second() {
     let (bus, server) = serve(quick(BOOTLOADER));
     let done = coflash(&[&["--bus", &bus, "flash", "-F", &file, "--baudrate", "115200"][..], &line].concat());
     assert_eq!(done.exit, 0, "{}", done.err);
-    assert!(done.err.contains("--vxd_type is passed over"), "{}", done.err);
+    assert!(done.err.contains("--vxd_type is ignored"), "{}", done.err);
     server.join().unwrap();
     // Without --bus the port is meant that the number names.
     let done = coflash(&[&["flash", "-F", &file, "--baudrate", "115200"][..], &line].concat());

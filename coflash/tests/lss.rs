@@ -273,7 +273,7 @@ fn nobody_there_and_refusals_have_words() {
     let error = master.set_bit_rate(BitRate::K800).unwrap_err();
     assert_eq!(
         (error.number(), error.to_string().as_str()),
-        (0x6000_02FF, "the device refuses giving the bit rate: error 255, 7 of its maker")
+        (0x6000_02FF, "the device refuses setting the bit rate: error 255, manufacturer's code 7")
     );
     let mut wrong = bus([Slave::new(ADDRESS, 5)]);
     assert!(Master::new(&mut wrong, ANSWER).select(&other).is_err());

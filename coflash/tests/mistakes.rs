@@ -89,7 +89,7 @@ const MISTAKES: &[Mistake] = &[
         "scan --bus slcan:/dev/ttyACM0@500",
         Nothing,
         2,
-        &["500 bit/s is no bit rate", "did you mean 500k?"],
+        &["500 bit/s is not a bit rate", "did you mean 500k?"],
     ),
     Mistake("flash {missing} --bus slcan:COM7@125", Nothing, 2, &["did you mean 125k?"]),
     Mistake("scan --bus slcan:/dev/ttyACM0@500kbit", Nothing, 2, &["did you mean 500k?"]),
@@ -108,7 +108,7 @@ const MISTAKES: &[Mistake] = &[
     Mistake("scan --bus candlelight:0@500k", Nothing, 2, &["did you mean gs_usb:0@500k?"]),
     Mistake("scan --bus SLCAN:COM7", Nothing, 2, &["did you mean slcan:COM7?"]),
     Mistake("scan --bus peak:USB1@500k", Nothing, 2, &["no channel of PCANBasic", "peak:PCAN_USBBUS1@500k"]),
-    Mistake("scan --bus peak:PCAN_USBBUS1@123k", Nothing, 2, &["PEAK adapters have 1M, 800k, 500k"]),
+    Mistake("scan --bus peak:PCAN_USBBUS1@123k", Nothing, 2, &["PEAK adapters support 1M, 800k, 500k"]),
     Mistake("scan --bus kvaser:can0@500k", Nothing, 2, &["no channel of CANlib", "kvaser:0@500k"]),
     Mistake("scan --bus gs_usb:@500k", Nothing, 2, &["by place or serial number", "gs_usb:0@500k"]),
     Mistake("scan --bus gs_usb:0", Nothing, 2, &["needs the bit rate of the bus", "gs_usb:0@125k"]),
@@ -120,14 +120,14 @@ const MISTAKES: &[Mistake] = &[
     ),
     Mistake("scan --bus socketcand://192.0.2.1", Nothing, 2, &["it names no bus", "append /can0"]),
     Mistake("scan --bus socketcand://host/can0@500k", Nothing, 2, &["the server sets the bit rate"]),
-    Mistake("scan --bus cia309://192.0.2.1/1", Nothing, 2, &["a gateway carries SDO alone"]),
-    Mistake("scan", Nothing, 2, &["not said on which CAN bus", "no adapter is found", "coflash adapters"]),
+    Mistake("scan --bus cia309://192.0.2.1/1", Nothing, 2, &["a gateway carries only SDO"]),
+    Mistake("scan", Nothing, 2, &["no CAN bus is given", "no adapter was found", "coflash adapters"]),
     // Serial ports.
     Mistake(
         "scan --bus slcan:/dev/there-is-none@500k",
         Nothing,
         4,
-        &["no such serial port", "serial port", "plug the adapter in"],
+        &["no serial port has this name", "serial port", "plug the adapter in"],
     ),
     Mistake(
         "scan --bus slcan:{port}@500k",
@@ -145,14 +145,14 @@ const MISTAKES: &[Mistake] = &[
         "scan --bus slcan:/dev/null@500k",
         Nothing,
         4,
-        &["it is no serial port", "--bus slcan:PORT@500k"],
+        &["it is not a serial port", "--bus slcan:PORT@500k"],
     ),
-    Mistake("scan --bus slcan:{file}@500k", Nothing, 4, &["it is no serial port"]),
+    Mistake("scan --bus slcan:{file}@500k", Nothing, 4, &["it is not a serial port"]),
     Mistake(
         "scan --bus slcan:tcp://{server}@500k",
         Server(b""),
         4,
-        &["answered neither V (version) nor O", "no SLCAN adapter", "serial port"],
+        &["answered neither V (version) nor O", "not an SLCAN adapter", "serial port"],
     ),
     Mistake(
         "scan --bus slcan:tcp://{server}@500k",
@@ -171,15 +171,15 @@ const MISTAKES: &[Mistake] = &[
         "scan --bus socketcan:can9",
         Refuses(0, "ERROR-ACTIVE"),
         4,
-        &["there is no such interface", "these CAN interfaces are there: vcan0"],
+        &["no interface has this name", "this computer has these CAN interfaces: vcan0"],
     ),
     Mistake(
         "scan --bus socketcan:can9",
         Nothing,
         4,
-        &["there is no such interface", "ip link", "type can bitrate 500000"],
+        &["no interface has this name", "ip link", "type can bitrate 500000"],
     ),
-    Mistake("scan --bus socketcan:lo", Nothing, 4, &["it is no CAN interface"]),
+    Mistake("scan --bus socketcan:lo", Nothing, 4, &["it is not a CAN interface"]),
     Mistake(
         "scan --bus socketcan:vcan0",
         Socket(97),
@@ -190,19 +190,19 @@ const MISTAKES: &[Mistake] = &[
         "scan --bus socketcan:vcan0",
         Refuses(100, "STOPPED"),
         4,
-        &["takes no frames", "switched off", "ip link set"],
+        &["accepts no more frames", "switched off", "ip link set"],
     ),
     Mistake(
         "scan --bus socketcan:vcan0",
         Refuses(105, "BUS-OFF"),
         4,
-        &["takes no frames", "bus-off", "500 kbit/s", "short circuit"],
+        &["accepts no more frames", "bus-off", "500 kbit/s", "short circuit"],
     ),
     Mistake(
         "scan --bus socketcan:vcan0",
         Refuses(105, "ERROR-PASSIVE"),
         4,
-        &["takes no frames", "nobody acknowledges", "power"],
+        &["accepts no more frames", "no other node acknowledges", "power"],
     ),
     // Servers.
     Mistake(
@@ -221,7 +221,7 @@ const MISTAKES: &[Mistake] = &[
         "scan --bus socketcand://{server}/can0",
         Server(b"< hi >< error unknown bus >"),
         4,
-        &["unknown bus", "knows this bus"],
+        &["unknown bus", "has this bus"],
     ),
     // The bus.
     Mistake(
@@ -234,7 +234,7 @@ const MISTAKES: &[Mistake] = &[
         "info -N 5 {quick} --bus socketcan:vcan0",
         Errors(0x20, [0; 8], "ERROR-PASSIVE"),
         5,
-        &["node 5 does not answer", "nobody acknowledges what the adapter sends", "power", "CAN-H"],
+        &["node 5 does not answer", "no other node acknowledges the adapter's frames", "power", "CAN-H"],
     ),
     Mistake(
         "info -N 5 {quick} --bus socketcan:vcan0",
@@ -246,13 +246,17 @@ const MISTAKES: &[Mistake] = &[
         "info -N 5 {quick} --bus socketcan:vcan0",
         Errors(0x04, [0, 0x10, 0, 0, 0, 0, 0, 0], "ERROR-PASSIVE"),
         5,
-        &["node 5 does not answer", "nobody acknowledges", "bit rate"],
+        &["node 5 does not answer", "no other node acknowledges", "bit rate"],
     ),
     Mistake(
         "info -N 5 {quick} --bus socketcan:vcan0",
         Errors(0x100, [0; 8], "ERROR-ACTIVE"),
         5,
-        &["what the adapter sends is acknowledged", "check that node 5 is the right one", "coflash scan"],
+        &[
+            "another node acknowledges the adapter's frames",
+            "check that node 5 is the right one",
+            "coflash scan",
+        ],
     ),
     Mistake(
         "info -N 5 {quick} --bus {bus}",
@@ -284,7 +288,7 @@ const MISTAKES: &[Mistake] = &[
         Device(|| starts(None)),
         7,
         &[
-            "node 5 does not answer since the program was started",
+            "node 5 has not answered since the program was started",
             "switch the device off and on",
             "coflash catch",
         ],
@@ -323,7 +327,7 @@ const MISTAKES: &[Mistake] = &[
         "flash -N 5 {blk} --check-target {quick} --bus {bus}",
         Device(|| Fake::new(APPLICATION)),
         6,
-        &["the program is for vendor-ID 00000000h", "nothing was changed", "belong together"],
+        &["the program is for vendor-ID 00000000h", "it was not changed", "belong together"],
     ),
     // The file.
     Mistake(

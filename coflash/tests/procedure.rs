@@ -96,8 +96,8 @@ fn the_whole_procedure_from_a_running_application() {
         [
             "calling the application back to the bootloader",
             "the bootloader is running",
-            "its dialect: block (block files, as SYS TEC has it)",
-            "telling it to erase the old program"
+            "its dialect: block (block files, SYS TEC)",
+            "commanding the device to erase the old program"
         ]
     );
     assert_eq!(words[5][..9], *"erased in");
@@ -105,8 +105,8 @@ fn the_whole_procedure_from_a_running_application() {
         words[7..],
         [
             "starting the program for a trial",
-            "the trial went well: an application (device type 00020192h) came up and came back",
-            "released for autostart (83h): the program starts by itself from now on",
+            "the trial was successful: an application (device type 00020192h) started and returned to the bootloader",
+            "released for autostart (83h): the program starts by itself after a reset",
             "starting the program",
             "running: an application (device type 00020192h)",
             report.to_string().as_str()
@@ -292,7 +292,7 @@ fn a_program_that_fails_its_trial_is_not_released() {
         (error.number(), rest, error.advice())
     };
     let (number, words, advice) = trial(&|fake| fake.starts = None);
-    assert_eq!((number, &*words), (0x6000_0014, "node 5 does not answer since the program was started"));
+    assert_eq!((number, &*words), (0x6000_0014, "node 5 has not answered since the program was started"));
     assert!(
         advice.contains("switch the device off and on") && advice.contains("coflash catch --node 5"),
         "{advice}"
@@ -712,14 +712,14 @@ fn info_in_words() {
         "\
 node 5: an application (device type 00020192h)
   device name       a device with a long name
-  hardware version  not told
+  hardware version  not reported
   software version  v1?
   vendor-ID         0000003Fh
   product code      000004D2h
-  revision          not told
-  serial number     not told
+  revision          not reported
+  serial number     not reported
   error register    00h (no error)
-  dialect           block (block files, as SYS TEC has it)
+  dialect           block (block files, SYS TEC)
   program 1
     state           running
     CRC             00000000h

@@ -270,9 +270,9 @@ fn the_device_tells_which_rule_is_broken() {
     // Each of these is what its signer has signed.
     let cases: [(usize, &[u8], Refusal); 7] = [
         (7, &[1 << 2], Refusal::Field("it has an unknown flag")),
-        (7, &[1 << 3], Refusal::Field("it has a dictionary, and is not compressed")),
-        (25, &[14], Refusal::Field("no device takes chunks of this size")),
-        (26, &[2, 0], Refusal::Field("it wants a newer bootloader")),
+        (7, &[1 << 3], Refusal::Field("it has a dictionary but is not compressed")),
+        (25, &[14], Refusal::Field("no device accepts chunks of this size")),
+        (26, &[2, 0], Refusal::Field("it needs a newer bootloader")),
         (28, &[0; 4], Refusal::Field("it is empty")),
         (
             28,
@@ -351,12 +351,12 @@ fn blocks_that_carry_no_whole_image_are_refused() {
         assert!(carried(whole[..end].to_vec()).is_err(), "{end}");
     }
     assert!(fault(&good[..count - 1]).contains("ends without its last block"));
-    assert!(fault(&[&good[..], &[vec![0]]].concat()).contains("there is more behind the last block"));
+    assert!(fault(&[&good[..], &[vec![0]]].concat()).contains("there are more bytes after the last block"));
     // A block is missing: by number, by address, and with a last block of what is left.
     let without = [&good[..2], &good[3..]].concat();
     assert!(fault(&without).contains("block 3 follows where block 2 must"));
     let renumbered = [&good[..2], &[of(2, START + 1200, 2)], &good[4..]].concat();
-    assert!(fault(&renumbered).contains("does not fit the blocks before it"));
+    assert!(fault(&renumbered).contains("does not match the blocks before it"));
     let filled = [&image[..600], &[0xFF; 600], &image[1200..]].concat();
     let gap = [&renumbered[..3], &[last(&filled)]].concat();
     let words = fault(&gap);
@@ -365,13 +365,13 @@ fn blocks_that_carry_no_whole_image_are_refused() {
     let swapped = [&good[..2], &[good[3].clone(), good[2].clone()], &good[4..]].concat();
     assert!(fault(&swapped).contains("block 3 follows where block 2 must"));
     let swapped = [&good[..2], &[of(2, START + 1200, 2), of(3, START + 600, 1)], &good[4..]].concat();
-    assert!(fault(&swapped).contains("does not lie behind the one before it"));
+    assert!(fault(&swapped).contains("does not lie after the one before it"));
     // A wrong CRC, of a block and of all.
     let mut wrong = good.clone();
     wrong[2][30] ^= 1;
     assert!(fault(&wrong).contains("CRC of block 2 is"));
     let wrong = [&good[..count - 1], &[last(&image[1..])]].concat();
-    assert!(fault(&wrong).contains("does not fit the blocks before it"));
+    assert!(fault(&wrong).contains("does not match the blocks before it"));
     // CRC-16, which is right everywhere, and which no sealed device takes.
     let crc_16 = crc::Crc::<u16>::new(&crc::CRC_16_XMODEM);
     let with_crc_16 = |mut block: Vec<u8>| {
@@ -384,12 +384,12 @@ fn blocks_that_carry_no_whole_image_are_refused() {
         block
     };
     let words = fault(&good.iter().cloned().map(with_crc_16).collect::<Vec<_>>());
-    assert!(words.contains("takes blocks with CRC-32 alone"), "{words}");
+    assert!(words.contains("accepts only blocks with CRC-32"), "{words}");
     // Erased flash in front of it or behind it is no part of it.
     let behind = [&good[..count - 1], &[last(&[&image[..], &[0xFF; 4]].concat())]].concat();
-    assert!(fault(&behind).contains("does not fit the blocks before it"));
+    assert!(fault(&behind).contains("does not match the blocks before it"));
     let front = [&good[..count - 1], &[last(&[&[0xFF; 4], &image[..]].concat())]].concat();
-    assert!(fault(&front).contains("does not fit the blocks before it"));
+    assert!(fault(&front).contains("does not match the blocks before it"));
 }
 
 #[test]
@@ -398,7 +398,7 @@ fn a_record_that_must_be_understood_and_is_not_is_refused() {
     let file = text.seal(&image(10), &release()).unwrap();
     let roots = [root().public()];
     assert!(verify(&changed(&file, 176, &[9, 0]), &device(&roots, &[])).is_ok());
-    let unknown = Refusal::Field("it has a record that must be understood and is not known");
+    let unknown = Refusal::Field("it has an unknown record that is marked as mandatory");
     assert_eq!(refusal(&changed(&file, 176, &[9, 0x80]), &device(&roots, &[])), unknown);
     // A record that is longer than the manifest.
     assert_eq!(refusal(&changed(&file, 178, &[5, 0]), &device(&roots, &[])), unknown);

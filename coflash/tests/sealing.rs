@@ -109,7 +109,7 @@ fn keys_are_made_once_and_are_those_of_openssl() {
     }
     let again = coflash(&["key", "new", "--role", "root", "-o", &root]);
     assert_eq!(again.exit, 2);
-    assert!(again.err.contains("is there already"), "{}", again.err);
+    assert!(again.err.contains("exists already"), "{}", again.err);
     assert_eq!(room.bytes("root.pem"), before);
     // The public key alone is there.
     fs::remove_file(&root).unwrap();
@@ -202,7 +202,7 @@ fn the_converter_encrypts_with_a_value() {
     let signed = [&words[..], &["--sign", &sign, "--cert", &cert, "--counter", "7"]].concat();
     let done = room.good(&[&signed[..], &["--add", "0xA5"]].concat());
     assert!(done.out.contains("app.blk: program 1 V1.10r100, counter 7, 9001 bytes"), "{}", done.out);
-    assert!(done.err.contains("--add changes nothing"), "{}", done.err);
+    assert!(done.err.contains("--add has no effect"), "{}", done.err);
     let kek = room.path("product.pem");
     room.good(&["key", "new", "--role", "kek", "--of-value", value, "-o", &kek]);
     assert!(room.verify("app.blk", &["--kek", &kek]).out.contains("the program is whole, 9001 bytes"));
@@ -382,9 +382,9 @@ fn a_program_is_sealed_shown_and_verified() {
     for (more, words, number) in [
         (&["--product", "1"][..], "it is for product code 000004D2h", "0x60000182"),
         (&["--vendor", "1"], "it is for vendor-ID 0000003Fh", "0x60000180"),
-        (&["-P", "2"], "it is program 1, and program 2 is written", "0x60000182"),
+        (&["-P", "2"], "it is for program 1, and program 2 is to be written", "0x60000182"),
         (&["--counter", "8"], "its security counter is 7", "0x6000018c"),
-        (&["--epoch", "4"], "its certificate is of epoch 3", "0x6000018c"),
+        (&["--epoch", "4"], "its certificate has epoch 3", "0x6000018c"),
         (&["--room", "9000"], "the program has 9001 bytes", "0x60000006"),
     ] {
         let done = room.verify("app.cbs", more);
@@ -398,7 +398,7 @@ fn a_program_is_sealed_shown_and_verified() {
     let done = coflash(&["verify", &file, "--root", &room.path("root.pub")]);
     assert!(done.err.contains("chunk 3 of 3") && done.err.contains("[0x6000018a]"), "{}", done.err);
     let done = coflash(&["verify", &room.path("app.cbs"), "--root", &room.path("release.pub")]);
-    assert!(done.err.contains("is none of the roots given [0x6000018e]"), "{}", done.err);
+    assert!(done.err.contains("is not one of the given roots [0x6000018e]"), "{}", done.err);
     for (name, bytes) in [("empty.cbs", &b""[..]), ("cut.cbs", &first[..600]), ("magic.cbs", b"CBS1")] {
         let file = room.0.file(name, bytes);
         for words in
@@ -445,9 +445,9 @@ fn encrypted_and_compressed_programs_come_out_again() {
     assert!(room.verify("app.cbs", &[]).out.contains("give --base"));
     assert!(room.verify("app.cbs", &["--base", &old]).out.contains("is whole"));
     let done = room.verify("app.cbs", &["--base", &room.path("app.hex")]);
-    assert!(done.err.contains("another program than the one given"), "{}", done.err);
+    assert!(done.err.contains("is not the given program"), "{}", done.err);
     let done = room.verify("app.cbs", &["--device", "000102030405060708090a0b"]);
-    assert!(done.err.contains("another unique ID alone"), "{}", done.err);
+    assert!(done.err.contains("another unique ID"), "{}", done.err);
     assert_eq!(room.verify("app.cbs", &["--hardware", "2"]).exit, 3);
 
     // For tests.
@@ -464,7 +464,7 @@ fn what_cannot_be_sealed_is_refused_with_what_to_do() {
     for (more, exit, words) in [
         (&["--counter", "1", "--vendor", "1"][..], 3, "the certificate allows the vendor-ID 0000003Fh"),
         (&["--counter", "1", "--encrypt", &kek, "--encrypt", &kek], 3, "encrypted twice"),
-        (&["--counter", "1", "--encrypt", &room.path("root.pub")], 3, "it is no key-encryption key"),
+        (&["--counter", "1", "--encrypt", &room.path("root.pub")], 3, "it is not a key-encryption key"),
         (&["--counter", "1", "--chunk", "1000"], 2, "a power of two from 512 to 8192"),
         (&["--counter", "1", "--device", "00"], 2, "24 hexadecimal digits"),
         (&["--counter", "1", "-P", "2"], 2, "has no program 2"),
@@ -510,7 +510,7 @@ fn a_module_signs_in_two_steps() {
     let wrong = room.0.file("wrong.sig", &[0; 64]);
     let done = coflash(&["seal", &out, "--key", &key, "--attach", &wrong]);
     assert_eq!(done.exit, 3);
-    assert!(done.err.contains("this is no signature of the key"), "{}", done.err);
+    assert!(done.err.contains("this is not a signature of the key"), "{}", done.err);
     let short = room.0.file("short.sig", &[0; 63]);
     assert!(coflash(&["seal", &out, "--key", &key, "--attach", &short]).err.contains("64 bytes"));
 
@@ -590,10 +590,10 @@ fn a_bootloader_gets_its_keys() {
         assert_eq!(fs::metadata(&out).unwrap().permissions().mode() & 0o777, 0o600);
     }
     for (more, exit, words) in [
-        (&["-o", &out][..], 2, "is there already"),
+        (&["-o", &out][..], 2, "exists already"),
         (&["-o", &room.path("x.elf")], 2, "name the file with .hex or .bin"),
-        (&["-o", &room.path("x.hex"), "--root", &root], 2, "the same key twice"),
-        (&["-o", &room.path("x.hex"), "--kek", &kek], 2, "the same key twice"),
+        (&["-o", &room.path("x.hex"), "--root", &root], 2, "a key was given twice"),
+        (&["-o", &room.path("x.hex"), "--kek", &kek], 2, "a key was given twice"),
     ] {
         let done = coflash(
             &[&["provision", &boot, "--board", "stm32f407g-disc1", "--root", &root, "--kek", &kek], more]
@@ -613,12 +613,12 @@ fn a_bootloader_gets_its_keys() {
         &room.path("y.hex"),
     ]);
     assert_eq!(again.exit, 3);
-    assert!(again.err.contains("where the keys go"), "{}", again.err);
+    assert!(again.err.contains("the place of the keys"), "{}", again.err);
     // To any other file keys would mean nothing.
     let other = room.0.file("other.bin", &self::bootloader(b"CBS2"));
     let out = room.path("none.hex");
     let done = coflash(&[&["provision", &other][..], &words_of(&root), &["-o", &out]].concat());
-    assert!(done.exit == 3 && done.err.contains("knows sealed images"), "{}", done.err);
+    assert!(done.exit == 3 && done.err.contains("support for sealed images"), "{}", done.err);
     assert!(!Path::new(&out).exists());
     let done = coflash(&["provision", &boot, "--root", &root]);
     assert!(done.exit == 2 && done.err.contains("give --board or --layout"), "{}", done.err);
@@ -680,7 +680,7 @@ fn a_sealed_image_goes_into_a_device_as_it_is() {
     assert!(other.0.err.contains("product code"), "{}", other.0.err);
     assert_eq!((other.0.exit, other.2.len()), (6, 0));
     let second = coflash(&["flash", &file, "-P", "2"]);
-    assert!(second.err.contains("it is program 1, and program 2 is written"), "{}", second.err);
+    assert!(second.err.contains("it is for program 1, and program 2 is to be written"), "{}", second.err);
     assert_eq!(second.exit, 3);
     let cut = room.0.file("cut.cbs", &bytes[..bytes.len() - 1]);
     let cut = coflash(&["flash", &cut]);
@@ -804,11 +804,11 @@ fn a_sealed_image_goes_into_a_device_block_by_block() {
     // A device that does not tell where its program starts, and one that takes no blocks.
     let untold = Told::sealed(program).but(((0x2004, 1), Vec::new()));
     let (done, fake) = on(BOOTLOADER, untold, &["flash", &file, "--blocks"]);
-    assert!(done.exit == 6 && done.err.contains("where its program starts (2004h)"), "{}", done.err);
+    assert!(done.exit == 6 && done.err.contains("the start of its program (2004h)"), "{}", done.err);
     assert!(fake.writes().is_empty(), "{:?}", fake.writes());
     let words = ["flash", &file, "--blocks", "--dialect", "raw"];
     let (done, fake) = on(BOOTLOADER, Told::sealed(program), &words);
-    assert!(done.exit == 2 && done.err.contains("and not in blocks"), "{}", done.err);
+    assert!(done.exit == 2 && done.err.contains("not in blocks"), "{}", done.err);
     assert!(fake.writes().is_empty(), "{:?}", fake.writes());
 }
 
@@ -825,7 +825,7 @@ fn a_device_without_keys_gets_no_sealed_image() {
         "{}",
         done.err
     );
-    assert!(done.err.contains("nothing was changed in it"), "{}", done.err);
+    assert!(done.err.contains("it was not changed"), "{}", done.err);
     assert!(fake.writes().is_empty(), "{:?}", fake.writes());
     // An application does not say it; the bootloader does, before anything is erased.
     let (done, fake) = on(APPLICATION, open(), &["flash", &file]);
@@ -846,7 +846,7 @@ fn a_device_is_compared_with_a_sealed_image() {
     let (done, fake) = compared(BOOTLOADER, Told::sealed(&program).but(revision.clone()), &[]);
     assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
     assert!(done.out.contains("node 5: holds program 1 of"), "{}", done.out);
-    assert!(done.out.contains("and does not run it") && !done.out.contains("not told"), "{}", done.out);
+    assert!(done.out.contains("and does not run it") && !done.out.contains("not reported"), "{}", done.out);
     assert!(fake.writes().is_empty());
 
     // In an application some of it is not told, and that is said.
@@ -871,7 +871,7 @@ fn a_device_is_compared_with_a_sealed_image() {
         (number(0x2005, 1, 0), "version of the program (2005h): the file has V1.10r100, the device V0.0r0"),
         (other_chip, "unique ID (2002h/1): the file has 00112233445566778899aabb, the device 010101"),
         (challenge(0x7FFF_FFFF), "the device is not sealed"),
-        (((0x2002, 1), Vec::new()), "knows no sealed images"),
+        (((0x2002, 1), Vec::new()), "without support for sealed images"),
         (
             event(2, [8, 0x1_0001, 6, 0x0064_0A01]),
             "security counter of the last installation (2003h): the file has 7, the device 6",
@@ -885,7 +885,7 @@ fn a_device_is_compared_with_a_sealed_image() {
         assert_eq!(done.exit, 3, "{words}: {}", done.out);
         assert!(done.out.contains(words), "{words}: {}", done.out);
         assert_eq!(done.out.matches("  differs ").count(), 1, "{}", done.out);
-        assert!(done.err.contains("node 5 differs from the file in one thing"), "{}", done.err);
+        assert!(done.err.contains("node 5 differs from the file in one property"), "{}", done.err);
     }
     let two = Told::sealed(&program).but(number(0x1018, 3, 1)).but(number(0x1F56, 1, 1)).but(challenge(0));
     let (done, _) = compared(BOOTLOADER, two, &["--json"]);
@@ -899,12 +899,12 @@ fn a_device_is_compared_with_a_sealed_image() {
     let forgotten = Told::sealed(&program).but(revision.clone()).but(event(2, [0; 4]));
     let forgotten = forgotten.but(event(3, [7, 0x1_0002, 1, 1]));
     let (done, _) = compared(BOOTLOADER, forgotten, &[]);
-    assert!(done.exit == 0 && done.out.contains("not told     2003h/1"), "{}{}", done.out, done.err);
+    assert!(done.exit == 0 && done.out.contains("not reported 2003h/1"), "{}{}", done.out, done.err);
 
     // A bad file is refused before a device is asked, a device that is not there has its own code.
     let other = room.path("release.pub");
     let done = coflash(&["verify-device", &file, "--root", &other, "--bus", "socketcand://127.0.0.1:1/can0"]);
-    assert!(done.exit == 3 && done.err.contains("is none of the roots given"), "{}", done.err);
+    assert!(done.exit == 3 && done.err.contains("is not one of the given roots"), "{}", done.err);
     let mut fake = Fake::new(BOOTLOADER);
     fake.running = None;
     let (bus, server) = serve(fake);

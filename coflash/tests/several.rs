@@ -42,7 +42,7 @@ fn a_list_of_nodes_is_updated_and_a_failure_stops_no_other() {
         "node 10: 100 %\n",
         "node 10: running: an application",
         "\nnode 9: error: writing block 0 failed: this part of the flash is protected (1F57h reads 0Eh) [0x60000007]\n  \
-         the device: its bootloader is running; there is no complete program in it\n",
+         the device: its bootloader is running; it contains no complete program\n",
         "\n2 of 3 devices are done\n",
     ] {
         assert!(done.out.contains(words), "{words} is not in\n{}", done.out);
@@ -87,7 +87,7 @@ fn a_job_file_says_who_gets_what() {
     fs::write(&small, b":020000040801F1\n:050000000102030405EC\n:00000001FF\n").unwrap();
     let done = coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--job", &job]);
     assert!(
-        done.exit == 3 && done.err.contains("small.hex: is no program: it does not begin"),
+        done.exit == 3 && done.err.contains("small.hex: is not a program: it does not begin"),
         "{}",
         done.err
     );
@@ -221,11 +221,14 @@ fn a_silent_device_is_diagnosed_by_what_the_bus_says() {
     };
     for (frames, words) in [
         (&[][..], "nothing at all is heard on the bus"),
-        (&[(0x705, &[5][..])], "node 5 is heard (heartbeat, operational) but does not answer"),
-        (&[(0x705, &[4])], "has been stopped, so that it serves no SDO: coflash reset --node 5"),
-        (&[(0x185, &[1])], "node 5 is heard but does not answer"),
+        (&[(0x705, &[5][..])], "node 5 sends heartbeats (operational) but does not answer"),
+        (
+            &[(0x705, &[4])],
+            "sends heartbeats in state stopped, in which SDO does not work: coflash reset --node 5",
+        ),
+        (&[(0x185, &[1])], "node 5 sends frames but does not answer"),
         (&[(0x703, &[5]), (0x187, &[])], "the bus works, and nodes 3, 7 are heard"),
-        (&[(0x7FF, &[])], "no CANopen node is heard"),
+        (&[(0x7FF, &[])], "no CANopen node sends frames"),
     ] {
         let said = advice(frames);
         assert!(said.contains(words), "{said}\n not {words}");
@@ -285,8 +288,8 @@ fn an_interruption_aborts_the_transfer_and_tells_how_the_device_is_left() {
     assert_eq!(done.status.code(), Some(130), "{err}");
     assert_eq!(
         err,
-        "error: cancelled [0x60000011]\n  the device: its bootloader is running; there is no complete program in it\n  \
-         what to do: run the same command again when you like\n"
+        "error: cancelled [0x60000011]\n  the device: its bootloader is running; it contains no complete program\n  \
+         what to do: run the same command again to continue\n"
     );
     let mut fake = server.join().unwrap();
     assert!(

@@ -379,7 +379,7 @@ fn a_sealed_image_shows_what_it_says_or_is_refused_with_what_to_do() {
     let other = ui.post("settings", &json!({ "board": null, "program": 2 }));
     assert_eq!(other.status, 422, "{}", other.body);
     let other = other.json();
-    assert_eq!(other["words"], "app.cbs: it is program 1, and program 2 is written");
+    assert_eq!(other["words"], "app.cbs: it is for program 1, and program 2 is to be written");
     assert!(other["advice"].as_str().unwrap().contains("seal the program for it"), "{other}");
     ui.until("no file", |state| state["firmware"].is_null());
     assert_eq!(ui.post("settings", &json!({ "board": null, "program": 1 })).status, 200);

@@ -70,15 +70,20 @@ const READ: [&str; 7] = ["read", "1000", "-N", "5", "--sdo-timeout", "200", "--s
 
 /// Bus, lie, exit code, and what the words must have.
 const LIES: [(&str, &str, i32, &[&str]); 26] = [
-    ("peak:PCAN_USBBUS2@500k", "", 4, &["it is not there (PCAN_ERROR_ILLHW)", "coflash adapters lists"]),
+    ("peak:PCAN_USBBUS2@500k", "", 4, &["it does not exist (PCAN_ERROR_ILLHW)", "coflash adapters lists"]),
     ("peak:PCAN_USBBUS1@500k", "in use", 4, &["another program uses it", "close the other program"]),
     ("peak:PCAN_USBBUS1@500k", "garbage", 4, &["status FFFFFFFFh", "plug it in"]),
     ("peak:PCAN_USBBUS1@500k", "hang", 4, &["has not come back for 5 s"]),
-    ("peak:PCAN_USBBUS1@500k", "length", 4, &["tells of a frame of 200 bytes"]),
+    ("peak:PCAN_USBBUS1@500k", "length", 4, &["reports a frame of 200 bytes"]),
     ("peak:PCAN_USBBUS1@500k", "flood", 5, &["node 5 does not answer", "the bus works"]),
     ("peak:PCAN_USBBUS1@500k", "lost", 4, &["is gone", "PCAN_ERROR_ILLHW"]),
     ("peak:PCAN_USBBUS1@500k", "garbage status", 5, &["node 5 does not answer"]),
-    ("peak:PCAN_USBBUS1@500k", "no acknowledge", 5, &["nobody acknowledges what the adapter sends", "power"]),
+    (
+        "peak:PCAN_USBBUS1@500k",
+        "no acknowledge",
+        5,
+        &["no other node acknowledges the adapter's frames", "power"],
+    ),
     ("peak:PCAN_USBBUS1@500k", "disturbed", 5, &["disturbed (50 bit", "the adapter has 500 kbit/s"]),
     ("peak:PCAN_USBBUS1@500k", "bus-off", 5, &["the adapter is bus-off", "short circuit"]),
     ("peak:PCAN_USBBUS1@500k", "passive", 5, &["error passive", "terminators"]),
@@ -86,20 +91,20 @@ const LIES: [(&str, &str, i32, &[&str]); 26] = [
         "peak:PCAN_USBBUS1@500k",
         "silent",
         5,
-        &["what the adapter sends is acknowledged", "coflash catch", "strap"],
+        &["another node acknowledges the adapter's frames", "coflash catch", "strap"],
     ),
     ("peak:PCAN_USBBUS1", "", 2, &["it needs the bit rate of the bus", "peak:PCAN_USBBUS1@125k"]),
-    ("kvaser:1@500k", "", 4, &["it is not there (canERR_NOTFOUND)", "coflash adapters lists"]),
+    ("kvaser:1@500k", "", 4, &["it does not exist (canERR_NOTFOUND)", "coflash adapters lists"]),
     ("kvaser:0@250k", "", 4, &["status -1"]),
     ("kvaser:0@500k", "in use", 4, &["another program uses it", "close the other program"]),
     ("kvaser:0@500k", "hang", 4, &["has not come back for 5 s"]),
-    ("kvaser:0@500k", "length", 4, &["tells of a frame of 4000000000 bytes"]),
+    ("kvaser:0@500k", "length", 4, &["reports a frame of 4000000000 bytes"]),
     ("kvaser:0@500k", "lost", 4, &["is gone", "was unplugged"]),
     ("kvaser:0@500k", "garbage status", 4, &["status -123456"]),
     ("kvaser:0@500k", "bus-off", 5, &["the adapter is bus-off"]),
     // The counter of sending stays at 128.
-    ("kvaser:0@500k", "passive", 5, &["nobody acknowledges what the adapter sends"]),
-    ("kvaser:0@500k", "silent", 5, &["what the adapter sends is acknowledged"]),
+    ("kvaser:0@500k", "passive", 5, &["no other node acknowledges the adapter's frames"]),
+    ("kvaser:0@500k", "silent", 5, &["another node acknowledges the adapter's frames"]),
     ("kvaser:0", "", 2, &["it needs the bit rate of the bus"]),
     ("kvaser:9@500k", "", 4, &["canERR_NOTFOUND"]),
 ];
@@ -123,13 +128,13 @@ fn a_library_that_lies_is_named_and_stops_nothing() {
             });
         }
     });
-    // One that takes no frames any more.
+    // One that accepts no more frames.
     for (folder, bus) in [(&peak, "peak:PCAN_USBBUS1@500k"), (&kvaser, "kvaser:0@500k")] {
         let patient = ["read", "1000", "-N", "5", "--sdo-timeout", "20000"];
         let done = call(folder, "full", &[&["--bus", bus][..], &patient].concat());
         assert_eq!(done.exit, 4, "{}", done.err);
         assert!(
-            done.err.contains("takes no frames any more") && done.err.contains("0x60000305"),
+            done.err.contains("accepts no more frames") && done.err.contains("0x60000305"),
             "{}",
             done.err
         );
@@ -193,8 +198,8 @@ fn adapters_are_listed_and_the_only_one_is_taken() {
     }
     // Virtual channels lead nowhere: the other one is the only one. Said on standard error.
     for (folder, words) in [
-        (&peak, "no --bus is given: taking the only adapter, peak:PCAN_USBBUS1 (PCAN-USB\u{FFFD}[2J)"),
-        (&kvaser, "no --bus is given: taking the only adapter, kvaser:0 (Kvaser Leaf Light v2)"),
+        (&peak, "no --bus is given: using the only adapter, peak:PCAN_USBBUS1 (PCAN-USB\u{FFFD}[2J)"),
+        (&kvaser, "no --bus is given: using the only adapter, kvaser:0 (Kvaser Leaf Light v2)"),
     ] {
         // -B 2 of the manual: 500 kbit/s.
         let done = flash(folder, &[], &["-B", "2"]);
@@ -202,13 +207,12 @@ fn adapters_are_listed_and_the_only_one_is_taken() {
     }
     let done = call(&peak, "two", &["scan"]);
     assert_eq!(done.exit, 2, "{}", done.err);
-    for words in
-        ["several adapters are there", "peak:PCAN_USBBUS1", "peak:PCAN_USBBUS2", "give one of them by --bus"]
+    for words in ["several adapters", "peak:PCAN_USBBUS1", "peak:PCAN_USBBUS2", "give one of them with --bus"]
     {
         assert!(done.err.contains(words), "{}", done.err);
     }
     let nowhere = run(command(&peak, "", &["scan"])
         .env("LD_LIBRARY_PATH", Path::new("/nowhere"))
         .env("COFLASH_SEARCH", "none"));
-    assert!(nowhere.exit == 2 && nowhere.err.contains("no adapter is found"), "{}", nowhere.err);
+    assert!(nowhere.exit == 2 && nowhere.err.contains("no adapter was found"), "{}", nowhere.err);
 }

@@ -1,22 +1,22 @@
-//! A board's memory map from a file, for boards that the tool was not built with.
+//! Reads a board's memory map from a file, for boards that the tool was not built with.
 //!
-//! `cargo xtask layout --toml` writes such a file. It is held to the rules that the layouts of this
-//! repository are held to when they are compiled.
+//! `cargo xtask layout --toml` writes such a file. It must meet the same rules as the compiled
+//! layouts of this repository.
 
 use serde::Deserialize;
 use shared_abi::geometry::{self, Geometry, Line, SectorRun};
 use shared_abi::layout::Layout;
 
-/// The most bytes that such a file may have.
+/// The most bytes of such a file.
 pub const MAX: usize = 64 * 1024;
 
 /// What is wrong with a memory map.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum BoardError {
-    /// It is no TOML, or has not what a memory map has, in this line.
+    /// The file is not TOML, or an entry is missing or invalid; with the number of the line.
     #[error("line {0}: {1}")]
     Syntax(usize, String),
-    /// It breaks this rule.
+    /// The memory map breaks this rule.
     #[error("{0}")]
     Rule(&'static str),
 }
@@ -68,8 +68,7 @@ struct Sectors {
     size: u32,
 }
 
-/// Takes a memory map apart and checks it. What it gives stays for as long as the program runs.
-///
+/// Parses and checks a memory map. The result lives as long as the program.
 /// # Errors
 /// [`BoardError`]: the line that cannot be read, or the rule that is broken.
 pub fn parse(text: &str) -> Result<&'static Layout, BoardError> {
@@ -80,7 +79,8 @@ pub fn parse(text: &str) -> Result<&'static Layout, BoardError> {
     let runs: Vec<SectorRun> =
         file.chip.sectors.iter().map(|run| SectorRun { count: run.count, size: run.size }).collect();
     let programs: Vec<geometry::Region> = file.programs.into_iter().map(Into::into).collect();
-    // A layout refers to what is there for ever; a command has one board, of some hundred bytes.
+    // A layout refers to static data. A command loads one board of some hundred bytes, so the leak
+    // is harmless.
     let chip = name(file.chip.name)?;
     let line = Line::of(chip).ok_or(BoardError::Rule(
         "the chip's name begins with that of no STM32F4 with a CAN controller of the kind bxCAN",
@@ -111,7 +111,7 @@ pub fn parse(text: &str) -> Result<&'static Layout, BoardError> {
     Ok(Box::leak(Box::new(layout)))
 }
 
-/// A name that can be shown.
+/// Checks that a name is printable.
 fn name(text: String) -> Result<&'static str, BoardError> {
     let good = (1..=64).contains(&text.len()) && text.bytes().all(|byte| byte.is_ascii_graphic());
     if good {

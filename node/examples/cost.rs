@@ -1,8 +1,8 @@
-//! What a frame costs the host: an update through a socketcand bus on this machine, into a node
-//! whose flash takes no time.
+//! The cost of a frame for the host: an update through a socketcand bus on this computer, into a
+//! node with a flash that takes no time.
 //!
-//! `cargo xtask bench` runs it. Nothing waits for a wire here, so the rate says how fast tool,
-//! system and node are together; the time on the processor is the tool's own.
+//! `cargo xtask bench` runs it. Nothing waits for a wire, so the rate shows the speed of tool,
+//! system and node together; the processor time is that of the tool alone.
 
 use std::error::Error;
 use std::io::{BufRead, BufReader};
@@ -23,7 +23,7 @@ use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 const SIZES: [u32; 2] = [256, 900];
 const TRANSFERS: [(Transfers, &str); 2] = [(Transfers::Blocks, "blocks"), (Transfers::Segments, "segments")];
 
-/// The bus, and what goes over it.
+/// The bus, with counters of its frames.
 struct Counted {
     bus: Box<dyn Adapter>,
     frames: u64,
@@ -46,7 +46,7 @@ impl Adapter for Counted {
     }
 }
 
-/// A node of its own process; ended when it is dropped.
+/// A node in its own process, which ends when this value is dropped.
 struct Node {
     child: Child,
     folder: PathBuf,
@@ -57,7 +57,7 @@ impl Node {
     fn start() -> Result<Self, Box<dyn Error>> {
         let folder = env::temp_dir().join(format!("coboot-cost-{}", std::process::id()));
         fs::create_dir_all(&folder)?;
-        // Examples lie in a folder beside the programs.
+        // Examples are in a folder beside the programs.
         let program = env::current_exe()?;
         let programs =
             program.parent().and_then(|folder| folder.parent()).ok_or("no folder above this one")?;
@@ -79,7 +79,7 @@ impl Node {
 
 impl Drop for Node {
     fn drop(&mut self) {
-        // It may have ended by itself, and its folder is for nobody else.
+        // The node may have ended already; no other program uses its folder.
         let _ = self.child.kill();
         let _ = self.child.wait();
         let _ = fs::remove_dir_all(&self.folder);
@@ -90,7 +90,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let json = match env::args().nth(1).as_deref() {
         None => false,
         Some("--json") => true,
-        Some(other) => return Err(format!("{other:?} is no option; there is --json").into()),
+        Some(other) => return Err(format!("{other:?} is not an option; the only option is --json").into()),
     };
     if !json {
         println!("An update over socketcand on this machine, into a node whose flash takes no time.\n");
@@ -100,7 +100,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     for (transfers, name) in TRANSFERS {
         for kib in SIZES {
             let file = program(kib)?;
-            // Each gets a new one: the first update of a node has nothing to erase.
+            // A new node for each run: the first update of a node has nothing to erase.
             let node = Node::start()?;
             let mut bus = Counted { bus: bus::open(&node.url)?, frames: 0 };
             let mut session = Session::new(&mut bus, NodeId::new(1).ok_or("no node-ID")?, Timing::default());
@@ -135,14 +135,14 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// What this thread, the only one at work, has had of the processor; `None` where the system does
-/// not tell.
+/// The processor time of this thread, the only one that works; `None` if the system does not report
+/// it.
 fn processor_time() -> Option<Duration> {
     let text = fs::read_to_string("/proc/thread-self/schedstat").ok()?;
     text.split_ascii_whitespace().next()?.parse().ok().map(Duration::from_nanos)
 }
 
-/// Bytes as in a program, with vectors that a bootloader takes for some.
+/// A program's bytes, with vectors that a bootloader accepts.
 fn program(kib: u32) -> Result<BlockFile, Box<dyn Error>> {
     let region = LAYOUT.programs[0];
     let mut bytes: Vec<u8> =

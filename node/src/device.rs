@@ -1,8 +1,8 @@
-//! A device: what the firmware's boot stage and tasks do around `boot-core`, without a chip.
+//! A device: the firmware's boot stage and tasks around `boot-core`, without a chip.
 //!
-//! A START leaves a request and resets, as on the chip, and so does whatever else ends the
-//! bootloader; the boot decision is made anew. Where it falls on a program there is no CPU to run
-//! it: the device is silent from then on, or a [stand-in](crate::stand_in) answers.
+//! A START leaves a request and resets the device, as on the chip, and so does everything else that
+//! ends the bootloader; the boot decision is then made again. If it selects a program, no CPU can
+//! run it: the device is silent from then on, or a [stand-in](crate::stand_in) answers.
 
 use std::io;
 use std::time::Duration;
@@ -25,14 +25,14 @@ use crate::file_flash::FileFlash;
 use crate::stand_in::StandIn;
 use crate::supports;
 
-/// Bytes of blocks that may wait for the flash, as in the firmware for the STM32F407.
+/// The bytes of blocks that may wait for the flash, as in the firmware for the STM32F407.
 pub const BUFFER: usize = 80 * 1024;
-/// How long a device stays after the answer to its leaving, in ms: clients want to see the answer
-/// before anything else happens.
+/// How long a device waits after the answer to the command that makes it leave, in ms: clients must
+/// get the answer before anything else happens.
 const ANSWER_TO_RESET_MS: u32 = 20;
 /// The file is never older than this while the flash changes.
 const SAVE_AFTER: Duration = Duration::from_millis(250);
-/// What the device does after a reset: the firmware's policy. Nothing here can crash.
+/// The firmware's policy for the boot decision. Nothing can crash here.
 const POLICY: Policy = Policy {
     autostart: Some(1),
     max_crash_resets: 3,
@@ -41,44 +41,44 @@ const POLICY: Policy = Policy {
     rescue_window_confirmed_ms: 0,
     start_allowed: |_| true,
 };
-/// Stands for no node-ID (CiA 305).
+/// The value for "no node-ID" (CiA 305).
 const NO_NODE_ID: u8 = 255;
 
-/// What does not change in a device's life.
+/// The constant properties of a device.
 #[derive(Clone, Copy, Debug)]
 pub struct Setup {
     /// The bootloader.
     pub config: &'static bootloader::Config,
-    /// The object dictionary of the stand-in; `None` for a program that is silent.
+    /// The object dictionary of the stand-in; `None` for a silent program.
     pub stand_in: Option<&'static [Entry]>,
     /// 1018h/4.
     pub serial_number: u32,
-    /// Node-ID and bit rate until others are stored.
+    /// Node-ID and bit rate until other values are stored.
     pub node: NodeParameters,
-    /// The entry strap is set: the device stays in the bootloader whatever program there is.
+    /// The entry strap is set: the device stays in the bootloader, also with a program.
     pub strap: bool,
 }
 
-/// What came of a reset, or of the bus.
+/// The result of a reset, or an event of the bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Event {
     /// The bootloader runs.
     Bootloader {
-        /// `None` while the device waits for one.
+        /// The active node-ID; `None` while the device waits for one.
         node: Option<NodeId>,
-        /// Why.
+        /// The reason.
         reason: StayReason,
     },
     /// A program would run.
     Program {
         /// Its number.
         number: u8,
-        /// Started without a signature, for once.
+        /// It is started once, without a release.
         trial: bool,
-        /// The node-ID that it would have.
+        /// Its node-ID.
         node: Option<NodeId>,
     },
-    /// What runs has taken over another node-ID, which layer setting services gave it.
+    /// The running program or bootloader has a new node-ID from layer setting services.
     NodeId(NodeId),
 }
 
@@ -93,33 +93,33 @@ enum Phase<'b, const PROGRAMS: usize> {
     Bootloader(Box<Running<Bootloader<'b, FileFlash, Journal, PROGRAMS>>>),
     StandIn(Box<Running<StandIn>>, &'b mut [u8]),
     Silent(Idle<'b>),
-    /// Only while one takes the place of the other.
+    /// Only during the change from one to the other.
     None,
 }
 
-/// What the bootloader will need again.
+/// The parts that the next bootloader needs.
 struct Idle<'b> {
     flash: FileFlash,
     buffer: &'b mut [u8],
 }
 
-/// A program on the bus.
+/// A program or a bootloader on the bus.
 struct Running<D> {
     device: D,
     slave: Slave,
-    /// The node-ID that was told last.
+    /// The node-ID that was reported last.
     told: Option<NodeId>,
-    /// The way out of the bootloader.
+    /// The reset that ends the bootloader.
     pending_reset: Option<PendingReset>,
-    /// What was asked of the program, and left to be answered by the bootloader.
+    /// A request to the program that the bootloader must answer.
     owed: Option<Frame>,
 }
 
-/// The device is about to reset.
+/// A reset that is due.
 #[derive(Clone, Copy)]
 struct PendingReset {
     request: Option<BootRequest>,
-    /// When; set once the answer is on the bus.
+    /// Its time; set after the answer is on the bus.
     at: Option<Instant>,
 }
 
@@ -132,7 +132,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         (device, event)
     }
 
-    /// Takes a frame of the bus, whatever it is.
+    /// Processes any frame of the bus.
     pub fn handle(&mut self, frame: &Frame, now: Instant) {
         match &mut self.phase {
             Phase::Bootloader(running) => running.handle(frame, now),
@@ -141,10 +141,11 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         }
     }
 
-    /// Carries everything on: a bounded piece of work on the flash, frames to send, a reset.
-    /// Whether there is more to do at once.
+    /// Continues all work: one bounded step on the flash, frames to send, a reset. Returns whether
+    /// there is more to do at once.
     ///
     /// # Errors
+    /// The file cannot be written.
     /// The file cannot be written.
     pub fn work(
         &mut self,
@@ -158,7 +159,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
             Phase::Bootloader(running) => {
                 running.device.set_time(now);
                 more = running.device.step() == Step::Again;
-                // What is finished is in the file before anybody is told of it.
+                // Finished work is in the file before it is reported.
                 let finished = !running.device.busy();
                 let flash = running.device.flash();
                 if finished && flash.is_urgent() || flash.unsaved().is_some_and(|since| since >= SAVE_AFTER) {
@@ -197,7 +198,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         Ok(more)
     }
 
-    /// The boot stage: bootloader or program.
+    /// The boot stage: selects bootloader or program.
     fn reset(&mut self, idle: Idle<'b>, request: Option<BootRequest>) -> Event {
         let Setup { config, stand_in, serial_number, node, strap } = self.setup;
         let Idle { flash, buffer } = idle;
@@ -212,7 +213,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         let verified = |number| verify(&flash, &journal, config.layout, config.download.crc, number);
         let decision = decide(&circumstances, &POLICY, verified);
         match decision {
-            // A program that is held back: the policy has no rescue window.
+            // A program that is delayed cannot occur: the policy has no rescue window.
             BootDecision::Stay(_) | BootDecision::Hold { .. } => {
                 let reason =
                     if let BootDecision::Stay(reason) = decision { reason } else { StayReason::Rescue };
@@ -268,7 +269,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
     }
 }
 
-/// What was asked of the program, as the bootloader serves it behind its boot-up.
+/// The request to the program, which the bootloader carries out after its boot-up message.
 fn asked(owed: Owed) -> Option<Frame> {
     let Owed { program, value, node_id } = owed;
     let request = [0x2F, 0x51, 0x1F, program, value, 0, 0, 0];
@@ -294,7 +295,7 @@ impl<D: SlaveDevice> Running<D> {
     }
 
     fn handle(&mut self, frame: &Frame, now: Instant) {
-        // Who is about to reset takes nothing on.
+        // A device that is about to reset accepts nothing.
         if self.pending_reset.is_some_and(|pending_reset| pending_reset.at.is_some()) {
             return;
         }
@@ -303,7 +304,7 @@ impl<D: SlaveDevice> Running<D> {
         }
     }
 
-    /// Tells a node-ID that came over the bus.
+    /// Reports a node-ID that was set over the bus.
     fn tell_node_id(&mut self, tell: &mut impl FnMut(Event)) {
         let id = self.slave.node().map(Node::id);
         if let Some(id) = id.filter(|_| id != self.told) {
@@ -312,7 +313,7 @@ impl<D: SlaveDevice> Running<D> {
         }
     }
 
-    /// Sends what there is to send. The request with which the device resets, once it is time.
+    /// Sends the waiting frames. Returns the request for the reset, when it is due.
     fn exchange(
         &mut self,
         now: Instant,
@@ -324,7 +325,7 @@ impl<D: SlaveDevice> Running<D> {
         }
         self.send(now, send);
         if let Some(asked) = self.owed.take() {
-            // Behind the boot-up.
+            // After the boot-up message.
             self.handle(&asked, now);
             self.send(now, send);
         }
@@ -346,7 +347,7 @@ impl<D: SlaveDevice> Running<D> {
     }
 }
 
-/// A program, which leaves as the application template does.
+/// A program that leaves like the application template.
 impl Running<StandIn> {
     fn handle_in_program(&mut self, frame: &Frame, now: Instant) {
         if self.device.control.proceed(false, now.as_millis()) != Next::Serve {
@@ -359,7 +360,7 @@ impl Running<StandIn> {
         self.device.leave_owed(&mut self.slave);
     }
 
-    /// Leaves if it is time, with this request, or sends what there is to send.
+    /// Leaves with this request if it is time; otherwise sends the waiting frames.
     fn leave_or_exchange(&mut self, now: Instant, send: &mut impl FnMut(Frame)) -> Option<BootRequest> {
         let quiet = self.slave.is_idle();
         match self.device.control.proceed(quiet, now.as_millis()) {

@@ -14,12 +14,12 @@ use boot_core::flash::{Flash, FlashFault, Operation};
 use shared_abi::geometry::{Geometry, Region, Sector};
 use shared_abi::layout::Layout;
 
-/// How long operations take.
+/// The duration of operations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Speed {
     /// No time.
     Instant,
-    /// What the datasheet of the STM32F405/407 gives as typical.
+    /// The typical times in the datasheet of the STM32F405/407.
     Typical,
 }
 
@@ -32,8 +32,8 @@ const ERASE: [(u32, Duration); 3] = [
 ];
 /// Typical time to program a word (the same table).
 const PROGRAM: Duration = Duration::from_micros(16);
-/// A host cannot wait for microseconds: words are programmed ahead of time after a wait, by no more
-/// than this.
+/// A host cannot wait for microseconds: words are programmed ahead of time after a wait, by at most
+/// this time.
 const CATCH_UP: Duration = Duration::from_millis(5);
 
 /// A flash in a file.
@@ -44,18 +44,18 @@ pub struct FileFlash {
     cells: Vec<u8>,
     speed: Speed,
     busy_until: Instant,
-    /// The file is older than the flash, since then.
+    /// The time since the file is older than the flash.
     unsaved: Option<Instant>,
-    /// Parameters are among what changed.
+    /// The changes include parameters.
     urgent: bool,
 }
 
 impl FileFlash {
-    /// Takes the contents from the file. Where there is none, the flash is erased, and the file is
-    /// made.
+    /// Loads the contents from the file. If the file does not exist, the flash is erased, and the
+    /// file is created.
     ///
     /// # Errors
-    /// It cannot be read or made, or is no image of this chip's flash.
+    /// The file cannot be read or created, or is not an image of this chip's flash.
     pub fn open(path: &Path, layout: &'static Layout, speed: Speed) -> io::Result<Self> {
         let chip = layout.chip;
         let size = chip.flash.size as usize;
@@ -64,7 +64,7 @@ impl FileFlash {
             Err(error) if error.kind() == io::ErrorKind::NotFound => None,
             Err(error) => return Err(error),
         };
-        // Looked at before it is read: whatever was named by mistake may be large.
+        // The size is checked before reading: a file named by mistake may be large.
         let cells = match found {
             Some(length) if length == size as u64 => fs::read(path)?,
             Some(length) => return Err(wrong_size(length, chip)),
@@ -87,23 +87,23 @@ impl FileFlash {
         &self.path
     }
 
-    /// How long the file has been older than the flash; `None` when it is not.
+    /// How long the file has been older than the flash; `None` if it is up to date.
     #[must_use]
     pub fn unsaved(&self) -> Option<Duration> {
         self.unsaved.map(|since| since.elapsed())
     }
 
-    /// Whether parameters changed that are not in the file: node-ID and bit rate, or that there is
-    /// a program, or none.
+    /// Whether parameters have changed that are not in the file: node-ID and bit rate, or the
+    /// record of a program.
     #[must_use]
     pub fn is_urgent(&self) -> bool {
         self.urgent
     }
 
-    /// Brings the file up to date.
+    /// Writes the current contents to the file.
     ///
     /// # Errors
-    /// It cannot be written; the old one is still there.
+    /// The file cannot be written; the old file still exists.
     pub fn save(&mut self) -> io::Result<()> {
         if self.unsaved.is_none() {
             return Ok(());
@@ -117,7 +117,7 @@ impl FileFlash {
         Ok(())
     }
 
-    /// Where a region that is inside the flash lies in the file.
+    /// The place of a region in the file, if the region lies inside the flash.
     fn place(&self, region: Region) -> Option<std::ops::Range<usize>> {
         let flash = self.layout.chip.flash;
         let at = flash.contains(region.base, region.size).then(|| (region.base - flash.base) as usize)?;
@@ -128,7 +128,7 @@ impl FileFlash {
         self.busy_until > Instant::now()
     }
 
-    /// An operation on this region, which takes so long.
+    /// Starts an operation on this region that takes the time `takes`.
     fn begin(&mut self, region: Region, takes: Duration, ahead: Duration) -> Result<&mut [u8], FlashFault> {
         let place = self.place(region).filter(|_| !self.is_busy()).ok_or(FlashFault::Failed)?;
         let now = Instant::now();
@@ -146,7 +146,7 @@ fn wrong_size(length: u64, chip: &Geometry) -> io::Error {
     io::Error::new(
         io::ErrorKind::InvalidData,
         format!(
-            "it has {length} bytes, and the flash of an {name} has {size}: name another file, or remove it for an erased flash"
+            "it has {length} bytes, and the flash of an {name} has {size}: name another file, or delete this one to start with erased flash"
         ),
     )
 }
@@ -174,8 +174,8 @@ impl Flash for FileFlash {
             }
             Operation::Program { address, word } => {
                 let cells = self.begin(Region::new(address, 4), PROGRAM, CATCH_UP)?;
-                // Programming makes zeros of ones and nothing else; what cannot be is found when it
-                // is read back.
+                // Programming only changes ones to zeros; an impossible change is found when the
+                // word is read back.
                 for (cell, byte) in cells.iter_mut().zip(word.to_le_bytes()) {
                     *cell &= byte;
                 }
@@ -240,7 +240,7 @@ mod tests {
         flash.save().unwrap();
         let saved = fs::read(&path).unwrap();
         assert_eq!(saved[0x1_0003..0x1_0009], [0xFF, 0x11, 0x22, 0x33, 0x40, 0xFF]);
-        // As another run finds it; and a sector, here number 4, loses all.
+        // Another run finds this state; then one sector, number 4, is erased.
         let mut flash = open(&path);
         assert_eq!(flash.read_word(0x0801_0004), 0x4033_2211);
         flash.start(Operation::Program { address: 0x0802_0000, word: 0 }).unwrap();
@@ -284,7 +284,7 @@ mod tests {
         while flash.poll().is_pending() {
             std::thread::sleep(Duration::from_millis(1));
         }
-        // The datasheet's 250 ms; how much later it is seen is the host's business.
+        // The datasheet's 250 ms; the host may notice it later.
         assert!(began.elapsed() >= Duration::from_millis(250));
         fs::remove_dir_all(path.parent().unwrap()).unwrap();
     }

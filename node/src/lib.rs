@@ -1,17 +1,17 @@
-//! Bootloader nodes without a chip: the `boot-core` of the firmware on a bus of the host, with a
-//! file in place of flash.
+//! Bootloader nodes without a chip: the firmware's `boot-core` on a bus of the host, with a file in
+//! place of flash.
 //!
-//! For whoever writes a tool or a CANopen master and wants a device to try it on, or many; and for
-//! tests.
+//! For developers of tools and CANopen masters who need one or many devices for their tests.
 //!
 //! | module | what it does |
 //! |---|---|
 //! | [`file_flash`] | the flash of a chip in a file |
-//! | [`device`] | a device: boot decision, bootloader, and what is there in place of a program |
-//! | [`stand_in`] | a program that is none: the objects that a host asks a running application for |
-//! | [`server`] | a bus of its own, for socketcand clients |
+//! | [`device`] | a device: boot decision, bootloader, and the replacement of a program |
+//! | [`stand_in`] | the replacement of a program: the objects that a host reads from a running
+//! application |
+//! | [`server`] | a separate bus for socketcand clients |
 //!
-//! What a node is and is not stands in `docs/node.md`.
+//! `docs/node.md` describes the properties and limits of a node.
 #![forbid(unsafe_code)]
 
 pub mod device;
@@ -21,8 +21,8 @@ pub mod stand_in;
 
 use boot_core::canopen::BitRate;
 
-/// Whether a device can be set to this bit rate. The bus has none of its own, so any can be; there
-/// is nothing to find out.
+/// Whether a device supports this bit rate. The bus has no bit rate, so a device supports all fixed
+/// ones and cannot detect one.
 #[must_use]
 pub fn supports(rate: BitRate) -> bool {
     rate != BitRate::Auto

@@ -24,18 +24,18 @@ use coboot_node::supports;
 use coflash::bus::{self, Adapter};
 use shared_abi::layout::{self, Layout};
 
-/// How often time passes for the nodes while nothing happens.
+/// The interval between two time steps of the nodes while nothing happens.
 const TICK: Duration = Duration::from_millis(2);
 
 /// Bootloader nodes on a CAN bus of the host, each with a file in place of its flash.
 ///
-/// They run the bootloader of the firmware and take programs as it does. There is no CPU behind
-/// them: a program that is started is silent from then on, or a stand-in answers for it. Ctrl-C is
-/// cutting the power: all that a node said to be stored is in its file.
+/// The nodes run the bootloader of the firmware and accept programs like it. They have no CPU for a
+/// program: after the start of a program a node is silent, or a stand-in answers. Ctrl-C cuts the
+/// power: everything that a node has reported as stored is in its file.
 #[derive(Debug, Parser)]
 #[command(name = "coboot-node", version)]
 struct Args {
-    /// A bus to take part in: socketcand://HOST:PORT/BUS, or another of coflash's adapters
+    /// An existing bus: socketcand://HOST:PORT/BUS, or another of coflash's adapters
     #[arg(long, value_name = "URL", required_unless_present = "listen")]
     bus: Option<String>,
 
@@ -43,32 +43,32 @@ struct Args {
     #[arg(long, value_name = "HOST:PORT", conflicts_with = "bus")]
     listen: Option<String>,
 
-    /// Node-ID; of several nodes the first one's
+    /// Node-ID of the first node
     #[arg(long, value_name = "ID", default_value = "1", value_parser = clap::value_parser!(u8).range(1..=127))]
     node: u8,
 
-    /// The nodes have no node-ID and wait for layer setting services
+    /// Start the nodes without a node-ID: they wait for layer setting services
     #[arg(long, conflicts_with = "node")]
     unconfigured: bool,
 
-    /// How many nodes; node-ID and serial number count up
+    /// Number of nodes; node-ID and serial number count up
     #[arg(long, default_value = "1", value_parser = clap::value_parser!(u8).range(1..=127))]
     count: u8,
 
-    /// Serial number; of several nodes the first one's
+    /// Serial number of the first node
     #[arg(long, default_value = "1", value_parser = number)]
     serial: u32,
 
-    /// Folder of the files, SERIAL.flash for each node: raw contents of the flash. What is not
-    /// there is made, erased
+    /// Folder of the files, SERIAL.flash for each node, with the raw contents of the flash. A
+    /// missing file is created with erased flash
     #[arg(long, default_value = ".", value_name = "DIR")]
     folder: PathBuf,
 
-    /// The board, whose sectors and programs the nodes have
+    /// The board with the sectors and programs of the nodes
     #[arg(long, default_value = layout::DEFAULT.board, value_parser = board)]
     board: &'static Layout,
 
-    /// Vendor-ID; with vendor-ID and product code both 0 the nodes take programs for any product
+    /// Vendor-ID; with vendor-ID and product code both 0 the nodes accept programs for any product
     #[arg(long, default_value = "0", value_parser = number)]
     vendor_id: u32,
 
@@ -84,24 +84,24 @@ struct Args {
     #[arg(long, default_value = "1000", value_name = "MS")]
     heartbeat: u16,
 
-    /// How long the flash takes to erase and to program
+    /// Duration of erase and program operations of the flash
     #[arg(long, value_enum, default_value = "typical")]
     flash: FlashSpeed,
 
-    /// What the nodes speak where dialects contradict each other
+    /// The dialect of the nodes where dialects contradict each other
     #[arg(long, value_enum, default_value = "standard")]
     profile: Dialect,
 
-    /// Blocks and programs carry a CRC-16, as of a product with `CrcKind::Crc16`; `coflash convert
-    /// --crc16` makes their files
+    /// Protect blocks and programs with a CRC-16, as in a product with `CrcKind::Crc16`; `coflash
+    /// convert --crc16` makes such files
     #[arg(long)]
     crc16: bool,
 
-    /// The nodes stay in the bootloader whatever program they have, as with the entry strap set
+    /// Keep the nodes in the bootloader, also with a program, as with the entry strap set
     #[arg(long)]
     stay: bool,
 
-    /// For a program that was started something answers what a host asks a running application for
+    /// Answer in place of a started program the requests that a host sends to a running application
     #[arg(long)]
     stand_in: bool,
 }
@@ -109,13 +109,13 @@ struct Args {
 /// The dialects of docs/dialects.md.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum Dialect {
-    /// Block files, raw images and Intel HEX, as the firmware is built by default
+    /// Block files, raw images and Intel HEX: the default of the firmware
     Standard,
     /// port's Paulus
     Paulus,
-    /// The boot loader of ESAcademy: 7F50h opens 1F50h
+    /// The boot loader of ESAcademy: 7F50h unlocks 1F50h
     Esacademy,
-    /// CiA 417 lifts: 6005h opens 1F50h, node-ID 126
+    /// CiA 417 lifts: 6005h unlocks 1F50h, node-ID 126
     Lift,
 }
 
@@ -154,12 +154,12 @@ fn board(name: &str) -> Result<&'static Layout, String> {
 
 fn number(text: &str) -> Result<u32, String> {
     let parsed = match text.strip_prefix("0x") {
-        // `from_str_radix` would take a sign.
+        // `from_str_radix` would accept a sign.
         Some(digits) if digits.starts_with('+') => None,
         Some(digits) => u32::from_str_radix(digits, 16).ok(),
         None => text.parse().ok().filter(|_| !text.starts_with('+')),
     };
-    parsed.ok_or_else(|| "it is no number of 32 bits (4096 or 0x1000)".to_owned())
+    parsed.ok_or_else(|| "it is not a number of 32 bits (4096 or 0x1000)".to_owned())
 }
 
 fn main() -> ExitCode {
@@ -172,14 +172,14 @@ fn main() -> ExitCode {
     match result {
         Ok(never) => match never {},
         Err(error) => {
-            // If that cannot be written either, the exit code has to do.
+            // If this fails, too, only the exit code remains.
             let _ = writeln!(io::stderr(), "coboot-node: {error}");
             ExitCode::FAILURE
         }
     }
 }
 
-/// The object dictionary of a device with so many programs.
+/// The object dictionary of a device with this many programs.
 fn table_of(programs: usize, extras: Extras) -> &'static [Entry] {
     macro_rules! one_of {
         ($($programs:literal $extras:expr),*) => {
@@ -216,7 +216,7 @@ fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, B
             print_line(&format!("bus: socketcand://{}/can0", server.address()));
             Box::new(server)
         }
-        (None, None) => return Err("name a bus: --bus URL or --listen HOST:PORT".into()),
+        (None, None) => return Err("no bus is named: give --bus URL or --listen HOST:PORT".into()),
     };
 
     let mut buffers = vec![[0; BUFFER]; setups.len()];
@@ -228,9 +228,9 @@ fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, B
     }
     let mut more = true;
     loop {
-        // What the nodes send does not concern the other nodes: they are slaves.
+        // The nodes are slaves: the frames of one node do not concern the others.
         let frame = bus.receive(if more { Duration::ZERO } else { TICK })?;
-        // Wraps after 49 days, as it does on the chip.
+        // Wraps after 49 days, as on the chip.
         let now = Instant::from_millis(bus.now().as_millis() as u32);
         more = frame.is_some();
         for (serial, device) in &mut devices {
@@ -251,7 +251,7 @@ fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, B
     }
 }
 
-/// What the nodes are; lives as long as the process.
+/// The setups of the nodes, which live as long as the process.
 fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
     let profile: Profile = args.profile.into();
     let config: &'static bootloader::Config = Box::leak(Box::new(bootloader::Config {
@@ -295,13 +295,13 @@ fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
         })
     };
     let setups: Option<Vec<Setup>> = (0..args.count).map(setup).collect();
-    Ok(setups.ok_or("so many nodes from there on have no node-IDs (1 to 127) or serial numbers (32 bits)")?)
+    Ok(setups.ok_or("with this first number and count, the nodes exceed the node-IDs (1 to 127) or the serial numbers (32 bits)")?)
 }
 
-/// Says what came of a reset.
+/// Prints the result of a reset.
 fn log_event(serial: u32, event: Event) {
     let (node, what) = match event {
-        Event::NodeId(node) => (Some(node), "this node-ID came by LSS".to_owned()),
+        Event::NodeId(node) => (Some(node), "node-ID set by LSS".to_owned()),
         Event::Bootloader { node, reason } => (node, format!("bootloader ({reason:?})")),
         Event::Program { number, trial, node } => {
             let trial = if trial { ", on trial" } else { "" };
@@ -313,7 +313,7 @@ fn log_event(serial: u32, event: Event) {
 }
 
 fn print_line(line: &str) {
-    // Nobody has to read it.
+    // An error of standard output is ignored.
     let _ = writeln!(io::stdout(), "{line}");
 }
 
@@ -325,7 +325,7 @@ mod pages;
 mod tests {
     use super::*;
 
-    /// Every call of this program on every page, for the command line's own reader.
+    /// Every call of this program on every page is parsed by the command line's own parser.
     #[test]
     fn what_the_pages_show_is_understood() {
         let mut count = 0;

@@ -1,8 +1,8 @@
-//! A bus of its own, for socketcand clients: coflash, python-can and their friends. Every client
-//! hears the devices and the other clients.
+//! A separate bus for socketcand clients: coflash, python-can and others. Every client receives the
+//! frames of the devices and of the other clients.
 //!
-//! Time on this bus is the host's, and a frame takes none: there is no bit rate, no arbitration and
-//! no error.
+//! This bus uses the host's time, and a frame takes no time: there is no bit rate, no arbitration
+//! and no error.
 
 use std::collections::BTreeMap;
 use std::io::{self, ErrorKind, Read, Write};
@@ -15,17 +15,18 @@ use boot_core::canopen::Frame;
 use coflash::bus::socketcand::{frame_message, parse_send, Messages};
 use coflash::bus::{Adapter, AdapterError};
 
-/// Clients at a time.
+/// The most clients at the same time.
 const MAX_CLIENTS: usize = 64;
-/// Messages of clients that wait for the bus; behind them connections are not read on.
+/// The most messages of clients that wait for the bus; beyond this number, connections are not
+/// read.
 const EVENTS: usize = 1024;
-/// A client that takes nothing for so long is disconnected.
+/// A client that accepts no data for this time is disconnected.
 const PATIENCE: Duration = Duration::from_millis(500);
-/// How long frames are held back behind the answer to `rawmode`: python-can wants that answer alone
-/// in one read.
+/// How long frames are delayed after the answer to `rawmode`: python-can needs this answer alone in
+/// one read.
 const HOLD: Duration = Duration::from_millis(10);
 
-/// What the threads of the connections tell, of the client of this number.
+/// A message of a connection's thread, with the number of its client.
 enum Event {
     Connected(u64, TcpStream),
     Message(u64, String),
@@ -41,15 +42,15 @@ struct Client {
 enum Mode {
     /// No bus is open.
     NoBus,
-    /// Frames can be sent.
+    /// The client may send frames.
     Open,
-    /// Frames can be sent and come in.
+    /// The client sends and receives frames.
     Raw,
-    /// They come in from then on; these wait for it.
+    /// The client receives frames from `until` on; these messages wait for it.
     Held { until: Instant, messages: String },
 }
 
-/// The server. Its threads read, and last as long as the process.
+/// The server. Its threads read, and live as long as the process.
 pub struct Server {
     address: SocketAddr,
     bus: String,
@@ -59,10 +60,10 @@ pub struct Server {
 }
 
 impl Server {
-    /// Listens. `bus` is the name that clients have to open, as a rule `can0`.
+    /// Opens the port. `bus` is the name that clients must open, usually `can0`.
     ///
     /// # Errors
-    /// What the operating system says, for instance that the address is in use.
+    /// The error of the operating system, for example that the address is in use.
     pub fn bind(address: impl ToSocketAddrs, bus: &str) -> io::Result<Self> {
         let listener = TcpListener::bind(address)?;
         let address = listener.local_addr()?;
@@ -71,18 +72,18 @@ impl Server {
         Ok(Self { address, bus: bus.to_owned(), started: Instant::now(), events, clients: BTreeMap::new() })
     }
 
-    /// Where it listens.
+    /// The address of the server.
     #[must_use]
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// Takes what a client says; gives the frame that it sends.
+    /// Processes an event of a client; returns the frame that the client sends.
     fn take(&mut self, event: Event) -> Option<Frame> {
         match event {
             Event::Connected(number, stream) => {
                 if self.clients.len() >= MAX_CLIENTS {
-                    // If not even that reaches it, it sees the end of the connection.
+                    // If this message does not reach the client, it sees the end of the connection.
                     let _ = (&stream).write_all(b"< error too many clients >");
                     let _ = stream.shutdown(Shutdown::Both);
                     return None;
@@ -103,7 +104,7 @@ impl Server {
         }
     }
 
-    /// One message of a client.
+    /// Processes one message of a client.
     fn message(&mut self, number: u64, message: &str) -> Option<Frame> {
         let client = self.clients.get_mut(&number)?;
         let mut words = message.split_ascii_whitespace();
@@ -112,7 +113,7 @@ impl Server {
                 client.mode = Mode::Open;
                 "< ok >".to_owned()
             }
-            ("open", Mode::NoBus) => format!("< error there is one bus here, {} >", self.bus),
+            ("open", Mode::NoBus) => format!("< error the only bus is {} >", self.bus),
             ("echo", _) => "< echo >".to_owned(),
             (_, Mode::NoBus) => format!("< error open a bus first: open {} >", self.bus),
             ("rawmode", Mode::Open) => {
@@ -129,23 +130,25 @@ impl Server {
                 None => "< error send needs an identifier, a data length and the data: send 601 2 40 00 >"
                     .to_owned(),
             },
-            _ => "< error unknown command, here are open, rawmode, bcmmode, send and echo >".to_owned(),
+            _ => {
+                "< error unknown command: the commands are open, rawmode, bcmmode, send and echo >".to_owned()
+            }
         };
         self.send_text(number, &answer);
         None
     }
 
-    /// Says something to a client; who does not listen is disconnected.
+    /// Sends a message to a client; a client that does not accept it is disconnected.
     fn send_text(&mut self, number: u64, message: &str) {
         let Some(client) = self.clients.get_mut(&number) else { return };
         if client.stream.write_all(message.as_bytes()).is_err() {
-            // Its thread sees the end of the connection.
+            // The client's thread then sees the end of the connection.
             let _ = client.stream.shutdown(Shutdown::Both);
             self.clients.remove(&number);
         }
     }
 
-    /// Brings a frame to all clients but the one that sent it.
+    /// Sends a frame to all clients except its sender.
     fn broadcast(&mut self, frame: &Frame, from: Option<u64>) {
         let message = frame_message(frame, self.started.elapsed());
         let mut listeners = Vec::new();
@@ -162,7 +165,7 @@ impl Server {
         }
     }
 
-    /// Brings to clients what was held back for long enough. When the next one is due.
+    /// Sends the delayed messages that are due. Returns the time of the next one.
     fn release(&mut self) -> Option<Instant> {
         let now = Instant::now();
         let mut due = Vec::new();
@@ -222,7 +225,7 @@ fn accept(listener: &TcpListener, events: &SyncSender<Event>) {
     for number in 0.. {
         let started = listener.accept().and_then(|(stream, _)| serve(stream, number, events.clone()));
         if started.is_err() {
-            // Out of file descriptors or threads, perhaps: some client will leave.
+            // File descriptors or threads may have run out; this ends when a client leaves.
             thread::sleep(Duration::from_millis(50));
         }
     }
@@ -236,7 +239,7 @@ fn serve(stream: TcpStream, number: u64, events: SyncSender<Event>) -> io::Resul
     thread::Builder::new().name(format!("client {number}")).spawn(move || {
         if events.send(Event::Connected(number, writing)).is_ok() {
             read(&stream, number, &events);
-            // If the bus is gone, nobody needs to know.
+            // If the bus is gone, no receiver is left.
             let _ = events.send(Event::Gone(number));
         }
         let _ = stream.shutdown(Shutdown::Both);
@@ -244,7 +247,7 @@ fn serve(stream: TcpStream, number: u64, events: SyncSender<Event>) -> io::Resul
     Ok(())
 }
 
-/// Takes a client's messages until the connection ends, or the client speaks another language.
+/// Reads a client's messages until the connection ends, or the client breaks the protocol.
 fn read(mut stream: &TcpStream, number: u64, events: &SyncSender<Event>) {
     let mut messages = Messages::default();
     let mut bytes = [0; 4096];

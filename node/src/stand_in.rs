@@ -1,6 +1,6 @@
-//! A program that is none: there is no CPU here that could run the one in the file. It answers what
-//! a host asks a running application for, as CiA 302-3 has it: which program runs (1F51h) and which
-//! one it is (1F56h); and it takes the commands of 1F51h as the application template does.
+//! The replacement of a program: no CPU can run the program in the file. The stand-in answers the
+//! requests that a host sends to a running application (CiA 302-3): which program runs (1F51h) and
+//! its identification (1F56h). It accepts the commands of 1F51h like the application template.
 
 use std::task::Poll;
 
@@ -24,10 +24,10 @@ use crate::file_flash::FileFlash;
 
 /// 1000h: no standardised profile, and not the bootloader's value.
 const DEVICE_TYPE: u32 = 0;
-/// 100Ah. Nobody shall take it for the program itself.
+/// 100Ah. It must not look like the program itself.
 const SOFTWARE_VERSION: &str = "coboot-node stand-in";
 
-/// The stand-in of a program.
+/// The stand-in for a program.
 #[derive(Debug)]
 pub struct StandIn {
     entries: &'static [Entry],
@@ -45,7 +45,7 @@ pub struct StandIn {
 #[derive(Debug)]
 struct Underneath {
     flash: FileFlash,
-    /// Where programs and journal are.
+    /// The places of programs and journal.
     layout: &'static Layout,
 }
 
@@ -81,8 +81,8 @@ impl Services for Underneath {
 }
 
 impl StandIn {
-    /// Of the program that came up so, on a device with this flash that says this of itself as a
-    /// bootloader. `hands_over`: the bootloader comes up as the same node.
+    /// The stand-in for the program that was started so, on a device with this flash and this identity
+    /// of the bootloader. `hands_over`: the bootloader comes up as the same node.
     #[must_use]
     pub fn new(
         entries: &'static [Entry],
@@ -100,7 +100,7 @@ impl StandIn {
         Self { entries, device, control, underneath, owed: None, now: Instant::from_millis(0) }
     }
 
-    /// Its object dictionary on a device with so many programs.
+    /// Its object dictionary on a device with this many programs.
     #[must_use]
     pub fn entries(programs: u8) -> Vec<Entry> {
         let mut entries = device::ENTRIES.to_vec();
@@ -112,7 +112,7 @@ impl StandIn {
         entries
     }
 
-    /// Who the device is, for layer setting services.
+    /// The address of the device for layer setting services.
     #[must_use]
     pub fn lss_address(&self) -> LssAddress {
         self.device.lss_address()
@@ -136,12 +136,12 @@ impl StandIn {
         }
     }
 
-    /// The flash behind it.
+    /// The flash of the device.
     pub fn flash(&mut self) -> &mut FileFlash {
         &mut self.underneath.flash
     }
 
-    /// Ends; gives the flash back.
+    /// Ends the stand-in, and returns the flash.
     #[must_use]
     pub fn into_flash(self) -> FileFlash {
         self.underneath.flash
@@ -191,7 +191,7 @@ impl LssDevice for StandIn {
         crate::supports(rate)
     }
 
-    /// Storing is the bootloader's.
+    /// Only the bootloader stores.
     fn store(&mut self, _: Option<NodeId>, _: Option<BitRate>) -> Poll<Result<(), StoreError>> {
         Poll::Ready(Err(StoreError::Unsupported))
     }
@@ -199,7 +199,7 @@ impl LssDevice for StandIn {
 
 impl SlaveDevice for StandIn {
     fn node_id_changed(&mut self, id: Option<NodeId>) {
-        // It is not stored: the bootloader comes up with the one that was in force before.
+        // The node-ID is not stored: the bootloader starts with the previous one.
         self.control.node_id_changed(id.map(NodeId::get));
     }
 }

@@ -1,5 +1,5 @@
 //! Every command of `coflash` that talks to a device, against nodes over a real socket. (`nodes.rs`
-//! has those that it needs itself; `convert`, `inspect`, `completions` and `man` talk to nobody.)
+//! uses some commands itself; `convert`, `inspect`, `completions` and `man` talk to no device.)
 
 mod bus;
 
@@ -12,7 +12,7 @@ use std::time::Duration;
 use bus::{Coflash, Folder, Nodes};
 use serde_json::{json, Value};
 
-/// A program as far as a bootloader looks at one: initial stack pointer in RAM, reset vector
+/// The part of a program that a bootloader checks: initial stack pointer in RAM, reset vector
 /// inside, Thumb bit set.
 fn program(first: u8) -> Vec<u8> {
     let mut bytes = vec![first; 200 * 1024];
@@ -39,7 +39,7 @@ fn the_steps_of_an_update_one_by_one() {
     let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
     let coflash = Coflash::new(&folder, &nodes);
     let on = |words: &[&str]| coflash.done(&[words, &["-N", "5"]].concat());
-    // Nothing there yet: the manual's "no valid program" (1F57h = 02h), as coflash numbers it.
+    // No program yet: the manual's "no valid program" (1F57h = 02h), with coflash's number.
     let refused = coflash.run(&["start", "-N", "5"]);
     assert_eq!(refused.exit, 7, "{}", refused.err);
     assert!(refused.err.contains("60000014"), "{}", refused.err);
@@ -47,18 +47,18 @@ fn the_steps_of_an_update_one_by_one() {
     assert!(on(&["status"]).contains("running"));
     assert_eq!(on(&["enter"]), "node 5: the bootloader is running\n");
     assert_eq!(on(&["enter"]), "node 5: the bootloader is running already\n");
-    assert!(on(&["withdraw"]).contains("not released for autostart any more"));
-    // START is a trial then, and the next reset ends in the bootloader.
+    assert!(on(&["withdraw"]).contains("no longer released for autostart"));
+    // START is then a trial, and after the next reset the device stays in the bootloader.
     assert!(on(&["start"]).contains("an application"));
     nodes.await_line("serial 1, node 5: would start program 1, on trial");
     on(&["reset"]);
     nodes.await_line("serial 1, node 5: bootloader (Unsigned)");
     assert_eq!(
         on(&["release"]),
-        "node 5: program 1 is released for autostart: it starts by itself from now on\n"
+        "node 5: program 1 is released for autostart: it starts by itself after a reset\n"
     );
     assert!(on(&["start"]).contains("an application"));
-    // The application is called back before it is erased; then nothing is left of it.
+    // The application is called back before the erase; then nothing is left of it.
     assert!(rest(&folder) > 190 * 1024);
     assert!(on(&["erase"]).starts_with("node 5: program 1 is erased, in "));
     assert_eq!(rest(&folder), 0, "erased, not only marked");
@@ -71,7 +71,7 @@ fn the_steps_of_an_update_one_by_one() {
     assert_eq!(on(&["reset"]), "back on the bus: node 5\n");
 }
 
-/// The erasure of a program on flash that takes its time.
+/// The erase of a program on flash with realistic times.
 #[test]
 fn erasing_waits_for_the_flash() {
     let folder = folder("erase");
@@ -81,12 +81,12 @@ fn erasing_waits_for_the_flash() {
     coflash.done(&[&["flash", "program.bin", "--no-start"][..], &two].concat());
     let erased = coflash.json(&["erase", "-N", "5"]);
     assert_eq!(rest(&folder), 0);
-    // 200 KiB lie in sectors 4 to 6: 550 ms and twice a second, by the datasheet.
+    // 200 KiB lie in sectors 4 to 6: 550 ms and two times a second, by the datasheet.
     assert!(erased["seconds"].as_f64().unwrap() >= 2.55, "{erased}");
 }
 
-/// What a device refuses to read is told with its abort code (06010001h: it is write-only), in
-/// words.
+/// If a device refuses a read, the message contains the abort code (06010001h: the object is
+/// write-only) in words.
 #[test]
 fn the_program_cannot_be_read_back() {
     let folder = folder("read");
@@ -124,7 +124,7 @@ fn an_update_in_all_its_ways() {
         let file = folder.read("1.flash");
         assert_eq!(file[0x1_0000..0x1_1000], program(number)[..0x1000], "{way:?}");
     }
-    // The last one was cut off where it was told to be.
+    // The last one was cut off at the given address.
     assert!(folder.read("1.flash")[0x2_0000..].iter().all(|byte| *byte != 6));
 }
 
@@ -175,13 +175,13 @@ fn scan_monitor_and_shell_hear_the_nodes() {
     assert_eq!(said.exit, 2, "typed by a script, the first that fails is the last: {}", said.err);
     assert!(said.out.contains("serial number     00000001h"), "{}{}", said.out, said.err);
     assert!(said.out.contains("node 6, 1018h/4: 2 (00000002h)"), "{}{}", said.out, said.err);
-    // What goes over the bus, kept and shown again.
+    // Traffic of the bus, recorded and shown again.
     coflash.done(&["read", "1018/4", "-N", "6", "--trace", "bus.log"]);
     let said = coflash.done(&["monitor", "--replay", "bus.log"]);
     assert!(said.contains("to node 6: read 1018h/4 (serial number)"), "{said}");
 }
 
-/// Ctrl-C wherever the update happens to be; the same command once more, at once, does it.
+/// Ctrl-C at any point of the update; the same command again, at once, completes it.
 #[cfg(unix)]
 #[test]
 fn an_interrupted_update_is_started_again_at_once() {
@@ -209,7 +209,7 @@ fn no_bus_no_node_no_sense() {
     let folder = folder("nobody");
     let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant"]);
     let coflash = Coflash::new(&folder, &nodes);
-    // Each asks a node of its own: an update notices who else does.
+    // Each command talks to its own node: an update notices other clients of its node.
     let quick =
         |number: usize| ["--sdo-timeout".to_string(), "50".into(), "-N".into(), (9 + number).to_string()];
     let commands: [&[&str]; 8] =
@@ -229,16 +229,16 @@ fn no_bus_no_node_no_sense() {
     let elsewhere = format!("socketcand://{}/can7", nodes.address());
     let done = coflash.run(&["info", "-N", "5", "--bus", &elsewhere]);
     assert_eq!(done.exit, 4, "{}", done.err);
-    assert!(done.err.contains("there is one bus here, can0"), "{}", done.err);
-    // A program that the device has none of.
+    assert!(done.err.contains("the only bus is can0"), "{}", done.err);
+    // A program number that the device does not have.
     let done = coflash.run(&[FLASH, &["-P", "1", "-N", "5", "--no-start"]].concat());
     assert_eq!(done.exit, 0, "{}", done.err);
     let done = coflash.run(&["start", "-N", "5", "-P", "2"]);
     assert_eq!(done.exit, 7, "{}{}", done.out, done.err);
 }
 
-/// Two hosts at one node: the second one notices before it changes anything, by the lock of the first
-/// or by its requests, and the first one comes to its end.
+/// Two hosts talk to one node: the second one notices before it changes anything, by the lock of
+/// the first or by its requests, and the first one completes.
 #[test]
 fn a_second_host_on_the_same_node_leaves_it_alone() {
     let folder = folder("two-hosts");
@@ -260,7 +260,7 @@ fn a_second_host_on_the_same_node_leaves_it_alone() {
         let how = if locks.is_none() {
             "another coflash on this computer, process "
         } else {
-            "another tool is at work"
+            "another tool is using"
         };
         assert!(done.err.contains(how) && done.err.contains("[0x60000012]"), "{}", done.err);
         assert!(!done.out.contains("erase"), "{}", done.out);
@@ -268,11 +268,11 @@ fn a_second_host_on_the_same_node_leaves_it_alone() {
         assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
         assert_eq!(folder.read("1.flash")[0x1_0000..0x4_2000], program(round));
     }
-    // Whoever is gone holds nothing.
+    // A process that has ended holds no lock.
     coflash.done(&update);
 }
 
-/// Requests of another client of the same bus.
+/// Requests of another client on the same bus.
 #[test]
 fn a_client_that_asks_the_node_keeps_an_update_from_beginning() {
     let folder = folder("two-clients");
@@ -295,15 +295,15 @@ fn a_client_that_asks_the_node_keeps_an_update_from_beginning() {
     is_ready.recv().unwrap();
     let refused = coflash.run(&[FLASH, &["-N", "5"]].concat());
     assert_eq!(refused.exit, 6, "{}", refused.err);
-    assert!(refused.err.contains("another tool is at work on node 5"), "{}", refused.err);
+    assert!(refused.err.contains("another tool is using node 5"), "{}", refused.err);
     assert!(!refused.out.contains("erase"), "{}", refused.out);
     drop(stop);
     asks.join().unwrap();
     coflash.done(&[FLASH, &["-N", "5"]].concat());
 }
 
-/// Somebody else fills the bus, also with frames that look like answers of other nodes and like
-/// nothing at all.
+/// Another client fills the bus, also with frames that look like answers of other nodes, and with
+/// invalid ones.
 #[test]
 fn frames_of_others_are_passed_over() {
     let folder = folder("noise");
@@ -316,8 +316,8 @@ fn frames_of_others_are_passed_over() {
         assert_eq!(bus::message(&mut stream), "< hi >");
         stream.write_all(b"< open can0 >").unwrap();
         assert_eq!(bus::message(&mut stream), "< ok >");
-        // Answers of node 6; an SDO that is too short; a heartbeat of five bytes; a 29-bit frame
-        // with an answer's number; PDOs.
+        // Answers of node 6; an SDO frame that is too short; a heartbeat of five bytes; a 29-bit
+        // frame with an answer's number; PDOs.
         let frames = b"< send 586 8 60 50 1F 1 0 0 0 0 >< send 586 8 80 50 1F 1 0 0 0 8 >< send 585 3 60 50 1F >\
                        < send 705 5 0 0 0 0 0 >< send 00000585 8 80 50 1F 1 0 0 0 8 >< send 185 8 1 2 3 4 5 6 7 8 >";
         let mut rounds = 0;
@@ -333,8 +333,8 @@ fn frames_of_others_are_passed_over() {
     assert_eq!(folder.read("1.flash")[0x1_0000..0x4_2000], program(0xA5));
 }
 
-/// Images and Intel HEX, and the dialects in which nodes contradict the standard one; coflash says
-/// which one it is.
+/// Images and Intel HEX, and the dialects in which nodes contradict the standard one; coflash names
+/// the dialect.
 #[test]
 fn dialects_are_found_out_or_named() {
     let folder = folder("dialects");
@@ -357,21 +357,21 @@ fn dialects_are_found_out_or_named() {
     let refused = coflash.run(&[FLASH, &["-N", "5", "--unlock", "OPEN"]].concat());
     assert_eq!(refused.exit, 6, "{}", refused.err);
     assert!(
-        refused.err.contains("password") && refused.err.contains("nothing was changed"),
+        refused.err.contains("password") && refused.err.contains("it was not changed"),
         "{}",
         refused.err
     );
-    // For half a second it takes none.
+    // It accepts none for half a second.
     std::thread::sleep(Duration::from_millis(700));
     let done = coflash.json(&[FLASH, &["-N", "5", "--unlock", "INIT"]].concat());
     assert_eq!((&done["dialect"], &done["running"]), (&json!("esacademy"), &json!(0)));
-    // The password would have erased what is to be read.
+    // The password would erase the program that is to be read.
     let refused = coflash.run(&["read", "1F50/1", "-N", "5", "--dialect", "esacademy", "--unlock", "INIT"]);
     assert_eq!(refused.exit, 2, "{}", refused.err);
 }
 
-/// The program with the label that a lift wants, for vendor-ID and product code 0: its check word
-/// is the ABI's fold over the seven words before, written again.
+/// The program with the label that a lift needs, for vendor-ID and product code 0. Its check word
+/// is the fold of the seven words before, implemented again here.
 fn labelled() -> Vec<u8> {
     let mut words = [0_u32; 7];
     words[0] = u32::from_le_bytes(*b"CBL1");
@@ -385,7 +385,7 @@ fn labelled() -> Vec<u8> {
     image
 }
 
-/// A lift's bootloader has one node-ID, whatever the device has; its program can be saved.
+/// The bootloader of a lift always has the same node-ID; its program can be saved.
 #[test]
 fn a_lift_is_updated_and_saved() {
     let folder = folder("lift");

@@ -1,5 +1,5 @@
-//! `coboot-node` as its users run it: over real sockets, with `coflash` as the host, and the file
-//! read from outside.
+//! `coboot-node` as its users run it: over real sockets, with `coflash` as the host, and with the
+//! file read from outside.
 
 mod bus;
 
@@ -19,7 +19,7 @@ fn program() -> Vec<u8> {
 /// zlib's crc32 over [`program`].
 const CRC: &str = "A6FB8F81h";
 
-/// What the flash of a device with the program at 0801_0000h holds behind its parameters.
+/// The flash after the parameters of a device with the program at 0801_0000h.
 fn flashed() -> Vec<u8> {
     let mut bytes = program();
     bytes.resize(0xF_0000, 0xFF);
@@ -49,11 +49,11 @@ fn the_file_holds_the_program_and_nothing_else() {
     assert!(flash[0x1_0000..] == flashed());
     assert!(coflash.done(&["info", "-N", "5"]).contains(&format!("CRC             {CRC}")));
 
-    // It survives: killed without notice, the device comes up as a chip would.
+    // The state survives: after a kill without notice, the device starts like a chip.
     drop(nodes);
     let nodes = Nodes::start(&folder, &["--node", "5"]);
     nodes.await_line("serial 1, node 5: would start program 1");
-    // No CPU, no answer.
+    // Without a CPU there is no answer.
     let coflash = Coflash::new(&folder, &nodes);
     assert_eq!(coflash.run(&["status", "-N", "5", "--sdo-timeout", "50"]).exit, 5);
     drop(nodes);
@@ -74,27 +74,28 @@ fn a_stand_in_answers_for_the_program_and_lets_itself_be_called_back() {
     nodes.await_line("serial 1, node 7: would start program 1, on trial");
     nodes.await_line("serial 1, node 7: bootloader (Requested)");
     nodes.await_line("serial 1, node 7: would start program 1");
-    // CiA 302-3: it runs, and 1F56h is what it was in the bootloader.
+    // CiA 302-3: it runs, and 1F56h has the same value as in the bootloader.
     assert_eq!(coflash.json(&["read", "1F51/1", "-N", "7"])["number"], 1);
     assert_eq!(coflash.json(&["read", "1F56/1", "-N", "7"])["hex"], "818FFBA6");
-    // Running or stopped, the program's version is told; written as in the manual's figure 13.
+    // The program's version is reported, running or stopped, in the format of the manual's figure
+    // 13.
     let scan = || coflash.done(&["scan", "-N", "7"]);
     assert!(scan().contains("running, CRC A6FB8F81h, V1.10r100"), "{}", scan());
     let said = coflash.done(&["enter", "-N", "7"]);
     assert!(said.contains("the bootloader is running"), "{said}");
     assert!(scan().contains("stopped, CRC A6FB8F81h, V1.10r100"), "{}", scan());
-    // The old program is no obstacle to the next one.
+    // The old program does not prevent the next one.
     coflash.done(&[FLASH, &["-N", "7", "--no-start"]].concat());
     coflash.done(&["reset", "-N", "7"]);
     nodes.await_line("serial 1, node 7: bootloader (Unsigned)");
-    // What the bus was told is in the file when it is told.
+    // Data are in the file when the bus reports them as stored.
     drop(nodes);
     let nodes = Nodes::start(&folder, &["--node", "7"]);
     nodes.await_line("serial 1, node 7: bootloader (Unsigned)");
 }
 
-/// A node of a product with CRC-16: files with the other CRC are refused, its own are taken, signed,
-/// and started, also behind a power-off.
+/// A node of a product with CRC-16: it refuses files with the other CRC; it accepts, releases and
+/// starts its own, also after a power-off.
 #[test]
 fn a_node_with_crc_16_starts_its_programs() {
     // Polynomial 1021h, start 0 (CiA 301 clause 7.2.4.3.16).
@@ -137,7 +138,7 @@ fn the_power_is_cut_in_the_middle_and_the_program_is_none() {
     let nodes = Nodes::start(&folder, &["--node", "5", "--stand-in"]);
     let coflash = Coflash::new(&folder, &nodes);
     coflash.done(&[FLASH, &["-N", "5", "--no-start"]].concat());
-    // Over the old program, which is gone with the first block.
+    // Replaces the old program, which is lost with the first block.
     let flashing = coflash.spawn(&[FLASH, &["-N", "5"]].concat());
     let beginning = program()[..0x400].to_vec();
     while folder.read("1.flash")[0x1_0000..0x1_0400] == beginning {
@@ -165,9 +166,9 @@ fn nodes_are_commissioned_by_layer_setting_services() {
     let coflash = Coflash::new(&folder, &nodes);
     let said = coflash.done(&["lss", "fastscan", "--assign", "40", "--store", "--lss-timeout", "60"]);
     assert!(said.contains("40") && said.contains("41"), "{said}");
-    // Those who look at the nodes' own words see who became what.
-    nodes.await_line("serial 77, node 40: this node-ID came by LSS");
-    nodes.await_line("serial 78, node 41: this node-ID came by LSS");
+    // The nodes report the node-IDs that were set.
+    nodes.await_line("serial 77, node 40: node-ID set by LSS");
+    nodes.await_line("serial 78, node 41: node-ID set by LSS");
     assert_eq!(coflash.json(&["read", "1018/2", "-N", "41"])["number"], 0x1234);
     drop(nodes);
     let nodes = start(&folder);
@@ -179,15 +180,15 @@ fn nodes_are_commissioned_by_layer_setting_services() {
     assert!(said.contains("500"), "{said}");
     let said = coflash.done(&[&["lss", "assign", "-N", "9", "--reset", "--store"][..], &device].concat());
     assert!(said.contains('9'), "{said}");
-    nodes.await_line("serial 78, node 9: this node-ID came by LSS");
+    nodes.await_line("serial 78, node 9: node-ID set by LSS");
     assert_eq!(coflash.json(&["read", "1018/4", "-N", "9"])["number"], 78);
     let said = coflash.done(&[&["lss", "inquire"][..], &device].concat());
     assert!(said.contains("serial 0000004Eh: node 9"), "{said}");
     coflash.done(&[&["lss", "store"][..], &device].concat());
 }
 
-/// From the factory to a running program in one job: the node-ID that a device is given by its LSS
-/// address outlives the restart.
+/// From the factory to a running program in one job: the node-ID that a device gets by its LSS
+/// address survives the restart.
 #[test]
 fn a_device_without_node_id_is_given_one_and_flashed_in_one_job() {
     let folder = folder("lss-job");
@@ -207,7 +208,7 @@ fn a_device_without_node_id_is_given_one_and_flashed_in_one_job() {
     assert!(said.contains("application"), "{said}");
 }
 
-/// A device of another product: nothing is lost, and what comes of it is the manual's number.
+/// A device of another product: nothing is lost, and the exit code is the manual's number.
 #[test]
 fn a_program_for_another_product_is_refused() {
     let folder = folder("product");
@@ -218,7 +219,7 @@ fn a_program_for_another_product_is_refused() {
     let said = coflash.run(&[FLASH, &["-N", "5", "--vid", "0", "--pid", "98"]].concat());
     assert_eq!(said.exit, 6, "{}", said.err);
     assert!(said.err.contains("60000182"), "{}", said.err);
-    assert!(said.err.contains("nothing was changed in it"), "{}", said.err);
+    assert!(said.err.contains("it was not changed"), "{}", said.err);
     assert!(folder.read("1.flash")[0x1_0000..] == before[0x1_0000..]);
 }
 
@@ -245,20 +246,21 @@ fn two_programs_have_their_places() {
     assert_eq!(coflash.json(&["read", "1F51/1", "-N", "1"])["number"], 3, "there is none");
     // zlib's crc32 over the 1000 bytes.
     assert_eq!(coflash.json(&["read", "1F56/2", "-N", "1"])["hex"], "1BD5F407");
-    // The first program, from the second one that runs; and the second, from the first.
+    // The first program is replaced while the second one runs, and the second while the first one
+    // runs.
     folder.write("program.bin", &program());
     coflash.done(&[&["flash", "program.bin", "-N", "1"][..], &flash].concat());
     nodes.await_line("serial 1, node 1: would start program 1");
     assert_eq!(coflash.json(&["read", "1F51/2", "-N", "1"])["number"], 0, "stopped");
     coflash.done(&[&["flash", "second.bin", "-N", "1", "-P", "2", "--verify"][..], &flash].concat());
     nodes.await_line("serial 1, node 1: would start program 2");
-    // Another one than the one that runs is started by way of the bootloader.
+    // Another program than the running one is started by way of the bootloader.
     coflash.done(&["start", "-N", "1", "-P", "1"]);
     nodes.await_line("serial 1, node 1: would start program 1");
 }
 
-/// A download in one go, started: the first 80h confirms it, and coflash asks again; STOP is answered by
-/// the bootloader.
+/// A download in one transfer, then started: the first 80h confirms it, and coflash calls again;
+/// the bootloader answers STOP.
 #[test]
 fn a_fresh_program_is_called_back_all_the_same() {
     let folder = folder("fresh");
@@ -275,7 +277,7 @@ fn a_fresh_program_is_called_back_all_the_same() {
     nodes.await_line("serial 1, node 7: bootloader (Requested)");
 }
 
-/// A node on somebody else's bus: here that of other nodes.
+/// A node on an existing bus: here the bus of other nodes.
 #[test]
 fn nodes_join_a_bus() {
     let folder = folder("join");
@@ -286,7 +288,7 @@ fn nodes_join_a_bus() {
     coflash.done(&[FLASH, &["-N", "2", "--no-start"]].concat());
     assert!(folder.read("2.flash")[0x1_0000..] == flashed());
     assert_eq!(folder.read("1.flash"), vec![0xFF; 1 << 20]);
-    // The bus is gone: an end with a reason.
+    // The bus is gone: the nodes end with a reason.
     drop(hosts);
     let said = guests.ended();
     assert_eq!(said.exit, 1);
@@ -304,13 +306,13 @@ fn clients_that_misbehave_harm_nobody() {
         assert_eq!(&hi, b"< hi >");
         stream
     };
-    // What is no message at all.
+    // Not a message.
     let mut stream = connect();
     stream.write_all(&[b"<".to_vec(), vec![b'x'; 100_000]].concat()).unwrap();
-    // The server ends it; a reset is an end, too.
+    // The server ends the connection; a reset is an end, too.
     let mut rest = Vec::new();
     let _ = stream.read_to_end(&mut rest);
-    // What makes no sense.
+    // Invalid messages.
     let mut stream = connect();
     for message in ["rawmode", "send 605 0", "open can1", "fly", "\u{fffd}", ""] {
         stream.write_all(format!("< {message} >").as_bytes()).unwrap();
@@ -325,7 +327,7 @@ fn clients_that_misbehave_harm_nobody() {
         let said = bus::message(&mut stream);
         assert!(said.starts_with("< error "), "{message}: {said}");
     }
-    // Who never reads (the heartbeats of 1 ms fill what waits for it) holds nobody up.
+    // A client that never reads (heartbeats every 1 ms fill its buffers) does not block the others.
     stream.write_all(b"< rawmode >").unwrap();
     let silent = [stream, connect(), connect()];
     let coflash = Coflash::new(&folder, &nodes);
@@ -334,8 +336,8 @@ fn clients_that_misbehave_harm_nobody() {
     drop(silent);
 }
 
-/// A block download that nobody goes on with: who asks is answered, and NMT reset node is carried out
-/// while somebody asks.
+/// An abandoned block download: other clients get answers, and NMT reset node is carried out while
+/// a client sends requests.
 #[test]
 fn an_abandoned_download_locks_nobody_out() {
     let folder = folder("abandoned");
@@ -366,7 +368,7 @@ fn an_abandoned_download_locks_nobody_out() {
     abandon(&mut stream);
     say(&mut stream, ASK);
     let first = heard(&mut stream);
-    // On a machine that is busy the question may come when the pause of the sub-block is over already.
+    // On a busy machine the request may arrive after the pause of the sub-block has ended.
     let answer = if first == "585#A2037F0000000000" { heard(&mut stream) } else { first };
     assert_eq!(answer, "585#4300100000000010");
     abandon(&mut stream);
@@ -384,8 +386,8 @@ fn an_abandoned_download_locks_nobody_out() {
     while heard(&mut stream) != "705#00" {
         answers += 1;
     }
-    // The reset takes 20 ms, so none is answered before it, or on a busy machine a few are; twenty were
-    // asked if the device had waited for the end of the transfer.
+    // The reset takes 20 ms, so no request or, on a busy machine, a few requests are answered
+    // before it; it would be twenty if the device waited for the end of the transfer.
     assert!(answers < 15, "{answers}");
     asking.join().unwrap();
 }
@@ -407,7 +409,7 @@ fn what_cannot_be_is_said() {
     );
     assert_eq!(folder.read("9.flash"), b"short");
     refused(&[&listen[..], &["--folder", "nowhere"]].concat(), 1, "nowhere");
-    refused(&[&listen[..], &["--node", "120", "--count", "9"]].concat(), 1, "have no node-IDs");
+    refused(&[&listen[..], &["--node", "120", "--count", "9"]].concat(), 1, "exceed the node-IDs");
     refused(&[&listen[..], &["--serial", "0xFFFFFFFF", "--count", "2"]].concat(), 1, "serial numbers");
     refused(&["--listen", "nowhere.invalid:1"], 1, "listening at nowhere.invalid:1: ");
     refused(&["--bus", "socketcand://127.0.0.1:1/can0"], 1, "cannot be opened");

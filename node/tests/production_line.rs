@@ -9,7 +9,7 @@ use coflash::file::{ihex, read, Firmware, Format};
 use serde_json::Value;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
-/// A program as far as a bootloader looks at one, as Intel HEX.
+/// The part of a program that a bootloader checks, as Intel HEX.
 fn program() -> String {
     let mut bytes = vec![0xA5; 20 * 1024];
     // Initial stack pointer in RAM, reset vector inside, Thumb bit set.
@@ -20,7 +20,7 @@ fn program() -> String {
     ihex::emit(&image)
 }
 
-/// Runs the station; gives its exit code and its lines.
+/// Runs the station; returns its exit code and its lines.
 fn station(url: &str, folder: &Folder, words: &[&str]) -> (u8, Vec<Value>) {
     let file = folder.path("program.hex").display().to_string();
     let arguments = [&[url, LAYOUT.board, file.as_str()], words].concat();
@@ -38,7 +38,7 @@ fn a_fresh_device_gets_its_node_id_and_its_program() {
         Nodes::start(&folder, &["--unconfigured", "--serial", "77", "--flash", "instant", "--stand-in"]);
     let (exit, lines) = station(nodes.url(), &folder, &["23", "--lss"]);
     assert_eq!(exit, 0, "{lines:?}");
-    nodes.await_line("serial 77, node 23: this node-ID came by LSS");
+    nodes.await_line("serial 77, node 23: node-ID set by LSS");
     let [events @ .., record] = lines.as_slice() else { panic!("{lines:?}") };
     let done = events.last().unwrap();
     assert_eq!((&done["event"], &done["error"]), (&"done".into(), &Value::Null), "{done}");
@@ -50,7 +50,7 @@ fn a_fresh_device_gets_its_node_id_and_its_program() {
         (&device["bootloader"], &device["programs"][0]["crc"]),
         (&false.into(), &done["report"]["crc"])
     );
-    // Once more, now that it has its node-ID: nobody is left for fastscan.
+    // Again, now that it has its node-ID: fastscan finds no device.
     assert_eq!(station(nodes.url(), &folder, &["23", "--lss"]).0, 1);
     assert_eq!(station(nodes.url(), &folder, &["23"]).0, 0);
 }
@@ -60,7 +60,7 @@ fn the_exit_code_says_whose_turn_it_is() {
     let folder = Folder::new("production-line-bad");
     folder.write("program.hex", program().as_bytes());
     let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant"]);
-    // Without a stand-in nothing answers for the program once it is started: a bad device.
+    // Without a stand-in nothing answers for the started program: a defective device.
     let (exit, lines) = station(nodes.url(), &folder, &["5"]);
     let last = lines.last().unwrap();
     assert_eq!((exit, &last["error"]["number"]), (2, &"0x60000014".into()), "{lines:?}");

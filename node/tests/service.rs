@@ -1,4 +1,4 @@
-//! What a service technician and a program around it do with `coflash`: single objects, network
+//! Typical work of a service technician, or of a program around `coflash`: single objects, network
 //! management, events, logs and reports, against nodes over a real socket.
 
 mod bus;
@@ -41,13 +41,13 @@ fn objects_are_read_in_lists_and_by_their_names() {
     assert_eq!(said.len(), 5, "{said:?}");
     assert_eq!(said[1], "node 5, 1018h/1: 63 (0000003Fh)");
     assert_eq!(said[4], "node 5, 1018h/4: 77 (0000004Dh)");
-    // In front of the command, too, and by name.
+    // The option may stand before the command, and the object may be named.
     let named = coflash.done(&["-N", "5", "read", "Identity object/4", "--eds", &eds()]);
     assert!(
         named.starts_with("node 5, 1018h/4 (Identity object/") && named.ends_with("): 77 (0000004Dh)\n"),
         "{named}"
     );
-    // A list; one that is not there does not keep the others away, and is the exit code.
+    // A list; an object that does not exist does not prevent the others, but gives the exit code.
     folder.write("list.txt", b"# identity\n1018/4  # serial\n\n2345/6\n1018/1\n");
     let mixed = coflash.run(&["read", "--file", "list.txt", "-N", "5", "--json"]);
     assert_eq!(mixed.exit, 6, "{}", mixed.err);
@@ -57,7 +57,7 @@ fn objects_are_read_in_lists_and_by_their_names() {
     assert!(all["objects"][1]["error"]["what"].as_str().unwrap().contains("2345h/6"), "{all}");
     let mixed = coflash.run(&["read", "1018/4", "2345", "-N", "5"]);
     assert!(mixed.err.contains("error: 1 of 2 objects could not be read"), "{}", mixed.err);
-    // One alone has the document that it always had.
+    // A single object has the same document as before.
     let one = coflash.json(&["read", "1018/4", "-N", "5"]);
     assert_eq!(
         (&one["command"], &one["number"], &one["hex"]),
@@ -66,13 +66,13 @@ fn objects_are_read_in_lists_and_by_their_names() {
     for (words, exit, why) in [
         (&["read", "Nothing", "--eds", &eds()][..], 2, "the EDS has no object 'Nothing'"),
         (&["read", "Nothing"], 2, "names need --eds FILE"),
-        (&["read", "1018/4..1"], 2, "is no range"),
+        (&["read", "1018/4..1"], 2, "is not a range"),
         (&["read", "1018/4", "1000", "-o", "x"], 2, "one object at a time"),
         (&["read"], 2, "OBJECT"),
-        (&["read", "1000", "--eds", "program.bin"], 3, "program.bin: it is no EDS"),
+        (&["read", "1000", "--eds", "program.bin"], 3, "program.bin: it is not an EDS"),
         (&["read", "1000", "--eds", "none.eds"], 3, "none.eds: cannot be read"),
-        (&["read", "1000", "--eds", "/dev/zero"], 3, "which is too much"),
-        (&["read", "--file", "/dev/zero"], 3, "which is too much"),
+        (&["read", "1000", "--eds", "/dev/zero"], 3, "the limit for this file"),
+        (&["read", "--file", "/dev/zero"], 3, "the limit for this file"),
     ] {
         let done = coflash.run(words);
         assert!(done.exit == exit && done.err.contains(why), "{words:?}: {} {}", done.exit, done.err);
@@ -85,12 +85,12 @@ fn a_value_is_written_if_its_type_has_room_for_it() {
     let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
     let coflash = Coflash::new(&folder, &nodes);
     coflash.done(&[FLASH, &["-N", "5", "--no-start"]].concat());
-    // What is written has its effect: program control of CiA 302-3, 1 starts and 80h calls back.
+    // A written value takes effect: in program control of CiA 302-3, 1 starts and 80h calls back.
     let said = coflash.done(&["write", "1F51/1", "1", "--type", "u8", "-N", "5"]);
     assert_eq!(said, "node 5, 1F51h/1: written, 1 byte\n");
     nodes.await_line("serial 1, node 5: would start program 1");
     coflash.done(&["reset", "-N", "5"]);
-    // The type is the data sheet's.
+    // The type comes from the data sheet.
     coflash.done(&["enter", "-N", "5"]);
     coflash.done(&["write", "Program control/1", "0x84", "--eds", &eds(), "-N", "5"]);
     coflash.done(&["reset", "-N", "5"]);
@@ -103,12 +103,12 @@ fn a_value_is_written_if_its_type_has_room_for_it() {
         (&["write", "1F51/1", "256", "--type", "u8"][..], 2, "256 is out of the range of u8: 0 to 255"),
         (&["write", "1F51/1", "-1", "--type", "u8"], 2, "-1 is out of the range of u8"),
         (&["write", "1F51/1", "0x100", "--eds", &eds()], 2, "out of the range of u8"),
-        (&["write", "1F51/1", "1"], 2, "it is not said of what type 1F51h/1 is"),
+        (&["write", "1F51/1", "1"], 2, "the type of 1F51h/1 is unknown"),
         (&["write", "1017", "1", "--eds", &eds()], 2, "is read-only by the EDS"),
         (&["write", "1F51/1..2", "1", "--type", "u8"], 2, "is more than one object"),
         (&["write", "1F51/1", "none.bin", "--type", "domain-from-file"], 3, "none.bin: cannot be read"),
-        (&["write", "1F51/1", "/dev/zero", "--type", "domain-from-file"], 3, "which is too much"),
-        // What the device refuses has its reason.
+        (&["write", "1F51/1", "/dev/zero", "--type", "domain-from-file"], 3, "the limit for this file"),
+        // A refusal of the device is shown with its reason.
         (&["write", "1000", "1", "--type", "u32"], 6, "read"),
         (&["write", "1F51/1", "1", "--type", "u32"], 6, "length"),
     ] {
@@ -128,9 +128,9 @@ fn network_management_tells_what_the_heartbeat_says() {
     let folder = folder("nmt");
     let nodes = Nodes::start(&folder, &["--node", "5", "--count", "2"]);
     let coflash = Coflash::new(&folder, &nodes);
-    // A bootloader is pre-operational and stays so.
+    // A bootloader is pre-operational and stays in this state.
     let said = coflash.done(&["nmt", "stop", "-N", "5"]);
-    assert_eq!(said, "node 5: sent; node 5 has not obeyed and is pre-operational\n");
+    assert_eq!(said, "node 5: command sent; node 5 has not carried out the command and is pre-operational\n");
     let all = coflash.json(&["nmt", "pre-operational", "--node", "all"]);
     let heard = all["heard"].as_array().unwrap();
     assert_eq!(heard.len(), 2, "{all}");
@@ -169,7 +169,7 @@ fn events_are_one_object_a_line() {
     assert_eq!((&last["done"], last["seconds_left"].as_f64()), (&last["total"], Some(0.0)), "{last}");
     assert!(all.iter().any(|line| line["phase"] == "verified"), "{kinds:?}");
     assert_eq!(all.last().unwrap()["size"], 20 * 1024);
-    // Several at once: each line says whose it is.
+    // With several devices, each line names its device.
     let said = coflash.run(&[FLASH, &["-N", "5,6,9", "--json-events", "--boot-timeout", "500"]].concat());
     assert_eq!(said.exit, 8);
     let all = lines(&said.out);
@@ -198,7 +198,7 @@ fn events_are_one_object_a_line() {
     assert_eq!((done.exit, &line["error"]["exit"], done.err.as_str()), (2, &2.into(), ""));
 }
 
-/// Alone or one of several: the advice for a silent device is the bus's.
+/// The advice for a silent device comes from the bus, for one device and for several.
 #[test]
 fn a_silent_device_of_several_is_diagnosed_as_one_alone() {
     let folder = folder("silent");
@@ -246,11 +246,11 @@ fn a_report_has_what_service_needs_and_no_password() {
     let events = lines(&text("events.jsonl"));
     assert!(events.iter().all(|line| line["time"].is_string()), "{events:?}");
     assert_eq!(events.last().unwrap()["event"], "done");
-    // The trace is one that the tool itself reads.
+    // The tool itself can read the trace.
     let trace = run.join("trace.log").display().to_string();
     let words = coflash.done(&["monitor", "--replay", &trace]);
     assert!(words.contains("1F51h/1"), "{words}");
-    // A failing run says why, and the log has every frame in words.
+    // A failed run has its reason in the report, and the log has every frame in words.
     let failed =
         coflash.run(&["write", "7F50/1", "0x494E4954", "--type", "u32", "-N", "5", "--report-dir", "others"]);
     assert_eq!(failed.exit, 6, "{}", failed.err);
@@ -263,7 +263,7 @@ fn a_report_has_what_service_needs_and_no_password() {
         let text = fs::read_to_string(other.join(file)).unwrap();
         assert!(!text.contains("494E4954") && !text.contains("54494E49"), "{file}: {text}");
     }
-    // One folder for each run; and a log alone.
+    // One folder for each run; and a separate log.
     coflash.done(&["info", "-N", "5", "--report-dir", "reports", "--log-file", "info.log"]);
     assert_eq!(fs::read_dir(folder.path("reports")).unwrap().count(), 2);
     let log = String::from_utf8(folder.read("info.log")).unwrap();
@@ -272,12 +272,12 @@ fn a_report_has_what_service_needs_and_no_password() {
         "{log}"
     );
     let line = coflash.typed(&["shell"], "info -N 5 --log-file line.log\n");
-    assert!(line.exit == 2 && line.err.contains("are for the shell as a whole"), "{}", line.err);
+    assert!(line.exit == 2 && line.err.contains("apply only to the shell as a whole"), "{}", line.err);
     let nowhere = coflash.run(&["info", "-N", "5", "--log-file", "none/info.log"]);
     assert!(nowhere.exit == 1 && nowhere.err.contains("cannot be written"), "{}", nowhere.err);
 }
 
-/// A board that no list has, from the file that `cargo xtask layout --toml` writes.
+/// A board that no list contains, from the file of `cargo xtask layout --toml`.
 #[test]
 fn a_layout_comes_from_a_file() {
     let folder = folder("layout");

@@ -81,7 +81,7 @@ fn flash<'py>(
     let target = match check_target {
         false => None,
         true => Some(content.target().ok_or_else(|| {
-            PyValueError::new_err("check_target: the file does not say for which device it is")
+            PyValueError::new_err("check_target: the file does not name its target device")
         })?),
     };
     let options = FlashOptions::default()
@@ -182,7 +182,9 @@ fn work<T: Send>(
     }
     match result {
         Ok(result) => result.map_err(|fault| fault.raise(py)),
-        Err(_) => Err(PyRuntimeError::new_err("coflash has a fault of its own: its thread has panicked")),
+        Err(_) => {
+            Err(PyRuntimeError::new_err("there was an internal error of coflash: its thread has panicked"))
+        }
     }
 }
 

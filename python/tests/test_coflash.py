@@ -142,7 +142,7 @@ def test_a_sealed_image_is_read_before_the_bus_is_opened(tmp_path):
     path = tmp_path / "program.cbs"
     # What the device would have said: 82h in 1F57h, wrong product, and the manual's number of a wrong format.
     for file, number, words in [
-        (sealed(program=2), 0x6000_0182, "it is program 2, and program 1 is written"),
+        (sealed(program=2), 0x6000_0182, "it is for program 2, and program 1 is to be written"),
         (sealed(cut=1), 0x6000_0002, "it is cut off"),
         (b"CBS1" + bytes(200), 0x6000_0002, "the head is damaged"),
     ]:

@@ -1,4 +1,4 @@
-//! The verifier against RFC 8032, all of Wycheproof's vectors and `ed25519-dalek`.
+//! The verifier against RFC 8032, all vectors of Wycheproof and `ed25519-dalek`.
 
 mod common;
 
@@ -22,7 +22,7 @@ fn verdict_and_steps(public: &[u8; 32], message: &[u8], signature: &[u8; 64]) ->
     (verdict, steps)
 }
 
-/// The verdict of `ed25519-dalek`.
+/// The result of `ed25519-dalek`.
 fn dalek(public: &[u8; 32], message: &[u8], signature: &[u8; 64]) -> bool {
     VerifyingKey::from_bytes(public)
         .is_ok_and(|key| key.verify_strict(message, &Signature::from_bytes(signature)).is_ok())
@@ -91,7 +91,7 @@ fn all_vectors_of_wycheproof() {
     for group in &set.test_groups {
         let public: &[u8; 32] = group.key.pk[..].try_into().expect("a public key has 32 bytes");
         for test in &group.tests {
-            // What has not 64 bytes is no signature that could be given to us.
+            // A signature with another length than 64 bytes cannot be passed to this verifier.
             let valid = test.sig[..].try_into().is_ok_and(|signature| verify(public, &test.msg, signature));
             assert_eq!(
                 valid,
@@ -108,8 +108,8 @@ fn all_vectors_of_wycheproof() {
     assert!(set.test_groups.iter().any(|group| group.key.pk[..] == long), "RFC 8032's TEST 1024");
 }
 
-/// y = 0 to 19 and p - 1 to 2^255 - 1 (so 0, 1, -1 in every encoding, and all that are not
-/// canonical), and y of the points of order 8, each with both signs of x.
+/// y = 0 to 19 and p - 1 to 2^255 - 1 (so 0, 1, -1 in every encoding, and all non-canonical
+/// encodings), and y of the points of order 8, each with both signs of x.
 fn strange_points() -> Vec<[u8; 32]> {
     let mut points = vec![
         array("c7176a703d4dd84fba3c0b760d10670f2a2053fa2c39ccc64ec7fd7792ac037a"),
@@ -160,7 +160,7 @@ fn strange_points_as_r_or_key_or_both_are_refused() {
     }
 }
 
-/// The group's order, little-endian (RFC 8032, 5.1).
+/// The order of the group, little-endian (RFC 8032, 5.1).
 fn plus_order(s: &[u8]) -> [u8; 32] {
     let order = array::<32>("edd3f55c1a631258d69cf7a2def9de1400000000000000000000000000000010");
     let mut carry = 0;
@@ -173,8 +173,8 @@ fn plus_order(s: &[u8]) -> [u8; 32] {
     sum
 }
 
-/// A key with a part of small order (a mixed one) is no reason to refuse; what counts is whether
-/// [k]A is worked out with k modulo L, as everybody does it, and without the cofactor.
+/// A key with a component of small order (a mixed key) is not refused; the result depends on
+/// whether [k]A is computed with k modulo L, as in other libraries, and without the cofactor.
 #[test]
 fn keys_with_a_part_of_small_order_get_dalek_s_verdict() {
     use ed25519_dalek::hazmat::ExpandedSecretKey;
@@ -183,7 +183,7 @@ fn keys_with_a_part_of_small_order_get_dalek_s_verdict() {
     for seed in 0..40_u8 {
         let key = SigningKey::from_bytes(&[seed; 32]);
         let mixed = (key.verifying_key().to_edwards() + torsion).compress().to_bytes();
-        // Signed for the mixed key: k has its encoding in it.
+        // Signed for the mixed key: k depends on its encoding.
         let public = VerifyingKey::from_bytes(&mixed).unwrap();
         let secret = ExpandedSecretKey::from(key.as_bytes());
         let signature = ed25519_dalek::hazmat::raw_sign::<Sha512>(&secret, b"mixed", &public).to_bytes();
@@ -191,12 +191,12 @@ fn keys_with_a_part_of_small_order_get_dalek_s_verdict() {
         assert_eq!(verdict, dalek(&mixed, b"mixed", &signature), "{seed}");
         verdicts[usize::from(verdict)] += 1;
     }
-    // One in eight values of k leaves nothing of the small part.
+    // For one in eight values of k, the component of small order vanishes.
     assert!(verdicts[0] > 0 && verdicts[1] > 0, "{verdicts:?}");
 }
 
-/// Whoever knows the secret key, or has no key at all, can make signatures that hold the equation
-/// with an R or a key of small order. Plain verification takes them.
+/// With the secret key, or without any key, one can make signatures that satisfy the equation with
+/// an R or a key of small order. Plain verification accepts them.
 #[test]
 fn what_holds_the_equation_with_small_order_is_refused() {
     let check = |key: EdwardsPoint, r: EdwardsPoint, s: &dyn Fn(Scalar) -> Scalar| {
@@ -207,7 +207,7 @@ fn what_holds_the_equation_with_small_order_is_refused() {
             let s = s(Scalar::from_bytes_mod_order_wide(&hash.finalize().into()));
             let signature: [u8; 64] = [r, s.to_bytes()].concat().try_into().unwrap();
             let theirs = VerifyingKey::from_bytes(&public).unwrap();
-            // One message in eight, where the parts of small order fit together.
+            // One message in eight, for which the components of small order cancel.
             if theirs.verify(&[message], &Signature::from_bytes(&signature)).is_ok() {
                 assert!(!verify(&public, &[message], &signature), "{message}");
                 assert!(!dalek(&public, &[message], &signature));
@@ -219,7 +219,7 @@ fn what_holds_the_equation_with_small_order_is_refused() {
     let secret = Scalar::from(123_456_789_u64);
     let key = EdwardsPoint::mul_base(&secret);
     for small in EIGHT_TORSION {
-        // The key of small order, R not; then R of small order, the key with a part of it.
+        // First a key of small order with a normal R; then an R of small order with a mixed key.
         check(small, key, &|_| secret);
         check(key + small, small, &|k| k * secret);
     }
@@ -238,7 +238,7 @@ proptest! {
         let mut public = key.verifying_key().to_bytes();
         let mut signature = key.sign(&message).to_bytes();
         prop_assert!(verify(&public, &message, &signature));
-        // S + L is the same number for the equation.
+        // S + L is the same number in the equation.
         let mut other = signature;
         other[32..].copy_from_slice(&plus_order(&signature[32..]));
         prop_assert!(!verify(&public, &message, &other));
@@ -259,7 +259,7 @@ proptest! {
         prop_assert_eq!(verify(&public, &message, &signature), dalek(&public, &message, &signature));
     }
 
-    /// Half of all keys are no point of the curve. Those are refused before anything is summed up.
+    /// Half of all keys are not points of the curve. These are refused before any sum is computed.
     #[test]
     fn a_key_that_is_no_point_is_refused_at_once(public: [u8; 32]) {
         let (verdict, steps) = verdict_and_steps(&public, b"", &[1; 64]);

@@ -22,8 +22,8 @@ fn pack(data: &[u8], dictionary: &[u8], mode: EncodeMode) -> Vec<u8> {
     writer.finish().unwrap()
 }
 
-/// Unpacks with `chunk` bytes of new input and room for `room` bytes of output at a time. The
-/// history is all that was unpacked behind the dictionary.
+/// Decompresses with `chunk` bytes of new input and room for `room` bytes of output at a time. The
+/// history is everything that was decompressed, and the dictionary before it.
 fn unpack(
     decoder: &mut Decoder,
     packed: &[u8],
@@ -36,7 +36,7 @@ fn unpack(
     let end = dictionary.len() + size;
     let mut from = 0;
     let mut to = chunk.min(packed.len());
-    // Each turn takes input or gives output, or both, or gets more input.
+    // Each turn consumes input or gives output, or both, or gets more input.
     for _ in 0..2 * (packed.len() + size) + 2 {
         let mut out = vec![0; room.min(end - all.len())];
         let history = |back: u32| all[all.len() - back as usize];
@@ -67,7 +67,7 @@ fn both_ways(data: &[u8], dictionary: &[u8], chunk: usize, room: usize) {
     }
 }
 
-/// This very program.
+/// The test program itself.
 fn program() -> Vec<u8> {
     std::fs::read(std::env::current_exe().unwrap()).unwrap()
 }
@@ -87,7 +87,7 @@ fn a_whole_program() {
     both_ways(&data[..data.len().min(3_000_000)], &[], 4096, 2048);
 }
 
-/// An update: the same with a byte inserted here and there, and a dictionary of odd and even size.
+/// An update: the same data with some inserted bytes, and a dictionary of odd and even size.
 #[test]
 fn the_former_program_is_the_dictionary() {
     let old = &program()[..100_001];
@@ -98,7 +98,7 @@ fn the_former_program_is_the_dictionary() {
     }
     let packed = pack(&new, old, EncodeMode::Normal);
     assert!(packed.len() < 1000, "{} bytes: the dictionary is used", packed.len());
-    // With another dictionary it is another program, or none.
+    // With another dictionary the result is another program, or an error.
     let other = vec![0; old.len()];
     let unpacked = unpack(&mut Decoder::new(), &packed, &other, new.len(), 512, 1024);
     assert!(unpacked.as_deref() != Ok(&new));
@@ -112,7 +112,7 @@ fn after_a_reset_it_takes_another_stream() {
     for dictionary in [&data[..0], &data[..77], &data[..0]] {
         let packed = pack(data, dictionary, EncodeMode::Normal);
         decoder.reset();
-        // The first one is left in the middle.
+        // The first stream is abandoned in the middle.
         assert!(unpack(&mut decoder, &packed[..500], dictionary, 9_999, 64, 64).is_err());
         decoder.reset();
         let unpacked = unpack(&mut decoder, &packed, dictionary, data.len(), 64, 64);
@@ -145,7 +145,7 @@ fn an_end_marker_is_no_part_of_a_stream() {
     assert_eq!(unpack(&mut Decoder::new(), &packed, &[], 10, 100, 100), Err(Corrupt));
 }
 
-/// Bytes of a small alphabet with copies in them, so that every kind of symbol comes.
+/// Bytes of a small alphabet with copies in them, so that every kind of symbol occurs.
 fn data() -> impl Strategy<Value = Vec<u8>> {
     let piece = (prop::collection::vec(any::<u8>(), 0..20), 1..4000_usize, 0..300_usize);
     prop::collection::vec(piece, 0..60).prop_map(|pieces| {
@@ -173,7 +173,7 @@ proptest! {
         both_ways(&data, &dictionary, chunk, room);
     }
 
-    /// No panic, no endless loop, nothing behind `out`: `unpack` asserts it.
+    /// No panic, no endless loop, nothing after `out`: `unpack` asserts it.
     #[test]
     fn hostile_bytes(
         bytes in prop::collection::vec(any::<u8>(), 0..2000),

@@ -55,8 +55,8 @@ fn sha_512_256_of_the_examples_of_nist() {
     );
 }
 
-/// RFC 4231, test cases 1 to 4. A key with fewer than 32 bytes is the same key with zeros behind it
-/// (RFC 2104, 2).
+/// RFC 4231, test cases 1 to 4. A key with fewer than 32 bytes is equal to the same key padded with
+/// zeros (RFC 2104, 2).
 #[test]
 fn hmac_of_the_test_cases_of_rfc_4231() {
     for (key, data, expected) in [
@@ -112,7 +112,7 @@ fn hmac_of_the_vectors_of_wycheproof() {
     assert!(seen >= 6, "only {seen} vectors have a key of up to 32 bytes");
 }
 
-/// Every length about the ends of the first three blocks.
+/// Every length around the ends of the first three blocks.
 #[test]
 fn every_length_agrees_with_sha2() {
     let message: Vec<u8> = (0..400_u32).map(|n| (n * 7 + n / 3) as u8).collect();

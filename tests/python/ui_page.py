@@ -264,7 +264,7 @@ def refused(bench):
     page.get_by_role("button", name="Update node 5").click()
     expect(page.locator("#notice")).to_have_attribute("role", "alert")
     expect(page.locator("#notice")).to_contain_text("not for node 5")
-    expect(page.locator("#notice")).to_contain_text("nothing was touched")
+    expect(page.locator("#notice")).to_contain_text("no device was changed")
     bench.picture(page, "refused", 860)
     expect(page.locator(".update")).to_have_count(0)
     folder = bench.folder / "folder"

@@ -1,5 +1,5 @@
-//! The bench: emulated boards with the built firmware on a bus, one as a rule, and a port for the
-//! host, all in virtual time.
+//! The bench: emulated boards with the built firmware on a bus, usually one board, and a port for
+//! the host, all in virtual time.
 
 use std::cell::{Cell, RefCell};
 use std::rc::Rc;
@@ -18,11 +18,11 @@ use emulator::world::{MachineId, PortId, World};
 
 use crate::firmware;
 
-/// How long a program that was never confirmed is held back (`bootloader/src/product.rs`), in ms.
+/// How long a program that was never confirmed is delayed (`bootloader/src/product.rs`), in ms.
 pub const RESCUE_WINDOW_MS: u64 = 300;
 
-/// Presses the entry strap of a board, or lets it go: a resistor pulls it the other way then, that of
-/// the board or the chip's own. Gives whether the board has one.
+/// Presses the entry strap of a board, or releases it: a resistor then pulls it the other way, that of
+/// the board or the chip's own. Returns whether the board has one.
 pub fn press(machine: &mut Machine, pressed: bool) -> bool {
     let Some(strap) = bsp::ENTRY_STRAP else { return false };
     let level = match (pressed, strap.pull) {
@@ -34,11 +34,12 @@ pub fn press(machine: &mut Machine, pressed: bool) -> bool {
     true
 }
 
-/// The node-ID and bit rate of a board that was never told others (bsp's board file).
+/// The node-ID and bit rate of a board without stored values (bsp's board file).
 pub const NODE: u8 = 1;
 /// See [`NODE`].
 pub const BIT_RATE: u32 = 125_000;
-/// Identifiers of its SDO server and of its heartbeat (CiA 301, 7.3.3: predefined connection set).
+/// The identifiers of its SDO server and of its heartbeat (CiA 301, 7.3.3: predefined connection
+/// set).
 pub const REQUEST: u16 = 0x600 + NODE as u16;
 /// See [`REQUEST`].
 pub const RESPONSE: u32 = 0x580 + NODE as u32;
@@ -55,9 +56,9 @@ pub const ACKNOWLEDGED: [u8; 8] = [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0];
 
 /// Boards on a bus.
 pub struct Bench {
-    /// All of it.
+    /// The emulated world.
     pub world: World<Machine>,
-    /// The board, or the first of several.
+    /// The board, or the first of several boards.
     pub device: MachineId,
     boards: Vec<MachineId>,
     port: PortId,
@@ -66,13 +67,13 @@ pub struct Bench {
 }
 
 impl Bench {
-    /// A board with the bootloader in its flash, and no power yet.
+    /// A board with the bootloader in its flash, still without power.
     #[must_use]
     pub fn new() -> Self {
         Self::with(Options::default())
     }
 
-    /// The same, on a chip of your choice.
+    /// The same on a given chip.
     ///
     /// # Panics
     /// If the emulator cannot be set up, or the firmware was not built.
@@ -81,7 +82,7 @@ impl Bench {
         Self::of(firmware::BOOTLOADER, vec![options])
     }
 
-    /// A board whose bootloader has every option.
+    /// A board with a bootloader with every option.
     #[must_use]
     pub fn complete() -> Self {
         Self::of(firmware::BOOTLOADER, vec![Options::default()])
@@ -93,16 +94,18 @@ impl Bench {
         Self::of(bootloader, vec![Options::default()])
     }
 
-    /// The same with the transceiver at this CAN controller, 1 or 2, and not where the board has it.
+    /// The same with the transceiver at this CAN controller, 1 or 2, instead of the board's own
+    /// one.
     #[must_use]
     pub fn of_image_at(bootloader: &str, controller: u8) -> Self {
         Self::at(controller, bootloader, vec![Options::default()])
     }
 
-    /// So many boards whose bootloaders have every option, each with a unique ID and noise of its
-    /// own. They share bus and node-ID until they are told others.
+    /// `count` boards with bootloaders with every option, each with its own unique ID and its own
+    /// noise. They share bus and node-ID until they get others.
     ///
     /// # Panics
+    /// As [`with`](Self::with), and for zero boards.
     /// As [`with`](Self::with), and for no board at all.
     #[must_use]
     pub fn of_boards(count: u32) -> Self {
@@ -145,14 +148,15 @@ impl Bench {
         Self { world, device: boards[0], boards, port, heard, clock: Rc::default() }
     }
 
-    /// The board, or the first of several.
+    /// The board, or the first of several boards.
     pub fn machine(&mut self) -> &mut Machine {
         self.world.machine_mut(self.device)
     }
 
-    /// The USART that the first board's firmware uses.
+    /// The USART of the first board's firmware.
     ///
     /// # Panics
+    /// If the firmware uses none.
     /// If it uses none.
     pub fn usart(&mut self) -> &mut Usart {
         let mut usarts = self.machine().usarts_mut().iter_mut();
@@ -171,13 +175,14 @@ impl Bench {
         self.world.now()
     }
 
-    /// Virtual time while a session borrows the bench: as of the host's last look at the bus.
+    /// Virtual time while a session borrows the bench: the time of the host's last access to the
+    /// bus.
     #[must_use]
     pub fn clock(&self) -> Rc<Cell<Time>> {
         Rc::clone(&self.clock)
     }
 
-    /// Changes the host over to another bit rate.
+    /// Sets another bit rate for the host.
     pub fn set_host_bit_rate(&mut self, bit_rate: u32) {
         self.world.port_mut(self.port).set_bit_rate(bit_rate);
     }
@@ -189,7 +194,7 @@ impl Bench {
         }
     }
 
-    /// Switches the power on; gives how long it takes to the program counter in program 1, in steps
+    /// Switches the power on; returns the time until the program counter is in program 1, in steps
     /// of 10 us.
     ///
     /// # Panics
@@ -213,10 +218,11 @@ impl Bench {
         }
     }
 
-    /// Writes zeros to the end of the flash of every program, and to the end of every sector in it, as a
-    /// debug probe could: each has to be erased before anything can be written.
+    /// Writes zeros to the end of the flash of every program, and to the end of every sector in it,
+    /// as a debug probe could: each sector must then be erased before anything can be written.
     ///
     /// # Panics
+    /// Never: the layout's programs are in flash.
     /// Never: the layout's programs are in flash.
     pub fn soil_programs(&mut self) {
         let board = firmware::board();
@@ -229,23 +235,23 @@ impl Bench {
         }
     }
 
-    /// Lets time pass.
+    /// Runs for this time.
     pub fn run_ms(&mut self, ms: u64) {
         self.world.run_for(Span::from_millis(ms));
     }
 
-    /// Runs until the board says its boot-up; gives the time of it.
+    /// Runs until the board sends its boot-up message; returns the time of it.
     ///
     /// # Panics
-    /// If that takes more than `within_ms`.
+    /// If this takes more than `within_ms`.
     pub fn await_boot_up(&mut self, within_ms: u64) -> Time {
         self.await_boot_up_of(NODE, within_ms)
     }
 
-    /// Runs until a node says its boot-up; gives the time of it.
+    /// Runs until a node sends its boot-up message; returns the time of it.
     ///
     /// # Panics
-    /// If that takes more than `within_ms`.
+    /// If this takes more than `within_ms`.
     pub fn await_boot_up_of(&mut self, node: u8, within_ms: u64) -> Time {
         let from = self.time();
         let deadline = from + Span::from_millis(within_ms);
@@ -263,8 +269,8 @@ impl Bench {
         }
     }
 
-    /// Runs until the program runs that starts by itself; gives the time of its boot-up. The boot-up
-    /// of a bootloader that holds it back for a rescue window comes before.
+    /// Runs until the program that starts by itself runs; returns the time of its boot-up message.
+    /// A bootloader with a rescue window sends its own boot-up message before.
     ///
     /// # Panics
     /// If the first boot-up takes more than `within_ms`.
@@ -287,11 +293,11 @@ impl Bench {
         self.await_program_of(NODE, within_ms)
     }
 
-    /// Has the program that runs bring the device back to the bootloader, which confirms it, and
-    /// starts it again.
+    /// Makes the running program call the bootloader, which confirms the program, and starts it
+    /// again.
     ///
     /// # Panics
-    /// If it does not come back, or does not start.
+    /// If the device does not return, or the program does not start.
     pub fn confirm_program(&mut self) {
         self.session().command(1, ProgramControl::StartBootloader).expect("it is answered");
         self.await_boot_up(1000);
@@ -300,7 +306,7 @@ impl Bench {
         self.await_boot_up(1000);
     }
 
-    /// Every good frame that began at or after a point of time, as identifier and data.
+    /// Every good frame that began at or after this time, as identifier and data.
     #[must_use]
     pub fn frames_since(&self, from: Time) -> Vec<(Time, u32, Vec<u8>)> {
         let heard = self.heard.borrow();
@@ -308,30 +314,30 @@ impl Bench {
         good.map(|record| (record.end, record.frame.raw_id(), record.frame.data().to_vec())).collect()
     }
 
-    /// Every record of the bus so far, errors included.
+    /// Every record of the bus so far, including errors.
     #[must_use]
     pub fn records(&self) -> Vec<Record> {
         self.heard.borrow().clone()
     }
 
-    /// Resets and other events of the board that nobody has asked for yet.
+    /// The resets and other events of the board that were not read yet.
     pub fn events(&mut self) -> Vec<(Time, Stop)> {
         std::iter::from_fn(|| self.world.news()).map(|news| (news.at, news.stop)).collect()
     }
 
-    /// Sends a raw frame from the host, and waits for nothing.
+    /// Sends a raw frame from the host, and does not wait.
     ///
     /// # Panics
-    /// If the frame is no frame.
+    /// If the frame is invalid.
     pub fn post(&mut self, id: u16, data: &[u8]) {
         self.world.send(self.port, Frame::standard(id, data).expect("11 bits, 8 bytes"));
     }
 
-    /// Sends a raw frame from the host and gives the next frame with identifier `answer`, within
+    /// Sends a raw frame from the host and returns the next frame with identifier `answer`, within
     /// 100 ms.
     ///
     /// # Panics
-    /// If the frame is no frame.
+    /// If the frame is invalid.
     pub fn ask(&mut self, id: u16, data: &[u8], answer: u32) -> Option<Vec<u8>> {
         self.post(id, data);
         let deadline = self.time() + Span::from_millis(100);
@@ -343,12 +349,12 @@ impl Bench {
         }
     }
 
-    /// As in the factory: gives a board alone on the bus (the others have no power) node-ID, 255
-    /// for none, and bit rate by layer setting services, and stores them. Gives the board's serial
-    /// number, and leaves it without power.
+    /// Configures a board as in the factory: sets its node-ID (255 for none) and bit rate by layer
+    /// setting services while it is alone on the bus (the others have no power), and stores them.
+    /// Returns the board's serial number, and switches it off.
     ///
     /// # Panics
-    /// If the board refuses, or does not answer as [`NODE`] at [`BIT_RATE`] as a new one does.
+    /// If the board refuses, or does not answer as [`NODE`] at [`BIT_RATE`] like a new board.
     pub fn commission(&mut self, board: MachineId, node: u8, rate: BitRate) -> u32 {
         self.world.power_on(board);
         self.await_boot_up(100);
@@ -364,7 +370,7 @@ impl Bench {
         serial
     }
 
-    /// Lets the endpoint's clients take part, and time go on to `until`; gives the number of frames
+    /// Lets the endpoint's clients take part until the time `until`; returns the number of frames
     /// that they got.
     pub fn serve(&mut self, server: &mut Server, until: Time) -> usize {
         let before = server.exchange(&mut self.world, self.port);
@@ -375,7 +381,7 @@ impl Bench {
     /// A host's session with the board.
     ///
     /// # Panics
-    /// Never: the node-ID is a good one.
+    /// Never: the node-ID is valid.
     pub fn session(&mut self) -> Session<'_> {
         self.session_with(NODE)
     }
@@ -383,13 +389,13 @@ impl Bench {
     /// A host's session with a node.
     ///
     /// # Panics
-    /// If the node-ID is none.
+    /// If the node-ID is invalid.
     pub fn session_with(&mut self, node: u8) -> Session<'_> {
         let node = NodeId::new(node).expect("1 to 127");
         Session::new(self, node, Timing::default())
     }
 
-    /// Whether a node answers as a bootloader, and not as an application.
+    /// Whether a node answers as a bootloader and not as an application.
     ///
     /// # Panics
     /// If it does not answer.
@@ -398,10 +404,10 @@ impl Bench {
         told.expect("1000h is mandatory").is_bootloader()
     }
 
-    /// Fails if the firmware of any board touched anything that the emulator does not model.
+    /// Fails if the firmware of any board accessed anything that the emulator does not model.
     ///
     /// # Panics
-    /// With the list of what it touched.
+    /// With the list of these accesses.
     pub fn assert_nothing_unmodelled(&mut self) {
         for board in self.boards() {
             let reports = self.world.machine_mut(board).reports();
@@ -427,7 +433,7 @@ fn convert<F: embedded_can::Frame, G: embedded_can::Frame>(frame: &F) -> Option<
     }
 }
 
-/// The host's way to the bus, in virtual time: waiting lets the board run.
+/// The host's access to the bus, in virtual time: the board runs while the host waits.
 impl Adapter for Bench {
     fn send(&mut self, frame: &canopen::Frame) -> Result<(), AdapterError> {
         if let Some(frame) = convert(frame) {

@@ -1,5 +1,4 @@
-//! The way back into the bootloader, asked for over the bus, at each bit rate that the board can
-//! make.
+//! The return to the bootloader, requested over the bus, at each bit rate of the board.
 
 use bsp::can::BitTiming;
 use canopen::program::ProgramControl;
@@ -23,15 +22,15 @@ const RATES: [(BitRate, u32); 8] = [
     (BitRate::K1000, 1_000_000),
 ];
 
-/// What has to be between the answer and the departure (SYS TEC manual L-1112d_10, 4.5).
+/// The required time between the answer and the reset (SYS TEC manual L-1112d_10, 4.5).
 const PAUSE: Span = Span::from_millis(10);
 
-/// At each bit rate of the board: installs the program, asks it by 1F51h for the bootloader, and
-/// looks that the answer is whole on the bus, and 10 ms more have passed, when the chip is reset.
-/// `then` goes on with the board, whose bootloader has answered.
+/// At each bit rate of the board: installs the program, calls the bootloader by 1F51h, and checks
+/// that the answer is completely on the bus, and 10 ms more have passed, when the chip is reset.
+/// `then` continues with the board after its bootloader has answered.
 ///
 /// # Panics
-/// When the board does not do that.
+/// If the board does not do this.
 pub fn at_every_bit_rate(image: &str, mut then: impl FnMut(BitRate, Bench)) {
     let blocks = firmware::blocks(image);
     for (rate, bits) in RATES {

@@ -1,8 +1,8 @@
-//! The EDS files (CiA 306-1): what a configuration tool knows of a device before it has met one.
+//! The EDS files (CiA 306-1), which describe a device to a configuration tool.
 //!
-//! They are made from the tables that the firmware itself serves, so that they cannot say anything
-//! else. Values that every image of a board shares come from its board file. `cargo xtask eds`
-//! writes them to `docs/eds/`.
+//! They are made from the tables of the firmware itself, so they cannot differ from it. Values that
+//! every image of a board shares come from its board file. `cargo xtask eds` writes them to
+//! `docs/eds/`.
 
 use std::fmt::Write;
 
@@ -13,24 +13,24 @@ use canopen::device::Device;
 use canopen::od::{Access, Address, DataType, DefaultValue, Entry, Kind};
 use canopen::program::{region_value, IDENTITY, PROGRAM_REGION};
 
-/// The table of the application template. It needs nothing of the chip.
+/// The table of the application template. It does not depend on the chip.
 #[path = "../../app-template/src/entries.rs"]
 mod application;
 
-/// CiA 306-1 asks for dates. The contents have none: the same table gives the same file.
+/// CiA 306-1 requires dates. The contents have none: the same table gives the same file.
 const DATE: &str = "11-21-2026";
 const TIME: &str = "12:00AM";
 
-/// Serial number: no two devices have the same.
+/// The serial number differs between devices.
 const SERIAL_NUMBER: Address = Address::new(IDENTITY, 4);
 
-/// The tables of the bootloader: of the standard and of Paulus, of ESAcademy, of a lift.
+/// The tables of the bootloader: standard and Paulus, ESAcademy, lift.
 static STANDARD: [Entry; len(Extras::NONE)] = entries(PROGRAMS, Extras::NONE).entries();
 static ESACADEMY: [Entry; len(Profile::ESACADEMY.extras)] =
     entries(PROGRAMS, Profile::ESACADEMY.extras).entries();
 static LIFT: [Entry; len(Profile::LIFT.extras)] = entries(PROGRAMS, Profile::LIFT.extras).entries();
 
-/// With sealed images.
+/// The same with sealed images.
 const SEALED: Extras = Extras { sealed: true, ..Extras::NONE };
 static SEALED_ENTRIES: [Entry; len(SEALED)] = entries(PROGRAMS, SEALED).entries();
 
@@ -42,21 +42,22 @@ const PROGRAMS: u8 = bsp::LAYOUT.programs.len() as u8;
 /// The table of the application.
 static APPLICATION: [Entry; application::entry_count(PROGRAMS)] = application::entries(PROGRAMS).entries();
 
-/// One image, as its EDS file describes it.
+/// The description of one image for its EDS file.
 pub struct Image {
     /// Name of the file in `docs/eds/`.
     pub file: &'static str,
-    /// What it is, in a line.
+    /// A description in one line.
     pub description: &'static str,
     /// Its object dictionary.
     pub entries: &'static [Entry],
-    /// What it says of itself. The serial number is not used.
+    /// Its device information. The serial number is not used.
     pub device: Device,
-    /// Whether node-ID and bit rate are set over the bus.
+    /// Whether node-ID and bit rate can be set over the bus.
     pub lss: bool,
 }
 
-/// All images: the bootloader in each profile and for sealed images, and the application template.
+/// All images: the bootloader with each profile and for sealed images, and the application
+/// template.
 #[must_use]
 pub fn images() -> [Image; 6] {
     [
@@ -95,7 +96,7 @@ pub fn bootloader() -> Image {
     bootloader_of("coboot-bootloader.eds", "coboot, the CANopen bootloader", Profile::STANDARD, &STANDARD)
 }
 
-/// The bootloader. What stands here and in its `main.rs` is compared over the bus by the tests.
+/// The bootloader. The tests compare these values with its `main.rs` over the bus.
 fn bootloader_of(
     file: &'static str,
     description: &'static str,
@@ -116,8 +117,8 @@ fn bootloader_of(
     }
 }
 
-/// The application template, version 1. What stands here and in its `objects.rs` is compared over
-/// the bus by the tests.
+/// The application template, version 1. The tests compare these values with its `objects.rs` over
+/// the bus.
 #[must_use]
 pub fn application() -> Image {
     Image {
@@ -129,7 +130,7 @@ pub fn application() -> Image {
     }
 }
 
-/// What the board file says.
+/// The values of the board file.
 const BOARD: Device = Device {
     device_type: 0,
     name: bsp::IDENTITY.device_name,
@@ -179,7 +180,7 @@ impl Image {
         indices
     }
 
-    /// The sections in front of the objects.
+    /// The sections before the objects.
     fn about(&self, eds: &mut Ini) {
         eds.section("FileInfo");
         eds.line("FileName", self.file);
@@ -206,7 +207,7 @@ impl Image {
         }
         eds.line("SimpleBootUpMaster", 0);
         eds.line("SimpleBootUpSlave", 1);
-        // No PDO, so none is put together bit by bit or byte by byte.
+        // There is no PDO, so no mapping with the granularity of bits or bytes.
         eds.line("Granularity", 0);
         eds.line("DynamicChannelsSupported", 0);
         eds.line("GroupMessaging", 0);
@@ -226,7 +227,7 @@ impl Image {
         eds.line("Line2", "Made from the table that the firmware serves; change that, not this.");
     }
 
-    /// The board's own bit rate; with LSS every one that its clock makes.
+    /// The board's own bit rate; with LSS every bit rate that its clock allows.
     fn supports(&self, bit_rate: u32) -> bool {
         bit_rate == bsp::BIT_RATE || self.lss && BitTiming::new(bsp::CAN_CLOCK, bit_rate).is_some()
     }
@@ -253,7 +254,7 @@ impl Image {
             eds.line("ObjectType", format_args!("0x{object_type:X}"));
             eds.line("SubNumber", parts);
             eds.section(format_args!("{index:04X}sub0"));
-            // With a head that can be written it is the number of those in use (1003h).
+            // For a writable head, the value is the number of used entries (1003h).
             let name = match entry.access {
                 Access::Const => "Highest sub-index supported",
                 _ => "Number of entries",
@@ -262,7 +263,7 @@ impl Image {
         }
     }
 
-    /// Sub-indices of an object, 0 among them.
+    /// The number of sub-indices of an object, including 0.
     fn parts(&self, index: u16) -> usize {
         self.entries.iter().filter(|entry| entry.at.index == index).count()
     }
@@ -279,8 +280,8 @@ impl Image {
         eds.line("PDOMapping", 0);
     }
 
-    /// What a device reads there as long as nobody wrote it: from the table, from the head itself,
-    /// or from what the device says of itself.
+    /// The value that a device returns before the first write: from the table, from the head
+    /// itself, or from the device information.
     fn default(&self, entry: &Entry) -> Option<String> {
         match (entry.default, entry.kind) {
             (DefaultValue::Number(value), _) => return Some(number(entry.data_type, value)),
@@ -322,7 +323,8 @@ fn access(access: Access) -> &'static str {
     }
 }
 
-/// Hexadecimal for what is read bit by bit or digit by digit, with all digits of its type.
+/// Hexadecimal for values that are read bit by bit or digit by digit, with all digits of their
+/// type.
 fn number(data_type: DataType, value: u64) -> String {
     match data_type {
         DataType::Unsigned32 => format!("0x{value:08X}"),
@@ -331,7 +333,7 @@ fn number(data_type: DataType, value: u64) -> String {
     }
 }
 
-/// The file as it grows.
+/// The contents of the file so far.
 struct Ini(String);
 
 impl Ini {

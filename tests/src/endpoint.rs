@@ -1,5 +1,5 @@
-//! The bench for other programs: they reach its bus through the socketcand endpoint, or the board's
-//! UART through a terminal, in real time.
+//! The bench for other programs: they access its bus through the socketcand endpoint, or the
+//! board's UART through a terminal, in real time.
 
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -22,20 +22,20 @@ pub struct Endpoint {
 }
 
 impl Endpoint {
-    /// Opens an endpoint on a free port of this machine.
+    /// Opens an endpoint on a free port of this computer.
     ///
     /// # Panics
-    /// If there is none.
+    /// If no port is free.
     #[must_use]
     pub fn new(bench: Bench) -> Self {
         let server = Server::bind("127.0.0.1:0", "can0").expect("a free port");
         Self { bench, server, serial: None }
     }
 
-    /// The same, for a board that speaks through its UART: that is at a pseudo-terminal.
+    /// The same for a board that uses its UART, which is connected to a pseudo-terminal.
     ///
     /// # Panics
-    /// If the system gives none.
+    /// If the system provides none.
     #[cfg(unix)]
     #[must_use]
     pub fn serial(mut bench: Bench) -> Self {
@@ -59,14 +59,14 @@ impl Endpoint {
         }
     }
 
-    /// Runs a program while the board lives on, until it ends.
+    /// Runs a program until it ends; the board runs meanwhile.
     ///
     /// # Panics
-    /// If it does not start, or does not end.
+    /// If the program does not start, or does not end.
     pub fn run(&mut self, command: &mut Command) -> Output {
         let command = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = command.spawn().unwrap_or_else(|error| panic!("{command:?}: {error}"));
-        // What it prints is fetched by other threads, so that it never waits for a full pipe.
+        // Other threads read its output, so that it never waits for a full pipe.
         let [out, err] = readers(&mut child);
         let began = Instant::now();
         let mut pacer = Pacer::new(Speed::Times(1.0), began, self.bench.time());

@@ -1,4 +1,4 @@
-//! The images that `cargo xtask build` made.
+//! The images from `cargo xtask build`.
 
 use std::path::{Path, PathBuf};
 use std::{env, fs};
@@ -10,36 +10,36 @@ use object::read::elf::ElfFile32;
 use object::{Endianness, Object, ObjectSection};
 use shared_abi::layout::{self, Layout};
 
-/// The images by the names that `cargo xtask build` gives them.
+/// The images, with their names in `cargo xtask build`.
 pub const BOOTLOADER: &str = "bootloader.elf";
-/// The one in which everything is off that a product may switch off.
+/// The bootloader without any optional feature.
 pub const BOOTLOADER_LEAST: &str = "bootloader-least.elf";
-/// The one whose blocks and programs carry CRC-16.
+/// The bootloader with CRC-16 in blocks and programs.
 pub const BOOTLOADER_CRC_16: &str = "bootloader-crc-16.elf";
-/// The one whose node-ID and bit rate are those of switches, with COB-IDs of its own.
+/// The bootloader that reads node-ID and bit rate from switches, with its own COB-IDs.
 pub const BOOTLOADER_SWITCHES: &str = "bootloader-switches.elf";
-/// The one for masters that know Paulus, and the one for those that know the boot loader of
+/// The bootloaders for masters that expect Paulus, and for masters that expect the boot loader of
 /// ESAcademy.
 pub const BOOTLOADER_PAULUS: &str = "bootloader-paulus.elf";
 /// See [`BOOTLOADER_PAULUS`].
 pub const BOOTLOADER_ESACADEMY: &str = "bootloader-esacademy.elf";
-/// The one of a lift, whose second program is a set of parameters.
+/// The bootloader of a lift; its second program is a set of parameters.
 pub const BOOTLOADER_LIFT: &str = "bootloader-lift.elf";
 /// The application of a lift, in two versions.
 pub const APP_LIFT: [&str; 2] = ["app-lift.elf", "app-lift-v2.elf"];
-/// One that tells a debug probe what it does, as text.
+/// The bootloader with a text log for a debug probe.
 pub const BOOTLOADER_LOG_RTT: &str = "bootloader-log-rtt.elf";
-/// The same by `defmt`.
+/// The same with a `defmt` log.
 pub const BOOTLOADER_LOG_DEFMT: &str = "bootloader-log-defmt.elf";
-/// The same as text, out of the board's UART.
+/// The same with a text log on the board's UART.
 pub const BOOTLOADER_LOG_UART: &str = "bootloader-log-uart.elf";
-/// The one that takes sealed images, and no others once it has keys.
+/// The bootloader that accepts sealed images, and only these after it has keys.
 pub const BOOTLOADER_SEALED: &str = "bootloader-sealed.elf";
-/// One with the debugger interface, which no product has.
+/// The bootloader with the debugger interface, which no product has.
 pub const BOOTLOADER_DEBUGGER: &str = "bootloader-debugger.elf";
-/// The one that speaks CAN over the board's UART.
+/// The bootloader with CAN over the board's UART.
 pub const BOOTLOADER_VIRTUAL_CAN: &str = "bootloader-virtual-can.elf";
-/// The application for it.
+/// The application for that bootloader.
 pub const APP_VIRTUAL_CAN: &str = "app-virtual-can.elf";
 /// Version 1 of the application.
 pub const APP_V1: &str = "app-v1.elf";
@@ -47,9 +47,9 @@ pub const APP_V1: &str = "app-v1.elf";
 pub const APP_V2: &str = "app-v2.elf";
 /// Version 1 of the application with the debugger interface, which no product has.
 pub const APP_DEBUGGER: &str = "app-debugger.elf";
-/// Version 2 of the application at the place of the second program, on a board that has one.
+/// Version 2 of the application for the region of the second program, on a board that has one.
 pub const PROGRAM_2: &str = "app-program-2.elf";
-/// The application in C, and the same one at the place of the second program.
+/// The application in C, and the same for the region of the second program.
 pub const APP_C: &str = "app-c.elf";
 /// See [`APP_C`].
 pub const APP_C_PROGRAM_2: &str = "app-c-program-2.elf";
@@ -59,16 +59,16 @@ pub const APP_C_PROBE: &str = "app-c-probe.elf";
 /// See [`APP_C_PROBE`].
 pub const APP_C_PROBE_PROGRAM_2: &str = "app-c-probe-program-2.elf";
 
-/// The name of an image of another board than the one that the tests are about.
+/// The name of an image for another board than the tested one.
 #[must_use]
 pub fn of_board(board: &str, image: &str) -> String {
     format!("../{board}/{image}")
 }
 
-/// The board that the images are for: `COBOOT_BOARD`, or the one whose board file is compiled in.
+/// The board of the images: `COBOOT_BOARD`, or the board with the compiled board file.
 ///
 /// # Panics
-/// If there is no such board.
+/// If the board does not exist.
 #[must_use]
 pub fn board() -> &'static Layout {
     match env::var("COBOOT_BOARD") {
@@ -79,7 +79,7 @@ pub fn board() -> &'static Layout {
     }
 }
 
-/// The folder of the images: `COBOOT_FIRMWARE_DIR`, or where `cargo xtask build` puts them.
+/// The folder of the images: `COBOOT_FIRMWARE_DIR`, or the default folder of `cargo xtask build`.
 #[must_use]
 pub fn dir() -> PathBuf {
     env::var_os("COBOOT_FIRMWARE_DIR").map_or_else(
@@ -88,10 +88,10 @@ pub fn dir() -> PathBuf {
     )
 }
 
-/// An application's image as the blocks that the device takes.
+/// An application's image as the blocks for the device.
 ///
 /// # Panics
-/// If it was not built, or does not fit the board.
+/// If it was not built, or does not match the board.
 #[must_use]
 pub fn blocks(name: &str) -> BlockFile {
     let _ = elf(name);
@@ -109,7 +109,7 @@ pub fn blocks_of_file(elf: &Path) -> BlockFile {
     blocks_of(image, &options).expect("it lies in the program's flash").file
 }
 
-/// An application as a raw image: its bytes from the start of the first program on, gaps FFh.
+/// An application as a raw image: its bytes from the start of the first program; gaps are FFh.
 ///
 /// # Panics
 /// If it was not built, or does not begin there.
@@ -118,7 +118,7 @@ pub fn raw(name: &str) -> Vec<u8> {
     raw_from(board().programs[0].base, name)
 }
 
-/// The same from the start of any program on.
+/// The same from the start of any program.
 ///
 /// # Panics
 /// As [`raw`].
@@ -139,7 +139,7 @@ pub fn raw_from(base: u32, name: &str) -> Vec<u8> {
 /// The bytes of an image.
 ///
 /// # Panics
-/// If it was not built; the message says how to.
+/// If it was not built; the message gives the command.
 #[must_use]
 pub fn elf(name: &str) -> Vec<u8> {
     let path = dir().join(name);
@@ -151,8 +151,8 @@ pub fn elf(name: &str) -> Vec<u8> {
     })
 }
 
-/// Bytes that a bootloader takes for the start of program 1: initial stack pointer in RAM, reset vector
-/// inside, the rest as `byte` says.
+/// Bytes that a bootloader accepts as the start of program 1: initial stack pointer in RAM, reset
+/// vector inside, the other bytes are `byte`.
 #[must_use]
 pub fn made_up(len: usize, byte: impl Fn(usize) -> u8) -> Vec<u8> {
     let (ram, program) = (board().ram, board().programs[0]);
@@ -162,10 +162,10 @@ pub fn made_up(len: usize, byte: impl Fn(usize) -> u8) -> Vec<u8> {
     bytes
 }
 
-/// A section of an ELF file: its address, and what it holds.
+/// A section of an ELF file: its address and its contents.
 ///
 /// # Panics
-/// If it is no ELF file, or has no such section.
+/// If it is not an ELF file, or has no such section.
 #[must_use]
 pub fn section(elf: &[u8], name: &str) -> (u32, Vec<u8>) {
     let file = ElfFile32::<Endianness>::parse(elf).expect("an ELF file");

@@ -1,9 +1,9 @@
-//! Intel HEX as tools write it, for devices that take it (Intel, "Hexadecimal Object File Format
+//! Intel HEX as tools write it, for devices that accept it (Intel, "Hexadecimal Object File Format
 //! Specification", 1988).
 
 use std::fmt::Write;
 
-/// One record: length, offset, type, data, and the two's complement of the sum of all that.
+/// One record: length, offset, type, data, and the two's complement of their sum.
 #[must_use]
 pub fn record(offset: u16, kind: u8, data: &[u8]) -> String {
     let mut bytes = vec![data.len() as u8];
@@ -41,8 +41,8 @@ pub fn intel_hex(base: u32, bytes: &[u8]) -> String {
 mod tests {
     use super::*;
 
-    /// The best-known example (Wikipedia "Intel HEX", after the specification), and a base record
-    /// summed by hand.
+    /// The best-known example (Wikipedia "Intel HEX", from the specification), and a base record
+    /// with a checksum computed by hand.
     #[test]
     fn records_are_those_of_the_specification() {
         let data = [0x21, 0x46, 0x01, 0x36, 1, 0x21, 0x47, 1, 0x36, 0, 0x7E, 0xFE, 9, 0xD2, 0x19, 1];

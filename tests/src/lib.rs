@@ -1,4 +1,4 @@
-//! What the tests and the demonstration share: the built firmware, and the bench that it runs on.
+//! Common code of the tests and the demonstration: the built firmware, and its bench.
 
 pub mod bench;
 pub mod call_back;

@@ -1,4 +1,4 @@
-//! Who reads what a bootloader tells by its log.
+//! The readers of a bootloader's log.
 
 use emulator::defmt::Decoder;
 use emulator::machine::Machine;
@@ -8,11 +8,11 @@ use emulator::rtt::Reader;
 use crate::bench::Bench;
 use crate::firmware;
 
-/// Who reads it.
+/// The reader of the log.
 pub enum Listener {
     /// A debug probe.
     Probe(Reader),
-    /// A terminal: what of a line it has.
+    /// A terminal: the received part of a line.
     Terminal(Vec<u8>),
 }
 
@@ -23,7 +23,7 @@ impl Listener {
         Self::Probe(Reader::default())
     }
 
-    /// A debug probe that has an image's ELF file, and reads frames of `defmt` by it.
+    /// A debug probe that reads frames of `defmt` with the help of an image's ELF file.
     #[must_use]
     pub fn probe_of(image: &str) -> Self {
         Self::Probe(Reader::with(Some(decoder(image))))
@@ -35,10 +35,10 @@ impl Listener {
         Self::Terminal(Vec::new())
     }
 
-    /// The whole lines since the last time.
+    /// The complete lines since the last call.
     ///
     /// # Panics
-    /// If what comes out of the UART is no text.
+    /// If the UART's output is not text.
     pub fn told(&mut self, bench: &mut Bench) -> Vec<String> {
         match self {
             Self::Probe(reader) => reader.lines(bench.machine(), firmware::board().chip.sram),
@@ -56,11 +56,10 @@ impl Listener {
     }
 }
 
-/// What has come out of the board's UARTs; a terminal at 115 200 bit/s reads what is 2 % off at
-/// most.
+/// The output of the board's UARTs; a terminal at 115 200 bit/s tolerates an error of 2 %.
 ///
 /// # Panics
-/// If it is further off.
+/// If the error is larger.
 pub fn heard(machine: &mut Machine) -> Vec<Character> {
     let usarts = machine.usarts_mut().iter_mut();
     let heard: Vec<_> = usarts.flat_map(|usart| usart.take_sent()).collect();
@@ -68,10 +67,10 @@ pub fn heard(machine: &mut Machine) -> Vec<Character> {
     heard
 }
 
-/// What explains the frames of an image.
+/// The decoder for the frames of an image.
 ///
 /// # Panics
-/// If it has none.
+/// If the image has none.
 #[must_use]
 pub fn decoder(image: &str) -> Decoder {
     Decoder::of_elf(&firmware::elf(image)).expect("words that are understood").expect("words")

@@ -1,7 +1,7 @@
-//! Masters that know CiA 302-3 and nothing of coboot, by their sequence of requests and its timing:
-//! Zephyr's `canopen_program.py` and the boot slave process of Lely's NMT master.
+//! Masters that support CiA 302-3 and know nothing of coboot, with their sequence of requests and
+//! its timing: Zephyr's `canopen_program.py` and the boot slave process of Lely's NMT master.
 //!
-//! Each request goes out once unless the original repeats it, and its answer is the next frame of
+//! Each request is sent once unless the original repeats it, and its answer is the next frame of
 //! the node's SDO server.
 
 use std::time::Duration;
@@ -11,13 +11,13 @@ use coflash::bus::Adapter;
 use coflash::device::{Doing, Session, Timing, Transfers};
 use embedded_can::{Frame as _, StandardId};
 
-/// What 1F51h takes (CiA 302-3; 80h is Zephyr's).
+/// The values of 1F51h (CiA 302-3; 80h is Zephyr's).
 const STOP: u8 = 0;
 const START: u8 = 1;
 const CLEAR: u8 = 3;
 const CONFIRM: u8 = 0x80;
 
-/// An SDO client with this patience, on any bus.
+/// An SDO client with this time-out, on any bus.
 pub struct Master<'a> {
     /// The bus.
     pub bus: &'a mut dyn Adapter,
@@ -26,21 +26,21 @@ pub struct Master<'a> {
 }
 
 impl<'a> Master<'a> {
-    /// A client of a node, which waits so long for each answer.
+    /// A client of a node with this time-out for each answer.
     pub fn new(bus: &'a mut dyn Adapter, node: u8, timeout: Duration) -> Self {
         Self { bus, node, timeout }
     }
 
     /// Sends a frame.
     ///
-    /// # Panics
+    /// If the frame is invalid.
     /// If it is no frame.
     pub fn post(&mut self, id: u16, data: &[u8]) {
         let id = StandardId::new(id).expect("11 bits");
         self.bus.send(&Frame::new(id, data).expect("8 bytes at most")).expect("the bus is there");
     }
 
-    /// Lets time pass.
+    /// Waits.
     ///
     /// # Panics
     /// If the bus is gone.
@@ -67,7 +67,7 @@ impl<'a> Master<'a> {
         }
     }
 
-    /// One SDO request, once: its answer, and how long that took.
+    /// Sends one SDO request once; returns its answer, and the time until the answer.
     pub fn ask(&mut self, request: [u8; 8]) -> Option<(Vec<u8>, Duration)> {
         let from = self.bus.now();
         self.post(0x600 + u16::from(self.node), &request);
@@ -75,10 +75,10 @@ impl<'a> Master<'a> {
         Some((answer, self.bus.now() - from))
     }
 
-    /// Writes a command to 1F51h of a program: 60 51 1F nn is the answer.
+    /// Writes a command to 1F51h of a program: the answer is 60 51 1F nn.
     ///
     /// # Errors
-    /// What came in its place.
+    /// The frame in place of the answer.
     pub fn control(&mut self, program: u8, command: u8) -> Result<Duration, String> {
         match self.ask([0x2F, 0x51, 0x1F, program, command, 0, 0, 0]) {
             Some((answer, took)) if answer == [0x60, 0x51, 0x1F, program, 0, 0, 0, 0] => Ok(took),
@@ -89,7 +89,7 @@ impl<'a> Master<'a> {
     /// Reads a number of 8 or 32 bits.
     ///
     /// # Errors
-    /// What came in its place.
+    /// The frame in place of the answer.
     pub fn number(&mut self, index: u16, sub: u8) -> Result<u32, String> {
         let [low, high] = index.to_le_bytes();
         match self.ask([0x40, low, high, sub, 0, 0, 0, 0]) {
@@ -103,7 +103,7 @@ impl<'a> Master<'a> {
     /// Writes a program to 1F50h.
     ///
     /// # Errors
-    /// What the transfer ended with.
+    /// The result of the transfer.
     pub fn download(&mut self, program: u8, image: &[u8], transfers: Transfers) -> Result<(), String> {
         let timing = Timing::default().sdo(self.timeout).attempts(1);
         let node = NodeId::new(self.node).ok_or("a node-ID")?;
@@ -114,18 +114,18 @@ impl<'a> Master<'a> {
     }
 }
 
-/// How Zephyr's runner goes (`scripts/west_commands/runners/canopen_program.py`), with the default
-/// options: an SDO time-out of 1 s, one attempt, 10 s for a status and for the boot-up, and the
-/// confirmation in the end.
+/// The procedure of Zephyr's runner (`scripts/west_commands/runners/canopen_program.py`), with the
+/// default options: an SDO time-out of 1 s, one attempt, 10 s for a status and for the boot-up
+/// message, and the confirmation at the end.
 pub struct Zephyr {
-    /// How long STOP and CLEAR took to be answered.
+    /// The times until STOP and CLEAR were answered.
     pub answers: [Duration; 2],
 }
 
-/// Between an answer and the next request of the runner, as a trace of it shows.
+/// The time between an answer and the next request of the runner, from a trace of it.
 pub const ZEPHYR_PAUSE: Duration = Duration::from_micros(1400);
 
-/// Carries Zephyr's procedure through.
+/// Runs Zephyr's procedure.
 ///
 /// # Errors
 /// The first step that fails; the runner gives up there.
@@ -172,21 +172,22 @@ pub fn zephyr(bus: &mut dyn Adapter, node: u8, image: &[u8]) -> Result<Zephyr, S
     Ok(Zephyr { answers: [stop, clear] })
 }
 
-/// How often Lely's master repeats what may meet a device that restarts.
+/// How many times Lely's master repeats a request that may meet a restarting device.
 const LELY_RETRY: u32 = 3;
-/// Its pause before it looks at 1F57h and 1F51h.
+/// Its pause before it reads 1F57h and 1F51h.
 const LELY_CHECK: Duration = Duration::from_millis(100);
 
-/// How often Lely's master had to send what it may repeat, beyond the first time.
+/// How many times Lely's master repeated a request.
 pub struct Lely {
-    /// Repetitions in all.
+    /// The total number of repetitions.
     pub repeated: u32,
-    /// Whether STOP was answered: the master goes on without, too.
+    /// Whether STOP was answered: the master also continues without an answer.
     pub stop_answered: bool,
 }
 
-/// Carries the step "check and update software version" of Lely's boot slave process through
-/// (`src/co/nmt_boot.c`), with its SDO time-out of 100 ms. `image` is what 1F58h has for the slave.
+/// Runs the step "check and update software version" of Lely's boot slave process
+/// (`src/co/nmt_boot.c`), with its SDO time-out of 100 ms. `image` is the value of 1F58h for the
+/// slave.
 ///
 /// # Errors
 /// The first step that fails; the process ends there.

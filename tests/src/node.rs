@@ -1,5 +1,5 @@
-//! `coboot-node` in virtual time: a device whose program a stand-in answers for, on a bus of its own
-//! on which a frame takes no time.
+//! `coboot-node` in virtual time: a device with a stand-in for its program, on its own bus, on
+//! which a frame takes no time.
 
 use std::collections::VecDeque;
 use std::path::Path;
@@ -43,7 +43,7 @@ static CONFIG: bootloader::Config = bootloader::Config {
     download: Profile::STANDARD.download,
     password: &[],
 };
-/// Steps of time.
+/// The time steps.
 const STEP: Duration = Duration::from_micros(200);
 
 /// The node and its bus.
@@ -51,15 +51,15 @@ pub struct NodeBus {
     device: Device<'static, 1>,
     now: Duration,
     sent: VecDeque<Frame>,
-    /// What came of resets.
+    /// The results of resets.
     pub events: Vec<Event>,
 }
 
 impl NodeBus {
-    /// A node with an erased flash, in a file of the test's name.
+    /// A node with erased flash, in a file with the test's name.
     ///
     /// # Panics
-    /// If the file cannot be made.
+    /// If the file cannot be created.
     #[must_use]
     pub fn new(test: &str) -> Self {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/tmp");
@@ -76,12 +76,12 @@ impl NodeBus {
         };
         let (device, event) = Device::new(setup, flash, vec![0; BUFFER].leak());
         let mut bus = Self { device, now: Duration::ZERO, sent: VecDeque::new(), events: vec![event] };
-        // Up to its boot-up.
+        // Until its boot-up message.
         bus.run(STEP);
         bus
     }
 
-    /// Lets time pass; what the node says meanwhile is nobody's.
+    /// Runs for this time; frames of the node are dropped.
     ///
     /// # Panics
     /// If its file cannot be written.

@@ -1,14 +1,14 @@
-//! Proof by power cut: the same update, the power cut at every flash operation, and once more in
-//! the recovery.
+//! Proof by power cut: the same update, with the power cut at every flash operation, and again
+//! during the recovery.
 //!
 //! | module | what it does |
 //! |---|---|
 //! | `device` | level 1: `boot-core` on the flash model, as the bootloader runs it |
-//! | `scenario` | what is done to the device, and what may be found after a cut |
-//! | `points` | cuts, looks and counts |
+//! | `scenario` | the actions on the device, and the permitted states after a cut |
+//! | `points` | cuts, checks and counts |
 //! | [`board`] | level 2: the built firmware in the emulator |
 //!
-//! Seeded bugs ([`Bug`]) show that the proof would notice.
+//! Seeded bugs ([`Bug`]) show that the proof detects them.
 
 pub mod board;
 mod device;

@@ -1,7 +1,7 @@
-//! Numbers for seeded attacks: the same seed gives the same ones. The tests of the cores use this file,
-//! too.
+//! Random numbers for seeded attacks: the same seed gives the same numbers. The tests of the core
+//! crates also use this file.
 
-/// A generator of numbers (splitmix64).
+/// A generator of random numbers (splitmix64).
 pub struct Random(pub u64);
 
 impl Random {
@@ -19,12 +19,12 @@ impl Random {
         (self.next() >> 33) as usize % end
     }
 
-    /// With this probability, in percent.
+    /// True with this probability, in percent.
     pub fn chance(&mut self, percent: usize) -> bool {
         self.below(100) < percent
     }
 
-    /// One of these.
+    /// One of these values.
     pub fn pick<T: Copy>(&mut self, among: &[T]) -> T {
         among[self.below(among.len())]
     }

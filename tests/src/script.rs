@@ -1,8 +1,8 @@
 //! Sessions between a master and the emulated device, as candump logs in `tests/expected/`.
 //!
-//! The frames of the master (000, 600h + node-ID, 7E5h) are sent, and each frame of the device has
-//! to be the next one that the device sends; heartbeats between them are passed over. Beside the
-//! log's lines there are
+//! The frames of the master (000, 600h + node-ID, 7E5h) are sent, and each frame of the device must
+//! be the next one that the device sends; heartbeats between them are ignored. There are also these
+//! lines:
 //!
 //! | line | what happens |
 //! |---|---|
@@ -10,16 +10,17 @@
 //! | `@raw IMAGE` | the master writes the image to 1F50h/1 in one segmented SDO download |
 //! | `@hex IMAGE` | the same as Intel HEX |
 //! | `@hex IMAGE PROGRAM` | the same to 1F50h/PROGRAM |
-//! | `@part BYTES IMAGE` | the same, but the master aborts when so many bytes were acknowledged |
+//! | `@part BYTES IMAGE` | the same, but the master aborts after this many acknowledged bytes |
 //! | `@wait MS` | time passes |
 //! | `@idle` | the master reads 1F57h/1 until it is not busy |
 //! | `@power` | off and on |
 //!
-//! In the data of the device's frames `..` is any byte: what differs from board to board. A letter
-//! behind F and a digit, `s0`, is a byte that has a name: any byte the first time, and the same one
-//! from then on, also in what the master sends. `p0` is the number of programs of the board.
+//! In the data of the device's frames, `..` is any byte: a value that differs between boards. A
+//! letter after F and a digit, for example `s0`, is a named byte: any byte the first time, and the
+//! same byte from then on, also in the master's frames. `p0` is the number of programs of the
+//! board.
 //!
-//! The frames are on the CAN bus, or text on a board's UART: that is [`Wire`].
+//! The frames are on the CAN bus, or are text on a board's UART: see [`Wire`].
 
 use std::collections::HashMap;
 use std::fs;
@@ -38,22 +39,22 @@ use crate::firmware;
 use crate::ihex::intel_hex;
 
 const DATA: Address = Address::new(0x1F50, 1);
-/// The longest that the device may take to answer.
+/// The longest time for an answer of the device.
 const PATIENCE_MS: u64 = 3000;
 
-/// What is between the master of a session and the device.
+/// The connection between the master of a session and the device.
 pub trait Wire {
     /// Virtual time.
     fn time(&self) -> Time;
-    /// Lets time pass.
+    /// Runs for this time.
     fn run_ms(&mut self, ms: u64);
     /// Switches the device off.
     fn power_off(&mut self);
     /// Switches the device on.
     fn power_on(&mut self);
-    /// Sends a frame of the master, and waits for nothing.
+    /// Sends a frame of the master, and does not wait.
     fn send(&mut self, id: u16, data: &[u8]);
-    /// The frames that began at or after a point of time, as end, identifier and data.
+    /// The frames that began at or after this time, as end, identifier and data.
     fn frames_since(&self, from: Time) -> Vec<(Time, u32, Vec<u8>)>;
     /// A host's session with a node.
     fn session_with(&mut self, node: u8) -> Session<'_>;
@@ -85,22 +86,23 @@ impl Wire for Bench {
     }
 
     fn session_with(&mut self, node: u8) -> Session<'_> {
-        // What came was looked at on the bus; no session shall take it for an answer of its own.
+        // Frames that arrived were checked on the bus; a session must not take them for its
+        // answers.
         while self.receive(Duration::ZERO).is_ok_and(|frame| frame.is_some()) {}
         self.session_with(node)
     }
 }
 
-/// Plays a script of `tests/expected`.
+/// Runs a script of `tests/expected`.
 ///
 /// # Panics
-/// Where the device does something else; the message names the line.
+/// If the device behaves differently; the message contains the line.
 pub fn play(bench: &mut Bench, script: &str) {
     play_on(bench, script, firmware::board(), &|image| image.to_owned());
 }
 
-/// The same on any wire, with a board of any layout. `image` gives the file for the name of an image
-/// in the script.
+/// The same on any wire, with a board of any layout. `image` returns the file for the name of an
+/// image in the script.
 ///
 /// # Panics
 /// As [`play`].
@@ -124,11 +126,11 @@ struct Player<'b> {
     wire: &'b mut dyn Wire,
     board: &'b Layout,
     image: &'b dyn Fn(&str) -> String,
-    /// Frames up to here were looked at.
+    /// The frames up to here were checked.
     seen: Time,
-    /// The node that was asked last.
+    /// The last addressed node.
     node: u8,
-    /// The bytes that have a name.
+    /// The named bytes.
     named: HashMap<String, u8>,
 }
 
@@ -169,7 +171,7 @@ impl Player<'_> {
         }
     }
 
-    /// What a byte has to be; `None` where it may be any.
+    /// The expected value of a byte; `None` for any value.
     fn value(&self, byte: &Byte) -> Option<u8> {
         match byte {
             Byte::Is(byte) => Some(*byte),
@@ -178,7 +180,7 @@ impl Player<'_> {
         }
     }
 
-    /// The next frame of the device; heartbeats are passed over unless one is expected.
+    /// The next frame of the device; heartbeats are skipped unless one is expected.
     fn expect(&mut self, id: u32, bytes: &[Byte], place: &str) {
         let deadline = self.wire.time() + Span::from_millis(PATIENCE_MS);
         loop {
@@ -230,7 +232,7 @@ impl Player<'_> {
             }
             _ => panic!("{place}: nobody knows what that is"),
         }
-        // What came meanwhile was looked at.
+        // Frames that arrived meanwhile were checked.
         if words[0] != "@power" {
             self.seen = self.wire.time();
         }
@@ -248,7 +250,7 @@ impl Player<'_> {
         session.write(at, data, Doing::Block(0), &mut |_| {}).expect("the device takes the program");
     }
 
-    /// The beginning of a download, with an abort behind it.
+    /// The beginning of a download, followed by an abort.
     fn part(&mut self, data: &[u8]) {
         let (request, response) = (0x600 + u16::from(self.node), 0x580 + u32::from(self.node));
         let mut ask = |bytes: &[u8; 8], answer: [u8; 8]| {

@@ -1,5 +1,5 @@
-//! A device that takes sealed images alone, on the flash model: the keys that it trusts, the files
-//! that come to it, and what may be found in its flash.
+//! A device that accepts only sealed images, on the flash model: its trusted keys, the files for
+//! it, and the permitted contents of its flash.
 
 use std::sync::OnceLock;
 
@@ -30,13 +30,13 @@ use crate::powercut::DECISION;
 
 // --- setups
 
-/// What a device is made for.
+/// The configuration of a device.
 pub struct Setup {
-    /// Its name, for who is told of a failure.
+    /// Its name, for messages.
     pub name: &'static str,
-    /// Who owns which address.
+    /// The memory layout: the owner of each address.
     pub layout: &'static Layout,
-    /// Who writes which password where.
+    /// The passwords and their objects.
     pub profile: Profile,
     config: Config,
 }
@@ -94,7 +94,7 @@ const fn config(
     }
 }
 
-/// The setup of a profile, with an object dictionary of its own.
+/// The setup of a profile, with its own object dictionary.
 macro_rules! setup {
     ($name:literal, $programs:literal, $layout:ident, $profile:expr, $seal:expr) => {{
         const PROFILE: Profile = $profile;
@@ -113,22 +113,22 @@ macro_rules! setup {
 pub static STANDARD_1: Setup = setup!("STANDARD_1", 1, ONE, Profile::STANDARD, SEAL);
 /// The standard profile, two programs.
 pub static STANDARD_2: Setup = setup!("STANDARD_2", 2, TWO, Profile::STANDARD, SEAL);
-/// A product whose bootloader takes no counter below 6.
+/// A product with a lowest counter of 6 in its bootloader.
 pub static CONSTANT_1: Setup =
     setup!("CONSTANT_1", 1, ONE, Profile::STANDARD, SealPolicy { counter: 6, ..SEAL });
-/// A product that raises the counter when a program is confirmed.
+/// A product that raises the counter at the confirmation of a program.
 pub static CONFIRMED_1: Setup =
     setup!("CONFIRMED_1", 1, ONE, Profile::STANDARD, SealPolicy { counter_with_confirmation: true, ..SEAL });
 /// The same with two programs.
 pub static CONFIRMED_2: Setup =
     setup!("CONFIRMED_2", 2, TWO, Profile::STANDARD, SealPolicy { counter_with_confirmation: true, ..SEAL });
-/// A password for each program, which voids it; and the program starts by itself.
+/// A password for each program, which makes it invalid; the program starts by itself.
 pub static ESACADEMY_2: Setup = setup!("ESACADEMY_2", 2, TWO, Profile::ESACADEMY, SEAL);
 /// A password, and program 2 is data.
 pub static LIFT_2: Setup = setup!("LIFT_2", 2, TWO, Profile::LIFT, SEAL);
 
 impl Setup {
-    /// How many programs there are.
+    /// The number of programs.
     #[must_use]
     pub fn programs(&self) -> u8 {
         self.layout.programs.len() as u8
@@ -140,7 +140,7 @@ impl Setup {
         self.layout.programs[usize::from(program) - 1]
     }
 
-    /// Whether a program is data of the application.
+    /// Whether a program number is for data of the application.
     #[must_use]
     pub fn is_data(&self, program: u8) -> bool {
         self.profile.download.data == Some(program)
@@ -149,19 +149,19 @@ impl Setup {
 
 // --- keys and files
 
-/// The keys of this world.
+/// The keys of these tests.
 pub struct Keys {
     /// In every key block.
     pub root: SigningKey,
     /// The second root of every key block.
     pub second_root: SigningKey,
-    /// What the root certifies.
+    /// A key certified by the root.
     pub release: SigningKey,
-    /// What nobody certifies.
+    /// A key without a certificate.
     pub stranger: SigningKey,
-    /// The key-encryption key that devices have.
+    /// The key-encryption key of the devices.
     pub keks: [Kek; 1],
-    /// One that they have not.
+    /// A key-encryption key that no device has.
     pub other_keks: [Kek; 1],
 }
 
@@ -185,7 +185,7 @@ pub const EPOCH: u32 = 4;
 /// The highest counter of [`certificate`].
 pub const HIGHEST: u32 = 1000;
 
-/// What the root says of the release key: any product, counters to [`HIGHEST`].
+/// The root's certificate for the release key: any product, counters up to [`HIGHEST`].
 #[must_use]
 pub fn certificate() -> Certificate {
     Certificate {
@@ -199,7 +199,7 @@ pub fn certificate() -> Certificate {
     }
 }
 
-/// The key block of every sealed device here, unless told otherwise.
+/// The key block of every sealed device here, unless a test sets another one.
 #[must_use]
 pub fn default_keys() -> [u8; 256] {
     let Keys { root, second_root, keks, .. } = keys();
@@ -209,7 +209,7 @@ pub fn default_keys() -> [u8; 256] {
 /// Whether an image is encrypted, and whether it is compressed.
 pub const FORMS: [(bool, bool); 4] = [(false, false), (true, false), (false, true), (true, true)];
 
-/// For an image of program 1 with counter 5 and version 1, of the release key.
+/// For an image of program 1 with counter 5 and version 1, signed by the release key.
 #[must_use]
 pub fn sealer((encrypted, compress): (bool, bool)) -> Sealer<'static> {
     static CERTIFICATE_BYTES: OnceLock<[u8; CERTIFICATE]> = OnceLock::new();
@@ -225,13 +225,13 @@ pub fn sealer((encrypted, compress): (bool, bool)) -> Sealer<'static> {
     }
 }
 
-/// Seals for the release key.
+/// Seals with the release key.
 #[must_use]
 pub fn seal(sealer: &Sealer<'_>, image: &[u8]) -> Vec<u8> {
     sealer.seal(image, &keys().release).expect("it can be sealed")
 }
 
-/// A program for this place: vectors, a label, and bytes that tell it from any other.
+/// A program for this region: vectors, a label, and distinct bytes.
 #[must_use]
 pub fn image(region: Region, len: usize, seed: u8) -> Vec<u8> {
     let mut bytes: Vec<u8> = (0..len).map(|i| (i as u8).wrapping_mul(31) ^ (i >> 8) as u8 ^ seed).collect();
@@ -249,7 +249,7 @@ pub fn image(region: Region, len: usize, seed: u8) -> Vec<u8> {
     bytes
 }
 
-/// CRC-32 of the catalogue (CRC-32/ISO-HDLC).
+/// The CRC-32 of the CRC catalogue (CRC-32/ISO-HDLC).
 #[must_use]
 pub fn crc32(bytes: &[u8]) -> u32 {
     crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(bytes)
@@ -265,21 +265,21 @@ pub fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
     block
 }
 
-/// A sealed image in its parts, to be made wrong.
+/// A sealed image in its parts, which tests can change.
 #[derive(Clone)]
 pub struct Parts {
-    /// With its own size in it.
+    /// The manifest, including its own size.
     pub manifest: Vec<u8>,
-    /// Empty for none.
+    /// The certificate; empty for none.
     pub certificate: Vec<u8>,
-    /// With their headers.
+    /// The signatures with their headers.
     pub signatures: Vec<u8>,
-    /// All of them.
+    /// All chunks.
     pub chunks: Vec<u8>,
 }
 
 impl Parts {
-    /// Of a file with one signature.
+    /// Splits a file with one signature.
     #[must_use]
     pub fn of(file: &[u8]) -> Self {
         let mut have = 8;
@@ -298,14 +298,14 @@ impl Parts {
         }
     }
 
-    /// Bytes in the manifest become these.
+    /// Replaces bytes in the manifest.
     #[must_use]
     pub fn with(mut self, at: usize, bytes: &[u8]) -> Self {
         self.manifest[at..at + bytes.len()].copy_from_slice(bytes);
         self
     }
 
-    /// One more record at the end of the manifest; `size` is what it says of itself.
+    /// Appends a record to the manifest; `size` is its announced size.
     #[must_use]
     pub fn with_record(mut self, tag: u16, size: u16, bytes: &[u8]) -> Self {
         self.manifest.extend(tag.to_le_bytes());
@@ -315,14 +315,14 @@ impl Parts {
         self.with(4, &size.to_le_bytes())
     }
 
-    /// With another certificate, signed as it should be.
+    /// Replaces the certificate, and signs correctly.
     #[must_use]
     pub fn certified(mut self, certificate: &[u8]) -> Self {
         self.certificate = certificate.to_vec();
         self
     }
 
-    /// With this payload, in chunks of the size that the manifest says.
+    /// Replaces the payload, in chunks of the size in the manifest.
     #[must_use]
     pub fn with_payload(self, payload: &[u8]) -> Self {
         let mut next = [0; 32];
@@ -337,13 +337,13 @@ impl Parts {
         Self { chunks: chunks.concat(), ..self }.with(36, &size.to_le_bytes()).with(72, &next)
     }
 
-    /// Its payload, where it is not encrypted.
+    /// Its payload, if it is not encrypted.
     #[must_use]
     pub fn payload(&self) -> Vec<u8> {
         self.chunks.chunks(32 + (1 << self.manifest[25])).flat_map(|chunk| &chunk[32..]).copied().collect()
     }
 
-    /// Signed by this key alone.
+    /// Signs with only this key.
     #[must_use]
     pub fn signed_by(mut self, key: &SigningKey) -> Self {
         self.signatures = Self::signature(key, &self.manifest);
@@ -370,7 +370,7 @@ impl Parts {
         [&self.manifest[..], &self.certificate, &self.signatures, &self.chunks].concat()
     }
 
-    /// Bytes in front of the chunks.
+    /// The number of bytes before the chunks.
     #[must_use]
     pub fn head(&self) -> usize {
         self.manifest.len() + self.certificate.len() + self.signatures.len()
@@ -381,7 +381,7 @@ impl Parts {
 
 /// What the rest of a device uses of its bootloader.
 pub trait Node: Objects + LssDevice {
-    /// A bounded piece of work; whether there was none.
+    /// Runs one bounded step; returns whether there was no work.
     fn is_idle_after_step(&mut self) -> bool;
     /// [`Bootloader::take_boot_request`].
     fn take_boot_request(&mut self) -> Option<BootRequest>;
@@ -411,9 +411,9 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Node for Bootloader<'_, F, 
 
 const BOARD_NODE: NodeParameters = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
 
-/// A device without power, or with it in [`run`](Self::run).
+/// A device without power, or with power in [`run`](Self::run).
 pub struct Device {
-    /// What it is made for.
+    /// Its configuration.
     pub setup: &'static Setup,
     /// Its flash.
     pub chip: Chip,
@@ -422,13 +422,13 @@ pub struct Device {
 }
 
 impl Device {
-    /// With this flash.
+    /// A device with this flash.
     #[must_use]
     pub fn on(setup: &'static Setup, flash: ModelFlash) -> Self {
         Self { setup, chip: Chip::new(flash), buffer: 2048 }
     }
 
-    /// With an empty flash but for this key block.
+    /// A device with empty flash except this key block.
     #[must_use]
     pub fn with_keys(setup: &'static Setup, block: &[u8; 256]) -> Self {
         let mut flash = ModelFlash::new(&CHIP);
@@ -436,19 +436,19 @@ impl Device {
         Self::on(setup, flash)
     }
 
-    /// With an empty flash but for [`default_keys`].
+    /// A device with empty flash except [`default_keys`].
     #[must_use]
     pub fn sealed(setup: &'static Setup) -> Self {
         Self::with_keys(setup, &default_keys())
     }
 
-    /// With an empty flash.
+    /// A device with empty flash.
     #[must_use]
     pub fn open(setup: &'static Setup) -> Self {
         Self::on(setup, ModelFlash::new(&CHIP))
     }
 
-    /// Another device with the same in its flash.
+    /// Another device with the same flash contents.
     #[must_use]
     pub fn copy(&self) -> Self {
         let mut flash = self.chip.model().clone();
@@ -457,7 +457,7 @@ impl Device {
         Self { buffer: self.buffer, ..Self::on(self.setup, flash) }
     }
 
-    /// Power on, bootloader mode, and somebody who talks to it; then power off.
+    /// Power on, bootloader mode, and a host that talks to it; then power off.
     pub fn run<R>(&self, talk: impl FnOnce(&mut Host<'_>) -> R) -> R {
         let flash = self.chip.clone();
         let parameters = Journal::open(&flash, self.setup.layout.parameters);
@@ -482,27 +482,27 @@ impl Device {
         Journal::open(&self.chip, self.setup.layout.parameters)
     }
 
-    /// What the boot stage makes of a program.
+    /// The boot stage's check of a program.
     ///
     /// # Errors
-    /// Why it would not start it.
+    /// The reason why the boot stage does not start it.
     pub fn verified(&self, program: u8) -> Result<VerifiedProgram, Invalid> {
         verify(&self.chip, &self.parameters(), self.setup.layout, CrcKind::Crc32, program)
     }
 
-    /// What is known of a program.
+    /// The record of a program.
     #[must_use]
     pub fn record(&self, program: u8) -> Option<ProgramRecord> {
         ProgramRecord::load(&self.parameters(), &self.chip, program)
     }
 
-    /// The lowest counter that is stored for a program.
+    /// The lowest counter stored for a program.
     #[must_use]
     pub fn counter(&self, program: u8) -> u32 {
         self.parameters().get(&self.chip, Key::Counter(program)).map_or(0, |[counter, ..]| counter)
     }
 
-    /// Which program the boot stage starts.
+    /// The program that the boot stage starts.
     #[must_use]
     pub fn starts(&self, request: Option<BootRequest>) -> Option<u8> {
         let circumstances = Circumstances { request, strap: false, crash_resets: 0, node_id: 5 };
@@ -519,7 +519,7 @@ impl Device {
         self.chip.model().cells(Region::new(base, len as u32)).to_vec()
     }
 
-    /// Whether the boot stage takes the program, it is this image, and the bits of it are sound.
+    /// Whether the boot stage accepts the program, it is this image, and all its bits are stable.
     #[must_use]
     pub fn holds(&self, program: u8, image: &[u8]) -> bool {
         let place = Region::new(self.setup.region(program).base, image.len() as u32);
@@ -528,8 +528,8 @@ impl Device {
             && self.chip.model().is_stable(place)
     }
 
-    /// What was erased or written since somebody looked last, but for the journal, where events are
-    /// recorded.
+    /// The regions that were erased or written since the last call, except the journal, which
+    /// records events.
     #[allow(clippy::must_use_candidate, reason = "it forgets, too")]
     pub fn take_touched(&self) -> Vec<Region> {
         let mut touched = std::mem::take(&mut self.chip.model().touched);
@@ -538,7 +538,7 @@ impl Device {
         touched
     }
 
-    /// Whether the flash of a program was touched since somebody looked last.
+    /// Whether the flash of a program was changed since the last call.
     #[must_use]
     pub fn was_touched(&self, program: u8) -> bool {
         let region = self.setup.region(program);
@@ -555,7 +555,7 @@ pub const SET_SIGNATURE: u8 = 0x83;
 /// CLR_SIGNATURE of 1F51h.
 pub const CLR_SIGNATURE: u8 = 0x84;
 
-/// Somebody who talks to the bootloader.
+/// A host that talks to the bootloader.
 pub struct Host<'a> {
     /// The device.
     pub device: &'a Device,
@@ -566,12 +566,12 @@ pub struct Host<'a> {
 }
 
 impl Host<'_> {
-    /// Steps until there is no work.
+    /// Runs until there is no work.
     pub fn settle(&mut self) {
         assert!((0..400_000).any(|_| self.node.is_idle_after_step()), "the work does not end");
     }
 
-    /// So many steps.
+    /// Runs this many steps.
     pub fn steps(&mut self, steps: usize) {
         for _ in 0..steps {
             self.node.is_idle_after_step();
@@ -599,7 +599,7 @@ impl Host<'_> {
         self.word(0x1F57, program)
     }
 
-    /// 1F51h; what it leads to is not waited for.
+    /// Writes a command to 1F51h without waiting for its result.
     ///
     /// # Errors
     /// The abort.
@@ -629,7 +629,7 @@ impl Host<'_> {
         self.settle();
     }
 
-    /// Begins a download and sends these bytes of it, so many at a time.
+    /// Begins a download and sends these bytes in pieces of this size.
     ///
     /// # Errors
     /// The abort.
@@ -657,7 +657,7 @@ impl Host<'_> {
         Ok(())
     }
 
-    /// The end of a download; what it leads to is not waited for.
+    /// Ends a download without waiting for the result.
     ///
     /// # Errors
     /// The abort.
@@ -665,19 +665,19 @@ impl Host<'_> {
         self.node.download_end(Address::new(0x1F50, program))
     }
 
-    /// The end of the transfer, as an SDO abort makes it.
+    /// Ends the transfer like an SDO abort.
     pub fn cancel(&mut self, program: u8) {
         self.node.download_cancel(Address::new(0x1F50, program));
     }
 
-    /// A download, carried out; gives the abort, if any, and the status.
+    /// A download with all its work; returns the abort, if any, and the status.
     pub fn send(&mut self, program: u8, data: &[u8], piece: usize) -> (Result<(), AbortCode>, u32) {
         let outcome = self.begin(program, data, piece).and_then(|()| self.end(program));
         self.settle();
         (outcome, self.status(program))
     }
 
-    /// The holder of a root asks for rights (2002h); whether they are granted.
+    /// The holder of a root asks for rights (2002h); returns whether they are granted.
     pub fn grant(&mut self, root: &SigningKey, rights: u32, argument: u32) -> bool {
         let mut challenge = [0; CHALLENGE];
         self.node.read(Address::new(0x2002, 1), &mut challenge).expect("it can be read");
@@ -693,7 +693,7 @@ impl Host<'_> {
         asked.is_ok() && u32::from_le_bytes([44, 45, 46, 47].map(|at| challenge[at])) & rights == rights
     }
 
-    /// The program is erased by who has the right to it.
+    /// A client with the right to do so erases the program.
     pub fn erase(&mut self, program: u8) {
         assert!(self.grant(&keys().root, right::ERASE, 0));
         for _ in 0..2 {
@@ -701,13 +701,13 @@ impl Host<'_> {
         }
     }
 
-    /// So long that no earlier failure slows anybody down.
+    /// Waits long enough that no earlier failure delays the next attempt.
     pub fn wait(&mut self) {
         self.now += 100_000;
         self.node.set_time(Instant::from_millis(self.now));
     }
 
-    /// The same behind password or CLEAR.
+    /// The same after password or CLEAR.
     pub fn update(&mut self, program: u8, data: &[u8], piece: usize) -> (Result<(), AbortCode>, u32) {
         self.wait();
         self.clear(program);
@@ -720,13 +720,13 @@ impl Host<'_> {
         self.node.take_boot_request();
     }
 
-    /// The program has brought the device back.
+    /// The program has returned the device to the bootloader.
     pub fn confirm(&mut self, program: u8) {
         self.node.confirm(program);
         self.settle();
     }
 
-    /// START; gives the program that the boot stage starts then.
+    /// START; returns the program that the boot stage then starts.
     pub fn start(&mut self, program: u8) -> Option<u8> {
         self.command(program, START).ok()?;
         let request = self.node.take_boot_request()?;

@@ -1,4 +1,5 @@
-//! Sealed devices and sealed images. The keys are made of fixed seeds, so that each run is the same.
+//! Sealed devices and sealed images. The keys are made from fixed seeds, so that every run is the
+//! same.
 
 use std::sync::LazyLock;
 
@@ -15,10 +16,10 @@ use crate::firmware;
 const DATA: Address = Address::new(0x1F50, 1);
 const STATUS: Address = Address::new(0x1F57, 1);
 
-/// The words of 1F57h: the error code from bit 1 on (SYS TEC manual, table 3; from 8Ah on those of
-/// sealed images).
+/// The words of 1F57h: the error code from bit 1 on (SYS TEC manual, table 3; from 8Ah on the codes
+/// of sealed images).
 pub mod status {
-    /// All is well.
+    /// No error.
     pub const OK: u32 = 0;
     /// FORMAT.
     pub const FORMAT: u32 = 0x04;
@@ -36,13 +37,13 @@ pub mod status {
     pub const KEY: u32 = 0x8E;
 }
 
-/// The lowest security counter that a new device takes, and the counter of [`sealer`].
+/// The lowest security counter that a new device accepts, and the counter of [`sealer`].
 pub const COUNTER: u32 = 7;
 
-/// The key-encryption key that the devices have.
+/// The key-encryption key of the devices.
 pub static KEKS: LazyLock<[Kek; 1]> = LazyLock::new(|| [Kek::new(KEK).expect("its id is not 0")]);
 
-/// The bytes of [`KEKS`]: no two of them are equal, and no four stand in any code.
+/// The bytes of [`KEKS`]: all are different, and no four consecutive ones occur in any code.
 pub const KEK: [u8; 32] = {
     let mut bytes = [0; 32];
     let mut at = 0;
@@ -53,7 +54,7 @@ pub const KEK: [u8; 32] = {
     bytes
 };
 
-/// A signing key of a seed.
+/// A signing key from a seed.
 ///
 /// # Panics
 /// Never for the seeds of these tests: no id is 0.
@@ -62,7 +63,7 @@ pub fn key(seed: u8) -> SigningKey {
     SigningKey::from_seed([seed; 32]).expect("its id is not 0")
 }
 
-/// The root that the devices know.
+/// The root of the devices.
 #[must_use]
 pub fn root() -> SigningKey {
     key(1)
@@ -74,7 +75,7 @@ pub fn release() -> SigningKey {
     key(2)
 }
 
-/// A program of the board's product with this security counter, neither compressed nor encrypted,
+/// A program for the board's product with this security counter, neither compressed nor encrypted,
 /// to be signed by [`release`].
 #[must_use]
 pub fn sealer(counter: u32) -> Sealer<'static> {
@@ -92,7 +93,7 @@ pub fn sealer(counter: u32) -> Sealer<'static> {
     Sealer { certificate, vendor_id, product_code, counter, ..Sealer::default() }
 }
 
-/// A board with the bootloader for sealed images and the keys for it, and no power yet.
+/// A board with the bootloader for sealed images and its keys, still without power.
 ///
 /// # Panics
 /// If the firmware was not built.
@@ -103,7 +104,7 @@ pub fn board() -> Bench {
     bench
 }
 
-/// Writes the keys into a board, as in production: it is a sealed one from its next reset on.
+/// Writes the keys into a board, as in production: it is a sealed device after its next reset.
 ///
 /// # Panics
 /// Never: the place of the keys is in flash.
@@ -113,14 +114,14 @@ pub fn provision(bench: &mut Bench) {
     bench.machine().load_bin(place.base, &block).expect("it is in flash");
 }
 
-/// The same without keys: an open device.
+/// The same without keys: a device that is not sealed.
 #[must_use]
 pub fn open_board() -> Bench {
     Bench::of_image(firmware::BOOTLOADER_SEALED)
 }
 
-/// Sends CLEAR and writes a file to 1F50h as a whole, as any master does; gives the abort code, if
-/// there was one, and the word of 1F57h when the device is not busy any more.
+/// Sends CLEAR and writes a file to 1F50h as a whole, like any master; returns the abort code, if
+/// any, and the word of 1F57h after the device is no longer busy.
 ///
 /// # Panics
 /// If the device does not answer.

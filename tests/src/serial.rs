@@ -1,4 +1,4 @@
-//! The board's serial line as a host's end of it, in virtual time.
+//! The host's end of the board's serial line, in virtual time.
 
 use std::collections::VecDeque;
 use std::io::{self, ErrorKind, Read, Write};
@@ -14,24 +14,24 @@ use emulator::time::{Span, Time};
 use crate::bench::Bench;
 use crate::script::Wire;
 
-/// How far the board goes on between two looks at the line.
+/// How long the board runs between two reads of the line.
 const LOOK: Span = Span::from_micros(100);
 /// Shorter than a character at 115 200 bit/s (87 us): a session that ends with a frame ends before
-/// the first character of the next one is complete, which is then still to be looked at.
+/// the first character of the next frame is complete, so that this frame is still checked.
 const SHORT_LOOK: Span = Span::from_micros(50);
 
-/// The host's end of the line of a board's UART. Whoever reads lets the board run.
+/// The host's end of the line of a board's UART. A read lets the board run.
 pub struct SerialLine<'b> {
     /// The bench of the board.
     pub bench: &'b mut Bench,
     epoch: Instant,
     timeout: Duration,
-    /// What has come and was not read yet.
+    /// Received bytes that were not read yet.
     come: VecDeque<u8>,
 }
 
 impl<'b> SerialLine<'b> {
-    /// The line of the first board of a bench, which has power and has set its UART up.
+    /// The line of the first board of a bench, which has power and has configured its UART.
     pub fn new(bench: &'b mut Bench) -> Self {
         Self { bench, epoch: Instant::now(), timeout: Duration::ZERO, come: VecDeque::new() }
     }
@@ -75,15 +75,15 @@ impl Line for SerialLine<'_> {
     }
 }
 
-/// A board's UART as a bus: frames as text, as the CAN232's manual has them. What coflash makes of
-/// that text has no part in it.
+/// A board's UART as a bus: frames as text, as in the CAN232's manual. This code is independent of
+/// coflash's parser.
 pub struct TextBus {
     /// The bench of the board.
     pub bench: Bench,
-    /// What has come of a line, and when the first character of it ended.
+    /// The received part of a line, and the end time of its first character.
     line: (Time, String),
     heard: Vec<Heard>,
-    /// Frames up to here were given to the host's session.
+    /// The frames up to here were passed to the host's session.
     given: usize,
 }
 
@@ -121,7 +121,7 @@ impl TextBus {
     }
 }
 
-/// The frame in a line of text; a line without one acknowledges what the host said.
+/// The frame in a line of text; a line without a frame acknowledges the host's text.
 fn frame(start: Time, end: Time, line: &str) -> Option<Heard> {
     let text = match line.strip_prefix('t') {
         Some(text) => text,

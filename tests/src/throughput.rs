@@ -1,4 +1,4 @@
-//! How long a program takes into the device, beside what the wire and the flash allow at best.
+//! The duration of a download, compared with the limits of wire and flash.
 
 use std::time::Duration;
 
@@ -21,8 +21,8 @@ use crate::sealed_board;
 
 const DATA: Address = Address::new(0x1F50, 1);
 const STATUS: Address = Address::new(0x1F57, 1);
-/// Bytes of a block, framing included: large enough that the wire hardly notices the framing, small
-/// enough that the last one is programmed in no time.
+/// Bytes of a block, including framing: large enough that the framing hardly matters on the wire,
+/// small enough that the last block is programmed in a short time.
 const BLOCK_SIZE: usize = 4096;
 /// Typical erase times of the STM32F405/407 by words, in ms (datasheet DocID022152, flash memory
 /// programming).
@@ -37,23 +37,23 @@ pub struct Measurement {
     pub bit_rate: u32,
     /// Size of the program in KiB.
     pub kib: u32,
-    /// From the CLEAR command to the status that says "verified".
+    /// From the CLEAR command to the status "verified".
     pub took: u64,
-    /// What one SDO block transfer of these bytes takes on the wire, without a pause: stuff bits,
-    /// acknowledgements and intermissions included.
+    /// The duration of one SDO block transfer of these bytes on the wire without a pause, including
+    /// stuff bits, acknowledgements and intermissions.
     pub wire: u64,
-    /// What erasing the sectors and programming the words take.
+    /// The duration of erasing the sectors and programming the words.
     pub flash: u64,
 }
 
 impl Measurement {
-    /// The lower limit of both, as it is the slower that limits.
+    /// The lower limit: the larger one of both.
     #[must_use]
     pub fn limit(&self) -> u64 {
         self.wire.max(self.flash)
     }
 
-    /// How near it came, in percent.
+    /// The efficiency in percent.
     #[must_use]
     pub fn percent(&self) -> u64 {
         self.limit() * 100 / self.took.max(1)
@@ -82,7 +82,7 @@ pub fn measure(rate: BitRate, kib: u32) -> Measurement {
     Measurement { bit_rate, kib, took, wire: wire_us(&bytes, bit_rate), flash: flash_us(bytes.len() as u32) }
 }
 
-/// A board that is up at this bit rate, and the bit rate in bit/s.
+/// A running board at this bit rate, and the bit rate in bit/s.
 fn board_at(rate: BitRate) -> (Bench, u32) {
     let mut bench = Bench::new();
     let bit_rate = change_over(&mut bench, rate);
@@ -91,7 +91,7 @@ fn board_at(rate: BitRate) -> (Bench, u32) {
     (bench, bit_rate)
 }
 
-/// Gives a new board another bit rate, and leaves it without power; gives the bit rate in bit/s.
+/// Sets another bit rate of a new board, and switches it off; returns the bit rate in bit/s.
 ///
 /// # Panics
 /// If the board refuses.
@@ -103,14 +103,14 @@ pub fn change_over(bench: &mut Bench, rate: BitRate) -> u32 {
     bit_rate
 }
 
-/// The form in which a program is sent as a whole.
+/// The form in which a program is sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Form {
-    /// As it lies in flash, into a device without keys.
+    /// As it lies in flash, to a device without keys.
     Raw,
-    /// Sealed, into a device with keys.
+    /// Sealed, to a device with keys.
     Sealed,
-    /// The same, compressed.
+    /// Sealed and compressed.
     Compressed,
 }
 
@@ -121,20 +121,21 @@ pub struct OfForm {
     pub bit_rate: u32,
     /// Size of the program in KiB.
     pub kib: u32,
-    /// How it is sent.
+    /// The form of the program.
     pub form: Form,
     /// Bytes that are sent.
     pub file: usize,
-    /// From the CLEAR command to the status that says "verified".
+    /// From the CLEAR command to the status "verified".
     pub took: u64,
-    /// What one SDO block transfer of the raw program takes on the wire, see [`Measurement::wire`].
+    /// The duration of one SDO block transfer of the raw program on the wire, see
+    /// [`Measurement::wire`].
     pub wire: u64,
     /// See [`Measurement::flash`].
     pub flash: u64,
 }
 
 impl OfForm {
-    /// What it took, in percent of the raw program's time on the wire.
+    /// The duration in percent of the raw program's time on the wire.
     #[must_use]
     pub fn percent(&self) -> u64 {
         self.took * 100 / self.wire.max(1)
@@ -168,8 +169,8 @@ pub fn measure_form(rate: BitRate, kib: u32, form: Form) -> OfForm {
     OfForm { bit_rate, kib, form, file: file.len(), took, wire, flash }
 }
 
-/// The application, filled up to so many KiB with half-words that are drawn from its own. To LZMA
-/// they are less alike than code is: it leaves 80 % of them, and 71 % of the application.
+/// The application, extended to this many KiB by half-words drawn from its own. For LZMA they are
+/// less similar than code: they compress to 80 %, and the application to 71 %.
 ///
 /// # Panics
 /// If it was not built.
@@ -186,20 +187,20 @@ pub fn code(kib: u32) -> Vec<u8> {
     bytes
 }
 
-/// How busy a bus is while `coflash flash` sends a program over it.
+/// The load of the bus while `coflash flash` sends a program.
 #[derive(Clone, Copy, Debug)]
 pub struct Load {
     /// Bit rate in bit/s.
     pub bit_rate: u32,
     /// Size of the program in KiB.
     pub kib: u32,
-    /// Bytes of a block, framing included.
+    /// Bytes of a block, including framing.
     pub block_size: usize,
-    /// From the first block to the status that says "verified", in us.
+    /// From the first block to the status "verified", in us.
     pub took: u64,
-    /// Of that, with a frame on the bus or in the intermission behind it, in us.
+    /// The part of this time with a frame on the bus or in the following intermission, in us.
     pub busy: u64,
-    /// Frames, of both directions.
+    /// The number of frames in both directions.
     pub frames: usize,
 }
 
@@ -211,9 +212,9 @@ impl Load {
     }
 }
 
-/// Has the procedure of `coflash flash`, as it is without any option but `--no-start`, bring a
-/// program of this size into a board in virtual time. So what the bus is idle is the procedure's
-/// and the device's doing, not the computer's.
+/// Runs the procedure of `coflash flash`, with no option but `--no-start`, to download a program of
+/// this size into a board in virtual time. Idle times of the bus are therefore caused by the
+/// procedure and the device, not by the computer.
 ///
 /// # Panics
 /// If the device refuses it, or the firmware was not built.
@@ -238,7 +239,7 @@ pub fn load(rate: BitRate, kib: u32, block_size: usize) -> Load {
     Load { bit_rate, kib, block_size, took, busy, frames: frames.len() }
 }
 
-/// The application, filled up to so many KiB with bytes that stuff as code does.
+/// The application, extended to this many KiB by bytes that cause stuff bits like code.
 ///
 /// # Panics
 /// If it was not built.
@@ -257,7 +258,7 @@ fn blocks(bytes: &[u8], block_size: usize) -> BlockFile {
     let options = Options::default()
         .region(Region::Strict(region.into()))
         .block_size(block_size)
-        // Tells the size, so that sectors are erased ahead of the data.
+        // Sends the size, so that sectors are erased ahead of the data.
         .label(Label::Device {
             vendor_id: bsp::IDENTITY.vendor_id,
             product_code: bsp::IDENTITY.product_code,
@@ -265,7 +266,8 @@ fn blocks(bytes: &[u8], block_size: usize) -> BlockFile {
     blocks_of(image, &options).expect("it fits").file
 }
 
-/// Frames of one block transfer, each with its stuff bits and the intermission behind it.
+/// The duration of one block transfer in us, each frame with its stuff bits and the following
+/// intermission.
 fn wire_us(bytes: &[u8], bit_rate: u32) -> u64 {
     let node = u16::from(NODE);
     let bits = |id: u16, data: [u8; 8]| u64::from(Frame::standard(id, &data).expect("8 bytes").bus_bits());

@@ -146,7 +146,7 @@ fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
     let blocks_of_set = blocks_of(raw, &Options::default()).unwrap().file;
     let second = options.program(2);
     update(&mut bench, NODE, &blocks_of_set, &second).0.unwrap();
-    assert!(version(&mut bench, NODE).contains("2.0.0"), "the program goes on");
+    assert!(version(&mut bench, NODE).contains("2.0.0"), "the program continues");
     let mut session = bench.session_with(NODE);
     let parameters = Address::new(0x1F50, 2);
     let stored = read_locked(&mut session, parameters, None, Password::new(PASSWORD), &mut |_| {}).unwrap();

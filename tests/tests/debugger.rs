@@ -420,7 +420,7 @@ fn registers_are_read_and_changed_and_steps_are_steps() {
         }
     }
     assert!(steps >= 4, "{steps}");
-    // Now back to the beginning of the function: the program goes on from there, and counts once
+    // Now back to the beginning of the function: the program continues from there, and counts once
     // more.
     let before = read_word(&mut bench, calls);
     let frame = {
@@ -679,7 +679,7 @@ fn coflash_debug_reads_writes_breaks_and_continues() {
     let said = done(debug(&mut endpoint, &["read", &calls]));
     assert!(said.ends_with("06 00 00 00 (00000006h)\n"), "{said}");
     assert_eq!(done(debug(&mut endpoint, &["break", "--clear"])), "node 1: no breakpoints\n");
-    assert_eq!(done(debug(&mut endpoint, &["continue"])), "node 1: the program goes on\n");
+    assert_eq!(done(debug(&mut endpoint, &["continue"])), "node 1: the program continues\n");
     for (words, exit, says) in [
         (&["continue"][..], 2, "the program is not stopped"),
         (&["registers"], 2, "the program is not stopped"),

@@ -1,8 +1,8 @@
 //! CANlib of Kvaser: the functions that a classic CAN adapter needs.
 //!
-//! Signatures are those of the public header `canlib.h` (CANlib 5); `long` is as wide as the system's.
+//! Signatures are those of the public header `canlib.h` (CANlib 5); `long` has the system's width.
 
-// What is a conversion on one system is none on another, whose `long` has 64 bits.
+// A conversion that is necessary on one system is useless on another, where `long` has 64 bits.
 #![allow(clippy::useless_conversion, clippy::unnecessary_fallible_conversions)]
 
 use std::ffi::{c_int, c_long, c_uint, c_ulong, c_void};
@@ -11,24 +11,24 @@ use std::fmt;
 use crate::load::Loaded;
 use crate::LoadError;
 
-/// The files in which the library comes, the first choice first.
+/// The file names of the library, in the order of preference.
 #[cfg(windows)]
 pub const FILES: &[&str] = &["canlib32.dll"];
-/// The files in which the library comes, the first choice first: Kvaser has none for macOS.
+/// The file names of the library, in the order of preference. Kvaser has no library for macOS.
 #[cfg(target_os = "macos")]
 pub const FILES: &[&str] = &["libcanlib.dylib"];
-/// The files in which the library comes, the first choice first.
+/// The file names of the library, in the order of preference.
 #[cfg(not(any(windows, target_os = "macos")))]
 pub const FILES: &[&str] = &["libcanlib.so.1", "libcanlib.so"];
 
-/// What `canReadWait` gives.
+/// A message from `canReadWait`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Message {
-    /// The identifier; not negative, if the library does not lie.
+    /// The identifier; negative only if the library is faulty.
     pub id: i64,
-    /// How many bytes of `data` count; 8 at most, if the library does not lie.
+    /// The number of valid bytes in `data`; more than 8 only if the library is faulty.
     pub len: u32,
-    /// `canMSG_…` and `canMSGERR_…`, bits.
+    /// Bits of `canMSG_…` and `canMSGERR_…`.
     pub flags: u32,
     /// The data.
     pub data: [u8; 8],
@@ -67,7 +67,7 @@ pub struct Canlib {
     read_wait: ReadWait,
     status: Status,
     counters: Counters,
-    // Last: the functions above are its.
+    // The last field, because the functions above belong to it.
     _library: Loaded,
 }
 
@@ -81,9 +81,9 @@ impl Canlib {
     /// Loads the library, and calls its `canInitializeLibrary`.
     ///
     /// # Errors
-    /// It is not there, or too old.
+    /// The library is missing or too old.
     pub fn load() -> Result<Self, LoadError> {
-        // SAFETY: the files are those of the vendor's installer; the types are those of canlib.h, and
+        // SAFETY: the files come from the vendor's installer; the types are those of canlib.h, and
         // the functions live as long as the library beside them.
         unsafe {
             let library = Loaded::first_of(FILES)?;
@@ -107,56 +107,56 @@ impl Canlib {
         }
     }
 
-    /// `canGetNumberOfChannels`: a `canStatus`, and the number.
+    /// `canGetNumberOfChannels`: returns a `canStatus` and the number.
     pub fn channels(&self) -> (i32, i32) {
         let mut count = 0;
-        // SAFETY: the number is ours.
+        // SAFETY: the number is a local variable.
         let status = unsafe { (self.channels)(&raw mut count) };
         (status, count)
     }
 
-    /// `canGetChannelData` of an item that is text: its bytes up to the first zero.
+    /// `canGetChannelData` of a text item: returns its bytes up to the first zero.
     pub fn text(&self, channel: i32, item: i32) -> (i32, Vec<u8>) {
         let mut text = [0_u8; 256];
-        // SAFETY: the buffer is ours, and longer than the length that is told.
+        // SAFETY: the buffer is a local variable and longer than the passed length.
         let status = unsafe { (self.channel_data)(channel, item, text.as_mut_ptr().cast(), 255) };
         (status, text.into_iter().take_while(|byte| *byte != 0).collect())
     }
 
-    /// `canOpenChannel`: a handle, or a negative `canStatus`.
+    /// `canOpenChannel`: returns a handle or a negative `canStatus`.
     pub fn open(&self, channel: i32, flags: i32) -> i32 {
-        // SAFETY: plain numbers.
+        // SAFETY: the arguments are plain numbers.
         unsafe { (self.open)(channel, flags) }
     }
 
     /// `canClose`.
     pub fn close(&self, handle: i32) -> i32 {
-        // SAFETY: plain numbers.
+        // SAFETY: the arguments are plain numbers.
         unsafe { (self.close)(handle) }
     }
 
-    /// `canSetBusParams` with one sample a bit: a bit rate in bit/s with its segments in time quanta, or one
-    /// of the `canBITRATE_…` with zeros.
+    /// `canSetBusParams` with one sample for each bit: a bit rate in bit/s with its segments in
+    /// time quanta, or one of the `canBITRATE_…` with zeros.
     pub fn bus_parameters(&self, handle: i32, rate: i32, segments: (u32, u32), jump_width: u32) -> i32 {
         let (before, behind) = segments;
         let samples = u32::from(before != 0);
-        // SAFETY: plain numbers.
+        // SAFETY: the arguments are plain numbers.
         unsafe { (self.bus_parameters)(handle, rate.into(), before, behind, jump_width, samples, 0) }
     }
 
     /// `canBusOn`.
     pub fn bus_on(&self, handle: i32) -> i32 {
-        // SAFETY: plain numbers.
+        // SAFETY: the arguments are plain numbers.
         unsafe { (self.bus_on)(handle) }
     }
 
     /// `canBusOff`.
     pub fn bus_off(&self, handle: i32) -> i32 {
-        // SAFETY: plain numbers.
+        // SAFETY: the arguments are plain numbers.
         unsafe { (self.bus_off)(handle) }
     }
 
-    /// `canWrite`; `data` has 8 bytes at most. Does not wait.
+    /// `canWrite`; `data` has at most 8 bytes. Does not wait.
     pub fn write(&self, handle: i32, id: u32, data: &[u8], len: u32, flags: u32) -> i32 {
         let mut bytes = [0_u8; 8];
         for (byte, value) in bytes.iter_mut().zip(data) {
@@ -164,16 +164,16 @@ impl Canlib {
         }
         // Identifiers have 29 bits.
         let id = c_long::try_from(id).unwrap_or_default();
-        // SAFETY: the library reads 8 bytes at most, which are there.
+        // SAFETY: the library reads at most 8 bytes, and the buffer has 8 bytes.
         unsafe { (self.write)(handle, id, bytes.as_mut_ptr().cast(), len.min(8), flags) }
     }
 
     /// `canReadWait` with a time in milliseconds.
     pub fn read_wait(&self, handle: i32, wait: u32) -> (i32, Message) {
         let (mut id, mut len, mut flags, mut time): (c_long, c_uint, c_uint, c_ulong) = (0, 0, 0, 0);
-        // A library that takes the channel for one of CAN FD has 64.
+        // A library that takes the channel for a CAN FD channel writes up to 64 bytes.
         let mut data = [0_u8; 64];
-        // SAFETY: all of it is ours, and of the header's types.
+        // SAFETY: all arguments are local variables with the types of the header.
         let status = unsafe {
             (self.read_wait)(
                 handle,
@@ -189,18 +189,18 @@ impl Canlib {
         (status, Message { id: id.into(), len, flags, data })
     }
 
-    /// `canReadStatus`: `canSTAT_…`, bits.
+    /// `canReadStatus`: returns the bits of `canSTAT_…`.
     pub fn status(&self, handle: i32) -> (i32, u64) {
         let mut flags: c_ulong = 0;
-        // SAFETY: the number is ours.
+        // SAFETY: the number is a local variable.
         let status = unsafe { (self.status)(handle, &raw mut flags) };
         (status, flags.into())
     }
 
-    /// `canReadErrorCounters`: of sending, and of receiving.
+    /// `canReadErrorCounters`: returns the transmit and the receive error counter.
     pub fn counters(&self, handle: i32) -> (i32, u32, u32) {
         let (mut send, mut receive, mut overruns) = (0, 0, 0);
-        // SAFETY: the numbers are ours.
+        // SAFETY: the numbers are local variables.
         let status = unsafe { (self.counters)(handle, &raw mut send, &raw mut receive, &raw mut overruns) };
         (status, send, receive)
     }

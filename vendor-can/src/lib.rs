@@ -1,18 +1,18 @@
-//! The libraries of two makers of CAN adapters, loaded while the program runs: nobody needs them to
-//! build it, or to use another adapter.
+//! The libraries of two manufacturers of CAN adapters, loaded at run time: they are not necessary
+//! to build the program, or to use another adapter.
 //!
 //! | module | library | from |
 //! |---|---|---|
 //! | [`pcan`] | PCANBasic | PEAK-System |
 //! | [`canlib`] | CANlib | Kvaser |
 //!
-//! This crate has the host tools' only `unsafe`: each module holds the signatures of one library, calls
-//! its functions, and hands out plain values. What these mean is judged elsewhere (`coflash::adapter`).
-//! A library that writes beyond the buffers that it is given cannot be held back by anybody; one that
-//! returns nonsense can, and callers have to expect it in every value.
+//! This crate has the only `unsafe` code of the host tools: each module holds the signatures of one
+//! library, calls its functions, and returns plain values. Other code (`coflash::adapter`) checks
+//! these values. Nothing can stop a library that writes beyond its buffers; but a library may
+//! return invalid values, and callers must expect them in every value.
 //!
-//! **Not tried on hardware**: the signatures are those of the public headers, and the tests call
-//! stand-ins that are compiled from the same.
+//! **Not tested on hardware**: the signatures are those of the public headers, and the tests call
+//! stand-ins that are compiled from the same headers.
 
 pub mod canlib;
 mod load;

@@ -1,4 +1,4 @@
-//! Finds a library and its functions.
+//! Loads a library and finds its functions.
 
 use std::fmt;
 
@@ -7,14 +7,14 @@ use libloading::Library;
 /// Why a library cannot be used.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum LoadError {
-    /// None of its files is there, or none can be loaded.
+    /// None of its files exists or can be loaded.
     Missing {
-        /// The file names that were looked for, in this order.
+        /// The file names that were tried, in this order.
         files: Vec<String>,
-        /// What the system said of the last one.
+        /// The system's message about the last one.
         why: String,
     },
-    /// It is there, and lacks a function that is needed: an old version, or another library.
+    /// The library lacks a required function: it is an old version, or another library.
     Old {
         /// The file.
         file: String,
@@ -36,21 +36,21 @@ impl fmt::Display for LoadError {
 
 impl std::error::Error for LoadError {}
 
-/// A library that is loaded, and the file that it came from.
+/// A loaded library, and its file name.
 pub(crate) struct Loaded {
     library: Library,
     file: String,
 }
 
 impl Loaded {
-    /// The first of these files that loads.
+    /// Loads the first of these files that can be loaded.
     ///
     /// # Safety
-    /// A library's own start-up code runs: the files must be those of the vendor.
+    /// The library's start-up code runs: the files must be the vendor's.
     pub(crate) unsafe fn first_of(files: &[&str]) -> Result<Self, LoadError> {
         let mut why = "this system has none".to_string();
         for file in files {
-            // SAFETY: passed on to the caller.
+            // SAFETY: the caller guarantees this.
             match unsafe { open(file) } {
                 Ok(library) => return Ok(Self { library, file: (*file).to_string() }),
                 Err(error) => why = one_line(&error),
@@ -59,12 +59,13 @@ impl Loaded {
         Err(LoadError::Missing { files: files.iter().map(|file| (*file).to_string()).collect(), why })
     }
 
-    /// The function of this name.
+    /// The function with this name.
     ///
     /// # Safety
-    /// `F` must be the function's type, and it must not be called when `self` is gone.
+    /// `F` must be the function's type, and the function must not be called after `self` was
+    /// dropped.
     pub(crate) unsafe fn function<F: Copy>(&self, symbol: &'static str) -> Result<F, LoadError> {
-        // SAFETY: the type is the caller's promise.
+        // SAFETY: the caller guarantees the type.
         match unsafe { self.library.get::<F>(symbol) } {
             Ok(function) => Ok(*function),
             Err(_) => Err(LoadError::Old { file: self.file.clone(), symbol }),
@@ -77,8 +78,8 @@ impl Loaded {
 #[cfg(windows)]
 unsafe fn open(file: &str) -> Result<Library, libloading::Error> {
     use libloading::os::windows;
-    // Not from the current folder: a firmware archive could bring a library of this name along.
-    // SAFETY: passed on to the caller.
+    // Not from the current folder: a firmware archive could contain a library with this name.
+    // SAFETY: the caller guarantees this.
     unsafe { windows::Library::load_with_flags(file, windows::LOAD_LIBRARY_SEARCH_DEFAULT_DIRS) }
         .map(Library::from)
 }
@@ -87,11 +88,12 @@ unsafe fn open(file: &str) -> Result<Library, libloading::Error> {
 /// As [`Loaded::first_of`].
 #[cfg(not(windows))]
 unsafe fn open(file: &str) -> Result<Library, libloading::Error> {
-    // SAFETY: passed on to the caller. A bare name is looked for in the system's folders alone.
+    // SAFETY: the caller guarantees this. A bare name is only looked up in the system's folders.
     unsafe { Library::new(file) }
 }
 
-/// What the system says, in one line: the error's own words are "dlopen failed", its source has more.
+/// The system's message in one line: the error itself only says "dlopen failed", and its source has
+/// the details.
 fn one_line(error: &libloading::Error) -> String {
     let source = std::error::Error::source(error).map(ToString::to_string);
     let text = source.unwrap_or_else(|| error.to_string());

@@ -1,7 +1,7 @@
 //! PCANBasic of PEAK-System: the functions that a classic CAN adapter needs.
 //!
-//! Signatures and `TPCANMsg` are those of the public header `PCANBasic.h` (PCAN-Basic 4); the library
-//! for macOS (PCBUSB) exports the same.
+//! Signatures and `TPCANMsg` are those of the public header `PCANBasic.h` (PCAN-Basic 4); the
+//! library for macOS (PCBUSB) exports the same functions.
 
 use std::ffi::c_void;
 use std::fmt;
@@ -9,13 +9,13 @@ use std::fmt;
 use crate::load::Loaded;
 use crate::LoadError;
 
-/// The files in which the library comes, the first choice first.
+/// The file names of the library, in the order of preference.
 #[cfg(windows)]
 pub const FILES: &[&str] = &["PCANBasic.dll"];
-/// The files in which the library comes, the first choice first.
+/// The file names of the library, in the order of preference.
 #[cfg(target_os = "macos")]
 pub const FILES: &[&str] = &["libPCBUSB.dylib", "/usr/local/lib/libPCBUSB.dylib"];
-/// The files in which the library comes, the first choice first.
+/// The file names of the library, in the order of preference.
 #[cfg(not(any(windows, target_os = "macos")))]
 pub const FILES: &[&str] = &["libpcanbasic.so", "libpcanbasic.so.4"];
 
@@ -25,9 +25,9 @@ pub const FILES: &[&str] = &["libpcanbasic.so", "libpcanbasic.so.4"];
 pub struct Message {
     /// The identifier.
     pub id: u32,
-    /// `MSGTYPE`, bits.
+    /// Bits of `MSGTYPE`.
     pub kind: u8,
-    /// How many bytes of `data` count; 8 at most, if the library does not lie.
+    /// The number of valid bytes in `data`; more than 8 only if the library is faulty.
     pub len: u8,
     /// The data.
     pub data: [u8; 8],
@@ -48,7 +48,7 @@ pub struct Pcan {
     write: Write,
     get: Value,
     set: Value,
-    // Last: the functions above are its.
+    // The last field, because the functions above belong to it.
     _library: Loaded,
 }
 
@@ -62,9 +62,9 @@ impl Pcan {
     /// Loads the library.
     ///
     /// # Errors
-    /// It is not there, or too old.
+    /// The library is missing or too old.
     pub fn load() -> Result<Self, LoadError> {
-        // SAFETY: the files are those of the vendor's installer; the types are those of PCANBasic.h,
+        // SAFETY: the files come from the vendor's installer; the types are those of PCANBasic.h,
         // and the functions live as long as the library beside them.
         unsafe {
             let library = Loaded::first_of(FILES)?;
@@ -81,57 +81,58 @@ impl Pcan {
         }
     }
 
-    /// `CAN_Initialize` of a plug-and-play channel, with the two timing registers of an SJA1000. Gives a
-    /// `TPCANStatus`, like all that follow.
+    /// `CAN_Initialize` of a plug-and-play channel, with the two timing registers of an SJA1000.
+    /// Returns a `TPCANStatus`, like all following functions.
     pub fn initialize(&self, channel: u16, btr0btr1: u16) -> u32 {
-        // SAFETY: plain numbers.
+        // SAFETY: the arguments are plain numbers.
         unsafe { (self.initialize)(channel, btr0btr1, 0, 0, 0) }
     }
 
     /// `CAN_Uninitialize`.
     pub fn uninitialize(&self, channel: u16) -> u32 {
-        // SAFETY: plain numbers.
+        // SAFETY: the arguments are plain numbers.
         unsafe { (self.uninitialize)(channel) }
     }
 
     /// `CAN_GetStatus`.
     pub fn status(&self, channel: u16) -> u32 {
-        // SAFETY: plain numbers.
+        // SAFETY: the arguments are plain numbers.
         unsafe { (self.status)(channel) }
     }
 
-    /// `CAN_Read`: the oldest message, if the status says that there is one. Does not wait.
+    /// `CAN_Read`: returns the oldest message, if the status reports one. Does not wait.
     pub fn read(&self, channel: u16) -> (u32, Message) {
         let mut message = Message::default();
-        // SAFETY: the message is ours and of the header's layout; the header allows no time stamp.
+        // SAFETY: the message is a local variable with the layout of the header; the header allows
+        // a null time stamp.
         let status = unsafe { (self.read)(channel, &raw mut message, std::ptr::null_mut()) };
         (status, message)
     }
 
     /// `CAN_Write`. Does not wait.
     pub fn write(&self, channel: u16, mut message: Message) -> u32 {
-        // SAFETY: the message is ours and of the header's layout.
+        // SAFETY: the message is a local variable with the layout of the header.
         unsafe { (self.write)(channel, &raw mut message) }
     }
 
-    /// `CAN_GetValue` of a parameter that is a number.
+    /// `CAN_GetValue` of a numeric parameter.
     pub fn number(&self, channel: u16, parameter: u8) -> (u32, u32) {
         let mut value = 0_u32;
-        // SAFETY: the buffer is ours, and of the length that is told.
+        // SAFETY: the buffer is a local variable of the passed length.
         let status = unsafe { (self.get)(channel, parameter, (&raw mut value).cast(), 4) };
         (status, value)
     }
 
-    /// `CAN_SetValue` of a parameter that is a number.
+    /// `CAN_SetValue` of a numeric parameter.
     pub fn set_number(&self, channel: u16, parameter: u8, mut value: u32) -> u32 {
-        // SAFETY: the buffer is ours, and of the length that is told.
+        // SAFETY: the buffer is a local variable of the passed length.
         unsafe { (self.set)(channel, parameter, (&raw mut value).cast(), 4) }
     }
 
-    /// `CAN_GetValue` of a parameter that is text: its bytes up to the first zero.
+    /// `CAN_GetValue` of a text parameter: returns its bytes up to the first zero.
     pub fn text(&self, channel: u16, parameter: u8) -> (u32, Vec<u8>) {
         let mut text = [0_u8; 256];
-        // SAFETY: the buffer is ours, and longer than the length that is told.
+        // SAFETY: the buffer is a local variable and longer than the passed length.
         let status = unsafe { (self.get)(channel, parameter, text.as_mut_ptr().cast(), 255) };
         (status, text.into_iter().take_while(|byte| *byte != 0).collect())
     }
@@ -141,7 +142,7 @@ impl Pcan {
 mod tests {
     use super::*;
 
-    /// `TPCANMsg` of the header: DWORD, BYTE, BYTE, BYTE[8], padded to whole DWORDs.
+    /// `TPCANMsg` in the header: DWORD, BYTE, BYTE, BYTE[8], padded to whole DWORDs.
     #[test]
     fn a_message_has_the_headers_layout() {
         use std::mem::{offset_of, size_of};

@@ -1,4 +1,4 @@
-//! A bootloader on the model of the flash, and what a host sends it.
+//! A bootloader on the model of the flash, and the actions of a host.
 #![allow(dead_code, reason = "each test file uses some of it")]
 
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config, Extras};
@@ -123,14 +123,14 @@ impl<'f> Bench<'f> {
         self.word(STATUS)
     }
 
-    /// A command, carried out; gives the status.
+    /// Carries out a command; returns the status.
     pub fn command(&mut self, command: u8) -> u32 {
         self.node.write(CONTROL, &[command]).unwrap();
         self.settle();
         self.status()
     }
 
-    /// A block in SDO segments; the abort, if any, and then the status when all work is done.
+    /// Sends a block in SDO segments; returns the abort, if any, and the status after all work.
     pub fn block(&mut self, block: &[u8]) -> (Result<(), AbortCode>, u32) {
         let outcome = self.transfer(block);
         self.settle();
@@ -140,7 +140,7 @@ impl<'f> Bench<'f> {
     pub fn transfer(&mut self, block: &[u8]) -> Result<(), AbortCode> {
         self.node.download_start(DATA, Some(block.len() as u32))?;
         for segment in block.chunks(7) {
-            // As the SDO server does it: an error ends the transfer and cancels the consumer.
+            // As the SDO server does: an error ends the transfer and cancels the receiver.
             if let Err(abort) = self.node.download_data(DATA, segment) {
                 self.node.download_cancel(DATA);
                 return Err(abort);
@@ -149,15 +149,15 @@ impl<'f> Bench<'f> {
         self.node.download_end(DATA)
     }
 
-    /// A whole program in one download, `pieces` of it at a time, with the flash working in between
-    /// when there is no room; the abort, if any, and then the status when all work is done.
+    /// Sends a whole program in one download, `pieces` of it at a time, and lets the flash work
+    /// when there is no room; returns the abort, if any, and the status after all work.
     pub fn stream(&mut self, data: &[u8], size: Option<u32>, pieces: usize) -> (Result<(), AbortCode>, u32) {
         let outcome = self.pour(data, size, pieces);
         self.settle();
         (outcome, self.status())
     }
 
-    /// The same, but for the work that is left when all is sent.
+    /// The same without the work that is left after the download.
     pub fn pour(&mut self, data: &[u8], size: Option<u32>, pieces: usize) -> Result<(), AbortCode> {
         self.node.download_start(DATA, size)?;
         for segment in data.chunks(pieces) {
@@ -241,7 +241,7 @@ pub fn program(len: usize, seed: u8) -> Vec<u8> {
     bytes
 }
 
-/// Which program would start after a reset, told by its first data byte; `Err` for none.
+/// The program that would start after a reset, identified by its first data byte; `Err` for none.
 pub fn autostart(flash: &ModelFlash) -> Result<u8, Invalid> {
     let journal = Journal::open(flash, LAYOUT.parameters);
     let verified = verify(flash, &journal, &LAYOUT, CrcKind::Crc32, 1)?;
@@ -252,8 +252,8 @@ pub fn autostart(flash: &ModelFlash) -> Result<u8, Invalid> {
     }
 }
 
-/// An update of an installed program, cut at every operation: what starts afterwards is the old
-/// program or the new one (told by their seeds), whole, or nothing; and the update then completes.
+/// An update of an installed program, cut at every operation: afterwards the old program or the new
+/// one starts (identified by their seeds), complete, or none; and the update then completes.
 pub fn cut_at_every_operation(installed: &ModelFlash, old: u8, new: u8, update: impl Fn(&mut ModelFlash)) {
     quiet_power_cuts();
     let cells = installed.cells(CHIP.flash).to_vec();

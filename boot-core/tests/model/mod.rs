@@ -1,5 +1,5 @@
-//! A strict flash: it does what the F4's does, refuses what the F4 would silently spoil, and loses
-//! power on demand.
+//! A strict flash: it behaves like the F4's, refuses operations that the F4 would carry out wrongly
+//! without an error, and loses power on demand.
 #![allow(dead_code)]
 
 use std::cell::{Cell, RefCell, RefMut};
@@ -45,20 +45,20 @@ pub const TWO_PROGRAMS: Layout =
     Layout { programs: &[Region::new(0x0800_0800, 0x1C00), Region::new(0x0800_2400, 0x2000)], ..ONE_PROGRAM }
         .checked();
 
-/// Thrown by the flash when the power goes. Catch it, then [`ModelFlash::power_on`].
+/// Thrown by the flash when the power is cut. Catch it, then call [`ModelFlash::power_on`].
 pub struct PowerCut;
 
-/// What the running operation has done when the power goes.
+/// The state of the running operation at a power cut.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Cut {
     /// Nothing.
     Before,
     /// A part: some bits of the word, a part of the sector.
     Torn(u64),
-    /// A part, and some bits are left between 0 and 1: they read differently each time, until they
-    /// are programmed to 0 or erased once more.
+    /// A part is done, and some bits are left between 0 and 1: they read differently each time,
+    /// until they are programmed to 0 or erased again.
     Unstable(u64),
-    /// All, but nobody has seen it.
+    /// All is done, but the result was not read.
     After,
 }
 
@@ -74,22 +74,22 @@ pub struct ModelFlash {
     cells: Vec<u8>,
     /// Bits that read differently each time, by cell.
     unstable: BTreeMap<usize, u8>,
-    /// Moves with every reading of an unstable bit.
+    /// Changes with every read of an unstable bit.
     noise: Cell<u64>,
     running: Option<Operation>,
     /// Polls until the running operation ends.
     polls_left: u32,
-    /// Operations begun since the last `power_on`.
+    /// Operations started since the last `power_on`.
     pub operations: u32,
-    /// Lose the power in the operation of this number.
+    /// Cut the power in the operation with this number.
     pub cut: Option<(u32, Cut)>,
-    /// Fail the operation of this number with this error.
+    /// Make the operation with this number fail with this error.
     pub fail: Option<(u32, FlashFault)>,
-    /// Let the operation of this number do a part, which the seed selects, and say that all is well.
+    /// Make the operation with this number do a part, selected by the seed, and report success.
     pub weak: Option<(u32, u64)>,
-    /// Every region that was written to or erased.
+    /// Every region that was written or erased.
     pub touched: Vec<Region>,
-    /// Bytes that were read.
+    /// The number of bytes that were read.
     pub bytes_read: Cell<usize>,
 }
 
@@ -163,7 +163,7 @@ impl ModelFlash {
         Ok(())
     }
 
-    /// Where the operation acts, and what it makes of the cells there.
+    /// The place of the operation, and its effect on the cells there.
     fn effect(&self, operation: Operation) -> Vec<(usize, u8)> {
         match operation {
             Operation::Erase(region) => {
@@ -186,7 +186,7 @@ impl ModelFlash {
             self.cells[at] = becomes;
             match operation {
                 Operation::Erase(_) => drop(self.unstable.remove(&at)),
-                // What is programmed to 0 is so for certain; a 1 stays what it was.
+                // A bit programmed to 0 is certain; a 1 keeps its state.
                 Operation::Program { .. } => {
                     if let Some(bits) = self.unstable.get_mut(&at) {
                         *bits &= becomes;
@@ -196,9 +196,8 @@ impl ModelFlash {
         }
     }
 
-    /// Does a part of the operation, which `seed` selects. An odd seed of a torn erase ends it in
-    /// the middle of the sector; an odd seed of an unstable operation does all of it but for one
-    /// bit.
+    /// Does a part of the operation, selected by `seed`. An odd seed of a torn erase ends it in the
+    /// middle of the sector; an odd seed of an unstable operation does everything except one bit.
     fn tear(&mut self, operation: Operation, seed: u64, unstable: bool) {
         let mut state = seed.wrapping_add(u64::from(self.operations) << 8);
         let odd = seed & 1 == 1;
@@ -297,7 +296,7 @@ impl Flash for ModelFlash {
     }
 }
 
-/// Runs `scenario`; true if the power went in it.
+/// Runs `scenario`; returns whether the power was cut in it.
 pub fn until_power_cut(scenario: impl FnOnce()) -> bool {
     let outcome = std::panic::catch_unwind(std::panic::AssertUnwindSafe(scenario));
     match outcome {
@@ -307,7 +306,7 @@ pub fn until_power_cut(scenario: impl FnOnce()) -> bool {
     }
 }
 
-/// Keeps the expected panics of [`until_power_cut`] out of the test's output.
+/// Suppresses the output of the expected panics of [`until_power_cut`].
 pub fn quiet_power_cuts() {
     let default = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |info| {
@@ -317,7 +316,7 @@ pub fn quiet_power_cuts() {
     }));
 }
 
-/// The flash for a bootloader that it outlives: what is done to one of them is done to all.
+/// A flash that outlives a bootloader: all copies refer to the same contents.
 #[derive(Clone)]
 pub struct Chip(Rc<RefCell<ModelFlash>>);
 

@@ -1,8 +1,8 @@
 //! A bootloader of any profile on one or two programs, driven through its object dictionary alone.
 //!
-//! Tests that use it say nothing of how the bootloader is made or of how it works inside. What is
-//! known of that stands in [`Rig::boot`] and [`Rig::stored`]: whoever changes the construction of
-//! the bootloader, or of what it keeps in flash, changes these two functions.
+//! Tests with this rig do not depend on the construction of the bootloader. That knowledge is in
+//! [`Rig::boot`] and [`Rig::stored`]: after a change of the construction, or of the stored data,
+//! adapt these two functions.
 #![allow(dead_code, reason = "each test file uses some of it")]
 
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config, PasswordObject};
@@ -24,7 +24,7 @@ use crate::model::{Chip, ModelFlash, CHIP, ONE_PROGRAM, TWO_PROGRAMS};
 
 // --- setups
 
-/// What a bootloader is made for.
+/// The configuration of a bootloader.
 pub struct Setup {
     pub name: &'static str,
     pub profile: Profile,
@@ -38,7 +38,7 @@ pub const PRODUCT_CODE: u32 = 0x0004_0001;
 static ONE: Layout = ONE_PROGRAM;
 static TWO: Layout = TWO_PROGRAMS;
 
-/// The setup of a profile, with an object dictionary of its own.
+/// The setup of a profile, with its own object dictionary.
 macro_rules! setup {
     ($name:literal, $programs:literal, $layout:ident, $profile:expr) => {{
         const PROFILE: Profile = $profile;
@@ -77,7 +77,7 @@ const fn config(profile: &Profile, layout: &'static Layout, entries: &'static [E
     }
 }
 
-/// The standard profile whose CLEAR erases at once.
+/// The standard profile with a CLEAR that erases at once.
 const AT_ONCE: Profile = Profile {
     download: Policy { erase: |_| Erase::AtOnce, ..Profile::STANDARD.download },
     ..Profile::STANDARD
@@ -102,12 +102,12 @@ impl Setup {
         self.layout.programs[usize::from(program) - 1]
     }
 
-    /// Whether a program is data of the application.
+    /// Whether a program number is for data of the application.
     pub fn is_data(&self, program: u8) -> bool {
         self.profile.download.data == Some(program)
     }
 
-    /// Where the password of a program is written, and what it is.
+    /// The object for a program's password, and the password.
     pub fn password(&self, program: u8) -> Option<(Address, &'static [u8])> {
         let at = match self.profile.extras.password {
             PasswordObject::None => return None,
@@ -120,9 +120,9 @@ impl Setup {
 
 // --- the device
 
-/// What the rest of a device uses of its bootloader.
+/// The parts of a bootloader that the rest of the device uses.
 pub trait Node: Objects + LssDevice {
-    /// A bounded piece of work; whether there was none.
+    /// Runs one bounded step; returns whether there was no work.
     fn is_idle_after_step(&mut self) -> bool;
     fn is_finishing(&mut self) -> bool;
     fn take_boot_request(&mut self) -> Option<BootRequest>;
@@ -147,7 +147,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Node for Bootloader<'_, F, 
     }
 }
 
-/// What the flash tells whoever looks after a reset.
+/// The stored state that would be found after a reset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stored {
     /// By program, from 1 on: size, CRC, signed, version.
@@ -166,19 +166,19 @@ pub struct Rig {
 pub const BOARD_NODE: NodeParameters = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
 
 impl Rig {
-    /// With an empty flash, and so many bytes of buffer for blocks.
+    /// A device with empty flash, and a buffer of this size for blocks.
     pub fn new(setup: &'static Setup, buffer: usize) -> Self {
         Self::on(setup, buffer, ModelFlash::new(&CHIP))
     }
 
-    /// With this flash.
+    /// A device with this flash.
     pub fn on(setup: &'static Setup, buffer: usize, flash: ModelFlash) -> Self {
         let chip = Chip::new(flash);
         let node = Self::boot(setup, &chip, buffer);
         Self { setup, chip, node, buffer }
     }
 
-    /// THE place where a bootloader is made.
+    /// THE function that makes a bootloader.
     fn boot(setup: &'static Setup, chip: &Chip, buffer: usize) -> Box<dyn Node> {
         let flash = chip.clone();
         let buffer = Box::leak(vec![0; buffer].into_boxed_slice());
@@ -210,7 +210,7 @@ impl Rig {
         }
     }
 
-    /// What would be read after a reset now. The flash is looked at through a copy.
+    /// The state that a reset would find now, from a copy of the flash.
     pub fn stored(&self) -> Stored {
         let mut flash = self.chip.model().clone();
         flash.power_on();
@@ -229,18 +229,18 @@ impl Rig {
         }
     }
 
-    /// A reset: whatever the flash is doing ends there.
+    /// A reset: a running flash operation ends there.
     pub fn reset(&mut self) {
         self.chip.model().power_on();
         self.node = Self::boot(self.setup, &self.chip, self.buffer);
     }
 
-    /// Steps until there is no work.
+    /// Runs until there is no work.
     pub fn settle(&mut self) {
         assert!(self.settles(), "the work does not end");
     }
 
-    /// The same; whether it came to an end.
+    /// The same; returns whether the work ended.
     pub fn settles(&mut self) -> bool {
         (0..200_000).any(|_| self.node.is_idle_after_step())
     }
@@ -257,7 +257,7 @@ impl Rig {
         u32::from_le_bytes(bytes)
     }
 
-    /// 1F51h: 0 stopped, 3 there is none.
+    /// 1F51h: 0 stopped, 3 no program.
     pub fn state(&mut self, program: u8) -> u32 {
         self.word(0x1F51, program)
     }
@@ -277,7 +277,7 @@ impl Rig {
         self.node.write(Address::new(0x1F51, program), &[command])
     }
 
-    /// The right password, where there is one.
+    /// The right password, if there is one.
     pub fn unlock(&mut self, program: u8) -> Result<(), AbortCode> {
         match self.setup.password(program) {
             Some((at, password)) => self.node.write(at, password),
@@ -301,7 +301,7 @@ impl Rig {
         Ok(())
     }
 
-    /// A whole download; what is left to do is not waited for.
+    /// A whole download, without waiting for the remaining work.
     pub fn send(&mut self, program: u8, data: &[u8]) -> Result<(), AbortCode> {
         self.begin(program, Some(data.len() as u32), data)?;
         self.node.download_end(Address::new(0x1F50, program))
@@ -311,8 +311,8 @@ impl Rig {
         self.node.download_cancel(Address::new(0x1F50, program));
     }
 
-    /// Password or CLEAR, and a program in one download, carried out; the request to start it, if
-    /// it makes one, is taken.
+    /// Password or CLEAR, and a program in one download, with all work; a resulting request to
+    /// start it is discarded.
     pub fn install(&mut self, program: u8, data: &[u8]) {
         self.unlock(program).expect("the password is right");
         if self.setup.password(program).is_none() {
@@ -325,13 +325,13 @@ impl Rig {
         self.node.take_boot_request();
     }
 
-    /// What the flash of a program holds, as a debug probe sees it.
+    /// The contents of a program's flash, as seen by a debug probe.
     pub fn cells(&self, program: u8) -> Vec<u8> {
         self.chip.model().cells(self.setup.region(program)).to_vec()
     }
 
-    /// The length of the part of a program's flash, from its start on, that has the CRC which 1F56h
-    /// tells; `None` where there is none: a record that stands is not true.
+    /// The length of the part of a program's flash, from its start, with the CRC in 1F56h; `None`
+    /// if no length matches: then the record is wrong.
     pub fn size_by_crc(&mut self, program: u8) -> Option<u32> {
         let told = self.identification(program);
         let cells = self.cells(program);
@@ -342,7 +342,7 @@ impl Rig {
         })
     }
 
-    /// Whether a program is none, or is what its record says.
+    /// Whether a program is missing, or matches its record.
     pub fn is_true(&mut self, program: u8) -> bool {
         self.state(program) == 3 || self.size_by_crc(program).is_some()
     }
@@ -391,7 +391,7 @@ pub fn crc32(bytes: &[u8]) -> u32 {
 
 // --- programs and how they are sent
 
-/// A program for this place and product: vectors, a label, and bytes that tell it from any other.
+/// A program for this region and product: vectors, a label, and distinct bytes.
 pub fn program(region: Region, product_code: u32, len: usize, seed: u8) -> Vec<u8> {
     let mut bytes: Vec<u8> = (0..len).map(|i| (i as u8).wrapping_mul(31) ^ (i >> 8) as u8 ^ seed).collect();
     bytes[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());

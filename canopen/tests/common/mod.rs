@@ -1,4 +1,4 @@
-//! A device to test against, and the wire between the two ends.
+//! A device for the tests, and the wire between both ends.
 #![allow(dead_code, missing_docs)]
 
 use canopen::od::{put, Access, DataType, Entry};
@@ -15,12 +15,12 @@ pub fn at(millis: u32) -> Instant {
     Instant::from_millis(millis)
 }
 
-/// What the client sends to the server.
+/// A frame of the client to the server.
 pub fn request(bytes: [u8; 8]) -> Frame {
     Frame::of(CobId::sdo_request(node()), &bytes)
 }
 
-/// What the server sends to the client.
+/// A frame of the server to the client.
 pub fn response(bytes: [u8; 8]) -> Frame {
     Frame::of(CobId::sdo_response(node()), &bytes)
 }
@@ -41,7 +41,7 @@ const ENTRIES: &[Entry] = &[
     Entry::var(0x2003, "Long", DataType::Unsigned64, Access::Rw),
 ];
 
-/// What the device has heard about the domain.
+/// The calls that the device has received for the domain.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Event {
     Start(Option<u32>),
@@ -49,26 +49,26 @@ pub enum Event {
     Cancel,
 }
 
-/// A domain at 2000h and 1F50h/1, and values that can be written.
+/// A domain at 2000h and 1F50h/1, and writable values.
 #[derive(Debug, Default)]
 pub struct Device {
     pub heartbeat: u16,
     pub control: u8,
     pub text: Vec<u8>,
     pub long: u64,
-    /// The domain as it was last completed; what an upload reads.
+    /// The last completed domain, which an upload reads.
     pub domain: Vec<u8>,
-    /// Whether an upload tells the size.
+    /// Whether an upload announces the size.
     pub tells_size: bool,
     pub incoming: Option<Vec<u8>>,
-    /// All data of downloads to a domain, whatever became of them.
+    /// All data of downloads to a domain, completed or not.
     pub taken: Vec<u8>,
     pub events: Vec<Event>,
-    /// Room left for domain data; `None` for any.
+    /// Room left for domain data; `None` for unlimited.
     pub space: Option<usize>,
-    /// Of that, what only a client gets that is held back.
+    /// The part of it that is a reserve for delayed clients.
     pub reserve: usize,
-    /// Refuses the end of a domain download.
+    /// Whether it refuses the end of a domain download.
     pub refuse_end: Option<AbortCode>,
 }
 
@@ -155,7 +155,7 @@ impl Objects for Device {
     }
 }
 
-/// A server on its own.
+/// A server alone.
 pub struct Bench {
     pub server: SdoServer,
     pub device: Device,
@@ -176,12 +176,12 @@ impl Bench {
         self.server.poll(at(self.now), &mut self.device)
     }
 
-    /// All that the server has to send.
+    /// All frames that the server sends now.
     pub fn sent(&mut self) -> Vec<Frame> {
         core::iter::from_fn(|| self.poll()).collect()
     }
 
-    /// All that it sends after this frame.
+    /// All frames that it sends after this frame.
     pub fn ask(&mut self, bytes: [u8; 8]) -> Vec<Frame> {
         self.send(&request(bytes));
         self.sent()

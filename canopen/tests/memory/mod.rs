@@ -1,5 +1,5 @@
-//! A device with the debugger interface, and a memory that fails the test when it is touched
-//! without leave.
+//! A device with the debugger interface, and a memory that fails the test if it is accessed without
+//! permission.
 #![allow(dead_code, missing_docs)]
 
 use core::task::Poll;
@@ -12,7 +12,7 @@ use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, Address, BitRate, CobId, Frame, Instant, NodeId, Objects};
 
 pub const NODE: u8 = 5;
-/// RAM of this size; in front of it lies a ROM of the same size.
+/// RAM of this size; a ROM of the same size lies before it.
 pub const SIZE: u32 = 0x1000;
 pub const RAM: u32 = 0x2000_0000;
 pub const ROM: u32 = RAM - SIZE;
@@ -25,7 +25,7 @@ pub fn at(millis: u32) -> Instant {
     Instant::from_millis(millis)
 }
 
-/// What the client sends to the server.
+/// A frame of the client to the server.
 pub fn request(bytes: [u8; 8]) -> Frame {
     Frame::of(CobId::sdo_request(node()), &bytes)
 }
@@ -35,9 +35,9 @@ pub struct Model {
     pub ram: Vec<u8>,
     pub rom: Vec<u8>,
     pub locked: bool,
-    /// What an access comes to.
+    /// The result of an access.
     pub refuse: Option<AbortCode>,
-    /// What was allowed last.
+    /// The last permitted command.
     allowed: Option<Command>,
     /// Address and length of every access.
     pub touched: Vec<(Kind, u32, usize)>,
@@ -99,7 +99,7 @@ impl Memory for Model {
     }
 }
 
-/// The device behind the interface.
+/// The device of the interface.
 #[derive(Debug, Default)]
 pub struct Plain {
     pub register: u8,
@@ -135,7 +135,7 @@ impl LssDevice for Plain {
 
 impl SlaveDevice for Plain {}
 
-/// All of it on a bus.
+/// The device on a bus.
 pub struct Target {
     pub node: Node,
     pub debugger: Debugger<Model>,
@@ -163,7 +163,7 @@ impl Target {
         self.node.poll(at(now), &mut device)
     }
 
-    /// Sends a request; gives what came back.
+    /// Sends a request; returns the answers.
     pub fn ask(&mut self, bytes: [u8; 8]) -> [u8; 8] {
         self.handle(&request(bytes), 0);
         *self.poll(0).expect("an answer").exactly().expect("8 bytes")

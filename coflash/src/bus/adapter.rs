@@ -1,4 +1,4 @@
-//! A CAN bus behind one trait, and what it can be out of.
+//! The trait for a CAN bus, and the errors that an adapter can report.
 
 use std::fmt;
 use std::io;
@@ -8,21 +8,22 @@ use canopen::Frame;
 
 use super::health::Health;
 
-/// A CAN bus, and the time on it.
+/// A CAN bus and its clock.
 ///
-/// The time belongs to the adapter, so that an emulated bus can serve its own. The rest of this
-/// library knows no other clock and never sleeps: it waits by receiving.
+/// The clock belongs to the adapter, so that an emulated bus can supply its own time. The rest of
+/// this library uses no other clock and never sleeps: it waits by receiving.
 pub trait Adapter {
     /// Hands a frame to the bus.
     ///
     /// # Errors
-    /// The adapter is gone, or takes no frames.
+    /// The adapter is gone, or it accepts no frames.
     fn send(&mut self, frame: &Frame) -> Result<(), AdapterError>;
 
-    /// The next frame from the bus. Waits for it, `timeout` at most; `None` means that this time
-    /// has passed on [`now`](Self::now)'s clock. A `timeout` of zero takes what is there already.
+    /// Returns the next frame from the bus. Waits for it for at most `timeout`. `None` means that
+    /// this time has passed on the clock of [`now`](Self::now). With a `timeout` of zero, it
+    /// returns only a frame that has already arrived.
     ///
-    /// Frames which this adapter sent need not and should not come back.
+    /// An adapter need not and should not return the frames that it sent itself.
     ///
     /// # Errors
     /// The adapter is gone.
@@ -31,8 +32,8 @@ pub trait Adapter {
     /// The time since an origin of the adapter's choice.
     fn now(&self) -> Duration;
 
-    /// What it knows of its bus beyond the frames; `None` where it tells nothing. It may ask the
-    /// system for it, so it is for when something has gone wrong.
+    /// What the adapter knows about its bus apart from the frames; `None` if it reports nothing.
+    /// The call may query the system, so use it only after something has gone wrong.
     fn health(&mut self) -> Option<Health> {
         None
     }
@@ -74,17 +75,17 @@ impl<A: Adapter + ?Sized> Adapter for Box<A> {
     }
 }
 
-/// What [`open`](super::open()) understands, for messages and help texts.
+/// The URLs that [`open`](super::open()) accepts, for messages and help texts.
 pub const URLS: &str = "socketcan:INTERFACE (Linux), slcan:PORT@BITRATE, slcan:tcp://HOST:PORT@BITRATE, \
                         peak:CHANNEL@BITRATE, kvaser:NUMBER@BITRATE, gs_usb:NUMBER@BITRATE, \
                         socketcand://HOST:PORT/BUS, cia309://HOST:PORT/NET (gateway, SDO alone)";
 
-/// What is wrong with a URL that names no adapter at all.
-pub(super) const NO_SCHEME: &str = "it has no ':' behind the adapter's name";
-/// The same with one that nobody knows.
+/// The message for a URL without a scheme.
+pub(super) const NO_SCHEME: &str = "it has no ':' after the adapter's name";
+/// The message for a URL with an unknown scheme.
 pub(super) const NO_ADAPTER: &str = "there is no such adapter";
 
-/// What an adapter can be out of.
+/// The errors of an adapter.
 #[derive(Debug)]
 pub enum AdapterError {
     /// The URL names no adapter.
@@ -94,56 +95,57 @@ pub enum AdapterError {
         /// What is wrong with it.
         why: String,
     },
-    /// The adapter is not there, or does not let us in.
+    /// The adapter is missing, or it denies access.
     Open {
-        /// Which one.
+        /// The adapter's name.
         adapter: String,
-        /// What it said.
+        /// The system's error.
         source: io::Error,
     },
-    /// The adapter is not there, does not let us in or lacks its driver, for a reason that is known.
+    /// The adapter is missing, denies access or lacks its driver, and the reason is known.
     Unusable {
-        /// Which one.
+        /// The adapter's name.
         adapter: String,
-        /// What is the matter.
+        /// What is wrong.
         what: String,
         /// What to do.
         advice: String,
-        /// Whether the reason is that another program has it.
+        /// Whether another program uses the adapter.
         in_use: bool,
     },
-    /// The adapter takes no frames any more: those that it has do not leave it.
+    /// The adapter accepts no more frames, because its queued frames do not reach the bus.
     Stuck {
-        /// Which one.
+        /// The adapter's name.
         adapter: String,
-        /// What it knows of its bus.
+        /// What the adapter knows about its bus.
         health: Health,
     },
-    /// The adapter did not speak as it must.
+    /// The adapter broke its protocol.
     Protocol {
-        /// Which one.
+        /// The adapter's name.
         adapter: String,
-        /// What it said instead.
+        /// What it sent instead of the expected answer.
         said: String,
     },
-    /// The adapter was there and is gone, or takes no frames any more.
+    /// The adapter was connected and is gone, or it accepts no more frames.
     Lost {
-        /// Which one.
+        /// The adapter's name.
         adapter: String,
-        /// How that showed.
+        /// The error that showed it.
         source: io::Error,
     },
-    /// A gateway does not answer, or does not do what it is asked, for a reason of its own.
+    /// A gateway does not answer, or it refuses a request for a reason of its own.
     Gateway {
-        /// Which one.
+        /// The gateway's name.
         adapter: String,
-        /// What is the matter, as a sentence about it.
+        /// What is wrong, as a clause with the gateway as its subject.
         what: String,
     },
 }
 
 impl AdapterError {
-    /// The stable number. The manual has none for its CAN drivers; these follow its scheme.
+    /// The stable error number. The manual defines none for CAN drivers; these numbers follow its
+    /// scheme.
     #[must_use]
     pub const fn number(&self) -> u32 {
         match self {
@@ -161,13 +163,13 @@ impl AdapterError {
     pub fn advice(&self) -> String {
         match self {
             Self::Url { why, .. } if why.contains("did you mean") => {
-                "give the bus like that, by --bus or in COFLASH_BUS"
+                "give this bus with --bus or in COFLASH_BUS"
             }
             Self::Url { why, .. }
                 if !why.starts_with(NO_SCHEME)
                     && !why.starts_with(NO_ADAPTER) =>
             {
-                "mend the bus in --bus or COFLASH_BUS; coflash adapters lists those that are there"
+                "correct the URL in --bus or COFLASH_BUS; coflash adapters lists the adapters of this computer"
             }
             Self::Url { .. } => {
                 return format!(
@@ -181,35 +183,35 @@ impl AdapterError {
                      check the port's number"
                 }
                 io::ErrorKind::TimedOut | io::ErrorKind::HostUnreachable | io::ErrorKind::NetworkUnreachable => {
-                    "check the address, the network cable and firewalls: the host does not answer"
+                    "the host does not answer: check the address, the network cable and firewalls"
                 }
-                io::ErrorKind::PermissionDenied => "check who may use it, or write there",
-                io::ErrorKind::NotFound => "check the name: there is nothing of this name",
-                _ => "check that the adapter is there, that its name is right and that it is switched on",
+                io::ErrorKind::PermissionDenied => "check that you have permission to use it or to write there",
+                io::ErrorKind::NotFound => "check the name: nothing with this name exists",
+                _ => "check that the adapter is connected and switched on, and that its name is right",
             },
             Self::Unusable { advice, .. } => return advice.clone(),
             Self::Stuck { health, .. } => {
                 return health.advice().unwrap_or_else(|| {
-                    "nobody acknowledges on the bus: check that the device has power, that cable and terminators are \
+                    "no other node acknowledges on the bus: check that the device has power, that cable and terminators are \
                      right, and that both sides use the same bit rate"
                         .to_string()
                 })
             }
             Self::Protocol { .. } => {
-                "check that the address is that of the adapter, and that it knows this bus"
+                "check that the address is the adapter's, and that the adapter has this bus"
             }
             Self::Gateway { .. } => {
                 "check the network's number behind the gateway's address, and that the gateway is on the bus; then run \
                  the command again"
             }
             Self::Lost { .. } => {
-                "check cable, adapter and the program behind it; the device can be flashed again at once"
+                "check the cable, the adapter and the program that serves it; then flash the device again"
             }
         }
         .to_string()
     }
 
-    /// A vendor's library that cannot be used, and where it is to be had.
+    /// A vendor's library that cannot be used. `from` says where to get the library.
     #[cfg(any(feature = "peak", feature = "kvaser"))]
     pub(crate) fn library(adapter: &str, error: &vendor_can::LoadError, from: &str) -> Self {
         let advice = match error {
@@ -236,7 +238,7 @@ impl fmt::Display for AdapterError {
             Self::Open { adapter, source } => write!(f, "{adapter} cannot be opened: {source}"),
             Self::Unusable { adapter, what, .. } => write!(f, "{adapter} cannot be opened: {what}"),
             Self::Stuck { adapter, .. } => {
-                write!(f, "{adapter} takes no frames any more: what it has does not get onto the bus")
+                write!(f, "{adapter} accepts no more frames: its queued frames do not reach the bus")
             }
             Self::Protocol { adapter, said } => write!(f, "{adapter} answered unexpectedly: {said}"),
             Self::Lost { adapter, source } => write!(f, "{adapter} is gone: {source}"),

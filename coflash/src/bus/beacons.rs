@@ -1,8 +1,8 @@
-//! socketcand servers that announce themselves (socketcand, `doc/protocol.md`, service discovery): a
-//! broadcast on UDP port 42000, every 3 s.
+//! socketcand servers that announce themselves by a broadcast on UDP port 42000 every 3 s
+//! (socketcand, `doc/protocol.md`, service discovery).
 //!
-//! The beacon is XML in name. Servers in the field leave tags open and write the address 0.0.0.0, so it
-//! is read for what is needed, and no more.
+//! The beacon is XML in name only: servers in the field leave tags open and send the address
+//! 0.0.0.0. This reader therefore looks only for the parts that it needs.
 
 use std::collections::BTreeMap;
 use std::io::ErrorKind;
@@ -13,10 +13,10 @@ use super::found::{shown, Found, Kind, Missing};
 
 /// The port of the beacons.
 const PORT: u16 = 42_000;
-/// Servers and buses that are taken in; a network with more is under attack.
+/// The most servers and buses that are listed. A network with more is under attack.
 const MOST: usize = 32;
 
-/// What is heard during `listen`.
+/// The buses that servers announce during `listen`.
 pub(super) fn list(listen: Duration) -> Result<Vec<Found>, Missing> {
     let address = SocketAddr::from((Ipv4Addr::UNSPECIFIED, PORT));
     let socket = socket(address).map_err(|error| Missing {
@@ -26,7 +26,7 @@ pub(super) fn list(listen: Duration) -> Result<Vec<Found>, Missing> {
     Ok(hear(&socket, listen))
 }
 
-/// A socket that others may listen beside.
+/// A socket that allows other programs to listen on the same port.
 fn socket(address: SocketAddr) -> std::io::Result<UdpSocket> {
     use socket2::{Domain, Protocol, Socket, Type};
     let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
@@ -53,7 +53,7 @@ fn hear(socket: &UdpSocket, listen: Duration) -> Vec<Found> {
                 }
             }
             Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => break,
-            // A beacon that is longer than the buffer, on Windows; and what a network may do.
+            // A beacon longer than the buffer (Windows), or another error of the network.
             Err(_) => std::thread::sleep(Duration::from_millis(1)),
         }
     }
@@ -72,7 +72,7 @@ fn parse(beacon: &str, from: IpAddr) -> Vec<Found> {
     else {
         return Vec::new();
     };
-    // Many servers do not know under which address they are reached.
+    // Many servers do not know the address at which they can be reached.
     let ip = if server.ip().is_unspecified() { from } else { server.ip() };
     let server = SocketAddr::from((ip, server.port()));
     let head = beacon.split('>').next().unwrap_or_default();
@@ -88,7 +88,7 @@ fn parse(beacon: &str, from: IpAddr) -> Vec<Found> {
         .filter(word)
         .take(MOST)
         .map(|bus| Found {
-            // Anybody on the network may announce one.
+            // Anyone on the network can send a beacon.
             certain: false,
             ..Found::new(Kind::Socketcand, format!("socketcand://{server}/{bus}"), about.clone())
         })
@@ -114,8 +114,8 @@ mod tests {
         parse(beacon, FROM).into_iter().map(|found| found.url).collect()
     }
 
-    /// The protocol description's example, what socketcand's own source writes, and a server that
-    /// leaves its tags open.
+    /// The example of the protocol description, a beacon as socketcand's own source writes it, and
+    /// a beacon with open tags.
     #[test]
     fn beacons_of_the_field_are_read() {
         let example = "<CANBeacon name=\"HeartOfGold\" type=\"SocketCAN\" description=\"A human readable description\">\n    \

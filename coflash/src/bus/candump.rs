@@ -1,4 +1,4 @@
-//! Logs as `candump -L` of the Linux can-utils writes them: `(1436509052.249713) can0
+//! Logs in the format of `candump -L` of the Linux can-utils: `(1436509052.249713) can0
 //! 044#2A366C2BBA`.
 
 use std::time::Duration;
@@ -15,7 +15,7 @@ pub struct Line {
     pub time: Duration,
     /// The name of the interface.
     pub interface: String,
-    /// What.
+    /// The frame.
     pub frame: Frame,
 }
 
@@ -27,11 +27,11 @@ impl std::fmt::Display for Line {
 }
 
 impl Line {
-    /// Takes a line apart. `Ok(None)` for one that holds no classic frame: an empty line, a
-    /// comment, a frame of CAN FD or an error frame.
+    /// Parses a line. `Ok(None)` for a line without a classic frame: an empty line, a comment, a
+    /// CAN FD frame or an error frame.
     ///
     /// # Errors
-    /// What is wrong with it.
+    /// What is wrong with the line.
     pub fn parse(line: &str) -> Result<Option<Self>, &'static str> {
         let mut words = line.split_ascii_whitespace();
         let Some(time) = words.next() else { return Ok(None) };
@@ -43,7 +43,7 @@ impl Line {
             time.and_then(parse_time).ok_or("it does not begin with a time, like (1436509052.249713)")?;
         let interface = words.next().ok_or("it names no interface")?;
         let frame = words.next().ok_or("it has no frame")?;
-        // candump may append the direction, R or T.
+        // candump can append the direction, R or T.
         let Some(frame) = parse_frame(frame)? else { return Ok(None) };
         Ok(Some(Self { time, interface: interface.to_string(), frame }))
     }
@@ -56,7 +56,7 @@ fn parse_time(text: &str) -> Option<Duration> {
         return None;
     }
     let nanos = fraction.parse::<u32>().ok()? * 10u32.pow(9 - fraction.len() as u32);
-    // Later than the year 9999 is no time.
+    // A time after the year 9999 is invalid.
     let seconds = seconds.parse::<u64>().ok().filter(|seconds| *seconds < 1 << 38)?;
     Some(Duration::new(seconds, nanos))
 }
@@ -80,7 +80,7 @@ fn parse_frame(text: &str) -> Result<Option<Frame>, &'static str> {
         return Frame::new_remote(id, dlc).map(Some).ok_or("a frame has at most 8 bytes");
     }
     let data = data.split('_').next().unwrap_or_default();
-    let bytes = hex_bytes(data).ok_or("its data are no pairs of hexadecimal digits")?;
+    let bytes = hex_bytes(data).ok_or("its data are not pairs of hexadecimal digits")?;
     Frame::new(id, &bytes).map(Some).ok_or("a frame has at most 8 bytes")
 }
 

@@ -1,4 +1,4 @@
-//! Frames in words: what `monitor` shows.
+//! Describes frames in words, for `monitor`.
 
 use std::collections::HashMap;
 use std::fmt::Write as _;
@@ -11,16 +11,16 @@ use canopen::sdo::wire::{BlockSegment, Payload, Request, Response};
 use canopen::{Address, CobId, Frame, NodeId};
 use embedded_can::Frame as _;
 
-/// Puts frames into words. It remembers the transfers that it has seen begin: a segment of a block
-/// transfer does not tell what it is.
+/// Describes frames in words. It remembers the transfers whose start it has seen, because a segment
+/// of a block transfer does not say that it is one.
 #[derive(Debug, Default)]
 pub struct Decoder {
     blocks: HashMap<NodeId, Block>,
-    /// What the segments of a node's transfer belong to.
+    /// The object that a node's current transfer reads or writes.
     at: HashMap<NodeId, Address>,
 }
 
-/// A block transfer under way.
+/// A block transfer in progress.
 #[derive(Clone, Copy, Debug)]
 struct Block {
     /// The client sends the data.
@@ -31,22 +31,22 @@ struct Block {
 
 #[derive(Clone, Copy, Debug)]
 enum Part {
-    /// Segments come.
+    /// The next frames are segments.
     Segments,
-    /// An acknowledgement comes; whether the last segment said that it was.
+    /// The next frame is an acknowledgement. `last`: the last segment was marked as the last one.
     Ack { seqno: u8, last: bool },
-    /// The end comes.
+    /// The next frame ends the transfer.
     End,
 }
 
 impl Decoder {
-    /// A decoder that has seen nothing yet.
+    /// A decoder that has seen no frame yet.
     #[must_use]
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// What a frame says.
+    /// Describes a frame.
     pub fn decode(&mut self, frame: &Frame) -> String {
         let Some(id) = frame.cob_id() else {
             return if frame.is_remote_frame() {
@@ -133,7 +133,7 @@ impl Decoder {
             Request::AckBlockUpload(ack) => self.ack(node, ack.ackseq, ack.blksize),
             Request::EndBlockUpload => {
                 self.blocks.remove(&node);
-                format!("all blocks {} are here", self.whose(node))
+                format!("all blocks {} have arrived", self.whose(node))
             }
         }
     }
@@ -176,11 +176,11 @@ impl Decoder {
         }
     }
 
-    /// A segment of a block transfer, if the side that sent the frame is sending some.
+    /// A segment of a block transfer, if the sender of the frame is the side that sends the data.
     fn block_data(&mut self, node: NodeId, bytes: &[u8; 8], by_client: bool) -> Option<String> {
         let block = self.blocks.get_mut(&node).filter(|block| block.download == by_client)?;
         let Part::Segments = block.part else { return None };
-        // No segment has number 0: what looks like one is an abort.
+        // Segment number 0 does not exist: a frame with this first byte is an abort.
         let segment = BlockSegment::parse(bytes)?;
         let BlockSegment { seqno, last, data } = segment;
         block.part = if last || seqno >= block.blksize { Part::Ack { seqno, last } } else { Part::Segments };
@@ -194,7 +194,7 @@ impl Decoder {
             block.blksize = blksize;
             block.part = if done { Part::End } else { Part::Segments };
         }
-        format!("segments up to {ackseq} are here, {blksize} may follow")
+        format!("segments up to {ackseq} have arrived, {blksize} may follow")
     }
 
     fn segment(&self, node: NodeId, data: &[u8], last: bool, what: &str) -> String {
@@ -202,11 +202,11 @@ impl Decoder {
         format!("{what} segment {}{end}: {}", self.whose(node), hex(data))
     }
 
-    /// Of which object a segment is.
+    /// The words for the object that a segment belongs to.
     fn whose(&self, node: NodeId) -> String {
         match self.at.get(&node) {
             Some(at) => format!("of {}", object(*at)),
-            None => "of an object unknown".to_string(),
+            None => "of an unknown object".to_string(),
         }
     }
 }
@@ -227,7 +227,7 @@ fn nmt(data: &[u8]) -> String {
     }
 }
 
-/// A state for people.
+/// The words for an NMT state.
 #[must_use]
 pub fn state_words(state: NmtState) -> &'static str {
     match state {
@@ -243,7 +243,7 @@ fn emergency(node: NodeId, frame: &Frame) -> String {
         return format!("node {node}: EMCY of {} bytes, not 8", frame.dlc());
     };
     let Emergency { code, register, detail } = Emergency::parse(bytes);
-    // CiA 301 table 26, by its first digits.
+    // CiA 301 table 26, by the first digits of the error code.
     let words = match code {
         0x0000..=0x00FF => "no error any more",
         0x1000..=0x10FF => "generic error",
@@ -290,7 +290,7 @@ fn lss(frame: &Frame, who: &str) -> String {
     let result = |what: &str| match (a, b) {
         (0, _) => format!("{what} is taken"),
         (code, 0) => format!("{what} is refused, error {code}"),
-        (code, detail) => format!("{what} is refused, error {code}, {detail} of its maker"),
+        (code, detail) => format!("{what} is refused, error {code}, manufacturer's code {detail}"),
     };
     const PARTS: [&str; 4] = ["vendor-ID", "product code", "revision", "serial number"];
     let slave = who == "slave";
@@ -326,7 +326,7 @@ fn lss(frame: &Frame, who: &str) -> String {
     format!("LSS {who}: {words}")
 }
 
-/// The data of an initiate frame, or how many follow.
+/// The data of an initiate frame, or the number of bytes that follow.
 fn value(payload: Payload) -> Result<Vec<u8>, Option<u32>> {
     match payload {
         Payload::Expedited(data) => Ok(data.to_vec()),
@@ -338,11 +338,11 @@ fn value(payload: Payload) -> Result<Vec<u8>, Option<u32>> {
 fn size_words(size: Option<u32>) -> String {
     match size {
         Some(size) => format!("{size} bytes"),
-        None => "an untold number of bytes".to_string(),
+        None => "an unknown number of bytes".to_string(),
     }
 }
 
-/// An object with its name, where this tool knows it.
+/// An object with its name, if this tool knows the name.
 fn object(at: Address) -> String {
     let name = match (at.index, at.sub) {
         (program::DEVICE_TYPE, _) => "device type",
@@ -369,7 +369,7 @@ fn object(at: Address) -> String {
     format!("{at} ({name})")
 }
 
-/// A value with its meaning, where this tool knows it.
+/// A value with its meaning, if this tool knows the meaning.
 fn worded(at: Address, data: &[u8]) -> String {
     let number = data.iter().rev().fold(0u32, |number, byte| number << 8 | u32::from(*byte));
     let digits = data.len() * 2;

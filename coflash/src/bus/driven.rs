@@ -1,8 +1,8 @@
-//! An adapter whose driver runs on a thread of its own.
+//! An adapter with its driver on a thread of its own.
 //!
-//! A vendor's library may block, lie or never come back; a USB device may stop answering. None of this
-//! may stop the tool: the thread waits for the driver, and the rest of the tool waits for the thread,
-//! with limits.
+//! A vendor's library may block, return wrong results or never return, and a USB device may stop
+//! answering. None of this may block the tool: the thread waits for the driver, and the rest of the
+//! tool waits for the thread with a time limit.
 
 use std::fmt;
 use std::io;
@@ -16,66 +16,67 @@ use canopen::Frame;
 use super::adapter::{Adapter, AdapterError};
 use super::health::Health;
 
-/// What stands between the thread and the hardware.
+/// The interface between the thread and the hardware.
 pub(super) trait Driver {
-    /// Hands a frame to the hardware's queue. Does not wait.
+    /// Puts a frame into the hardware's queue. Does not wait.
     fn send(&mut self, frame: &Frame) -> Result<Sent, Fault>;
 
-    /// What comes next, after `wait` at most. `None` where that is no frame.
+    /// Returns the next frame. Waits for at most `wait`. `None` if nothing arrived, or something
+    /// that is not a frame.
     fn receive(&mut self, wait: Duration) -> Result<Option<Frame>, Fault>;
 
-    /// What it knows of the bus by now.
+    /// What the driver knows about the bus at this time.
     fn health(&mut self) -> Health;
 
     /// Leaves the bus.
     fn close(&mut self);
 }
 
-/// What became of a frame.
+/// The result of sending a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Sent {
-    /// The hardware has it.
+    /// The hardware has accepted the frame.
     Taken,
-    /// There is no room for it at present.
+    /// The hardware has no room for the frame at present.
     Full,
 }
 
-/// What ends an adapter.
+/// The reasons why an adapter ends.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Fault {
-    /// It is gone, and how that showed.
+    /// The adapter is gone, and the error that showed it.
     Lost(String),
-    /// It says what makes no sense.
+    /// The adapter sends invalid data.
     Nonsense(String),
-    /// It takes no frames any more.
+    /// The adapter accepts no more frames.
     Stuck(Health),
 }
 
 /// How long a driver may take to open.
 const OPENING: Duration = Duration::from_secs(5);
-/// How long a frame may wait for room, and a driver for its end.
+/// How long a frame may wait for room, and how long a driver may take to close.
 const PATIENCE: Duration = Duration::from_secs(1);
-/// How long the thread waits for a frame before it looks for one to send.
+/// How long the thread waits for a received frame before it checks for a frame to send.
 const TURN: Duration = Duration::from_millis(1);
 /// How often the driver is asked for the state of the bus.
 const LOOK: Duration = Duration::from_millis(50);
-/// Frames that may wait to be sent, and to be received. What comes beyond that is lost, as it is in a
-/// controller that nobody reads.
+/// The most frames that may wait to be sent or to be received. Further frames are lost, as in a
+/// controller that is not read.
 const OUTGOING: usize = 64;
 const INCOMING: usize = 4096;
 
-/// What the thread leaves behind.
+/// The results that the thread leaves.
 #[derive(Default)]
 struct Left {
     health: Health,
     fault: Option<Fault>,
 }
 
-/// The tool's side.
+/// The tool's side of the thread.
 pub(super) struct Driven {
     name: String,
     opened: Instant,
-    /// `None` while it is dropped.
+    /// `None` during drop.
     outgoing: Option<SyncSender<Frame>>,
     incoming: Receiver<Frame>,
     left: Arc<Mutex<Left>>,
@@ -88,7 +89,7 @@ impl fmt::Debug for Driven {
 }
 
 impl Driven {
-    /// Opens a driver on its thread. `name` is for messages.
+    /// Opens a driver on its own thread. `name` is for messages.
     pub(super) fn open<D: Driver>(
         name: String,
         open: impl FnOnce() -> Result<D, AdapterError> + Send + 'static,
@@ -106,7 +107,7 @@ impl Driven {
                     return;
                 }
             };
-            // Nobody waits any more: it took too long.
+            // If this fails, the tool has given up waiting for the driver.
             if told.send(Ok(())).is_ok() {
                 if let Err(fault) = work(&mut driver, &commands, &frames, &shared) {
                     lock(&shared).fault = Some(fault);
@@ -127,7 +128,7 @@ impl Driven {
         }
     }
 
-    /// Why the thread has ended.
+    /// The reason why the thread has ended.
     fn fault(&self) -> AdapterError {
         let adapter = self.name.clone();
         match lock(&self.left).fault.clone() {
@@ -139,19 +140,19 @@ impl Driven {
     }
 }
 
-/// A thread that has panicked has left nothing half done here.
+/// Locks `left`. A thread that panics leaves nothing half done here.
 fn lock(left: &Mutex<Left>) -> std::sync::MutexGuard<'_, Left> {
     left.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Carries frames between the tool and the driver until the tool has gone.
+/// Carries frames between the tool and the driver until the tool closes the channel.
 fn work(
     driver: &mut impl Driver,
     commands: &Receiver<Frame>,
     frames: &SyncSender<Frame>,
     left: &Mutex<Left>,
 ) -> Result<(), Fault> {
-    // A frame for which there was no room, and since when.
+    // A frame that found no room, and the time of the first attempt.
     let mut waiting: Option<(Frame, Instant)> = None;
     let mut looked = Instant::now();
     loop {
@@ -185,11 +186,11 @@ fn work(
 }
 
 impl Drop for Driven {
-    /// What waits to be sent is sent, and the bus is left; if the driver does not come back, so be it.
+    /// Sends the waiting frames and leaves the bus. Gives up if the driver does not return.
     fn drop(&mut self) {
         self.outgoing = None;
         let until = Instant::now() + PATIENCE;
-        // The thread's end closes the channel.
+        // The channel closes when the thread ends.
         while let Ok(_) | Err(RecvTimeoutError::Timeout) = self.incoming.recv_timeout(TURN) {
             if Instant::now() >= until {
                 break;

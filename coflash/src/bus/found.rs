@@ -1,11 +1,11 @@
-//! An adapter that is there.
+//! An adapter that was found on this computer or network.
 
 use std::fmt;
 
-/// The ways in which adapters are found.
+/// The ways to find adapters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
-    /// Serial ports, behind which an SLCAN adapter may be.
+    /// Serial ports, which may have an SLCAN adapter.
     Serial,
     /// CAN interfaces of the Linux kernel.
     SocketCan,
@@ -15,16 +15,16 @@ pub enum Kind {
     Kvaser,
     /// gs_usb devices on USB.
     GsUsb,
-    /// socketcand servers that announce themselves on the network.
+    /// socketcand servers that send beacons on the network.
     Socketcand,
 }
 
 impl Kind {
-    /// All of them. [`Socketcand`](Self::Socketcand), the one that takes time, is the last.
+    /// All kinds. [`Socketcand`](Self::Socketcand), which takes time, is the last one.
     pub const ALL: [Self; 6] =
         [Self::Serial, Self::SocketCan, Self::Peak, Self::Kvaser, Self::GsUsb, Self::Socketcand];
 
-    /// Its name on the command line.
+    /// The name on the command line.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -44,43 +44,43 @@ impl fmt::Display for Kind {
     }
 }
 
-/// An adapter that is there.
+/// An adapter that was found.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Found {
     /// How it was found.
     pub kind: Kind,
-    /// What `--bus` takes, without a bit rate.
+    /// The URL for `--bus`, without a bit rate.
     pub url: String,
-    /// What it calls itself.
+    /// The adapter's own name or description.
     pub about: String,
-    /// Its state, where that is worth a word.
+    /// Its state, if it is unusual.
     pub state: Option<String>,
-    /// The bit rate that it has in bit/s, where that is known.
+    /// The bit rate in bit/s that is already set, if it is known.
     pub bit_rate: Option<u32>,
-    /// Whether it surely leads to a CAN bus, so that it may be taken unasked. A serial port may have
-    /// anything behind it.
+    /// Whether the adapter certainly leads to a CAN bus, so that it can be used without the user
+    /// naming it. A serial port may lead to any device.
     pub certain: bool,
 }
 
 impl Found {
     pub(super) fn new(kind: Kind, url: String, about: String) -> Self {
-        // The vendor's drivers come with channels that lead nowhere.
+        // The vendors' drivers also list virtual channels, which lead to no bus.
         let certain = !about.to_ascii_lowercase().contains("virtual");
         Self { kind, url, about, state: None, bit_rate: None, certain }
     }
 }
 
-/// Why adapters of a kind could not be looked for.
+/// The reason why a search for one kind of adapter was not possible.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Missing {
-    /// What is the matter.
+    /// What is wrong.
     pub what: String,
     /// What to do.
     pub advice: &'static str,
 }
 
-/// Text of somebody else's, for people: no control characters, and not too long.
+/// External text made safe to show: no control characters, and a limited length.
 pub(super) fn shown(text: &[u8]) -> String {
     let text = String::from_utf8_lossy(text);
     let printable = text.chars().map(|c| if c.is_control() { '\u{FFFD}' } else { c });

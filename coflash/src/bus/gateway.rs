@@ -1,11 +1,11 @@
-//! Gateways: ways to devices whose CAN bus is somewhere else, at the level of SDO.
+//! Gateways: access to devices on a remote CAN bus at the level of SDO.
 //!
-//! A gateway is told "read this object of that node" and does the transfer on its bus by itself. So
-//! there are no frames to see: what listens to the bus (scan, monitor, LSS) needs an
-//! [`Adapter`](super::Adapter). What reads and writes objects, the update among it, works
-//! over either, since a [`Session`](crate::Session) hides which of them it has.
+//! A gateway takes requests such as "read this object of that node" and does the transfer on its
+//! bus by itself. The tool sees no frames: commands that listen to the bus (scan, monitor, LSS)
+//! need an [`Adapter`](super::Adapter). Commands that read and write objects, the update among
+//! them, work with both, because a [`Session`](crate::Session) hides the difference.
 //!
-//! Another gateway is one file beside [`cia309`](super::cia309) and one line of
+//! To add a gateway, add one file beside [`cia309`](super::cia309) and one line to
 //! [`Link::open`](super::Link::open).
 
 use std::time::Duration;
@@ -14,18 +14,18 @@ use canopen::{AbortCode, Address, NodeId};
 
 use super::adapter::AdapterError;
 
-/// Their URLs, for messages and help texts.
+/// The URLs of gateways, for messages and help texts.
 pub const URLS: &str = "cia309://HOST:PORT/NET";
 
-/// A way to the object dictionaries of devices.
+/// Access to the object dictionaries of devices.
 pub trait Gateway {
-    /// Reads an object. `progress` is told how many bytes are here.
+    /// Reads an object. Calls `progress` with the number of bytes that have arrived.
     ///
     /// # Errors
     /// See [`GatewayError`].
     fn upload(&mut self, ask: &Ask<'_>, progress: &mut dyn FnMut(u32)) -> Result<Vec<u8>, GatewayError>;
 
-    /// Writes an object. `progress` is told how many bytes the gateway has taken.
+    /// Writes an object. Calls `progress` with the number of bytes that the gateway has accepted.
     ///
     /// # Errors
     /// See [`GatewayError`].
@@ -36,14 +36,14 @@ pub trait Gateway {
         progress: &mut dyn FnMut(u32),
     ) -> Result<(), GatewayError>;
 
-    /// Has a node reset by network management (NMT reset node).
+    /// Makes the gateway reset a node by network management (NMT reset node).
     ///
     /// # Errors
     /// See [`GatewayError`].
     fn reset_node(&mut self, node: NodeId) -> Result<(), GatewayError>;
 
-    /// Lets time pass; gives the node whose boot-up message the gateway tells of meanwhile. Many tell
-    /// nothing.
+    /// Waits for `time`. Returns early with the node-ID if the gateway reports a boot-up message.
+    /// Many gateways report none.
     ///
     /// # Errors
     /// [`GatewayError::Adapter`].
@@ -53,31 +53,31 @@ pub trait Gateway {
     fn now(&self) -> Duration;
 }
 
-/// One object of one node, and how long to wait for it.
+/// A request for one object of one node, with its time limits.
 #[derive(Clone, Copy)]
 pub struct Ask<'c> {
     /// The node.
     pub node: NodeId,
     /// The object.
     pub at: Address,
-    /// How long the node may take for an answer, as the gateway counts it on its bus.
+    /// How long the node may take for an answer, measured by the gateway on its bus.
     pub sdo: Duration,
-    /// How long the gateway may say nothing, or take nothing, until it is given up.
+    /// How long the gateway may send nothing or accept nothing before the request is given up.
     pub patience: Duration,
-    /// Whether the user has given up.
+    /// Whether the user has cancelled.
     pub cancelled: &'c dyn Fn() -> bool,
 }
 
-/// Why a gateway did not do what it was asked.
+/// Why a gateway did not do what it was asked to do.
 #[derive(Debug)]
 pub enum GatewayError {
     /// The gateway itself failed.
     Adapter(AdapterError),
-    /// The node does not answer it.
+    /// The node does not answer the gateway.
     NoAnswer,
-    /// The node refused, or the gateway's SDO client did.
+    /// The node, or the gateway's SDO client, aborted the transfer.
     Abort(AbortCode),
-    /// The user gave up.
+    /// The user cancelled.
     Cancelled,
 }
 

@@ -1,25 +1,26 @@
-//! What an adapter knows of its bus beyond the frames: the state of its controller, and the errors
-//! that it sees. It tells apart why nobody answers.
+//! What an adapter knows about its bus apart from the frames: the state of its controller, and the
+//! errors that it sees. This information explains why no node answers.
 
 use std::fmt;
 
 /// The state of a CAN controller (fault confinement, ISO 11898-1).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Controller {
-    /// Error active: it takes part in full.
+    /// Error active: the controller takes part without limits.
     Active,
     /// An error counter has reached 96.
     Warning,
     /// Error passive: an error counter has reached 128.
     Passive,
-    /// Bus-off: the error counter of sending has gone beyond 255, and it takes no part any more.
+    /// Bus-off: the transmit error counter has exceeded 255, and the controller takes no part any
+    /// more.
     Off,
-    /// Switched off, or asleep.
+    /// Switched off, or in sleep mode.
     Stopped,
 }
 
 impl Controller {
-    /// The words for people.
+    /// The name of the state in messages.
     #[must_use]
     pub const fn words(self) -> &'static str {
         match self {
@@ -36,19 +37,19 @@ impl Controller {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Health {
-    /// The controller's state, where the adapter tells it.
+    /// The controller's state, if the adapter reports it.
     pub controller: Option<Controller>,
     /// Attempts to send that no other node acknowledged.
     pub unacknowledged: u32,
     /// Bit, stuff, form and CRC errors.
     pub disturbed: u32,
-    /// The error counters of sending and of receiving, where the adapter tells them.
+    /// The transmit and receive error counters, if the adapter reports them.
     pub counters: Option<(u8, u8)>,
     /// The bit rate in bit/s, where it is known.
     pub bit_rate: Option<u32>,
 }
 
-/// What is the matter with a bus.
+/// The problem of a bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Trouble {
     /// The adapter's controller is switched off.
@@ -57,26 +58,27 @@ pub enum Trouble {
     Off,
     /// Frames are disturbed.
     Disturbed,
-    /// Nobody acknowledges what the adapter sends.
+    /// No other node acknowledges the adapter's frames.
     Unacknowledged,
-    /// The controller is error passive, and the adapter does not tell of which errors.
+    /// The controller is error passive, and the adapter does not report the kind of the errors.
     Passive,
 }
 
-/// The error counter of a sender that nobody acknowledges stays here: an error passive sender does not
-/// count missing acknowledgements (ISO 11898-1, fault confinement, exception A).
+/// The transmit error counter of a sender without any receiver stays at this value: an error
+/// passive sender does not count missing acknowledgements (ISO 11898-1, fault confinement,
+/// exception A).
 const LONELY: u8 = 128;
 
 impl Health {
-    /// What is the matter, if something is.
+    /// The problem of the bus, if there is one.
     #[must_use]
     pub fn trouble(&self) -> Option<Trouble> {
         let passive = self.controller == Some(Controller::Passive);
         match self.controller {
             Some(Controller::Stopped) => Some(Trouble::Stopped),
             Some(Controller::Off) => Some(Trouble::Off),
-            // A disturbed frame does not come as far as its acknowledgement: where both are seen, the
-            // more frequent one is the cause.
+            // A disturbed frame ends before its acknowledgement. If both errors were seen, the more
+            // frequent one is the cause.
             _ if self.disturbed > self.unacknowledged => Some(Trouble::Disturbed),
             _ if self.unacknowledged > 0 => Some(Trouble::Unacknowledged),
             _ if passive
@@ -89,13 +91,14 @@ impl Health {
         }
     }
 
-    /// Whether other nodes acknowledge what is sent, as far as the adapter tells.
+    /// Whether other nodes acknowledge the adapter's frames, as far as the adapter reports it.
     #[must_use]
     pub fn acknowledged(&self) -> bool {
         self.controller == Some(Controller::Active) && self.trouble().is_none()
     }
 
-    /// What is the matter and what to do, as a sentence. `None` where nothing is, or nothing is known.
+    /// The problem and the advice, as a sentence. `None` if there is no problem, or nothing is
+    /// known.
     #[must_use]
     pub fn advice(&self) -> Option<String> {
         let rate = self.bit_rate.map_or(String::new(), |rate| format!(" (the adapter has {})", Rate(rate)));
@@ -106,7 +109,7 @@ impl Health {
                     .to_string()
             }
             Trouble::Off => format!(
-                "the adapter is bus-off: all that it sent was disturbed, as by a wrong bit rate{rate} or a short circuit \
+                "the adapter is bus-off: all its frames were disturbed, for example by a wrong bit rate{rate} or a short circuit \
                  between CAN-H and CAN-L; check both, then switch the adapter off and on (sudo ip link set can0 down, \
                  then up, with its own name)"
             ),
@@ -116,24 +119,24 @@ impl Health {
                 self.disturbed
             ),
             Trouble::Unacknowledged => format!(
-                "nobody acknowledges what the adapter sends: no other node is on this bus; check that the device has \
+                "no other node acknowledges the adapter's frames; check that the device has \
                  power, that CAN-H, CAN-L and ground are connected and not swapped, and that it is not silent because \
                  its bit rate is another one{rate}"
             ),
             Trouble::Passive => format!(
-                "the adapter is error passive: nobody acknowledges what it sends, or the bit rate is wrong{rate}; check \
+                "the adapter is error passive: no node acknowledges its frames, or the bit rate is wrong{rate}; check \
                  power, cable, terminators and bit rate"
             ),
         })
     }
 
-    /// Takes in an error frame of Linux (`linux/can/error.h`), as SocketCAN and gs_usb have it: the
-    /// identifier's bits below `CAN_ERR_FLAG`, and the data.
+    /// Adds an error frame of Linux (`linux/can/error.h`), the format of SocketCAN and gs_usb: the
+    /// bits of the identifier below `CAN_ERR_FLAG`, and the data.
     pub fn error_frame(&mut self, class: u32, data: &[u8]) {
         let byte = |at: usize| data.get(at).copied().unwrap_or_default();
-        // CAN_ERR_ACK; or CAN_ERR_PROT at the place CAN_ERR_PROT_LOC_ACK.
+        // CAN_ERR_ACK, or CAN_ERR_PROT with the location CAN_ERR_PROT_LOC_ACK.
         let unacknowledged = class & 0x20 != 0 || class & 0x08 != 0 && byte(3) == 0x19;
-        // CAN_ERR_PROT with BIT, FORM, STUFF, BIT0 or BIT1, or the places of a CRC error.
+        // CAN_ERR_PROT with BIT, FORM, STUFF, BIT0 or BIT1, or with the location of a CRC error.
         let disturbed = class & 0x08 != 0 && (byte(2) & 0x1F != 0 || matches!(byte(3), 0x08 | 0x18));
         if unacknowledged {
             self.unacknowledged = self.unacknowledged.saturating_add(1);
@@ -149,7 +152,7 @@ impl Health {
                 _ => self.controller,
             };
         }
-        // CAN_ERR_CNT, and drivers that are older than this flag.
+        // CAN_ERR_CNT; drivers older than this flag set the counters alone.
         if class & 0x200 != 0 || byte(6) != 0 || byte(7) != 0 {
             self.counters = Some((byte(6), byte(7)));
         }
@@ -163,7 +166,7 @@ impl Health {
     }
 }
 
-/// A bit rate in the unit that people use.
+/// A bit rate in kbit/s or Mbit/s.
 struct Rate(u32);
 
 impl fmt::Display for Rate {
@@ -197,7 +200,8 @@ mod tests {
             data
         };
         for (frames, trouble) in [
-            // CAN_ERR_ACK, as candleLight and flexcan have it; PROT at the ACK slot, as SJA1000 has it.
+            // CAN_ERR_ACK, as candleLight and flexcan send it; PROT at the ACK slot, as SJA1000
+            // sends it.
             (vec![(0x20, [0; 8])], Some(Trouble::Unacknowledged)),
             (vec![(0x88, at(3, 0x19))], Some(Trouble::Unacknowledged)),
             // PROT: BIT 01h, FORM 02h, STUFF 04h, BIT0 08h, BIT1 10h, CRC at 08h.
@@ -214,14 +218,14 @@ mod tests {
             (vec![(0x04, at(1, 0x20)), (0x04, at(1, 0x40))], None),
             (vec![(0x40, [0; 8])], Some(Trouble::Off)),
             (vec![(0x40, [0; 8]), (0x100, [0; 8])], None),
-            // CNT: nobody acknowledges, and the counter stays at 128.
+            // CNT: no node acknowledges, and the counter stays at 128.
             (vec![(0x204, [0, 0x20, 0, 0, 0, 0, 128, 0])], Some(Trouble::Unacknowledged)),
             (vec![(0x204, [0, 0x20, 0, 0, 0, 0, 200, 0])], Some(Trouble::Passive)),
             (vec![], None),
         ] {
             assert_eq!(after(&frames).trouble(), trouble, "{frames:X?}");
         }
-        // Data that is shorter than a driver's.
+        // Data shorter than those of a driver.
         let mut health = Health::default();
         health.error_frame(0xFFFF_FFFF, &[]);
         assert_eq!(health.trouble(), Some(Trouble::Unacknowledged));

@@ -1,12 +1,12 @@
-//! Hexadecimal digits, as the text protocols of adapters and logs have them.
+//! Hexadecimal digits in the text protocols of adapters and in logs.
 
-/// A number in hexadecimal digits and nothing else: no sign, no blank.
+/// A number of hexadecimal digits alone, without sign or blank.
 pub(crate) fn hex_number(text: &str) -> Option<u32> {
     let digits = !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_hexdigit());
     digits.then(|| u32::from_str_radix(text, 16).ok()).flatten()
 }
 
-/// Bytes in pairs of hexadecimal digits and nothing else.
+/// Bytes as pairs of hexadecimal digits alone.
 pub(crate) fn hex_bytes(text: &str) -> Option<Vec<u8>> {
     if !text.is_ascii() || !text.len().is_multiple_of(2) {
         return None;

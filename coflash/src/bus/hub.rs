@@ -1,9 +1,9 @@
-//! Several conversations over one adapter at once.
+//! Several conversations over one adapter at the same time.
 //!
-//! Each conversation runs in a thread of its own with a [`Port`] as its adapter, and needs to know
-//! nothing of the others. The adapter stays where it is: while all conversations wait, the hub
-//! waits for them, and whoever got a frame, or whose time is over, goes on. Nothing runs beside the
-//! hub, so that the same answers give the same course of events.
+//! Each conversation runs in its own thread with a [`Port`] as its adapter and knows nothing of the
+//! others. The adapter stays with the hub: when all conversations wait, the hub receives for them,
+//! and each conversation continues when it gets a frame or its time is over. No other thread runs
+//! at the same time, so the same answers always give the same course of events.
 
 use std::collections::VecDeque;
 use std::io;
@@ -15,27 +15,28 @@ use canopen::{Frame, NodeId};
 
 use super::adapter::{Adapter, AdapterError};
 
-/// What a conversation does with its port; what it gives is gathered by [`run`].
+/// The work of a conversation with its port. [`run`] collects the results.
 pub type Conversation<'c, R> = Box<dyn FnOnce(&mut Port) -> R + Send + 'c>;
 
-/// Frames that wait in the adapter may be the ones that are waited for: a conversation's time is
-/// over when there are none, or so much later.
+/// A frame that is still in the adapter may be the one that a conversation waits for. The time of a
+/// conversation is therefore over only when the adapter has no frames left, or after this
+/// additional time.
 const GRACE: Duration = Duration::from_secs(1);
 
-/// What ports tell the hub.
+/// A port's message to the hub.
 enum Ask {
     Send(usize, Frame),
     Receive { port: usize, until: Duration },
     Gone(usize),
 }
 
-/// What the hub tells a port.
+/// The hub's message to a port.
 struct Answer {
     frame: Result<Option<Frame>, AdapterError>,
     now: Duration,
 }
 
-/// A conversation's way to the bus: hears what concerns its node alone.
+/// A conversation's access to the bus: it receives only the frames that concern its node.
 #[derive(Debug)]
 pub struct Port {
     number: usize,
@@ -45,7 +46,7 @@ pub struct Port {
 }
 
 impl Port {
-    /// The hub does not go before its ports; should it, that is a lost adapter.
+    /// The hub outlives its ports. If it does not, the port reports a lost adapter.
     fn hub_is_gone() -> AdapterError {
         let source = io::Error::from(io::ErrorKind::BrokenPipe);
         AdapterError::Lost { adapter: "the hub".to_string(), source }
@@ -54,7 +55,7 @@ impl Port {
 
 impl Adapter for Port {
     fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        // Should the adapter refuse it, the next wait tells.
+        // If the adapter refuses the frame, the next wait reports it.
         self.asks.send(Ask::Send(self.number, *frame)).map_err(|_| Self::hub_is_gone())
     }
 
@@ -73,12 +74,12 @@ impl Adapter for Port {
 
 impl Drop for Port {
     fn drop(&mut self) {
-        // If the hub is gone there is nobody to tell.
+        // If the hub is gone, no receiver is left.
         let _ = self.asks.send(Ask::Gone(self.number));
     }
 }
 
-/// A port as the hub sees it.
+/// The hub's record of a port.
 struct Line {
     node: NodeId,
     answers: Sender<Answer>,
@@ -87,20 +88,20 @@ struct Line {
 
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum State {
-    /// The conversation is at work, and will ask for something.
+    /// The conversation works, and will send its next request.
     Running,
-    /// It waits for a frame.
+    /// The conversation waits for a frame.
     Waiting {
         until: Duration,
     },
     Gone,
 }
 
-/// Holds the conversations, each with one node and `at_once` of them at a time, and gives what they
-/// gave, in their order.
+/// Runs the conversations, each with one node and at most `at_once` of them at the same time.
+/// Returns their results in the order of the conversations.
 ///
 /// # Panics
-/// If a conversation does.
+/// If a conversation panics.
 pub fn run<'c, R: Send + 'c>(
     adapter: &mut dyn Adapter,
     conversations: Vec<(NodeId, Conversation<'c, R>)>,
@@ -139,8 +140,8 @@ pub fn run<'c, R: Send + 'c>(
     results.into_iter().map(|(_, result)| result).collect()
 }
 
-/// Takes what the ports ask until all of them wait, and sends what they want to send: in the order
-/// of the ports, whoever was faster.
+/// Reads the ports' requests until all ports wait, then sends their frames in the order of the
+/// ports, independent of the threads' timing.
 fn settle(
     adapter: &mut dyn Adapter,
     asked: &Receiver<Ask>,
@@ -150,7 +151,7 @@ fn settle(
     let running = |line: &Option<Line>| line.as_ref().is_some_and(|line| line.state == State::Running);
     let mut frames: Vec<(usize, Frame)> = Vec::new();
     while lines.iter().any(running) {
-        // The caller holds a sender, and each port tells when it goes: this comes to its end.
+        // The caller holds a sender, and each port reports its end: this loop ends.
         let Ok(ask) = asked.recv() else { return };
         let (port, state) = match ask {
             Ask::Send(port, frame) => {
@@ -172,7 +173,7 @@ fn settle(
     }
 }
 
-/// Waits until somebody can go on, and lets them.
+/// Waits until at least one conversation can continue, and wakes it.
 fn serve(adapter: &mut dyn Adapter, lines: &mut [Option<Line>], lost: &mut Option<AdapterError>) {
     let waiting = |line: &Line| match line.state {
         State::Waiting { until } => Some(until),
@@ -194,7 +195,7 @@ fn serve(adapter: &mut dyn Adapter, lines: &mut [Option<Line>], lost: &mut Optio
             Err(error) => Err(copy(error)),
         };
         line.state = State::Running;
-        // A conversation that has ended meanwhile will say that it is gone.
+        // If the conversation has ended in the meantime, it reports its end itself.
         let _ = line.answers.send(Answer { frame, now });
     }
     if let Err(error) = received {
@@ -202,15 +203,15 @@ fn serve(adapter: &mut dyn Adapter, lines: &mut [Option<Line>], lost: &mut Optio
     }
 }
 
-/// Whether a frame comes from this node (answer, heartbeat or emergency), or is somebody's request
-/// to it.
+/// Whether a frame comes from this node (answer, heartbeat or emergency), or is another client's
+/// request to it.
 fn concerns(frame: &Frame, node: NodeId) -> bool {
     let from =
         |id: u16| id & 0x7F == u16::from(node.get()) && matches!(id & 0x780, 0x080 | 0x580 | 0x600 | 0x700);
     frame.cob_id().is_some_and(|id| from(id.get()))
 }
 
-/// One loss is told to each conversation.
+/// Copies the error, so that each conversation gets it.
 fn copy(error: &AdapterError) -> AdapterError {
     let again = |source: &io::Error| match source.raw_os_error() {
         Some(code) => io::Error::from_raw_os_error(code),

@@ -1,10 +1,11 @@
-//! Work that may never come to an end.
+//! Work that may never end.
 
 use std::sync::mpsc;
 use std::thread;
 use std::time::Duration;
 
-/// What `work` gives, if it does within `limit`. Otherwise its thread is left to itself.
+/// Returns the result of `work` if it ends within `limit`. Otherwise its thread keeps running
+/// without a receiver.
 pub(super) fn in_time<T: Send + 'static>(
     limit: Duration,
     work: impl FnOnce() -> T + Send + 'static,
@@ -25,7 +26,7 @@ mod tests {
         assert_eq!(in_time(Duration::from_secs(60), || 7), Some(7));
         let (_held, never) = mpsc::channel::<()>();
         assert_eq!(in_time(Duration::from_millis(10), move || never.recv()), None);
-        // One that panics is none either.
+        // Work that panics gives no result either.
         assert_eq!(in_time::<()>(Duration::from_secs(60), || std::panic::resume_unwind(Box::new(()))), None);
     }
 }

@@ -1,7 +1,7 @@
-//! Kvaser adapters, by CANlib: `kvaser:0@500k`, the channel's number as CANlib counts.
+//! Kvaser adapters with CANlib: `kvaser:0@500k`, with CANlib's channel number.
 //!
-//! Names and values are those of `canlib.h` and `canstat.h` (CANlib 5). Not tried on hardware: tested
-//! against a stand-in for the library.
+//! Names and values are those of `canlib.h` and `canstat.h` (CANlib 5). Tested against a stand-in
+//! for the library, not on hardware.
 
 use std::time::Duration;
 
@@ -14,13 +14,13 @@ use super::driven::{Driven, Driver, Fault, Sent};
 use super::found::{shown, Found, Kind, Missing};
 use super::health::{Controller, Health};
 
-/// Where the library is to be had.
+/// Where to get the library.
 const FROM: &str =
     "install the adapter's driver and CANlib from www.kvaser.com (Windows and Linux; there is none for \
                     macOS); on Linux the kernel's own driver needs no library: socketcan:can0";
 
-/// The bit rates: what `canSetBusParams` is given. One of the `canBITRATE_…`, or the rate itself with
-/// its segments: 16 quanta sampled at 87.5 %, 10 at 80 %.
+/// The arguments of `canSetBusParams` for each bit rate: one of the constants `canBITRATE_…`, or
+/// the rate itself with its segments (16 quanta sampled at 87.5 %, 10 at 80 %).
 const BIT_RATES: [(u32, i32, (u32, u32)); 8] = [
     (1_000_000, -1, (0, 0)),
     (800_000, 800_000, (7, 2)),
@@ -32,13 +32,13 @@ const BIT_RATES: [(u32, i32, (u32, u32)); 8] = [
     (20_000, 20_000, (13, 2)),
 ];
 
-/// `canStatus` of functions that have nothing, and no room.
+/// `canStatus` of functions that find no message, and of functions without room.
 const NO_MESSAGE: i32 = -2;
 const NO_ROOM: i32 = -13;
-/// `canStatus` of a channel that another program has.
+/// `canStatus` of a channel that another program uses.
 const NO_CHANNELS: i32 = -5;
 const NO_ACCESS: i32 = -31;
-/// `canOPEN_ACCEPT_VIRTUAL`: virtual channels are as good as others.
+/// `canOPEN_ACCEPT_VIRTUAL`: virtual channels are accepted, too.
 const ACCEPT_VIRTUAL: i32 = 0x20;
 /// `canCHANNELDATA_DEVDESCR_ASCII`.
 const DESCRIPTION: i32 = 26;
@@ -57,7 +57,7 @@ mod flag {
     pub const DISTURBED: u32 = 0xF800;
 }
 
-/// What `canSetBusParams` is given for a bit rate in bit/s.
+/// The arguments of `canSetBusParams` for a bit rate in bit/s.
 pub(super) fn parameters(rate: u32) -> Option<(i32, (u32, u32))> {
     BIT_RATES.iter().find_map(|(known, given, segments)| (*known == rate).then_some((*given, *segments)))
 }
@@ -74,7 +74,7 @@ pub(super) fn open(channel: u16, rate: u32) -> Result<Driven, AdapterError> {
     };
     let Some((given, segments)) = parameters(rate) else {
         return Err(unusable(
-            format!("it has no bit rate of {rate} bit/s"),
+            format!("it does not support {rate} bit/s"),
             "choose one from 20k to 1M",
             false,
         ));
@@ -98,12 +98,12 @@ pub(super) fn open(channel: u16, rate: u32) -> Result<Driven, AdapterError> {
     })
 }
 
-/// The channels that are there, or why the library cannot say.
+/// The connected channels, or the reason why the library cannot list them.
 pub(super) fn list() -> Result<Vec<Found>, Missing> {
     let library = Canlib::load().map_err(|error| Missing { what: error.to_string(), advice: FROM })?;
     let (status, count) = library.channels();
     if status < 0 || !(0..=MOST_CHANNELS).contains(&count) {
-        let what = format!("CANlib tells of {count} channels, status {status}");
+        let what = format!("CANlib reports {count} channels, status {status}");
         return Err(Missing { what, advice: FROM });
     }
     let found = (0..count).map(|channel| {
@@ -188,7 +188,7 @@ impl Driver for Kvaser {
 
 /// The frame in a message.
 fn frame_of(message: &Message) -> Result<Frame, Fault> {
-    let nonsense = |what: String| Fault::Nonsense(format!("CANlib tells of a frame {what}"));
+    let nonsense = |what: String| Fault::Nonsense(format!("CANlib reports a frame {what}"));
     let data = usize::try_from(message.len).ok().and_then(|len| message.data.get(..len));
     let Some(data) = data else {
         return Err(nonsense(format!("of {} bytes", message.len)));
@@ -205,25 +205,25 @@ fn frame_of(message: &Message) -> Result<Frame, Fault> {
     frame.ok_or_else(|| nonsense(format!("with identifier {:X}h", message.id)))
 }
 
-/// The words for a `canStatus`.
+/// The message for a `canStatus`.
 fn words(status: i32) -> String {
     let why = match status {
-        -3 => "it is not there (canERR_NOTFOUND)",
+        -3 => "it does not exist (canERR_NOTFOUND)",
         NO_CHANNELS => "no channel is free (canERR_NOCHANNELS)",
-        -10 => "its handle is not valid any more (canERR_INVHANDLE)",
+        -10 => "its handle is no longer valid (canERR_INVHANDLE)",
         -15 => "its hardware has failed, or was unplugged (canERR_HARDWARE)",
         -23 | -24 => "its driver does not load (canERR_DRIVERLOAD)",
-        -26 => "no adapter is there (canERR_NOCARD)",
+        -26 => "no adapter is connected (canERR_NOCARD)",
         NO_ACCESS => "another program uses it (canERR_NO_ACCESS)",
         _ => "CANlib reports an error",
     };
     format!("{why}, status {status}")
 }
 
-/// What to do about a `canStatus`.
+/// The advice for a `canStatus`.
 fn advice(status: i32) -> &'static str {
     match status {
-        -3 | -26 => "plug it in, and check its number: coflash adapters lists those that are there",
+        -3 | -26 => "plug it in, and check its number: coflash adapters lists the adapters of this computer",
         NO_CHANNELS | NO_ACCESS => {
             "close the other program (CanKing, for example), and run the command again"
         }
@@ -253,7 +253,7 @@ mod tests {
         }
     }
 
-    /// Values of canstat.h: canBITRATE_1M is -1, and so on.
+    /// Values of canstat.h: for example, canBITRATE_1M is -1.
     #[test]
     fn bit_rates_are_those_of_the_header() {
         assert_eq!(parameters(1_000_000), Some((-1, (0, 0))));

@@ -1,4 +1,4 @@
-//! What a URL leads to: a CAN bus, or a gateway to one.
+//! The target of a URL: a CAN bus, or a gateway to one.
 
 use std::fmt;
 
@@ -6,12 +6,12 @@ use super::adapter::{Adapter, AdapterError};
 use super::gateway::Gateway;
 use super::{cia309, open};
 
-/// A way to devices. What needs frames takes the bus, what needs objects a
+/// Access to devices. Commands that need frames use the bus; commands that need objects use a
 /// [`Session`](crate::Session::on).
 pub enum Link {
     /// A CAN bus.
     Bus(Box<dyn Adapter + Send>),
-    /// A gateway, which carries SDO alone.
+    /// A gateway, which carries only SDO.
     Gateway(Box<dyn Gateway + Send>),
 }
 
@@ -25,11 +25,11 @@ impl fmt::Debug for Link {
 }
 
 impl Link {
-    /// Opens what a URL names ([`URLS`](super::URLS)), at this bit rate (in bit/s) if the URL names none
-    /// and it is an adapter that sets it.
+    /// Opens the target of a URL ([`URLS`](super::URLS)). `bit_rate` (in bit/s) applies if the URL
+    /// contains none and the adapter sets the bit rate.
     ///
     /// # Errors
-    /// The URL is no good, or what it names does not open.
+    /// The URL is invalid, or its target does not open.
     pub fn open(url: &str, bit_rate: Option<u32>) -> Result<Self, AdapterError> {
         match url.strip_prefix("cia309:") {
             Some(rest) => Ok(Self::Gateway(Box::new(cia309::open(url, rest)?))),

@@ -1,7 +1,7 @@
-//! The CAN interfaces of Linux, as `ip -json -details link show` tells of them.
+//! The CAN interfaces of Linux, as `ip -json -details link show` reports them.
 //!
-//! `ip` is the program that sets these interfaces up, so it is there where they are; what it writes is
-//! netlink's answer in a form that does not change.
+//! Users configure these interfaces with `ip`, so a computer with such an interface has this
+//! program. Its output is the answer of netlink in a stable format.
 
 use std::io::Read;
 use std::process::{Command, Stdio};
@@ -13,7 +13,7 @@ use super::found::{shown, Found, Kind, Missing};
 use super::health::{Controller, Health};
 use super::in_time::in_time;
 
-/// How long `ip` may take, and how much it may say.
+/// How long `ip` may take.
 const PATIENCE: Duration = Duration::from_secs(2);
 const MOST: u64 = 4 << 20;
 
@@ -21,11 +21,11 @@ const MOST: u64 = 4 << 20;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Link {
     pub(super) name: String,
-    /// `can`, `vcan`, `slcan` and so on.
+    /// `can`, `vcan`, `slcan` and others.
     pub(super) kind: String,
     /// Whether it is switched on.
     pub(super) up: bool,
-    /// What is known of its controller; nothing of a virtual one.
+    /// What is known about its controller. A virtual interface has none.
     pub(super) health: Health,
 }
 
@@ -34,22 +34,22 @@ pub(super) fn all() -> Result<Vec<Link>, Missing> {
     let missing =
         |what: String| Missing { what, advice: "install iproute2, whose program ip sets up CAN interfaces" };
     let mut last = String::new();
-    // Users' PATH often lacks the folder that it lies in.
+    // The PATH of a user often lacks the folder of `ip`.
     for program in ["ip", "/usr/sbin/ip", "/sbin/ip"] {
         match text_of(program) {
             Ok(text) => return Ok(parse(&text)),
             Err(error) => last = error,
         }
     }
-    Err(missing(format!("ip cannot be asked for CAN interfaces: {last}")))
+    Err(missing(format!("the program ip cannot list the CAN interfaces: {last}")))
 }
 
-/// The interface of this name.
+/// The interface with this name.
 pub(super) fn of(name: &str) -> Option<Link> {
     all().ok()?.into_iter().find(|link| link.name == name)
 }
 
-/// What the program says.
+/// The output of the program.
 fn text_of(program: &str) -> Result<String, String> {
     let mut command = Command::new(program);
     command.args(["-json", "-details", "link", "show"]);
@@ -60,7 +60,8 @@ fn text_of(program: &str) -> Result<String, String> {
         let mut text = Vec::new();
         output.take(MOST).read_to_end(&mut text).map(|_| text)
     });
-    // One that still runs has had its time; one that has ended does not mind.
+    // A program that still runs has used up its time; for a program that has ended this does
+    // nothing.
     let _ = child.kill();
     let _ = child.wait();
     match text {
@@ -70,7 +71,7 @@ fn text_of(program: &str) -> Result<String, String> {
     }
 }
 
-/// The CAN interfaces in what `ip` says. What it does not say as it should is left out.
+/// The CAN interfaces in the output of `ip`. Entries in an unexpected form are left out.
 fn parse(text: &str) -> Vec<Link> {
     let all: Vec<Value> = serde_json::from_str(text).unwrap_or_default();
     all.iter().filter(|link| link["link_type"] == "can").filter_map(link).collect()
@@ -104,7 +105,7 @@ fn link(link: &Value) -> Option<Link> {
     })
 }
 
-/// The CAN interfaces, as adapters.
+/// The CAN interfaces as adapters.
 pub(super) fn list() -> Result<Vec<Found>, Missing> {
     let found = all()?.into_iter().map(|link| {
         let state = match link.health.controller {
@@ -114,7 +115,7 @@ pub(super) fn list() -> Result<Vec<Found>, Missing> {
         };
         let about = shown(format!("CAN interface of the kernel ({})", link.kind).as_bytes());
         let found = Found::new(Kind::SocketCan, format!("socketcan:{}", shown(link.name.as_bytes())), about);
-        // One that somebody has made for a purpose, virtual or not.
+        // A user has created this interface for a purpose, even if it is virtual.
         Found { state, bit_rate: link.health.bit_rate, certain: true, ..found }
     });
     Ok(found.collect())
@@ -125,8 +126,8 @@ mod tests {
     use super::*;
     use crate::bus::health::Trouble;
 
-    /// What iproute2 wrote of a real interface (a sun4i_can at 250 kbit/s that hears a wrong bit rate),
-    /// and of a USB adapter that is switched off; shortened.
+    /// The output of iproute2 for a real interface (a sun4i_can at 250 kbit/s on a bus with another
+    /// bit rate), and for a USB adapter that is switched off; shortened.
     const SEEN: &str = r#"[
         {"ifindex":1,"ifname":"lo","flags":["LOOPBACK","UP","LOWER_UP"],"operstate":"UNKNOWN","link_type":"loopback"},
         {"ifindex":3,"ifname":"can0","flags":["NOARP","UP","LOWER_UP","ECHO"],"mtu":16,"operstate":"UP","link_type":"can",

@@ -1,4 +1,4 @@
-//! Which adapters are there.
+//! Lists the adapters of this computer.
 
 use std::time::Duration;
 
@@ -14,17 +14,18 @@ use super::links;
 use super::peak;
 use super::{beacons, ports};
 
-/// What was found.
+/// The result of a search.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct List {
     /// The adapters.
     pub found: Vec<Found>,
-    /// The kinds that could not be looked for.
+    /// The kinds for which the search failed.
     pub missing: Vec<(Kind, Missing)>,
 }
 
 impl List {
-    /// The only adapter that may be taken unasked, if there is exactly one.
+    /// The adapter to use if the user has named none: the only certain one, if there is exactly
+    /// one.
     #[must_use]
     pub fn only(&self) -> Option<&Found> {
         let mut certain = self.found.iter().filter(|found| found.certain);
@@ -32,14 +33,13 @@ impl List {
     }
 }
 
-/// How long a kind may take, besides the time that it is given to listen.
+/// How long the search for one kind may take, in addition to the time for listening.
 const LIMIT: Duration = Duration::from_secs(5);
-/// More adapters of a kind than anybody has: what goes beyond is a lie.
+/// More adapters of one kind than any computer has. A longer list is wrong.
 const MOST: usize = 100;
 
-/// Looks for adapters of these kinds. Beacons of socketcand are listened for during `listen`; its
-/// servers send one every 3 s. Returns in any case: a kind that does not come to an end within 5 s is
-/// given up.
+/// Searches for adapters of these kinds. Listens for beacons of socketcand servers, which come
+/// every 3 s, during `listen`. Always returns: a search that takes longer than 5 s is given up.
 #[must_use]
 pub fn list(kinds: &[Kind], listen: Duration) -> List {
     let mut list = List::default();
@@ -49,7 +49,7 @@ pub fn list(kinds: &[Kind], listen: Duration) -> List {
             Some(Ok(found)) => list.found.extend(found.into_iter().take(MOST)),
             Some(Err(missing)) => list.missing.push((kind, missing)),
             None => {
-                let what = format!("the search did not come to an end within {} s", limit.as_secs());
+                let what = format!("the search did not end within {} s", limit.as_secs());
                 let advice = "unplug these adapters and plug them in again, or install their driver anew";
                 list.missing.push((kind, Missing { what, advice }));
             }

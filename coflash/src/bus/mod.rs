@@ -1,6 +1,7 @@
-//! Ways to a CAN bus, and what goes over it.
+//! Access to a CAN bus, and the formats of frames.
 //!
-//! Here are frames, and nothing of what a device makes of them: that is [`device`](crate::device).
+//! This module handles frames. Their meaning for a device is the subject of
+//! [`device`](crate::device).
 
 pub mod adapter;
 mod beacons;
@@ -58,7 +59,7 @@ pub use self::trace::{OnFailure, Trace};
 mod tests {
     use super::*;
 
-    /// A bus can be opened here and used in another thread. Compiling this is the test.
+    /// A link can be opened in one thread and used in another. This test only has to compile.
     #[test]
     fn whatever_leads_to_a_bus_can_move_to_a_thread() {
         fn moves<T: Send + 'static>() {}

@@ -1,4 +1,4 @@
-//! The adapter that a URL names.
+//! Opens the adapter of a URL.
 
 #[cfg(doc)]
 use super::adapter::URLS;
@@ -15,15 +15,15 @@ use super::socketcan::SocketCan;
 use super::socketcand::Socketcand;
 use super::target::Target;
 
-/// Opens the adapter that a URL names (see [`URLS`]).
+/// Opens the adapter of a URL (see [`URLS`]).
 ///
 /// # Errors
-/// The URL is no good, or the adapter does not open.
+/// The URL is invalid, or the adapter does not open.
 pub fn open(url: &str) -> Result<Box<dyn Adapter + Send>, AdapterError> {
     open_at(url, None)
 }
 
-/// Judges a URL, of an adapter or a gateway, without opening anything.
+/// Checks the URL of an adapter or a gateway without opening anything.
 ///
 /// # Errors
 /// [`AdapterError::Url`].
@@ -35,11 +35,11 @@ fn target(url: &str) -> Result<Target, AdapterError> {
     Target::parse(url).map_err(|why| AdapterError::Url { url: url.to_string(), why })
 }
 
-/// Opens the adapter that a URL names, at this bit rate (in bit/s) if the URL names none and the
-/// adapter sets it. This is the place to add other adapters.
+/// Opens the adapter of a URL. `bit_rate` (in bit/s) applies if the URL contains none and the
+/// adapter sets the bit rate. To add another adapter, add it here.
 ///
 /// # Errors
-/// The URL is no good, or the adapter does not open.
+/// The URL is invalid, or the adapter does not open.
 pub fn open_at(url: &str, bit_rate: Option<u32>) -> Result<Box<dyn Adapter + Send>, AdapterError> {
     let bad = |why: &str| AdapterError::Url { url: url.to_string(), why: why.to_string() };
     #[cfg(any(feature = "peak", feature = "kvaser", feature = "gs_usb"))]
@@ -59,11 +59,13 @@ pub fn open_at(url: &str, bit_rate: Option<u32>) -> Result<Box<dyn Adapter + Sen
         Target::Kvaser { channel, rate } => Box::new(kvaser::open(channel, needed(rate)?)?),
         #[cfg(feature = "gs_usb")]
         Target::GsUsb { which, rate } => Box::new(gs_usb::open(which, needed(rate)?)?),
-        Target::Gateway => return Err(bad("a gateway carries SDO alone, and this needs the CAN bus itself")),
+        Target::Gateway => {
+            return Err(bad("a gateway carries only SDO, and this command needs the CAN bus itself"))
+        }
     })
 }
 
-/// The bit rate that a URL names, in bit/s.
+/// The bit rate in a URL, in bit/s.
 #[must_use]
 pub fn bit_rate_of(url: &str) -> Option<u32> {
     Target::parse(url).ok()?.rate()

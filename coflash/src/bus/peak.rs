@@ -1,7 +1,7 @@
-//! PEAK adapters, by PCANBasic: `peak:PCAN_USBBUS1@500k`.
+//! PEAK adapters with PCANBasic: `peak:PCAN_USBBUS1@500k`.
 //!
-//! Names and values are those of `PCANBasic.h` and of the manual of PCAN-Basic ("Error Frames"). Not
-//! tried on hardware: tested against a stand-in for the library.
+//! Names and values are those of `PCANBasic.h` and of the manual of PCAN-Basic ("Error Frames").
+//! Tested against a stand-in for the library, not on hardware.
 
 use std::thread;
 use std::time::Duration;
@@ -15,21 +15,22 @@ use super::driven::{Driven, Driver, Fault, Sent};
 use super::found::{shown, Found, Kind, Missing};
 use super::health::{Controller, Health};
 
-/// Where the library is to be had.
+/// Where to get the library.
 const FROM: &str =
     "install the driver of the adapter with PCAN-Basic from www.peak-system.com (on macOS PCBUSB from \
                     www.mac-can.com); on Linux the kernel's own driver needs no library: socketcan:can0";
 
-/// The channels of plug-and-play hardware: name without number, and the values from number 1 on.
+/// The channels of plug-and-play hardware: the name without its number, and the values from number
+/// 1 on.
 const CHANNELS: [(&str, &[(u16, u16)]); 4] = [
-    // First value, and how many follow each other.
+    // The first value, and the number of consecutive values.
     ("USBBUS", &[(0x51, 8), (0x509, 8)]),
     ("PCIBUS", &[(0x41, 8), (0x409, 8)]),
     ("LANBUS", &[(0x801, 16)]),
     ("PCCBUS", &[(0x61, 2)]),
 ];
 
-/// The bit rates with the registers of an SJA1000 (`PCAN_BAUD_…`).
+/// The bit rates with their register values of an SJA1000 (`PCAN_BAUD_…`).
 const BIT_RATES: [(u32, u16); 10] = [
     (1_000_000, 0x0014),
     (800_000, 0x0016),
@@ -50,7 +51,7 @@ mod parameter {
     pub const ALLOW_ERROR_FRAMES: u8 = 0x20;
 }
 
-/// Bits of a `TPCANStatus` that tell of a frame or of the bus. All others are errors.
+/// Bits of a `TPCANStatus` that describe a frame or the bus. All other bits are errors.
 mod status {
     pub const CONTROLLER_FULL: u32 = 0x1;
     pub const OVERRUN: u32 = 0x2;
@@ -76,11 +77,11 @@ mod kind {
     pub const STATUS: u8 = 0x80;
 }
 
-/// How long to wait before an empty queue is looked at again. The library has no function that waits on
+/// The pause before an empty queue is read again. The library has no wait function that works on
 /// all systems.
 const PAUSE: Duration = Duration::from_micros(500);
 
-/// The value of a channel's name, with or without `PCAN_`.
+/// The value for a channel's name, with or without `PCAN_`.
 pub(super) fn channel(name: &str) -> Option<u16> {
     let name = name.to_ascii_uppercase();
     let name = name.strip_prefix("PCAN_").unwrap_or(&name);
@@ -95,7 +96,7 @@ fn names() -> impl Iterator<Item = (String, u16)> {
     })
 }
 
-/// The registers of a bit rate in bit/s.
+/// The register values for a bit rate in bit/s.
 pub(super) fn registers(rate: u32) -> Option<u16> {
     BIT_RATES.iter().find_map(|(known, registers)| (*known == rate).then_some(*registers))
 }
@@ -111,11 +112,7 @@ pub(super) fn open(channel_name: &str, rate: u32) -> Result<Driven, AdapterError
         in_use,
     };
     let (Some(channel), Some(registers)) = (channel(channel_name), registers(rate)) else {
-        return Err(unusable(
-            format!("it has no bit rate of {rate} bit/s"),
-            "choose one from 5k to 1M",
-            false,
-        ));
+        return Err(unusable(format!("it does not support {rate} bit/s"), "choose one from 5k to 1M", false));
     };
     Driven::open(name, move || {
         let library = Pcan::load().map_err(|error| AdapterError::library("PEAK adapter", &error, FROM))?;
@@ -123,13 +120,14 @@ pub(super) fn open(channel_name: &str, rate: u32) -> Result<Driven, AdapterError
         if status & !status::HARMLESS != 0 {
             return Err(unusable(words(status), advice(status), status & 0xC00 != 0 && status & 0x1000 == 0));
         }
-        // A library of before 2018 does not know it, and tells of the controller's state all the same.
+        // A library from before 2018 does not know this parameter; it reports the controller's
+        // state all the same.
         let _ = library.set_number(channel, parameter::ALLOW_ERROR_FRAMES, 1);
         Ok(Peak { library, channel, health: Health { bit_rate: Some(rate), ..Health::default() } })
     })
 }
 
-/// The channels that are there, or why the library cannot say.
+/// The connected channels, or the reason why the library cannot list them.
 pub(super) fn list() -> Result<Vec<Found>, Missing> {
     let library = Pcan::load().map_err(|error| Missing { what: error.to_string(), advice: FROM })?;
     let found = names().filter_map(|(name, channel)| {
@@ -158,7 +156,7 @@ struct Peak {
 }
 
 impl Peak {
-    /// What a status tells of the bus.
+    /// Records what a status says about the bus.
     fn note(&mut self, status: u32) {
         self.health.controller = Some(match status {
             status if status & status::BUS_OFF != 0 => Controller::Off,
@@ -168,17 +166,17 @@ impl Peak {
         });
     }
 
-    /// An error frame ("Error Frames" of the manual): the kind of error in the identifier; direction,
-    /// place in the frame, and both counters in the data.
+    /// An error frame ("Error Frames" of the manual): the identifier holds the kind of error; the
+    /// data hold direction, position in the frame, and both counters.
     fn error_frame(&mut self, message: &Message) {
         let [_, place, receive, send, ..] = message.data;
         self.health.counters = Some((send, receive));
         match (message.id, place) {
             // The acknowledge slot.
             (1..=8, 25) => self.health.unacknowledged = self.health.unacknowledged.saturating_add(1),
-            // Bit, form, stuff; and others, such as CRC.
+            // Bit, form or stuff error; other errors, such as CRC.
             (1..=8, _) => self.health.disturbed = self.health.disturbed.saturating_add(1),
-            // Counters alone.
+            // Only the counters.
             _ => {}
         }
     }
@@ -245,7 +243,7 @@ impl Driver for Peak {
 
 /// The frame in a message.
 fn frame_of(message: &Message) -> Result<Frame, Fault> {
-    let nonsense = |what: String| Fault::Nonsense(format!("its library tells of a frame {what}"));
+    let nonsense = |what: String| Fault::Nonsense(format!("its library reports a frame {what}"));
     let len = usize::from(message.len);
     let Some(data) = message.data.get(..len) else {
         return Err(nonsense(format!("of {len} bytes")));
@@ -262,26 +260,28 @@ fn frame_of(message: &Message) -> Result<Frame, Fault> {
     frame.ok_or_else(|| nonsense(format!("with identifier {:X}h", message.id)))
 }
 
-/// The words for the error in a status.
+/// The message for the error in a status.
 fn words(status: u32) -> String {
     let why = match status & !status::HARMLESS {
-        0x100 => "the test of its controller failed: no hardware is there (PCAN_ERROR_REGTEST)",
+        0x100 => "the test of its controller failed: no hardware is connected (PCAN_ERROR_REGTEST)",
         0x200 => "its driver is not loaded (PCAN_ERROR_NODRIVER)",
         0x400 => "another program uses it (PCAN_ERROR_HWINUSE)",
         0x800 => "another program uses its net (PCAN_ERROR_NETINUSE)",
-        0x1400 => "it is not there (PCAN_ERROR_ILLHW)",
-        0x1800 | 0x1C00 => "its handle is not valid any more (PCAN_ERROR_ILLHANDLE)",
+        0x1400 => "it does not exist (PCAN_ERROR_ILLHW)",
+        0x1800 | 0x1C00 => "its handle is no longer valid (PCAN_ERROR_ILLHANDLE)",
         0x2000 => "the driver is out of resources (PCAN_ERROR_RESOURCE)",
-        0x400_0000 => "it is not initialised any more (PCAN_ERROR_INITIALIZE)",
+        0x400_0000 => "it is no longer initialised (PCAN_ERROR_INITIALIZE)",
         _ => "its library reports an error",
     };
     format!("{why}, status {status:X}h")
 }
 
-/// What to do about the error in a status.
+/// The advice for the error in a status.
 fn advice(status: u32) -> &'static str {
     match status & !status::HARMLESS {
-        0x100 | 0x1400 => "plug it in, and check its number: coflash adapters lists those that are there",
+        0x100 | 0x1400 => {
+            "plug it in, and check its number: coflash adapters lists the adapters of this computer"
+        }
         0x200 => FROM,
         0x400 | 0x800 => "close the other program (PCAN-View, for example), and run the command again",
         _ => "unplug the adapter, plug it in and run the command again",

@@ -1,20 +1,20 @@
-//! Serial ports: which are there, and why one cannot be opened.
+//! Lists serial ports, and explains why a port cannot be opened.
 
 use serialport::{ErrorKind, SerialPortInfo, SerialPortType};
 
 use super::adapter::AdapterError;
 use super::found::{shown, Found, Kind, Missing};
 
-/// USB vendor and product of adapters that speak SLCAN and nothing else (CANable, now and at first).
+/// USB vendor and product IDs of adapters that speak only SLCAN (CANable: current and first IDs).
 const SLCAN: [(u16, u16); 2] = [(0x16D0, 0x117E), (0xAD50, 0x60C4)];
 
-/// The serial ports. One on USB may have an SLCAN adapter behind it.
+/// The serial ports. A port on USB may be an SLCAN adapter.
 pub(super) fn list() -> Result<Vec<Found>, Missing> {
     let ports = serialport::available_ports().map_err(|error| Missing {
         what: format!("the serial ports cannot be listed: {error}"),
         advice: "name the port: --bus slcan:PORT@500k",
     })?;
-    // macOS lists each port twice; the side that waits for a modem's carrier is none for us.
+    // macOS lists each port twice; the tty side waits for a modem's carrier and is of no use here.
     Ok(ports.iter().filter(|port| !port.port_name.starts_with("/dev/tty.")).map(found).collect())
 }
 
@@ -31,7 +31,7 @@ fn found(port: &SerialPortInfo) -> Found {
     Found { certain, ..Found::new(Kind::Serial, url, shown(about.as_bytes())) }
 }
 
-/// The ports that are there, for advice.
+/// A list of the serial ports, for advice.
 pub(super) fn those_there() -> String {
     let ports: Vec<String> = serialport::available_ports()
         .unwrap_or_default()
@@ -42,11 +42,11 @@ pub(super) fn those_there() -> String {
         .collect();
     match ports.as_slice() {
         [] => "this computer has no serial port at present".to_string(),
-        ports => format!("these serial ports are there: {}", ports.join(", ")),
+        ports => format!("this computer has these serial ports: {}", ports.join(", ")),
     }
 }
 
-/// Why a port did not open, and what to do.
+/// The error for a port that did not open, with advice.
 pub(super) fn refused(adapter: String, port: &str, error: &serialport::Error) -> AdapterError {
     let io = match error.kind() {
         ErrorKind::Io(kind) => Some(kind),
@@ -73,11 +73,11 @@ pub(super) fn refused(adapter: String, port: &str, error: &serialport::Error) ->
             )
         }
         (ErrorKind::NoDevice, _) | (_, Some(std::io::ErrorKind::NotFound)) => (
-            "there is no such serial port".to_string(),
+            "no serial port has this name".to_string(),
             format!("{}; plug the adapter in, or name the right one: --bus slcan:PORT@500k", those_there()),
         ),
         _ if there => (
-            format!("it is no serial port ({})", shown(error.to_string().as_bytes())),
+            format!("it is not a serial port ({})", shown(error.to_string().as_bytes())),
             format!("{}; name the right one: --bus slcan:PORT@500k", those_there()),
         ),
         _ => (
@@ -90,7 +90,7 @@ pub(super) fn refused(adapter: String, port: &str, error: &serialport::Error) ->
 
 fn busy(port: &str) -> (String, String) {
     let who = if cfg!(unix) {
-        format!("sudo fuser -v {port} names it; ModemManager takes new ports for some seconds")
+        format!("sudo fuser -v {port} names it; ModemManager opens new ports for some seconds")
     } else {
         "a terminal program, for example".to_string()
     };
@@ -100,7 +100,7 @@ fn busy(port: &str) -> (String, String) {
     )
 }
 
-/// The group that may use a port; `dialout` where that cannot be told.
+/// The group that may use a port; `dialout` if this is unknown.
 fn group(port: &str) -> String {
     #[cfg(unix)]
     {

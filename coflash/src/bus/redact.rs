@@ -1,24 +1,24 @@
-//! Frames without passwords, for records that are handed on.
+//! Removes passwords from frames, for records that users pass on.
 
 use std::collections::BTreeMap;
 
 use canopen::{Address, Frame, NodeId};
 use embedded_can::{Frame as _, Id};
 
-/// The objects that passwords are written to: the access code of CiA 814-1, and the password of
+/// The objects to which passwords are written: the access code of CiA 814-1, and the password of
 /// ESAcademy's bootloader.
 const PASSWORDS: [u16; 2] = [0x6005, 0x7F50];
 
-/// Whether what is written to this object is a password.
+/// Whether data written to this object are a password.
 #[must_use]
 pub fn is_password(at: Address) -> bool {
     PASSWORDS.contains(&at.index)
 }
 
-/// Makes the bytes of passwords 0 in SDO downloads, whatever their form.
+/// Replaces the bytes of passwords by 0 in SDO downloads of every form.
 #[derive(Debug, Default)]
 pub struct Redactor {
-    /// Nodes that are being sent a password.
+    /// The nodes to which a client is sending a password.
     under_way: BTreeMap<NodeId, Form>,
 }
 
@@ -29,7 +29,8 @@ enum Form {
 }
 
 impl Redactor {
-    /// The frame as it may be shown: frames have to come in the order of the bus.
+    /// Returns the frame in a form that may be shown. Frames must be passed in the order of the
+    /// bus.
     pub fn frame(&mut self, frame: &Frame) -> Frame {
         let Id::Standard(id) = frame.id() else { return *frame };
         let Some(node) = NodeId::new((id.as_raw() & 0x7F) as u8) else { return *frame };
@@ -83,7 +84,7 @@ impl Redactor {
     }
 }
 
-/// The frame with zeros from this byte on.
+/// The frame with zeros from byte `from` on.
 fn without(frame: &Frame, from: usize) -> Frame {
     let mut data = frame.data().to_vec();
     data.iter_mut().skip(from).for_each(|byte| *byte = 0);
@@ -106,7 +107,7 @@ mod tests {
 
     #[test]
     fn a_password_is_not_in_what_is_shown() {
-        // CiA 301: expedited, in segments, and as a block; what follows is shown.
+        // CiA 301: expedited, segmented, and block download; the data of the next object are shown.
         let after = (true, [0x2F, 0x51, 0x1F, 1, 0x80, 0, 0, 0]);
         let cases: [&[(bool, [u8; 8])]; 3] = [
             &[

@@ -8,12 +8,12 @@ use embedded_can::Frame as _;
 use super::adapter::{Adapter, AdapterError};
 use super::health::Health;
 
-/// An adapter behind which devices listen to SDO requests, and answer them, on identifiers of their
-/// own (`BLCOP_BASE_REQUEST` and `BLCOP_BASE_RESPONSE` of the manual). To its user they are those of
-/// the predefined connection set, 600h and 580h with the node-ID on top.
+/// An adapter for devices that use their own identifiers for SDO requests and answers
+/// (`BLCOP_BASE_REQUEST` and `BLCOP_BASE_RESPONSE` of the manual). The adapter's user sees the
+/// identifiers of the predefined connection set, 600h and 580h plus the node-ID.
 ///
-/// What comes on 580h and 600h themselves and their node-IDs is of devices that the user does not speak
-/// to, and is left out.
+/// Frames that really have the identifiers 580h or 600h plus a node-ID belong to other devices, and
+/// the adapter drops them.
 #[derive(Debug)]
 pub struct SdoIds<A> {
     adapter: A,
@@ -25,14 +25,15 @@ const REQUEST: u16 = 0x600;
 const RESPONSE: u16 = 0x580;
 
 impl<A: Adapter> SdoIds<A> {
-    /// Requests go to `request` and the node-ID on top, answers come from `response` and the node-ID
-    /// on top; both 80h to 780h.
+    /// Requests go to `request` plus the node-ID, answers come from `response` plus the node-ID.
+    /// Both are 80h to 780h.
     pub fn new(adapter: A, request: u16, response: u16) -> Self {
         Self { adapter, request, response }
     }
 }
 
-/// The same frame with another base of its identifier; `None` if it has no node-ID above `from`.
+/// The same frame with another base of its identifier; `None` if its identifier is not `from` plus
+/// a node-ID.
 fn moved(frame: &Frame, from: u16, to: u16) -> Option<Frame> {
     let node = frame.cob_id()?.get().checked_sub(from)?;
     let node = NodeId::new(u8::try_from(node).ok()?)?;
@@ -56,7 +57,7 @@ impl<A: Adapter> Adapter for SdoIds<A> {
             if let Some(answer) = moved(&frame, self.response, RESPONSE) {
                 return Ok(Some(answer));
             }
-            // What others ask the node.
+            // Requests of other clients to the node.
             if let Some(request) = moved(&frame, self.request, REQUEST) {
                 return Ok(Some(request));
             }
@@ -79,7 +80,7 @@ impl<A: Adapter> Adapter for SdoIds<A> {
 mod tests {
     use super::*;
 
-    /// What was sent, and what comes.
+    /// The frames to receive, and the frames that were sent.
     #[derive(Default)]
     struct Script {
         sent: Vec<Option<CobId>>,
@@ -109,11 +110,11 @@ mod tests {
     fn sdo_goes_by_other_identifiers_and_all_else_as_it_is() {
         let coming = vec![
             frame(0x4AA, &[0x60, 0, 0, 0, 0, 0, 0, 0]),
-            // Another device, of the predefined connection set.
+            // Another device, which uses the predefined connection set.
             frame(0x5AA, &[0x60, 1, 1, 1, 1, 1, 1, 1]),
             frame(0x62A, &[0x40, 1, 1, 1, 1, 1, 1, 1]),
             frame(0x72A, &[0x7F]),
-            // Somebody else asks the device.
+            // Another client sends a request to the device.
             frame(0x6AA, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]),
         ];
         let mut adapter = SdoIds::new(Script { coming, ..Script::default() }, 0x680, 0x480);

@@ -15,27 +15,27 @@ use super::hex::{hex_bytes, hex_number};
 use super::ports;
 use super::tcp::{connect, PATIENCE};
 
-/// How long an adapter may take to answer a command. Some never do, and work nevertheless.
+/// How long an adapter may take to answer a command. Some adapters never answer, but work.
 const ANSWER: Duration = Duration::from_millis(300);
-/// No message of the protocol comes near this length.
+/// Longer than any message of the protocol.
 const LONGEST_MESSAGE: usize = 64;
-/// Frames that are kept while an answer is waited for.
+/// The most frames that are kept while the tool waits for an answer.
 const MOST_EARLY: usize = 1024;
-/// The speed of a serial line; adapters on USB do not look at it.
+/// The speed of a serial line; adapters on USB ignore it.
 const BAUD: u32 = 115_200;
 
-/// The bit rates with their numbers (`S0` to `S8`).
+/// The bit rates in the order of their commands (`S0` to `S8`).
 const BIT_RATES: [u32; 9] = [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000];
 
-/// What the text goes over.
+/// The line that carries the text.
 pub trait Line: Read + Write {
-    /// How long a read waits at most.
+    /// Sets how long a read waits at most.
     ///
     /// # Errors
     /// The line is gone.
     fn set_timeout(&mut self, timeout: Duration) -> io::Result<()>;
 
-    /// The time, by the clock that the line's other end lives by.
+    /// The time on the clock of the line's other end.
     fn now(&self) -> Instant {
         Instant::now()
     }
@@ -43,7 +43,7 @@ pub trait Line: Read + Write {
 
 impl Line for TcpStream {
     fn set_timeout(&mut self, timeout: Duration) -> io::Result<()> {
-        // Zero would mean for ever.
+        // Zero would mean no time-out.
         self.set_read_timeout(Some(timeout.max(Duration::from_micros(1))))
     }
 }
@@ -60,38 +60,38 @@ pub struct Slcan<L: Line> {
     line: L,
     name: String,
     opened: Instant,
-    /// What has arrived of a message that is not complete.
+    /// Received bytes of an incomplete message.
     partial: Vec<u8>,
-    /// What has arrived and was not looked at yet.
+    /// Received bytes that were not parsed yet.
     rest: Vec<u8>,
-    /// Frames that came while an answer was waited for.
+    /// Frames that arrived while the tool waited for an answer.
     early: VecDeque<Frame>,
-    /// Something that it said while it was opened, and that is not of the protocol.
+    /// A message outside the protocol that the adapter sent while it was opened.
     odd: Option<String>,
 }
 
-/// What came of a command.
+/// The result of a command.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Answer {
-    /// It was answered as the protocol has it.
+    /// The adapter answered as the protocol requires.
     Done,
-    /// It was refused (BEL).
+    /// The adapter refused (BEL).
     Refused,
-    /// Nothing came, or nothing of the protocol.
+    /// The adapter sent nothing, or nothing of the protocol.
     None,
 }
 
 /// A message of the adapter.
 #[derive(Debug, PartialEq, Eq)]
 enum Message {
-    /// A line, without its end.
+    /// A line, without its end character.
     Text(Vec<u8>),
-    /// It refuses (BEL).
+    /// A refusal (BEL).
     Refused,
 }
 
 impl Slcan<TcpStream> {
-    /// Connects to an adapter, or a server that plays one, at `host:port`, and opens its bus.
+    /// Connects to an adapter at `host:port`, or to a server that acts as one, and opens its bus.
     ///
     /// # Errors
     /// [`AdapterError::Open`] or [`AdapterError::Protocol`].
@@ -106,7 +106,7 @@ impl Slcan<TcpStream> {
 }
 
 impl Slcan<Box<dyn serialport::SerialPort>> {
-    /// Opens the serial port `port` and the bus behind it.
+    /// Opens the serial port `port` and the bus of its adapter.
     ///
     /// # Errors
     /// [`AdapterError::Open`] or [`AdapterError::Protocol`].
@@ -121,35 +121,35 @@ impl Slcan<Box<dyn serialport::SerialPort>> {
 }
 
 impl<L: Line> Slcan<L> {
-    /// Opens the bus of the adapter at the other end of `line`, at `bit_rate` (bit/s) or at the one
-    /// that it has.
+    /// Opens the bus of the adapter at the other end of `line`, at `bit_rate` (bit/s) or at the
+    /// adapter's current bit rate.
     ///
     /// # Errors
-    /// [`AdapterError::Protocol`] where the adapter refuses, [`AdapterError::Lost`] where it goes.
+    /// [`AdapterError::Protocol`] if the adapter refuses, [`AdapterError::Lost`] if the line fails.
     pub fn open(line: L, name: String, bit_rate: Option<u32>) -> Result<Self, AdapterError> {
         let mut adapter = Self::opened(line, name);
-        // Whatever was under way before: end it, and close the bus. A bus that is closed already is
-        // refused, which is well.
+        // End a session that was active before, and close the bus. The adapter refuses C if the bus
+        // is closed already, which does no harm.
         adapter.send_text("\r\rC\r")?;
         adapter.settle()?;
-        // The version: an adapter that leaves out acknowledgements tells at least that.
+        // The version: an adapter that sends no acknowledgements answers at least this command.
         let version = adapter.command("V\r", |text| text.len() > 1 && text[0] == b'V')?;
         if let Some(rate) = bit_rate {
             let Some(number) = BIT_RATES.iter().position(|known| *known == rate) else {
-                return Err(adapter.unexpected(format!("{rate} bit/s is none of its bit rates")));
+                return Err(adapter.unexpected(format!("it does not support {rate} bit/s")));
             };
             if adapter.command(&format!("S{number}\r"), <[u8]>::is_empty)? == Answer::Refused {
                 return Err(adapter.unexpected("it refuses the bit rate".to_string()));
             }
         }
         match adapter.command("O\r", <[u8]>::is_empty)? {
-            Answer::Refused => Err(adapter.unexpected("it refuses opening the bus".to_string())),
+            Answer::Refused => Err(adapter.unexpected("it refuses to open the bus".to_string())),
             Answer::None if version == Answer::None => Err(adapter.mute()),
             Answer::Done | Answer::None => Ok(adapter),
         }
     }
 
-    /// The adapter at the other end of `line`, whose bus is open already.
+    /// The adapter at the other end of `line`; its bus is open already.
     pub fn opened(line: L, name: String) -> Self {
         Self {
             opened: line.now(),
@@ -162,7 +162,7 @@ impl<L: Line> Slcan<L> {
         }
     }
 
-    /// Gives a command and waits for the answer that `answers` knows, if one comes.
+    /// Sends a command and waits for the answer that `answers` recognises.
     fn command(&mut self, text: &str, answers: impl Fn(&[u8]) -> bool) -> Result<Answer, AdapterError> {
         self.send_text(text)?;
         let deadline = self.line.now() + ANSWER;
@@ -172,7 +172,7 @@ impl<L: Line> Slcan<L> {
                 Message::Text(text) if answers(&text) => return Ok(Answer::Done),
                 Message::Text(text) => self.stray(&text),
             }
-            // A line that never ends its chatter ends the waiting all the same.
+            // The deadline also ends the wait on a line that sends without pause.
             if self.line.now() >= deadline {
                 break;
             }
@@ -180,7 +180,7 @@ impl<L: Line> Slcan<L> {
         Ok(Answer::None)
     }
 
-    /// Keeps what came while something else was waited for.
+    /// Keeps a message that arrived while the tool waited for another one.
     fn stray(&mut self, text: &[u8]) {
         match parse_frame(text) {
             // Frames may come as soon as the bus is open.
@@ -191,7 +191,7 @@ impl<L: Line> Slcan<L> {
         }
     }
 
-    /// What answers neither V nor O is no SLCAN adapter.
+    /// The error for a device that answers neither V nor O: it is not an SLCAN adapter.
     fn mute(&self) -> AdapterError {
         let said = match &self.odd {
             Some(odd) => format!("; it sent '{odd}'"),
@@ -199,21 +199,21 @@ impl<L: Line> Slcan<L> {
         };
         let what = format!("it answered neither V (version) nor O (open the bus){said}");
         let advice = format!(
-            "this is no SLCAN adapter, or another port of it: {}; some adapters have to be told to speak SLCAN, or speak gs_usb \
+            "this is not an SLCAN adapter, or another port of it: {}; some adapters must be switched to SLCAN, or speak gs_usb \
              (coflash adapters)",
             ports::those_there()
         );
         AdapterError::unusable(self.name.clone(), what, advice)
     }
 
-    /// Reads what comes until nothing does.
+    /// Reads until nothing more arrives.
     fn settle(&mut self) -> Result<(), AdapterError> {
         let end = self.line.now() + ANSWER;
         while self.line.now() < end {
             let quiet = self.line.now() + Duration::from_millis(50);
             match self.message(quiet.min(end))? {
                 Some(Message::Text(text)) if parse_frame(&text).is_none() => self.stray(&text),
-                // Frames of a bus that was open are of a time before ours.
+                // Frames of a bus that was open before belong to an earlier session.
                 Some(_) => {}
                 None => break,
             }
@@ -226,7 +226,7 @@ impl<L: Line> Slcan<L> {
         done.map_err(|error| self.lost(error))
     }
 
-    /// The next message; `None` when the deadline has passed.
+    /// The next message; `None` if the deadline has passed.
     fn message(&mut self, deadline: Instant) -> Result<Option<Message>, AdapterError> {
         loop {
             if let Some(message) = self.take()? {
@@ -234,7 +234,7 @@ impl<L: Line> Slcan<L> {
             }
             let left = deadline.saturating_duration_since(self.line.now());
             let mut bytes = [0; 4096];
-            // What is there already is taken even when the time is over.
+            // Received data are read even after the deadline.
             let read = self.line.set_timeout(left).and_then(|()| self.line.read(&mut bytes));
             match read {
                 Ok(0) => {
@@ -253,7 +253,7 @@ impl<L: Line> Slcan<L> {
         }
     }
 
-    /// A complete message from what has arrived.
+    /// Takes a complete message from the received bytes.
     fn take(&mut self) -> Result<Option<Message>, AdapterError> {
         let mut taken = None;
         let mut used = 0;
@@ -275,7 +275,7 @@ impl<L: Line> Slcan<L> {
         self.rest.drain(..used);
         if self.partial.len() > LONGEST_MESSAGE {
             let said = String::from_utf8_lossy(&self.partial).escape_debug().to_string();
-            return Err(self.unexpected(format!("a message without end: '{said}'")));
+            return Err(self.unexpected(format!("a message without an end: '{said}'")));
         }
         Ok(taken)
     }
@@ -290,8 +290,8 @@ impl<L: Line> Slcan<L> {
 }
 
 impl<L: Line> Drop for Slcan<L> {
-    /// Closes the bus, so that the adapter does not fill up while nobody listens. If it is gone, so
-    /// be it.
+    /// Closes the bus, so that the adapter's buffers do not fill up while no program reads. An
+    /// error is ignored: the adapter may be gone.
     fn drop(&mut self) {
         let _ = self.send_text("C\r");
     }
@@ -308,9 +308,8 @@ impl<L: Line> Adapter for Slcan<L> {
         }
         let deadline = self.line.now() + timeout;
         while let Some(message) = self.message(deadline)? {
-            // Acknowledgements of what was sent (z, Z, empty) are not for us. A frame that the
-            // adapter refused is lost as one may be lost on the bus: it will be missed and
-            // repeated.
+            // Acknowledgements (z, Z, empty) are ignored. A frame that the adapter refused counts
+            // as lost on the bus: its sender misses the answer and repeats it.
             if let Message::Text(text) = message {
                 if let Some(frame) = parse_frame(&text) {
                     return Ok(Some(frame));
@@ -327,7 +326,7 @@ impl<L: Line> Adapter for Slcan<L> {
         self.line.now().saturating_duration_since(self.opened)
     }
 
-    /// Asks for the status flags (`F`), which not all adapters know.
+    /// Reads the status flags (`F`). Not all adapters know this command.
     fn health(&mut self) -> Option<Health> {
         let flags = std::cell::Cell::new(None);
         let answers = |text: &[u8]| {
@@ -346,7 +345,7 @@ impl<L: Line> Adapter for Slcan<L> {
     }
 }
 
-/// Bits of the status flags: error warning, and error passive.
+/// Bits of the status flags: error warning and error passive.
 const WARNING: u32 = 0x04;
 const PASSIVE: u32 = 0x20;
 
@@ -356,7 +355,7 @@ fn status_flags(text: &[u8]) -> Option<u32> {
     hex_number(std::str::from_utf8(digits).ok()?)
 }
 
-/// `t6018400010…`, `T1234567880…`, `r6018`, `R123456788`, with the line's end.
+/// `t6018400010…`, `T1234567880…`, `r6018`, `R123456788`, with the end of the line.
 fn text_of(frame: &Frame) -> String {
     let (kind, id) = match (frame.id(), frame.is_remote_frame()) {
         (Id::Standard(id), false) => ('t', format!("{:03X}", id.as_raw())),
@@ -368,7 +367,7 @@ fn text_of(frame: &Frame) -> String {
     format!("{kind}{id}{}{data}\r", frame.dlc())
 }
 
-/// The frame in a message. Four digits of time may follow it (the adapter's command `Z1`).
+/// The frame in a message. Four digits of a time stamp may follow it (the adapter's command `Z1`).
 fn parse_frame(text: &[u8]) -> Option<Frame> {
     let text = std::str::from_utf8(text).ok().filter(|text| text.is_ascii())?;
     let kind = text.chars().next()?;
@@ -442,7 +441,7 @@ mod tests {
         }
     }
 
-    /// An adapter that plays a script: each text that was written brings an answer.
+    /// An adapter that follows a script: each text written to it gives an answer.
     #[derive(Debug, Default)]
     struct Played {
         answers: VecDeque<(&'static str, &'static [u8])>,
@@ -453,7 +452,7 @@ mod tests {
 
     impl Read for Played {
         fn read(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
-            // One byte at a time: nobody may rely on more.
+            // One byte at a time: the reader must not rely on more.
             match self.incoming.pop_front() {
                 Some(byte) => bytes[0] = byte,
                 None if self.gone => return Ok(0),
@@ -493,7 +492,7 @@ mod tests {
 
     #[test]
     fn a_session_sets_the_bit_rate_opens_and_closes() {
-        // The bus was closed already; the frame comes right behind the acknowledge.
+        // The bus was closed already; the frame follows the acknowledgement directly.
         let answers = [
             ("C\r", &b"\r\x07"[..]),
             ("V\r", b"V1013\r"),
@@ -529,7 +528,7 @@ mod tests {
         assert!(error.ends_with("; it sent 'O'"), "{error}");
         for (answers, rate, words) in [
             (vec![("S4\r", &b"\x07"[..])], 125_000, "it refuses the bit rate"),
-            (vec![("O\r", &b"\x07"[..])], 125_000, "it refuses opening the bus"),
+            (vec![("O\r", &b"\x07"[..])], 125_000, "it refuses to open the bus"),
             (vec![], 123_456, "123456 bit/s is none of its bit rates"),
         ] {
             let mut played = Played { answers: answers.into(), ..Played::default() };
@@ -555,7 +554,7 @@ mod tests {
             let mut played = Played { answers: answers.into(), ..Played::default() };
             let mut bus = open(&mut played, None).unwrap();
             assert_eq!(bus.health().and_then(|health| health.controller), controller, "{answer:?}");
-            // A frame that came meanwhile is not lost.
+            // A frame that arrives meanwhile is not lost.
             let frame_came = answer.starts_with(b"t");
             assert_eq!(bus.receive(Duration::ZERO).unwrap().is_some(), frame_came);
         }
@@ -566,7 +565,7 @@ mod tests {
         let mut played = Played::default();
         played.incoming.extend([b'x'; LONGEST_MESSAGE + 1]);
         let error = open(&mut played, None).map(|_| ()).unwrap_err();
-        assert!(error.to_string().contains("a message without end: 'xxx"), "{error}");
+        assert!(error.to_string().contains("a message without an end: 'xxx"), "{error}");
     }
 
     proptest! {

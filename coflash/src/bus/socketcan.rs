@@ -16,16 +16,17 @@ use super::found::shown;
 use super::health::{Controller, Health};
 use super::links;
 
-/// How long the interface may take to accept a frame. Its queue is full while nobody acknowledges
-/// on the bus.
+/// How long the interface may take to accept a frame. Its queue stays full while no node
+/// acknowledges on the bus.
 const PATIENCE: Duration = Duration::from_secs(1);
-/// `ENOBUFS`: the interface's queue is full. The kernel does not block for it.
+/// `ENOBUFS`: the interface's queue is full. The kernel does not wait for room.
 const QUEUE_FULL: i32 = 105;
-/// `ENODEV` and `ENXIO`: there is no such interface, or it is none of CAN.
+/// `ENODEV` and `ENXIO`: no interface has this name, or it is not a CAN interface.
 const NONE: [i32; 2] = [19, 6];
 /// `ENETDOWN`: the interface is switched off.
 const DOWN: i32 = 100;
-/// `EAFNOSUPPORT`, `EPROTONOSUPPORT` and `ESOCKTNOSUPPORT`: the kernel has no CAN, or not loaded.
+/// `EAFNOSUPPORT`, `EPROTONOSUPPORT` and `ESOCKTNOSUPPORT`: the kernel has no CAN support, or has
+/// not loaded it.
 const NO_CAN: [i32; 3] = [97, 93, 94];
 
 /// A CAN interface of the kernel.
@@ -35,13 +36,13 @@ pub struct SocketCan {
     interface: String,
     name: String,
     opened: Instant,
-    /// What the error frames have told.
+    /// What the error frames have reported.
     health: Health,
 }
 
 impl SocketCan {
-    /// Opens an interface, `can0` for example. Its bit rate is set and it is switched on by `ip
-    /// link`.
+    /// Opens an interface, for example `can0`. The user sets its bit rate and switches it on with
+    /// `ip link`.
     ///
     /// # Errors
     /// [`AdapterError::Unusable`].
@@ -53,7 +54,7 @@ impl SocketCan {
                 format!("switch it on, with the bit rate of the bus: sudo ip link set {interface} up type can bitrate 500000");
             return Err(AdapterError::unusable(name, "it is switched off", advice));
         }
-        // Without error frames the bus works as well, and less can be told of it.
+        // The bus also works without error frames, but the tool knows less about it.
         let _ = socket.set_error_filter_accept_all();
         let interface = interface.to_string();
         Ok(Self { socket, interface, name, opened: Instant::now(), health: Health::default() })
@@ -69,20 +70,20 @@ impl SocketCan {
     }
 }
 
-/// Whether an interface is switched on (`IFF_UP`), where that can be told.
+/// Whether an interface is switched on (`IFF_UP`), if this is known.
 fn is_up(interface: &str) -> Option<bool> {
     let flags = fs::read_to_string(class(interface)?.join("flags")).ok()?;
     let flags = u32::from_str_radix(flags.trim().strip_prefix("0x")?, 16).ok()?;
     Some(flags & 1 != 0)
 }
 
-/// What the kernel tells of an interface.
+/// The kernel's folder for an interface.
 fn class(interface: &str) -> Option<std::path::PathBuf> {
     let path = Path::new("/sys/class/net").join(interface);
     (!interface.contains('/') && path.exists()).then_some(path)
 }
 
-/// Why an interface did not open, and what to do.
+/// The error for an interface that did not open, with advice.
 fn refused(name: &str, interface: &str, error: &io::Error) -> AdapterError {
     let code = error.raw_os_error().unwrap_or_default();
     let there = class(interface).is_some();
@@ -90,16 +91,16 @@ fn refused(name: &str, interface: &str, error: &io::Error) -> AdapterError {
     // ARPHRD_CAN
     let can = kind.is_none_or(|kind| kind.trim() == "280");
     let (what, advice) = if there && !can {
-        ("it is no CAN interface".to_string(), those_there())
+        ("it is not a CAN interface".to_string(), those_there())
     } else if NO_CAN.contains(&code) {
         (
-            format!("this kernel has no CAN at present ({error})"),
-            "load it: sudo modprobe can_raw; where that fails, the kernel was built without, and an adapter goes without \
-             it: slcan:, peak:, kvaser: or gs_usb: (coflash adapters)"
+            format!("this kernel has no CAN support at present ({error})"),
+            "load it: sudo modprobe can_raw; if that fails, the kernel was built without CAN: use slcan:, peak:, \
+             kvaser: or gs_usb: instead (coflash adapters)"
                 .to_string(),
         )
     } else if NONE.contains(&code) {
-        ("there is no such interface".to_string(), those_there())
+        ("no interface has this name".to_string(), those_there())
     } else if code == DOWN {
         (
             "it is switched off".to_string(),
@@ -108,7 +109,8 @@ fn refused(name: &str, interface: &str, error: &io::Error) -> AdapterError {
     } else if error.kind() == ErrorKind::PermissionDenied {
         (
             "permission denied".to_string(),
-            "CAN interfaces need no rights on Linux; a container or a sandbox may forbid them".to_string(),
+            "Linux needs no permissions for CAN interfaces, but a container or a sandbox may forbid them"
+                .to_string(),
         )
     } else {
         (error.to_string(), those_there())
@@ -116,16 +118,16 @@ fn refused(name: &str, interface: &str, error: &io::Error) -> AdapterError {
     AdapterError::unusable(name, what, advice)
 }
 
-/// The CAN interfaces that are there, for advice.
+/// A list of the CAN interfaces, for advice.
 fn those_there() -> String {
     let links = links::all().unwrap_or_default();
     let names: Vec<String> = links.iter().map(|link| shown(link.name.as_bytes())).take(16).collect();
     match names.as_slice() {
-        [] => "this computer has no CAN interface at present: plug the adapter in, whose driver makes one (ip link shows it), \
-               then sudo ip link set can0 up type can bitrate 500000; an SLCAN adapter is used without: \
+        [] => "this computer has no CAN interface at present: plug the adapter in; its driver creates one (ip link shows it); \
+               then sudo ip link set can0 up type can bitrate 500000; an SLCAN adapter works without an interface: \
                slcan:/dev/ttyACM0@500k"
             .to_string(),
-        names => format!("these CAN interfaces are there: {}", names.join(", ")),
+        names => format!("this computer has these CAN interfaces: {}", names.join(", ")),
     }
 }
 
@@ -136,7 +138,8 @@ impl Adapter for SocketCan {
         } else {
             CanFrame::new(frame.id(), frame.data())
         };
-        // Both kinds of frame have an identifier of 11 or 29 bits and at most 8 bytes.
+        // `made` is `None` only for an impossible frame: both kinds have an identifier of 11 or 29
+        // bits and at most 8 bytes.
         let Some(made) = made else { return Ok(()) };
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -167,7 +170,7 @@ impl Adapter for SocketCan {
                     }
                 }
                 Ok(CanFrame::Error(frame)) => self.health.error_frame(frame.error_bits(), frame.data()),
-                // Remote frames are not for us.
+                // Remote frames are ignored.
                 Ok(CanFrame::Remote(_)) => {}
                 Err(error)
                     if matches!(
@@ -186,7 +189,7 @@ impl Adapter for SocketCan {
         self.opened.elapsed()
     }
 
-    /// What the error frames have told, and what the kernel says of the controller now.
+    /// The reports of the error frames, and the controller's present state from the kernel.
     fn health(&mut self) -> Option<Health> {
         let link = links::of(&self.interface);
         let now = link.map(|link| Health {
@@ -210,7 +213,7 @@ mod tests {
     #[test]
     fn an_interface_that_is_not_there_is_named() {
         let error = SocketCan::open("nocan99").unwrap_err();
-        assert_eq!(error.to_string(), "CAN interface nocan99 cannot be opened: there is no such interface");
+        assert_eq!(error.to_string(), "CAN interface nocan99 cannot be opened: no interface has this name");
         assert!(error.advice().contains("CAN interface"), "{}", error.advice());
     }
 }

@@ -1,5 +1,5 @@
 //! The socketcand protocol: CAN frames as text over TCP (socketcand, `doc/protocol.md`, raw mode).
-//! The client, and what a server needs of its texts.
+//! This module has the client, and the message formats for a server.
 
 use std::collections::VecDeque;
 use std::io::{self, ErrorKind, Read, Write};
@@ -13,9 +13,9 @@ use super::adapter::{Adapter, AdapterError};
 use super::hex::{hex_bytes, hex_number};
 use super::tcp::{connect, PATIENCE};
 
-/// No message of the protocol comes near this length.
+/// Longer than any message of the protocol.
 const LONGEST_MESSAGE: usize = 4096;
-/// The port that socketcand listens on unless told otherwise.
+/// The default port of socketcand.
 const DEFAULT_PORT: u16 = 29536;
 
 /// A bus of a socketcand server.
@@ -36,7 +36,8 @@ impl Socketcand {
         let name = format!("socketcand {server}, bus {bus}");
         let open = |source| AdapterError::Open { adapter: name.clone(), source };
         let stream = connect(server, Some(DEFAULT_PORT)).map_err(open)?;
-        // Frames are small and each waits for its answer: Nagle's algorithm would hold them back.
+        // Frames are small, and the client waits for each answer: Nagle's algorithm would delay
+        // them.
         stream.set_nodelay(true).map_err(open)?;
         stream.set_write_timeout(Some(PATIENCE)).map_err(open)?;
         let mut adapter = Self { stream, name, opened: Instant::now(), messages: Messages::default() };
@@ -54,7 +55,7 @@ impl Socketcand {
         loop {
             match self.message(deadline)? {
                 Some(message) if message == word => return Ok(()),
-                // Frames may come as soon as the bus is open.
+                // Frames may arrive as soon as the bus is open.
                 Some(message) if message.starts_with("frame ") => {}
                 Some(message) => {
                     return Err(self.unexpected(format!("'< {message} >' instead of '< {word} >'")))
@@ -68,7 +69,7 @@ impl Socketcand {
         self.stream.write_all(message.as_bytes()).map_err(|error| self.lost(error))
     }
 
-    /// The next message without its brackets; `None` when the deadline has passed.
+    /// The next message without its brackets; `None` if the deadline has passed.
     fn message(&mut self, deadline: Instant) -> Result<Option<String>, AdapterError> {
         loop {
             match self.messages.next() {
@@ -101,7 +102,7 @@ impl Socketcand {
         }
     }
 
-    /// Reads what is there already. (A time-out would be rounded up to the system's tick.)
+    /// Reads the data that have arrived. (The system would round up a read time-out to its tick.)
     fn read_now(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
         self.stream.set_nonblocking(true)?;
         let read = self.stream.read(bytes);
@@ -132,8 +133,8 @@ impl Adapter for Socketcand {
             if let Some(error) = message.strip_prefix("error") {
                 return Err(self.unexpected(format!("error{error}")));
             }
-            // Anything else (echo, statistics, frames of CAN FD) is not for us; a server that sends
-            // nothing else does not keep us here for ever.
+            // Other messages (echo, statistics, CAN FD frames) are ignored. A server that sends
+            // only such messages cannot keep the client in this loop.
             if Instant::now() >= deadline {
                 break;
             }
@@ -146,16 +147,17 @@ impl Adapter for Socketcand {
     }
 }
 
-/// What a client says to send a frame: `< send 605 8 40 0 10 0 0 0 0 0 >`; a 29-bit identifier has
-/// eight digits.
+/// The client's message that sends a frame: `< send 605 8 40 0 10 0 0 0 0 0 >`. A 29-bit identifier
+/// has eight digits.
 #[must_use]
 pub fn send_message(frame: &Frame) -> String {
     let data: String = frame.data().iter().map(|byte| format!("{byte:02X} ")).collect();
     format!("< send {} {} {data}>", identifier(frame), frame.dlc())
 }
 
-/// The frame that a server tells of: `frame 585 12.345678 4000100000000000`, without the brackets;
-/// servers write the data with or without blanks between the bytes. `None` for anything else.
+/// The frame in a server's message `frame 585 12.345678 4000100000000000`, passed without the
+/// brackets. Servers write the data with or without blanks between the bytes. `None` for any other
+/// message.
 #[must_use]
 pub fn parse_frame(message: &str) -> Option<Frame> {
     let mut words = message.split_ascii_whitespace();
@@ -165,8 +167,8 @@ pub fn parse_frame(message: &str) -> Option<Frame> {
     Frame::new(id, &hex_bytes(&digits)?)
 }
 
-/// What a server says of a frame on the bus, so long after its start: `< frame 585 12.345678
-/// 4000100000000000 >`. Without data there are two blanks before the bracket; python-can wants
+/// The server's message for a frame on the bus at `time` after its start: `< frame 585 12.345678
+/// 4000100000000000 >`. Without data there are two blanks before the bracket; python-can needs
 /// them.
 #[must_use]
 pub fn frame_message(frame: &Frame, time: Duration) -> String {
@@ -174,8 +176,8 @@ pub fn frame_message(frame: &Frame, time: Duration) -> String {
     format!("< frame {} {}.{:06} {data} >", identifier(frame), time.as_secs(), time.subsec_micros())
 }
 
-/// The frame that a client sends: `send 605 8 40 0 10 0 0 0 0 0`, without the brackets. `None` for
-/// anything else.
+/// The frame in a client's message `send 605 8 40 0 10 0 0 0 0 0`, passed without the brackets.
+/// `None` for any other message.
 #[must_use]
 pub fn parse_send(message: &str) -> Option<Frame> {
     let mut words = message.split_ascii_whitespace();
@@ -186,7 +188,7 @@ pub fn parse_send(message: &str) -> Option<Frame> {
     (dlc == data.len().to_string()).then(|| Frame::new(id, &data)).flatten()
 }
 
-/// Three digits for 11 bits, eight for 29.
+/// Three digits for an identifier of 11 bits, eight for 29 bits.
 fn identifier(frame: &Frame) -> String {
     match frame.id() {
         Id::Standard(id) => format!("{:03X}", id.as_raw()),
@@ -203,17 +205,17 @@ fn parse_identifier(word: &str) -> Option<Id> {
     })
 }
 
-/// Cuts the byte stream into messages, however TCP has split and joined them.
+/// Cuts the byte stream into messages, regardless of how TCP splits and joins them.
 #[derive(Debug, Default)]
 pub struct Messages {
-    /// What has arrived of a message that is not complete.
+    /// Received bytes of an incomplete message.
     partial: Option<Vec<u8>>,
     complete: VecDeque<String>,
     overlong: bool,
 }
 
 impl Messages {
-    /// Takes what has arrived.
+    /// Adds received bytes.
     pub fn add(&mut self, bytes: &[u8]) {
         for &byte in bytes {
             match (byte, &mut self.partial) {
@@ -224,7 +226,7 @@ impl Messages {
                 }
                 (_, Some(text)) if text.len() < LONGEST_MESSAGE => text.push(byte),
                 (_, Some(_)) => self.overlong = true,
-                // Between two messages.
+                // A byte between two messages.
                 (_, None) => {}
             }
         }
@@ -233,11 +235,11 @@ impl Messages {
     /// The oldest complete message, without its brackets.
     ///
     /// # Errors
-    /// What a peer said that speaks another language.
+    /// The text from a peer that uses another protocol.
     #[allow(clippy::should_implement_trait)]
     pub fn next(&mut self) -> Result<Option<String>, String> {
         if self.overlong {
-            return Err("a message without end".to_string());
+            return Err("a message without an end".to_string());
         }
         Ok(self.complete.pop_front())
     }
@@ -258,7 +260,7 @@ mod tests {
         Frame::of(CobId::new(id).unwrap(), data)
     }
 
-    /// Both directions as socketcand's protocol description writes them.
+    /// Both directions, as the protocol description of socketcand writes them.
     #[test]
     fn messages_are_those_of_the_protocol() {
         assert_eq!(send_message(&frame(0x123, &[0x11, 0x22, 0xA3])), "< send 123 3 11 22 A3 >");
@@ -287,7 +289,8 @@ mod tests {
         }
     }
 
-    /// Both directions as socketcand's protocol description writes them, and what python-can needs.
+    /// Both directions, as the protocol description of socketcand writes them and as python-can
+    /// needs them.
     #[test]
     fn a_server_reads_and_writes_messages_of_the_protocol() {
         assert_eq!(parse_send("send 123 0"), Some(frame(0x123, &[])));
@@ -318,7 +321,7 @@ mod tests {
         assert_eq!(frame_message(&extended, time), "< frame 1AAAAAAA 23.024242 11F1 >");
     }
 
-    /// A server that plays `script`: what to wait for, and what to answer then.
+    /// A server that follows `script`: pairs of the text to wait for and the answer to send.
     fn server(script: &'static [(&'static str, &'static str)]) -> String {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = listener.local_addr().unwrap().to_string();
@@ -329,7 +332,7 @@ mod tests {
                 let mut got = vec![0; awaited.len()];
                 stream.read_exact(&mut got).unwrap();
                 assert_eq!(std::str::from_utf8(&got).unwrap(), *awaited);
-                // Byte by byte: the client may rely on no border of a packet.
+                // Byte by byte: the client must not rely on packet borders.
                 for byte in answer.as_bytes() {
                     stream.write_all(&[*byte]).unwrap();
                 }

@@ -1,4 +1,4 @@
-//! A bus that somebody listens in on.
+//! A bus with a listener.
 
 use std::fmt;
 use std::time::Duration;
@@ -7,10 +7,10 @@ use canopen::Frame;
 
 use super::adapter::{Adapter, AdapterError};
 
-/// Is told the time on the bus and each frame, sent or received.
+/// A function that gets the bus time and each frame, sent or received.
 pub type Ear = Box<dyn FnMut(Duration, &Frame) + Send>;
 
-/// An adapter whose frames, sent and received, are told on.
+/// An adapter that reports its frames, sent and received, to a function.
 pub struct Tap<A> {
     adapter: A,
     ear: Ear,
@@ -23,7 +23,7 @@ impl<A> fmt::Debug for Tap<A> {
 }
 
 impl<A: Adapter> Tap<A> {
-    /// Tells the frames of `adapter` to `ear`.
+    /// Reports the frames of `adapter` to `ear`.
     pub fn new(adapter: A, ear: Ear) -> Self {
         Self { adapter, ear }
     }

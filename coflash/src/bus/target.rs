@@ -1,4 +1,4 @@
-//! The URL of an adapter, judged before anything is opened.
+//! The URL of an adapter, checked before anything is opened.
 
 use super::adapter::{NO_ADAPTER, NO_SCHEME};
 #[cfg(feature = "gs_usb")]
@@ -8,14 +8,14 @@ use super::kvaser;
 #[cfg(feature = "peak")]
 use super::peak;
 
-/// What a URL names.
+/// The target of a URL.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Target {
     /// A bus of a socketcand server.
     Socketcand { server: String, bus: String },
     /// An SLCAN adapter on a serial port.
     SlcanPort { port: String, rate: Option<u32> },
-    /// The same over TCP.
+    /// An SLCAN adapter over TCP.
     SlcanTcp { server: String, rate: Option<u32> },
     /// An interface of the Linux kernel.
     #[cfg(target_os = "linux")]
@@ -29,12 +29,12 @@ pub(super) enum Target {
     /// A gs_usb device and its channel.
     #[cfg(feature = "gs_usb")]
     GsUsb { which: Which, rate: Option<u32> },
-    /// A gateway, which is no adapter.
+    /// A gateway, which is not an adapter.
     Gateway,
 }
 
 impl Target {
-    /// The bit rate that it names, in bit/s.
+    /// The bit rate in the URL, in bit/s.
     pub(super) fn rate(&self) -> Option<u32> {
         match self {
             Self::SlcanPort { rate, .. } | Self::SlcanTcp { rate, .. } => *rate,
@@ -48,10 +48,10 @@ impl Target {
         }
     }
 
-    /// Reads a URL.
+    /// Parses a URL.
     ///
     /// # Errors
-    /// What is wrong with it, as a sentence about it.
+    /// What is wrong with the URL, as a sentence about it.
     pub(super) fn parse(url: &str) -> Result<Self, String> {
         let Some((scheme, rest)) = url.split_once(':') else { return Err(no_scheme(url)) };
         let word = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_ascii_graphic());
@@ -63,9 +63,7 @@ impl Target {
                     return Err("it must be socketcand://HOST:PORT/BUS".to_string());
                 }
                 if bus.contains('@') {
-                    return Err(
-                        "the server sets the bit rate: leave out what stands behind the @".to_string()
-                    );
+                    return Err("the server sets the bit rate: leave out the @ and the bit rate".to_string());
                 }
                 Ok(Self::Socketcand { server: server.to_string(), bus: bus.to_string() })
             }
@@ -87,7 +85,7 @@ impl Target {
             "kvaser" => kvaser_channel(rest),
             "gs_usb" => gs_usb_device(rest),
             "cia309" => Ok(Self::Gateway),
-            // A drive of Windows is no port, but COM7: is often written so.
+            // A Windows drive is not a port, but users often write COM7: for a port.
             scheme if is_port(scheme) => Err(no_scheme(url.trim_end_matches(':'))),
             scheme => {
                 let meant = match scheme.to_ascii_lowercase().as_str() {
@@ -115,7 +113,7 @@ fn interface(rest: &str) -> Result<Target, String> {
     match with_rate(rest)? {
         ("", _) => Err("it names no interface: socketcan:can0".to_string()),
         (interface, Some(rate)) => Err(format!(
-            "the bit rate of an interface is set beforehand: sudo ip link set {interface} up type can bitrate {rate}; then \
+            "set the bit rate of the interface first: sudo ip link set {interface} up type can bitrate {rate}; then \
              socketcan:{interface}"
         )),
         (interface, None) => Ok(Target::SocketCan { interface: interface.to_string() }),
@@ -124,7 +122,7 @@ fn interface(rest: &str) -> Result<Target, String> {
 
 #[cfg(not(target_os = "linux"))]
 fn interface(_: &str) -> Result<Target, String> {
-    Err("only Linux has SocketCAN; peak:, kvaser:, gs_usb: and slcan: go without it".to_string())
+    Err("only Linux has SocketCAN; peak:, kvaser:, gs_usb: and slcan: work without it".to_string())
 }
 
 #[cfg(feature = "peak")]
@@ -134,7 +132,9 @@ fn peak_channel(rest: &str) -> Result<Target, String> {
         return Err("it names no channel of PCANBasic: peak:PCAN_USBBUS1@500k".to_string());
     }
     if rate.is_some_and(|rate| peak::registers(rate).is_none()) {
-        return Err("PEAK adapters have 1M, 800k, 500k, 250k, 125k, 100k, 50k, 20k, 10k and 5k".to_string());
+        return Err(
+            "PEAK adapters support 1M, 800k, 500k, 250k, 125k, 100k, 50k, 20k, 10k and 5k".to_string()
+        );
     }
     Ok(Target::Peak { channel: channel.to_string(), rate })
 }
@@ -147,7 +147,7 @@ fn kvaser_channel(rest: &str) -> Result<Target, String> {
         return Err("it names no channel of CANlib by its number: kvaser:0@500k".to_string());
     };
     if rate.is_some_and(|rate| kvaser::parameters(rate).is_none()) {
-        return Err("Kvaser adapters have 1M, 800k, 500k, 250k, 125k, 100k, 50k and 20k".to_string());
+        return Err("Kvaser adapters support 1M, 800k, 500k, 250k, 125k, 100k, 50k and 20k".to_string());
     }
     Ok(Target::Kvaser { channel, rate })
 }
@@ -174,14 +174,16 @@ fn gs_usb_device(_: &str) -> Result<Target, String> {
     Err("this coflash was built without gs_usb".to_string())
 }
 
-/// What stands before the last `@`, and the bit rate behind it.
+/// The text before the last `@`, and the bit rate after it.
 fn with_rate(text: &str) -> Result<(&str, Option<u32>), String> {
     let Some((before, rate)) = text.rsplit_once('@') else { return Ok((text, None)) };
     let bare = rate.bytes().all(|byte| byte.is_ascii_digit()).then(|| rate.parse::<u32>().ok()).flatten();
     match (bare, parse_bit_rate(rate)) {
-        // Nobody has a bus of 500 bit/s.
-        (Some(1), _) => Err("1 bit/s is no bit rate; did you mean 1M?".to_string()),
-        (Some(few @ 5..=1000), _) => Err(format!("{few} bit/s is no bit rate; did you mean {few}k?")),
+        // No CAN bus runs at 500 bit/s.
+        (Some(1), _) => Err("1 bit/s is not a bit rate of CAN; did you mean 1M?".to_string()),
+        (Some(few @ 5..=1000), _) => {
+            Err(format!("{few} bit/s is not a bit rate of CAN; did you mean {few}k?"))
+        }
         (_, Some(rate)) => Ok((before, Some(rate))),
         (Some(_), None) => Err("its bit rate must be like 125k, 500k or 1M; CAN goes up to 1M".to_string()),
         (None, None) => {
@@ -232,7 +234,7 @@ fn is_port(text: &str) -> bool {
     com || text.starts_with("/dev/")
 }
 
-/// What was probably meant where there is no scheme.
+/// Advice for a URL without a scheme: what the user probably meant.
 fn no_scheme(text: &str) -> String {
     let none = NO_SCHEME;
     let bare = text.split('@').next().unwrap_or_default();
@@ -285,7 +287,7 @@ mod tests {
         );
     }
 
-    /// Each is a mistake that people make.
+    /// Each of these is a common mistake.
     #[test]
     fn a_mistake_is_answered_with_what_was_meant() {
         for (url, words) in [

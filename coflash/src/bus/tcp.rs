@@ -1,13 +1,13 @@
-//! Connections to servers.
+//! TCP connections to servers.
 
 use std::io;
 use std::net::{TcpStream, ToSocketAddrs};
 use std::time::Duration;
 
-/// How long a server may take to let us in, and to take what we send.
+/// How long a server may take to accept the connection, and to accept data.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(3);
 
-/// Connects to the first of the server's addresses that answers.
+/// Connects to the first address of the server that answers.
 pub(crate) fn connect(server: &str, default_port: Option<u16>) -> io::Result<TcpStream> {
     let has_port = server.rsplit_once(':').is_some_and(|(host, port)| {
         !port.is_empty()

@@ -1,4 +1,4 @@
-//! Writes down what goes over a bus, as `candump -L` does.
+//! Writes the frames of a bus to a file in the format of `candump -L`.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -11,17 +11,17 @@ use super::adapter::{Adapter, AdapterError};
 use super::candump::Line;
 use super::health::Health;
 
-/// An adapter whose frames, sent and received, are written to a file.
+/// An adapter that writes its frames, sent and received, to a file.
 pub struct Trace<A> {
     adapter: A,
     file: BufWriter<File>,
     /// The wall clock at the adapter's origin of time.
     origin: Duration,
-    /// Told once, when the file cannot be written any more: the bus goes on without it.
+    /// Called once if writing to the file fails. The bus continues without the trace.
     failed: Option<OnFailure>,
 }
 
-/// What is told why a file cannot be written any more.
+/// The function that gets the error when the file can no longer be written.
 pub type OnFailure = Box<dyn FnOnce(std::io::Error) + Send>;
 
 impl<A> std::fmt::Debug for Trace<A> {
@@ -31,11 +31,11 @@ impl<A> std::fmt::Debug for Trace<A> {
 }
 
 impl<A: Adapter> Trace<A> {
-    /// Writes what goes over `adapter` to `path`, which is overwritten. `failed` is told when that
-    /// does not go on.
+    /// Writes the frames of `adapter` to `path`, which is overwritten. `failed` is called if
+    /// writing fails later.
     ///
     /// # Errors
-    /// [`AdapterError::Open`] where the file cannot be made.
+    /// [`AdapterError::Open`] if the file cannot be created.
     pub fn new(adapter: A, path: &Path, failed: OnFailure) -> Result<Self, AdapterError> {
         let file = File::create(path).map_err(|source| AdapterError::Open {
             adapter: format!("trace file {}", path.display()),

@@ -1,4 +1,4 @@
-//! `coflash unlock` and `events`: a sealed device and the holder of its root key.
+//! `coflash unlock` and `events`: what the holder of the root key can do with a sealed device.
 
 use std::path::PathBuf;
 
@@ -15,19 +15,19 @@ use super::values::number;
 
 /// Asks a sealed device for rights, with the signature of a root key.
 ///
-/// The device is in its bootloader. Rights last until its next reset. A device that was shown a wrong
-/// signature waits, longer each time.
+/// The device must be in its bootloader. Rights last until its next reset. After a wrong signature
+/// the device waits before it accepts another one; the wait grows with each wrong signature.
 #[derive(Debug, Args)]
 pub(super) struct Unlock {
-    /// What is asked for; several with commas between.
+    /// The rights to ask for, separated by commas.
     #[arg(value_enum, value_delimiter = ',', required = true)]
     rights: Vec<Right>,
 
-    /// The private key of a root of the device.
+    /// The private key of one of the device's roots.
     #[arg(long, value_name = "FILE")]
     root: PathBuf,
 
-    /// The security counter that one image may have, where it is lower than the device's.
+    /// The security counter of the one image to install, which is lower than the device's counter.
     #[arg(long, value_name = "NUMBER", value_parser = number, required_if_eq("rights", "lower-counter"))]
     counter: Option<u32>,
 
@@ -38,9 +38,9 @@ pub(super) struct Unlock {
 /// A right.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Right {
-    /// Erase a program without another one in its place.
+    /// Erase a program without installing another one.
     Erase,
-    /// Take a program's release for autostart away (withdraw).
+    /// Withdraw a program's release for autostart.
     Withdraw,
     /// Install one program with a lower security counter.
     LowerCounter,
@@ -48,7 +48,8 @@ enum Right {
     Store,
     /// Read programs back.
     ReadBack,
-    /// Leave the sealed state for good, from the next reset on: any program is taken and started.
+    /// Leave the sealed state permanently from the next reset on: the device then accepts and
+    /// starts any program.
     Open,
 }
 
@@ -65,7 +66,8 @@ impl Right {
     }
 }
 
-/// Shows what a sealed device has recorded: the last eight installations, refusals and grants.
+/// Shows the events that a sealed device has recorded: the last eight installations, refusals and
+/// grants of rights.
 #[derive(Debug, Args)]
 pub(super) struct Events {
     #[command(flatten)]
@@ -80,7 +82,7 @@ impl Unlock {
         let mut link = context.link()?;
         let mut session = self.device.session(&mut link)?;
         let node = session.node();
-        let waiting = context.waiting(format!("node {node} looks at the signature"));
+        let waiting = context.waiting(format!("node {node} has checked the signature"));
         let granted = challenge(&mut session)
             .and_then(|challenge| {
                 let signature = key.sign(&challenge.tbs(asked.0, asked.1, asked.2));
@@ -90,14 +92,14 @@ impl Unlock {
         drop(waiting);
         if !granted {
             return Err(Failure::usage(
-                format!("node {node} has not granted what was asked for"),
-                "name the private key of a root that the device has (coflash key show), and wait half a minute",
+                format!("node {node} has not granted the rights"),
+                "use the private key of one of the device's roots (coflash key show), and wait half a minute",
             ));
         }
         let words = if rights & right::OPEN != 0 {
-            "granted; the device is open from the next reset on (coflash reset)"
+            "rights rights granted; the device is open from the next reset on (coflash reset)"
         } else {
-            "granted until the next reset"
+            "rights granted until the next reset"
         };
         context.out.result(
             format_args!("node {node}: {words}"),
@@ -114,7 +116,8 @@ impl Events {
         let recorded = events(&mut session).map_err(|error| Failure::diagnosed(error, &mut session))?;
         let node = session.node();
         let lines: String = recorded.iter().map(|event| format!("\n{event}")).collect();
-        let words = if recorded.is_empty() { "nothing is recorded" } else { "recorded, the newest first" };
+        let words =
+            if recorded.is_empty() { "no events are recorded" } else { "recorded events, the newest first" };
         context.out.result(format_args!("node {node}: {words}{lines}"), || {
             let events: Vec<_> = recorded
                 .iter()

@@ -1,4 +1,4 @@
-//! `coflash adapters`: which adapters are there.
+//! `coflash adapters`: lists the adapters of this computer.
 
 use std::fmt;
 use std::time::Duration;
@@ -11,14 +11,15 @@ use super::context::Context;
 use super::output::Failure;
 use super::values::milliseconds;
 
-/// Lists the CAN adapters that are there: serial ports, CAN interfaces of Linux, PEAK and Kvaser
+/// Lists the CAN adapters of this computer: serial ports, CAN interfaces of Linux, PEAK and Kvaser
 /// channels, gs_usb devices, and socketcand servers that announce themselves on the network.
 ///
-/// Without --bus the other commands take the only adapter, if there is exactly one. Serial ports, which
-/// may have anything behind them, and servers on the network are not taken unasked.
+/// Without --bus the other commands use the only adapter, if there is exactly one. They never
+/// choose a serial port, which may lead to any device, or a server on the network by themselves.
 #[derive(Debug, Args)]
 pub(super) struct Adapters {
-    /// How long to listen for socketcand servers, in milliseconds; they announce themselves every 3 s.
+    /// How long to listen for socketcand servers, in milliseconds; they announce themselves every
+    /// 3 s.
     #[arg(long, value_parser = milliseconds, value_name = "MS", default_value = "3100")]
     listen: Duration,
 }
@@ -35,14 +36,14 @@ impl Adapters {
     }
 }
 
-/// A line for each adapter, and one for what could not be looked for.
+/// A line for each adapter, and one for the kinds that could not be searched for.
 struct Table<'l>(&'l List);
 
 impl fmt::Display for Table<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let List { found, missing } = self.0;
         if found.is_empty() {
-            writeln!(f, "no adapter is found: plug one in, or name a server on the network by --bus")?;
+            writeln!(f, "no adapter was found: plug one in, or name a server on the network with --bus")?;
         } else {
             let head = ["--bus", "what it is", "bit rate", "state"].map(str::to_string);
             let rows: Vec<[String; 4]> = std::iter::once(head).chain(found.iter().map(row)).collect();
@@ -56,7 +57,7 @@ impl fmt::Display for Table<'_> {
         }
         if !missing.is_empty() {
             let kinds: Vec<&str> = missing.iter().map(|(kind, _)| kind.name()).collect();
-            write!(f, "not looked for: {} (--verbose tells why)", kinds.join(", "))?;
+            write!(f, "not searched for: {} (--verbose shows why)", kinds.join(", "))?;
         }
         Ok(())
     }

@@ -1,4 +1,4 @@
-//! `coflash catch`: a device is held in its bootloader as soon as it has power.
+//! `coflash catch`: holds a device in its bootloader as soon as it has power.
 
 use std::time::Duration;
 
@@ -12,14 +12,15 @@ use super::device::Device;
 use super::output::Failure;
 use super::values::milliseconds;
 
-/// Waits for a device that is switched on, and holds it in its bootloader.
+/// Waits until a device is switched on, and holds it in its bootloader.
 ///
-/// For a device whose program does not answer: run this, then switch the device off and on. It is
-/// asked ten times a second, so that its bootloader hears it before the program starts: one that was
-/// never confirmed is held back for 300 ms. An application that answers is called back.
+/// Use this for a device whose program does not answer: run the command, then switch the device off
+/// and on. The tool sends requests to the device ten times a second, so that its bootloader
+/// receives one before it starts the program: it holds back a program that was never confirmed for
+/// 300 ms. An application that answers is called back.
 ///
-/// Not caught: a program that was confirmed once starts at once, so that its device needs its entry
-/// strap.
+/// The command cannot catch a device whose program was confirmed once: that program starts at once.
+/// Use the device's entry strap instead.
 #[derive(Debug, Args)]
 pub(super) struct Catch {
     #[command(flatten)]
@@ -28,8 +29,8 @@ pub(super) struct Catch {
     #[command(flatten)]
     limit: Limit,
 
-    /// Whichever device comes up, whatever its node-ID, or without one. Every device that comes up
-    /// meanwhile is held in its bootloader (by "identify non-configured slave" of LSS).
+    /// Catch any device, whatever its node-ID, and also one without a node-ID. Every device that
+    /// starts meanwhile is held in its bootloader (by "identify non-configured slave" of LSS).
     #[arg(long)]
     any: bool,
 }
@@ -37,7 +38,7 @@ pub(super) struct Catch {
 /// How long to wait.
 #[derive(Debug, Args)]
 pub(super) struct Limit {
-    /// Give up after this time, in milliseconds; otherwise Ctrl-C does.
+    /// Give up after this time, in milliseconds. Without it, Ctrl-C ends the wait.
     #[arg(long, value_parser = milliseconds, value_name = "MS")]
     within: Option<Duration>,
 }
@@ -54,7 +55,7 @@ impl Catch {
     }
 }
 
-/// Catches a device, for the command of this name.
+/// Catches a device for the command with this name.
 pub(super) fn run(
     context: &Context,
     command: &str,
@@ -65,19 +66,19 @@ pub(super) fn run(
     let mut link = context.link()?;
     let mut session = device.session(&mut link)?;
     if any && !session.hears_the_bus() {
-        let advice = "name the device by --node, or reach its CAN bus by an adapter";
-        return Err(Failure::usage("a gateway does not tell who comes up", advice));
+        let advice = "name the device with --node, or connect to its CAN bus with an adapter";
+        return Err(Failure::usage("a gateway does not report which device starts", advice));
     }
     let began = session.now();
     let options = CatchOptions::default().any(any).within(limit.within);
     let whom = if any { "any device".to_string() } else { format!("node {}", session.node()) };
-    let words = format!("{whom} comes up: switch the device off and on (Ctrl-C ends it)");
+    let words = format!("{whom} starts: switch the device off and on (Ctrl-C ends the wait)");
     if !context.out.shows_waiting() {
         context.out.say(format_args!("waiting until {words}"));
     }
     let waiting = context.waiting(words);
     let caught = catch(&mut session, &options, &mut |event| match event {
-        // The line on the screen says it.
+        // The line on the screen already says this.
         Event::Phase(Phase::Searching { .. }) => {}
         event => waiting.beside(|| context.out.say(format_args!("  {event}"))),
     });
@@ -87,7 +88,7 @@ pub(super) fn run(
     let words = match node {
         Some(node) => format!("node {node}: the bootloader is running, after {seconds:.1} s"),
         None => format!(
-            "a device without node-ID is there, after {seconds:.1} s: give it one by coflash lss fastscan --assign"
+            "a device without a node-ID started, after {seconds:.1} s: give it one with coflash lss fastscan --assign"
         ),
     };
     context.out.result(words, || {

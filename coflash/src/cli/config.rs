@@ -1,6 +1,6 @@
-//! Where the configuration file is, and its way into the command line.
+//! Finds the configuration file and adds its values to the command line as defaults.
 //!
-//! What the command line or the environment says wins over it.
+//! The command line and the environment take precedence over the file.
 
 use std::path::{Path, PathBuf};
 
@@ -12,8 +12,8 @@ use coflash::update::config::{parse, Fault, Setting};
 use super::objects::bytes_of;
 use super::output::Failure;
 
-/// The file: what `--config` or `COFLASH_CONFIG` says, otherwise `coflash.toml` in the current
-/// folder, otherwise the user's own; `None` where there is none.
+/// The path of the file: the value of `--config` or `COFLASH_CONFIG`, otherwise `coflash.toml` in
+/// the current folder, otherwise the user's own file; `None` if none exists.
 pub(super) fn find(named: Option<PathBuf>) -> Option<PathBuf> {
     named.or_else(|| {
         let here = PathBuf::from("coflash.toml");
@@ -25,11 +25,11 @@ pub(super) fn find(named: Option<PathBuf>) -> Option<PathBuf> {
     })
 }
 
-/// The options that a file has no say in: what names it, what asks for words, and what is to be done
-/// at all, which is said each time as FILE is.
+/// The options that a file cannot set: the option that names the file, help and version, and the
+/// job file, which the user names in each call like FILE.
 const NOT_SETTINGS: [&str; 4] = ["config", "help", "version", "job"];
 
-/// The options that a file may give defaults for: all that `flash` has.
+/// The options that a file can set: all options of `flash`.
 fn settings(command: &Command) -> impl Iterator<Item = &Arg> {
     let flash = command.find_subcommand("flash").into_iter().flat_map(Command::get_arguments);
     command.get_arguments().chain(flash).filter(|argument| {
@@ -38,8 +38,8 @@ fn settings(command: &Command) -> impl Iterator<Item = &Arg> {
     })
 }
 
-/// The command line with the file's values as defaults. `given` is what the user has said, as far as
-/// that can be read.
+/// The command line with the file's values as defaults. `given` holds the options that the user
+/// gave, as far as they can be read.
 pub(super) fn apply(command: Command, path: &Path, given: &ArgMatches) -> Result<Command, Failure> {
     let text = bytes_of(path, MAX)?;
     let text = String::from_utf8_lossy(&text);
@@ -49,13 +49,16 @@ pub(super) fn apply(command: Command, path: &Path, given: &ArgMatches) -> Result
     };
     let wrong = |what: String| {
         let all: Vec<&str> = settings(&command).filter_map(Arg::get_long).collect();
-        Failure::usage(format!("{}: {what}", path.display()), format!("it may have {}", all.join(", ")))
+        Failure::usage(
+            format!("{}: {what}", path.display()),
+            format!("the file may contain {}", all.join(", ")),
+        )
     };
     let settings: Vec<(String, Setting)> = parse(&text, &is_switch).map_err(|fault| match fault {
         Fault::Line(line, what) => Failure::line(path, line, &what),
         Fault::Setting(what) => wrong(what),
     })?;
-    // As on the command line, two that exclude each other are a mistake.
+    // Two options that exclude each other are a mistake, as on the command line.
     if let Some(flash) = command.find_subcommand("flash") {
         let on = |setting: &Setting| *setting != Setting::Switch(false);
         for (number, (one, value)) in settings.iter().enumerate() {
@@ -72,10 +75,10 @@ pub(super) fn apply(command: Command, path: &Path, given: &ArgMatches) -> Result
     Ok(settings.iter().fold(command, |command, (key, value)| with_default(command, key, value, &said)))
 }
 
-/// What is longer is no configuration.
+/// The most bytes of a configuration file.
 const MAX: u64 = 1024 * 1024;
 
-/// The options that the user has given, on the command line or in the environment.
+/// The options that the user gave on the command line or in the environment.
 fn said(given: &ArgMatches) -> Vec<String> {
     let own = given.ids().filter(|id| {
         let by_user = [ValueSource::CommandLine, ValueSource::EnvVariable];
@@ -90,7 +93,7 @@ fn said(given: &ArgMatches) -> Vec<String> {
     all
 }
 
-/// Whether a command does not take both of two options, by their long names.
+/// Whether a command rejects two options together. Both are long names.
 fn exclude(command: &Command, one: &str, other: &str) -> bool {
     let named = |name: &str| command.get_arguments().find(|argument| argument.get_long() == Some(name));
     let (Some(one), Some(other)) = (named(one), named(other)) else { return false };
@@ -101,7 +104,7 @@ fn excludes(command: &Command, one: &Arg, other: &str) -> bool {
     command.get_arg_conflicts_with(one).iter().any(|conflict| conflict.get_id() == other)
 }
 
-/// Sets a default wherever the option is, unless the user has said something that excludes it.
+/// Sets a default wherever the option exists, unless the user gave an option that excludes it.
 fn with_default(command: Command, key: &str, value: &Setting, said: &[String]) -> Command {
     let own = command.get_arguments().find(|argument| argument.get_long() == Some(key));
     let excluded = own.is_some_and(|own| {
@@ -116,7 +119,7 @@ fn with_default(command: Command, key: &str, value: &Setting, said: &[String]) -
         Some(id) => command.mut_arg(id, |argument| default(argument, value)),
         None => command,
     };
-    // What `lss` gives a device is said on the command line alone.
+    // The values that `lss` gives a device come only from the command line.
     if command.get_name() == "lss" {
         return command;
     }
@@ -128,11 +131,11 @@ fn with_default(command: Command, key: &str, value: &Setting, said: &[String]) -
 }
 
 fn default(argument: Arg, value: &Setting) -> Arg {
-    // An option that had to be given is given now.
+    // A required option now has a value.
     let argument = argument.required(false);
     match value {
         Setting::Value(value) => argument.default_value(value.clone()),
-        // A switch that the file sets can be taken back: --verify=false.
+        // The user can override a switch that the file sets: --verify=false.
         Setting::Switch(on) if !argument.get_action().takes_values() => argument
             .action(ArgAction::Set)
             .value_parser(FalseyValueParser::new())
@@ -149,8 +152,8 @@ fn default(argument: Arg, value: &Setting) -> Arg {
 mod tests {
     use super::*;
 
-    /// An option that `flash` gets has to get its line in the page's example, which is all that a
-    /// file may have; and each of them reaches the command line's reader.
+    /// Each option of `flash` must have a line in the example on the page, which shows everything
+    /// that a file may contain, and the command line's reader must accept each line.
     #[test]
     fn the_documentations_example_has_every_option_of_flash() {
         let page = include_str!("../../../docs/coflash.md");
@@ -160,7 +163,7 @@ mod tests {
             let argument = settings(&command).find(|argument| argument.get_long() == Some(key))?;
             Some(!argument.get_action().takes_values())
         };
-        // Those that exclude another one are there as comments.
+        // Options that exclude another one stand there as comments.
         let example: String =
             example.lines().map(|line| format!("{}\n", line.trim_start_matches("# "))).collect();
         let shown = parse(&example, &is_switch).unwrap();

@@ -1,4 +1,4 @@
-//! What every command is given, and its way to the bus.
+//! The values that every command gets, and access to the bus.
 
 use std::path::PathBuf;
 
@@ -11,14 +11,15 @@ use super::record;
 use super::search::{only, Kinds};
 use super::waiting::Waiting;
 
-/// What every command is given.
+/// The values that every command gets.
 pub(super) struct Context {
-    /// What `--bus`, `COFLASH_BUS` or the configuration says.
+    /// The value of `--bus`, `COFLASH_BUS` or the configuration.
     pub(super) bus: Option<String>,
-    /// What `--search` says.
+    /// The value of `--search`.
     pub(super) search: Option<Kinds>,
     pub(super) trace: Option<PathBuf>,
-    /// COB-IDs of SDO requests and answers, without the node-ID, where they are not the usual ones.
+    /// The base COB-IDs of SDO requests and answers, without the node-ID, if they differ from the
+    /// predefined ones.
     pub(super) sdo_request: Option<u16>,
     pub(super) sdo_response: Option<u16>,
     /// The configuration file that `--config` or `COFLASH_CONFIG` names.
@@ -33,30 +34,31 @@ impl Context {
         self.traced(adapter)
     }
 
-    /// A way to devices: the CAN bus, or a gateway.
+    /// Access to devices: the CAN bus, or a gateway.
     pub(super) fn link(&self) -> Result<Link, Failure> {
         self.link_at(self.bus.as_deref(), None)
     }
 
-    /// The same to this bus, at this bit rate if the URL names none and the adapter sets it.
+    /// Access through this bus. `bit_rate` applies if the URL contains none and the adapter sets
+    /// the bit rate.
     pub(super) fn link_at(&self, bus: Option<&str>, bit_rate: Option<u32>) -> Result<Link, Failure> {
         match Link::open(&self.url(bus)?, bit_rate)? {
             Link::Bus(adapter) => Ok(Link::Bus(self.traced(adapter)?)),
             gateway => {
                 if self.trace.is_some() {
-                    self.out.warn("a gateway shows no frames: nothing is traced");
+                    self.out.warn("a gateway shows no frames: the trace file stays empty");
                 }
                 Ok(gateway)
             }
         }
     }
 
-    /// The kinds of adapters that are looked for.
+    /// The kinds of adapters to search for.
     pub(super) fn kinds(&self) -> Vec<Kind> {
         self.search.as_ref().map_or_else(|| Kind::ALL.to_vec(), |kinds| kinds.0.clone())
     }
 
-    /// The bus that is given, or that of the only adapter that is there.
+    /// The given bus, or the bus of the only adapter.
     fn url(&self, bus: Option<&str>) -> Result<String, Failure> {
         match bus {
             Some(bus) => Ok(bus.to_string()),
@@ -64,12 +66,12 @@ impl Context {
         }
     }
 
-    /// Sees to it that no other process of this computer is at work on the node.
+    /// Locks the node, so that no other process of this computer works on it.
     pub(super) fn lock(&self, bus: Option<&str>, node: NodeId) -> Result<Lock, Failure> {
         Ok(Lock::of(&self.url(bus)?, node)?)
     }
 
-    /// Shows what is waited for, as in "node 5 answers", until it is dropped.
+    /// Shows what the tool waits for, as in "node 5 answers", until the value is dropped.
     pub(super) fn waiting(&self, what: impl Into<String>) -> Waiting {
         Waiting::new(self.out, what)
     }
@@ -78,13 +80,13 @@ impl Context {
         let traced: Box<dyn Adapter + Send> = match &self.trace {
             Some(path) => {
                 let (out, name) = (self.out, path.display().to_string());
-                let failed =
-                    move |error| out.warn(format_args!("{name}: cannot be written any more: {error}"));
+                let failed = move |error| out.warn(format_args!("{name}: writing failed: {error}"));
                 Box::new(Trace::new(adapter, path, Box::new(failed))?)
             }
             None => adapter,
         };
-        // Passwords are known by the usual COB-IDs: what is kept for service is taken behind these.
+        // Passwords are recognised by the usual COB-IDs, so records are taken behind the
+        // translation of COB-IDs.
         Ok(record::tapped(match (self.sdo_request, self.sdo_response) {
             (None, None) => traced,
             (request, response) => {

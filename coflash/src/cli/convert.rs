@@ -1,4 +1,4 @@
-//! `coflash convert`: a firmware file into a block file.
+//! `coflash convert`: converts a firmware file into a block file.
 
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -21,17 +21,17 @@ use super::values::{number, program_number};
 
 /// Converts a firmware file into a block file, ready for 1F50h.
 ///
-/// The same input gives the same output, byte for byte; with --ver, if --date or SOURCE_DATE_EPOCH
-/// is given.
+/// The same input gives the same output, byte for byte; with --ver this also needs --date or
+/// SOURCE_DATE_EPOCH.
 ///
-/// Numbers are in C notation: 4096, 0x1000 or octal 010000. The options of BinaryBlockConv are
-/// accepted in its own spelling, too (--start_address and so on).
+/// Numbers are in C notation: 4096, 0x1000 or octal 010000. The options of BinaryBlockConv are also
+/// accepted in their original spelling (--start_address and so on).
 #[derive(Debug, Args)]
 pub(super) struct Convert {
     #[command(flatten)]
     input: Input,
 
-    /// The block file to write; otherwise the firmware's name with .blk.
+    /// The block file to write; by default the firmware's name with .blk.
     #[arg(value_name = "OUT")]
     output: Option<PathBuf>,
 
@@ -45,12 +45,12 @@ pub(super) struct Convert {
     #[command(flatten)]
     labels: Labels,
 
-    /// Also write the program as it will lie in flash, gaps filled, to OUT's name with .tmp in the
-    /// current folder.
+    /// Also write the program as it will lie in flash, with filled gaps, to the current folder,
+    /// under the name of OUT with .tmp.
     #[arg(long)]
     temp: bool,
 
-    /// The output's format. There is one.
+    /// The output's format. There is only one.
     #[arg(short = 'O', value_name = "FORMAT", value_parser = ["binary"], ignore_case = true, hide = true)]
     output_format: Option<String>,
 
@@ -58,15 +58,15 @@ pub(super) struct Convert {
     encryption: Encryption,
 }
 
-/// For whom the program is: what goes into block 0.
+/// The target of the program: the contents of block 0.
 #[derive(Debug, Args)]
 pub(super) struct Labels {
-    /// Vendor-ID of the devices that may take this program (1018h/1). Without --vid and --pid, block
-    /// 0 gets what the label in the image tells: vendor-ID, product code and version.
+    /// Vendor-ID of the devices for which this program is (1018h/1). Without --vid and --pid, block
+    /// 0 contains the vendor-ID, product code and version from the label in the image.
     #[arg(long, value_name = "NUMBER", value_parser = number, requires = "pid")]
     vid: Option<u32>,
 
-    /// Product code of the devices that may take this program (1018h/2).
+    /// Product code of the devices for which this program is (1018h/2).
     #[arg(long, value_name = "NUMBER", value_parser = number, requires = "vid")]
     pid: Option<u32>,
 
@@ -75,50 +75,52 @@ pub(super) struct Labels {
     #[arg(long, value_name = "NUMBER", value_parser = number, requires = "vid")]
     ver: Option<u32>,
 
-    /// The date that goes with --ver or with the image's label, in seconds since 1970; otherwise
-    /// SOURCE_DATE_EPOCH, otherwise now for --ver and none for the label.
+    /// The date that belongs to --ver or to the image's label, in seconds since 1970. The default
+    /// is SOURCE_DATE_EPOCH; without it, the current time for --ver and no date for the label.
     #[arg(long, value_name = "SECONDS", env = "SOURCE_DATE_EPOCH")]
     date: Option<u64>,
 
-    /// Tell nothing in block 0, whatever the label in the image says.
+    /// Write no identity into block 0, even if the image has a label.
     #[arg(long, conflicts_with = "vid")]
     no_label: bool,
 }
 
-/// The manual's encryption. It names no algorithm, so that what is made here is a sealed image, for the
-/// sealed bootloader of this house.
+/// The encryption of the manual's tools. The manual names no algorithm, so these options produce a
+/// sealed image for coboot's sealed bootloader instead.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Encryption")]
 struct Encryption {
     /// Encrypt with this value of 128 bits, in 32 hexadecimal digits; needs --sign and --counter.
     ///
-    /// The manual names no algorithm: encrypted files of its tool can be neither made nor read. The result
-    /// is a block file that carries a sealed image (one named .cbs is the image itself), encrypted for the
-    /// key that `coflash key new --role kek --of-value` makes of the same value.
+    /// The manual names no algorithm: coflash can neither write nor read encrypted files of its
+    /// tool. The result is a block file that carries a sealed image (a file named .cbs is the image
+    /// itself), encrypted for the key that `coflash key new --role kek --of-value` makes from the
+    /// same value.
     #[arg(long, value_name = "HEX128", value_parser = value_of_128_bits, conflicts_with_all = ["crc16", "last_block_2008", "no_label"])]
     key: Option<[u8; 16]>,
 
-    /// The start value of the manual's encryption, which changes nothing here.
+    /// The start value of the manual's encryption; it has no effect here.
     ///
-    /// Every sealed image has a nonce of its own.
+    /// Every sealed image has its own nonce.
     #[arg(long, value_name = "VALUE", value_parser = number, requires = "key")]
     add: Option<u32>,
 
-    /// The private key that signs what is encrypted, as --key of `coflash seal`.
+    /// The private key that signs the encrypted image, as --key of `coflash seal`.
     #[arg(long, value_name = "FILE", requires = "key")]
     sign: Option<PathBuf>,
 
-    /// That key's certificate. Without one the key must be a root of the devices.
+    /// The certificate of that key. Without one, the key must be a root of the devices.
     #[arg(long, value_name = "FILE", requires = "key")]
     cert: Option<PathBuf>,
 
-    /// The security counter: devices refuse programs with a lower one than they have seen.
+    /// The security counter: a device refuses a program with a counter lower than the highest one
+    /// that it has accepted.
     #[arg(long, value_name = "NUMBER", value_parser = number, requires = "key")]
     counter: Option<u32>,
 }
 
 impl Encryption {
-    /// The way of the result, if it is to be encrypted.
+    /// The parameters for sealing, if the result is to be encrypted.
     fn sealing(&self) -> Result<Option<Sealing>, Failure> {
         let Some(value) = self.key else { return Ok(None) };
         let (Some(sign), Some(counter)) = (&self.sign, self.counter) else {
@@ -126,10 +128,8 @@ impl Encryption {
                 .into_iter()
                 .filter_map(|(option, is_missing)| is_missing.then_some(option))
                 .collect();
-            let what = format!(
-                "an encrypted program is a sealed one here, and {} is missing",
-                missing.join(" and ")
-            );
+            let what =
+                format!("coflash encrypts a program by sealing it, and {} is missing", missing.join(" and "));
             let advice =
                 "give --sign with the private key that signs (and --cert with its certificate, unless it \
                           is a root), and --counter; or leave --key out: the file is not encrypted then";
@@ -144,7 +144,7 @@ impl Encryption {
     }
 }
 
-/// What an encrypted program is sealed with.
+/// The parameters for sealing an encrypted program.
 struct Sealing {
     kek: [Kek; 1],
     key: SigningKey,
@@ -158,19 +158,19 @@ impl Convert {
         let input = self.input.path();
         let output = self.output.clone().unwrap_or_else(|| input.with_extension("blk"));
         if same_file(input, &output) {
-            let what = format!("{} would be overwritten by its own conversion", input.display());
+            let what = format!("the result would overwrite its own input {}", input.display());
             return Err(Failure::usage(what, "name another file for the result"));
         }
         let (firmware, _) = self.source.load(input, self.program)?;
         let of_image = self.labels.vid.is_none() && matches!(firmware, Firmware::Image(_));
         if let Firmware::Blocks(blocks) = &firmware {
-            // Blocks are taken as they are, their CRC among it.
+            // Blocks are copied unchanged, including their CRC.
             let (file, kept) = (input.display(), blocks.checksum());
-            context.out.say(format_args!("{file}: a block file already, which keeps its {kept}"));
+            context.out.say(format_args!("{file}: this is already a block file; it keeps its {kept}"));
             if self.source.wants(kept) || self.labels.vid.is_some() {
-                let advice = "convert the firmware that it was made of";
+                let advice = "convert the original firmware instead";
                 context.out.warn(format_args!(
-                    "{file}: --crc16, --vid and --pid change nothing in blocks: {advice}"
+                    "{file}: --crc16, --vid and --pid cannot change a block file: {advice}"
                 ));
             }
         }
@@ -233,7 +233,7 @@ impl Convert {
             false => Form::Blocks { start: blocks.program_start(), size: self.source.block_size() },
         };
         if self.encryption.add.is_some_and(|add| add != 0) {
-            context.out.warn("--add changes nothing: every sealed image has a nonce of its own");
+            context.out.warn("--add has no effect: every sealed image has its own nonce");
         }
         let file = seal::put(output, image, form)?;
         seal::tell(context, "convert", output, &file, true);
@@ -287,7 +287,7 @@ impl Labels {
     }
 }
 
-/// Whether two names lead to one file, as far as that can be told.
+/// Whether two names refer to one file, as far as this can be determined.
 fn same_file(one: &Path, other: &Path) -> bool {
     let canonical = |path: &Path| path.canonicalize().ok();
     one == other || canonical(one).is_some_and(|one| canonical(other) == Some(one))

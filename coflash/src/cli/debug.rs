@@ -16,11 +16,11 @@ use super::device::Device;
 use super::output::Failure;
 use super::values::{milliseconds, number};
 
-/// Memory, breakpoints and steps of a device on the bench.
+/// Reads and writes memory, sets breakpoints and steps a device on the bench.
 ///
-/// For firmware that was built with the feature `debugger` (docs/debugger.md); no product has it.
-/// Addresses are in C notation, like 0x20000000.
-// The device may be named behind what is done with it, too.
+/// The firmware must have been built with the feature `debugger` (docs/debugger.md); no product has
+/// it. Addresses are in C notation, like 0x20000000.
+// The options that name the device are also accepted after the subcommand.
 #[derive(Debug, Args)]
 #[command(mut_args(|argument| argument.global(true)))]
 pub(super) struct Debug {
@@ -33,15 +33,15 @@ pub(super) struct Debug {
 
 #[derive(Debug, Subcommand)]
 enum What {
-    /// Read memory or registers of peripherals.
+    /// Read memory or peripheral registers.
     Read(Read),
-    /// Write RAM or registers of peripherals.
+    /// Write RAM or peripheral registers.
     Write(Write),
-    /// Set a breakpoint and wait for it; without an address, list those that are set.
+    /// Set a breakpoint and wait for it; without an address, list the breakpoints.
     Break(Break),
-    /// Let a stopped program go on.
+    /// Let a stopped program continue.
     Continue(Continue),
-    /// Let a stopped program carry out one instruction.
+    /// Let a stopped program execute one instruction.
     Step,
     /// Stop the program, wherever it is.
     Stop,
@@ -51,26 +51,26 @@ enum What {
 
 #[derive(Debug, Args)]
 struct Read {
-    /// Where to begin.
+    /// The first address.
     #[arg(value_parser = number, value_name = "ADDRESS")]
     address: u32,
 
-    /// How many bytes.
+    /// The number of bytes.
     #[arg(value_parser = number, value_name = "BYTES", default_value = "4")]
     len: u32,
 
-    /// Write them to this file instead.
+    /// Write the bytes to this file instead of showing them.
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
 }
 
 #[derive(Debug, Args)]
 struct Write {
-    /// Where to begin.
+    /// The first address.
     #[arg(value_parser = number, value_name = "ADDRESS")]
     address: u32,
 
-    /// A word (32 bits).
+    /// A word of 32 bits.
     #[arg(value_parser = number, value_name = "WORD", required_unless_present_any = ["bytes", "input"])]
     word: Option<u32>,
 
@@ -78,7 +78,7 @@ struct Write {
     #[arg(long, value_parser = bytes, value_name = "HEX", conflicts_with_all = ["word", "input"])]
     bytes: Option<Bytes>,
 
-    /// The bytes of this file.
+    /// The contents of this file.
     #[arg(long, short, value_name = "FILE", conflicts_with = "word")]
     input: Option<PathBuf>,
 }
@@ -89,7 +89,7 @@ struct Break {
     #[arg(value_parser = number, value_name = "ADDRESS")]
     address: Option<u32>,
 
-    /// Take this breakpoint away; without an address, all of them.
+    /// Remove this breakpoint; without an address, all breakpoints.
     #[arg(long)]
     clear: bool,
 
@@ -105,19 +105,19 @@ struct Continue {
 
 #[derive(Debug, Args)]
 struct Wait {
-    /// Wait for the program to stop, so many milliseconds at most.
+    /// Wait for the program to stop, for at most this many milliseconds.
     #[arg(long, value_parser = milliseconds, value_name = "MS")]
     wait: Option<Duration>,
 }
 
-/// How long a program may take for an instruction, or to be stopped.
+/// How long a program may take to execute an instruction or to stop.
 const AT_ONCE: Duration = Duration::from_secs(2);
 
 /// Bytes of the command line.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Bytes(Vec<u8>);
 
-/// What to tell.
+/// The result of a subcommand.
 struct Done {
     words: String,
     value: Value,
@@ -144,7 +144,7 @@ impl Debug {
     }
 }
 
-/// What went wrong, and where.
+/// The error of a subcommand, and where it occurred.
 enum Trouble {
     Device(Error),
     Here(Failure),
@@ -173,7 +173,7 @@ impl What {
                 debugger.resume()?;
                 match wait.wait {
                     Some(time) => stop(debugger, time),
-                    None => Ok(Done { words: "the program goes on".to_string(), value: json!({}) }),
+                    None => Ok(Done { words: "the program continues".to_string(), value: json!({}) }),
                 }
             }
             Self::Step => {
@@ -205,11 +205,11 @@ fn stopped_program(debugger: &mut Debugger<'_, '_>) -> Result<Registers, Trouble
     })
 }
 
-/// Waits for a stop, and tells of it.
+/// Waits for a stop, and reports it.
 fn stop(debugger: &mut Debugger<'_, '_>, time: Duration) -> Result<Done, Trouble> {
     let Some(Stopped { stop, address }) = debugger.await_stop(time)? else {
         let advice =
-            "the instruction may not be reached, or lie in code that cannot be stopped (docs/debugger.md)";
+            "the program may never reach the instruction, or the instruction lies in code that cannot be stopped (docs/debugger.md)";
         let what = format!("the program has not stopped within {} ms", time.as_millis());
         return Err(Failure::usage(what, advice).into());
     };
@@ -218,7 +218,7 @@ fn stop(debugger: &mut Debugger<'_, '_>, time: Duration) -> Result<Done, Trouble
         Stop::Step => ("stopped at", "step"),
         Stop::OutOfReach => {
             let what = format!(
-                "the code at {address:08X}h cannot be stopped: breakpoints are off, the program runs on"
+                "the code at {address:08X}h cannot be stopped: breakpoints are disabled, and the program continues"
             );
             let advice = "it belongs to an interrupt above the debugger, or runs in a critical section (docs/debugger.md)";
             return Err(Failure::usage(what, advice).into());
@@ -259,7 +259,7 @@ impl Write {
                 let read = limit::read(path).map_err(|cause| Place::File.fault(cause).of(path.display()));
                 read.map_err(Failure::from)?
             }
-            // clap asks for one of them.
+            // clap requires one of them.
             (None, None, None) => Vec::new(),
         };
         if bytes.is_empty() {
@@ -311,7 +311,7 @@ fn refused(address: u32, why: NoBreakpoint) -> Failure {
         ),
         NoBreakpoint::Full => Failure::usage(
             format!("all {BREAKPOINTS} breakpoints are taken"),
-            "take one away with coflash debug break ADDRESS --clear",
+            "remove one with coflash debug break ADDRESS --clear",
         ),
         NoBreakpoint::Disabled => Failure::usage(
             "the device does not stop at breakpoints",
@@ -320,7 +320,7 @@ fn refused(address: u32, why: NoBreakpoint) -> Failure {
     }
 }
 
-/// Sixteen bytes a line behind their address; a few stand alone.
+/// Sixteen bytes on each line after their address; a few bytes stand alone.
 fn dump(address: u32, bytes: &[u8]) -> String {
     let line = |(n, bytes): (usize, &[u8])| {
         let at = address.wrapping_add(16 * n as u32);

@@ -1,4 +1,4 @@
-//! Which device, and how patient to be with it: for every command that talks to one.
+//! The options that name a device and set its time limits, for every command that talks to one.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -35,28 +35,28 @@ pub(super) struct Program {
 }
 
 impl Device {
-    /// A session which Ctrl-C ends.
+    /// A session that Ctrl-C ends.
     pub(super) fn session<'a>(&self, link: &'a mut Link) -> Result<Session<'a>, Failure> {
         self.patience.session(link, self.node)
     }
 }
 
-/// How long to wait for what.
+/// The time limits.
 #[derive(Debug, Args)]
 pub(super) struct Patience {
     /// How long the answer to one request may take, in milliseconds.
     #[arg(long, aliases = ["sdo_timeout", "timeout"], default_value = "500", value_parser = milliseconds, value_name = "MS")]
     sdo_timeout: Duration,
 
-    /// How often a request that may be repeated is sent when no answer comes.
+    /// How many times a request that may be repeated is sent if no answer comes.
     #[arg(long, default_value = "3", value_parser = attempts, value_name = "TIMES")]
     sdo_attempts: u32,
 
-    /// How long a command (erasing, checking) may take, in milliseconds.
+    /// How long a command (such as erase) may take, in milliseconds.
     #[arg(long, default_value = "60000", value_parser = milliseconds, value_name = "MS")]
     command_timeout: Duration,
 
-    /// How long a device may say nothing at all while it carries out a command, in milliseconds.
+    /// How long a device may send nothing while it executes a command, in milliseconds.
     #[arg(long, default_value = "10000", value_parser = milliseconds, value_name = "MS")]
     silence_timeout: Duration,
 
@@ -64,27 +64,27 @@ pub(super) struct Patience {
     #[arg(long, default_value = "5000", value_parser = milliseconds, value_name = "MS")]
     boot_timeout: Duration,
 
-    /// The pause between two looks at a device that is at work, in milliseconds; otherwise 10 at
-    /// first and 250 at most.
+    /// The pause between two status requests to a busy device, in milliseconds; by default 10 at
+    /// first and at most 250.
     #[arg(long, value_parser = milliseconds, value_name = "MS", conflicts_with = "command_timeout")]
     delay: Option<Duration>,
 
-    /// How often a device that is at work is looked at before it is given up, --delay (or a second)
-    /// apart; in place of --command-timeout.
+    /// How many status requests a busy device gets before it is given up, with a pause of --delay
+    /// (or a second) between them; replaces --command-timeout.
     #[arg(long, value_parser = number, value_name = "TIMES", conflicts_with = "command_timeout")]
     repeats: Option<u32>,
 
-    /// Write in segments, and not as blocks where the device knows them.
+    /// Download in segments, even if the device supports block transfer.
     #[arg(long)]
     segmented: bool,
 }
 
-/// The manual's defaults (table 9) for `--delay` and `--repeats` where only one of them is given.
+/// The manual's defaults (table 9) for `--delay` and `--repeats` if only one of them is given.
 const DELAY: Duration = Duration::from_secs(1);
 const REPEATS: u32 = 0x400;
 
 impl Patience {
-    /// A session which Ctrl-C ends.
+    /// A session that Ctrl-C ends.
     pub(super) fn session<'a>(&self, link: &'a mut Link, node: NodeId) -> Result<Session<'a>, Failure> {
         let mut session = Session::on(link, node, self.timing());
         session.cancel_by(cancelled()?);
@@ -116,8 +116,8 @@ impl Patience {
     }
 }
 
-/// The flag that Ctrl-C sets. The first time ends a transfer in order, the second time the program
-/// at once.
+/// The flag that Ctrl-C sets. The first Ctrl-C ends a transfer in an orderly way, the second one
+/// ends the program at once.
 pub(super) fn cancelled() -> Result<Arc<AtomicBool>, Failure> {
     static FLAG: OnceLock<Arc<AtomicBool>> = OnceLock::new();
     if let Some(flag) = FLAG.get() {
@@ -157,7 +157,7 @@ mod tests {
     fn delay_and_repeats_are_those_of_the_manuals_tool() {
         let ms = Duration::from_millis;
         assert_eq!(timing(&[]), Timing::default());
-        // Table 9: 400h looks, a second apart, and an SDO time-out of 500 ms.
+        // Table 9: 400h status requests, a second apart, and an SDO time-out of 500 ms.
         let legacy = timing(&["--delay", "1000", "--repeats", "0x000400", "--timeout", "500"]);
         assert_eq!(
             (legacy.command, legacy.poll_first, legacy.poll_most),

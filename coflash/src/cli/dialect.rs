@@ -1,25 +1,25 @@
-//! `--dialect` and `--unlock`: what a device speaks, and what opens it.
+//! `--dialect` and `--unlock`: the dialect of a bootloader, and its password.
 
 use clap::{Args, ValueEnum};
 use coflash::device::Dialect;
 use coflash::update::Password;
 
-/// How to deal with devices of other makers.
+/// How to handle devices of other makers.
 #[derive(Debug, Args)]
 pub(super) struct Access {
-    /// What the bootloader speaks.
+    /// The dialect of the bootloader.
     #[arg(long, value_name = "DIALECT", value_enum, default_value = "auto")]
     dialect: Name,
 
-    /// The password of a device that is locked: a text for lifts; for esacademy a number like
-    /// 0x494E4954 or its four characters, in place of its default.
+    /// The password of a locked device: a text for lift; for esacademy a number like 0x494E4954 or
+    /// its four characters, in place of the default password.
     #[arg(long, value_name = "PASSWORD", env = "COFLASH_UNLOCK", hide_env_values = true, value_parser = password)]
     unlock: Option<Password>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Name {
-    /// Find it out: by the device type, and by the objects that there are.
+    /// Detect it by the device type and the objects of the device.
     Auto,
     /// Block files, as SYS TEC's tools send them.
     Block,
@@ -34,7 +34,7 @@ enum Name {
 }
 
 impl Access {
-    /// `None` to find it out.
+    /// The dialect; `None` to detect it.
     pub(super) fn dialect(&self) -> Option<Dialect> {
         match self.dialect {
             Name::Auto => None,

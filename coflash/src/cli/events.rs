@@ -1,7 +1,7 @@
-//! `--json-events`: what happens, as it happens, one JSON object a line.
+//! `--json-events`: reports events as they happen, one JSON object on each line.
 //!
-//! Each line has `event`: those of an update as the library names them (`found`, `phase`, `progress`,
-//! `retry`, `note`, `warning`, `done`), `result` for what a command came to, and `error`.
+//! Each line has `event`: the library's events of an update (`found`, `phase`, `progress`, `retry`,
+//! `note`, `warning`, `done`), `result` for the result of a command, and `error`.
 
 use std::time::Instant;
 
@@ -18,7 +18,7 @@ pub(super) struct Lines {
     out: Output,
     node: NodeId,
     began: Option<Instant>,
-    /// What was shown last, in percent.
+    /// The percentage that was shown last.
     percent: Option<usize>,
 }
 
@@ -27,11 +27,12 @@ impl Lines {
         Self { out, node, began: None, percent: None }
     }
 
-    /// One line; of progress one for each percent, with rate and remaining time.
+    /// Writes one line. For progress, writes one line for each percent, with rate and remaining
+    /// time.
     pub(super) fn show(&mut self, event: &Event) {
         let mut line = match serde_json::to_value(event.line(self.node)) {
             Ok(line) => line,
-            // Events have nothing that JSON has not.
+            // JSON can represent every event, so this arm is not reached.
             Err(_) => json!({ "node": self.node.get(), "text": event.to_string() }),
         };
         if let Event::Progress { done, total } = *event {
@@ -42,7 +43,7 @@ impl Lines {
             }
             self.percent = Some(pace.percent());
             line["bytes_per_second"] = (pace.rate.round() as u64).into();
-            // Before the first byte nothing is known of the rate.
+            // Before the first byte the rate is unknown.
             let left = (done > 0).then(|| (pace.left * 10.0).round() / 10.0);
             line["seconds_left"] = left.into();
         }

@@ -1,4 +1,4 @@
-//! The firmware file and how to read it: what `convert` and `flash` share.
+//! The options for the firmware file and how to read it, shared by `convert` and `flash`.
 
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -15,25 +15,25 @@ use super::objects::bytes_of;
 use super::output::Failure;
 use super::values::number;
 
-/// The board, by its name or by its file.
+/// The board, by its name or by a file.
 #[derive(Clone, Debug, Default, Args)]
 pub(super) struct MemoryMap {
-    /// The board, whose memory map says what lies where; data outside is refused.
+    /// The board whose memory map applies; data outside its program region are refused.
     #[arg(long, value_name = "BOARD", value_parser = board)]
     board: Option<&'static layout::Layout>,
 
-    /// The same for a board that this tool was not built with: its memory map, as `cargo xtask
-    /// layout --toml` writes it.
+    /// The memory map of a board that this tool was not built with, as `cargo xtask layout --toml`
+    /// writes it.
     #[arg(long, value_name = "FILE", conflicts_with = "board")]
     layout: Option<PathBuf>,
 
-    /// What that file says, once it was read.
+    /// The contents of that file, after it was read.
     #[arg(skip)]
     loaded: OnceLock<&'static layout::Layout>,
 }
 
 impl MemoryMap {
-    /// The memory map, if one was named.
+    /// The memory map, if the user named one.
     pub(super) fn layout(&self) -> Result<Option<&'static layout::Layout>, Failure> {
         let Some(path) = &self.layout else { return Ok(self.board) };
         if let Some(layout) = self.loaded.get() {
@@ -44,30 +44,30 @@ impl MemoryMap {
     }
 }
 
-/// Where a program lies, and how its file is read.
+/// The place of a program, and the format of its file.
 #[derive(Clone, Debug, Args)]
 pub(super) struct Place {
     #[command(flatten)]
     map: MemoryMap,
 
-    /// The first address of the program's region; data before it is left out.
+    /// The first address of the program's region; data below it are left out.
     #[arg(long, alias = "start_address", value_name = "ADDRESS", value_parser = number, conflicts_with_all = ["board", "layout"])]
     start_address: Option<u32>,
 
-    /// The last address of the program's region; data behind it is left out.
+    /// The last address of the program's region; data above it are left out.
     #[arg(long, alias = "end_address", value_name = "ADDRESS", value_parser = number, conflicts_with_all = ["board", "layout"])]
     end_address: Option<u32>,
 
-    /// What is added to every address of the file (0xF8000000 takes 0x08000000 away).
+    /// The number that is added to every address of the file (0xF8000000 subtracts 0x08000000).
     #[arg(long, alias = "adjust_start", value_name = "OFFSET", value_parser = number, default_value = "0")]
     adjust_start: u32,
 
-    /// Where a raw binary goes that nothing is said about: for devices that take an image as it is,
-    /// and have no addresses in it.
+    /// The start address of a raw binary if no option gives one: for devices that take an image
+    /// without addresses.
     #[arg(skip)]
     image_at: Option<u32>,
 
-    /// The file's format, if the first bytes do not tell it.
+    /// The file's format, if the first bytes do not show it.
     #[arg(short = 'I', long = "input-format", value_name = "FORMAT", ignore_case = true)]
     format: Option<FormatName>,
 }
@@ -78,25 +78,26 @@ pub(super) struct Source {
     #[command(flatten)]
     place: Place,
 
-    /// Bytes of a block, its 16 bytes of framing included: at most the bootloader's buffer.
+    /// The size of a block in bytes, including its 16 bytes of framing: at most the bootloader's
+    /// buffer.
     #[arg(long, alias = "block_size", value_name = "BYTES", value_parser = number, default_value = "0x400")]
     block_size: u32,
 
-    /// What fills gaps inside a block: a byte, or a 32-bit pattern.
+    /// The value that fills gaps inside a block: a byte, or a 32-bit pattern.
     #[arg(long, alias = "gap_fill", value_name = "VALUE", value_parser = number, default_value = "0xFFFFFFFF")]
     gap_fill: u32,
 
-    /// The most bytes in a row that a block may have without data of the program; a longer gap
-    /// starts a new block. Otherwise as many as the block has room for.
+    /// The longest gap inside a block, in bytes; a longer gap starts a new block. The default is
+    /// the room in the block.
     #[arg(long, alias = "block_max_gap", value_name = "BYTES", value_parser = number)]
     block_max_gap: Option<u32>,
 
-    /// Check blocks and program with the 16-bit CRC (polynomial 1021h): for a bootloader that was
+    /// Protect blocks and program with the 16-bit CRC (polynomial 1021h), for a bootloader that was
     /// built for it.
     #[arg(long)]
     crc16: bool,
 
-    /// Put 32 reserved bytes into the last block, in front of size and CRC of the program: for a
+    /// Put 32 reserved bytes into the last block before size and CRC of the program, for a
     /// bootloader of 2008 (manual L-1112e_5).
     #[arg(long)]
     last_block_2008: bool,
@@ -141,19 +142,18 @@ fn board(name: &str) -> Result<&'static layout::Layout, String> {
 }
 
 impl Source {
-    /// Reads `file` for program `number` and makes its blocks. No device is needed, and none is
-    /// touched.
+    /// Reads `file` for program `number` and converts it into blocks, without access to a device.
     pub(super) fn blocks(&self, file: &Path, program: u8, label: Label) -> Result<Converted, Failure> {
         let (firmware, _) = self.load(file, program)?;
         self.convert(firmware, file, program, label)
     }
 
-    /// Reads `file`; tells its format, too.
+    /// Reads `file`; also returns its format.
     pub(super) fn load(&self, file: &Path, program: u8) -> Result<(Firmware, Format), Failure> {
         self.place.load(file, program)
     }
 
-    /// Makes the blocks of a file that was read.
+    /// Converts a file that was read into blocks.
     pub(super) fn convert(
         &self,
         firmware: Firmware,
@@ -173,7 +173,7 @@ impl Source {
         blocks_of(firmware, &options).map_err(|error| Failure::convert(error, file))
     }
 
-    /// The same for another board.
+    /// The same options for another board.
     pub(super) fn for_board(&self, name: &str) -> Result<Self, Failure> {
         let layout =
             board(name).map_err(|known| Failure::usage(format!("there is no board '{name}'"), known))?;
@@ -182,23 +182,23 @@ impl Source {
         Ok(Self { place, ..self.clone() })
     }
 
-    /// The same for a device that takes images without addresses.
+    /// The same options for a device that takes images without addresses.
     pub(super) fn for_images(&self) -> Self {
         let place = Place { image_at: Some(0), ..self.place.clone() };
         Self { place, ..self.clone() }
     }
 
-    /// Bytes of a block, framing included.
+    /// The size of a block in bytes, including framing.
     pub(super) fn block_size(&self) -> usize {
         self.block_size as usize
     }
 
-    /// Whether another CRC was asked for than the one that a file has.
+    /// Whether the user asked for another CRC than the file's CRC `kept`.
     pub(super) fn wants(&self, kept: Checksum) -> bool {
         self.crc16 && kept != Checksum::Crc16
     }
 
-    /// Whether it was said where the program may lie.
+    /// Whether the options give the program's region.
     pub(super) fn has_region(&self) -> bool {
         let Place { map, start_address, end_address, .. } = &self.place;
         let has_map = map.board.is_some() || map.layout.is_some();
@@ -207,10 +207,10 @@ impl Source {
 }
 
 impl Place {
-    /// Reads `file` for program `number`; tells its format, too.
+    /// Reads `file` for program `number`; also returns its format.
     pub(super) fn load(&self, file: &Path, program: u8) -> Result<(Firmware, Format), Failure> {
-        // A raw file starts where the region does; conversion will adjust that like any other
-        // address.
+        // A raw file begins at the start of the region; the conversion adjusts this address like
+        // any other one.
         let raw_address = match self.region(program)? {
             Region::Unknown | Region::CutBehind(_) => self.image_at,
             Region::Strict(range) => Some(range.first.wrapping_sub(self.adjust_start)),
@@ -219,12 +219,12 @@ impl Place {
         Ok(read::load_telling(file, self.format.map(Format::from), raw_address)?)
     }
 
-    /// How to convert for this place.
+    /// The options of a conversion for this place.
     pub(super) fn options(&self, program: u8) -> Result<Options, Failure> {
         Ok(Options::default().region(self.region(program)?).adjust_start(self.adjust_start))
     }
 
-    /// Where the program starts, as far as that is said and the firmware is not looked at.
+    /// The program's start address, if the options give it; the firmware is not read.
     pub(super) fn start(&self, program: u8) -> Result<Option<u32>, Failure> {
         Ok(match self.region(program)? {
             Region::Unknown | Region::CutBehind(_) => None,
@@ -253,14 +253,15 @@ impl Place {
     }
 }
 
-/// The memory map in a file.
+/// Reads the memory map from a file.
 fn board_of_file(path: &Path) -> Result<&'static layout::Layout, Failure> {
     let bytes = bytes_of(path, file::board::MAX as u64)?;
     let text = String::from_utf8_lossy(&bytes);
     file::board::parse(&text).map_err(|error| Failure::file(path, &error.to_string()))
 }
 
-/// The other program of a device, as in flash: a firmware file, or the bytes of the flash.
+/// The device's other program as it lies in flash: from a firmware file, or from the bytes of the
+/// flash.
 pub(super) fn base(path: &Path) -> Result<Vec<u8>, Failure> {
     let bytes = limit::read(path).map_err(|cause| Failure::file(path, &cause.to_string()))?;
     if bytes.is_empty() {
@@ -288,12 +289,12 @@ impl Input {
     }
 }
 
-/// All of a firmware file.
+/// Reads a whole firmware file.
 pub(super) fn bytes(path: &Path) -> Result<Vec<u8>, Failure> {
     Ok(limit::read(path).map_err(|cause| file::Place::File.fault(cause).of(path.display()))?)
 }
 
-/// Says what was left out, if something was.
+/// Warns if data were left out.
 pub(super) fn warn_left_out(context: &Context, file: &Path, converted: &Converted) {
     if converted.left_out > 0 {
         context.out.warn(format_args!(

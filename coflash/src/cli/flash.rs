@@ -1,4 +1,4 @@
-//! `coflash flash`: a program into a device.
+//! `coflash flash`: downloads a program into a device.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -34,26 +34,26 @@ use super::progress::Progress;
 use super::values::{nodes, number, program_number};
 use super::verify::{self, is_sealed};
 
-/// Puts a program into a device, or into many, and starts it.
+/// Downloads a program into a device, or into many devices, and starts it.
 ///
-/// Takes a block file or a sealed image, or any other firmware file and converts it on the fly. The file is read and
-/// checked completely before a device is touched. An update that was interrupted can be started
-/// again at once.
+/// The file may be a block file or a sealed image; any other firmware file is converted first. The
+/// tool reads and checks the whole file before it changes a device. An interrupted update can be
+/// started again at once.
 ///
-/// Devices with bootloaders of other makers are told apart by themselves, or by --dialect.
+/// The tool detects bootloaders of other makers by itself; --dialect names one.
 ///
-/// With several nodes, or a job file, the devices are updated at the same time; a failure of one
-/// does not stop the others.
+/// With several nodes, or with a job file, the devices are updated at the same time; if one device
+/// fails, the others continue.
 ///
-/// The options of BinaryBlockDownload and DotNetFlashtool are accepted in their own spelling, too
-/// (-F, --node_id, --prog_no, --chk_tgt, --chk_run, --sdo_timeout, --timeout and so on).
+/// The options of BinaryBlockDownload and DotNetFlashtool are also accepted in their original
+/// spelling (-F, --node_id, --prog_no, --chk_tgt, --chk_run, --sdo_timeout, --timeout and so on).
 #[derive(Debug, Args)]
 pub(super) struct Flash {
     /// The firmware: Intel HEX, Motorola S-record, ELF, raw binary, block file or sealed image.
     #[arg(value_name = "FILE", required_unless_present_any = ["legacy_file", "job", "vxd_type", "index"])]
     file: Option<PathBuf>,
 
-    /// The same in DotNetFlashtool's spelling.
+    /// The firmware file in DotNetFlashtool's spelling.
     #[arg(short = 'F', value_name = "FILE", conflicts_with = "file", hide = true)]
     legacy_file: Option<PathBuf>,
 
@@ -61,15 +61,16 @@ pub(super) struct Flash {
     #[arg(long, short = 'N', alias = "node_id", default_value = "1", value_parser = nodes, value_name = "NODES")]
     node: Vec<Vec<NodeId>>,
 
-    /// A file that says which devices get what (see the manual), in place of FILE and --node.
+    /// A job file, which names the devices and their programs (see the manual), in place of FILE
+    /// and --node.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["file", "legacy_file", "node", "vid"])]
     job: Option<PathBuf>,
 
-    /// How many devices are at work at the same time.
+    /// How many devices are updated at the same time.
     #[arg(long, value_name = "DEVICES", value_parser = number, default_value = "8")]
     at_once: u32,
 
-    /// Write what came of it to this file, as JSON.
+    /// Write the results to this file as JSON.
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
 
@@ -90,50 +91,52 @@ pub(super) struct Flash {
     #[arg(long)]
     check_target: bool,
 
-    /// Release the program for autostart without a trial. Otherwise, where the dialect has such a
-    /// release, it is started once, its identity (1018h) is compared with the bootloader's, and it is
-    /// called back.
+    /// Release the program for autostart without a trial. By default, if the dialect has such a
+    /// release, the program is started once, its identity (1018h) is compared with the
+    /// bootloader's, and it is called back.
     #[arg(long)]
     no_trial: bool,
 
-    /// The trial in the manual's spelling: there is one anyway.
+    /// The trial in the manual's spelling; it is the default.
     #[arg(long = "chk_run", hide = true)]
     chk_run: bool,
 
-    /// Search until the bootloader is there or Ctrl-C ends it: the device may still be switched on,
-    /// and an application that stays is asked again and again.
+    /// Search until the bootloader answers or Ctrl-C ends the search: the device may still be
+    /// switched off, and an application that does not leave is called again and again.
     #[arg(long)]
     wait: bool,
 
-    /// Go on although another tool speaks to the device, or another coflash of this computer is at work
-    /// on it.
+    /// Continue even if another tool talks to the device, or another coflash process of this
+    /// computer works on it.
     #[arg(long)]
     not_alone: bool,
 
-    /// Leave a flying NMT master alone (CiA 302-2); otherwise it is asked for its place around the
-    /// update of a lift device.
+    /// Do not ask a flying NMT master (CiA 302-2) for mastership; by default the tool takes the
+    /// mastership during the update of a lift device.
     #[arg(long)]
     no_mastership: bool,
 
-    /// Leave the device in the bootloader, and the program untried and not released for autostart.
+    /// Leave the device in the bootloader, with the program neither tried nor released for
+    /// autostart.
     #[arg(long)]
     no_start: bool,
 
-    /// Compare the program's CRC once more at the very end, as the running program tells it.
+    /// At the very end, compare the program's CRC once more with the CRC that the running program
+    /// reports.
     #[arg(long)]
     verify: bool,
 
-    /// Send a sealed image block by block (--block-size), and not with one download.
+    /// Download a sealed image block by block (--block-size) instead of in one transfer.
     #[arg(long = "blocks")]
     in_blocks: bool,
 
-    /// How often one block is sent again after a CRC error or a broken transfer.
+    /// How many times a block is sent again after a CRC error or a broken transfer.
     #[arg(long, value_name = "TIMES", value_parser = number, default_value = "3")]
     block_repeats: u32,
 
-    /// Leave it to the device to judge the image. Otherwise an image that can be no program of an
-    /// STM32F4 (vector table, a bootloader, nothing but zeros), and one for another device or another
-    /// place in flash, is refused before anything is done to the device.
+    /// Let the device alone judge the image. By default the tool refuses an image that cannot be a
+    /// program of an STM32F4 (vector table, a bootloader, only zeros), and an image for another
+    /// device or another place in flash, before it changes the device.
     #[arg(long)]
     force: bool,
 
@@ -144,7 +147,7 @@ pub(super) struct Flash {
     legacy: Legacy,
 }
 
-/// What one device is to get.
+/// The program for one device.
 struct Assignment {
     node: Option<NodeId>,
     address: Option<LssAddress>,
@@ -172,7 +175,7 @@ impl Flash {
         }
     }
 
-    /// How to read a file for the dialect, as far as that is named.
+    /// The options for reading a file for the named dialect.
     fn source(&self) -> Source {
         match self.access.dialect() {
             Some(Dialect::Raw | Dialect::Lift) => self.source.for_images(),
@@ -180,9 +183,9 @@ impl Flash {
         }
     }
 
-    /// The devices of the command line, which all get the same.
+    /// The devices of the command line, which all get the same program.
     fn devices(&self, context: &Context) -> Result<Vec<Assignment>, Failure> {
-        let unnamed = || Failure::usage("no file is named", "name the firmware: coflash flash FILE");
+        let unnamed = || Failure::usage("no firmware file is named", "name the firmware: coflash flash FILE");
         let image = self.file.as_deref().or(self.legacy_file.as_deref()).ok_or_else(unnamed)?;
         let file = self.program(context, image, self.program, &self.source(), self.labels.label()?)?;
         let options = self.options(&file, &Settings::default())?;
@@ -201,7 +204,7 @@ impl Flash {
             }
         }
         if address.is_some() && nodes.len() > 1 {
-            let advice = "give one --node, or a job file with an lss address for each device";
+            let advice = "give one --node, or use a job file with an LSS address for each device";
             return Err(Failure::usage("one LSS address cannot get several node-IDs", advice));
         }
         let assign = |node| Assignment {
@@ -214,9 +217,9 @@ impl Flash {
         Ok(nodes.into_iter().map(assign).collect())
     }
 
-    /// The devices of a job file. Every image is read and checked before any device is touched.
+    /// The devices of a job file. Every image is read and checked before any device is changed.
     fn devices_of_job(&self, context: &Context, job: &Path) -> Result<Vec<Assignment>, Failure> {
-        // Devices that get the same share it.
+        // Devices with the same image share it.
         let mut known: Vec<(PathBuf, Option<String>, u8, Program)> = Vec::new();
         let mut devices = Vec::new();
         let text = read_text(job).map_err(|error| Failure::unreadable(job, &error))?;
@@ -246,7 +249,7 @@ impl Flash {
         Ok(devices)
     }
 
-    /// Reads what is to go into a device, and judges it.
+    /// Reads and checks the program for a device.
     fn program(
         &self,
         context: &Context,
@@ -263,7 +266,8 @@ impl Flash {
             };
             let file = file.map_err(|refusal| Failure::sealed(path, &refusal))?;
             if self.in_blocks {
-                // Where the program starts the device tells; whether such blocks can be is known now.
+                // The device reports the program's start address later; this checks now whether
+                // such blocks are possible.
                 blocks_of_sealed(&file, 0, source.block_size())
                     .map_err(|error| Failure::convert(error, path))?;
             }
@@ -275,8 +279,8 @@ impl Flash {
         Ok(Arc::new(done.file).into())
     }
 
-    /// Refuses what can be no program, before a device is asked anything. Whether another number than
-    /// 1 is a program's is not known without the device, if it may be a lift's.
+    /// Refuses a file that cannot be a program, before any request to a device. For a possible lift
+    /// device, the meaning of a program number above 1 is not known without the device.
     fn judge(&self, path: &Path, file: &BlockFile, program: u8) -> Result<(), Failure> {
         let dialect = self.access.dialect();
         if self.force || is_data(dialect.unwrap_or(Dialect::Lift), program) {
@@ -285,11 +289,11 @@ impl Flash {
         judge(&file.image(), file.program_start()).map_err(|fault| Failure::no_program(path, fault))
     }
 
-    /// What the command line says, unless a device's own settings say otherwise.
+    /// The options of the command line, unless the device's own settings replace them.
     fn options(&self, file: &Program, settings: &Settings) -> Result<FlashOptions, Failure> {
         let check = settings.check_target.unwrap_or(self.check_target || self.legacy.check_target());
-        let advice = "convert it with --vid and --pid, or give them here";
-        let unnamed = || Failure::usage("the file does not say for which device it is", advice);
+        let advice = "convert it with --vid and --pid, or give these options here";
+        let unnamed = || Failure::usage("the file does not name its target device", advice);
         let check_target = if check { Some(file.target().ok_or_else(unnamed)?) } else { None };
         Ok(FlashOptions::default()
             .program(self.program)
@@ -307,24 +311,27 @@ impl Flash {
             .force(self.force))
     }
 
-    /// The node-ID of a device, which is given it first if it is named by its LSS address.
+    /// The node-ID of a device. A device named by its LSS address gets its node-ID first.
     fn node_of(&self, link: &mut Link, device: &Assignment) -> Result<NodeId, Failure> {
         match (device.address, device.node) {
             (Some(address), node) => {
                 let Link::Bus(adapter) = link else {
-                    let advice = "name the device by its node-ID, or reach its CAN bus by an adapter";
-                    return Err(Failure::usage("behind a gateway no device has an LSS address", advice));
+                    let advice = "name the device by its node-ID, or connect to its CAN bus with an adapter";
+                    return Err(Failure::usage(
+                        "a device behind a gateway cannot be named by its LSS address",
+                        advice,
+                    ));
                 };
                 let boot = self.patience.timing().boot;
                 Ok(ensure_node_id(&mut **adapter, &address, node, boot, &cancelled()?)?)
             }
             (None, Some(node)) => Ok(node),
-            // A job without either was refused.
+            // A job with neither was refused earlier.
             (None, None) => Err(Failure::usage("a device has no node-ID", "give it one")),
         }
     }
 
-    /// Sees to it that no other process of this computer is at work on the node.
+    /// Locks the node, so that no other process of this computer works on it.
     fn lock(&self, context: &Context, node: NodeId) -> Result<Option<Lock>, Failure> {
         let bus = context.bus.clone().or_else(|| self.legacy.bus());
         if self.not_alone {
@@ -348,7 +355,7 @@ impl Flash {
             event => progress.show(event),
         });
         progress.finish();
-        let waiting = result.is_err().then(|| context.waiting("it is known what the bus says"));
+        let waiting = result.is_err().then(|| context.waiting("the bus has been observed"));
         let result = result.map_err(|error| Failure::diagnosed(error, &mut session).leaving(left));
         drop(waiting);
         let report = match (&self.report, result) {
@@ -418,7 +425,7 @@ impl Flash {
         };
         board.finish();
         let waiting =
-            results.iter().any(Result::is_err).then(|| context.waiting("it is known what the bus says"));
+            results.iter().any(Result::is_err).then(|| context.waiting("the bus has been observed"));
         let diagnosis = match nodes.first() {
             Some(node) => diagnose_silence(&mut self.patience.session(link, *node)?, &results),
             None => None,
@@ -433,7 +440,7 @@ impl Flash {
     }
 }
 
-/// What is to be known of a sealed image before it is sent.
+/// A summary of a sealed image before the download.
 fn brief(file: &SealedFile) -> String {
     let head = file.head();
     let names: Vec<&str> = flags(head.flags()).collect();
@@ -450,7 +457,7 @@ fn brief(file: &SealedFile) -> String {
 }
 
 impl Assignment {
-    /// For people.
+    /// The device's name in messages.
     fn name(&self) -> String {
         match (self.node, self.address) {
             (Some(node), _) => format!("node {node}"),

@@ -1,4 +1,4 @@
-//! `coflash completions` and `coflash man`: what an installer puts beside the program.
+//! `coflash completions` and `coflash man`: files for an installer.
 
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use super::context::Context;
 use super::help;
 use super::output::{Failure, EXIT_CODES};
 
-/// Writes the completions for a shell to standard output.
+/// Writes shell completions to standard output.
 #[derive(Debug, Args)]
 pub(super) struct Completions {
     #[arg(value_enum)]
@@ -20,7 +20,8 @@ pub(super) struct Completions {
 
 /// Writes the manual pages.
 ///
-/// That of the program goes to standard output, or with --out one for each command into a folder.
+/// By default, the page of the program goes to standard output. With --out, one page for each
+/// command goes into a folder.
 #[derive(Debug, Args)]
 pub(super) struct Manual {
     /// The folder.
@@ -30,7 +31,7 @@ pub(super) struct Manual {
 
 impl Completions {
     pub(super) fn run(&self, mut commands: Command) -> Result<(), Failure> {
-        // Made in memory: clap's own writer panics where nobody reads.
+        // Written to memory first: clap's own writer panics if standard output is closed.
         let mut script = Vec::new();
         clap_complete::generate(self.shell, &mut commands, "coflash", &mut script);
         let _ = std::io::stdout().write_all(&script);
@@ -59,7 +60,7 @@ impl Manual {
     }
 }
 
-/// A page for each command, and for each command of a command.
+/// Writes a page for each command and each subcommand.
 fn write_pages(command: &Command, folder: &Path) -> io::Result<()> {
     let name = Man::new(command.clone()).get_filename();
     std::fs::write(folder.join(name), page(command)?)?;
@@ -99,14 +100,14 @@ fn page(command: &Command) -> io::Result<Vec<u8>> {
     Ok(page)
 }
 
-/// The files that the tool looks for by itself.
+/// The files that the tool reads by itself.
 const FILES: [(&str, &str); 3] = [
     ("coflash.toml", "Defaults for options, in the current folder."),
-    ("~/.config/coflash/coflash.toml", "The same for a user, where the current folder has none."),
-    ("~/.local/state/coflash/history", "What was typed into coflash shell."),
+    ("~/.config/coflash/coflash.toml", "Defaults of the user, if the current folder has no such file."),
+    ("~/.local/state/coflash/history", "The commands typed into coflash shell."),
 ];
 
-/// The environment, as the options tell it.
+/// The environment variables of the options.
 fn variables(command: &Command) -> Vec<(String, String)> {
     let variable = |argument: &Arg| {
         let name = argument.get_env()?.to_string_lossy().into_owned();
@@ -114,11 +115,11 @@ fn variables(command: &Command) -> Vec<(String, String)> {
         Some((name, format!("{option}{}", argument.get_help().map(ToString::to_string).unwrap_or_default())))
     };
     let mut all: Vec<_> = command.get_arguments().filter_map(variable).collect();
-    all.push(("NO_COLOR".to_string(), "Where it is set, there are no colours.".to_string()));
+    all.push(("NO_COLOR".to_string(), "If it is set, output has no colours.".to_string()));
     all
 }
 
-/// Words with what they mean; or, without a meaning, lines as they stand.
+/// Words with their meanings; without a meaning, a line is written unchanged.
 fn section(page: &mut Vec<u8>, title: &str, rows: &[(&str, &str)]) -> io::Result<()> {
     writeln!(page, ".SH \"{title}\"")?;
     for (word, meaning) in rows {
@@ -131,7 +132,7 @@ fn section(page: &mut Vec<u8>, title: &str, rows: &[(&str, &str)]) -> io::Result
     Ok(())
 }
 
-/// Text as roff takes it: no backslash and no dot in front mean something else.
+/// Text for roff: backslashes and leading dots are escaped.
 fn escaped(text: &str) -> String {
     let text = text.replace('\\', "\\e").replace('-', "\\-");
     if text.starts_with(['.', '\'']) {

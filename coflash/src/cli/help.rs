@@ -1,6 +1,6 @@
-//! How help is put in order: options in groups, `-h` short and with examples, `--help` with all.
+//! Arranges the help: options in groups, `-h` short and with examples, `--help` with all options.
 //!
-//! The options say what they do where they are; here is said where they stand.
+//! The help text of an option stands at the option; this file gives its place.
 
 use clap::{Arg, Command};
 
@@ -61,7 +61,7 @@ const GROUPS: [(&str, &[&str]); 5] = [
     ("Devices of other makers", &["dialect", "unlock"]),
 ];
 
-/// Options for special cases: `--help` has them, `-h` does not.
+/// Options for special cases: only `--help` shows them, not `-h`.
 const RARE: [&str; 38] = [
     "trace",
     "log_file",
@@ -103,10 +103,10 @@ const RARE: [&str; 38] = [
     "temp",
 ];
 
-/// Options of the manual's tools; their group is not in `-h`.
+/// Options of the manual's tools; `-h` does not show their group.
 const LEGACY: [&str; 4] = ["serial", "revision", "product", "vendor"];
 
-/// What people type, by command; the empty name is the program.
+/// Typical calls of each command; the empty name is the program itself.
 const EXAMPLES: [(&str, &str); 33] = [
     (
         "",
@@ -364,7 +364,7 @@ pub(super) fn in_order(command: Command) -> Command {
     below(command.mut_args(placed), &|name| examples(name))
 }
 
-/// The commands below this one; those below them have no examples of their own.
+/// Arranges the subcommands; their own subcommands have no examples.
 fn below(command: Command, examples: &dyn Fn(&str) -> Option<&'static str>) -> Command {
     let names: Vec<String> = command.get_subcommands().map(|below| below.get_name().to_string()).collect();
     names.into_iter().fold(command, |command, name| {
@@ -405,7 +405,7 @@ mod tests {
                 continue;
             }
             for line in text.lines().filter_map(|line| line.strip_prefix("  coflash ")) {
-                // None of them has a blank inside quotes but for names.
+                // No example has a blank inside quotes, except in names.
                 let mut words = vec!["coflash".to_string()];
                 for (number, part) in line.split('"').enumerate() {
                     match number % 2 {
@@ -433,7 +433,8 @@ mod tests {
         }
     }
 
-    /// What is placed here is there; and every option of `flash` that `-h` shows has a line that fits.
+    /// Every option in the groups exists, and every option of `flash` that `-h` shows has a line
+    /// that fits.
     #[test]
     fn the_groups_name_options_that_there_are() {
         let command = super::super::commands();

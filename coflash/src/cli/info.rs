@@ -1,4 +1,4 @@
-//! `coflash info`: what a device says about itself.
+//! `coflash info`: shows what a device reports about itself.
 
 use clap::Args;
 use coflash::device::info::{info, DeviceInfo};
@@ -27,7 +27,7 @@ impl Info {
     }
 }
 
-/// For programs.
+/// The JSON value.
 pub(super) fn value(info: &DeviceInfo) -> Value {
     let mut value = json!(info);
     value["command"] = "info".into();

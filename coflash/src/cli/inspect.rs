@@ -1,4 +1,4 @@
-//! `coflash inspect`: what a firmware file holds, in words.
+//! `coflash inspect`: shows the contents of a firmware file.
 
 use clap::Args;
 use coflash::file::inspect::Inspection;
@@ -11,13 +11,13 @@ use super::output::Failure;
 use super::values::program_number;
 use super::verify::{is_sealed, show};
 
-/// Shows what a firmware file holds, and checks all of it.
+/// Shows the contents of a firmware file, and checks the whole file.
 ///
-/// That is every record, size and CRC, of a block file, too. Of a sealed image it is the form alone;
-/// verify checks it.
+/// This checks every record, size and CRC, also those of a block file. Of a sealed image it checks
+/// only the form; verify checks the rest.
 ///
-/// With --board it also checks that the program lies where the board has room for it. No device is
-/// needed.
+/// With --board it also checks that the program fits into its region of that board's flash. This
+/// command needs no device.
 #[derive(Debug, Args)]
 pub(super) struct Inspect {
     #[command(flatten)]
@@ -38,8 +38,8 @@ impl Inspect {
             return show(context, "inspect", path);
         }
         let (firmware, format) = self.source.load(path, self.program)?;
-        // What conversion would refuse is worth knowing now; an image without a board has no region
-        // to leave.
+        // Report now what a conversion would refuse. Without a board there is no region for the
+        // image to leave.
         let mut start = None;
         if self.source.has_region() || matches!(firmware, Firmware::Blocks(_)) {
             let done = self.source.convert(firmware.clone(), path, self.program, Default::default())?;

@@ -1,4 +1,4 @@
-//! `coflash key`: keys of sealed images, and certificates of those that sign.
+//! `coflash key`: keys for sealed images, and certificates of signing keys.
 
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
@@ -20,8 +20,8 @@ const MAX: u64 = 16 * 1024;
 
 /// Makes keys for sealed images, certifies them, and shows them.
 ///
-/// A root key certifies the keys that sign programs; devices know the root's public key. A
-/// key-encryption key (kek) opens encrypted programs; devices have it, so it is as secret as the
+/// A root key certifies the keys that sign programs; devices hold the root's public key. A
+/// key-encryption key (kek) decrypts encrypted programs; devices hold it, so it is as secret as the
 /// private keys.
 #[derive(Debug, Args)]
 pub(super) struct Key {
@@ -31,42 +31,43 @@ pub(super) struct Key {
 
 #[derive(Debug, Subcommand)]
 enum Job {
-    /// Make a key. The private part is readable for its owner alone.
+    /// Make a key. Only the owner of the file can read the private part.
     New(New),
-    /// Certify a key that signs programs, with a root.
+    /// Certify a key that signs programs, with a root key.
     Certify(Certify),
-    /// Show a key or a certificate. Secrets are not shown.
+    /// Show a key or a certificate, but no secrets.
     Show(Show),
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum KeyRole {
-    /// Certifies the keys that sign. Keep it offline.
+    /// Certifies the signing keys. Keep it offline.
     Root,
     /// Signs programs.
     Release,
-    /// Opens encrypted programs.
+    /// Decrypts encrypted programs.
     Kek,
 }
 
 #[derive(Debug, Args)]
 struct New {
-    /// What the key is for. Root and release are Ed25519 keys in PKCS#8 PEM, as OpenSSL makes them.
+    /// The purpose of the key. Root and release keys are Ed25519 keys in PKCS#8 PEM, as OpenSSL
+    /// makes them.
     #[arg(long, value_name = "ROLE")]
     role: KeyRole,
 
-    /// The file for the private key; otherwise the role's name with .pem. The public key goes beside
-    /// it, with .pub.
+    /// The file for the private key; by default the role's name with .pem. The public key goes into
+    /// a file of the same name with .pub.
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
 
-    /// Make the key-encryption key of this value of 128 bits, in 32 hexadecimal digits, as the
-    /// manual's tools take one for encryption.
+    /// Make the key-encryption key from this value of 128 bits, in 32 hexadecimal digits, which the
+    /// manual's tools use for encryption.
     #[arg(long, value_name = "HEX128", value_parser = value_of_128_bits)]
     of_value: Option<[u8; 16]>,
 
-    /// Replace files that are there already. What was sealed or certified with the old key stays with
-    /// it.
+    /// Replace existing files. Programs and certificates made with the old key remain valid for the
+    /// old key only.
     #[arg(long = "force")]
     overwrite: bool,
 }
@@ -81,7 +82,7 @@ struct Certify {
     #[arg(long, value_name = "FILE")]
     key: PathBuf,
 
-    /// The epoch: devices that have taken a program of a higher one refuse this key.
+    /// The epoch: a device that has accepted a program with a higher epoch refuses this key.
     #[arg(long, value_name = "NUMBER", value_parser = number)]
     epoch: u32,
 
@@ -89,23 +90,23 @@ struct Certify {
     #[arg(long, alias = "vid", value_name = "NUMBER", value_parser = number)]
     vendor: u32,
 
-    /// Their product code (1018h/2); otherwise all products of the vendor.
+    /// Product code of the devices (1018h/2); by default all products of the vendor.
     #[arg(long, alias = "pid", value_name = "NUMBER", value_parser = number, default_value = "0")]
     product: u32,
 
-    /// The lowest security counter that the key may sign.
+    /// The lowest security counter of the programs that the key may sign.
     #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0")]
     lowest: u32,
 
-    /// The highest one.
+    /// The highest security counter of the programs that the key may sign.
     #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0xFFFFFFFF")]
     highest: u32,
 
-    /// The key signs programs for devices that are marked for tests, and for no others.
+    /// Certify the key only for programs of devices that are marked for tests.
     #[arg(long)]
     test: bool,
 
-    /// The file for the certificate; otherwise the key's name with .cert.
+    /// The file for the certificate; by default the key's name with .cert.
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
 }
@@ -117,39 +118,40 @@ struct Show {
     file: PathBuf,
 }
 
-/// What a sealed device has in its key block.
+/// The contents of a sealed device's key block.
 #[derive(Debug, Args)]
 pub(super) struct KeyBlock {
-    /// The public key of a root that the device knows; once for each.
+    /// The public key of a root; give the option once for each root.
     #[arg(long, value_name = "FILE", required = true)]
     root: Vec<PathBuf>,
 
-    /// A key-encryption key of the device, which opens encrypted images; once for each.
+    /// A key-encryption key of the device, which decrypts encrypted images; give the option once
+    /// for each key.
     #[arg(long, value_name = "FILE")]
     kek: Vec<PathBuf>,
 
-    /// The lowest security counter that the device takes, of every program.
+    /// The lowest security counter that the device accepts, for every program.
     #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0")]
     pub(super) counter: u32,
 
-    /// The lowest epoch of a certificate that it takes.
+    /// The lowest epoch of a certificate that the device accepts.
     #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0")]
     pub(super) epoch: u32,
 
-    /// The device is marked for tests: it takes programs that are signed with test keys, too.
+    /// Mark the device for tests: it also accepts programs signed with test keys.
     #[arg(long)]
     pub(super) for_tests: bool,
 }
 
 impl KeyBlock {
-    /// The keys in the files that are named: roots and key-encryption keys.
+    /// The keys in the named files: roots and key-encryption keys.
     pub(super) fn keys(&self) -> Result<(Vec<PublicKey>, Vec<Kek>), Failure> {
         let roots = self.root.iter().map(|path| public_key(path)).collect::<Result<_, Failure>>()?;
         Ok((roots, keks(&self.kek)?))
     }
 }
 
-/// 16 bytes in hexadecimal digits. The words of a fault do not repeat the value, which is secret.
+/// Parses 16 bytes in hexadecimal digits. The error does not repeat the value, which is secret.
 pub(super) fn value_of_128_bits(text: &str) -> Result<[u8; 16], String> {
     let digits = text.strip_prefix("0x").unwrap_or(text);
     let bytes = hexadecimal(digits).and_then(|bytes| bytes.try_into().ok());
@@ -175,7 +177,7 @@ impl New {
         };
         if self.of_value.is_some() && !is_kek {
             let advice = "leave --of-value out, or make a key-encryption key: --role kek";
-            return Err(Failure::usage("a value makes a key-encryption key alone", advice));
+            return Err(Failure::usage("a value can only make a key-encryption key", advice));
         }
         let output = self.output.clone().unwrap_or_else(|| PathBuf::from(format!("{name}.pem")));
         let fault = |fault: KeyFault| Failure::system(fault.to_string());
@@ -187,7 +189,7 @@ impl New {
             let public = output.with_extension("pub");
             if public == output {
                 let what = format!("{} is the name of the public key's file", output.display());
-                return Err(Failure::usage(what, "name the private key's file with .pem"));
+                return Err(Failure::usage(what, "give the private key's file a name with .pem"));
             }
             if !self.overwrite && public.exists() {
                 return Err(exists(&public));
@@ -270,7 +272,7 @@ impl Show {
             ("key-encryption key", kek.id(), None)
         } else {
             let why =
-                "is no key and no certificate; one with a password must be decrypted first (openssl pkey)";
+                "is neither a key nor a certificate; decrypt a key with a password first (openssl pkey)";
             return Err(Failure::file(path, why));
         };
         let public = public.map(|key| digits(&key.bytes()));
@@ -283,7 +285,7 @@ impl Show {
     }
 }
 
-/// A certificate for programs.
+/// The JSON value of a certificate.
 pub(super) fn certificate_value(certificate: wire::Certificate<'_>) -> serde_json::Value {
     json!({
         "role": role_name(certificate.role()),
@@ -307,7 +309,7 @@ pub(super) fn signing_key(path: &Path) -> Result<SigningKey, Failure> {
     SigningKey::from_pem(&text(path)?).map_err(|fault| Failure::file(path, &fault.to_string()))
 }
 
-/// The public key in a file; that of a private key does, too.
+/// The public key in a file. The file may also hold a private key.
 pub(super) fn public_key(path: &Path) -> Result<PublicKey, Failure> {
     let text = text(path)?;
     match SigningKey::from_pem(&text) {
@@ -323,23 +325,24 @@ pub(super) fn keks(paths: &[PathBuf]) -> Result<Vec<Kek>, Failure> {
     paths.iter().map(kek).collect()
 }
 
-/// The certificate in a file. What it says is judged where it is used.
+/// Reads a certificate. Its contents are checked where it is used.
 pub(super) fn certificate(path: &Path) -> Result<[u8; CERTIFICATE], Failure> {
     let bytes = bytes_of(path, MAX)?;
     let bytes = Some(bytes).filter(|bytes| bytes.starts_with(&CERTIFICATE_MAGIC));
-    let why = "is no certificate: coflash key certify makes one";
+    let why = "is not a certificate: coflash key certify makes one";
     bytes.and_then(|bytes| bytes.try_into().ok()).ok_or_else(|| Failure::file(path, why))
 }
 
-/// Writes what everybody may read.
+/// Writes a file that everyone may read.
 pub(super) fn write(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
     std::fs::write(path, bytes).map_err(|error| unwritable(path, &error))
 }
 
-/// Writes what its owner alone may read. A file that is there is replaced only if that is wanted.
+/// Writes a file that only its owner may read. Replaces an existing file only if `overwrite` is
+/// set.
 pub(super) fn write_secret(path: &Path, text: impl AsRef<[u8]>, overwrite: bool) -> Result<(), Failure> {
     if overwrite {
-        // A new file has the right mode; one that is there would keep its own.
+        // A new file gets the right mode; an existing one would keep its own mode.
         match std::fs::remove_file(path) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(unwritable(path, &error)),
             _ => {}
@@ -357,7 +360,7 @@ pub(super) fn write_secret(path: &Path, text: impl AsRef<[u8]>, overwrite: bool)
 }
 
 fn exists(path: &Path) -> Failure {
-    let what = format!("{} is there already", path.display());
+    let what = format!("{} exists already", path.display());
     Failure::usage(what, "name another file; --force replaces it, and the old key is gone then")
 }
 

@@ -1,5 +1,5 @@
-//! What the manual's download tools have and this one does otherwise (tables 9 and 11): accepted,
-//! so that a script works by changing the program's name.
+//! The options of the manual's download tools that this tool handles differently (tables 9 and 11).
+//! They are accepted, so that a script works after only the program's name was changed.
 
 use std::fmt::Write as _;
 
@@ -10,18 +10,18 @@ use super::context::Context;
 use super::output::Failure;
 use super::values::number;
 
-/// The options that mean nothing here, or something that is said otherwise.
+/// The options that have no effect here, or have another spelling.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Options of the manual's tools")]
 pub(super) struct Legacy {
     /// The bit rate as an index (0 is 1 Mbit/s, 2 is 500, 3 is 250, 4 is 125 kbit/s), for adapters
-    /// that set it; ? lists all of them.
+    /// that set the bit rate; ? lists all indices.
     #[arg(short = 'B', alias = "br_idx", long = "bit-rate-index", value_name = "0..8", value_parser = index,
           overrides_with = "baudrate")]
     index: Option<Index>,
 
-    /// The bit rate in kbit/s, for adapters that set it; with --vxd_type 16 that of the serial line
-    /// in bit/s.
+    /// The bit rate in kbit/s, for adapters that set it; with --vxd_type 16 the bit rate of the
+    /// serial line in bit/s.
     #[arg(long, alias = "baurate", value_name = "KBITS", value_parser = number, overrides_with = "index")]
     baudrate: Option<u32>,
 
@@ -29,23 +29,24 @@ pub(super) struct Legacy {
     #[arg(long = "chk_tgt", value_name = "VALUE", value_parser = number, hide = true)]
     chk_tgt: Option<u32>,
 
-    /// Give the device with this LSS address the node-ID of --node first: its serial number.
+    /// Give the device with this LSS address the node-ID of --node first: the serial number of the
+    /// address.
     #[arg(long = "ser_num", value_name = "NUMBER", value_parser = number)]
     serial: Option<u32>,
 
-    /// The same: its revision.
+    /// The revision of the LSS address.
     #[arg(long = "rev", value_name = "NUMBER", value_parser = number)]
     revision: Option<u32>,
 
-    /// The same: its product code.
+    /// The product code of the LSS address.
     #[arg(long = "pcode", value_name = "NUMBER", value_parser = number)]
     product: Option<u32>,
 
-    /// The same: its vendor-ID; 0x3F unless told otherwise.
+    /// The vendor-ID of the LSS address; by default 0x3F.
     #[arg(long = "vendor", value_name = "NUMBER", value_parser = number)]
     vendor: Option<u32>,
 
-    /// The PC's CAN interface, by the manual's number: ? lists them, with what --bus has for each.
+    /// The PC's CAN interface, by the manual's number: ? lists the numbers with the URL for --bus.
     #[arg(long = "vxd_type", value_name = "1..16", value_parser = interface)]
     vxd_type: Option<Interface>,
 
@@ -68,7 +69,7 @@ pub(super) struct Legacy {
 /// `--br_idx`.
 #[derive(Clone, Copy, Debug)]
 enum Index {
-    /// `?`: tell which there are.
+    /// `?`: list the indices.
     List,
     /// In bit/s.
     Rate(u32),
@@ -77,21 +78,21 @@ enum Index {
 /// `--vxd_type`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Interface {
-    /// `?`: tell which there are.
+    /// `?`: list the interfaces.
     List,
     /// Its number in table 12.
     Type(u32),
 }
 
-/// Table 13, by their index.
+/// Table 13, in the order of the indices.
 const KILOBITS: [u32; 9] = [1000, 800, 500, 250, 125, 100, 50, 20, 10];
 
 /// CAN over a serial line (table 12).
 const VIRTUAL_CAN: u32 = 16;
-/// The bit rate of that line: the manual's, and this tool's.
+/// The bit rate of that line in the manual and in this tool.
 const SERIAL_BIT_RATE: u32 = 115_200;
 
-/// Table 12, in short: the interface, and the URL that reaches it here.
+/// Table 12, shortened: the interface, and the URL for it in this tool.
 const INTERFACES: [(&str, &str); 16] = [
     ("pcNetCAN (ISA), PhyCAN driver", "none"),
     ("pcNetCAN (ISA), PCAN 1.x driver", "none"),
@@ -112,7 +113,7 @@ const INTERFACES: [(&str, &str); 16] = [
 ];
 
 impl Legacy {
-    /// What a question mark asks for; then nothing else is done.
+    /// The list that a question mark asks for. The command then does nothing else.
     pub(super) fn list(&self) -> Option<String> {
         let mut text = String::new();
         if self.vxd_type == Some(Interface::List) {
@@ -133,10 +134,10 @@ impl Legacy {
         (!text.is_empty()).then_some(text)
     }
 
-    /// Refuses what cannot be done, and tells what is passed over.
+    /// Refuses options that this tool cannot support, and warns about options that it ignores.
     pub(super) fn check(&self, context: &Context) -> Result<(), Failure> {
         if self.gateway_id.unwrap_or(0) != 0 || self.network_id.unwrap_or(0) != 0 {
-            let what = "an SDO gateway on the CAN bus (CiA 302-7) cannot be spoken to";
+            let what = "an SDO gateway on the CAN bus (CiA 302-7) is not supported";
             let advice = "connect the adapter to the device's own network and leave --gateway_id and --network_id out, \
                           or reach it through a gateway with CiA 309-3: --bus cia309://HOST:PORT/NET";
             return Err(Failure::usage(what, advice));
@@ -148,7 +149,7 @@ impl Legacy {
                 return Err(Failure::usage(what, format!("its bit rate is {SERIAL_BIT_RATE}")));
             }
             Some(rate) if !serial && !(1..=1000).contains(&rate) => {
-                let what = format!("{rate} kbit/s is no bit rate of a CAN bus");
+                let what = format!("{rate} kbit/s is not a bit rate of a CAN bus");
                 let advice = "bit rates are 1 to 1000 kbit/s; a serial line (--vxd_type 16) has 115200 bit/s";
                 return Err(Failure::usage(what, advice));
             }
@@ -164,13 +165,13 @@ impl Legacy {
             ("--ip_port", self.ip_port.is_some()),
         ] {
             if given {
-                context.out.warn(format_args!("{name} is passed over: the adapter is what --bus says"));
+                context.out.warn(format_args!("{name} is ignored: --bus names the adapter"));
             }
         }
         Ok(())
     }
 
-    /// The bus that these options name by themselves: CAN over the serial port of this number.
+    /// The URL that these options give without --bus: CAN over the serial port with this number.
     pub(super) fn bus(&self) -> Option<String> {
         let port = self.device_no.filter(|_| self.vxd_type == Some(Interface::Type(VIRTUAL_CAN)))?;
         Some(if cfg!(windows) {
@@ -181,7 +182,7 @@ impl Legacy {
         })
     }
 
-    /// The LSS address, if any part of it was given; the other parts have the manual's defaults
+    /// The LSS address, if the user gave any part of it; the other parts have the manual's defaults
     /// (table 9).
     pub(super) fn address(&self) -> Option<LssAddress> {
         let parts = [self.vendor, self.product, self.revision, self.serial];
@@ -193,12 +194,12 @@ impl Legacy {
         })
     }
 
-    /// Whether the old spelling of `--check-target` was given.
+    /// Whether the user gave the old spelling of `--check-target`.
     pub(super) fn check_target(&self) -> bool {
         self.chk_tgt.is_some_and(|value| value > 0)
     }
 
-    /// In bit/s. That of a serial line is no bit rate of a bus.
+    /// The bit rate in bit/s. The bit rate of a serial line is not a bit rate of the bus.
     pub(super) fn bit_rate(&self) -> Option<u32> {
         let of_bus = self.vxd_type != Some(Interface::Type(VIRTUAL_CAN));
         match (self.baudrate.filter(|_| of_bus), self.index) {

@@ -1,4 +1,4 @@
-//! `coflash lss`: node-ID and bit rate over the bus.
+//! `coflash lss`: sets node-ID and bit rate over the bus.
 
 use std::time::Duration;
 
@@ -15,7 +15,7 @@ use super::device::cancelled;
 use super::output::Failure;
 use super::values::{milliseconds, node_id, number};
 
-/// Layer setting services: node-ID and bit rate over the bus.
+/// Sets node-ID and bit rate over the bus by layer setting services (LSS).
 ///
 /// There must be no other LSS master on the bus.
 #[derive(Debug, Args)]
@@ -31,19 +31,19 @@ pub(super) struct Lss {
 
 #[derive(Debug, Subcommand)]
 enum Service {
-    /// Find devices without node-ID, and give them one if asked to.
+    /// Find devices without a node-ID, and give them one if --assign is given.
     Fastscan(Fastscan),
     /// Give a device a node-ID.
     Assign(Assign),
     /// Give a device a bit rate.
     BitRate(SetBitRate),
-    /// Have a device store its node-ID and bit rate.
+    /// Make a device store its node-ID and bit rate.
     Store(Store),
     /// Ask a device for its LSS address and node-ID.
     Inquire(Inquire),
 }
 
-/// Which device. Without any of these: the only one on the bus.
+/// The options that select a device. Without them the command addresses the only device on the bus.
 #[derive(Clone, Copy, Debug, Args)]
 struct Which {
     /// Its vendor-ID (1018h/1).
@@ -62,11 +62,11 @@ struct Which {
 
 #[derive(Debug, Args)]
 struct Fastscan {
-    /// Give the devices node-IDs, from this one on upwards, in the order in which they are found.
+    /// Give the devices node-IDs from this one upwards, in the order in which they are found.
     #[arg(long, value_parser = node_id, value_name = "1..127")]
     assign: Option<NodeId>,
 
-    /// Have them store it.
+    /// Make the devices store their node-IDs.
     #[arg(long, requires = "assign")]
     store: bool,
 }
@@ -77,16 +77,16 @@ struct Assign {
     #[arg(long, short = 'N', alias = "node_id", value_parser = node_id, value_name = "1..127", required_unless_present = "none")]
     node: Option<NodeId>,
 
-    /// Take the node-ID away.
+    /// Take the node-ID from the device.
     #[arg(long, conflicts_with = "node")]
     none: bool,
 
-    /// Have it stored.
+    /// Make the device store the node-ID.
     #[arg(long)]
     store: bool,
 
-    /// Reset the communication of a device that had another node-ID, so that the new one comes into
-    /// force at once.
+    /// Reset the communication of a device that had another node-ID, so that the new one takes
+    /// effect at once.
     #[arg(long)]
     reset: bool,
 
@@ -100,12 +100,12 @@ struct SetBitRate {
     #[arg(value_name = "KBITS", value_parser = bit_rate)]
     rate: BitRate,
 
-    /// Change over now, after so many milliseconds of silence; the adapter's own bit rate has to
-    /// follow.
+    /// Switch the bit rate now, after this many milliseconds of silence; afterwards set the
+    /// adapter's bit rate, too.
     #[arg(long, value_name = "MS", value_parser = milliseconds, num_args = 0..=1, default_missing_value = "500")]
     activate: Option<Duration>,
 
-    /// Have it stored.
+    /// Make the device store the bit rate.
     #[arg(long)]
     store: bool,
 
@@ -126,7 +126,7 @@ struct Inquire {
 }
 
 impl Which {
-    /// The address, where all of it was given (clap has seen to "all or nothing").
+    /// The address, if the user gave all of it (clap checks "all or nothing").
     fn address(self) -> Option<LssAddress> {
         Some(LssAddress {
             vendor_id: self.vendor?,
@@ -164,7 +164,7 @@ impl Lss {
                 }
                 Service::Inquire(inquire) => inquire.run(&mut master),
             };
-            // A device that was activated has fallen silent and is waiting already.
+            // A device that has switched its bit rate is silent and already in waiting state.
             let back = master.switch_all(false);
             let done = done?;
             back?;
@@ -189,11 +189,11 @@ impl Lss {
     }
 }
 
-/// What a service has to tell.
+/// The result of a service.
 struct Done {
     words: String,
     value: Value,
-    /// Whose communication is to be reset.
+    /// The node-ID of the device whose communication must be reset.
     reset: Option<NodeId>,
 }
 
@@ -225,14 +225,15 @@ impl Fastscan {
             context.out.detail(&line);
             words.push(line);
             devices.push(device);
-            // It takes its node-ID, and boots. One that gets none would be found again.
+            // In waiting state the device takes its node-ID and boots. A device without one would
+            // be found again.
             master.switch_all(false)?;
             if next.is_none() {
                 break;
             }
         }
         if words.is_empty() {
-            words.push("no device without node-ID".to_string());
+            words.push("no device without a node-ID".to_string());
         }
         Ok(Done { words: words.join("\n"), value: json!({ "devices": devices }), reset: None })
     }
@@ -252,10 +253,10 @@ impl Assign {
         };
         let reset = old.filter(|old| self.reset && Some(*old) != self.node);
         let when = match old {
-            Some(old) if self.node == Some(old) => ", as before".to_string(),
+            Some(old) if self.node == Some(old) => ", unchanged".to_string(),
             None => " from now on".to_string(),
             Some(_) if reset.is_some() => " from now on".to_string(),
-            Some(old) => format!(", in force after coflash reset --communication --node {old}"),
+            Some(old) => format!(", effective after coflash reset --communication --node {old}"),
         };
         let value = json!({ "node": self.node.map(NodeId::get), "old": old.map(NodeId::get) });
         Ok(Done { words: format!("{given}{when}"), value, reset })
@@ -273,10 +274,10 @@ impl SetBitRate {
         let when = match self.activate {
             Some(delay) => {
                 master.activate(delay)?;
-                format!("changes over after {} ms", delay.as_millis())
+                format!("switches to it after {} ms", delay.as_millis())
             }
-            None if self.store => "changes over with its next start".to_string(),
-            None => "was not told to change over".to_string(),
+            None if self.store => "switches to it at its next start".to_string(),
+            None => "does not switch to it yet".to_string(),
         };
         let words = format!("the device is given {} kbit/s and {when}", rate / 1000);
         Ok(Done {

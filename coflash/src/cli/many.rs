@@ -1,4 +1,4 @@
-//! What a person and a program see of the update of many devices.
+//! The output of an update of many devices, for people and for programs.
 
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
@@ -19,8 +19,7 @@ use super::record;
 
 const STYLE: &str = "{prefix:<9} {bar:30} {percent:>3} %  {rate:>12}  {msg}";
 
-/// A line of progress for each device: a bar on a terminal, and elsewhere lines with the node in
-/// front.
+/// Progress of each device: a bar on a terminal, and otherwise lines that begin with the node.
 pub(super) struct Board {
     out: Output,
     nodes: Vec<NodeId>,
@@ -30,9 +29,9 @@ pub(super) struct Board {
 
 enum Form {
     Terminal(Vec<ProgressBar>),
-    /// Tenths that were shown, for each device.
+    /// On a pipe or in a file: the tenths that were shown, for each device.
     Plain(Mutex<Vec<usize>>),
-    /// For programs.
+    /// The output for programs.
     Lines(Mutex<Vec<Lines>>),
 }
 
@@ -45,7 +44,7 @@ impl Board {
             let all = MultiProgress::with_draw_target(ProgressDrawTarget::stdout());
             let bar = |name: &String| {
                 let bar = all.add(ProgressBar::new(1)).with_prefix(name.clone());
-                // The template is a constant; should it ever be wrong, a bar in another style does.
+                // The template is a constant. If it were wrong, a bar in another style is shown.
                 if let Ok(style) = ProgressStyle::with_template(STYLE) {
                     bar.set_style(with_rate(style).progress_chars("=> "));
                 }
@@ -59,7 +58,7 @@ impl Board {
         Self { out, nodes: nodes.to_vec(), names, form }
     }
 
-    /// Shows what happens to a device.
+    /// Shows an event of a device.
     pub(super) fn show(&self, device: usize, event: Event) {
         let (Some(name), Some(node)) = (self.names.get(device), self.nodes.get(device)) else { return };
         record::event(*node, &event);
@@ -68,7 +67,7 @@ impl Board {
                 let mut lines = lines.lock().unwrap_or_else(PoisonError::into_inner);
                 lines[device].show(&event);
             }
-            // The summary tells it.
+            // The summary shows it.
             (_, Event::Done(_)) => {}
             (Form::Terminal(bars), Event::Progress { done, total }) => {
                 bars[device].set_length(total as u64);
@@ -78,9 +77,9 @@ impl Board {
             (Form::Terminal(bars), event) => bars[device].set_message(event.to_string()),
             (Form::Plain(tenths), Event::Progress { done, total }) => {
                 let now = (done * 10).checked_div(total).unwrap_or(10);
-                // Nobody panics while it is held; and if so, the number is still one.
+                // No thread panics while it holds the lock; and if one did, the number stays valid.
                 let mut tenths = tenths.lock().unwrap_or_else(PoisonError::into_inner);
-                // Many devices have many lines: every half does.
+                // Many devices give many lines, so a line for each half is enough.
                 if now / 5 > tenths[device] / 5 {
                     self.out.say(format_args!("{name}: {:>3} %", now * 10));
                 }
@@ -90,7 +89,7 @@ impl Board {
         }
     }
 
-    /// Leaves the bars as they stand.
+    /// Leaves the bars on the screen.
     pub(super) fn finish(&self) {
         if let Form::Terminal(bars) = &self.form {
             bars.iter().filter(|bar| !bar.is_finished()).for_each(ProgressBar::abandon);
@@ -98,10 +97,10 @@ impl Board {
     }
 }
 
-/// How it went with one device.
+/// The result for one device.
 pub(super) struct Outcome {
     pub(super) node: Option<NodeId>,
-    /// The device as the job names it.
+    /// The device's name in the job.
     pub(super) name: String,
     pub(super) image: String,
     pub(super) result: Result<Report, Failure>,
@@ -121,8 +120,7 @@ impl Outcome {
     }
 }
 
-/// What the bus says while devices of several are silent: it is listened to once for all of them, as
-/// for one alone.
+/// Observes the bus once for all devices that are silent, as for a single device.
 pub(super) fn diagnose_silence(
     session: &mut Session<'_>,
     results: &[Result<Report, Failed>],
@@ -132,11 +130,11 @@ pub(super) fn diagnose_silence(
     if !session.hears_the_bus() || !results.iter().any(silent) {
         return None;
     }
-    // The first reason stands, should the bus be gone.
+    // If the bus has failed, the first error remains the reason.
     diagnose(session).ok()
 }
 
-/// Tells the summary, and gives what the command comes to.
+/// Shows the summary and returns the result of the command.
 pub(super) fn summary(out: Output, outcomes: &[Outcome], report: Option<&Path>) -> Result<(), Failure> {
     let failed = outcomes.iter().filter(|outcome| outcome.result.is_err()).count();
     let document = document(outcomes);
@@ -165,14 +163,14 @@ pub(super) fn summary(out: Output, outcomes: &[Outcome], report: Option<&Path>) 
     }
 }
 
-/// What came of all devices, for programs.
+/// The results of all devices, as JSON.
 pub(super) fn document(outcomes: &[Outcome]) -> Value {
     let failed = outcomes.iter().filter(|outcome| outcome.result.is_err()).count();
     let devices: Vec<Value> = outcomes.iter().map(outcome_value).collect();
     json!({ "command": "flash", "devices": devices, "failed": failed })
 }
 
-/// Writes it to a file.
+/// Writes the JSON document to a file.
 pub(super) fn write_report(path: &Path, document: &Value) -> Result<(), Failure> {
     std::fs::write(path, format!("{document:#}\n"))
         .map_err(|error| Failure::system(format!("{}: cannot be written: {error}", path.display())))

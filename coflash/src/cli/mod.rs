@@ -1,4 +1,4 @@
-//! The commands, one file each, and what they share.
+//! The commands, one file for each, and the code that they share.
 
 use std::ffi::OsString;
 use std::path::PathBuf;
@@ -56,48 +56,50 @@ mod waiting;
 mod words;
 mod write;
 
-/// Converts firmware and flashes it over CANopen.
+/// Converts firmware and downloads it over CANopen.
 #[derive(Debug, Parser)]
 #[command(name = "coflash", version, max_term_width = 100)]
 struct Cli {
-    /// The CAN bus: socketcan:INTERFACE (on Linux), slcan:PORT@BITRATE, slcan:tcp://HOST:PORT@BITRATE,
-    /// peak:CHANNEL@BITRATE, kvaser:NUMBER@BITRATE, gs_usb:NUMBER@BITRATE or socketcand://HOST:PORT/BUS;
-    /// or a gateway to it: cia309://HOST:PORT/NET. Without it the only adapter is taken.
+    /// The CAN bus: socketcan:INTERFACE (on Linux), slcan:PORT@BITRATE,
+    /// slcan:tcp://HOST:PORT@BITRATE, peak:CHANNEL@BITRATE, kvaser:NUMBER@BITRATE,
+    /// gs_usb:NUMBER@BITRATE or socketcand://HOST:PORT/BUS; or a gateway to it:
+    /// cia309://HOST:PORT/NET. The default is the only adapter of this computer.
     #[arg(long, global = true, help_heading = GLOBAL, env = "COFLASH_BUS", value_name = "URL")]
     bus: Option<String>,
 
-    /// Which kinds of adapters are looked for, by the command adapters and where no --bus is given:
-    /// serial, socketcan, peak, kvaser, gs_usb, socketcand (with commas between), or none.
+    /// The kinds of adapters to search for, with the command adapters and if no --bus is given:
+    /// serial, socketcan, peak, kvaser, gs_usb, socketcand (separated by commas), or none.
     #[arg(long, global = true, help_heading = GLOBAL, env = "COFLASH_SEARCH", value_name = "KINDS",
           value_parser = Kinds::parse)]
     search: Option<Kinds>,
 
-    /// A file with defaults for options; otherwise coflash.toml in the current folder, or the
-    /// user's own.
+    /// A file with defaults for options; by default coflash.toml in the current folder, or the
+    /// user's own file.
     #[arg(long, global = true, help_heading = GLOBAL, env = "COFLASH_CONFIG", value_name = "FILE")]
     config: Option<PathBuf>,
 
-    /// Write all frames to this file, as candump -L does; monitor --replay shows it in words.
+    /// Write all frames to this file in the format of candump -L; monitor --replay shows it in
+    /// words.
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "FILE")]
     trace: Option<PathBuf>,
 
-    /// Write everything that happens to this file, with the time: events, words, frames. No
-    /// passwords are in it.
+    /// Write everything that happens to this file, with time stamps: events, messages and frames,
+    /// but no passwords.
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "FILE")]
     log_file: Option<PathBuf>,
 
-    /// Make a folder in this one for what service sends back: versions, command line, events, log,
-    /// trace. No passwords are in it.
+    /// Create a folder in this folder with everything that a service department needs: versions,
+    /// command line, events, log and trace, but no passwords.
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "FOLDER")]
     report_dir: Option<PathBuf>,
 
-    /// SDO requests go to this COB-ID and the node-ID on top, for devices that do not listen on 0x600
-    /// (BLCOP_BASE_REQUEST of the manual).
+    /// The base COB-ID of SDO requests, to which the node-ID is added, for devices that do not
+    /// listen on 0x600 (BLCOP_BASE_REQUEST of the manual).
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "COB-ID", value_parser = base_id)]
     sdo_request: Option<u16>,
 
-    /// SDO answers come from this COB-ID and the node-ID on top, and not from 0x580
-    /// (BLCOP_BASE_RESPONSE).
+    /// The base COB-ID of SDO answers, to which the node-ID is added, in place of 0x580
+    /// (BLCOP_BASE_RESPONSE of the manual).
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "COB-ID", value_parser = base_id)]
     sdo_response: Option<u16>,
 
@@ -146,7 +148,7 @@ enum Command {
 }
 
 impl Command {
-    /// Whether it may talk to a bus.
+    /// Whether the command may use a bus.
     fn takes_a_bus(&self) -> bool {
         !matches!(
             self,
@@ -219,12 +221,12 @@ impl Cli {
     }
 }
 
-/// The commands and their options, their help in order.
+/// The commands and their options, with the help arranged.
 fn commands() -> clap::Command {
     help::in_order(Cli::command())
 }
 
-/// Runs the command that the user gave.
+/// Runs the command of the user.
 pub fn main() -> ExitCode {
     let (name, cli) = match command_line() {
         Ok(read) => read,
@@ -254,21 +256,21 @@ pub fn main() -> ExitCode {
     }
 }
 
-/// What the command line says about output, as far as it can be read.
+/// The options for output, as far as the command line can be read.
 fn early_output() -> Output {
     let matches = commands().ignore_errors(true).get_matches_from(words());
     Output::from_arg_matches(&matches).unwrap_or_default().or(Output::of_words())
 }
 
-/// The words of the command line, in the order in which they are read.
+/// The words of the command line, in the order for the parser.
 fn words() -> Vec<OsString> {
     words::ordered(std::env::args_os().collect(), &commands())
 }
 
-/// Reads the command line and the command's name, with defaults from the configuration file. Help and wrong usage end the
-/// program here.
+/// Parses the command line and the command's name, with defaults from the configuration file. Help
+/// and wrong usage end the program here.
 fn command_line() -> Result<(String, Cli), Failure> {
-    // The file has to be known before the command line can be read in earnest.
+    // The name of the file must be known before the command line can be parsed completely.
     let first = commands().ignore_errors(true).get_matches_from(words());
     let named = first.get_one::<PathBuf>("config").cloned();
     let matches = configured(named, &first)?.try_get_matches_from(words());
@@ -283,7 +285,8 @@ fn command_line() -> Result<(String, Cli), Failure> {
             }
             out.exit(&failure)
         }
-        // Help goes to standard output and is no error; both have their colours.
+        // clap prints help to standard output and treats it as success; errors and help have their
+        // own colours.
         let _ = error.print();
         std::process::exit(0)
     });
@@ -303,21 +306,21 @@ fn shell_line(context: &Context, words: Vec<String>) -> Result<(), Failure> {
     let cli = match read {
         Ok(cli) => cli,
         Err(error) if !error.use_stderr() => {
-            // Help that was asked for.
+            // The user asked for help.
             context.out.say(error.to_string().trim_end());
             return Ok(());
         }
         Err(error) => return Err(Failure::bare_usage(error.to_string())),
     };
     if matches!(cli.command, Command::Shell(_)) {
-        return Err(Failure::usage("this is the shell already", "leave the word shell out"));
+        return Err(Failure::usage("this is already the shell", "leave the word shell out"));
     }
     if cli.log_file.is_some() || cli.report_dir.is_some() {
         let advice = "start the shell with them: coflash shell --log-file FILE";
-        return Err(Failure::usage("--log-file and --report-dir are for the shell as a whole", advice));
+        return Err(Failure::usage("--log-file and --report-dir apply only to the shell as a whole", advice));
     }
     let line = cli.context();
-    // What the line does not say, the shell's own command line does.
+    // Options that the line does not contain come from the shell's own command line.
     let line = Context {
         bus: line.bus.or_else(|| context.bus.clone()),
         search: line.search.or_else(|| context.search.clone()),
@@ -353,13 +356,13 @@ mod tests {
         commands().debug_assert();
     }
 
-    /// Every call of this tool on every page, for the command line's own reader.
+    /// Every call of this tool on every page is parsed by the command line's own reader.
     #[test]
     fn what_the_pages_show_is_understood() {
         let mut count = 0;
         for shown in pages::commands() {
             let Some(words) = pages::call_of(&shown.words, "coflash") else { continue };
-            // What stands for something is something.
+            // A placeholder is replaced by a value.
             let of = |word: &String| if word == "BOARD" { "stm32f407g-disc1" } else { word }.to_string();
             let words = std::iter::once("coflash".to_string()).chain(words.iter().map(of));
             let words: Vec<String> = words.filter(|word| word != "COMMAND").collect();

@@ -1,4 +1,4 @@
-//! `coflash monitor`: the bus in words.
+//! `coflash monitor`: shows the bus in words.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader};
@@ -17,24 +17,24 @@ use super::device::cancelled;
 use super::output::Failure;
 use super::values::{milliseconds, nodes};
 
-/// Shows what goes over the bus, in words.
+/// Shows the frames on the bus in words.
 ///
-/// That is SDO, NMT, EMCY, heartbeat, LSS. Ctrl-C ends it.
+/// It explains SDO, NMT, EMCY, heartbeat and LSS. Ctrl-C ends it.
 #[derive(Debug, Args)]
 pub(super) struct Monitor {
     /// Show a log of candump -L or --trace instead of the bus.
     #[arg(long, value_name = "FILE")]
     replay: Option<PathBuf>,
 
-    /// Show these nodes' frames alone (and those to all nodes), like 1,5,9-12.
+    /// Show only the frames of these nodes (and those to all nodes), like 1,5,9-12.
     #[arg(long, short = 'N', alias = "node", value_parser = nodes, value_name = "NODES")]
     nodes: Option<Vec<Vec<NodeId>>>,
 
-    /// End after so many frames.
+    /// End after this many frames.
     #[arg(long, value_name = "FRAMES")]
     count: Option<u64>,
 
-    /// End after so many milliseconds.
+    /// End after this many milliseconds.
     #[arg(long = "for", value_name = "MS", value_parser = milliseconds)]
     time: Option<Duration>,
 }
@@ -88,13 +88,13 @@ struct Show<'c> {
     monitor: &'c Monitor,
     context: &'c Context,
     decoder: Decoder,
-    /// How many frames are yet to be shown.
+    /// How many frames remain to be shown.
     left: u64,
 }
 
 impl Show<'_> {
     fn frame(&mut self, time: Duration, frame: &Frame) {
-        // The decoder sees all frames: what it shows may begin with one that is not shown.
+        // The decoder must see all frames: a transfer may begin with a frame that is not shown.
         let words = self.decoder.decode(frame);
         if let (Some(nodes), Some(id)) = (&self.monitor.nodes, frame.cob_id()) {
             let node = NodeId::new((id.get() & 0x7F) as u8).filter(|_| (0x080..0x780).contains(&id.get()));

@@ -1,4 +1,4 @@
-//! `coflash nmt`: a command of network management.
+//! `coflash nmt`: sends a command of network management.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -16,41 +16,41 @@ use super::device::cancelled;
 use super::output::Failure;
 use super::values::{milliseconds, node_id};
 
-/// Network management: starts, stops or resets a node, or all.
+/// Starts, stops or resets one node or all nodes by network management (NMT).
 ///
-/// No device answers to NMT. What its heartbeat or its boot-up message says afterwards is told; a
-/// reset device that does not come back is an error.
+/// No device answers to NMT. The command therefore reports the heartbeat or the boot-up message
+/// that follows; a device that does not come back after a reset is an error.
 #[derive(Debug, Args)]
 pub(super) struct Nmt {
-    /// What to do.
+    /// The command.
     #[arg(value_enum, value_name = "COMMAND")]
     command: Service,
 
-    /// The device's node-ID, or all of them.
+    /// The device's node-ID, or all.
     #[arg(long, short = 'N', alias = "node_id", default_value = "1", value_parser = addressed, value_name = "1..127|all")]
     node: Addressed,
 
-    /// How long to wait for boot-up messages, in milliseconds; a reset ends with the one that is
-    /// waited for.
+    /// How long to wait for boot-up messages, in milliseconds; the wait for a single device ends
+    /// with its message.
     #[arg(long, default_value = "2000", value_parser = milliseconds, value_name = "MS")]
     boot_timeout: Duration,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Service {
-    /// Go operational: SDO and PDO are served.
+    /// Enter operational state: SDO and PDO work.
     Start,
-    /// Go stopped: neither SDO nor PDO is served.
+    /// Enter stopped state: neither SDO nor PDO works.
     Stop,
-    /// Go pre-operational: SDO is served, PDO is not.
+    /// Enter pre-operational state: SDO works, PDO does not.
     PreOperational,
     /// Restart the device.
     Reset,
-    /// Restart the communication alone: a new node-ID comes into force.
+    /// Restart only the communication: a new node-ID takes effect.
     ResetCommunication,
 }
 
-/// Whom an NMT command addresses.
+/// The nodes that an NMT command addresses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Addressed {
     One(NodeId),
@@ -75,7 +75,7 @@ impl Service {
         }
     }
 
-    /// The state that a heartbeat has to tell when the command was carried out.
+    /// The state in the heartbeat of a node that has carried out the command.
     fn leads_to(self) -> NmtState {
         match self {
             Self::Start => NmtState::Operational,
@@ -96,7 +96,7 @@ impl Nmt {
         let reset = target == NmtState::Initialisation;
         let mut adapter = context.open()?;
         adapter.send(&self.command.command().emit(node))?;
-        // Heartbeats come once a second in most networks.
+        // In most networks, heartbeats come once a second.
         let time = if reset { self.boot_timeout } else { LISTEN };
         let mut told: BTreeMap<NodeId, NmtState> = BTreeMap::new();
         let what = if reset { "a boot-up message comes" } else { "a heartbeat comes" };
@@ -128,14 +128,14 @@ impl Nmt {
         let one = |(node, state): (&NodeId, &NmtState)| match reset {
             true => format!("node {node}"),
             false if *state == self.command.leads_to() => format!("node {node} is {}", state_words(*state)),
-            false => format!("node {node} has not obeyed and is {}", state_words(*state)),
+            false => format!("node {node} has not carried out the command and is {}", state_words(*state)),
         };
         let list = told.iter().map(one).collect::<Vec<_>>().join(", ");
         match (reset, list.is_empty()) {
-            (true, true) => format!("{whom}: sent; nobody has sent a boot-up message"),
+            (true, true) => format!("{whom}: command sent; no node has sent a boot-up message"),
             (true, false) => format!("back on the bus: {list}"),
-            (false, true) => format!("{whom}: sent; no heartbeat has said what came of it"),
-            (false, false) => format!("{whom}: sent; {list}"),
+            (false, true) => format!("{whom}: command sent; no heartbeat has shown its effect"),
+            (false, false) => format!("{whom}: command sent; {list}"),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Which objects: by index and sub-index, or by the names of an EDS.
+//! The options that name objects, by index and sub-index or by the names of an EDS.
 
 use std::fmt;
 use std::io::Read as _;
@@ -13,30 +13,30 @@ use serde_json::{json, Value};
 use super::output::Failure;
 use super::values::{address, number};
 
-/// Where names of objects come from.
+/// The source of objects' names.
 #[derive(Debug, Args)]
 pub(super) struct Names {
-    /// The device's electronic data sheet: objects may be named as it names them ("Program
-    /// control/1"), and have the types that it says.
+    /// The device's electronic data sheet: objects may be named as in the sheet ("Program
+    /// control/1"), and have the data types of the sheet.
     #[arg(long, value_name = "FILE", env = "COFLASH_EDS")]
     eds: Option<PathBuf>,
 }
 
-/// An object, and what is known of it.
+/// An object, with its entry in the EDS if there is one.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Object {
     pub(super) at: Address,
     pub(super) entry: Option<Entry>,
 }
 
-/// The most bytes of a list of objects.
+/// The most bytes of a file with a list of objects.
 const LIST_MAX: u64 = 1024 * 1024;
 
 /// The objects that a file lists.
 pub(super) fn list(path: &Path) -> Result<Vec<String>, Failure> {
     let bytes = bytes_of(path, LIST_MAX)?;
     let text = String::from_utf8_lossy(&bytes);
-    // A name may have a number sign in it, but not behind a blank.
+    // A number sign may be part of a name, but a blank and a number sign begin a comment.
     let object = |line: &str| {
         let end = line
             .match_indices('#')
@@ -52,19 +52,19 @@ pub(super) fn list(path: &Path) -> Result<Vec<String>, Failure> {
     Ok(objects)
 }
 
-/// A file of this many bytes at most; devices and pipes may have no end.
+/// Reads a file of at most `max` bytes; devices and pipes may never end.
 pub(super) fn bytes_of(path: &Path, max: u64) -> Result<Vec<u8>, Failure> {
     let mut bytes = Vec::new();
     let read = std::fs::File::open(path).and_then(|file| file.take(max + 1).read_to_end(&mut bytes));
     read.map_err(|error| Failure::unreadable(path, &error))?;
     if bytes.len() as u64 > max {
-        return Err(Failure::file(path, &format!("it has more than {max} bytes, which is too much")));
+        return Err(Failure::file(path, &format!("it has more than {max} bytes, the limit for this file")));
     }
     Ok(bytes)
 }
 
 impl Names {
-    /// The objects that are meant.
+    /// The objects that the user named.
     pub(super) fn objects(&self, words: &[String]) -> Result<Vec<Object>, Failure> {
         let eds = match &self.eds {
             Some(path) => {
@@ -82,7 +82,7 @@ impl Names {
         Ok(objects)
     }
 
-    /// The one object that is meant.
+    /// The single object that the user named.
     pub(super) fn object(&self, word: &str) -> Result<Object, Failure> {
         let several = || Failure::usage(format!("'{word}' is more than one object"), "name one: 1018/4");
         let mut objects = self.objects(&[word.to_string()])?;
@@ -94,12 +94,12 @@ impl Names {
 }
 
 impl Object {
-    /// Its data type, where that is known.
+    /// Its data type, if it is known.
     pub(super) fn kind(&self) -> Option<DataType> {
         self.entry.as_ref()?.kind
     }
 
-    /// For programs.
+    /// The JSON value.
     pub(super) fn value(&self) -> Value {
         let name = self.entry.as_ref().map(Entry::path);
         json!({ "index": self.at.index, "sub": self.at.sub, "name": name })
@@ -116,7 +116,7 @@ impl fmt::Display for Object {
     }
 }
 
-/// `1018/1..4` is four objects.
+/// Expands a range: `1018/1..4` is four objects.
 fn spread(word: &str) -> Result<Vec<String>, Failure> {
     let range = word.rsplit_once('/').and_then(|(head, subs)| Some((head, subs.split_once("..")?)));
     let Some((head, (first, last))) = range else { return Ok(vec![word.to_string()]) };
@@ -127,7 +127,7 @@ fn spread(word: &str) -> Result<Vec<String>, Failure> {
         }
         _ => {
             let advice = "a range of sub-indices goes from the lower to the higher one, like 1018/1..4";
-            Err(Failure::usage(format!("'{word}' is no range"), advice))
+            Err(Failure::usage(format!("'{word}' is not a range"), advice))
         }
     }
 }
@@ -147,7 +147,7 @@ fn resolve(word: &str, eds: Option<&Eds>) -> Result<Object, Failure> {
         (None, None) => {
             let advice =
                 "an object is a hexadecimal index and a sub-index, like 1018/4; names need --eds FILE";
-            Err(Failure::usage(format!("'{word}' is no object"), advice))
+            Err(Failure::usage(format!("'{word}' is not an object"), advice))
         }
     }
 }

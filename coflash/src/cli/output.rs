@@ -1,4 +1,4 @@
-//! What a command says: words for people, one JSON document for programs, and how it ends.
+//! The output of a command: words for people, one JSON document for programs, and the exit code.
 
 use std::fmt;
 use std::io::{self, IsTerminal, Write as _};
@@ -21,38 +21,38 @@ use serde_json::{json, Value};
 
 use super::record;
 
-/// Under this the options that all commands have are listed.
+/// The heading of the options that all commands have.
 pub(super) const GLOBAL: &str = "For all commands";
 
-/// How much is said, and in which form. For all commands.
+/// The options for the amount and the form of the output, for all commands.
 #[derive(Clone, Copy, Debug, Default, Args)]
 pub(super) struct Output {
-    /// Write one JSON document to standard output in place of words for people.
+    /// Write one JSON document to standard output in place of words.
     #[arg(long, global = true, help_heading = GLOBAL)]
     json: bool,
 
-    /// Write what happens to standard output as it happens, one JSON object a line: found, phase,
+    /// Write events to standard output as they happen, one JSON object on each line: found, phase,
     /// progress, retry, done; then the result, or the error.
     #[arg(long, global = true, help_heading = GLOBAL, conflicts_with = "json")]
     json_events: bool,
 
-    /// Say nothing unless something goes wrong.
+    /// Print nothing unless there is an error.
     #[arg(long, short, global = true, help_heading = GLOBAL, conflicts_with = "verbose")]
     quiet: bool,
 
-    /// Say more: what is waited for, and what was chosen where the command line did not say it.
+    /// Print more: what the tool waits for, and what it has chosen by itself.
     #[arg(long, short, global = true, help_heading = GLOBAL)]
     verbose: bool,
 
-    /// End with the error numbers of the manual's tools (0x60000013 and so on) in place of the exit
-    /// codes below; of these numbers Unix keeps the last two digits.
+    /// Exit with the error numbers of the manual's tools (0x60000013 and so on) in place of the
+    /// exit codes below; Unix keeps only the last two digits of these numbers.
     #[arg(long, global = true, help_heading = GLOBAL, env = "COFLASH_LEGACY_EXIT_CODES",
           value_parser = clap::builder::FalseyValueParser::new())]
     legacy_exit_codes: bool,
 }
 
 impl Output {
-    /// What either of two says.
+    /// Combines the options of two sources.
     pub(super) fn or(self, other: Self) -> Self {
         let Self { json, json_events, quiet, verbose, legacy_exit_codes } = other;
         Self {
@@ -64,7 +64,7 @@ impl Output {
         }
     }
 
-    /// What the plain words of the command line say, where it cannot be read as a whole.
+    /// The output options among the words of a command line that cannot be parsed as a whole.
     pub(super) fn of_words() -> Self {
         let set = std::env::var("COFLASH_LEGACY_EXIT_CODES").unwrap_or_default().to_lowercase();
         let falsey = matches!(set.as_str(), "" | "0" | "n" | "no" | "f" | "false" | "off");
@@ -78,7 +78,7 @@ impl Output {
         }
     }
 
-    /// The code that the program ends with for a failure.
+    /// The program's exit code for a failure.
     pub(super) fn code(self, failure: &Failure) -> u32 {
         if self.legacy_exit_codes {
             failure.legacy
@@ -87,40 +87,39 @@ impl Output {
         }
     }
 
-    /// Ends the program for a failure.
+    /// Ends the program with a failure.
     pub(super) fn exit(self, failure: &Failure) -> ! {
         let code = self.code(failure);
         // All numbers are below 2^31.
         std::process::exit(code as i32)
     }
 
-    /// Whether people read along.
+    /// Whether the output is for people.
     pub(super) fn for_people(self) -> bool {
         !self.for_programs() && !self.quiet
     }
 
-    /// Whether a program reads along, and people do not.
+    /// Whether the output is for programs alone.
     pub(super) fn for_programs(self) -> bool {
         self.json || self.json_events
     }
 
-    /// Whether a program is told what happens.
+    /// Whether programs get events.
     pub(super) fn shows_events(self) -> bool {
         self.json_events
     }
 
-    /// Whether a person may want to know what is waited for; that goes to standard error.
+    /// Whether to show what the tool waits for; this goes to standard error.
     pub(super) fn shows_waiting(self) -> bool {
         self.for_people() && io::stderr().is_terminal()
     }
 
-    /// Whether a bar that moves makes sense.
+    /// Whether a progress bar is useful.
     pub(super) fn on_terminal(self) -> bool {
         self.for_people() && io::stdout().is_terminal()
     }
 
-    /// Says something to people. A reader that has gone away (`| head`) is no reason to stop an
-    /// update.
+    /// Prints a message for people. A closed standard output (`| head`) does not stop an update.
     pub(super) fn say(self, words: impl fmt::Display) {
         record::note("said", &words.to_string());
         if self.for_people() {
@@ -128,14 +127,14 @@ impl Output {
         }
     }
 
-    /// Says on standard error what people should know and programs need not.
+    /// Prints a message on standard error that people need and programs do not.
     pub(super) fn note(self, words: impl fmt::Display) {
         if self.for_people() {
             let _ = writeln!(io::stderr(), "{words}");
         }
     }
 
-    /// Says something to people who asked for more.
+    /// Prints a message for people who asked for more output.
     pub(super) fn detail(self, words: impl fmt::Display) {
         record::note("detail", &words.to_string());
         if self.verbose {
@@ -143,7 +142,7 @@ impl Output {
         }
     }
 
-    /// The result of a command: words for people, the value for programs.
+    /// Prints the result of a command: words for people, the value for programs.
     pub(super) fn result(self, words: impl fmt::Display, value: impl FnOnce() -> Value) {
         let text = words.to_string();
         record::note("result", &text);
@@ -155,13 +154,13 @@ impl Output {
         }
     }
 
-    /// What a command came to, as one JSON document in one line.
+    /// Prints the result of a command as one JSON document in one line.
     pub(super) fn value(self, value: &Value) {
         record::result(value);
         self.document("result", value);
     }
 
-    /// Something that happens, for programs.
+    /// Prints an event for programs.
     pub(super) fn event(self, line: &Value) {
         if self.json_events {
             let _ = writeln!(io::stdout(), "{line}");
@@ -180,8 +179,8 @@ impl Output {
         }
     }
 
-    /// A line of an endless list: words for people, a value for programs. Tells whether anybody
-    /// still reads.
+    /// Prints a line of an endless list: words for people, a value for programs. Returns whether
+    /// standard output is still open.
     pub(super) fn listed(self, words: impl fmt::Display, value: impl FnOnce() -> Value) -> bool {
         if self.for_programs() {
             writeln!(io::stdout(), "{}", value()).is_ok()
@@ -190,13 +189,14 @@ impl Output {
         }
     }
 
-    /// Something that people should know although the command goes on. Never on standard output.
+    /// Prints a warning: the command continues, but people should know about it. Never uses
+    /// standard output.
     pub(super) fn warn(self, words: impl fmt::Display) {
         record::note("warning", &words.to_string());
         let _ = writeln!(io::stderr(), "{} {words}", paint("warning:", "33"));
     }
 
-    /// A failure, as the last thing that a command says.
+    /// Prints a failure, the last message of a command.
     pub(super) fn failure(self, failure: &Failure) {
         record::note("error", failure.to_string().trim_end());
         if self.for_programs() {
@@ -209,7 +209,7 @@ impl Output {
     }
 }
 
-/// Colours a word on standard error, if that is a terminal and nobody objects
+/// Colours a word on standard error, if that is a terminal and the user allows colours
 /// (<https://no-color.org>).
 fn paint(word: &str, colour: &str) -> String {
     let objected = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
@@ -220,7 +220,7 @@ fn paint(word: &str, colour: &str) -> String {
     }
 }
 
-/// The exit codes, as every `--help` tells them.
+/// The exit codes, for the end of each `--help`.
 pub(super) const EXIT_CODES: &str = "\
 Exit codes:
   0    done
@@ -249,11 +249,12 @@ pub(super) enum Exit {
     Cancelled = 130,
 }
 
-/// EIO: what the system refuses has its own number where it is known, and this one elsewhere.
+/// EIO: an error of the operating system has its own number if this is known, and this number
+/// otherwise.
 const INPUT_OUTPUT: u32 = 5;
 
 impl Exit {
-    /// The number that a tool of the manual ends with, where the failure itself has none.
+    /// The exit code of the manual's tools, if the failure itself has no number.
     const fn legacy(self) -> u32 {
         match self {
             Self::System => INPUT_OUTPUT,
@@ -265,36 +266,37 @@ impl Exit {
     }
 }
 
-/// Why a command failed: what happened, what to do, and how it ends.
+/// Why a command failed: what happened, what to do, and the exit code.
 #[derive(Debug)]
 pub(super) struct Failure {
     pub(super) exit: Exit,
-    /// The stable number, where there is one.
+    /// The stable error number, if there is one.
     number: Option<u32>,
-    /// What a tool of the manual ends with.
+    /// The exit code of the manual's tools.
     pub(super) legacy: u32,
     what: String,
-    /// In what state the device is left, where that is known.
+    /// The state of the device after the failure, if it is known.
     left: Option<Left>,
     advice: Option<String>,
-    /// Whether the document on standard output has it already.
+    /// Whether the document on standard output already contains the failure.
     told: bool,
 }
 
 impl Failure {
-    /// A conversation that failed. Where the device is silent, the bus is listened to for the
+    /// An error of a conversation. If the device is silent, the tool observes the bus to find the
     /// reason.
     pub(super) fn diagnosed(error: Error, session: &mut Session<'_>) -> Self {
         let silent = matches!(error, Error::NoAnswer { .. }) && session.hears_the_bus();
         let failure = Self::from(error);
         match silent.then(|| diagnose(session)) {
             Some(Ok(diagnosis)) => Self { advice: Some(diagnosis.to_string()), ..failure },
-            // The first reason stands.
+            // The first error remains the reason.
             Some(Err(_)) | None => failure,
         }
     }
 
-    /// A conversation of several that failed: where the device was silent, this is why.
+    /// An error of one of several conversations. If the device was silent, `diagnosis` gives the
+    /// reason.
     pub(super) fn diagnosed_by(error: Error, diagnosis: Option<&Diagnosis>, node: NodeId) -> Self {
         let silent = matches!(error, Error::NoAnswer { .. });
         let failure = Self::from(error);
@@ -307,27 +309,27 @@ impl Failure {
         }
     }
 
-    /// Devices of several have failed, and the summary has told why; the manual's tools, which know
-    /// one device, would have ended with `legacy` for the first of them.
+    /// Several devices have failed, and the summary has shown the reasons. `legacy` is the exit
+    /// code of the manual's tools, which handle one device, for the first failed device.
     pub(super) fn told(exit: Exit, legacy: u32, failed: usize, of: usize) -> Self {
         let what = format!("{failed} of {of} devices failed");
         Self { told: true, legacy, ..Self::new(exit, None, what, None) }
     }
 
-    /// A device that differs from a file in so many things, each of which was told.
+    /// A device that differs from a file in `count` properties; each one was shown.
     pub(super) fn differs(node: NodeId, count: usize) -> Self {
         let what = match count {
-            1 => format!("node {node} differs from the file in one thing"),
-            count => format!("node {node} differs from the file in {count} things"),
+            1 => format!("node {node} differs from the file in one property"),
+            count => format!("node {node} differs from the file in {count} properties"),
         };
         let advice =
-            "flash the file, or look for the one that the device was made with; coflash events tells \
+            "flash the file, or find the file that the device was programmed with; coflash events shows \
                       what was installed";
         Self { told: true, ..Self::new(Exit::File, None, what, Some(advice.to_string())) }
     }
 
-    /// Objects of several that the device refused, each of which was told; it ends as the first of
-    /// them would have.
+    /// The device refused some of several objects; each refusal was shown. The exit code is that of
+    /// the first refusal.
     pub(super) fn unread(first: &Self, failed: usize, of: usize) -> Self {
         let what = format!("{failed} of {of} objects could not be read");
         Self { told: true, legacy: first.legacy, ..Self::new(first.exit, None, what, None) }
@@ -338,7 +340,7 @@ impl Failure {
         Self { exit, number, legacy, what, left: None, advice, told: false }
     }
 
-    /// What the command line's reader objects to.
+    /// An error of the command line's parser.
     pub(super) fn unreadable_line(error: &clap::Error) -> Self {
         let of_node = error.get(ContextKind::InvalidArg).is_some_and(|name| {
             let ContextValue::String(name) = name else { return false };
@@ -349,12 +351,12 @@ impl Failure {
         Self { legacy, ..Self::bare_usage(error.render().to_string()) }
     }
 
-    /// A fault in a job file.
+    /// An error in a job file.
     pub(super) fn job(path: &Path, fault: &Fault) -> Self {
         Self::new(Exit::File, None, format!("{}, {fault}", path.display()), None)
     }
 
-    /// The same, with the state in which the device is left.
+    /// The same failure, with the state of the device.
     pub(super) fn leaving(self, left: Option<Left>) -> Self {
         Self { left, ..self }
     }
@@ -363,7 +365,7 @@ impl Failure {
         Self::new(Exit::Usage, None, what.into(), Some(advice.into()))
     }
 
-    /// Words of the command line's reader, which have their advice in them.
+    /// A message of the command line's parser, which contains its advice.
     pub(super) fn bare_usage(words: String) -> Self {
         let what = words.strip_prefix("error: ").unwrap_or(&words).trim_end().to_string();
         Self::new(Exit::Usage, None, what, None)
@@ -376,12 +378,12 @@ impl Failure {
         Self::new(Exit::File, number, what, None)
     }
 
-    /// A file, other than firmware, that is not what it should be.
+    /// A file, other than firmware, with invalid contents.
     pub(super) fn file(path: &Path, why: &str) -> Self {
         Self::new(Exit::File, None, format!("{}: {why}", path.display()), None)
     }
 
-    /// A fault in a line of a file, other than firmware.
+    /// An error in a line of a file, other than firmware.
     pub(super) fn line(path: &Path, line: usize, why: &str) -> Self {
         let what = format!("{}, line {line}: {why}", path.display());
         Self::new(Exit::File, None, what, None)
@@ -391,7 +393,7 @@ impl Failure {
         Self::new(Exit::System, None, what, None)
     }
 
-    /// A device that was reset and has not come back.
+    /// A device that sent no boot-up message after a reset.
     pub(super) fn no_boot_up(node: NodeId) -> Self {
         let advice = "check that node-ID and bit rate are right; a device with a new node-ID comes back under that one";
         let what = format!("node {node} has sent no boot-up message");
@@ -399,7 +401,7 @@ impl Failure {
         Self::new(Exit::NoAnswer, Some(0x6000_0013), what, advice)
     }
 
-    /// A firmware file that holds no program.
+    /// A firmware file that cannot contain a program.
     pub(super) fn no_program(path: &Path, fault: judge::Fault) -> Self {
         let (what, advice) = (format!("{}: {fault}", path.display()), fault.advice().to_string());
         Self::new(Exit::File, Some(judge::Fault::NUMBER), what, Some(advice))
@@ -409,12 +411,12 @@ impl Failure {
     pub(super) fn sealed(path: &Path, refusal: &Refusal) -> Self {
         let number = Some(refusal_number(refusal));
         let (what, advice) = (format!("{}: {refusal}", path.display()), refusal.advice().to_string());
-        // The manual's tools know no such files.
+        // The manual's tools do not know such files.
         let legacy = Exit::File.legacy();
         Self { legacy, ..Self::new(Exit::File, number, what, Some(advice)) }
     }
 
-    /// A conversion of `file` that failed.
+    /// A failed conversion of `file`.
     pub(super) fn convert(error: ConvertError, file: &Path) -> Self {
         match error {
             ConvertError::File(error) => error.of(file.display()).into(),
@@ -426,7 +428,7 @@ impl Failure {
         }
     }
 
-    /// For programs.
+    /// The JSON value.
     pub(super) fn value(&self) -> Value {
         json!({
             "error": {
@@ -454,17 +456,17 @@ impl From<FileError> for Failure {
         let cause = &error.error.cause;
         let advice = match cause {
             Cause::Io(error) => match error.kind() {
-                io::ErrorKind::NotFound => "check the file's name, and the folder that the command runs in",
+                io::ErrorKind::NotFound => "check the file's name and the current folder",
                 io::ErrorKind::IsADirectory => "name the firmware file in this folder",
-                io::ErrorKind::PermissionDenied => "check who may read the file",
+                io::ErrorKind::PermissionDenied => "check that you have permission to read the file",
                 _ => "copy the file to this computer's own disk, and try again",
             },
-            Cause::Empty => "build the program again, or copy the file again: nothing is in it",
+            Cause::Empty => "the file is empty: build the program again, or copy the file again",
             Cause::NotFirmware => "name the linker's output (ELF, Intel HEX, S-record) or a block file",
             Cause::CutOff { .. } | Cause::NoEnd(_) | Cause::Checksum { .. } | Cause::BadDigit { .. } => {
                 "copy the file again from where it was built, or build it again"
             }
-            // Their words say what to do.
+            // Their messages contain the advice.
             _ => "",
         };
         let advice = Some(advice.to_string()).filter(|advice| !advice.is_empty());

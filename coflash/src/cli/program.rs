@@ -1,4 +1,5 @@
-//! `coflash start`, `enter`, `erase`, `release`, `withdraw` and `status`: the single steps of an update.
+//! `coflash start`, `enter`, `erase`, `release`, `withdraw` and `status`: the single steps of an
+//! update.
 
 use canopen::program::ProgramState;
 use clap::Args;
@@ -23,14 +24,14 @@ pub(super) struct Start {
     program: Program,
 }
 
-/// Calls the application back to the bootloader, and waits until that answers.
+/// Calls the application back to the bootloader, and waits until the bootloader answers.
 #[derive(Debug, Args)]
 pub(super) struct Enter {
     #[command(flatten)]
     program: Program,
 
-    /// Wait for a device that does not answer yet, as coflash catch does: it may still be switched
-    /// on.
+    /// Wait for a device that does not answer yet, like coflash catch: the device may still be
+    /// switched off.
     #[arg(long)]
     wait: bool,
 
@@ -45,14 +46,14 @@ pub(super) struct Erase {
     program: Program,
 }
 
-/// Releases the program for autostart (83h of 1F51h), so that it starts by itself.
+/// Releases the program for autostart (83h of 1F51h): it then starts by itself after a reset.
 #[derive(Debug, Args)]
 pub(super) struct Release {
     #[command(flatten)]
     program: Program,
 }
 
-/// Withdraws the program's release for autostart, so that the device stays in the bootloader after a
+/// Withdraws the program's release for autostart: the device then stays in the bootloader after a
 /// reset.
 #[derive(Debug, Args)]
 pub(super) struct Withdraw {
@@ -66,12 +67,12 @@ pub(super) struct Status {
     #[command(flatten)]
     program: Program,
 
-    /// Set the flash status back to "no error" first.
+    /// First set the flash status to "no error".
     #[arg(long)]
     clear: bool,
 }
 
-/// Does something with one program of one device, and tells the outcome.
+/// Carries out a command on one program of one device, and shows the result.
 fn with(
     context: &Context,
     command: &str,
@@ -82,7 +83,7 @@ fn with(
     let mut session = program.device.session(&mut link)?;
     let _lock =
         if command == "erase" { Some(context.lock(context.bus.as_deref(), session.node())?) } else { None };
-    let waiting = context.waiting(format!("node {} is done ({command})", session.node()));
+    let waiting = context.waiting(format!("node {} has carried out the command ({command})", session.node()));
     let (words, more) = act(&mut session, program.program, &mut |event| context.out.detail(event))
         .map_err(|error| Failure::diagnosed(error, &mut session))?;
     drop(waiting);
@@ -151,11 +152,12 @@ impl Erase {
 impl Release {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         with(context, "release", &self.program, |session, number, tell| {
-            // Nobody there is told at once; a command that goes unanswered is waited for.
+            // Report an absent device at once; the wait below is for a device that does not answer
+            // the command.
             tell(Event::Found(session.find()?));
             release(session, number, tell)?;
             let words =
-                format!("program {number} is released for autostart: it starts by itself from now on");
+                format!("program {number} is released for autostart: it starts by itself after a reset");
             Ok((words, json!({})))
         })
     }
@@ -167,7 +169,7 @@ impl Withdraw {
             tell(Event::Found(session.find()?));
             withdraw(session, number)?;
             let words = format!(
-                "program {number} is not released for autostart any more: the device stays in the bootloader"
+                "program {number} is no longer released for autostart: the device stays in the bootloader"
             );
             Ok((words, json!({})))
         })
@@ -195,7 +197,8 @@ impl Status {
     }
 }
 
-/// Whether this program runs in a device whose application runs. One that does not tell has no other.
+/// Whether this program runs, given that an application runs. A device that does not report it has
+/// only one program.
 fn runs(session: &mut Session<'_>, number: u8) -> Result<bool, Error> {
     let info = program_info(session, number)?;
     Ok(info.control.is_none_or(|state| state == ProgramState::Running as u32))

@@ -1,5 +1,5 @@
-//! What is seen of an update: a bar on a terminal, plain lines elsewhere, an object a line for
-//! programs.
+//! The output of an update: a bar on a terminal, plain lines elsewhere, one JSON object on each
+//! line for programs.
 
 use std::time::Instant;
 
@@ -22,7 +22,7 @@ pub(super) struct Progress {
 }
 
 enum Form {
-    /// On a terminal: a bar while blocks go, and what is waited for around it.
+    /// On a terminal: a bar during the download, and a message before and after it.
     Terminal { bar: Option<ProgressBar>, waiting: Option<Waiting> },
     /// In a file or a pipe: a line for each tenth.
     Plain {
@@ -30,7 +30,7 @@ enum Form {
         /// How many tenths have been shown.
         tenths: usize,
     },
-    /// For programs.
+    /// The output for programs.
     Lines(events::Lines),
 }
 
@@ -53,7 +53,7 @@ impl Progress {
             (Form::Lines(lines), event) => lines.show(&event),
             (Form::Terminal { bar, waiting }, Event::Progress { done, total }) => {
                 let shown = bar.get_or_insert_with(|| new_bar(total));
-                // The end is told by more than one answer.
+                // More than one event reports the end.
                 if shown.is_finished() {
                     return;
                 }
@@ -64,7 +64,7 @@ impl Progress {
                     *waiting = Some(Waiting::new(self.out, waits_until(&Event::Progress { done, total })));
                 }
             }
-            // The command tells the end.
+            // The command reports the end.
             (Form::Terminal { waiting, .. }, Event::Done(_)) => *waiting = None,
             (Form::Plain { .. }, Event::Done(_)) => {}
             (Form::Terminal { bar: Some(bar), .. }, event) if !bar.is_finished() => {
@@ -87,7 +87,7 @@ impl Progress {
         }
     }
 
-    /// Leaves the bar where it stands.
+    /// Leaves the bar on the screen.
     pub(super) fn finish(&mut self) {
         if let Form::Terminal { bar, waiting } = &mut self.form {
             *waiting = None;
@@ -98,9 +98,9 @@ impl Progress {
     }
 }
 
-/// A bar's rate and remaining time, in this tool's units.
+/// Adds rate and remaining time in this tool's units to a bar.
 pub(super) fn with_rate(style: ProgressStyle) -> ProgressStyle {
-    // A bar that cannot be drawn is no reason to stop.
+    // An error of the drawing code does not stop the command.
     style
         .with_key("rate", |state: &ProgressState, text: &mut dyn std::fmt::Write| {
             let _ = write!(text, "{}", rate(state.per_sec()));
@@ -114,7 +114,7 @@ fn new_bar(total: usize) -> ProgressBar {
     let bar = ProgressBar::with_draw_target(Some(total as u64), ProgressDrawTarget::stdout());
     match ProgressStyle::with_template(STYLE) {
         Ok(style) => bar.with_style(with_rate(style).progress_chars("=> ")),
-        // The template is a constant; should it ever be wrong, a bar in another style does.
+        // The template is a constant. If it were wrong, a bar in another style is shown.
         Err(_) => bar,
     }
 }

@@ -1,4 +1,4 @@
-//! `coflash provision`: a bootloader with its keys, for production.
+//! `coflash provision`: writes keys into a bootloader, for production.
 
 use std::path::PathBuf;
 
@@ -14,17 +14,17 @@ use super::file::{Input, MemoryMap};
 use super::keys::{write_secret, KeyBlock};
 use super::output::Failure;
 
-/// Puts keys into a bootloader, which makes devices that take sealed programs alone.
+/// Writes keys into a bootloader image, so that its devices accept only sealed programs.
 ///
-/// There is room for two roots and three key-encryption keys. The result is written in production, by a
-/// debug probe. Key-encryption keys in it make it as secret as they are; it is readable for its owner
-/// alone.
+/// There is room for two roots and three key-encryption keys. A debug probe writes the result into
+/// the device in production. With key-encryption keys in it, the file is as secret as the keys;
+/// only its owner can read it.
 #[derive(Debug, Args)]
 pub(super) struct Provision {
     #[command(flatten)]
     input: Input,
 
-    /// The file to write: .hex or .bin; otherwise the bootloader's name with .hex.
+    /// The file to write: .hex or .bin; by default the bootloader's name with .hex.
     #[arg(long, short, value_name = "OUT")]
     output: Option<PathBuf>,
 
@@ -34,7 +34,7 @@ pub(super) struct Provision {
     #[command(flatten)]
     keys: KeyBlock,
 
-    /// Replace a file that is there already.
+    /// Replace an existing file.
     #[arg(long = "force")]
     overwrite: bool,
 }
@@ -42,7 +42,7 @@ pub(super) struct Provision {
 impl Provision {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = self.input.path();
-        let unnamed = || Failure::usage("it is not said where the keys go", "give --board or --layout");
+        let unnamed = || Failure::usage("the address of the keys is unknown", "give --board or --layout");
         let layout = self.map.layout()?.ok_or_else(unnamed)?;
         let output = self.output.clone().unwrap_or_else(|| path.with_extension("hex"));
         let extension = output.extension().map(|extension| extension.to_ascii_lowercase());
@@ -50,19 +50,19 @@ impl Provision {
             Some("hex") => false,
             Some("bin") => true,
             _ => {
-                let what = format!("{}: it cannot be told which format that is", output.display());
+                let what = format!("{}: the name does not show the format", output.display());
                 return Err(Failure::usage(what, "name the file with .hex or .bin"));
             }
         };
         if output == path {
-            let what = format!("{} would be overwritten", output.display());
+            let what = format!("the result would overwrite {}", output.display());
             return Err(Failure::usage(what, "name another file for the result: --output"));
         }
         let bytes = super::file::bytes(path)?;
         let format = Format::detect(&bytes).or(Some(Format::Raw));
         let firmware = read::read(&bytes, format, Some(layout.bootloader.base));
         let Firmware::Image(image) = firmware.map_err(|error| error.of(path.display()))? else {
-            return Err(Failure::file(path, "is a block file, and no bootloader: give the linker's output"));
+            return Err(Failure::file(path, "is a block file, not a bootloader: give the linker's output"));
         };
         let (roots, keks) = self.keys.keys()?;
         let KeyBlock { counter, epoch, for_tests, .. } = self.keys;
@@ -73,7 +73,7 @@ impl Provision {
         if binary {
             let mut flash = vec![0xFF; layout.bootloader.size as usize];
             for (address, data) in made.segments() {
-                // `provision` let nothing out of the region.
+                // `provision` has refused data outside the region.
                 let at = (address - layout.bootloader.base) as usize;
                 flash[at..at + data.len()].copy_from_slice(&data);
             }

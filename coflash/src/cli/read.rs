@@ -1,4 +1,4 @@
-//! `coflash read`: the values of any objects.
+//! `coflash read`: reads the values of objects.
 
 use std::path::PathBuf;
 
@@ -14,21 +14,21 @@ use super::dialect::Access;
 use super::objects::{self, Names, Object};
 use super::output::{Exit, Failure};
 
-/// Reads objects, or a program where the device allows it (1F50/1).
+/// Reads objects, or a program if the device allows it (1F50/1).
 ///
-/// An object is a hexadecimal index and, behind a slash, a decimal sub-index: 1018/4, or 100A for
+/// An object is a hexadecimal index and, after a slash, a decimal sub-index: 1018/4, or 100A for
 /// sub-index 0. 1018/1..4 is a range of sub-indices. With --eds an object may be named: "Program
-/// control/1". An object that the device refuses does not keep the others from being read.
+/// control/1". If the device refuses one object, the others are still read.
 ///
-/// With --unlock a lift device is brought into its bootloader, unlocked there and restarted
-/// afterwards, so that its program (1F50/1) and its parameter set (1F50/2) can be saved.
+/// With --unlock the tool calls a lift device into its bootloader, unlocks it and restarts it
+/// afterwards, so that you can save its program (1F50/1) and its parameter set (1F50/2).
 #[derive(Debug, Args)]
 pub(super) struct Read {
-    /// The objects: INDEX, INDEX/SUB, INDEX/FIRST..LAST, or with --eds names.
+    /// The objects: INDEX, INDEX/SUB, INDEX/FIRST..LAST, or names with --eds.
     #[arg(value_name = "OBJECT", required_unless_present = "file")]
     objects: Vec<String>,
 
-    /// Read the objects that this file lists, one a line; # begins a comment.
+    /// Read the objects in this file, one on each line; # begins a comment.
     #[arg(long, value_name = "LIST")]
     file: Option<PathBuf>,
 
@@ -41,18 +41,18 @@ pub(super) struct Read {
     #[command(flatten)]
     access: Access,
 
-    /// How to show the values.
+    /// The form of the values.
     #[arg(long = "as", value_name = "KIND", default_value = "auto", value_enum)]
     kind: Kind,
 
-    /// Write the bytes of the one object to this file instead.
+    /// Write the bytes of a single object to this file instead.
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Kind {
-    /// Up to four bytes as a number, what is printable as text, anything else as bytes.
+    /// Up to four bytes as a number, printable bytes as text, anything else as bytes.
     Auto,
     /// Unsigned, little-endian, up to 8 bytes.
     Number,
@@ -71,7 +71,7 @@ impl Read {
         let objects = self.names.objects(&words)?;
         if let (Some(_), [_, _, ..]) = (&self.output, objects.as_slice()) {
             let advice = "read one object at a time with --output";
-            return Err(Failure::usage("several objects do not go into one file", advice));
+            return Err(Failure::usage("--output takes only one object", advice));
         }
         let mut link = context.link()?;
         let mut session = self.device.session(&mut link)?;
@@ -111,11 +111,11 @@ impl Read {
         }
     }
 
-    /// Reads one object and shows it to people; gives what programs get.
+    /// Reads one object and shows it to people; returns the JSON value.
     fn one(&self, context: &Context, session: &mut Session<'_>, object: &Object) -> Result<Value, Failure> {
         let (node, at) = (session.node(), object.at);
         let (dialect, unlock) = (self.access.dialect(), self.access.unlock());
-        let waiting = context.waiting(format!("{at} of node {node} is read"));
+        let waiting = context.waiting(format!("{at} of node {node} has been read"));
         let bytes = match (dialect, unlock) {
             (None | Some(Dialect::Block | Dialect::Raw | Dialect::Hex), None) => {
                 session.upload(at, &mut |_| {})
@@ -153,7 +153,7 @@ fn show(bytes: &[u8], kind: Kind) -> Result<String, Failure> {
         || number(bytes).map(|number| format!("{number} ({number:0digits$X}h)", digits = bytes.len() * 2));
     let as_text = || visible(bytes).map(|text| format!("{text:?}"));
     let wrong = |what: &str| {
-        Failure::usage(format!("{} bytes are no {what}", bytes.len()), "show them with --as hex")
+        Failure::usage(format!("{} bytes are not a {what}", bytes.len()), "show them with --as hex")
     };
     Ok(match kind {
         Kind::Number => as_number().ok_or_else(|| wrong("number"))?,

@@ -1,7 +1,7 @@
-//! What is kept of a run: the log of `--log-file`, and the folder of `--report-dir` that service
-//! sends back.
+//! Records a run: the log of `--log-file`, and the folder of `--report-dir` for the service
+//! department.
 //!
-//! There is one of it for the whole program, so that whatever says something need not be handed it.
+//! One record serves the whole program, so that code with a message need not have access to it.
 
 use std::ffi::OsString;
 use std::fs::{self, File};
@@ -23,7 +23,8 @@ use super::secrets;
 
 static RECORD: OnceLock<Record> = OnceLock::new();
 
-/// Files that are written as things happen: a program that is killed leaves what was there.
+/// The open files. They are written as events happen, so that a killed program leaves everything up
+/// to that point.
 struct Record {
     logs: Vec<Sink>,
     report: Option<Report>,
@@ -33,11 +34,11 @@ struct Report {
     folder: PathBuf,
     events: Sink,
     trace: Sink,
-    /// `report.json`, which is written at the beginning and again at the end.
+    /// `report.json`, written at the beginning and again at the end.
     document: Mutex<Value>,
 }
 
-/// A file that may become full: that is told once, and the command goes on.
+/// A file that may become full. The first error is shown, and the command continues.
 struct Sink {
     name: String,
     file: Mutex<Option<File>>,
@@ -57,7 +58,7 @@ impl Sink {
         let Some(open) = file.as_mut() else { return };
         if let Err(error) = open.write_all(format!("{line}\n").as_bytes()) {
             *file = None;
-            let _ = writeln!(io::stderr(), "warning: {}: cannot be written any more: {error}", self.name);
+            let _ = writeln!(io::stderr(), "warning: {}: writing failed: {error}", self.name);
         }
     }
 }
@@ -66,7 +67,8 @@ fn cannot(path: &Path, error: &io::Error) -> String {
     format!("{}: cannot be written: {error}", path.display())
 }
 
-/// Begins what the command line asks for. `command` is the command's name, for the folder's.
+/// Starts the records that the command line asks for. `command` is the command's name, for the name
+/// of the folder.
 pub(super) fn begin(
     log: Option<&Path>,
     reports: Option<&Path>,
@@ -106,7 +108,7 @@ pub(super) fn begin(
     Ok(())
 }
 
-/// A folder of this run alone.
+/// Creates a folder for this run.
 fn own_folder(all: &Path, command: &str) -> Result<PathBuf, String> {
     fs::create_dir_all(all).map_err(|error| cannot(all, &error))?;
     let time: String = stamp(wall()).chars().filter(|c| !matches!(c, '-' | ':')).take(15).collect();
@@ -123,7 +125,7 @@ fn own_folder(all: &Path, command: &str) -> Result<PathBuf, String> {
             Err(error) => return Err(cannot(&folder, &error)),
         }
     }
-    Err(format!("{}: no folder can be made in it", all.display()))
+    Err(format!("{}: no folder can be created in it", all.display()))
 }
 
 /// The folder of the report, if there is one.
@@ -131,7 +133,7 @@ pub(super) fn folder() -> Option<&'static Path> {
     Some(&RECORD.get()?.report.as_ref()?.folder)
 }
 
-/// How the run has ended.
+/// Records the end of the run.
 pub(super) fn end(exit: u32, error: Option<Value>) -> Result<(), String> {
     let Some(record) = RECORD.get() else { return Ok(()) };
     record.note("end", &format!("exit code {exit}"));
@@ -143,19 +145,19 @@ pub(super) fn end(exit: u32, error: Option<Value>) -> Result<(), String> {
     ])
 }
 
-/// Whether there is a record at all.
+/// Whether there is a record.
 pub(super) fn is_kept() -> bool {
     RECORD.get().is_some()
 }
 
-/// Notes what was said.
+/// Records a message.
 pub(super) fn note(kind: &str, words: &str) {
     if let Some(record) = RECORD.get() {
         record.note(kind, words);
     }
 }
 
-/// Notes what happens to a device.
+/// Records an event of a device.
 pub(super) fn event(node: NodeId, event: &Event) {
     let Some(record) = RECORD.get() else { return };
     record.note("event", &format!("node {node}: {event}"));
@@ -166,15 +168,15 @@ pub(super) fn event(node: NodeId, event: &Event) {
     }
 }
 
-/// Notes what a command came to, for programs.
+/// Records the result of a command, as JSON.
 pub(super) fn result(value: &Value) {
     if let Some(report) = RECORD.get().and_then(|record| record.report.as_ref()) {
-        // What cannot be written shows at the end.
+        // An error of writing is reported at the end of the run.
         let _ = report.write(&[("result", value.clone())]);
     }
 }
 
-/// The adapter, whose frames are noted.
+/// The adapter with a recorder for its frames.
 pub(super) fn tapped(adapter: Box<dyn Adapter + Send>) -> Box<dyn Adapter + Send> {
     if !is_kept() {
         return adapter;
@@ -208,7 +210,7 @@ impl Record {
 }
 
 impl Report {
-    /// Writes `report.json` with these entries, too.
+    /// Writes `report.json` with these additional entries.
     fn write(&self, entries: &[(&str, Value)]) -> Result<(), String> {
         let mut document = self.document.lock().unwrap_or_else(PoisonError::into_inner);
         for (name, value) in entries {

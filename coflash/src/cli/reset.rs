@@ -13,9 +13,10 @@ use super::device::cancelled;
 use super::output::Failure;
 use super::values::{milliseconds, node_id};
 
-/// Resets a device, or all of them, and shows who comes back.
+/// Resets one device or all devices, and shows which ones come back.
 ///
-/// After a reset a device starts its program if that is released for autostart and its autostart is on.
+/// After a reset a device starts its program if the program is released for autostart and the
+/// device's autostart is enabled.
 #[derive(Debug, Args)]
 pub(super) struct Reset {
     /// The device's node-ID.
@@ -26,7 +27,7 @@ pub(super) struct Reset {
     #[arg(long, conflicts_with = "node")]
     all: bool,
 
-    /// Reset the communication alone: a new node-ID comes into force.
+    /// Reset only the communication: a new node-ID takes effect.
     #[arg(long)]
     communication: bool,
 
@@ -38,7 +39,7 @@ pub(super) struct Reset {
 impl Reset {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let command = if self.communication { NmtCommand::ResetCommunication } else { NmtCommand::ResetNode };
-        // A node-ID of the configuration file does not count against --all.
+        // A node-ID from the configuration file does not exclude --all.
         let node = self.node.filter(|_| !self.all);
         let mut adapter = context.open()?;
         adapter.send(&command.emit(node))?;
@@ -50,13 +51,13 @@ impl Reset {
                     back.push(node);
                 }
             }
-            // With a new node-ID it comes back as another one: only the one that was reset ends the
-            // waiting.
+            // A device with a new node-ID comes back under that one. The wait ends early only for
+            // the node-ID that was reset.
             node.is_some_and(|node| back.contains(&node))
         })?;
         drop(waiting);
         let words = match back.as_slice() {
-            [] => "nobody has sent a boot-up message".to_string(),
+            [] => "no node has sent a boot-up message".to_string(),
             nodes => {
                 let nodes: Vec<String> = nodes.iter().map(NodeId::to_string).collect();
                 format!("back on the bus: node {}", nodes.join(", "))

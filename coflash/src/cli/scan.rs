@@ -1,4 +1,4 @@
-//! `coflash scan`: who is on the bus.
+//! `coflash scan`: lists the nodes on the bus.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -18,15 +18,15 @@ use super::info;
 use super::output::Failure;
 use super::values::{milliseconds, nodes};
 
-/// Shows who is on the bus.
+/// Lists the nodes on the bus.
 ///
-/// Asks all node-IDs by SDO, and listens for heartbeats.
+/// It sends an SDO request to each node-ID, and listens for heartbeats.
 ///
-/// It aborts an SDO transfer that another tool has under way with a node, or has left unfinished;
-/// --listen-only asks nothing.
+/// It aborts an SDO transfer that another tool is running or has left unfinished; --listen-only
+/// sends no requests.
 #[derive(Debug, Args)]
 pub(super) struct Scan {
-    /// Whom to ask: node-IDs and ranges, like 1,5,9-12.
+    /// The node-IDs to ask, with ranges, like 1,5,9-12.
     #[arg(long, short = 'N', alias = "node", value_parser = nodes, value_name = "NODES", default_value = "1-127")]
     nodes: Vec<Vec<NodeId>>,
 
@@ -34,7 +34,7 @@ pub(super) struct Scan {
     #[arg(long, value_parser = milliseconds, value_name = "MS", default_value = "1100")]
     listen: Duration,
 
-    /// Ask nothing.
+    /// Send no requests.
     #[arg(long)]
     listen_only: bool,
 
@@ -51,8 +51,8 @@ impl Scan {
             .timing(Timing::default().sdo(self.sdo_timeout))
             .ask(!self.listen_only);
         let mut adapter = context.open()?;
-        context.out.detail("asking and listening");
-        let waiting = context.waiting("everybody was asked, and had time to be heard");
+        context.out.detail("sending requests to the nodes, and listening");
+        let waiting = context.waiting("all nodes were asked, and had time to answer");
         let found = scan(&mut *adapter, &options, &cancelled()?)?;
         drop(waiting);
         let advice = match found.is_empty() {
@@ -68,7 +68,7 @@ impl Scan {
 /// A line for each node.
 struct Table<'f> {
     found: &'f BTreeMap<NodeId, Found>,
-    /// Why nobody may answer.
+    /// The reason why no node answered, if it is known.
     advice: Option<&'f str>,
 }
 
@@ -76,9 +76,9 @@ impl std::fmt::Display for Table<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         if self.found.is_empty() {
             return match self.advice {
-                Some(advice) => write!(f, "nobody answers, and nobody is heard: {advice}"),
+                Some(advice) => write!(f, "no node answers, and no node was heard: {advice}"),
                 None => f.write_str(
-                    "nobody answers, and nobody is heard (coflash lss fastscan finds devices without node-ID)",
+                    "no node answers, and no node was heard (coflash lss fastscan finds devices without node-ID)",
                 ),
             };
         }
@@ -116,7 +116,7 @@ fn row((node, found): (&NodeId, &Found)) -> [String; 7] {
     [node, runs.to_string(), text(&info.name), text(&info.software_version), serial, program, state]
 }
 
-/// What is there of a program: the state that 1F51h tells, the CRC of 1F56h, and its version.
+/// A program in one cell: the state from 1F51h, the CRC from 1F56h, and its version.
 fn cell(program: &ProgramInfo) -> String {
     if program.status.is_some_and(|status| status.busy) {
         return "busy".to_string();

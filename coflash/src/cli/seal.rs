@@ -1,4 +1,4 @@
-//! `coflash seal`: a program into a sealed image.
+//! `coflash seal`: makes a sealed image from a program.
 
 use std::path::{Path, PathBuf};
 
@@ -21,47 +21,49 @@ use super::output::Failure;
 use super::values::{number, program_number, unique_id};
 use super::verify::value;
 
-/// Seals a program: signed, and encrypted or compressed if wanted, ready for devices with keys.
+/// Seals a program for devices with keys: signs it, and encrypts or compresses it if asked to.
 ///
 /// The same input gives the same output, byte for byte.
 ///
-/// For a key in a hardware security module in two steps: with --tbs and the public key, and, when the
-/// module has signed what is in that file, with --attach.
+/// For a key in a hardware security module this takes two steps: first --tbs with the public key,
+/// and, after the module has signed that file, --attach.
 #[derive(Debug, Args)]
 pub(super) struct Seal {
     #[command(flatten)]
     input: Input,
 
-    /// The sealed image to write; otherwise the firmware's name with .cbs, or with .blk for --blocks.
+    /// The sealed image to write; by default the firmware's name with .cbs, or with .blk for
+    /// --blocks.
     #[arg(long, short, value_name = "OUT")]
     output: Option<PathBuf>,
 
-    /// The private key that signs; with --tbs and --attach the public key does.
+    /// The private key that signs; with --tbs and --attach the public key is sufficient.
     #[arg(long, value_name = "FILE")]
     key: PathBuf,
 
-    /// The key's certificate. Without one the key must be a root of the devices.
+    /// The key's certificate. Without one, the key must be a root of the devices.
     #[arg(long, value_name = "FILE")]
     cert: Option<PathBuf>,
 
-    /// The security counter: devices refuse programs with a lower one than they have seen.
+    /// The security counter: a device refuses a program with a counter lower than the highest one
+    /// that it has accepted.
     #[arg(long, value_name = "NUMBER", value_parser = number, required_unless_present = "attach")]
     counter: Option<u32>,
 
-    /// Vendor-ID of the devices (1018h/1); otherwise that of the label in the image.
+    /// Vendor-ID of the devices (1018h/1); by default that of the label in the image.
     #[arg(long, alias = "vid", value_name = "NUMBER", value_parser = number)]
     vendor: Option<u32>,
 
-    /// Their product code (1018h/2); otherwise that of the label in the image.
+    /// Product code of the devices (1018h/2); by default that of the label in the image.
     #[arg(long, alias = "pid", value_name = "NUMBER", value_parser = number)]
     product: Option<u32>,
 
-    /// The program's version: major in bits 0-7, minor in bits 8-15, release in bits 16-31; otherwise
-    /// that of the label in the image.
+    /// The program's version: major in bits 0-7, minor in bits 8-15, release in bits 16-31; by
+    /// default that of the label in the image.
     #[arg(long, value_name = "NUMBER", value_parser = number)]
     ver: Option<u32>,
 
-    /// The date to tell, in seconds since 1970; otherwise SOURCE_DATE_EPOCH, otherwise none.
+    /// The date in the image, in seconds since 1970; by default SOURCE_DATE_EPOCH, otherwise none.
     #[arg(long, value_name = "SECONDS", env = "SOURCE_DATE_EPOCH")]
     date: Option<u64>,
 
@@ -72,7 +74,7 @@ pub(super) struct Seal {
     #[command(flatten)]
     place: Place,
 
-    /// Encrypt for the devices with this key-encryption key; once for each key.
+    /// Encrypt for the devices with this key-encryption key; give the option once for each key.
     #[arg(long, value_name = "FILE")]
     encrypt: Vec<PathBuf>,
 
@@ -80,56 +82,58 @@ pub(super) struct Seal {
     #[arg(long)]
     compress: bool,
 
-    /// Compress against this firmware, which is the other program of the device.
+    /// Compress against this firmware, the other program of the device.
     #[arg(long, value_name = "FILE")]
     base: Option<PathBuf>,
 
-    /// For the device with this unique ID alone: 24 hexadecimal digits, as it reads.
+    /// Make the image only for the device with this unique ID: 24 hexadecimal digits, as the device
+    /// reports it.
     #[arg(long, value_name = "UID", value_parser = unique_id)]
     device: Option<[u8; 12]>,
 
-    /// For devices of this hardware revision alone (low 5 bits of 1018h/3); once for each.
+    /// Make the image only for devices of this hardware revision (low 5 bits of 1018h/3); give the
+    /// option once for each.
     #[arg(long, value_name = "REVISION", value_parser = number)]
     hardware: Vec<u32>,
 
-    /// Write a block file that carries the sealed image, for masters that know nothing else; its blocks
-    /// have at most so many bytes, framing included.
+    /// Write a block file that carries the sealed image, for masters that support nothing else; its
+    /// blocks have at most this many bytes, including framing.
     #[arg(long, value_name = "BYTES", value_parser = number, num_args = 0..=1, default_missing_value = "0x400", conflicts_with = "tbs")]
     blocks: Option<u32>,
 
-    /// Payload of a chunk: a power of two from 512 to 8192. A device has to have room for one.
+    /// Payload of a chunk: a power of two from 512 to 8192. A device must have room for one chunk.
     #[arg(long, value_name = "BYTES", value_parser = chunk, default_value = "4096")]
     chunk: u8,
 
-    /// A text for people.
+    /// A text for people, stored in the image.
     #[arg(long, value_name = "TEXT")]
     text: Option<String>,
 
-    /// The software bill of materials, whose hash the image tells.
+    /// The software bill of materials; the image contains its hash.
     #[arg(long, value_name = "FILE")]
     sbom: Option<PathBuf>,
 
-    /// The file is data of the application, and no program.
+    /// Mark the file as data of the application instead of a program.
     #[arg(long)]
     data: bool,
 
-    /// The application writes to flash itself: the device does not lock it.
+    /// Mark the application as one that writes to flash itself: the device does not lock its flash.
     #[arg(long)]
     writes_flash: bool,
 
-    /// For devices that are marked for tests, and for no others.
+    /// Make the image only for devices that are marked for tests.
     #[arg(long)]
     test: bool,
 
-    /// Write to this file what the key has to sign (pure Ed25519), and leave the signature out.
+    /// Write the bytes to be signed (pure Ed25519) to this file, and leave out the signature.
     #[arg(long, value_name = "FILE", conflicts_with = "attach")]
     tbs: Option<PathBuf>,
 
-    /// Complete a sealed image that was made with --tbs: the file with the signature, of 64 bytes.
+    /// Complete a sealed image that was made with --tbs: the file with the signature of 64 bytes.
     #[arg(long, value_name = "FILE")]
     attach: Option<PathBuf>,
 
-    /// Seal the file although it can be no program of an STM32F4.
+    /// Seal the file even if it cannot be a program of an STM32F4.
     #[arg(long)]
     force: bool,
 }
@@ -145,32 +149,32 @@ fn chunk(text: &str) -> Result<u8, String> {
     }
 }
 
-/// A program that is to be sealed, and what the command line says of it.
+/// A program to seal, and the options for it.
 pub(super) struct Program<'p> {
     /// Its file.
     pub(super) path: &'p Path,
-    /// What is in it.
+    /// Its blocks.
     pub(super) blocks: &'p BlockFile,
-    /// Vendor-ID and product code; otherwise those of its label.
+    /// Vendor-ID and product code; if absent, those of its label.
     pub(super) identity: (Option<u32>, Option<u32>),
-    /// The options that give them.
+    /// The names of these options, for messages.
     pub(super) options: (&'static str, &'static str),
-    /// Its version; otherwise that of its label.
+    /// Its version; if absent, that of its label.
     pub(super) version: Option<u32>,
 }
 
 impl Program<'_> {
-    /// Refuses what can be no program, as `flash` does.
+    /// Refuses a file that cannot be a program, like `flash`.
     pub(super) fn judge(&self) -> Result<(), Failure> {
         let (image, start) = (self.blocks.image(), self.blocks.program_start());
         judge(&image, start).map_err(|fault| Failure::no_program(self.path, fault))
     }
 
-    /// Seals it with this identity and version, and with the rest as `sealer` has it.
+    /// Adds the program's identity and version to the parameters in `sealer`.
     pub(super) fn sealer<'s>(&self, sealer: Sealer<'s>) -> Result<Sealer<'s>, Failure> {
         let label = label_of(&self.blocks.image(), self.blocks.program_start());
         let unnamed = |what: &str, option: &str| {
-            let what = format!("{}: the program does not say for which {what} it is", self.path.display());
+            let what = format!("{}: the program has no {what} of its target device", self.path.display());
             Failure::usage(what, format!("give {option}"))
         };
         let vendor_id = self.identity.0.or(label.map(|label| label.vendor_id));
@@ -183,7 +187,7 @@ impl Program<'_> {
         })
     }
 
-    /// The program as it lies in flash, sealed with this key.
+    /// Seals the program as it lies in flash with this key.
     pub(super) fn seal(&self, sealer: &Sealer<'_>, key: &SigningKey) -> Result<Vec<u8>, Failure> {
         sealer.seal(&self.blocks.flash_image(), key).map_err(|fault| self.fault(&fault))
     }
@@ -193,16 +197,16 @@ impl Program<'_> {
     }
 }
 
-/// What a sealed image is written as.
+/// The form in which a sealed image is written.
 #[derive(Clone, Copy)]
 pub(super) enum Form {
-    /// As it is.
+    /// Unchanged.
     Plain,
     /// In blocks of at most `size` bytes, for a program that starts at `start`.
     Blocks { start: u32, size: usize },
 }
 
-/// Writes a sealed image, and gives it back; its signature may be missing.
+/// Writes a sealed image and returns it; its signature may be missing.
 pub(super) fn put(output: &Path, image: Vec<u8>, form: Form) -> Result<SealedFile, Failure> {
     let file = SealedFile::parse(image).map_err(|refusal| Failure::sealed(output, &refusal))?;
     match form {
@@ -216,7 +220,7 @@ pub(super) fn put(output: &Path, image: Vec<u8>, form: Form) -> Result<SealedFil
     Ok(file)
 }
 
-/// Tells what was written.
+/// Reports what was written.
 pub(super) fn tell(context: &Context, command: &str, output: &Path, file: &SealedFile, signed: bool) {
     let head = file.head();
     let (size, payload) = (head.size(), head.payload());
@@ -253,7 +257,7 @@ impl Seal {
         let extension = if self.blocks.is_some() { "blk" } else { "cbs" };
         let output = self.output.clone().unwrap_or_else(|| path.with_extension(extension));
         if output == path || self.tbs.as_ref() == Some(&output) {
-            let what = format!("{} would be overwritten", output.display());
+            let what = format!("the result would overwrite {}", output.display());
             return Err(Failure::usage(what, "name another file for the result: --output"));
         }
         let (firmware, _) = self.place.load(path, self.program)?;
@@ -277,7 +281,7 @@ impl Seal {
             sbom.map_err(|cause| Failure::file(self.sbom.as_deref().unwrap_or(path), &cause.to_string()))?;
         let sealer = program.sealer(Sealer {
             certificate: self.cert.as_deref().map(keys::certificate).transpose()?,
-            // clap wants it wherever it comes to this.
+            // clap requires the option in every case that reaches this line.
             counter: self.counter.unwrap_or(0),
             program: self.program,
             chunk: self.chunk,
@@ -309,7 +313,7 @@ impl Seal {
         Ok(())
     }
 
-    /// What the result is written as, if the program starts there.
+    /// The form of the result, for a program at the address that `start` returns.
     fn form(&self, start: impl FnOnce() -> Result<u32, Failure>) -> Result<Form, Failure> {
         Ok(match self.blocks {
             None => Form::Plain,
@@ -317,7 +321,7 @@ impl Seal {
         })
     }
 
-    /// The second of two steps.
+    /// The second of the two steps.
     fn complete(&self, context: &Context, path: &Path, signature: &Path) -> Result<(), Failure> {
         let output = self.output.clone().unwrap_or_else(|| match self.blocks {
             None => path.to_path_buf(),
@@ -325,14 +329,15 @@ impl Seal {
         });
         let form = self.form(|| {
             let unknown = || {
-                let what = "a sealed image does not say where its program starts, and blocks do";
+                let what =
+                    "a block file needs the program's start address, which a sealed image does not contain";
                 Failure::usage(what, "give --board, --layout or --start-address")
             };
             self.place.start(self.program)?.ok_or_else(unknown)
         })?;
         let file = limit::read(path).map_err(|cause| Failure::file(path, &cause.to_string()))?;
         let key = keys::public_key(&self.key)?;
-        let why = "is no signature: it must have 64 bytes, as openssl pkeyutl -sign -rawin writes them";
+        let why = "is not a signature: it must have 64 bytes, as openssl pkeyutl -sign -rawin writes them";
         let bytes: Option<[u8; 64]> = bytes_of(signature, 1024)?.try_into().ok();
         let bytes = bytes.ok_or_else(|| Failure::file(signature, why))?;
         let image = Unsigned::of_file(file, key).and_then(|unsigned| unsigned.attach(&bytes));

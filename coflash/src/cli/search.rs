@@ -1,4 +1,4 @@
-//! The adapter that is taken where no `--bus` is given.
+//! Chooses the adapter if no `--bus` is given.
 
 use std::fmt;
 use std::time::Duration;
@@ -7,7 +7,7 @@ use coflash::bus::{list, Found, Kind, URLS};
 
 use super::output::{Failure, Output};
 
-/// What `--search` takes.
+/// The value of `--search`.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Kinds(pub(super) Vec<Kind>);
 
@@ -19,23 +19,23 @@ impl Kinds {
         }
         let kind = |word: &str| {
             Kind::ALL.into_iter().find(|kind| kind.name() == word.trim()).ok_or_else(|| {
-                format!("kinds of adapters are {}, or none of them", Kind::ALL.map(Kind::name).join(", "))
+                format!("kinds of adapters are {}, or none", Kind::ALL.map(Kind::name).join(", "))
             })
         };
         text.split(',').map(kind).collect::<Result<_, _>>().map(Self)
     }
 }
 
-/// The bus of the only adapter that is there.
+/// The URL of the only adapter.
 pub(super) fn only(out: Output, kinds: &[Kind]) -> Result<String, Failure> {
-    // Servers on the network are not taken unasked, so there is no need to wait for them.
+    // The tool never chooses a server on the network by itself, so it need not wait for beacons.
     let kinds: Vec<Kind> = kinds.iter().copied().filter(|kind| *kind != Kind::Socketcand).collect();
     let list = list(&kinds, Duration::ZERO);
     if let Some(only) = list.only() {
-        out.note(format_args!("no --bus is given: taking the only adapter, {}", Line(only)));
+        out.note(format_args!("no --bus is given: using the only adapter, {}", Line(only)));
         return Ok(only.url.clone());
     }
-    let unsaid = "it is not said on which CAN bus the device is";
+    let unsaid = "no CAN bus is given";
     let lines = |certain: bool| {
         let found = list.found.iter().filter(|found| found.certain == certain);
         found.map(|found| Line(found).to_string()).collect::<Vec<_>>()
@@ -43,19 +43,19 @@ pub(super) fn only(out: Output, kinds: &[Kind]) -> Result<String, Failure> {
     let (certain, others) = (lines(true), lines(false));
     Err(match (certain.as_slice(), others.as_slice()) {
             ([], []) => Failure::usage(
-                format!("{unsaid}, and no adapter is found"),
+                format!("{unsaid}, and no adapter was found"),
                 format!(
-                    "plug the adapter in (coflash adapters lists those that are there, and servers on the network), or give \
+                    "plug the adapter in (coflash adapters lists the adapters of this computer and servers on the network), or give \
                      --bus URL or set COFLASH_BUS; known are {URLS}"
                 ),
             ),
             ([], others) => Failure::usage(
                 unsaid,
-                format!("give --bus URL; these may be adapters: {}", others.join(", ")),
+                format!("give --bus URL; possible adapters are: {}", others.join(", ")),
             ),
             (several, _) => Failure::usage(
-                format!("{unsaid}, and several adapters are there"),
-                format!("give one of them by --bus: {}", several.join(", ")),
+                format!("{unsaid}, and this computer has several adapters"),
+                format!("give one of them with --bus: {}", several.join(", ")),
             ),
         })
 }

@@ -1,4 +1,4 @@
-//! A command line without its passwords, for records that are handed on.
+//! Removes passwords from a command line, for records that users pass on.
 
 use std::ffi::OsString;
 
@@ -6,14 +6,14 @@ use coflash::bus::redact::is_password;
 
 use super::values::address;
 
-/// The options whose value is a secret.
+/// The options with a secret value.
 const SECRET: [&str; 3] = ["--unlock", "--key", "--of-value"];
 
-/// What stands in place of a password.
+/// The replacement for a password.
 const HIDDEN: &str = "***";
 
-/// The words, with each password hidden: the value of `--unlock`, `--key` and `--of-value`, and what `write` puts
-/// into an object of a password.
+/// The words with the secrets hidden: the values of `--unlock`, `--key` and `--of-value`, and the
+/// value that `write` writes into an object for a password.
 pub(super) fn without(words: &[OsString]) -> Vec<String> {
     let mut hide = false;
     let writes = words.iter().any(|word| word == "write");

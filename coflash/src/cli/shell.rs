@@ -1,4 +1,4 @@
-//! `coflash shell`: one command after the other.
+//! `coflash shell`: runs several commands one after another.
 
 use std::io::IsTerminal;
 use std::path::PathBuf;
@@ -12,27 +12,27 @@ use super::context::Context;
 use super::device::cancelled;
 use super::output::Failure;
 
-/// Reads commands, from the keyboard or from standard input.
+/// Reads commands from the keyboard or from standard input and runs them.
 ///
-/// From the keyboard with history, from standard input one a line.
+/// From the keyboard, with a history; from standard input, one on each line.
 ///
-/// What was said on the command line (--bus, --json and so on) holds for all of them. `exit` or
-/// Ctrl-D ends it. From standard input the first command that fails ends it.
+/// The options of the command line (--bus, --json and so on) apply to all commands. `exit` or
+/// Ctrl-D ends the shell. If a command from standard input fails, the shell ends.
 #[derive(Debug, Args)]
 pub(super) struct Shell {}
 
-/// What runs one line, given in words.
+/// The function that runs one line, passed as words.
 pub(super) type Runner = fn(&Context, Vec<String>) -> Result<(), Failure>;
 
 impl Shell {
-    /// Reads commands and has each of them run by `command`.
+    /// Reads commands and runs each of them with `command`.
     pub(super) fn run(&self, context: &Context, command: Runner) -> Result<(), Failure> {
         let interactive = std::io::stdin().is_terminal();
         let history = interactive.then(history_file).flatten();
-        let mut editor =
-            DefaultEditor::new().map_err(|error| Failure::system(format!("no line editor: {error}")))?;
+        let mut editor = DefaultEditor::new()
+            .map_err(|error| Failure::system(format!("the line editor does not start: {error}")))?;
         if let Some(history) = &history {
-            // The first time there is none.
+            // At the first start there is no history.
             let _ = editor.load_history(history);
         }
         loop {
@@ -68,7 +68,7 @@ impl Shell {
     }
 }
 
-/// Words between blanks; quotes hold blanks together.
+/// Splits a line at blanks; quotes keep blanks inside a word.
 fn split(line: &str) -> Result<Vec<String>, Failure> {
     let mut words = Vec::new();
     let mut word: Option<String> = None;

@@ -8,17 +8,18 @@ use super::context::Context;
 use super::device::cancelled;
 use super::output::Failure;
 
-/// Serves a page in the browser, to this machine alone: scan, update, LSS and the bus in words.
+/// Serves a page for the browser to this computer only: scan, update, LSS and the bus in words.
 ///
-/// The page is at the URL that is printed, with a random token in it: who knows it may do all that
-/// the page can. Ctrl-C ends it, and an update that is running in order.
+/// The command prints the URL of the page, which contains a random token: anyone with the URL can
+/// do everything that the page offers. Ctrl-C ends the command; a running update is ended in an
+/// orderly way.
 #[derive(Debug, Args)]
 pub(super) struct Ui {
-    /// The port on 127.0.0.1; otherwise a free one.
+    /// The port on 127.0.0.1; by default a free one.
     #[arg(long, value_name = "PORT", default_value = "0", hide_default_value = true)]
     port: u16,
 
-    /// Print the URL, and open no browser.
+    /// Print the URL without opening a browser.
     #[arg(long)]
     no_open: bool,
 }

@@ -1,4 +1,4 @@
-//! Quantities in words, the same everywhere: amounts in bytes, rates in KiB/s, bit rates in kbit/s,
+//! Quantities in the same units everywhere: amounts in bytes, rates in KiB/s, bit rates in kbit/s,
 //! times in seconds.
 
 use std::time::Duration;
@@ -8,7 +8,7 @@ pub(super) fn rate(bytes: f64) -> String {
     format!("{:.1} KiB/s", bytes / 1024.0)
 }
 
-/// How far something of known length has come.
+/// The progress of a job of known length.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Pace {
     pub(super) done: usize,

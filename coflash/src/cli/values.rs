@@ -1,4 +1,4 @@
-//! Values on the command line, in the notations that the manual's tools take.
+//! Values on the command line, in the notations of the manual's tools.
 
 use std::time::Duration;
 
@@ -6,14 +6,14 @@ use canopen::{Address, NodeId};
 use coflash::device::value::integer;
 use coflash::file::sealed::key::hexadecimal;
 
-/// A number of up to 32 bits in C notation: `4096`, `0x1000`, `010000` (octal), with an `u` or `l`
-/// behind it if need be.
+/// A number of up to 32 bits in C notation: `4096`, `0x1000`, `010000` (octal), optionally with the
+/// suffix `u` or `l`.
 pub(super) fn number(text: &str) -> Result<u32, String> {
     let bare = text.trim_end_matches(['u', 'U', 'l', 'L']);
     let number = integer(bare).filter(|_| !bare.starts_with('-'));
-    let number =
-        number.ok_or_else(|| "it is no number in C notation (4096, 0x1000 or octal 010000)".to_string())?;
-    u32::try_from(number).map_err(|_| "it is no number of up to 32 bits".to_string())
+    let number = number
+        .ok_or_else(|| "it is not a number in C notation (4096, 0x1000 or octal 010000)".to_string())?;
+    u32::try_from(number).map_err(|_| "it is not a number of up to 32 bits".to_string())
 }
 
 pub(super) fn node_id(text: &str) -> Result<NodeId, String> {
@@ -21,7 +21,7 @@ pub(super) fn node_id(text: &str) -> Result<NodeId, String> {
     u8::try_from(number).ok().and_then(NodeId::new).ok_or_else(|| "node-IDs are 1 to 127".to_string())
 }
 
-/// Node-IDs and ranges of them: `1,5,9-12`. Each appears once, in the order given.
+/// Node-IDs and ranges of node-IDs: `1,5,9-12`. Each appears once, in the given order.
 pub(super) fn nodes(text: &str) -> Result<Vec<NodeId>, String> {
     let mut nodes = Vec::new();
     for part in text.split(',') {
@@ -52,15 +52,15 @@ pub(super) fn milliseconds(text: &str) -> Result<Duration, String> {
     }
 }
 
-/// A COB-ID that has room for a node-ID on top.
+/// A COB-ID to which a node-ID can be added.
 pub(super) fn base_id(text: &str) -> Result<u16, String> {
     match u16::try_from(number(text)?) {
         Ok(id @ 0x80..=0x780) => Ok(id),
-        _ => Err("it must be 0x80 to 0x780, so that there is room for a node-ID on top".to_string()),
+        _ => Err("it must be 0x80 to 0x780, so that a node-ID can be added".to_string()),
     }
 }
 
-/// How often something is tried: once at least.
+/// A number of attempts, at least one.
 pub(super) fn attempts(text: &str) -> Result<u32, String> {
     match number(text)? {
         0 => Err("it must be at least 1".to_string()),
@@ -86,7 +86,7 @@ pub(super) fn unique_id(text: &str) -> Result<[u8; 12], String> {
     let id = hexadecimal(text).and_then(|bytes| bytes.try_into().ok());
     match id {
         Some(id) if id != [0; 12] => Ok(id),
-        _ => Err("it must have 24 hexadecimal digits, and not be 0".to_string()),
+        _ => Err("it must have 24 hexadecimal digits, and must not be 0".to_string()),
     }
 }
 

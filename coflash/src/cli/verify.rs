@@ -1,4 +1,4 @@
-//! `coflash verify` and `coflash show`: what a sealed image is, and whether a device takes it.
+//! `coflash verify` and `coflash show`: checks and describes a sealed image.
 
 use std::path::{Path, PathBuf};
 
@@ -16,11 +16,11 @@ use super::keys::{self, KeyBlock};
 use super::output::Failure;
 use super::values::{number, program_number, unique_id};
 
-/// Checks a sealed image as a device does, and says which rule it breaks.
+/// Checks a sealed image as a device does, and names the rule that it breaks.
 ///
-/// That is all of it: the form, the device that it is for, counter and epoch, the certificate, the
-/// signature, every chunk, and the program itself. What is not told about the device is taken as the
-/// image wants it. Without --kek the program in an encrypted image is not looked at.
+/// This covers the form, the target device, counter and epoch, the certificate, the signature,
+/// every chunk, and the program itself. A property of the device that no option gives is assumed to
+/// match the image. Without --kek the program in an encrypted image is not checked.
 #[derive(Debug, Args)]
 pub(super) struct Verify {
     #[command(flatten)]
@@ -42,11 +42,11 @@ pub(super) struct Verify {
     #[arg(long, value_name = "UID", value_parser = unique_id)]
     device: Option<[u8; 12]>,
 
-    /// The program number that is to be written.
+    /// The program number to be written.
     #[arg(long, short = 'P', value_name = "1..254", value_parser = program_number)]
     program: Option<u8>,
 
-    /// Bytes of the program's flash.
+    /// The size of the program's flash in bytes.
     #[arg(long, value_name = "BYTES", value_parser = number)]
     room: Option<u32>,
 }
@@ -66,7 +66,7 @@ pub(super) struct Checked {
     base: Option<PathBuf>,
 }
 
-/// Shows what a sealed image says of itself. Nothing is checked but its form.
+/// Shows the contents of a sealed image's manifest. Only the form is checked.
 #[derive(Debug, Args)]
 pub(super) struct Show {
     /// The sealed image, or the block file that carries one.
@@ -75,8 +75,8 @@ pub(super) struct Show {
 }
 
 impl Checked {
-    /// Checks the image for a device with these keys, of which `device` tells the rest; gives the file
-    /// and what became of it.
+    /// Checks the image for a device with these keys; `device` holds the other properties. Returns
+    /// the file and the opened image.
     pub(super) fn check(&self, device: &Device<'_>) -> Result<(SealedFile, Opened), Failure> {
         let path = &self.file;
         let refused = |refusal| Failure::sealed(path, &refusal);
@@ -106,17 +106,14 @@ impl Verify {
         let (key, root) = (opened.signed_by.id(), opened.root.id());
         let image = match opened.closed {
             None => format!("the program is whole, {} bytes, CRC {:08X}h", head.size(), head.crc()),
-            Some(Closed::Encrypted) => {
-                "the program was not looked at: it is encrypted, give --kek".to_string()
-            }
+            Some(Closed::Encrypted) => "the program was not checked: it is encrypted; give --kek".to_string(),
             Some(Closed::Dictionary) => {
-                "the program was not looked at: it was compressed against another one, give --base"
-                    .to_string()
+                "the program was not checked: it was compressed against another one; give --base".to_string()
             }
         };
         let whose = match key == root {
-            true => "a root itself".to_string(),
-            false => format!("which root {root:08X}h has certified"),
+            true => "which is a root".to_string(),
+            false => format!("certified by root {root:08X}h"),
         };
         let words = format!(
             "{}: good\n  signed by    key {key:08X}h, {whose}\n  \
@@ -146,7 +143,7 @@ impl Show {
     }
 }
 
-/// Shows a sealed image, for the command of this name.
+/// Shows a sealed image, for the command with this name.
 pub(super) fn show(context: &Context, command: &str, path: &Path) -> Result<(), Failure> {
     let Carried { image, blocks } = read(path)?;
     let file = SealedFile::parse(image).map_err(|refusal| Failure::sealed(path, &refusal))?;
@@ -168,8 +165,8 @@ pub(super) fn show(context: &Context, command: &str, path: &Path) -> Result<(), 
     Ok(())
 }
 
-/// Whether the file begins as a sealed image, or as a block file that carries one; what cannot be read
-/// does not.
+/// Whether the file begins as a sealed image, or as a block file that carries one; `false` if it
+/// cannot be read.
 pub(super) fn is_sealed(path: &Path) -> bool {
     use std::io::Read as _;
     let is_file = std::fs::metadata(path).is_ok_and(|told| told.is_file());
@@ -178,12 +175,12 @@ pub(super) fn is_sealed(path: &Path) -> bool {
     is_file && std::fs::File::open(path).and_then(&mut read).is_ok() && blocks::looks_like(&front)
 }
 
-/// Reads a sealed image, out of the blocks of a block file if it is in some.
+/// Reads a sealed image, from the blocks of a block file if the file is one.
 pub(super) fn read(path: &Path) -> Result<Carried, Failure> {
     Ok(carried(bytes(path)?).map_err(|fault| fault.of(path.display()))?)
 }
 
-/// A sealed image for programs.
+/// The JSON value of a sealed image.
 pub(super) fn value(file: &SealedFile) -> Value {
     let sealed = file.parts();
     let head = sealed.head;

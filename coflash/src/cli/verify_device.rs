@@ -1,4 +1,4 @@
-//! `coflash verify-device`: whether a device holds the program of a sealed image.
+//! `coflash verify-device`: checks whether a device holds the program of a sealed image.
 
 use clap::Args;
 use coflash::file::sealed::Device as Its;
@@ -10,13 +10,15 @@ use super::device::Device;
 use super::output::Failure;
 use super::verify::Checked;
 
-/// Says whether a device holds exactly the program of a sealed image.
+/// Checks whether a device holds exactly the program of a sealed image.
 ///
-/// The file is checked as verify does. Then what the device tells is compared with it, in the
-/// bootloader or in the application: vendor-ID, product code, hardware revision, unique ID and keys of
-/// the device, CRC and version of the program, and what was installed last. Nothing is changed in it.
+/// The file is checked as verify does. Then it is compared with the device's answers, in the
+/// bootloader or in the application: vendor-ID, product code, hardware revision, unique ID and keys
+/// of the device, CRC and version of the program, and the last installation. The command changes
+/// nothing in the device.
 ///
-/// The device's answers are its own: one that runs somebody else's code may give any.
+/// The answers come from the device's own software: a device with foreign software may give any
+/// answers.
 #[derive(Debug, Args)]
 pub(super) struct VerifyDevice {
     #[command(flatten)]
@@ -37,8 +39,8 @@ impl VerifyDevice {
         let Held { running, runs, differences, untold, .. } = &held;
         let which = format!("program {program} of {}", path.display());
         let verdict = match (held.is_same(), runs) {
-            (true, true) => format!("runs {which}, as far as it tells"),
-            (true, false) => format!("holds {which}, and does not run it, as far as it tells"),
+            (true, true) => format!("runs {which}, according to its own answers"),
+            (true, false) => format!("holds {which} and does not run it, according to its own answers"),
             (false, _) => format!("is not the device of {which}, or has another program"),
         };
         let mut words = format!("node {node}: {verdict}\n  running      {running}");
@@ -48,7 +50,7 @@ impl VerifyDevice {
         }
         if !untold.is_empty() {
             let objects: Vec<String> = untold.iter().map(ToString::to_string).collect();
-            words += &format!("\n  not told     {}", objects.join(", "));
+            words += &format!("\n  not reported {}", objects.join(", "));
         }
         context.out.result(words, || {
             json!({

@@ -1,4 +1,4 @@
-//! A sign of life while something takes its time: what is waited for, on a terminal alone.
+//! Shows what the tool waits for, on a terminal only.
 
 use std::time::Duration;
 
@@ -9,10 +9,10 @@ use super::output::Output;
 
 const STYLE: &str = "{spinner} {msg} ({waited})";
 
-/// How often it turns.
+/// The period of the spinner's steps.
 const TURN: Duration = Duration::from_millis(120);
 
-/// Turns for as long as it lives.
+/// A spinner that turns until it is dropped.
 #[derive(Debug)]
 pub(super) struct Waiting(Option<ProgressBar>);
 
@@ -21,12 +21,12 @@ impl Waiting {
     pub(super) fn new(out: Output, what: impl Into<String>) -> Self {
         Self(out.shows_waiting().then(|| {
             let spinner = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
-            // The template is a constant; should it ever be wrong, another style does.
+            // The template is a constant. If it were wrong, another style is shown.
             if let Ok(style) = ProgressStyle::with_template(STYLE) {
                 spinner.set_style(style.with_key(
                     "waited",
                     |state: &ProgressState, text: &mut dyn std::fmt::Write| {
-                        // What cannot be drawn is no reason to stop.
+                        // An error of the drawing code does not stop the command.
                         let _ = write!(text, "{} s", state.elapsed().as_secs());
                     },
                 ));
@@ -37,7 +37,7 @@ impl Waiting {
         }))
     }
 
-    /// Does what writes to the terminal meanwhile.
+    /// Runs a function that writes to the terminal while the spinner turns.
     pub(super) fn beside(&self, write: impl FnOnce()) {
         match &self.0 {
             Some(spinner) => spinner.suspend(write),
@@ -54,10 +54,10 @@ impl Drop for Waiting {
     }
 }
 
-/// What is waited for once this has happened in an update.
+/// What the tool waits for after this event of an update.
 pub(super) fn waits_until(event: &Event) -> &'static str {
     match event {
-        Event::Phase(Phase::Searching { .. }) => "the bootloader is there (Ctrl-C ends it)",
+        Event::Phase(Phase::Searching { .. }) => "the bootloader answers (Ctrl-C ends the wait)",
         Event::Phase(Phase::CallingBack) => "the bootloader answers",
         Event::Phase(Phase::Erasing) => "the old program is erased",
         Event::Phase(Phase::TrialStarting | Phase::Starting) => "the program answers",

@@ -1,12 +1,12 @@
-//! The words of the command line, before they are read: an option of a command may stand in front of
-//! it, too.
+//! Reorders the words of the command line before parsing: an option of a command may also stand
+//! before the command.
 
 use std::ffi::OsString;
 
 use clap::{Arg, Command};
 
-/// Puts options that stand in front of their command behind it: `coflash --node 5 info` is `coflash
-/// info --node 5`. What cannot be understood stays as it is, for the reader to object to.
+/// Moves options that stand before their command behind it: `coflash --node 5 info` becomes
+/// `coflash info --node 5`. Unknown options stay in place, and the parser reports them.
 pub(super) fn ordered(words: Vec<OsString>, root: &Command) -> Vec<OsString> {
     let mut kept: Vec<OsString> = Vec::new();
     let mut moved: Vec<(String, Vec<OsString>)> = Vec::new();
@@ -45,14 +45,15 @@ pub(super) fn ordered(words: Vec<OsString>, root: &Command) -> Vec<OsString> {
             moved.push((text.to_string(), all));
         }
     };
-    // A command of a command, as `lss assign`.
+    // A subcommand of a command, for example `lss assign`.
     let mut levels = vec![(command, kept.len())];
     let mut rest: Vec<OsString> = rest.cloned().collect();
     while let Some(next) = rest.first().and_then(|word| levels.last()?.0.find_subcommand(word)) {
         kept.push(rest.remove(0));
         levels.push((next, kept.len()));
     }
-    // Behind the last command that has it: from the end on, so that the places stay.
+    // Insert behind the last command with this option, from the end on, so that earlier positions
+    // stay valid.
     let place = |text: &str| {
         let has = |(command, _): &&(&Command, usize)| {
             Name::of(text).is_some_and(|name| command.get_arguments().any(|argument| name.is_of(argument)))
@@ -69,23 +70,23 @@ pub(super) fn ordered(words: Vec<OsString>, root: &Command) -> Vec<OsString> {
     kept
 }
 
-/// The first command, or command of a command, that has this option.
+/// The first command or subcommand that has this option.
 fn within<'c>(command: &'c Command, name: &Name<'_>) -> Option<&'c Arg> {
     let own = command.get_arguments().find(|argument| name.is_of(argument));
     own.or_else(|| command.get_subcommands().find_map(|below| within(below, name)))
 }
 
-/// An option as it is written.
+/// An option as written by the user.
 struct Name<'w> {
-    /// Without dashes and value.
+    /// The name without dashes and value.
     bare: &'w str,
     long: bool,
-    /// Whether its value is in the same word.
+    /// Whether the same word contains the value.
     valued: bool,
 }
 
 impl<'w> Name<'w> {
-    /// `None` for a word that is no option.
+    /// `None` for a word that is not an option.
     fn of(word: &'w str) -> Option<Self> {
         match word.strip_prefix("--") {
             Some("") => None,
@@ -111,7 +112,7 @@ impl<'w> Name<'w> {
         }
     }
 
-    /// Whether the next word is its value.
+    /// Whether the next word is the option's value.
     fn takes_next(&self, argument: &Arg) -> bool {
         !self.valued && argument.get_action().takes_values() && !argument.is_require_equals_set()
     }
@@ -143,7 +144,7 @@ mod tests {
         ] {
             assert_eq!(line(words), ordered, "{words}");
         }
-        // What is in order, and what nobody understands.
+        // Words in the right order, and words with an unknown option.
         for words in [
             "info --node 5",
             "--json info",

@@ -1,4 +1,4 @@
-//! `coflash write`: a value into any object.
+//! `coflash write`: writes a value into an object.
 
 use std::path::Path;
 
@@ -13,26 +13,27 @@ use super::device::Device;
 use super::objects::{bytes_of, Names, Object};
 use super::output::Failure;
 
-/// The type whose value is the name of a file.
+/// The type with the name of a file as its value.
 const FROM_FILE: &str = "domain-from-file";
 
 /// Writes a value into an object.
 ///
-/// The value is checked against the type before anything is sent; what the device refuses is told
-/// with its reason. Numbers are in C notation (4096, 0x1000, octal 010000), with a minus sign if need
-/// be.
+/// The value is checked against the type before anything is sent; a refusal of the device is shown
+/// with its reason. Numbers are in C notation (4096, 0x1000, octal 010000), optionally with a minus
+/// sign.
 #[derive(Debug, Args)]
 pub(super) struct Write {
-    /// The object: hexadecimal index and decimal sub-index, like 1017 or 1F51/1; with --eds its name.
+    /// The object: hexadecimal index and decimal sub-index, like 1017 or 1F51/1, or its name with
+    /// --eds.
     #[arg(value_name = "OBJECT")]
     object: String,
 
-    /// The value: a number, true or false, a text, bytes like "DE AD BE EF", or with --type
-    /// domain-from-file the name of a file.
+    /// The value: a number, true or false, a text, bytes like "DE AD BE EF", or the name of a file
+    /// with --type domain-from-file.
     #[arg(allow_hyphen_values = true)]
     value: String,
 
-    /// The value's type; otherwise the one that --eds tells.
+    /// The value's type; by default the type in the EDS.
     #[arg(long = "type", value_name = "TYPE", value_parser = PossibleValuesParser::new(
         DataType::names().chain([FROM_FILE])))]
     kind: Option<String>,
@@ -50,7 +51,7 @@ impl Write {
         let bytes = self.bytes(&object)?;
         let mut link = context.link()?;
         let mut session = self.device.session(&mut link)?;
-        let waiting = context.waiting(format!("{} of node {} is written", object.at, session.node()));
+        let waiting = context.waiting(format!("{} of node {} has been written", object.at, session.node()));
         session
             .write(object.at, &bytes, Doing::Write(object.at), &mut |_| {})
             .map_err(|error| Failure::diagnosed(error, &mut session))?;
@@ -67,7 +68,7 @@ impl Write {
         Ok(())
     }
 
-    /// What is to be sent, after every check that needs no device.
+    /// The bytes to send, after every check that needs no device.
     fn bytes(&self, object: &Object) -> Result<Vec<u8>, Failure> {
         if let Some(entry) = object.entry.as_ref().filter(|entry| !entry.writable) {
             let advice =
@@ -84,10 +85,13 @@ impl Write {
         };
         let Some(kind) = kind else {
             let advice = "give --type u8, u16, u32, string and so on, or --eds FILE, which knows it";
-            return Err(Failure::usage(format!("it is not said of what type {object} is"), advice));
+            return Err(Failure::usage(format!("the type of {object} is unknown"), advice));
         };
         let refused = |why: String| {
-            Failure::usage(format!("{object}: {why}"), "nothing was sent; give a value that the object takes")
+            Failure::usage(
+                format!("{object}: {why}"),
+                "nothing was sent; give a value that the object accepts",
+            )
         };
         let bytes = kind.encode(&self.value).map_err(|error| refused(error.to_string()))?;
         if let (Some(entry), Some(number)) = (&object.entry, coflash::device::value::integer(&self.value)) {

@@ -1,5 +1,5 @@
-//! A sealed device: what it does for the holder of a root key alone (2002h), and what it has recorded
-//! (2003h). `seal::access` has the numbers.
+//! Access to a sealed device: the functions that need a root key (2002h), and the event log
+//! (2003h). `seal::access` defines the numbers.
 
 use std::fmt;
 use std::time::Duration;
@@ -11,15 +11,15 @@ use seal::wire::{array, word};
 
 use super::{Doing, Error, Session};
 
-/// How long a device may look at a signature.
+/// How long a device may take to check a signature.
 const VERDICT: Duration = Duration::from_secs(2);
-/// How often it is asked meanwhile.
+/// The pause between two requests meanwhile.
 const PERIOD: Duration = Duration::from_millis(50);
 
-/// The rights in the last word of 2002h/1; beside them is [`SEALED`].
+/// The rights in the last word of 2002h/1; the word also contains [`SEALED`].
 const RIGHTS: u32 = 0xFFFF;
 
-/// What a device wants to be signed together with a request (2002h/1).
+/// The bytes that the device wants signed together with a request (2002h/1).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Challenge([u8; CHALLENGE]);
 
@@ -36,13 +36,14 @@ impl Challenge {
         word(&self.0, SIGNED_CHALLENGE) & RIGHTS
     }
 
-    /// Whether the device is sealed: it has keys, and takes sealed images alone.
+    /// Whether the device is sealed: it has keys, and accepts only sealed images.
     #[must_use]
     pub fn is_sealed(&self) -> bool {
         word(&self.0, SIGNED_CHALLENGE) & SEALED != 0
     }
 
-    /// What the holder of the root key signs: rights, their argument and the id of the key.
+    /// The bytes that the holder of the root key signs: rights, their argument, and the id of the
+    /// key.
     #[must_use]
     pub fn tbs(&self, rights: u32, argument: u32, key_id: u32) -> Vec<u8> {
         let mut message = [&DOMAIN[..], &self.0[..SIGNED_CHALLENGE]].concat();
@@ -55,19 +56,21 @@ fn request(rights: u32, argument: u32, key_id: u32) -> impl Iterator<Item = u8> 
     [rights, argument, key_id].into_iter().flat_map(u32::to_le_bytes)
 }
 
-/// Asks the device for its challenge.
+/// Reads the device's challenge.
 ///
 /// # Errors
-/// What a [read](Session::read) has; a device that takes no sealed images has no such object.
+/// The errors of a [read](Session::read). A device without support for sealed images does not have
+/// this object.
 pub fn challenge(session: &mut Session<'_>) -> Result<Challenge, Error> {
     let bytes = session.read(Address::new(ACCESS, 1))?;
     Ok(Challenge(array(&bytes, 0)))
 }
 
-/// The same, of a device that may have no such object: `None` then, and where what it tells is none.
+/// Reads the challenge of a device that may not have this object. `None` if the object is missing
+/// or its value is invalid.
 ///
 /// # Errors
-/// As [`challenge`], but for a refusal.
+/// The errors of [`challenge`], except a refusal.
 pub fn told_challenge(session: &mut Session<'_>) -> Result<Option<Challenge>, Error> {
     match session.read(Address::new(ACCESS, 1)) {
         Ok(bytes) => Ok(bytes.try_into().ok().map(Challenge)),
@@ -76,11 +79,12 @@ pub fn told_challenge(session: &mut Session<'_>) -> Result<Option<Challenge>, Er
     }
 }
 
-/// Asks for rights with the signature of a root over [`Challenge::tbs`]; whether all are granted.
+/// Asks for rights with the signature of a root over [`Challenge::tbs`]. Returns whether the device
+/// has granted all of them.
 ///
 /// # Errors
-/// What a [write](Session::write) has: 06090030h from a device that does not have the key,
-/// 08000022h from one that works, or waits after a wrong signature.
+/// The errors of a [write](Session::write): 06090030h from a device that does not have the key,
+/// 08000022h from a device that is busy, or that waits after a wrong signature.
 pub fn ask(
     session: &mut Session<'_>,
     (rights, argument, key_id): (u32, u32, u32),
@@ -92,7 +96,7 @@ pub fn ask(
     let deadline = session.now() + VERDICT;
     loop {
         if challenge(session)?.granted() & rights == rights {
-            // It records that, and takes no command meanwhile.
+            // The device records the grant, and accepts no command meanwhile.
             session.wait(PERIOD)?;
             return Ok(true);
         }
@@ -103,16 +107,16 @@ pub fn ask(
     }
 }
 
-/// Something that a device has recorded.
+/// An entry of the device's event log.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Event {
-    /// 1 is the first of the device's life.
+    /// The entry's number; 1 is the first entry in the device's life.
     pub number: u32,
     /// The kind in the upper half, its detail in the lower half (`seal::access::event`).
     pub what: u32,
-    /// Security counter of the image that it is about.
+    /// Security counter of the image that the entry concerns.
     pub counter: u32,
-    /// Its version.
+    /// Version of that image.
     pub version: u32,
 }
 
@@ -135,10 +139,11 @@ impl fmt::Display for Event {
     }
 }
 
-/// What the device has recorded last, the newest first.
+/// Reads the device's event log, the newest entry first.
 ///
 /// # Errors
-/// What a [read](Session::read) has; a device that takes no sealed images has no such object.
+/// The errors of a [read](Session::read). A device without support for sealed images does not have
+/// this object.
 pub fn events(session: &mut Session<'_>) -> Result<Vec<Event>, Error> {
     let mut events = Vec::new();
     for place in 1..=seal::access::EVENTS as u8 {

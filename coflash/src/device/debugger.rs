@@ -1,8 +1,8 @@
 //! The debugger interface of a device on the bench: memory, breakpoints and steps through 1025h. A
-//! product has no such object.
+//! product does not have this object.
 //!
-//! The device's part stands in `docs/debugger.md` of coboot; breakpoints are those of a Cortex-M4
-//! (ARM DDI 0403E section C1).
+//! `docs/debugger.md` of coboot describes the device's side; the breakpoints are those of a
+//! Cortex-M4 (ARM DDI 0403E section C1).
 
 use std::time::Duration;
 
@@ -15,18 +15,18 @@ use super::doing::Doing;
 use super::error::Error;
 use super::session::Session;
 
-/// Bytes that one command reads or writes at most.
+/// The most bytes that one command reads or writes.
 const CHUNK: u32 = 4096;
-/// How often a program is asked whether it has stopped, where no emergency tells.
+/// The pause between two status requests while no emergency reports a stop.
 const LOOK: Duration = Duration::from_millis(200);
 
 const FP_CTRL: u32 = 0xE000_2000;
 const FP_CTRL_ON: u32 = 0b11;
 const FP_COMP: u32 = 0xE000_2008;
-/// Code comparators of a Cortex-M4.
+/// The number of code comparators of a Cortex-M4.
 pub const BREAKPOINTS: u32 = 6;
 const ENABLE: u32 = 1 << 0;
-/// Where code comparators can stop.
+/// The end of the addresses at which code comparators can stop.
 const CODE_END: u32 = 0x2000_0000;
 
 const DCRDR: u32 = 0xE000_EDF8;
@@ -37,62 +37,62 @@ const DEMCR_STEP: u32 = 1 << 18;
 const DEMCR_STOPPED: u32 = 1 << 19;
 const DEMCR_ENABLED: u32 = 1 << 16;
 
-/// Names of the registers, as [`Registers`] counts them.
+/// The names of the registers, in the order of [`Registers`].
 pub const NAMES: [&str; 17] = [
     "r0", "r1", "r2", "r3", "r4", "r5", "r6", "r7", "r8", "r9", "r10", "r11", "r12", "sp", "lr", "pc", "xpsr",
 ];
 
-/// The registers of a program that is stopped: R0 to R12, SP, LR, PC, xPSR.
+/// The registers of a stopped program: R0 to R12, SP, LR, PC, xPSR.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Registers(pub [u32; 17]);
 
 impl Registers {
-    /// The next instruction.
+    /// The address of the next instruction.
     #[must_use]
     pub const fn pc(&self) -> u32 {
         self.0[15]
     }
 
-    /// From what the device has saved: the handler's ten words, and the core's eight, which begin
-    /// at the address that the first word says.
+    /// Combines the two parts that the device has saved: the handler's ten words, and the core's
+    /// eight words at the address in the handler's first word.
     fn of(handler: &[u32; 10], core: &[u32; 8]) -> Self {
         let [frame, r4, r5, r6, r7, r8, r9, r10, r11, exc_return] = *handler;
         let [r0, r1, r2, r3, r12, lr, pc, xpsr] = *core;
-        // With those of the FPU the frame has 26 words; bit 9 of xPSR tells of one for alignment
-        // (DDI 0403E section B1.5).
+        // With the FPU registers the frame has 26 words; bit 9 of xPSR marks an alignment word (DDI
+        // 0403E section B1.5).
         let words = if exc_return & 0x10 == 0 { 26 } else { 8 } + (xpsr >> 9 & 1);
         let sp = frame.wrapping_add(4 * words);
         Self([r0, r1, r2, r3, r4, r5, r6, r7, r8, r9, r10, r11, r12, sp, lr, pc, xpsr & !(1 << 9)])
     }
 }
 
-/// A program that stopped, or could not.
+/// A program that stopped, or that could not be stopped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stopped {
-    /// Why.
+    /// The reason.
     pub stop: Stop,
-    /// The next instruction.
+    /// The address of the next instruction.
     pub address: u32,
 }
 
-/// Why a breakpoint cannot be set.
+/// The reasons why a breakpoint cannot be set.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum NoBreakpoint {
     /// The address is odd, or not in flash.
     Address,
-    /// All comparators are taken.
+    /// All comparators are in use.
     Full,
-    /// The program does not stop: it is a bootloader, or one without breakpoints.
+    /// The program does not stop: it is a bootloader, or an application without breakpoints.
     Disabled,
 }
 
-/// A session that looks into the device's memory.
+/// A session that accesses the device's memory.
 pub struct Debugger<'s, 'a> {
     session: &'s mut Session<'a>,
 }
 
 impl<'s, 'a> Debugger<'s, 'a> {
-    /// On this session.
+    /// A debugger on this session.
     pub fn new(session: &'s mut Session<'a>) -> Self {
         Self { session }
     }
@@ -100,8 +100,8 @@ impl<'s, 'a> Debugger<'s, 'a> {
     /// Reads memory. Addresses do not wrap.
     ///
     /// # Errors
-    /// What the device says: 06090030h for what may not be read, 08000022h for a device that is
-    /// secured.
+    /// The device's refusal: 06090030h for memory that may not be read, 08000022h for a secured
+    /// device.
     pub fn read(&mut self, address: u32, len: u32, progress: &mut dyn FnMut(u32)) -> Result<Vec<u8>, Error> {
         let mut bytes = Vec::new();
         for (at, len) in chunks(address, len) {
@@ -118,7 +118,7 @@ impl<'s, 'a> Debugger<'s, 'a> {
     /// Writes memory.
     ///
     /// # Errors
-    /// As [`read`](Self::read); what lies before the address that is refused may have been written.
+    /// The errors of [`read`](Self::read). Bytes before the refused address may have been written.
     pub fn write(&mut self, address: u32, bytes: &[u8], progress: &mut dyn FnMut(u32)) -> Result<(), Error> {
         let len = u32::try_from(bytes.len()).unwrap_or(u32::MAX);
         let mut rest = bytes;
@@ -151,7 +151,7 @@ impl<'s, 'a> Debugger<'s, 'a> {
         self.write(address, &value.to_le_bytes(), &mut |_| {})
     }
 
-    /// The addresses at which the program stops.
+    /// Reads the addresses of the breakpoints.
     ///
     /// # Errors
     /// As [`read`](Self::read).
@@ -163,10 +163,10 @@ impl<'s, 'a> Debugger<'s, 'a> {
         Ok(comparators.into_iter().flat_map(addresses).collect())
     }
 
-    /// Sets a breakpoint at an instruction, by a comparator that is free.
+    /// Sets a breakpoint at an instruction with a free comparator.
     ///
     /// # Errors
-    /// As [`read`](Self::read); within, why it cannot be set.
+    /// The errors of [`read`](Self::read). The inner result says why the breakpoint cannot be set.
     pub fn break_at(&mut self, address: u32) -> Result<Result<(), NoBreakpoint>, Error> {
         if !address.is_multiple_of(2) || address >= CODE_END {
             return Ok(Err(NoBreakpoint::Address));
@@ -176,7 +176,7 @@ impl<'s, 'a> Debugger<'s, 'a> {
         }
         let on = self.word(FP_CTRL)? & ENABLE != 0;
         let comparators: [u32; BREAKPOINTS as usize] = self.words(FP_COMP)?;
-        // What was left behind while the unit was off does not come back with it.
+        // Comparators set before the unit was disabled must not become active with it.
         if !on {
             self.write(FP_COMP, &[0; 4 * BREAKPOINTS as usize], &mut |_| {})?;
         }
@@ -192,7 +192,7 @@ impl<'s, 'a> Debugger<'s, 'a> {
         Ok(Ok(()))
     }
 
-    /// Takes a breakpoint away; whether there was one.
+    /// Removes a breakpoint; returns whether it existed.
     ///
     /// # Errors
     /// As [`read`](Self::read).
@@ -208,7 +208,7 @@ impl<'s, 'a> Debugger<'s, 'a> {
         Ok(found)
     }
 
-    /// Takes all breakpoints away.
+    /// Removes all breakpoints.
     ///
     /// # Errors
     /// As [`read`](Self::read).
@@ -224,7 +224,7 @@ impl<'s, 'a> Debugger<'s, 'a> {
         Ok(self.word(DEMCR)? & DEMCR_STOPPED != 0)
     }
 
-    /// Lets a program that is stopped go on.
+    /// Lets a stopped program continue.
     ///
     /// # Errors
     /// As [`read`](Self::read).
@@ -232,7 +232,7 @@ impl<'s, 'a> Debugger<'s, 'a> {
         self.set_word(DEMCR, DEMCR_ON)
     }
 
-    /// Lets a program that is stopped carry out one instruction.
+    /// Lets a stopped program execute one instruction.
     ///
     /// # Errors
     /// As [`read`](Self::read).
@@ -248,7 +248,7 @@ impl<'s, 'a> Debugger<'s, 'a> {
         self.set_word(DEMCR, DEMCR_ON | DEMCR_PEND)
     }
 
-    /// The registers of a program that is stopped.
+    /// The registers of a stopped program.
     ///
     /// # Errors
     /// As [`read`](Self::read).
@@ -262,14 +262,14 @@ impl<'s, 'a> Debugger<'s, 'a> {
         Ok(Some(Registers::of(&handler, &core)))
     }
 
-    /// Waits until the program stops, or has run over a breakpoint that cannot stop it; `None` when
-    /// it has not within this time.
+    /// Waits until the program stops, or has passed a breakpoint that cannot stop it; `None` if
+    /// neither happens within `time`.
     ///
-    /// An emergency may come before the answer to the command that brought the stop about, and be
-    /// gone: so the program is asked as well.
+    /// An emergency may come before the answer to the command that caused the stop, and be lost.
+    /// The method therefore also reads the program's state.
     ///
     /// # Errors
-    /// As [`read`](Self::read), and those of the adapter.
+    /// The errors of [`read`](Self::read), and those of the adapter.
     pub fn await_stop(&mut self, time: Duration) -> Result<Option<Stopped>, Error> {
         let (began, node) = (self.session.now(), self.session.node());
         loop {
@@ -283,8 +283,8 @@ impl<'s, 'a> Debugger<'s, 'a> {
             if left.is_zero() {
                 return Ok(None);
             }
-            // Out of reach: the device has turned the unit off and left the comparators as they
-            // were.
+            // The device could not stop here: it has disabled the unit and left the comparators
+            // unchanged.
             if self.word(FP_CTRL)? & ENABLE == 0 {
                 let comparators: [u32; BREAKPOINTS as usize] = self.words(FP_COMP)?;
                 if let Some(address) = comparators.into_iter().flat_map(addresses).next() {
@@ -303,7 +303,7 @@ impl<'s, 'a> Debugger<'s, 'a> {
     }
 }
 
-/// What an emergency tells of a stop.
+/// The stop that an emergency reports.
 fn stop_of(frame: &Frame, id: CobId) -> Option<Stopped> {
     if frame.cob_id() != Some(id) {
         return None;
@@ -313,7 +313,7 @@ fn stop_of(frame: &Frame, id: CobId) -> Option<Stopped> {
     Some(Stopped { stop, address: u32::from_le_bytes([a, b, c, d]) })
 }
 
-/// The pieces of a range, which ends with the address space.
+/// The pieces of a range; the range ends at the end of the address space.
 fn chunks(address: u32, len: u32) -> impl Iterator<Item = (u32, u16)> {
     (0..len).step_by(CHUNK as usize).map_while(move |offset| {
         let at = address.checked_add(offset)?;
@@ -321,13 +321,13 @@ fn chunks(address: u32, len: u32) -> impl Iterator<Item = (u32, u16)> {
     })
 }
 
-/// The comparator that stops at an address.
+/// The comparator value for an address.
 const fn comparator(address: u32) -> u32 {
     let half = if address & 2 == 0 { 1 << 30 } else { 1 << 31 };
     half | address & !3 | ENABLE
 }
 
-/// The addresses that a comparator stops at.
+/// The addresses at which a comparator stops.
 fn addresses(comparator: u32) -> impl Iterator<Item = u32> + Clone {
     let word = comparator & 0x1FFF_FFFC;
     let on = comparator & ENABLE != 0;
@@ -341,7 +341,7 @@ fn addresses(comparator: u32) -> impl Iterator<Item = u32> + Clone {
 mod tests {
     use super::*;
 
-    /// DDI 0403E section C1.11: REPLACE 01b is the lower halfword, 10b the upper one.
+    /// DDI 0403E section C1.11: REPLACE 01b selects the lower halfword, 10b the upper one.
     #[test]
     fn comparators_name_a_halfword() {
         for (address, value) in [(0x0801_2344, 0x4801_2345), (0x0801_2346, 0x8801_2345)] {
@@ -359,7 +359,7 @@ mod tests {
         assert_eq!(chunks(u32::MAX, 5000).collect::<Vec<_>>(), [(u32::MAX, 4096)]);
     }
 
-    /// The frame begins behind ten words; SP lies behind it, and behind the word that aligned it.
+    /// The frame begins after ten words; SP points behind it and behind its alignment word.
     #[test]
     fn registers_are_put_together_from_both_parts() {
         let handler = [0x2000_0128, 4, 5, 6, 7, 8, 9, 10, 11, 0xFFFF_FFF9];

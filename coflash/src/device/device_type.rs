@@ -1,4 +1,4 @@
-//! What a device says it is: 1000h.
+//! The device type, 1000h.
 
 use std::fmt;
 
@@ -6,13 +6,13 @@ use canopen::program::{BOOTLOADER_DEVICE_TYPE, ESACADEMY_DEVICE_TYPE, LIFT_DEVIC
 use serde::ser::SerializeStruct as _;
 use serde::{Serialize, Serializer};
 
-/// What 1000h reads.
+/// The value of 1000h.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DeviceType(pub u32);
 
 impl DeviceType {
-    /// Whether it is that of a bootloader, of one dialect or the other; everything else is an
-    /// application's.
+    /// Whether this is the device type of a bootloader, of any dialect; every other value belongs
+    /// to an application.
     #[must_use]
     pub const fn is_bootloader(self) -> bool {
         matches!(self.0, BOOTLOADER_DEVICE_TYPE | LIFT_DEVICE_TYPE | ESACADEMY_DEVICE_TYPE)
@@ -27,7 +27,7 @@ impl fmt::Display for DeviceType {
 }
 
 impl Serialize for DeviceType {
-    /// `device_type`, and whether it is a `bootloader`.
+    /// Writes `device_type`, and `bootloader` if it is the device type of a bootloader.
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut fields = serializer.serialize_struct("DeviceType", 2)?;
         fields.serialize_field("device_type", &self.0)?;

@@ -1,4 +1,4 @@
-//! Why a device may not answer, judged by what the bus says meanwhile.
+//! Explains why a device may not answer, from the traffic on the bus.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -12,19 +12,19 @@ use super::session::Session;
 use crate::bus::decode::state_words;
 use crate::bus::Health;
 
-/// How long to listen: heartbeats come once a second in most networks.
+/// How long to listen: in most networks, heartbeats come once a second.
 pub const LISTEN: Duration = Duration::from_millis(1200);
 
-/// What the bus says while a device is silent. `Display` has the conclusion, with what to do.
+/// The traffic on the bus while a device is silent. `Display` gives the conclusion and the advice.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Diagnosis {
     /// The silent device.
     pub node: NodeId,
     /// Frames heard, of any kind.
     pub frames: usize,
-    /// Nodes heard, with the state that they told last.
+    /// The nodes that were heard, with their last reported states.
     pub heard: BTreeMap<NodeId, Option<NmtState>>,
-    /// What the adapter knows of its bus, where it tells.
+    /// The adapter's knowledge of its bus, if it reports any.
     pub health: Option<Health>,
 }
 
@@ -39,7 +39,7 @@ pub fn diagnose(session: &mut Session<'_>) -> Result<Diagnosis, Error> {
         if let Some((node, state)) = parse_state_message(frame) {
             diagnosis.heard.insert(node, Some(state));
         } else if let Some(id) = frame.cob_id().map(|id| id.get()) {
-            // What a node sends by itself: EMCY, PDO, SDO answers.
+            // Messages that a node sends: EMCY, PDO, SDO answers.
             let sent_by = matches!(id & 0x780, 0x080 | 0x180 | 0x280 | 0x380 | 0x480 | 0x580);
             if let Some(node) = NodeId::new((id & 0x7F) as u8).filter(|_| sent_by) {
                 diagnosis.heard.entry(node).or_insert(None);
@@ -60,9 +60,9 @@ impl fmt::Display for Diagnosis {
             if health.is_some_and(|health| health.acknowledged()) {
                 return write!(
                     f,
-                    "what the adapter sends is acknowledged, so another node is on the bus and the bit rate is right: check that \
+                    "another node acknowledges the adapter's frames, so the bit rate is right: check that \
                      node {node} is the right one (coflash scan asks all of them, coflash lss fastscan finds devices without \
-                     node-ID), and that it is switched on; a program that never answers is caught by coflash catch while the \
+                     node-ID), and that it is switched on; coflash catch catches a program that never answers while the \
                      device is switched off and on, or kept from starting by the entry strap"
                 );
             }
@@ -77,22 +77,22 @@ impl fmt::Display for Diagnosis {
         match heard.get(node) {
             Some(Some(NmtState::Stopped)) => write!(
                 f,
-                "node {node} is heard and has been stopped, so that it serves no SDO: coflash reset --node {node}"
+                "node {node} sends heartbeats in state stopped, in which SDO does not work: coflash reset --node {node}"
             ),
             Some(Some(state)) => write!(
                 f,
-                "node {node} is heard (heartbeat, {}) but does not answer: another tool may be at work on it, or it \
+                "node {node} sends heartbeats ({}) but does not answer: another tool may be using it, or it \
                  needs a longer --sdo-timeout",
                 state_words(*state)
             ),
             Some(None) => write!(
                 f,
-                "node {node} is heard but does not answer: another tool may be at work on it, or it needs a longer \
+                "node {node} sends frames but does not answer: another tool may be using it, or it needs a longer \
                  --sdo-timeout"
             ),
             None if heard.is_empty() => write!(
                 f,
-                "the bus works, but no CANopen node is heard: check that node {node} is the right one and that it has \
+                "the bus works, but no CANopen node sends frames: check that node {node} is the right one and that it has \
                  power; coflash scan asks all of them"
             ),
             None => {

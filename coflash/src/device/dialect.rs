@@ -1,7 +1,7 @@
-//! Dialects: what different bootloaders make of the same objects.
+//! Dialects: the ways in which different bootloaders use the same objects.
 //!
-//! Here is which there are, and how their bootloaders say so; what each of them is told in an update
-//! is in [`update::dialect`](crate::update::dialect).
+//! This module lists the dialects and detects them from the device type. The commands of each
+//! dialect during an update are in [`update::dialect`](crate::update::dialect).
 
 use std::fmt;
 
@@ -11,14 +11,14 @@ use serde::{Serialize, Serializer};
 
 use super::device_type::DeviceType;
 
-/// Which dialect a bootloader speaks.
+/// The dialect of a bootloader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Dialect {
-    /// SYS TEC, and coboot's own.
+    /// Block files: the dialect of SYS TEC and of coboot.
     Block,
-    /// CiA 302-3, an image.
+    /// CiA 302-3 with a binary image.
     Raw,
-    /// CiA 302-3, Intel HEX.
+    /// CiA 302-3 with Intel HEX.
     Hex,
     /// CiA 417, as CiA 814-1 describes it.
     Lift,
@@ -27,10 +27,10 @@ pub enum Dialect {
 }
 
 impl Dialect {
-    /// All of them.
+    /// All dialects.
     pub const ALL: [Self; 5] = [Self::Block, Self::Raw, Self::Hex, Self::Lift, Self::EsAcademy];
 
-    /// Its name on the command line.
+    /// The name on the command line.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -42,8 +42,8 @@ impl Dialect {
         }
     }
 
-    /// What a bootloader with this device type speaks, at this node-ID; `None` for what is an
-    /// application or unknown.
+    /// The dialect of a bootloader with this device type at this node-ID; `None` for an application
+    /// or an unknown device type.
     #[must_use]
     pub fn of_bootloader(running: DeviceType, node: NodeId) -> Option<Self> {
         match running.0 {
@@ -59,7 +59,7 @@ impl Dialect {
 impl fmt::Display for Dialect {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            Self::Block => "block (block files, as SYS TEC has it)",
+            Self::Block => "block (block files, SYS TEC)",
             Self::Raw => "raw (CiA 302-3, an image)",
             Self::Hex => "hex (CiA 302-3, Intel HEX)",
             Self::Lift => "lift (CiA 417)",

@@ -1,11 +1,11 @@
-//! What the host was about, for the words of an error.
+//! The action of the host that failed, for error messages.
 
 use std::fmt;
 
 use canopen::program::ProgramControl;
 use canopen::Address;
 
-/// What the host was about when something went wrong.
+/// The host's action at the time of an error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Doing {
     /// Reading an object.
@@ -18,9 +18,9 @@ pub enum Doing {
     Block(u32),
     /// Writing the whole program at once.
     Program,
-    /// Writing the password of a device that is locked.
+    /// Writing the password of a locked device.
     Unlock,
-    /// Telling the bootloader to restart into the program.
+    /// Commanding the bootloader to restart into the program.
     Restart,
 }
 
@@ -47,32 +47,32 @@ impl fmt::Display for Doing {
     }
 }
 
-/// What the LSS master was about when something went wrong.
+/// The LSS master's action at the time of an error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LssDoing {
-    /// Addressing a device by its LSS address.
+    /// Selecting a device by its LSS address.
     Select,
-    /// Asking for the address or the node-ID.
+    /// Asking for the LSS address or the node-ID.
     Inquire,
-    /// Giving a node-ID.
+    /// Setting the node-ID.
     NodeId,
-    /// Giving a bit rate.
+    /// Setting the bit rate.
     BitRate,
-    /// Having it stored.
+    /// Storing node-ID and bit rate.
     Store,
-    /// Searching.
+    /// Searching by fastscan.
     Fastscan,
 }
 
 impl LssDoing {
-    /// For people.
+    /// The words for messages.
     #[must_use]
     pub const fn words(self) -> &'static str {
         match self {
             Self::Select => "selecting the device by its LSS address",
             Self::Inquire => "asking for LSS address or node-ID",
-            Self::NodeId => "giving the node-ID",
-            Self::BitRate => "giving the bit rate",
+            Self::NodeId => "setting the node-ID",
+            Self::BitRate => "setting the bit rate",
             Self::Store => "storing node-ID and bit rate",
             Self::Fastscan => "fastscan",
         }

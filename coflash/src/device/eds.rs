@@ -1,7 +1,8 @@
 //! Electronic data sheets (CiA 306-1): names, types and access of a device's objects.
 //!
-//! A sheet comes from somewhere: one that is too large, no INI file or without objects is an error,
-//! and what is odd about a single object costs that object's type or limits, not the sheet.
+//! The source of a sheet is not trusted: a sheet that is too large, that is not an INI file or that
+//! has no objects is an error. An invalid entry of a single object removes only that object's type
+//! or limits.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -10,32 +11,32 @@ use configparser::ini::Ini;
 
 use super::value::{integer, DataType};
 
-/// The most bytes that a sheet may have. Those of drives with hundreds of objects have some 300 KiB.
+/// The most bytes of a sheet. Sheets of drives with hundreds of objects have about 300 KiB.
 pub const MAX: usize = 8 * 1024 * 1024;
 
-/// A data sheet's objects.
+/// The objects of a data sheet.
 #[derive(Clone, Debug, Default)]
 pub struct Eds {
     objects: BTreeMap<(u16, u8), Entry>,
 }
 
-/// One object, or one sub-index of it.
+/// One object, or one sub-index of an object.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Entry {
-    /// Where it is.
+    /// Index and sub-index.
     pub at: Address,
-    /// Its name, printable.
+    /// Its name, in printable characters.
     pub name: String,
-    /// The name of the record or array that it is in.
+    /// The name of the record or array that contains it.
     pub within: Option<String>,
-    /// Its data type; `None` for one that has no notation here.
+    /// Its data type; `None` if this tool has no notation for the type.
     pub kind: Option<DataType>,
     /// Whether it may be written.
     pub writable: bool,
-    /// The least value that it takes, where the sheet tells.
+    /// The lowest permitted value, if the sheet gives it.
     pub low: Option<i128>,
-    /// The greatest value that it takes, where the sheet tells.
+    /// The highest permitted value, if the sheet gives it.
     pub high: Option<i128>,
 }
 
@@ -43,33 +44,33 @@ pub struct Entry {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum EdsError {
     /// It has more than [`MAX`] bytes.
-    #[error("it is larger than {} MiB: that is no data sheet", MAX / (1024 * 1024))]
+    #[error("it is larger than {} MiB: it is not a data sheet", MAX / (1024 * 1024))]
     TooLarge,
-    /// It is no INI file.
-    #[error("it is no EDS: {0}")]
+    /// It is not an INI file.
+    #[error("it is not an EDS: {0}")]
     Syntax(String),
-    /// There is no object in it.
-    #[error("it is no EDS: no section of it is an object, like [1018] or [1018sub1]")]
+    /// It contains no object.
+    #[error("it is not an EDS: none of its sections is an object, like [1018] or [1018sub1]")]
     NoObjects,
 }
 
-/// Why a name leads to no object.
+/// Why a name selects no object.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum NoObject {
-    /// Nothing has this name.
+    /// No object has this name.
     #[error("the EDS has no object '{name}'{}", like(.near))]
     Unknown {
-        /// What was asked for.
+        /// The name.
         name: String,
-        /// Names that have it in them.
+        /// Similar names, which contain it.
         near: Vec<String>,
     },
-    /// Several have it.
+    /// Several objects have this name.
     #[error("several objects are called '{name}': {}", .all.join(", "))]
     Ambiguous {
-        /// What was asked for.
+        /// The name.
         name: String,
-        /// Where they are.
+        /// Their addresses.
         all: Vec<String>,
     },
 }
@@ -81,11 +82,11 @@ fn like(near: &[String]) -> String {
     }
 }
 
-/// How many names are told that are like the one asked for.
+/// The most similar names in a message.
 const NEAR: usize = 6;
 
 impl Entry {
-    /// The name that leads to it and to nothing else: `Identity object/Serial number`.
+    /// The full name, which selects only this object: `Identity object/Serial number`.
     #[must_use]
     pub fn path(&self) -> String {
         match &self.within {
@@ -96,7 +97,7 @@ impl Entry {
 }
 
 impl Eds {
-    /// Takes a data sheet apart. What is not UTF-8 is taken for a character of its own.
+    /// Parses a data sheet. Bytes that are not UTF-8 are replaced.
     ///
     /// # Errors
     /// [`EdsError`].
@@ -108,7 +109,7 @@ impl Eds {
         let mut form = ini.defaults();
         form.delimiters = vec!['='];
         form.comment_symbols = vec![';'];
-        // "Motor 1; speed" is a name.
+        // "Motor 1; speed" is a valid name.
         form.inline_comment_symbols = Some(Vec::new());
         ini.load_defaults(form);
         let sections = ini.read(String::from_utf8_lossy(bytes).into_owned()).map_err(EdsError::Syntax)?;
@@ -132,8 +133,8 @@ impl Eds {
         Ok(eds)
     }
 
-    /// A section that is an object as a whole: a variable, an array in short form, or the head of
-    /// what has sections of its own.
+    /// Adds the object of a section without sub-index: a variable, an array in short form, or the
+    /// head of an object with further sections.
     fn object(&mut self, index: u16, keys: &Keys, sections: &HashMap<String, Keys>) {
         let variable =
             !matches!(number(keys, "objecttype"), Some(0x8 | 0x9)) && number(keys, "subnumber").is_none();
@@ -151,7 +152,7 @@ impl Eds {
             let name = given.map_or_else(|| format!("{record}{sub}"), |name| printable(&name));
             let mut entry = entry(Address::new(index, sub), Some(record), keys);
             entry.name = name;
-            // A section of its own wins.
+            // A section for this sub-index takes precedence.
             if !sections.contains_key(&format!("{index:04x}sub{sub:x}")) {
                 self.objects.insert((index, sub), entry);
             }
@@ -164,8 +165,9 @@ impl Eds {
         self.objects.get(&(at.index, at.sub))
     }
 
-    /// The object of this name, capital or small: that of a variable, `RECORD/SUB` with the number or
-    /// the name of the sub-index, or the name of a sub-index that only one object has.
+    /// Finds an object by its name, in upper or lower case: the name of a variable, `RECORD/SUB`
+    /// with the number or the name of the sub-index, or the name of a sub-index that only one
+    /// object has.
     ///
     /// # Errors
     /// [`NoObject`].
@@ -196,7 +198,7 @@ impl Eds {
     }
 }
 
-/// A section's keys, in small letters.
+/// The keys of a section, in lower case.
 type Keys = HashMap<String, Option<String>>;
 
 fn entry(at: Address, within: Option<String>, keys: &Keys) -> Entry {
@@ -218,12 +220,12 @@ fn parameter_name(keys: &Keys) -> String {
     printable(keys.get("parametername").and_then(Option::as_deref).unwrap_or_default())
 }
 
-/// Names are shown on terminals: what would move the cursor is replaced.
+/// Names are shown on terminals: control characters are replaced.
 fn printable(text: &str) -> String {
     text.trim().chars().map(|c| if c.is_control() { '?' } else { c }).collect()
 }
 
-/// `None` for what is no number, as `$NODEID+0x600`.
+/// `None` for a value that is not a number, such as `$NODEID+0x600`.
 fn number(keys: &Keys, key: &str) -> Option<i128> {
     integer(keys.get(key)?.as_deref()?.trim())
 }
@@ -237,7 +239,7 @@ fn hex16(digits: &str) -> Option<u16> {
 mod tests {
     use super::*;
 
-    /// As CiA 306-1 has them, with what sheets of the field have beside: capitals anywhere, blanks, a
+    /// The format of CiA 306-1, with features of sheets in the field: capitals anywhere, blanks, a
     /// name with a number sign, an array in short form.
     const SHEET: &[u8] = b"; a comment\n[FileInfo]\nFileName=x.eds\n\n[1000]\nParameterName=Device type\n\
         ObjectType=0x7\nDataType=0x0007\nAccessType=ro\n\
@@ -305,7 +307,7 @@ mod tests {
             assert!(Eds::parse(bytes).is_err(), "{:?}", String::from_utf8_lossy(bytes));
         }
         assert_eq!(Eds::parse(&vec![b'a'; MAX + 1]).unwrap_err(), EdsError::TooLarge);
-        // Odd objects cost themselves.
+        // An invalid object is left out.
         let odd = b"[1000]\nParameterName=A\x1B[2J\nDataType=0xFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFF\n[1018sub100]\n\
                     ParameterName=B\n[10sub]\n[1018subx]\n[\xC3\xA4\xC3\xB6\xC3\xBC]\n[2001]\nObjectType=8\nCompactSubObj=900\n";
         let eds = Eds::parse(odd).unwrap();

@@ -1,4 +1,4 @@
-//! What can go wrong with a device: what happened, a stable number, and what to do next.
+//! Errors of a device: what happened, a stable number, and what to do next.
 
 use std::fmt;
 use std::time::Duration;
@@ -22,153 +22,153 @@ mod advice;
 pub enum Error {
     /// The CAN adapter failed.
     Adapter(AdapterError),
-    /// The user gave up.
+    /// The user cancelled.
     Cancelled,
     /// The device does not answer.
     NoAnswer {
-        /// Which one.
+        /// The device.
         node: NodeId,
-        /// What it was asked.
+        /// The action.
         doing: Doing,
     },
-    /// The device answered with an SDO abort, and 1F57h does not say more.
+    /// The device answered with an SDO abort, and 1F57h gives no further reason.
     Refused {
-        /// Which one.
+        /// The device.
         node: NodeId,
-        /// What it was asked.
+        /// The action.
         doing: Doing,
         /// The abort code.
         code: AbortCode,
     },
-    /// The device's answer was none: wrong toggle, wrong command, wrong length.
+    /// The device sent an invalid answer: wrong toggle bit, wrong command, wrong length.
     Protocol {
-        /// What it was asked.
+        /// The action.
         doing: Doing,
-        /// The code that the device was sent.
+        /// The abort code that was sent to the device.
         code: AbortCode,
     },
-    /// 1F57h says that the bootloader could not do what it was told.
+    /// 1F57h reports that the bootloader could not carry out a command.
     Failed {
-        /// What it was told.
+        /// The action.
         doing: Doing,
-        /// Why it could not.
+        /// The error in 1F57h.
         error: FlashError,
-        /// More about it, from the device's maker.
+        /// The manufacturer's detail of the error.
         detail: u16,
-        /// The abort code, where the SDO was refused.
+        /// The abort code, if the SDO request was refused.
         code: Option<AbortCode>,
     },
     /// 1F57h stays busy.
     Busy {
-        /// Which device.
+        /// The device.
         node: NodeId,
-        /// What it was told.
+        /// The action.
         doing: Doing,
-        /// How long it was waited for.
+        /// How long the tool has waited.
         waited: Duration,
     },
     /// The file is for another device.
     WrongTarget {
-        /// Which device was looked at.
+        /// The device.
         node: NodeId,
-        /// What differs.
+        /// The property that differs.
         what: Mismatch,
-        /// What the device says.
+        /// The device's value.
         device: u32,
-        /// What the file says.
+        /// The file's value.
         file: u32,
     },
-    /// The image can be no program.
+    /// The image cannot be a program.
     NoProgram {
-        /// What is wrong with it, as what follows "the image".
+        /// What is wrong with it, as the rest of a sentence that begins with "the image".
         why: String,
         /// What to do next.
         advice: &'static str,
     },
-    /// The device has its program elsewhere than the image is for.
+    /// The device has the program at another address than the image.
     OtherRegion {
-        /// Which device was looked at.
+        /// The device.
         node: NodeId,
         /// The program's number.
         program: u8,
         /// First and last address of the image.
         image: (u32, u32),
-        /// First and last address of the device's program, as 2004h tells it.
+        /// First and last address of the device's program, as 2004h reports it.
         region: (u32, u32),
     },
-    /// The program on trial is another device than its bootloader.
+    /// The program on trial reports another identity than its bootloader.
     OtherIdentity {
-        /// Which device was looked at.
+        /// The device.
         node: NodeId,
-        /// What differs.
+        /// The property that differs.
         what: IdentityPart,
-        /// What the bootloader told.
+        /// The bootloader's value.
         bootloader: Option<u32>,
-        /// What the program on trial tells, `None` for nothing.
+        /// The value of the program on trial; `None` if it reports none.
         application: Option<u32>,
     },
-    /// The application does not go back to the bootloader.
+    /// The application does not return to the bootloader.
     NoBootloader {
-        /// Which device.
+        /// The device.
         node: NodeId,
-        /// What runs instead, `None` where nothing answers.
+        /// What runs instead; `None` if nothing answers.
         running: Option<DeviceType>,
-        /// The abort code, where the application refused.
+        /// The abort code, if the application refused.
         code: Option<AbortCode>,
     },
-    /// The program in the device is not that of the file.
+    /// The program in the device is not the program of the file.
     WrongCrc {
-        /// What 1F56h reads.
+        /// The value of 1F56h.
         device: u32,
-        /// What the file says.
+        /// The file's value.
         file: u32,
     },
-    /// The device's dialect has no such thing.
+    /// The device's dialect does not support an option.
     NotInDialect {
         /// The dialect.
         dialect: Dialect,
-        /// What is missing, as a sentence.
+        /// The missing feature, as a sentence.
         what: &'static str,
     },
-    /// The device is locked, and no password was given.
+    /// The device is locked, and the user gave no password.
     NoPassword {
-        /// Which device.
+        /// The device.
         node: NodeId,
     },
-    /// Another device has the node-ID that this one's bootloader takes.
+    /// Another device has the node-ID that the bootloader of this device uses.
     Occupied {
         /// The node-ID.
         node: NodeId,
     },
-    /// Somebody else is at work on the device.
+    /// Another tool is using the device.
     NotAlone {
-        /// Which device.
+        /// The device.
         node: NodeId,
-        /// How that showed.
+        /// How it was noticed.
         who: Intruder,
     },
     /// A layer setting service failed.
     Lss {
-        /// What the master was about.
+        /// The master's action.
         doing: LssDoing,
-        /// How it failed.
+        /// The kind of failure.
         failure: LssFailure,
     },
-    /// The program on trial was not heard of, or could not be called back: it is not released for
+    /// The program on trial did not answer, or could not be called back: it is not released for
     /// autostart.
     TrialFailed {
-        /// Which device.
+        /// The device.
         node: NodeId,
-        /// How it failed.
+        /// The kind of failure.
         how: TrialFailure,
     },
-    /// The program does not come up.
+    /// The program does not start.
     StartFailed {
-        /// Which device.
+        /// The device.
         node: NodeId,
-        /// What answers instead, `None` where nothing does.
+        /// What answers instead; `None` if nothing answers.
         running: Option<DeviceType>,
-        /// What 1F57h says, if something.
+        /// The status in 1F57h, if it could be read.
         status: Option<FlashStatus>,
     },
 }
@@ -176,42 +176,42 @@ pub enum Error {
 /// How the trial of a program failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TrialFailure {
-    /// It was started, and nothing answers.
+    /// The program was started, and nothing answers.
     Silent,
-    /// The device stays in its bootloader; with what 1F57h says, if something.
+    /// The device stays in its bootloader; with the status in 1F57h, if it could be read.
     NotStarted(Option<FlashStatus>),
-    /// It runs, and does not let itself be called back; with the abort code, where it refused.
+    /// The program runs and does not return to the bootloader; with the abort code, if it refused.
     Stays(Option<AbortCode>),
-    /// It was called back, and nothing answers any more.
+    /// The program was called back, and nothing answers any more.
     Lost,
 }
 
-/// How it showed that somebody else is at work on a device.
+/// How the tool noticed another tool.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Intruder {
-    /// Its SDO requests were heard; the object of the last one, where it said it.
+    /// Its SDO requests were seen; with the object of the last one, if the request names it.
     Requests(Option<Address>),
-    /// Another process of this computer has the node locked; its number, where it says it.
+    /// Another process of this computer has locked the node; with its process id, if it is known.
     Process(Option<u32>),
 }
 
 /// How a layer setting service failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LssFailure {
-    /// Nobody answers.
+    /// No device answers.
     NoAnswer,
-    /// The device has no node-ID, and it is not said which one to give.
+    /// The device has no node-ID, and the user has not given one.
     None,
     /// The device refuses.
     Refused {
-        /// The standard's error code; FFh for one of the maker's own.
+        /// The standard's error code; FFh for a manufacturer's code.
         code: u8,
-        /// The maker's own error code.
+        /// The manufacturer's error code.
         detail: u8,
     },
 }
 
-/// A part of 1018h.
+/// A part of the identity object, 1018h.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum IdentityPart {
     /// 1018h/1.
@@ -223,7 +223,7 @@ pub enum IdentityPart {
 }
 
 impl IdentityPart {
-    /// That of a sub-index of 1018h, among those which are compared.
+    /// The part at this position among the compared sub-indices.
     pub(crate) const fn of(sub: usize) -> Self {
         match sub {
             1 => Self::VendorId,
@@ -241,7 +241,7 @@ impl IdentityPart {
     }
 }
 
-/// In what a device is another one than the file's.
+/// The part of the identity in which file and device differ.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mismatch {
     /// 1018h/1.
@@ -251,7 +251,7 @@ pub enum Mismatch {
 }
 
 impl Mismatch {
-    /// The error that the bootloader would have for it.
+    /// The error that the bootloader reports for it.
     const fn error(self) -> FlashError {
         match self {
             Self::VendorId => FlashError::WrongVendorId,
@@ -267,15 +267,15 @@ impl From<AdapterError> for Error {
 }
 
 impl Error {
-    /// Whether the device has refused what it was told, at once and by an abort: it has not begun with
-    /// it.
+    /// Whether the device has refused the command at once with an abort, and so has not begun to
+    /// carry it out.
     #[must_use]
     pub const fn is_refusal(&self) -> bool {
         matches!(self, Self::Refused { .. } | Self::Failed { code: Some(_), .. })
     }
 
-    /// Whether the device has refused block 0 or the first one with data: one that erases with the
-    /// first good data has lost nothing then.
+    /// Whether the device has refused block 0 or the first block with data. A device that erases
+    /// when it receives the first good block has then lost nothing.
     #[must_use]
     pub fn refuses_first_blocks(&self) -> bool {
         matches!(
@@ -285,9 +285,9 @@ impl Error {
         )
     }
 
-    /// The stable number: the manual's (L-1112e_5, table 5, which holds all of the newer manual's)
-    /// where it has one, otherwise 60000100h plus the word of 1F57h, 60000200h plus the error code
-    /// of LSS, and 6000030xh for adapters.
+    /// The stable error number: the manual's number (L-1112e_5, table 5, which contains all numbers
+    /// of the newer manual) if there is one, otherwise 60000100h plus the code of 1F57h, 60000200h
+    /// plus the error code of LSS, or 6000030xh for adapters.
     #[must_use]
     pub const fn number(&self) -> u32 {
         match self {
@@ -295,7 +295,7 @@ impl Error {
             Self::WrongCrc { .. } => 0x6000_0001,
             Self::Failed { error, .. } => flash_error_number(*error),
             Self::WrongTarget { what, .. } => flash_error_number(what.error()),
-            // Those of a firmware file for which the same is known without a device.
+            // The numbers of the same errors in a firmware file, found without a device.
             Self::OtherRegion { .. } => 0x6000_0015,
             Self::NoProgram { .. } => 0x6000_0021,
             Self::NoBootloader { .. } => 0x6000_0010,
@@ -326,7 +326,7 @@ pub const fn flash_error_number(error: FlashError) -> u32 {
         FlashError::Write => 0x6000_0005,
         FlashError::Address => 0x6000_0006,
         FlashError::Secured => 0x6000_0007,
-        // Newer than the manual's list.
+        // Newer than the list in the manual.
         FlashError::NvData
         | FlashError::WrongVendorId
         | FlashError::WrongProductId
@@ -401,20 +401,23 @@ impl fmt::Display for Error {
             Self::NotInDialect { dialect, what } => write!(f, "in the dialect {}: {what}", dialect.name()),
             Self::NoPassword { node } => write!(f, "node {node} is locked, and no password was given"),
             Self::Occupied { node } => {
-                write!(f, "node {node} answers already: another device is in its bootloader")
+                write!(f, "another device is in its bootloader and answers as node {node}")
             }
             Self::NotAlone { node, who } => match who {
                 Intruder::Requests(None) => {
-                    write!(f, "another tool is at work on node {node}: its SDO requests are heard")
+                    write!(f, "another tool is using node {node}: it sends SDO requests")
                 }
                 Intruder::Requests(Some(at)) => {
-                    write!(f, "another tool is at work on node {node}: its SDO requests are heard, the last one for {at}")
+                    write!(
+                        f,
+                        "another tool is using node {node}: it sends SDO requests, the last one for {at}"
+                    )
                 }
                 Intruder::Process(None) => {
-                    write!(f, "another coflash on this computer is at work on node {node}")
+                    write!(f, "another coflash on this computer is using node {node}")
                 }
                 Intruder::Process(Some(id)) => {
-                    write!(f, "another coflash on this computer, process {id}, is at work on node {node}")
+                    write!(f, "another coflash on this computer, process {id}, is using node {node}")
                 }
             },
             Self::Lss { doing, failure: LssFailure::NoAnswer } => {
@@ -425,14 +428,14 @@ impl fmt::Display for Error {
                 write!(f, "the device refuses {}: error {code}", doing.words())?;
                 match detail {
                     0 => Ok(()),
-                    detail => write!(f, ", {detail} of its maker"),
+                    detail => write!(f, ", manufacturer's code {detail}"),
                 }
             }
             Self::TrialFailed { node, how } => {
                 write!(f, "the trial failed, and the program is not released for autostart: ")?;
                 match how {
                     TrialFailure::Silent => {
-                        write!(f, "node {node} does not answer since the program was started")
+                        write!(f, "node {node} has not answered since the program was started")
                     }
                     TrialFailure::NotStarted(status) => {
                         write!(f, "it does not start, node {node} stays in the bootloader")?;
@@ -442,16 +445,13 @@ impl fmt::Display for Error {
                         }
                     }
                     TrialFailure::Stays(None) => {
-                        write!(
-                            f,
-                            "it runs in node {node}, and does not go back to the bootloader when called"
-                        )
+                        write!(f, "it runs in node {node} and does not return to the bootloader when called")
                     }
                     TrialFailure::Stays(Some(code)) => {
                         write!(f, "it runs in node {node}, and refuses the call to the bootloader with abort {code}")
                     }
                     TrialFailure::Lost => {
-                        write!(f, "node {node} does not answer since the program was called back")
+                        write!(f, "node {node} has not answered since the program was called back")
                     }
                 }
             }
@@ -478,7 +478,7 @@ impl std::error::Error for Error {
     }
 }
 
-/// What became of an object behind a gateway, as a transfer of our own has it.
+/// Translates a gateway's error into the error of a transfer over the bus.
 pub(crate) fn of_gateway(error: GatewayError, node: NodeId, doing: Doing) -> Error {
     match error {
         GatewayError::Adapter(error) => Error::Adapter(error),
@@ -488,7 +488,7 @@ pub(crate) fn of_gateway(error: GatewayError, node: NodeId, doing: Doing) -> Err
     }
 }
 
-/// Makes the absence of an object a value.
+/// Turns the error "no such object" into `None`.
 pub(crate) fn optional<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
     match read {
         Ok(value) => Ok(Some(value)),

@@ -1,6 +1,6 @@
-//! NMT mastership of a network with flying masters (CiA 302-2, "NMT flying master"): asked for before
-//! the tool restarts devices of a lift, and given back afterwards (CiA 814-1 clause 6.3).
-//!
+//! NMT mastership of a network with flying masters (CiA 302-2, "NMT flying master"). The tool asks
+//! for the mastership before it restarts devices of a lift, and gives it back afterwards (CiA 814-1
+//! clause 6.3).
 //! | CAN-ID | data | meaning |
 //! |---|---|---|
 //! | 071h | priority, node-ID | the active master tells that it is it |
@@ -8,8 +8,8 @@
 //! | 073h | none | who is the active master? |
 //! | 076h | none | the active master is to let the others negotiate |
 //!
-//! A candidate's slot begins at priority × 1F90h/4 + node-ID × 1F90h/5 milliseconds; priority 0 is the
-//! highest. The tool takes part with the highest one for as long as it works.
+//! A candidate's time slot begins at priority × 1F90h/4 + node-ID × 1F90h/5 milliseconds; priority
+//! 0 is the highest. The tool takes part with the highest priority during its work.
 
 use std::time::Duration;
 
@@ -19,7 +19,7 @@ use super::error::{optional, Error};
 use super::session::Session;
 use super::timing::Timing;
 
-/// "NMT master node-ID": who is the active master.
+/// "NMT master node-ID": sent by the active master.
 const ACTIVE_MASTER: CobId = id(0x071);
 /// "NMT flying master negotiation".
 const NEGOTIATION: CobId = id(0x072);
@@ -35,12 +35,12 @@ const NEGOTIATION_DELAY: (u8, u32) = (2, 500);
 const PRIORITY_SLOT: (u8, u32) = (4, 1500);
 const DEVICE_SLOT: (u8, u32) = (5, 10);
 
-/// The active master has answered by then (1F90h/1: 100 ms), and a slow bus has carried it.
+/// The active master has answered within this time (1F90h/1: 100 ms), even on a slow bus.
 const ANSWER: Duration = Duration::from_millis(200);
-/// No time of 1F90h is longer: 16 bits of milliseconds.
+/// The longest time in 1F90h: 16 bits of milliseconds.
 const LONGEST: u32 = 0xFFFF;
 
-/// A master: what 071h tells of it.
+/// A master, as 071h describes it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Master {
     /// 0 is the highest, 2 the lowest.
@@ -49,7 +49,7 @@ pub struct Master {
     pub node: NodeId,
 }
 
-/// What the tool takes part as: the highest priority, and the node-ID that the manual's tool has
+/// The tool's own data in a negotiation: the highest priority, and the node-ID of the manual's tool
 /// (L-1112d_10, table 11).
 pub const TOOL: Master = Master { priority: 0, node: NodeId::new(127).expect("1 to 127") };
 
@@ -65,40 +65,40 @@ impl Master {
     }
 }
 
-/// What came of asking.
+/// The result of asking for the mastership.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Asked {
-    /// There is no flying master in the network: nobody has to be asked.
+    /// The network has no flying master.
     Nobody,
-    /// This one keeps the mastership: it has the highest priority, too, or does not let go.
+    /// This master keeps the mastership: it also has the highest priority, or does not release it.
     Kept(Master),
-    /// The tool has it.
+    /// The tool has the mastership.
     Taken(Mastership),
 }
 
-/// Mastership that the tool has taken from somebody.
+/// The mastership that the tool has taken over.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Mastership {
-    /// The master before.
+    /// The previous master.
     pub from: Master,
-    /// When its time slot begins in a negotiation.
+    /// The start of the tool's time slot in a negotiation.
     slot: Duration,
 }
 
-/// The answer of a tool that is the master to a frame of the protocol, if one is due: it is here,
-/// and it stays the master.
+/// The answer of the tool, as the active master, to a frame of the protocol, if one is due: the
+/// tool announces itself and stays the master.
 fn answer(frame: &Frame) -> Option<Frame> {
     let asked = [DETECTION, NEGOTIATION].iter().any(|id| frame.cob_id() == Some(*id));
     asked.then(|| TOOL.frame())
 }
 
-/// Asks for the NMT mastership. Nothing but a question is sent where there is no flying master.
+/// Asks for the NMT mastership. In a network without a flying master, this sends only one question.
 ///
 /// # Errors
 /// [`Error::Adapter`] or [`Error::Cancelled`].
 pub fn ask(session: &mut Session<'_>) -> Result<Asked, Error> {
     if !session.hears_the_bus() {
-        // Whose network it is, is the gateway's affair.
+        // Behind a gateway, the mastership is the gateway's concern.
         return Ok(Asked::Nobody);
     }
     let Some(active) = detect(session)? else { return Ok(Asked::Nobody) };
@@ -114,7 +114,7 @@ pub fn ask(session: &mut Session<'_>) -> Result<Asked, Error> {
         begun = frame.cob_id().filter(|id| *id == NEGOTIATION || *id == DETECTION);
         begun.is_some()
     })?;
-    // A candidate that asks for the active master first is answered at once.
+    // A candidate that first asks for the active master gets its answer at once.
     if begun != Some(DETECTION) {
         if begun.is_none() {
             session.send(&Frame::of(NEGOTIATION, &[]))?;
@@ -137,8 +137,8 @@ pub fn ask(session: &mut Session<'_>) -> Result<Asked, Error> {
     Ok(Asked::Taken(Mastership { from: active, slot }))
 }
 
-/// Gives the mastership back: the others negotiate without the tool. Tells who is the master then,
-/// `None` where nobody says so in time.
+/// Gives the mastership back: the other masters negotiate without the tool. Returns the new master;
+/// `None` if none announces itself in time.
 ///
 /// # Errors
 /// [`Error::Adapter`] or [`Error::Cancelled`].
@@ -153,7 +153,7 @@ pub fn give_back(session: &mut Session<'_>, taken: Mastership) -> Result<Option<
     Ok(active)
 }
 
-/// Asks who the active master is.
+/// Asks for the active master.
 fn detect(session: &mut Session<'_>) -> Result<Option<Master>, Error> {
     session.send(&Frame::of(DETECTION, &[]))?;
     let mut active = None;
@@ -164,7 +164,7 @@ fn detect(session: &mut Session<'_>) -> Result<Option<Master>, Error> {
     Ok(active)
 }
 
-/// A time of 1F90h, or its default where the master does not tell it.
+/// A time of 1F90h, or its default if the master does not report it.
 fn milliseconds(
     session: &mut Session<'_>,
     node: NodeId,

@@ -1,4 +1,4 @@
-//! What a device says about itself.
+//! What a device reports about itself.
 
 use std::fmt;
 
@@ -15,7 +15,7 @@ use super::recognise::recognise;
 use super::session::Session;
 use crate::json;
 
-/// What a device says about itself. What it does not have is `None`.
+/// What a device reports about itself; `None` for an object that it does not have.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct DeviceInfo {
@@ -36,15 +36,15 @@ pub struct DeviceInfo {
     /// 1018h/1 to 4: vendor-ID, product code, revision, serial number.
     #[serde(flatten, serialize_with = "identity_fields")]
     pub identity: Identity,
-    /// What its bootloader speaks, as far as that can be seen; `None` for a device without
+    /// The dialect of its bootloader, as far as it can be detected; `None` for a device without
     /// programs.
     pub dialect: Option<Dialect>,
     /// Its programs, from number 1 on.
     pub programs: Vec<ProgramInfo>,
 }
 
-/// What a device tells people of itself before an update (CiA 814-1 clause 6.3): 1008h, 1009h, 100Ah
-/// and 1018h. `Display` has it in one line.
+/// The data that the user sees before an update (CiA 814-1 clause 6.3): 1008h, 1009h, 100Ah and
+/// 1018h. `Display` shows them in one line.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct Nameplate {
@@ -59,7 +59,8 @@ pub struct Nameplate {
     pub identity: Identity,
 }
 
-/// 1018h/1 to 4: vendor-ID, product code, revision, serial number; `None` for what is not told.
+/// 1018h/1 to 4: vendor-ID, product code, revision, serial number; `None` for a value that the
+/// device does not report.
 pub type Identity = [Option<u32>; 4];
 
 /// The parts of the identity under their names.
@@ -72,7 +73,7 @@ fn identity_fields<S: Serializer>(identity: &Identity, serializer: S) -> Result<
     fields.end()
 }
 
-/// What a device says about one of its programs.
+/// What a device reports about one of its programs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct ProgramInfo {
@@ -82,7 +83,7 @@ pub struct ProgramInfo {
     pub control: Option<u32>,
     /// 1F56h: CRC of the program.
     pub crc: Option<u32>,
-    /// 2005h of coboot: version of the program that is stored, 0 for none told.
+    /// 2005h of coboot: version of the stored program, 0 if unknown.
     pub version: Option<u32>,
     /// 1F57h.
     #[serde(serialize_with = "json::status")]
@@ -90,8 +91,8 @@ pub struct ProgramInfo {
 }
 
 impl ProgramInfo {
-    /// Whether there is a program, and whether it runs, as far as the device tells: some say by 1F51h
-    /// that there is none, others by a CRC of 0.
+    /// Whether there is a program, and whether it runs, as far as the device reports it: some
+    /// devices report a missing program in 1F51h, others by a CRC of 0.
     #[must_use]
     pub const fn state(&self) -> Option<ProgramState> {
         const STOPPED: u32 = ProgramState::Stopped as u32;
@@ -105,17 +106,17 @@ impl ProgramInfo {
         }
     }
 
-    /// The version that the stored program came with, where the device tells one.
+    /// The version of the stored program, if the device reports one.
     #[must_use]
     pub fn release(&self) -> Option<ProgramVersion> {
         self.version.filter(|version| *version != 0).map(ProgramVersion)
     }
 }
 
-/// Asks a device for all of it.
+/// Reads all of a device's information.
 ///
 /// # Errors
-/// [`Error::NoAnswer`] and the like; an object that the device does not have is no error.
+/// [`Error::NoAnswer`] and others; a missing object is not an error.
 pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
     let device_type = session.find()?;
     let Nameplate { name, hardware_version, software_version, identity } = nameplate(session)?;
@@ -144,7 +145,7 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
     })
 }
 
-/// Asks a device for its name, its versions and its identity.
+/// Reads a device's name, versions and identity.
 ///
 /// # Errors
 /// As [`info`].
@@ -156,7 +157,7 @@ pub fn nameplate(session: &mut Session<'_>) -> Result<Nameplate, Error> {
     Ok(Nameplate { name, hardware_version, software_version, identity: identity(session)? })
 }
 
-/// Asks a device for its identity.
+/// Reads a device's identity.
 ///
 /// # Errors
 /// As [`info`].
@@ -168,7 +169,7 @@ pub fn identity(session: &mut Session<'_>) -> Result<Identity, Error> {
     Ok(identity)
 }
 
-/// Asks a device about one of its programs.
+/// Reads the information about one of a device's programs.
 ///
 /// # Errors
 /// As [`info`].
@@ -183,7 +184,7 @@ pub fn program_info(session: &mut Session<'_>, program: u8) -> Result<ProgramInf
 
 impl fmt::Display for DeviceInfo {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        const ABSENT: &str = "not told";
+        const ABSENT: &str = "not reported";
         let text = |value: &Option<String>| value.clone().unwrap_or_else(|| ABSENT.to_string());
         let hex = |value: Option<u32>| value.map_or(ABSENT.to_string(), |value| format!("{value:08X}h"));
         let [vendor, product, revision, serial] = self.identity.map(hex);
@@ -214,8 +215,9 @@ impl fmt::Display for DeviceInfo {
 
 impl fmt::Display for Nameplate {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let text = |value: &Option<String>| value.clone().unwrap_or_else(|| "not told".to_string());
-        let hex = |value: Option<u32>| value.map_or("not told".to_string(), |value| format!("{value:08X}h"));
+        let text = |value: &Option<String>| value.clone().unwrap_or_else(|| "not reported".to_string());
+        let hex =
+            |value: Option<u32>| value.map_or("not reported".to_string(), |value| format!("{value:08X}h"));
         let [vendor, product, revision, serial] = self.identity.map(hex);
         write!(
             f,

@@ -1,9 +1,9 @@
-//! The numbers that the manual's download tools end with: `ERRORLEVEL` of Windows, 32 bits wide
-//! (manual L-1112e_5, chapter 5.4; L-1112d_10, chapter 5.2.1).
+//! The exit codes of the manual's download tools: `ERRORLEVEL` of Windows, 32 bits wide (manual
+//! L-1112e_5, chapter 5.4; L-1112d_10, chapter 5.2.1).
 //!
-//! [`Error::number`] has them where the manual has one, and new ones elsewhere. A script that was
-//! written for those tools knows theirs alone, so that here every error has one of them. Numbers
-//! below 60000000h are the operating system's (errno).
+//! [`Error::number`] uses these numbers if the manual has one, and new numbers otherwise. A script
+//! written for those tools knows only the old numbers, so this module gives every error one of
+//! them. Numbers below 60000000h are those of the operating system (errno).
 
 use std::io::ErrorKind;
 
@@ -12,36 +12,36 @@ use canopen::program::FlashError;
 use super::error::{Error, LssFailure};
 use crate::bus::AdapterError;
 
-/// `ERR_BL_ERROR`: the bootloader tells an error that the tool does not know.
+/// `ERR_BL_ERROR`: the bootloader reports an error that the tool does not know.
 pub const UNKNOWN: u32 = 0x6000_0008;
-/// `ERR_DOWNLOAD_RUNNING`: a download was begun while one goes on.
+/// `ERR_DOWNLOAD_RUNNING`: a download was started during another one.
 pub const DOWNLOAD_RUNNING: u32 = 0x6000_0012;
 /// `ERR_INVALID_NODEID`.
 pub const INVALID_NODE_ID: u32 = 0x6000_0017;
 /// `ERR_INVALID_PARAM`.
 pub const INVALID_PARAMETER: u32 = 0x6000_0018;
-/// From here on it is a return code of the CANopen stack, plus this (table 5; the codes themselves
-/// are those of the stack's `errordef.h`, which L-1020 lists).
+/// The numbers from here on are return codes of the CANopen stack plus this value (table 5; the
+/// codes are in the stack's `errordef.h`, which L-1020 lists).
 pub const STACK: u32 = 0x6000_1000;
 
-/// The CAN driver could not be set up (`kCopCdrvInitError`).
+/// The CAN driver could not be initialised (`kCopCdrvInitError`).
 const DRIVER_INIT: u32 = STACK + 0x13;
-/// There is no such kind of CAN interface (`kCopCdrvInvalidDriverType`).
+/// This kind of CAN interface does not exist (`kCopCdrvInvalidDriverType`).
 const DRIVER_TYPE: u32 = STACK + 0x19;
-/// The CAN interface is not there (`kCopCdrvInvalidBaseAddress`).
+/// The CAN interface was not found (`kCopCdrvInvalidBaseAddress`).
 const NO_CONTROLLER: u32 = STACK + 0x1B;
 /// The CAN interface is in use (`kCopCdrvDevAlreadyInUse`).
 const IN_USE: u32 = STACK + 0x1E;
-/// The CAN interface does not get a frame out (`kCopCdrvBusy`).
+/// The CAN interface cannot send a frame (`kCopCdrvBusy`).
 const BUSY: u32 = STACK + 0x18;
-/// The operating system lost it (`kCopCdrvHostOsError`).
+/// The operating system has lost the interface (`kCopCdrvHostOsError`).
 const HOST: u32 = STACK + 0x1F;
 /// No LSS slave answers (`kCopLssmTimeout`).
 const LSS_TIMEOUT: u32 = STACK + 0xD4;
 /// The LSS slave answers with an error code (`kCopLssmErrorInConfirm`).
 const LSS_REFUSED: u32 = STACK + 0xD5;
 
-/// The number that a tool of the manual ends with for this error.
+/// The exit code of the manual's tools for this error.
 #[must_use]
 pub fn exit_code(error: &Error) -> u32 {
     match error {
@@ -60,9 +60,9 @@ pub fn exit_code(error: &Error) -> u32 {
         Error::Adapter(AdapterError::Gateway { .. }) => BUSY,
         Error::Lss { failure: LssFailure::NoAnswer, .. } => LSS_TIMEOUT,
         Error::Lss { failure: LssFailure::Refused { .. }, .. } => LSS_REFUSED,
-        // 1F57h reads 86h: the program data were written while another download was at work.
+        // 1F57h reads 86h: program data were written during another download.
         Error::Failed { error: FlashError::Busy, .. } => DOWNLOAD_RUNNING,
-        // The words of 1F57h that are newer than the table are errors that its tools do not know.
+        // The codes of 1F57h that are newer than the table are unknown errors to its tools.
         error => match error.number() {
             0x6000_0100..=0x6000_01FF => UNKNOWN,
             number => number,
@@ -80,7 +80,7 @@ mod tests {
     use super::*;
     use crate::device::doing::{Doing, LssDoing};
 
-    /// Table 5, and the words of 1F57h that table 3 of the newer manual adds.
+    /// Table 5, and the codes of 1F57h that table 3 of the newer manual adds.
     #[test]
     fn every_error_has_a_number_of_the_manuals() {
         let failed = |word| {

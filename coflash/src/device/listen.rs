@@ -1,4 +1,4 @@
-//! Listening to a bus without a session.
+//! Listens to a bus without a session.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use canopen::Frame;
 use super::error::Error;
 use crate::bus::Adapter;
 
-/// Receives for a time, or until it is enough.
+/// Receives for `time`, or until `enough` returns true.
 ///
 /// # Errors
 /// [`Error::Adapter`] or [`Error::Cancelled`].

@@ -1,7 +1,8 @@
-//! A lock for a node of a bus among the processes of one computer, so that a second one notices before
-//! it touches the device.
+//! A lock for a node of a bus among the processes of one computer: a second process notices the
+//! first one before it changes the device.
 //!
-//! The operating system holds the lock for as long as the process lives: a file that is left over
+//! The operating system holds the lock during the life of the process; a file that is left over has
+//! no effect. If the file cannot be created, there is no lock.
 //! means nothing. Where there can be no such file there is no lock.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
@@ -13,30 +14,30 @@ use crc::{Crc, CRC_64_XZ};
 
 use super::error::{Error, Intruder};
 
-/// The most digits of a process's number.
+/// The most digits of a process id.
 const DIGITS: u64 = 20;
 
-/// A node that no other process has; until this is dropped.
+/// A node that no other process uses, until this value is dropped.
 #[derive(Debug)]
 pub struct Lock {
     _file: Option<File>,
 }
 
 impl Lock {
-    /// Locks a node of the bus that this URL leads to.
+    /// Locks a node of the bus with this URL.
     ///
     /// # Errors
-    /// [`Error::NotAlone`] with the process that has it. A file that cannot be made or locked is no
-    /// error.
+    /// [`Error::NotAlone`] with the process that holds the lock. A file that cannot be created or
+    /// locked is not an error.
     pub fn of(url: &str, node: NodeId) -> Result<Self, Error> {
         let folder = std::env::var_os("XDG_RUNTIME_DIR").filter(|folder| !folder.is_empty());
         Self::in_folder(&folder.map_or_else(std::env::temp_dir, PathBuf::from), url, node)
     }
 
-    /// The same by a file in this folder.
+    /// Locks a node by a file in this folder.
     ///
     /// # Errors
-    /// As [`of`](Self::of).
+    /// The errors of [`of`](Self::of).
     pub fn in_folder(folder: &Path, url: &str, node: NodeId) -> Result<Self, Error> {
         let Some(mut file) = open(&folder.join(name(url, node))) else { return Ok(Self { _file: None }) };
         match file.try_lock() {
@@ -49,7 +50,7 @@ impl Lock {
             }
             Err(TryLockError::Error(_)) => return Ok(Self { _file: None }),
         }
-        // Whoever finds it locked would like to know by whom; without that it is still locked.
+        // The process id is information for other processes; the lock works without it.
         let _ = file.set_len(0);
         let _ = file.seek(SeekFrom::Start(0));
         let _ = write!(file, "{}", std::process::id());
@@ -57,8 +58,8 @@ impl Lock {
     }
 }
 
-/// Opens or makes the file. Nothing but a file is opened: in a folder of all users somebody may have
-/// put something else in its place.
+/// Opens or creates the file. Refuses anything but a regular file: in a folder that all users
+/// share, another user may have put something else in its place.
 fn open(path: &Path) -> Option<File> {
     match fs::symlink_metadata(path) {
         Ok(there) if !there.is_file() => return None,
@@ -67,7 +68,7 @@ fn open(path: &Path) -> Option<File> {
     OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path).ok()
 }
 
-/// The same for each URL of a bus: the bit rate behind `@` does not make it another one.
+/// The same name for every URL of a bus: the bit rate after `@` is left out.
 fn name(url: &str, node: NodeId) -> String {
     let bus = url.rsplit_once('@').map_or(url, |(bus, _)| bus);
     format!("coflash-{:016x}-{node}.lock", Crc::<u64>::new(&CRC_64_XZ).checksum(bus.as_bytes()))
@@ -93,14 +94,14 @@ mod tests {
         let others = [take("slcan:/dev/ttyACM0", 6), take("slcan:/dev/ttyACM1", 5)];
         assert!(others.iter().all(Result::is_ok));
         drop(held);
-        // What is left is a file with a number in it, and locks nothing.
+        // A file with a number that is left over locks nothing.
         let path = folder.join(name("slcan:/dev/ttyACM0", node(5)));
         assert_eq!(fs::read_to_string(&path).unwrap(), this.to_string());
         fs::write(&path, "4294967295999999999999999999").unwrap();
         let held = take("slcan:/dev/ttyACM0", 5).unwrap();
         assert_eq!(fs::read_to_string(&path).unwrap(), this.to_string());
         drop(held);
-        // No folder, no lock, and no error.
+        // Without a folder there is no lock and no error.
         assert!(Lock::in_folder(&folder.join("none"), "can0", node(5)).is_ok());
         fs::remove_dir_all(&folder).unwrap();
     }

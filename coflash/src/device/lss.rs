@@ -1,4 +1,4 @@
-//! Layer setting services, the master's side (CiA 305): node-ID and bit rate over the bus, for
+//! The master of layer setting services (CiA 305): sets node-ID and bit rate over the bus, for
 //! devices without switches.
 
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -29,21 +29,20 @@ const FASTSCAN: u8 = 0x51;
 const INQUIRE: [u8; 4] = [0x5A, 0x5B, 0x5C, 0x5D];
 const INQUIRE_NODE_ID: u8 = 0x5E;
 
-/// Fastscan: "who has no node-ID?".
+/// Fastscan: "which device has no node-ID?".
 const ANYBODY: u8 = 0x80;
 /// The node-ID of a device without one.
 const NO_NODE_ID: u8 = 0xFF;
 
-/// How long a slave may take for its answer, unless told otherwise. Fastscan waits so long for each
-/// bit that is set in an address, so that patience costs time there.
+/// The default time for a slave's answer. Fastscan waits this long for each bit that is set in an
+/// address, so a longer time slows it down.
 pub const ANSWER: Duration = Duration::from_millis(100);
-/// How long a device may take to store what it was given: it may have to erase a sector of its
-/// flash for that.
+/// How long a device may take to store its settings: it may have to erase a flash sector.
 const STORE_ANSWER: Duration = Duration::from_secs(2);
-/// Error code of a store: the device has no place for it (CiA 305).
+/// Error code of a store: the device does not support storing (CiA 305).
 const STORE_UNSUPPORTED: u8 = 1;
 
-/// The master of the bus. There must not be two.
+/// The LSS master. A bus must have only one.
 pub struct Master<'a> {
     adapter: &'a mut dyn Adapter,
     answer: Duration,
@@ -57,18 +56,17 @@ impl std::fmt::Debug for Master<'_> {
 }
 
 impl<'a> Master<'a> {
-    /// A master that waits so long for an answer ([`ANSWER`]). Nothing is sent yet.
+    /// A master that waits `answer` for each answer ([`ANSWER`]). It sends nothing yet.
     pub fn new(adapter: &'a mut dyn Adapter, answer: Duration) -> Self {
         Self { adapter, answer, cancelled: None }
     }
 
-    /// Ends with [`Error::Cancelled`] as soon as `flag` is set.
+    /// Ends with [`Error::Cancelled`] when `flag` is set.
     pub fn cancel_by(&mut self, flag: Arc<AtomicBool>) {
         self.cancelled = Some(flag);
     }
 
-    /// Switches every device that listens into configuration state, or back to waiting. Nobody
-    /// answers.
+    /// Switches all devices into configuration state, or back to waiting state. No device answers.
     ///
     /// # Errors
     /// [`Error::Adapter`] or [`Error::Cancelled`].
@@ -76,10 +74,10 @@ impl<'a> Master<'a> {
         self.send([SWITCH_GLOBAL, u8::from(to_configuration), 0, 0, 0, 0, 0, 0])
     }
 
-    /// Switches the one device with this address into configuration state.
+    /// Switches the device with this address into configuration state.
     ///
     /// # Errors
-    /// [`Error::Lss`] where no device answers to the address.
+    /// [`Error::Lss`] if no device has the address.
     pub fn select(&mut self, address: &LssAddress) -> Result<(), Error> {
         let LssAddress { vendor_id, product_code, revision, serial_number } = *address;
         let numbers = [vendor_id, product_code, revision, serial_number];
@@ -90,7 +88,7 @@ impl<'a> Master<'a> {
         self.await_answer(SELECTED, self.answer)?.map(|_| ()).ok_or(no_answer(LssDoing::Select))
     }
 
-    /// Asks the device in configuration state for its address.
+    /// Reads the address of the device in configuration state.
     ///
     /// # Errors
     /// [`Error::Lss`].
@@ -105,8 +103,7 @@ impl<'a> Master<'a> {
         Ok(LssAddress { vendor_id, product_code, revision, serial_number })
     }
 
-    /// Asks the device in configuration state for the node-ID that it has in force; `None` where it
-    /// has none.
+    /// Reads the active node-ID of the device in configuration state; `None` if it has none.
     ///
     /// # Errors
     /// [`Error::Lss`].
@@ -115,9 +112,9 @@ impl<'a> Master<'a> {
         Ok(NodeId::new(answer[1]))
     }
 
-    /// Gives the device in configuration state a node-ID, or takes it away. A device without one
-    /// takes it when it is switched back to waiting; one that has another needs a reset of its
-    /// communication.
+    /// Sets or clears the node-ID of the device in configuration state. A device without a node-ID
+    /// takes the new one when it is switched to waiting state; a device with another node-ID needs
+    /// a reset of its communication.
     ///
     /// # Errors
     /// [`Error::Lss`].
@@ -126,8 +123,8 @@ impl<'a> Master<'a> {
         self.order([CONFIGURE_NODE_ID, number, 0, 0, 0, 0, 0, 0], LssDoing::NodeId)
     }
 
-    /// Gives the device in configuration state a bit rate; it comes into force by
-    /// [`activate`](Self::activate), or with the next start when it was stored.
+    /// Sets the bit rate of the device in configuration state. The rate takes effect with
+    /// [`activate`](Self::activate), or at the next start if it was stored.
     ///
     /// # Errors
     /// [`Error::Lss`].
@@ -135,9 +132,8 @@ impl<'a> Master<'a> {
         self.order([CONFIGURE_BIT_TIMING, 0, rate as u8, 0, 0, 0, 0, 0], LssDoing::BitRate)
     }
 
-    /// Has all devices in configuration state change over to the bit rate that they were given:
-    /// they fall silent for `delay`, change over, and stay silent for as long again. Nobody
-    /// answers.
+    /// Makes all devices in configuration state switch to their new bit rate: they are silent for
+    /// `delay`, switch over, and are silent for `delay` again. No device answers.
     ///
     /// # Errors
     /// [`Error::Adapter`] or [`Error::Cancelled`].
@@ -146,7 +142,7 @@ impl<'a> Master<'a> {
         self.send([ACTIVATE_BIT_TIMING, low, high, 0, 0, 0, 0, 0])
     }
 
-    /// Has the device in configuration state store node-ID and bit rate.
+    /// Makes the device in configuration state store node-ID and bit rate.
     ///
     /// # Errors
     /// [`Error::Lss`].
@@ -159,19 +155,19 @@ impl<'a> Master<'a> {
     }
 
     /// Finds one of the devices without a node-ID, bit by bit of its address, and switches it into
-    /// configuration state; `None` where there is no such device. `progress` is told how many of
-    /// the 128 bits are known.
+    /// configuration state; `None` if there is no such device. Calls `progress` with the number of
+    /// known bits, up to 128.
     ///
     /// # Errors
-    /// [`Error::Lss`] where the device has gone in the middle.
+    /// [`Error::Lss`] if the device disappears during the scan.
     pub fn fastscan(&mut self, progress: &mut dyn FnMut(u32)) -> Result<Option<LssAddress>, Error> {
         self.drain()?;
         if !self.is_there(0, ANYBODY, 0, 0, self.answer)? {
             return Ok(None);
         }
-        // Answers of several devices come close behind one another, as a rule. Where one was so
-        // late that it was taken for the answer to the next question, the whole time is left for
-        // it.
+        // The answers of several devices usually come close together. If one was so late that it
+        // was taken for the answer to the next question, the scan is repeated with the full time
+        // for late answers.
         let address = match self.identify(self.answer / 5, progress)? {
             None => self.identify(self.answer, progress)?,
             found => found,
@@ -179,28 +175,29 @@ impl<'a> Master<'a> {
         address.map(Some).ok_or(no_answer(LssDoing::Fastscan))
     }
 
-    /// The address of one device; `None` where it comes out as one that no device has. `late` is
-    /// how long further answers may lag behind the first.
+    /// The address of one device; `None` if the result is an address that no device has. `late` is
+    /// how long further answers may follow the first one.
     fn identify(
         &mut self,
         late: Duration,
         progress: &mut dyn FnMut(u32),
     ) -> Result<Option<LssAddress>, Error> {
-        // Takes all devices to the first part of their addresses.
+        // Sets all devices to the first part of their addresses.
         if !self.is_there(0, ANYBODY, 0, 0, late)? {
             return Ok(None);
         }
         let mut numbers = [0; 4];
         for (part, number) in (0..).zip(&mut numbers) {
             for bit in (0..32).rev() {
-                // "Do your bits from 31 down to this one read as these?": silence means that this
-                // one is set.
+                // "Do your bits from 31 down to this one have these values?" No answer means that
+                // this bit is 1.
                 if !self.is_there(*number, bit, part, part, late)? {
                     *number |= 1 << bit;
                 }
                 progress(u32::from(part) * 32 + 32 - u32::from(bit));
             }
-            // The whole number once more: who has it goes on to the next part, or is found.
+            // The whole number again: a device with this number continues with the next part, or is
+            // found.
             if !self.is_there(*number, 0, part, (part + 1) % 4, late)? {
                 return Ok(None);
             }
@@ -209,15 +206,15 @@ impl<'a> Master<'a> {
         Ok(Some(LssAddress { vendor_id, product_code, revision, serial_number }))
     }
 
-    /// One question of fastscan. Several devices may answer, all with the same frame; these are all
-    /// heard before the next question.
+    /// Asks one question of fastscan. Several devices may answer, all with the same frame; the
+    /// method waits for all answers before the next question.
     fn is_there(&mut self, number: u32, bit: u8, part: u8, next: u8, late: Duration) -> Result<bool, Error> {
         let [a, b, c, d] = number.to_le_bytes();
         self.send([FASTSCAN, a, b, c, d, bit, part, next])?;
         if self.await_answer(IDENTIFIED, self.answer)?.is_none() {
             return Ok(false);
         }
-        // At most as many as there are node-IDs.
+        // There are at most as many answers as node-IDs.
         let mut more = 0;
         while more < 127 && self.await_answer(IDENTIFIED, late)?.is_some() {
             more += 1;
@@ -225,7 +222,7 @@ impl<'a> Master<'a> {
         Ok(true)
     }
 
-    /// Gives an order that is answered with an error code.
+    /// Sends a command whose answer has an error code.
     fn order(&mut self, request: [u8; 8], doing: LssDoing) -> Result<(), Error> {
         let [_, code, detail, ..] = self.ask(request)?.ok_or(no_answer(doing))?;
         match code {
@@ -246,7 +243,7 @@ impl<'a> Master<'a> {
         Ok(self.adapter.send(&Frame::of(CobId::LSS_REQUEST, &request))?)
     }
 
-    /// Forgets what came before the question.
+    /// Discards frames that arrived before the question.
     fn drain(&mut self) -> Result<(), Error> {
         let mut stale = 0;
         while stale < 1000 && self.adapter.receive(Duration::ZERO)?.is_some() {
@@ -283,13 +280,14 @@ impl<'a> Master<'a> {
     }
 }
 
-/// Sees to it that the device with this address has a node-ID: its own, or the one that is asked
-/// for, which it is given if need be, and stores if it can: it has to outlive the restart into the
-/// program. Afterwards it is on the bus with it.
+/// Makes sure that the device with this address has a node-ID: its own one, or the requested one.
+/// The device gets the requested node-ID if it has another one, and stores it if it can, because
+/// the node-ID must survive the restart into the program. Afterwards the device is on the bus with
+/// this node-ID.
 ///
 /// # Errors
-/// [`Error::Lss`] where the device does not answer, has no node-ID and none is asked for, or
-/// refuses; [`Error::NoAnswer`] where it does not come up with its new node-ID within `boot`.
+/// [`Error::Lss`] if the device does not answer, if it has no node-ID and none is requested, or if
+/// it refuses; [`Error::NoAnswer`] if it does not start with its new node-ID within `boot`.
 pub fn ensure_node_id(
     adapter: &mut dyn Adapter,
     address: &LssAddress,
@@ -312,7 +310,7 @@ pub fn ensure_node_id(
         (old, Some(node)) => {
             master.set_node_id(Some(node))?;
             match master.store() {
-                // It cannot, or has never heard of the service.
+                // The device cannot store, or does not know the service.
                 Err(Error::Lss {
                     failure: LssFailure::Refused { code: STORE_UNSUPPORTED, .. } | LssFailure::NoAnswer,
                     ..

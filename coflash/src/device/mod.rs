@@ -1,5 +1,5 @@
-//! One device on the bus, or whoever is there: conversations by SDO, what devices say about
-//! themselves, node-ID and bit rate by LSS, and what can go wrong.
+//! Devices on the bus: conversations by SDO, information about devices, node-ID and bit rate by
+//! LSS, and errors.
 
 pub mod access;
 pub mod debugger;

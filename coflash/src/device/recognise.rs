@@ -1,4 +1,4 @@
-//! Which dialect a device speaks.
+//! Detects the dialect of a device.
 
 use canopen::{program, AbortCode, Address};
 
@@ -7,17 +7,18 @@ use super::dialect::Dialect;
 use super::error::Error;
 use super::session::Session;
 
-/// "Lock/unlock parameters: Firmware update" (CiA 814-1 clause 6.3). Where it has no sub-index 1,
-/// it is a plain variable.
+/// "Lock/unlock parameters: Firmware update" (CiA 814-1 clause 6.3). A device without sub-index 1
+/// has it as a plain variable.
 pub(crate) const UNLOCK: [Address; 2] =
     [Address::new(program::UNLOCK, program::UNLOCK_FIRMWARE), Address::new(program::UNLOCK, 0)];
 
-/// Finds out which dialect a device speaks of which this is running. A bootloader tells it by its
-/// device type. Of an application it is known for lifts; of the others, whether they belong to a
-/// bootloader with the status of 1F57h, which tells more when it runs.
+/// Detects the dialect of a device from the device type and the objects of what runs on it. The
+/// device type of a bootloader gives the dialect. Applications of lifts have the object for
+/// unlocking. Another application with 1F57h belongs to a bootloader with block files. This is a
+/// first guess: the bootloader gives more information when it runs.
 ///
 /// # Errors
-/// What a [read](Session::read) has.
+/// The errors of a [read](Session::read).
 pub fn recognise(session: &mut Session<'_>, running: DeviceType, number: u8) -> Result<Dialect, Error> {
     if let Some(dialect) = Dialect::of_bootloader(running, session.node()) {
         return Ok(dialect);
@@ -31,7 +32,7 @@ pub fn recognise(session: &mut Session<'_>, running: DeviceType, number: u8) -> 
     Ok(Dialect::Raw)
 }
 
-/// Whether there is such an object, readable or not.
+/// Whether the object exists, readable or not.
 fn has(session: &mut Session<'_>, at: Address) -> Result<bool, Error> {
     match session.read(at) {
         Ok(_) => Ok(true),

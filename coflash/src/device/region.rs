@@ -1,4 +1,4 @@
-//! Where a device has its programs: object 2004h of coboot.
+//! The place of a device's programs: object 2004h of coboot.
 
 use canopen::program::{region_of, PROGRAM_REGION};
 use canopen::Address;
@@ -9,18 +9,18 @@ use super::session::Session;
 /// Main flash of the STM32F4: 08000000h, at most 2 MiB.
 const FLASH: std::ops::Range<u64> = 0x0800_0000..0x0820_0000;
 
-/// The flash of a program: its first address and how many bytes it has, at least one.
+/// The flash of a program: its first address and its size, at least one byte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ProgramRegion {
     /// First address.
     pub base: u32,
-    /// Bytes.
+    /// Size in bytes.
     pub size: u32,
 }
 
 impl ProgramRegion {
-    /// From the value of 2004h. A device of another maker may have something else there: what is no
-    /// part of an STM32F4's flash is `None`.
+    /// Parses the value of 2004h. A device of another manufacturer may use this object differently:
+    /// a value outside an STM32F4's flash gives `None`.
     #[must_use]
     pub fn parse(value: &[u8]) -> Option<Self> {
         let (base, size) = region_of(value.try_into().ok()?);
@@ -37,10 +37,10 @@ impl ProgramRegion {
     }
 }
 
-/// Asks a device where it has a program; `None` where it does not tell.
+/// Reads the place of a program from a device; `None` if the device does not report it.
 ///
 /// # Errors
-/// What a [read](Session::read) has, but for a refusal.
+/// The errors of a [read](Session::read), except a refusal.
 pub fn program_region(session: &mut Session<'_>, program: u8) -> Result<Option<ProgramRegion>, Error> {
     match session.read(Address::new(PROGRAM_REGION, program)) {
         Ok(value) => Ok(ProgramRegion::parse(&value)),

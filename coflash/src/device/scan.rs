@@ -1,4 +1,4 @@
-//! Who is on the bus.
+//! Finds the nodes on the bus.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::AtomicBool;
@@ -18,28 +18,28 @@ use super::session::Session;
 use super::timing::Timing;
 use crate::bus::Adapter;
 
-/// A node that was seen or heard.
+/// A node that answered or was heard.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Found {
     /// The last boot-up or heartbeat message heard.
     pub state: Option<NmtState>,
-    /// What it told by SDO, if it answers.
+    /// Its SDO information, if it answers.
     pub info: Option<DeviceInfo>,
 }
 
-/// How to search.
+/// Options of a scan.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct ScanOptions {
-    /// Whom to ask.
+    /// The node-IDs to ask.
     pub nodes: Vec<NodeId>,
-    /// How long to listen to what the bus says by itself; heartbeats come once a second in most
-    /// networks.
+    /// How long to listen for messages that nodes send by themselves; in most networks, heartbeats
+    /// come once a second.
     pub listen: Duration,
-    /// How long to wait for what.
+    /// The time limits.
     pub timing: Timing,
-    /// Whether to ask at all.
+    /// Whether to send requests.
     pub ask: bool,
 }
 
@@ -63,17 +63,17 @@ impl Default for ScanOptions {
     }
 }
 
-/// How many nodes are asked at once: each that is there answers, and an adapter must not lose
-/// answers.
+/// How many nodes are asked at the same time: every present node answers, and the adapter must not
+/// lose answers.
 const AT_ONCE: usize = 16;
 
-/// Asks all nodes what they are, and listens to what the bus says by itself.
+/// Asks all nodes for their device type, and listens for messages that nodes send by themselves.
 ///
-/// A transfer that is under way with a node is aborted first: within a block download a question could
-/// be taken for a segment, and go unanswered.
+/// First it aborts a transfer that may be running with a node: within a block download, the device
+/// could take a request for a segment and not answer it.
 ///
 /// # Errors
-/// [`Error::Adapter`] or [`Error::Cancelled`]; nobody there is no error.
+/// [`Error::Adapter`] or [`Error::Cancelled`]; an empty bus is not an error.
 pub fn scan(
     adapter: &mut dyn Adapter,
     options: &ScanOptions,
@@ -110,7 +110,8 @@ pub fn scan(
         let told = match info(&mut session) {
             Ok(told) => Some(told),
             Err(error @ (Error::Adapter(_) | Error::Cancelled)) => return Err(error),
-            // It answered once, so that it is there; what it does not tell is left out.
+            // The node has answered once, so it exists; information that it does not give is left
+            // out.
             Err(_) => None,
         };
         found.entry(node).or_default().info = told;
@@ -118,10 +119,10 @@ pub fn scan(
     Ok(found)
 }
 
-/// Nobody on a bus that works takes longer for the first answer.
+/// On a working bus, no node takes longer for the first answer.
 const AT_ONCE_LIMIT: Duration = Duration::from_millis(200);
 
-/// Whether the node answers something by SDO, be it an abort.
+/// Whether the frame is an SDO answer of the node, including an abort.
 fn is_answer(frame: &Frame, node: NodeId) -> bool {
     frame.cob_id() == Some(CobId::sdo_response(node)) && frame.dlc() == 8
 }

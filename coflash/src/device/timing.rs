@@ -1,29 +1,29 @@
-//! How long to wait for what, and how to write.
+//! The time limits of a session, and the form of its downloads.
 
 use std::time::Duration;
 
 use serde::Serialize;
 
-/// How long to wait for what.
+/// The time limits of a session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Timing {
-    /// The answer to one SDO request. The manual's default.
+    /// How long the answer to one SDO request may take. The default is the manual's.
     pub sdo: Duration,
-    /// How often a read, or a write that may be repeated, is tried when no answer comes.
+    /// How many times a read, or a write that may be repeated, is tried if no answer comes.
     pub attempts: u32,
-    /// A command's execution (erase, program, check): how long 1F57h may read busy.
+    /// How long a command (erase, program, check) may take: how long 1F57h may read busy.
     pub command: Duration,
-    /// How long a device may be silent while it carries out a command. Devices of other makers may be
-    /// unable to answer while they erase a sector, 2 s at worst on an STM32F4; those that erase all of
-    /// it before they answer have three times as long.
+    /// How long a device may be silent while it carries out a command. Devices of other
+    /// manufacturers may be unable to answer while they erase a sector, at most 2 s on an STM32F4.
+    /// Devices that erase all sectors before they answer get three times as long.
     pub silent: Duration,
-    /// A restart: how long a device may take until it answers again.
+    /// How long a restart may take until the device answers again.
     pub boot: Duration,
-    /// The first pause between two looks at a device that is at work. It doubles from look to look
+    /// The first pause between two status requests to a busy device. It doubles after each request
     /// …
     pub poll_first: Duration,
-    /// … up to this one, so that the bus is not flooded.
+    /// … up to this one, which limits the load on the bus.
     pub poll_most: Duration,
 }
 
@@ -38,7 +38,7 @@ impl Timing {
         poll_most: Duration,
     }
 
-    /// Patience with a device that may erase all of its flash before it answers.
+    /// The time limits for a device that may erase all of its flash before it answers.
     pub(crate) fn erasing(&self) -> Self {
         Self { sdo: self.sdo.max((3 * self.silent).min(self.command)), ..*self }
     }
@@ -58,14 +58,13 @@ impl Default for Timing {
     }
 }
 
-/// How values of more than four bytes are written.
+/// The form of downloads of more than four bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Transfers {
-    /// As blocks, the fast way, until the device says that it does not know them; from then on in
-    /// segments.
+    /// By block transfer, the fast form, until the device refuses it; from then on in segments.
     #[default]
     Blocks,
-    /// In segments, which every device knows: one answer for seven bytes.
+    /// In segments, which every device supports: one answer for seven bytes.
     Segments,
 }

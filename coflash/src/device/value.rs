@@ -1,5 +1,4 @@
-//! Values of objects by their data type (CiA 301, clause 7.1.6): text into bytes, and bytes into
-//! text.
+//! Values of objects by their data type (CiA 301, clause 7.1.6): conversion between text and bytes.
 
 use std::fmt;
 
@@ -8,9 +7,9 @@ use std::fmt;
 pub enum DataType {
     /// BOOLEAN: one byte, 0 or 1.
     Boolean,
-    /// UNSIGNED8 to UNSIGNED64: so many bytes, 1 to 8.
+    /// UNSIGNED8 to UNSIGNED64: the number of bytes, 1 to 8.
     Unsigned(u8),
-    /// INTEGER8 to INTEGER64: so many bytes, 1 to 8, two's complement.
+    /// INTEGER8 to INTEGER64: the number of bytes, 1 to 8, two's complement.
     Integer(u8),
     /// REAL32 (IEEE 754).
     Real32,
@@ -18,35 +17,35 @@ pub enum DataType {
     Real64,
     /// VISIBLE_STRING: printable ASCII.
     VisibleString,
-    /// OCTET_STRING, and all that has no other notation here: bytes.
+    /// OCTET_STRING, and all types without another notation here: bytes.
     OctetString,
-    /// DOMAIN: bytes of any number.
+    /// DOMAIN: any number of bytes.
     Domain,
 }
 
-/// Why a text is no value of a type. `Display` says what would be one.
+/// Why a text is not a value of a type. `Display` describes a valid value.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ValueError {
-    /// It is not written as this type's values are.
-    #[error("'{text}' is no {kind}: {notation}")]
+    /// The text does not follow the type's notation.
+    #[error("'{text}' is not a {kind}: {notation}")]
     Notation {
-        /// What was given.
-        text: String,
-        /// What it should have been.
-        kind: DataType,
-        /// How one is written.
-        notation: &'static str,
-    },
-    /// It is a number that the type has no room for.
-    #[error("{text} is out of the range of {kind}: {low} to {high}")]
-    Range {
-        /// What was given.
+        /// The text.
         text: String,
         /// The type.
         kind: DataType,
-        /// Its least value.
+        /// The type's notation.
+        notation: &'static str,
+    },
+    /// The number is out of the type's range.
+    #[error("{text} is out of the range of {kind}: {low} to {high}")]
+    Range {
+        /// The text.
+        text: String,
+        /// The type.
+        kind: DataType,
+        /// The type's lowest value.
         low: String,
-        /// Its greatest value.
+        /// The type's highest value.
         high: String,
     },
     /// An SDO transfer has at least one byte.
@@ -54,7 +53,7 @@ pub enum ValueError {
     Empty,
 }
 
-/// The types by the names that [`DataType::by_name`] takes.
+/// The types with their names for [`DataType::by_name`].
 const NAMES: [(&str, DataType); 21] = [
     ("bool", DataType::Boolean),
     ("u8", DataType::Unsigned(1)),
@@ -80,19 +79,19 @@ const NAMES: [(&str, DataType); 21] = [
 ];
 
 impl DataType {
-    /// The type of this name: `u8`, `i32`, `f64`, `string`, `hex` and so on.
+    /// The type with this name: `u8`, `i32`, `f64`, `string`, `hex` and so on.
     #[must_use]
     pub fn by_name(name: &str) -> Option<Self> {
         NAMES.iter().find(|(known, _)| *known == name).map(|(_, kind)| *kind)
     }
 
-    /// All names that [`by_name`](Self::by_name) takes.
+    /// All names for [`by_name`](Self::by_name).
     pub fn names() -> impl Iterator<Item = &'static str> {
         NAMES.iter().map(|(name, _)| *name)
     }
 
-    /// The type of this index (CiA 301, table 44): 0007h is UNSIGNED32. `None` for one that has no
-    /// notation here, as structures and times.
+    /// The type with this index (CiA 301, table 44): 0007h is UNSIGNED32. `None` for a type without
+    /// a notation here, such as structures and times.
     #[must_use]
     pub const fn from_index(index: u32) -> Option<Self> {
         Some(match index {
@@ -112,7 +111,7 @@ impl DataType {
         })
     }
 
-    /// The least and the greatest value of a type of whole numbers.
+    /// The lowest and the highest value of an integer type.
     #[must_use]
     pub fn range(self) -> Option<(i128, i128)> {
         match self {
@@ -126,11 +125,11 @@ impl DataType {
         }
     }
 
-    /// The bytes of a value in words: a number in C notation, `true` or `false`, a text, or pairs of
-    /// hexadecimal digits.
+    /// The bytes of a value given as text: a number in C notation, `true` or `false`, a text, or
+    /// pairs of hexadecimal digits.
     ///
     /// # Errors
-    /// [`ValueError`] where it is none, or the type has no room for it.
+    /// [`ValueError`] if the text is not a value of the type.
     pub fn encode(self, text: &str) -> Result<Vec<u8>, ValueError> {
         let notation = |notation| ValueError::Notation { text: text.to_string(), kind: self, notation };
         let whole = |bytes: u8| -> Result<Vec<u8>, ValueError> {
@@ -163,7 +162,9 @@ impl DataType {
             Self::Real64 => real()?.to_le_bytes().to_vec(),
             Self::VisibleString => {
                 if !text.bytes().all(|byte| matches!(byte, b' '..=b'~')) {
-                    return Err(notation("a text has printable ASCII characters; other bytes go as hex"));
+                    return Err(notation(
+                        "a text consists of printable ASCII characters; give other bytes as hex",
+                    ));
                 }
                 text.as_bytes().to_vec()
             }
@@ -188,7 +189,7 @@ impl DataType {
         }
     }
 
-    /// A value in words; `None` where so many bytes are none of this type, or are no text.
+    /// The value as text; `None` if the bytes are not a value of this type, or not printable.
     #[must_use]
     pub fn show(self, bytes: &[u8]) -> Option<String> {
         let number = || bytes.iter().rev().fold(0_u64, |number, byte| number << 8 | u64::from(*byte));
@@ -218,8 +219,7 @@ impl fmt::Display for DataType {
     }
 }
 
-/// A whole number in C notation, with a minus sign if need be: `-1`, `4096`, `0x1000`, octal
-/// `010000`.
+/// An integer in C notation, optionally with a minus sign: `-1`, `4096`, `0x1000`, octal `010000`.
 #[must_use]
 pub fn integer(text: &str) -> Option<i128> {
     let (sign, bare) = match text.strip_prefix('-') {
@@ -231,15 +231,15 @@ pub fn integer(text: &str) -> Option<i128> {
         None if bare.len() > 1 && bare.starts_with('0') => (&bare[1..], 8),
         None => (bare, 10),
     };
-    // `from_str_radix` would take a sign.
+    // `from_str_radix` would accept a sign.
     if digits.is_empty() || !digits.chars().all(|digit| digit.is_digit(radix)) {
         return None;
     }
     i128::from_str_radix(digits, radix).ok().map(|number| sign * number)
 }
 
-/// Bytes in pairs of hexadecimal digits, with blanks wherever: `DE AD BE EF`, `DEADBEEF`. At least
-/// one.
+/// Bytes as pairs of hexadecimal digits, with blanks anywhere: `DE AD BE EF`, `DEADBEEF`. At least
+/// one byte.
 #[must_use]
 pub fn hex_digits(text: &str) -> Option<Vec<u8>> {
     let digits: Vec<char> = text.chars().filter(|c| !c.is_whitespace()).collect();
@@ -251,7 +251,7 @@ pub fn hex_digits(text: &str) -> Option<Vec<u8>> {
     digits.chunks_exact(2).map(pair).collect()
 }
 
-/// The text, if all of it is printable ASCII; a zero may end it.
+/// The text, if it is all printable ASCII; a zero may end it.
 #[must_use]
 pub fn visible(bytes: &[u8]) -> Option<String> {
     let bytes = bytes.strip_suffix(&[0]).unwrap_or(bytes);
@@ -301,13 +301,13 @@ mod tests {
             ("u24", "16777216", "0 to 16777215"),
             ("i56", "36028797018963968", "-36028797018963968 to 36028797018963967"),
             ("u64", "18446744073709551616", "0 to 18446744073709551615"),
-            ("u64", "999999999999999999999999999999999999999999", "is no u64"),
+            ("u64", "999999999999999999999999999999999999999999", "is not a u64"),
             ("f32", "1e39", "1e39 is out of the range of f32"),
-            ("bool", "2", "'2' is no bool: it is true, false, 1 or 0"),
-            ("u16", "12h", "'12h' is no u16: a number is written as 4096, 0x1000"),
-            ("u16", "", "is no u16"),
-            ("u16", "--1", "is no u16"),
-            ("f64", "one", "'one' is no f64"),
+            ("bool", "2", "'2' is not a bool: it is true, false, 1 or 0"),
+            ("u16", "12h", "'12h' is not a u16: a number is written as 4096, 0x1000"),
+            ("u16", "", "is not a u16"),
+            ("u16", "--1", "is not a u16"),
+            ("f64", "one", "'one' is not a f64"),
             ("string", "größe", "printable ASCII"),
             ("string", "", "an empty value"),
             ("hex", "ABC", "pairs of hexadecimal digits"),

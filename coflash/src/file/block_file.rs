@@ -1,4 +1,4 @@
-//! Block files: read, verified and written. The format itself is in [`shared_abi::block_file`].
+//! Reads, checks and writes block files. [`shared_abi::block_file`] defines the format.
 
 use std::fmt;
 
@@ -15,12 +15,12 @@ use super::range::AddressRange;
 /// The CRC of blocks and programs: polynomial EDB88320h reflected (manual L-1112d_10, chapter 3.1).
 pub const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISO_HDLC);
 
-/// The CRC that a bootloader built for it takes instead: polynomial 1021h, start value 0, as SDO
-/// block transfer has it (manual L-1112d_10, table 8, `--crc16`).
+/// The CRC of a bootloader that was built for it: polynomial 1021h, start value 0, as in SDO block
+/// transfer (manual L-1112d_10, table 8, `--crc16`).
 const CRC16: Crc<u16, Table<16>> = Crc::<u16, Table<16>>::new(&CRC_16_XMODEM);
 
-/// With what the blocks and the program are checked. The file does not say it: host and bootloader
-/// have to agree.
+/// The CRC that protects the blocks and the program. The file does not name it: host and bootloader
+/// must agree.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Checksum {
     /// [`CRC`].
@@ -31,7 +31,7 @@ pub enum Checksum {
 }
 
 impl Checksum {
-    /// Over all of the parts, one behind the other.
+    /// The CRC over all parts in sequence.
     fn of<'a>(self, parts: impl Iterator<Item = &'a [u8]>) -> u32 {
         match self {
             Self::Crc32 => {
@@ -60,8 +60,8 @@ impl fmt::Display for Checksum {
 /// The most data bytes that a block can have.
 pub const MAX_DATA: usize = MAX_BLOCK_SIZE - FRAMING;
 
-/// The most bytes from a program's start to its last one. No microcontroller's flash comes near it;
-/// what exceeds it holds data for two memories.
+/// The most bytes from a program's start to its last byte. The flash of any microcontroller is
+/// smaller; a larger file holds data for two memories.
 pub const MAX_PROGRAM_SIZE: u32 = 64 * 1024 * 1024;
 
 /// The form of the last block.
@@ -70,18 +70,18 @@ pub enum LastBlock {
     /// Size and CRC of the program: the manual of 2015.
     #[default]
     Of2015,
-    /// 32 reserved bytes in front of them: the manual of 2008.
+    /// 32 reserved bytes before them: the manual of 2008.
     Of2008,
 }
 
-/// One block, as one SDO download takes it.
+/// One block, the data of one SDO download.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Block {
     /// 0, 1…N or FFFFFFFFh.
     pub number: u32,
-    /// Where the data goes.
+    /// The address for the data.
     pub flash_address: u32,
-    /// The data: control, program, or size and CRC of it.
+    /// The data: control data, a part of the program, or its size and CRC.
     pub data: Vec<u8>,
 }
 
@@ -99,7 +99,7 @@ impl Block {
             number: self.number,
             flash_address: self.flash_address,
             size: match (self.number, self.data.len()) {
-                // The manual of 2008 does not count the reserved bytes.
+                // The size field of the manual of 2008 does not include the reserved bytes.
                 (NUMBER_LAST, LAST_SIZE_2008) => LAST_SIZE as u32,
                 // A block is never larger than `MAX_DATA`.
                 (_, size) => size as u32,
@@ -114,7 +114,7 @@ impl Block {
     }
 }
 
-/// A whole block file whose numbers, sizes and CRCs are right.
+/// A complete block file with correct numbers, sizes and CRCs.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BlockFile {
     blocks: Vec<Block>,
@@ -124,10 +124,10 @@ pub struct BlockFile {
 }
 
 impl BlockFile {
-    /// Puts a file together from the blocks of the program, whose region starts at `start`.
+    /// Makes a file from the blocks of a program with a region that starts at `start`.
     ///
-    /// `blocks` are (address, data) in address order and not before `start`; each has at most
-    /// [`MAX_DATA`] bytes. `control` makes block 0 when the program's size is known.
+    /// `blocks` are pairs of address and data in the order of addresses, none before `start`; each
+    /// has at most [`MAX_DATA`] bytes. `control` makes block 0 after the program's size is known.
     pub(crate) fn new(
         start: u32,
         blocks: Vec<(u32, Vec<u8>)>,
@@ -139,7 +139,8 @@ impl BlockFile {
         let program_crc =
             program_crc(checksum, start, program_size, blocks.iter().map(|(a, d)| (*a, d.as_slice())));
         let control = control(program_size);
-        // Flash address 0: the older manual (L-1112e_5) asks for it, the newer one allows anything.
+        // Flash address 0: the older manual (L-1112e_5) requires it, the newer one allows any
+        // value.
         let last = Last { program_size, program_crc };
         let (bytes, len) = control.emit();
         let block = |number, flash_address, data| Block { number, flash_address, data };
@@ -153,7 +154,7 @@ impl BlockFile {
         Self { blocks: all, control, last, checksum }
     }
 
-    /// Whether bytes begin like a block file: block 0 at address 0 with one of the known lengths.
+    /// Whether bytes begin like a block file: block 0 at address 0 with one of the valid lengths.
     #[must_use]
     pub fn looks_like(bytes: &[u8]) -> bool {
         bytes.first_chunk().is_some_and(|header| {
@@ -162,8 +163,8 @@ impl BlockFile {
         })
     }
 
-    /// Reads a file and checks every number, size and CRC in it. Which CRC it is, the first block
-    /// tells.
+    /// Parses a file and checks every number, size and CRC in it. The first block shows which CRC
+    /// the file uses.
     ///
     /// # Errors
     /// The first fault, with its offset.
@@ -197,7 +198,7 @@ impl BlockFile {
             }
         };
         if offset != bytes.len() {
-            let words = "there is more behind the last block: not one block file, or damaged";
+            let words = "there are more bytes after the last block: the file is damaged, or consists of several files";
             return Err(Place::Offset(offset).fault(Cause::Malformed(words)));
         }
         let control = &blocks[0].data;
@@ -207,8 +208,8 @@ impl BlockFile {
         if file.program_blocks().is_empty() {
             return Err(Place::File.fault(Cause::NoData));
         }
-        // The file does not say where its program starts. It is the first byte, or whatever lies
-        // the program's size before the end of the last byte.
+        // The file does not contain the start of its program. It is the first byte, or the address
+        // that lies the program's size before the end of the last byte.
         let span = file.span();
         let by_end = (u64::from(span.last) + 1).checked_sub(last.program_size.into());
         let fits = |start| file.starts_at(start);
@@ -218,8 +219,8 @@ impl BlockFile {
         Err(Place::Offset(offset - FRAMING - 8).fault(file.program_fault()))
     }
 
-    /// Checks a file that was read from elsewhere against the region that it is to go into: every
-    /// block inside, and size and CRC counted from the region's start, as the device counts them.
+    /// Checks the file against the region for its program: every block must lie inside, and size
+    /// and CRC must be right when counted from the start of the region, as the device counts them.
     ///
     /// # Errors
     /// [`Cause::Outside`] or [`Cause::ProgramCrc`].
@@ -239,11 +240,11 @@ impl BlockFile {
         }
     }
 
-    /// Whether size and CRC of the last block are those of the blocks, counted from `start`.
+    /// Whether size and CRC in the last block match the blocks, counted from `start`.
     fn starts_at(&self, start: u32) -> bool {
         let span = self.span();
         let Last { program_size, program_crc: crc } = self.last;
-        // Blocks that reach behind the size would not be covered by the CRC.
+        // The CRC would not cover blocks beyond the size.
         let covered = start <= span.first
             && program_size <= MAX_PROGRAM_SIZE
             && u64::from(start) + u64::from(program_size) > u64::from(span.last);
@@ -261,14 +262,14 @@ impl BlockFile {
         &self.blocks
     }
 
-    /// The blocks that carry the program: 1…N.
+    /// The blocks with the program: 1…N.
     #[must_use]
     pub fn program_blocks(&self) -> &[Block] {
         let end = self.blocks.len().saturating_sub(1).max(1);
         &self.blocks[1..end]
     }
 
-    /// From the program's first byte in a block to its last one.
+    /// The range from the program's first byte in a block to its last one.
     #[must_use]
     pub fn span(&self) -> AddressRange {
         let blocks = self.program_blocks();
@@ -278,19 +279,19 @@ impl BlockFile {
         }
     }
 
-    /// What block 0 says.
+    /// The contents of block 0.
     #[must_use]
     pub fn control(&self) -> &Control {
         &self.control
     }
 
-    /// With what it is checked.
+    /// The CRC of the blocks and the program.
     #[must_use]
     pub fn checksum(&self) -> Checksum {
         self.checksum
     }
 
-    /// The memory contents that the blocks carry.
+    /// The memory contents in the blocks.
     #[must_use]
     pub fn image(&self) -> Image {
         let mut pieces = Pieces::default();
@@ -304,7 +305,7 @@ impl BlockFile {
         pieces.in_order()
     }
 
-    /// Where the program starts: its region's first address, as far as the file tells it.
+    /// The start of the program: the first address of its region, as far as the file shows it.
     #[must_use]
     pub fn program_start(&self) -> u32 {
         let span = self.span();
@@ -314,7 +315,7 @@ impl BlockFile {
         span.last.wrapping_add(1).wrapping_sub(self.last.program_size)
     }
 
-    /// The flash from the program's start to its last byte, as the device will have it.
+    /// The contents of the flash after the download, from the program's start to its last byte.
     #[must_use]
     pub fn flash_image(&self) -> Vec<u8> {
         let start = self.program_start();
@@ -329,13 +330,13 @@ impl BlockFile {
         flash
     }
 
-    /// Bytes of the program, from its region's start on.
+    /// Size of the program in bytes, from the start of its region.
     #[must_use]
     pub fn program_size(&self) -> u32 {
         self.last.program_size
     }
 
-    /// CRC of the program: what 1F56h reads when it is in the device.
+    /// CRC of the program: the value of 1F56h after the download.
     #[must_use]
     pub fn program_crc(&self) -> u32 {
         self.last.program_crc
@@ -352,7 +353,7 @@ fn last_address(block: &Block) -> u32 {
     block.flash_address.saturating_add((block.data.len() as u32).saturating_sub(1))
 }
 
-/// One block from the front of `bytes`, and how long it is.
+/// Parses one block at the front of `bytes`; also returns its length.
 fn parse_block(bytes: &[u8], checksum: Checksum, place: Place) -> Result<(Block, usize), ReadError> {
     let cut_off = |what, needed| place.fault(Cause::CutOff { what, needed, found: bytes.len() });
     let header = bytes.first_chunk().ok_or_else(|| cut_off("the header of a block", HEADER_SIZE))?;
@@ -362,7 +363,8 @@ fn parse_block(bytes: &[u8], checksum: Checksum, place: Place) -> Result<(Block,
     }
     let mut crc_at = HEADER_SIZE + size as usize;
     let of_2008 = HEADER_SIZE + LAST_SIZE_2008;
-    // The manual of 2008 does not count the reserved bytes. The last block ends with the file.
+    // The size field of the manual of 2008 does not include the reserved bytes. The last block ends
+    // with the file.
     if number == NUMBER_LAST && size as usize == LAST_SIZE && bytes.len() == of_2008 + CRC_SIZE {
         crc_at = of_2008;
     }
@@ -376,7 +378,7 @@ fn parse_block(bytes: &[u8], checksum: Checksum, place: Place) -> Result<(Block,
     Ok((Block { number, flash_address, data }, crc_at + CRC_SIZE))
 }
 
-/// Checks that a program block has data, ends inside the address space and lies behind the one
+/// Checks that a program block has data, ends inside the address space and lies after the block
 /// before it.
 fn check_order(before: Option<&Block>, block: &Block, place: Place) -> Result<(), ReadError> {
     if matches!(block.number, NUMBER_CONTROL | NUMBER_LAST) {
@@ -391,15 +393,15 @@ fn check_order(before: Option<&Block>, block: &Block, place: Place) -> Result<()
     }
     match before {
         Some(before) if before.number != NUMBER_CONTROL && address <= last_address(before) => {
-            Err(place.fault(Cause::Malformed("the block does not lie behind the one before it")))
+            Err(place.fault(Cause::Malformed("the block does not lie after the one before it")))
         }
         _ => Ok(()),
     }
 }
 
-/// CRC of the first `size` bytes from `start`, as they are to lie in flash: erased bytes read FFh.
+/// CRC of the first `size` bytes from `start` as they will lie in flash: erased bytes read FFh.
 ///
-/// The blocks lie between `start` and `start + size`, in address order.
+/// The blocks lie between `start` and `start + size`, in the order of addresses.
 fn program_crc<'a>(
     checksum: Checksum,
     start: u32,

@@ -1,4 +1,4 @@
-//! Conversion: from the memory contents of a program to the block file that a bootloader takes.
+//! Converts the memory contents of a program into a block file for a bootloader.
 
 use std::borrow::Cow;
 
@@ -13,28 +13,29 @@ use super::raw;
 use super::read::Firmware;
 use super::sealed::SealedFile;
 
-/// The manual's `--block-size`: 1024 bytes, framing included.
+/// The manual's default for `--block-size`: 1024 bytes, including framing.
 pub const DEFAULT_BLOCK_SIZE: usize = 0x400;
 
-/// Flash is programmed by words: no block starts inside one, and no word lies in two blocks.
+/// Flash is programmed in words: a block begins at a word, and no word lies in two blocks.
 const WORD: u32 = 4;
 
-/// Where a program may lie, and what becomes of data that lies elsewhere.
+/// The region of a program, and the treatment of data outside it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Region {
-    /// Nobody knows: the program starts at the first byte of the file (rounded down to a word).
+    /// Unknown: the program starts at the first byte of the file (rounded down to a word).
     #[default]
     Unknown,
-    /// The flash of a program on a known board: data outside is an error.
+    /// The flash of a program on a known board: data outside it are an error.
     Strict(AddressRange),
-    /// What `--start-address` and `--end-address` cut out (manual, table 8): data outside is left
-    /// out.
+    /// The region between `--start-address` and `--end-address` (manual, table 8): data outside it
+    /// are left out.
     Cut(AddressRange),
-    /// The same with `--end-address` alone: the program starts at the first byte.
+    /// `--end-address` alone: the program starts at the first byte, and data beyond the end are
+    /// left out.
     CutBehind(u32),
 }
 
-/// What gaps inside a block are filled with: a 32-bit pattern, as the flash's words would show it.
+/// The value that fills gaps inside a block: a 32-bit pattern, aligned to the words of the flash.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct GapFill([u8; 4]);
 
@@ -42,8 +43,8 @@ impl GapFill {
     /// The erased state of the flash.
     pub const ERASED: Self = Self([0xFF; 4]);
 
-    /// The manual's value: up to FFh it is a byte (as in the manual of 2008), above it 32 bits (as
-    /// in that of 2015).
+    /// The value in the manual's form: up to FFh it is a byte (manual of 2008), above that 32 bits
+    /// (manual of 2015).
     #[must_use]
     pub fn new(value: u32) -> Self {
         match u8::try_from(value) {
@@ -63,15 +64,15 @@ impl Default for GapFill {
     }
 }
 
-/// For whom the program is and which one it is: what goes into block 0.
+/// The target and the version of a program: the contents of block 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Label {
-    /// What the image's own label tells, if it has one, and otherwise nothing.
+    /// The contents of the image's label, if it has one; otherwise nothing.
     OfImage {
-        /// Seconds since 1970-01-01 UTC, 0 where it is not told: a label has no date.
+        /// Seconds since 1970-01-01 UTC, 0 if unknown: a label contains no date.
         date: u64,
     },
-    /// Nothing is told.
+    /// No identity.
     None,
     /// Vendor-ID and product code, compared with 1018h by the bootloader.
     Device {
@@ -80,7 +81,7 @@ pub enum Label {
         /// Product code, as in 1018h/2.
         product_code: u32,
     },
-    /// The same, with version and date.
+    /// Vendor-ID and product code, with version and date.
     Release {
         /// Vendor-ID, as in 1018h/1.
         vendor_id: u32,
@@ -100,7 +101,7 @@ impl Default for Label {
 }
 
 impl Label {
-    /// What is to be told of a program that starts at `start`.
+    /// The label for a program that starts at `start`.
     fn resolved(self, image: &Image, start: u32) -> Self {
         let Self::OfImage { date } = self else { return self };
         label_of(image, start).map_or(Self::None, |label| Self::Release {
@@ -124,32 +125,31 @@ impl Label {
         }
     }
 
-    /// Bytes of block 0 with framing.
+    /// The size of block 0 with framing.
     fn block_size(self) -> usize {
         self.control(0).emit().1 + FRAMING
     }
 }
 
-/// How to convert. The default is the manual's.
+/// The options of a conversion. The default is the manual's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Options {
-    /// Where the program may lie.
+    /// The region of the program.
     pub region: Region,
-    /// Bytes of the largest block, framing included; the bootloader's buffer must hold it.
+    /// The size of the largest block, including framing; it must fit into the bootloader's buffer.
     pub block_size: usize,
-    /// What gaps inside a block are filled with.
+    /// The value that fills gaps inside a block.
     pub gap_fill: GapFill,
-    /// What goes into block 0.
+    /// The contents of block 0.
     pub label: Label,
-    /// What is added to every address, after [`Region::Cut`] and before [`Region::Strict`]; 2³² − n
-    /// takes n away.
+    /// The offset that is added to every address, after [`Region::Cut`] and before
+    /// [`Region::Strict`]; 2³² − n subtracts n.
     pub adjust_start: u32,
-    /// With what the blocks and the program are checked: what the bootloader was built for.
+    /// The CRC of blocks and program: the one that the bootloader was built for.
     pub checksum: Checksum,
-    /// The most bytes in a row that a block may have without data of the program between two that
-    /// have (manual L-1112e_5, `FT_BLOCK_MAX_GAP`): a longer gap starts a new block. `None`: as many
-    /// as the block has room for.
+    /// The longest gap inside a block, in bytes (manual L-1112e_5, `FT_BLOCK_MAX_GAP`): a longer
+    /// gap starts a new block. `None`: the room in the block is the only limit.
     pub max_gap: Option<u32>,
     /// The form of the last block.
     pub last_block: LastBlock,
@@ -183,39 +183,39 @@ impl Default for Options {
     }
 }
 
-/// Why nothing was converted.
+/// Why a conversion failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ConvertError {
-    /// The file and the region do not fit each other.
+    /// The file does not fit into the region.
     #[error(transparent)]
     File(#[from] ReadError),
-    /// The block size is no good.
+    /// The block size is invalid.
     #[error(
         "a block size of {given} is impossible: it counts the 16 bytes of framing and must be {min} to {max}"
     )]
     BlockSize {
-        /// What was asked for.
+        /// The requested size.
         given: usize,
-        /// The least that this conversion needs.
+        /// The lowest size for this conversion.
         min: usize,
-        /// The most that the manual allows.
+        /// The highest size that the manual allows.
         max: usize,
     },
-    /// The program's start is no word address.
-    #[error("a program cannot start at {0:#010x}: flash is programmed by words of 4 bytes")]
+    /// The program's start is not a word address.
+    #[error("a program cannot start at {0:#010x}: flash is programmed in words of 4 bytes")]
     Start(u32),
     /// A region that ends before it starts.
     #[error("the address range {0} ends before it starts")]
     Range(AddressRange),
-    /// Addresses that leave the address space when they are adjusted.
-    #[error("adding {0:#010x} to the addresses moves the program over the end of the address space")]
+    /// Adding the offset moves addresses out of the address space.
+    #[error("adding {0:#010x} to the addresses moves the program beyond the end of the address space")]
     Adjust(u32),
-    /// Blocks cannot be changed any more.
-    #[error("a block file is taken as it is: {0} needs the firmware that it was made of")]
+    /// The contents of a block file cannot be changed.
+    #[error("a block file cannot be changed: {0} needs the original firmware")]
     Blocks(&'static str),
 }
 
-/// A conversion's result.
+/// The result of a conversion.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Converted {
     /// The blocks.
@@ -224,11 +224,10 @@ pub struct Converted {
     pub left_out: u64,
 }
 
-/// Makes blocks out of a program.
+/// Makes blocks from a program.
 ///
-/// Blocks start at the first byte that is not yet in a block, rounded down to a word; gaps inside a
-/// block are filled, gaps between blocks are left to the erased flash. The same input gives the
-/// same blocks.
+/// A block starts at the first byte that is not yet in a block, rounded down to a word. Gaps inside
+/// a block are filled; gaps between blocks stay erased flash. The same input gives the same blocks.
 ///
 /// # Errors
 /// See [`ConvertError`].
@@ -249,8 +248,8 @@ pub fn convert(image: &Image, options: &Options) -> Result<Converted, ConvertErr
     Ok(Converted { file, left_out })
 }
 
-/// Blocks of whatever a file holds: an image is [converted](convert), blocks are checked against a
-/// strict region and taken as they are.
+/// Makes the blocks of any firmware file: an image is [converted](convert); blocks are checked
+/// against a strict region and used unchanged.
 ///
 /// # Errors
 /// See [`ConvertError`].
@@ -273,12 +272,12 @@ pub fn blocks_of(firmware: Firmware, options: &Options) -> Result<Converted, Con
     }
 }
 
-/// The blocks that carry a sealed image, of at most `block_size` bytes with framing, to a device whose
-/// program starts at `start`: its bytes in order from there on, and block 0 with what it says.
-///
+/// Makes the blocks that carry a sealed image, of at most `block_size` bytes with framing, to a
+/// device with a program that starts at `start`. The blocks hold the image's bytes in order from
+/// this address on; block 0 holds the identity from its manifest.
 /// # Errors
-/// [`ConvertError::BlockSize`], [`ConvertError::Start`], and [`ConvertError::File`] for one that runs
-/// over the end of the address space.
+/// [`ConvertError::BlockSize`], [`ConvertError::Start`], and [`ConvertError::File`] if the image
+/// exceeds the address space.
 pub fn blocks_of_sealed(file: &SealedFile, start: u32, block_size: usize) -> Result<BlockFile, ConvertError> {
     let head = file.head();
     let label = Label::Release {
@@ -291,7 +290,7 @@ pub fn blocks_of_sealed(file: &SealedFile, start: u32, block_size: usize) -> Res
     Ok(convert(&bytes, &Options::default().block_size(block_size).label(label))?.file)
 }
 
-/// Data bytes of the largest block: whole words.
+/// The data bytes of the largest block, a multiple of a word.
 fn payload(given: usize, label: Label) -> Result<usize, ConvertError> {
     // The last block has 8 data bytes, block 0 at least as many.
     let (min, max) = (label.block_size(), MAX_BLOCK_SIZE);
@@ -302,8 +301,8 @@ fn payload(given: usize, label: Label) -> Result<usize, ConvertError> {
     Ok(data - data % WORD as usize)
 }
 
-/// What of the image belongs to the program, where the program starts, and how many bytes do not
-/// belong to it.
+/// The part of the image that belongs to the program, the program's start address, and the number
+/// of bytes outside it.
 fn place<'i>(image: &'i Image, options: &Options) -> Result<(Cow<'i, Image>, u32, u64), ConvertError> {
     let offset = options.adjust_start;
     let adjusted = |image: Cow<'i, Image>| match offset {
@@ -359,16 +358,16 @@ fn blocks(image: &Image, payload: usize, options: &Options) -> Vec<(u32, Vec<u8>
     for piece in image.pieces() {
         let (mut address, mut data) = (u64::from(piece.address), piece.data.as_slice());
         while !data.is_empty() {
-            // The block under way, if its window reaches this far, or else a new one.
+            // Continue the current block if it reaches this far, otherwise start a new one.
             let reaches = |(start, data): &(u32, Vec<u8>)| {
                 let end = u64::from(*start) + data.len() as u64;
-                // A word that the block has begun is the block's: no word lies in two.
+                // A word that a block has begun belongs to it: no word lies in two blocks.
                 let same_word = address < end.next_multiple_of(WORD.into());
                 let near = options.max_gap.is_none_or(|most| address - end <= most.into());
                 address < u64::from(*start) + payload as u64 && (near || same_word)
             };
             if !blocks.last().is_some_and(reaches) {
-                // `address` is that of a byte, so it fits.
+                // `address` is the address of a byte, so it fits.
                 blocks.push((address as u32 & !(WORD - 1), Vec::with_capacity(payload)));
             }
             let Some((start, block)) = blocks.last_mut() else { break };

@@ -8,10 +8,11 @@ use super::block_file::MAX_PROGRAM_SIZE;
 use super::fault::{Cause, Place, ReadError};
 use super::image::{Image, Pieces};
 
-/// Reads a whole file.
+/// Parses a whole file.
 ///
-/// What counts are the `PT_LOAD` program headers: `p_filesz` bytes at `p_paddr`, where they lie in
-/// flash. (Sections and `p_vaddr` tell where they are used, which is RAM for initialised data.)
+/// The memory contents are those of the `PT_LOAD` program headers: `p_filesz` bytes at `p_paddr`,
+/// their address in flash. (Sections and `p_vaddr` give the addresses at run time, which lie in RAM
+/// for initialised data.)
 ///
 /// # Errors
 /// The first fault, with its offset.
@@ -24,9 +25,9 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
             return Err(DATA.fault(Cause::WrongElf("is not little-endian; the device is")))
         }
         [0x7F, b'E', b'L', b'F', ..] => {
-            return Err(CLASS.fault(Cause::WrongElf("is no 32-bit ELF file, as the device needs it")))
+            return Err(CLASS.fault(Cause::WrongElf("is not a 32-bit ELF file; the device needs one")))
         }
-        _ => return Err(Place::Offset(0).fault(Cause::WrongElf("is no ELF file"))),
+        _ => return Err(Place::Offset(0).fault(Cause::WrongElf("is not an ELF file"))),
     }
     let cut_off = |what, needed: u64| {
         let needed = usize::try_from(needed).unwrap_or(usize::MAX);
@@ -39,7 +40,7 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
         return Err(Place::Offset(18).fault(Cause::WrongMachine(machine)));
     }
     if header.e_type(endian) != ET_EXEC {
-        let words = "is no linked program (an object file or library): give the linker's output";
+        let words = "is not a linked program (it is an object file or library): give the linker's output";
         return Err(Place::Offset(16).fault(Cause::WrongElf(words)));
     }
     let table = u64::from(header.e_phoff(endian));
@@ -52,8 +53,8 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
         let with_size = program_headers.iter().map(|segment| (segment, u64::from(segment.p_filesz(endian))));
         with_size.filter(|(segment, size)| segment.p_type(endian) == PT_LOAD && *size != 0)
     };
-    // Headers are cheap and may all show the same bytes: their sum is looked at before any is
-    // copied. It cannot overflow: there are 65535 headers at most, of 32 bits each.
+    // Headers are small and may all refer to the same bytes: check the sum of their sizes before
+    // copying. It cannot overflow: there are at most 65535 headers of 32 bits each.
     if loads().map(|(_, size)| size).sum::<u64>() > MAX_PROGRAM_SIZE.into() {
         return Err(Place::File.fault(Cause::SegmentsTooLarge { most: MAX_PROGRAM_SIZE }));
     }
@@ -68,8 +69,8 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
         }
         pieces.add(address, data.to_vec(), place);
     }
-    // Linkers write the section headers last: a file that lacks them was cut off, even if all
-    // segments are there.
+    // Linkers write the section headers last: without them the file was cut off, even if all
+    // segments are present.
     let sections = u64::from(header.e_shoff(endian));
     let sections_end = sections + u64::from(header.e_shentsize(endian)) * u64::from(header.e_shnum(endian));
     if sections != 0 && sections_end > bytes.len() as u64 {
@@ -121,11 +122,11 @@ mod tests {
     #[test]
     fn refuses_what_the_device_cannot_run() {
         for (words, found) in [
-            ("offset 0x4: is no 32-bit ELF file", fault(|b| b[4] = 2)),
+            ("offset 0x4: is not a 32-bit ELF file", fault(|b| b[4] = 2)),
             ("offset 0x5: is not little-endian", fault(|b| b[5] = 2)),
             ("offset 0x12: is an ELF file for machine 62 and not for Arm", fault(|b| b[18] = 62)),
-            ("offset 0x10: is no linked program", fault(|b| b[16] = 1)),
-            ("offset 0x0: is no ELF file", fault(|b| b[0] = 0)),
+            ("offset 0x10: is not a linked program", fault(|b| b[16] = 1)),
+            ("offset 0x0: is not an ELF file", fault(|b| b[0] = 0)),
             (
                 "offset 0x78: the data at 0x08010003 overlaps that of offset 0x74",
                 fault(|b| b[96..98].copy_from_slice(&[3, 0])),
@@ -146,7 +147,7 @@ mod tests {
             ),
             ("the file: holds no data", fault(|b| (b[52], b[84]) = (6, 6))),
             (
-                "offset 0x74: the data from 0xfffffffd on runs over the end",
+                "offset 0x74: the data from 0xfffffffd on exceeds the end",
                 fault(|b| b[64..68].copy_from_slice(&[0xFD, 0xFF, 0xFF, 0xFF])),
             ),
         ] {

@@ -1,4 +1,4 @@
-//! What can be wrong with a firmware file, and where in it.
+//! The faults of a firmware file, with their places in the file.
 
 use std::fmt;
 
@@ -6,10 +6,10 @@ use shared_abi::block_file::{FRAMING, MAX_BLOCK_SIZE};
 
 use super::range::AddressRange;
 
-/// Where in a file something is.
+/// A place in a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Place {
-    /// No place in particular: the file as a whole.
+    /// The file as a whole.
     File,
     /// A line of a text file; the first is 1.
     Line(usize),
@@ -35,31 +35,31 @@ impl fmt::Display for Place {
     }
 }
 
-/// Why bytes are no usable firmware, and where.
+/// Why bytes are not usable firmware, and where.
 #[derive(Debug, thiserror::Error)]
 #[error("{place}: {cause}")]
 pub struct ReadError {
     /// Where the fault is.
     pub place: Place,
-    /// What it is.
+    /// The kind of the fault.
     #[source]
     pub cause: Cause,
 }
 
 impl ReadError {
-    /// The same, with the file's name in front.
+    /// The same error with the file's name.
     #[must_use]
     pub fn of(self, file: impl fmt::Display) -> FileError {
         FileError { file: file.to_string(), error: self }
     }
 }
 
-/// Why a file is no usable firmware: `file, place: cause`.
+/// Why a file is not usable firmware: `file, place: cause`.
 #[derive(Debug)]
 pub struct FileError {
     /// Name of the file, as the user gave it.
     pub file: String,
-    /// What is wrong in it.
+    /// The fault.
     pub error: ReadError,
 }
 
@@ -78,121 +78,123 @@ impl std::error::Error for FileError {
     }
 }
 
-/// What can be wrong with a firmware file. The words say what to do where it is not plain.
+/// The faults of a firmware file. The messages give advice if it is not obvious.
 #[derive(Debug, thiserror::Error)]
 pub enum Cause {
-    /// The file cannot be read at all.
+    /// The file cannot be read.
     #[error("cannot be read: {0}")]
     Io(#[source] std::io::Error),
-    /// Something that has no end, or none that can be known.
-    #[error("is {0} and no file: give a file, or save into one what comes from there")]
+    /// A device, pipe or the like, with an unknown or infinite size.
+    #[error("is {0} and not a file: save the data to a file first")]
     NoRegularFile(&'static str),
     /// A file larger than any firmware.
-    #[error("has {size} bytes, and no firmware file has more than {most}: it is another file, or an ELF file whose symbols must be stripped first")]
+    #[error("has {size} bytes, and a firmware file has at most {most}: check that it is the right file, or strip the symbols of the ELF file")]
     TooLarge {
-        /// Bytes that it has, or at least has.
+        /// Size of the file, or a lower limit of it.
         size: u64,
-        /// The most that are read.
+        /// The most bytes that are read.
         most: u64,
     },
-    /// Load segments that hold more together than any program.
-    #[error("its load segments have more than {most} bytes together: the file is damaged, or no firmware")]
+    /// Load segments that together are larger than any program.
+    #[error(
+        "its load segments have more than {most} bytes together: the file is damaged, or it is not firmware"
+    )]
     SegmentsTooLarge {
-        /// The most that they may have.
+        /// The most bytes of all segments.
         most: u32,
     },
-    /// No bytes.
+    /// The file has no bytes.
     #[error("is empty")]
     Empty,
-    /// None of the known formats.
-    #[error("is no firmware file (neither Intel HEX, S-record, ELF nor block file; for a raw binary give -I binary and --start-address)")]
+    /// A file in none of the known formats.
+    #[error("is not a firmware file (neither Intel HEX, S-record, ELF nor block file; for a raw binary give -I binary and --start-address)")]
     NotFirmware,
-    /// A sealed image where the program itself is needed.
-    #[error("is a sealed image, which is taken as it is: `coflash flash` sends it, `coflash show` and `coflash verify` tell what it is")]
+    /// A sealed image in a place that needs the program itself.
+    #[error("is a sealed image and cannot be converted: `coflash flash` downloads it, `coflash show` and `coflash verify` describe it")]
     Sealed,
-    /// A raw file, and nobody said where it goes.
-    #[error("a raw binary does not say where it belongs: give --start-address or --board")]
+    /// A raw file without an address.
+    #[error("a raw binary does not contain its address: give --start-address or --board")]
     NoAddress,
-    /// The record or structure ends too early.
+    /// A record or structure ends too early.
     #[error(
         "{what} is cut off: it must have {needed} bytes and has {found}; the file is truncated or damaged"
     )]
     CutOff {
-        /// What ends too early.
+        /// The part that ends too early.
         what: &'static str,
-        /// Bytes that it announces.
+        /// Announced size in bytes.
         needed: usize,
-        /// Bytes that are there.
+        /// Actual size in bytes.
         found: usize,
     },
-    /// A record is longer than it says.
+    /// A record is longer than announced.
     #[error("the record has {found} bytes but announces {needed}")]
     TooLong {
-        /// Bytes that it announces.
+        /// Announced size in bytes.
         needed: usize,
-        /// Bytes that are there.
+        /// Actual size in bytes.
         found: usize,
     },
-    /// The record that ends such a file is absent.
+    /// The end record is missing.
     #[error("the file ends without {0}: it is truncated")]
     NoEnd(&'static str),
-    /// There is more behind the record that ends the file.
-    #[error("there is more text behind the end record")]
+    /// There is text after the end record.
+    #[error("there is more text after the end record")]
     AfterEnd,
-    /// Not what this format looks like.
+    /// A violation of the format.
     #[error("{0}")]
     Malformed(&'static str),
-    /// A character that is no hexadecimal digit.
-    #[error("character {column} is no hexadecimal digit")]
+    /// A character that is not a hexadecimal digit.
+    #[error("character {column} is not a hexadecimal digit")]
     BadDigit {
         /// Its column; the first is 1.
         column: usize,
     },
-    /// A record type that the format does not know.
+    /// A record type that the format does not define.
     #[error("unknown record type {0}")]
     UnknownRecord(String),
-    /// A record's checksum does not match.
+    /// A wrong checksum of a record.
     #[error("checksum is {found:02X} and must be {needed:02X}: the line is damaged")]
     Checksum {
-        /// What the record says.
+        /// The record's checksum.
         found: u8,
-        /// What its other bytes add up to.
+        /// The checksum of the record's other bytes.
         needed: u8,
     },
-    /// A record count does not match.
+    /// A wrong record count.
     #[error(
-        "the file has {counted} data records and its count record says {says}: lines are missing or doubled"
+        "the file has {counted} data records and its count record has {says}: lines are missing or doubled"
     )]
     Count {
-        /// What the count record says, modulo its width.
+        /// The number in the count record, modulo its width.
         says: u32,
-        /// What was counted.
+        /// The number of records found.
         counted: usize,
     },
-    /// Data runs over the end of what its addresses can express.
-    #[error("the data from {address:#010x} on runs over the end of {what}")]
+    /// Data beyond the end of the range that their addresses can express.
+    #[error("the data from {address:#010x} on exceeds the end of {what}")]
     AddressOverflow {
         /// First address of the data.
         address: u32,
-        /// What ends there.
+        /// The range that is exceeded.
         what: &'static str,
     },
-    /// Two parts of the file say what belongs at one address.
+    /// Two parts of the file give data for one address.
     #[error("the data at {address:#010x} overlaps that of {with}")]
     Overlap {
-        /// First address that is doubled.
+        /// The first address with two data.
         address: u32,
-        /// The other one.
+        /// The place of the other data.
         with: Place,
     },
-    /// Data where the program may not lie.
+    /// Data outside the program's region.
     #[error("the data at {first:#010x}..={last:#010x} lies outside {region}: link the program for this region, or choose another board or program")]
     Outside {
         /// First address of the data.
         first: u32,
-        /// Its last.
+        /// Last address of the data.
         last: u32,
-        /// Where the program may lie.
+        /// The region of the program.
         region: AddressRange,
     },
     /// A well-formed file without data.
@@ -201,67 +203,67 @@ pub enum Cause {
     /// A well-formed file without data in the region.
     #[error("holds no data inside {0}")]
     NothingInside(AddressRange),
-    /// First and last byte are too far apart for one program.
-    #[error("the data spans {first:#010x}..={last:#010x}, too much for one program: choose the part to take with --start-address and --end-address")]
+    /// The distance between the first and the last byte is too large for one program.
+    #[error("the data spans {first:#010x}..={last:#010x}, too much for one program: select the program with --start-address and --end-address")]
     TooSparse {
         /// First address of the program.
         first: u32,
         /// Last address of the data.
         last: u32,
     },
-    /// Not an ELF file that can run on the device.
+    /// An ELF file that cannot run on the device.
     #[error("{0}")]
     WrongElf(&'static str),
     /// An ELF file for another machine.
     #[error("is an ELF file for machine {0} and not for Arm (40)")]
     WrongMachine(u16),
-    /// A block's CRC does not match.
+    /// A wrong CRC of a block.
     #[error("CRC of block {number} is {found:#010x} and must be {needed:#010x}: the file is damaged")]
     BlockCrc {
         /// Number of the block.
         number: u32,
-        /// What the block says.
+        /// The block's CRC.
         found: u32,
-        /// What its other bytes give.
+        /// The CRC of the block's other bytes.
         needed: u32,
     },
-    /// A block out of its place.
+    /// A block in the wrong place.
     #[error("block {found} follows where block {expected} must: the file is damaged")]
     BlockNumber {
         /// The number in its header.
         found: u32,
-        /// The number that must be there.
+        /// The expected number.
         expected: u32,
     },
-    /// A block larger than any bootloader takes.
+    /// A block larger than any bootloader's buffer.
     #[error("block {number} has {size} data bytes, at most {max} are allowed", max = MAX_BLOCK_SIZE - FRAMING)]
     BlockSize {
         /// Number of the block.
         number: u32,
-        /// Its data bytes.
+        /// The size of its data in bytes.
         size: u32,
     },
-    /// Block 0 has a length that no bootloader knows.
+    /// Block 0 has an unknown length.
     #[error("block 0 has {0} data bytes; 8, 12 and 24 are known")]
     ControlSize(usize),
-    /// The last block is not what it must be.
+    /// The last block has a wrong length.
     #[error("the last block has {0} data bytes and must have 8")]
     LastSize(usize),
-    /// The last block's size or CRC does not fit the blocks before it.
+    /// Size or CRC in the last block do not match the blocks before it.
     #[error(
-        "the last block says {size} bytes with CRC {crc:#010x}, which does not fit the blocks before it"
+        "the last block gives {size} bytes with CRC {crc:#010x}, which does not match the blocks before it"
     )]
     ProgramCrc {
-        /// Program size it says.
+        /// The program size in the block.
         size: u32,
-        /// Program CRC it says.
+        /// The program CRC in the block.
         crc: u32,
     },
 }
 
 impl Cause {
-    /// The stable number: that of the manual's error table (L-1112e_5, table 5) where it has one,
-    /// otherwise the operating system's.
+    /// The stable error number: the manual's number (L-1112e_5, table 5) if there is one, otherwise
+    /// the operating system's.
     #[must_use]
     pub fn number(&self) -> u32 {
         match self {

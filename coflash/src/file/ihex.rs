@@ -4,17 +4,17 @@ use super::fault::{Cause, Place, ReadError};
 use super::image::{Image, Pieces};
 use super::text::{bytes_of, check_length, lines};
 
-/// What the 16-bit offsets of data records count from.
+/// The base address for the 16-bit offsets of data records.
 #[derive(Clone, Copy)]
 enum Base {
-    /// Segment base address (record 02, and 0 before any base record): an offset may not leave its
-    /// 64 KiB.
+    /// Segment base address (record 02; 0 before any base record): data must stay inside its 64
+    /// KiB.
     Segment(u32),
     /// Upper half of a linear address (record 04).
     Linear(u32),
 }
 
-/// Reads a whole file.
+/// Parses a whole file.
 ///
 /// # Errors
 /// The first fault, with its line.
@@ -35,8 +35,8 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
             }
             0x02 => base = Base::Segment(number(&data, 2, place)? << 4),
             0x04 => base = Base::Linear(number(&data, 2, place)? << 16),
-            // Start addresses: a device starts through its vector table, so they are checked and
-            // passed over.
+            // Start addresses: a device starts through its vector table, so these records are
+            // checked and ignored.
             0x03 | 0x05 => expect_length(&data, 4, place)?,
             _ => return Err(place.fault(Cause::UnknownRecord(format!("{kind:02X}")))),
         }
@@ -50,7 +50,7 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
 /// Offset, type and data of one line.
 fn record(place: Place, line: &[u8]) -> Result<(u16, u8, Vec<u8>), ReadError> {
     let digits =
-        line.strip_prefix(b":").ok_or(place.fault(Cause::Malformed("the line has no ':' in front")))?;
+        line.strip_prefix(b":").ok_or(place.fault(Cause::Malformed("the line does not begin with ':'")))?;
     let bytes = bytes_of(digits, 1, place)?;
     // Length, offset (2), type, data, checksum.
     let needed = 5 + bytes.first().copied().map_or(0, usize::from);
@@ -91,8 +91,8 @@ fn number(data: &[u8], len: usize, place: Place) -> Result<u32, ReadError> {
     Ok(data.iter().fold(0, |number, byte| number << 8 | u32::from(*byte)))
 }
 
-/// An image as Intel HEX text: 16 bytes in a record, extended linear addresses (Intel, revision A,
-/// 1988).
+/// An image as Intel HEX text: 16 bytes in each record, extended linear addresses (Intel, revision
+/// A, 1988).
 #[must_use]
 pub fn emit(image: &Image) -> String {
     const RECORD: usize = 16;
@@ -115,7 +115,7 @@ pub fn emit(image: &Image) -> String {
                 upper = Some(at >> 16);
                 record(0, 4, &((at >> 16) as u16).to_be_bytes());
             }
-            // Up to an address that 16 divides, so that no record crosses 64 KiB.
+            // End at a multiple of 16, so that no record crosses a 64 KiB border.
             let len = rest.len().min(RECORD - at as usize % RECORD);
             record(at as u16, 0, &rest[..len]);
             at = at.wrapping_add(len as u32);
@@ -138,7 +138,7 @@ mod tests {
         read(text.as_bytes()).unwrap_err().to_string()
     }
 
-    /// Two records of the best-known example file (Wikipedia "Intel HEX", after the specification).
+    /// Two records of the best-known example file (Wikipedia "Intel HEX", from the specification).
     const EXAMPLE: &str = ":10010000214601360121470136007EFE09D2190140\n:00000001FF\n";
 
     #[test]
@@ -148,8 +148,8 @@ mod tests {
         assert!(image.segments().eq([(0x100, data.to_vec())]));
     }
 
-    /// Segment base 1234h (12340h) and linear base 0801h; the base records' checksums by hand:
-    /// two's complement of 02+02+12+34 = 4A and of 02+04+08+01 = 0F.
+    /// Segment base 1234h (12340h) and linear base 0801h; the checksums of the base records were
+    /// computed by hand: two's complement of 02+02+12+34 = 4A and of 02+04+08+01 = 0F.
     #[test]
     fn base_records_move_what_follows() {
         let text = "\
@@ -184,23 +184,23 @@ mod tests {
             (format!("{good}:\n"), "line 2: the record is cut off: it must have 5 bytes and has 0"),
             (format!("{good}:0100010001FDFD\n"), "line 2: the record has 7 bytes but announces 6"),
             (format!("{good}:010001000\n"), "line 2: the last byte has only one digit"),
-            (format!("{good}:01000100G1FD\n"), "line 2: character 10 is no hexadecimal digit"),
-            (format!("{good}:0100010\u{e9}01FD\n"), "line 2: character 9 is no hexadecimal digit"),
-            (format!("{good}hello\n"), "line 2: the line has no ':' in front"),
+            (format!("{good}:01000100G1FD\n"), "line 2: character 10 is not a hexadecimal digit"),
+            (format!("{good}:0100010\u{e9}01FD\n"), "line 2: character 9 is not a hexadecimal digit"),
+            (format!("{good}hello\n"), "line 2: the line does not begin with ':'"),
             (format!("{good}:00000006FA\n"), "line 2: unknown record type 06"),
             (format!("{good}:0100000101FD\n"), "line 2: this record type has another length"),
             (format!("{good}:0100000401FA\n"), "line 2: this record type has another length"),
-            (format!("{good}:00000001FF\n{good}"), "line 3: there is more text behind the end record"),
+            (format!("{good}:00000001FF\n{good}"), "line 3: there is more text after the end record"),
             (good.to_string(), "the file: the file ends without its end record"),
             (":00000001FF\n".to_string(), "the file: holds no data"),
             (format!("{good}{good}:00000001FF\n"), "line 2: the data at 0x00000000 overlaps that of line 1"),
             (
                 ":02FFFF000102FD\n:00000001FF".to_string(),
-                "line 1: the data from 0x0000ffff on runs over the end of its 64 KiB segment",
+                "line 1: the data from 0x0000ffff on exceeds the end of its 64 KiB segment",
             ),
             (
                 ":02000004FFFFFC\n:02FFFF000102FD\n:00000001FF".to_string(),
-                "line 2: the data from 0xffffffff on runs over the end of the address space",
+                "line 2: the data from 0xffffffff on exceeds the end of the address space",
             ),
         ] {
             assert!(fault(&text).starts_with(words), "{text:?}\n gave {}\n not  {words}", fault(&text));

@@ -1,9 +1,9 @@
-//! Memory contents with holes, as a firmware file tells them.
+//! The memory contents in a firmware file, with gaps.
 
 use super::fault::{Cause, Place, ReadError};
 use super::range::AddressRange;
 
-/// Bytes of one record or segment of a file.
+/// The bytes of one record or segment of a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Piece {
     pub(crate) address: u32,
@@ -14,33 +14,33 @@ pub(crate) struct Piece {
 
 impl Piece {
     pub(crate) fn range(&self) -> AddressRange {
-        // `Pieces::add` lets nothing empty in, and the readers nothing that leaves the address
+        // `Pieces::add` drops empty pieces, and the readers refuse data that leave the address
         // space.
         AddressRange { first: self.address, last: self.address + (self.data.len() - 1) as u32 }
     }
 }
 
-/// Pieces in the order of the file, on their way to an [`Image`].
+/// Pieces in the order of the file, before they become an [`Image`].
 #[derive(Debug, Default)]
 pub(crate) struct Pieces(Vec<Piece>);
 
 impl Pieces {
-    /// Adds what the file has at `place`; the caller has checked that it ends inside the address
-    /// space.
+    /// Adds the data at `place` of the file. The caller has checked that the data end inside the
+    /// address space.
     pub(crate) fn add(&mut self, address: u32, data: Vec<u8>, place: Place) {
         if !data.is_empty() {
             self.0.push(Piece { address, data, place });
         }
     }
 
-    /// Brings the pieces into address order.
+    /// Sorts the pieces by address.
     pub(crate) fn into_image(self) -> Result<Image, ReadError> {
         let Self(mut pieces) = self;
         if pieces.is_empty() {
             return Err(Place::File.fault(Cause::NoData));
         }
-        // The sort is stable: of two pieces at one address the earlier one in the file stays in
-        // front.
+        // The sort is stable: of two pieces at one address, the one that comes earlier in the file
+        // stays first.
         pieces.sort_by_key(|piece| piece.address);
         for pair in pieces.windows(2) {
             let (low, high) = (&pair[0], &pair[1]);
@@ -52,19 +52,20 @@ impl Pieces {
         Ok(Image { pieces })
     }
 
-    /// Pieces that are in address order and without overlap already.
+    /// An image from pieces that are already in address order and do not overlap.
     pub(crate) fn in_order(self) -> Image {
         Image { pieces: self.0 }
     }
 }
 
-/// What stands in front of the software version in a program (CiA 814-1, section 6.5), its final
-/// zero included.
+/// The text before the software version in a program (CiA 814-1, section 6.5), including its final
+/// zero.
 const VERSION_MARK: &[u8] = b"$CANopenSoftwareVersion\0";
-/// The longest software version that is looked at.
+/// The longest software version that is read.
 const VERSION_MAX: usize = 255;
 
-/// The memory contents of a firmware file: at least one byte, no two of them at one address.
+/// The memory contents in a firmware file: at least one byte, and at most one byte for each
+/// address.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Image {
     /// In address order, without overlap.
@@ -72,22 +73,22 @@ pub struct Image {
 }
 
 impl Image {
-    /// From the first byte to the last, holes included.
+    /// The range from the first byte to the last, including gaps.
     #[must_use]
     pub fn span(&self) -> AddressRange {
-        // An image has at least one piece; the fallback is never taken.
+        // An image has at least one piece, so the fallback is never used.
         let first = self.pieces.first().map_or(0, |piece| piece.address);
         let last = self.pieces.last().map_or(0, |piece| piece.range().last);
         AddressRange { first, last }
     }
 
-    /// How many bytes the file tells, holes not counted.
+    /// The number of bytes without gaps.
     #[must_use]
     pub fn byte_count(&self) -> u64 {
         self.pieces.iter().map(|piece| piece.data.len() as u64).sum()
     }
 
-    /// The runs of bytes without a hole, in address order.
+    /// The contiguous ranges of bytes, in address order.
     pub fn segments(&self) -> impl Iterator<Item = (u32, Vec<u8>)> + '_ {
         let mut pieces = self.pieces.iter().peekable();
         std::iter::from_fn(move || {
@@ -102,8 +103,8 @@ impl Image {
         })
     }
 
-    /// The same, so many bytes further up in memory, or `None` where the address space ends before
-    /// it does. An offset of 2³² − n is one of −n.
+    /// The image moved up by `offset`, or `None` if it would exceed the address space. An offset of
+    /// 2³² − n moves it down by n.
     #[must_use]
     pub fn moved(&self, offset: u32) -> Option<Self> {
         let mut pieces = self.pieces.clone();
@@ -111,14 +112,13 @@ impl Image {
             piece.address = piece.address.wrapping_add(offset);
             piece.address.checked_add((piece.data.len() - 1) as u32)?;
         }
-        // Where some pieces went over the border and some did not, the order is lost.
+        // If some pieces wrapped around and others did not, the order is lost.
         let in_order = pieces.windows(2).all(|pair| pair[0].address < pair[1].address);
         in_order.then_some(Self { pieces })
     }
 
-    /// The software version that the program has behind `$CANopenSoftwareVersion` (CiA 814-1,
-    /// section 6.5): the text of object 100Ah, encoded as ISO 8859-1. What would move a cursor is
-    /// replaced.
+    /// The software version after `$CANopenSoftwareVersion` in the program (CiA 814-1, section
+    /// 6.5): the text of object 100Ah, encoded as ISO 8859-1. Control characters are replaced.
     #[must_use]
     pub fn software_version(&self) -> Option<String> {
         self.segments().find_map(|(_, data)| {
@@ -133,7 +133,7 @@ impl Image {
         })
     }
 
-    /// The bytes from an address on, or `None` where the file does not tell all of them.
+    /// The bytes from an address on, or `None` if the file does not have all of them.
     #[must_use]
     pub fn bytes<const N: usize>(&self, address: u32) -> Option<[u8; N]> {
         let mut bytes = [0; N];
@@ -152,7 +152,7 @@ impl Image {
         (told == N).then_some(bytes)
     }
 
-    /// The byte that all of its bytes are, if they are one.
+    /// The value of all bytes, if they are all equal.
     pub(crate) fn only_byte(&self) -> Option<u8> {
         let first = self.pieces.first()?.data[0];
         let all = self.pieces.iter().flat_map(|piece| &piece.data);
@@ -163,7 +163,7 @@ impl Image {
         &self.pieces
     }
 
-    /// Says where the first data outside `range` is, if there is any.
+    /// Checks that no data lie outside `range`.
     ///
     /// # Errors
     /// [`Cause::Outside`] with the place in the file.
@@ -177,7 +177,7 @@ impl Image {
         }
     }
 
-    /// The part inside `range`, or `None` where nothing is inside.
+    /// The part inside `range`, or `None` if nothing lies inside.
     #[must_use]
     pub fn part(&self, range: AddressRange) -> Option<Self> {
         let pieces: Vec<Piece> = self

@@ -1,4 +1,5 @@
-//! What a firmware file holds, told without a device. Reading it has checked it already.
+//! Describes the contents of a firmware file without a device. The readers have already checked the
+//! file.
 
 use std::fmt;
 
@@ -12,58 +13,58 @@ use super::label::{label_of, Words};
 use super::range::AddressRange;
 use super::read::{Firmware, Format};
 
-/// What a firmware file holds. `Display` has words for people.
+/// The contents of a firmware file. `Display` describes them for people.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Inspection {
     /// The file's format.
     pub format: Format,
-    /// The runs of bytes without a hole, in address order.
+    /// The contiguous ranges of bytes, in address order.
     pub segments: Vec<AddressRange>,
-    /// Bytes that the file has for the flash.
+    /// The number of bytes for the flash.
     pub bytes: u64,
-    /// What the program has behind `$CANopenSoftwareVersion`.
+    /// The text after `$CANopenSoftwareVersion` in the program.
     pub software_version: Option<String>,
-    /// For whom the program is, by its own label.
+    /// The target of the program, from its own label.
     pub label: Option<Label>,
-    /// Whether it can be a program at all.
+    /// Whether the image can be a program.
     pub judgement: Result<(), Fault>,
-    /// What only a block file tells.
+    /// The parts that only a block file has.
     pub blocks: Option<Blocks>,
 }
 
-/// What only a block file tells.
+/// The parts that only a block file has.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Blocks {
     /// All blocks in the file's order.
     pub all: Vec<BlockLine>,
-    /// With what they are checked.
+    /// The CRC of blocks and program.
     pub checksum: Checksum,
-    /// What block 0 says.
+    /// The contents of block 0.
     pub control: Control,
-    /// Where the program's region starts.
+    /// The start of the program's region.
     pub program_start: u32,
-    /// Bytes of the program from there on.
+    /// The size of the program in bytes from there on.
     pub program_size: u32,
-    /// What 1F56h reads when the program is in the device.
+    /// The value of 1F56h after the download.
     pub program_crc: u32,
 }
 
-/// One block in short.
+/// A summary of one block.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BlockLine {
     /// 0, 1…N or FFFFFFFFh.
     pub number: u32,
-    /// Where its data goes.
+    /// The address for its data.
     pub flash_address: u32,
-    /// Data bytes.
+    /// The size of its data in bytes.
     pub size: usize,
     /// Its CRC.
     pub crc: u32,
 }
 
 impl Inspection {
-    /// Looks at what a file of this format has turned out to hold. `start` is where the program
-    /// starts, if that is known otherwise; an image starts with its first byte.
+    /// Describes the contents of a file of this format. `start` is the program's start, if it is
+    /// known from elsewhere; otherwise an image starts with its first byte.
     #[must_use]
     pub fn of(firmware: &Firmware, format: Format, start: Option<u32>) -> Self {
         match firmware {
@@ -78,7 +79,7 @@ impl Inspection {
 
     fn of_image(image: &Image, format: Format, start: u32) -> Self {
         let segments = image.segments().map(|(first, data)| {
-            // A segment is never empty and ends inside the address space.
+            // A segment is not empty and ends inside the address space.
             AddressRange { first, last: first + (data.len() as u32 - 1) }
         });
         Self {
@@ -92,7 +93,7 @@ impl Inspection {
         }
     }
 
-    /// What lies between the segments.
+    /// The gaps between the segments.
     pub fn gaps(&self) -> impl Iterator<Item = AddressRange> + '_ {
         self.segments.windows(2).map(|pair| AddressRange { first: pair[0].last + 1, last: pair[1].first - 1 })
     }
@@ -120,7 +121,7 @@ impl Blocks {
         }
     }
 
-    /// For whom the program is, if block 0 says it.
+    /// The target of the program, if block 0 names it.
     #[must_use]
     pub fn identity(&self) -> Option<&Identity> {
         match &self.control {
@@ -129,7 +130,7 @@ impl Blocks {
         }
     }
 
-    /// Version and date (seconds since 1970 UTC), if block 0 says them.
+    /// Version and date (seconds since 1970 UTC), if block 0 gives them.
     #[must_use]
     pub fn release(&self) -> Option<(ProgramVersion, u64)> {
         match self.control {
@@ -139,7 +140,8 @@ impl Blocks {
     }
 }
 
-/// Seconds since 1970 UTC as `2015-01-01 00:00:00 UTC`. What no calendar needs is shown as seconds.
+/// Seconds since 1970 UTC, shown as `2015-01-01 00:00:00 UTC`. Very large values are shown as
+/// seconds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Date(pub u64);
 
@@ -237,7 +239,7 @@ impl fmt::Display for Inspection {
 mod tests {
     use super::*;
 
-    /// Second column: GNU `date -u -d @…`.
+    /// Second column: the output of GNU `date -u -d @…`.
     #[test]
     fn a_date_is_that_of_the_calendar() {
         for (seconds, words) in [

@@ -1,51 +1,51 @@
-//! Whether an image can be a program of an STM32F4: what can be told without a device and without
-//! its memory map.
+//! Checks whether an image can be a program of an STM32F4, without a device and without its memory
+//! map.
 //!
-//! It is not stricter than the device, with two exceptions: an image at the start of the flash is a
-//! bootloader's and not a program's, and behind the end of an image is nothing that a reset vector
-//! could point to.
+//! The checks are not stricter than the device's, with two exceptions: an image at the start of the
+//! flash is a bootloader and not a program, and a reset vector must point into the image.
 
 use std::fmt;
 
 use super::image::Image;
 use super::range::AddressRange;
 
-/// Main flash of the family: at most 2 MiB.
+/// Main flash of the STM32F4: at most 2 MiB.
 pub(crate) const FLASH: AddressRange = AddressRange { first: 0x0800_0000, last: 0x081F_FFFF };
-/// Its first sector, which has 16 KiB on every chip and which no program can have for itself: a reset
-/// starts what is in it.
+/// Its first sector, which has 16 KiB on every chip. No program can have it, because the CPU starts
+/// there after a reset.
 const FIRST_SECTOR: AddressRange = AddressRange { first: 0x0800_0000, last: 0x0800_3FFF };
-/// Where a stack may end: right behind the last byte of the RAM, or inside. At most 320 KiB (STM32F413,
-/// STM32F469) and 64 KiB of core-coupled RAM.
+/// The possible ends of a stack: inside the RAM, or directly after its last byte. The RAM has at
+/// most 320 KiB (STM32F413, STM32F469), the core-coupled RAM 64 KiB.
 const STACKS: [AddressRange; 2] = [
     AddressRange { first: 0x2000_0008, last: 0x2005_0000 },
     AddressRange { first: 0x1000_0008, last: 0x1001_0000 },
 ];
 
-/// Why an image can be no program.
+/// Why an image cannot be a program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
-    /// It begins where the bootloader is.
+    /// It begins at the address of the bootloader.
     Bootloader,
-    /// All of its bytes are this one, 00h or FFh.
+    /// All its bytes have this value, 00h or FFh.
     Blank(u8),
-    /// It does not hold the first two vectors.
+    /// It does not contain the first two vectors.
     NoVectors,
-    /// The first word is no pointer to the end of a stack.
+    /// The first word cannot be an initial stack pointer.
     StackPointer(u32),
     /// The second word does not point into the program.
     ResetVector {
-        /// The word.
+        /// The reset vector.
         vector: u32,
-        /// Where it must point.
+        /// The range for a valid vector.
         range: AddressRange,
     },
-    /// It does, but its bit 0 is clear, as that of no code for this CPU is.
+    /// The reset vector points into the program, but its bit 0 is clear: this CPU only executes
+    /// Thumb code.
     NotThumb(u32),
 }
 
 impl Fault {
-    /// The stable number: that of a file that is no firmware.
+    /// The stable error number: that of a file that is not firmware.
     pub const NUMBER: u32 = 0x6000_0021;
 
     /// What to do next.
@@ -53,10 +53,10 @@ impl Fault {
     pub fn advice(&self) -> &'static str {
         match self {
             Self::Bootloader => {
-                "give the program, linked behind the bootloader; a bootloader is written by a debug probe"
+                "give the program, linked for an address after the bootloader; use a debug probe to write a bootloader"
             }
             _ => {
-                "check that it is the right file, and that its first word is the vector table's; \
+                "check that it is the right file, and that it begins with the vector table; \
                  --force leaves that to the device"
             }
         }
@@ -69,19 +69,19 @@ impl fmt::Display for Fault {
             Self::Bootloader => {
                 f.write_str("begins at the start of the flash, as a bootloader does and a program does not")
             }
-            Self::Blank(byte) => write!(f, "is no program: all of its bytes are {byte:02X}h"),
+            Self::Blank(byte) => write!(f, "is not a program: all its bytes are {byte:02X}h"),
             Self::NoVectors => {
-                f.write_str("is no program: it does not begin with an initial stack pointer and a reset vector")
+                f.write_str("is not a program: it does not begin with an initial stack pointer and a reset vector")
             }
             Self::StackPointer(word) => write!(
                 f,
-                "is no program: its first word is {word:08X}h, and no initial stack pointer (a multiple of 8 in the RAM)"
+                "is not a program: its first word, {word:08X}h, is not an initial stack pointer (a multiple of 8 in the RAM)"
             ),
             Self::ResetVector { vector, range } => {
-                write!(f, "is no program: its reset vector is {vector:08X}h, outside {range}")
+                write!(f, "is not a program: its reset vector is {vector:08X}h, outside {range}")
             }
             Self::NotThumb(vector) => {
-                write!(f, "is no program: its reset vector is {vector:08X}h, without the Thumb bit")
+                write!(f, "is not a program: its reset vector is {vector:08X}h, without the Thumb bit")
             }
         }
     }
@@ -89,10 +89,10 @@ impl fmt::Display for Fault {
 
 impl std::error::Error for Fault {}
 
-/// Judges an image whose program starts at `start`; 0 for one that came without addresses.
+/// Checks an image with a program that starts at `start`; 0 for an image without addresses.
 ///
 /// # Errors
-/// The first thing that is wrong with it.
+/// The first fault.
 pub fn judge(image: &Image, start: u32) -> Result<(), Fault> {
     let end = image.span().last;
     if start == FLASH.first
@@ -115,7 +115,7 @@ pub fn judge(image: &Image, start: u32) -> Result<(), Fault> {
     judge_reset_vector(vector, range)
 }
 
-/// Judges the reset vector of an image that came without addresses, when it is known where it goes.
+/// Checks the reset vector of an image without addresses, when its place is known.
 ///
 /// # Errors
 /// [`Fault::ResetVector`], [`Fault::NotThumb`] or [`Fault::NoVectors`].
@@ -163,7 +163,8 @@ mod tests {
         for vector in [START + 9, START + 0x3FF] {
             assert_eq!(with(0x2001_FFC0, vector, START), Ok(()), "{vector:08X}h");
         }
-        // Without addresses it may be linked for any place of the flash that a program may have.
+        // Without addresses, the image may be linked for any place of the flash that a program may
+        // have.
         for vector in [0x0800_4189, 0x0801_0189, 0x081F_FFFF] {
             assert_eq!(with(0x2001_FFC0, vector, 0), Ok(()), "{vector:08X}h");
         }
@@ -191,7 +192,7 @@ mod tests {
     fn a_bootloader_is_no_program_with_addresses_and_without() {
         assert_eq!(with(0x2001_FFC0, 0x0800_0189, 0x0800_0000), Err(Fault::Bootloader));
         assert_eq!(with(0x2001_FFC0, 0x0800_0189, 0), Err(Fault::Bootloader));
-        // It is said before the rest, whatever that is.
+        // This fault is reported before all others.
         assert_eq!(with(0, 0, 0x0800_0000), Err(Fault::Bootloader));
     }
 
@@ -203,7 +204,7 @@ mod tests {
         }
         let image = raw::read(&[0, 0, 1, 0x20, 0x89, 1, 1], Some(START)).unwrap();
         assert_eq!(judge(&image, START), Err(Fault::NoVectors));
-        // Vectors that are not at the start are none.
+        // Vectors after the start do not count.
         let image = raw::read(&[0x5A; 64], Some(START + 4)).unwrap();
         assert_eq!(judge(&image, START), Err(Fault::NoVectors));
     }

@@ -1,4 +1,5 @@
-//! The label in an image: for whom it is, and which version. Its form is in [`shared_abi::label`].
+//! The label in an image, which names its target device and version. [`shared_abi::label`] defines
+//! the format.
 
 use std::fmt;
 
@@ -7,13 +8,13 @@ use shared_abi::label::{Label, OFFSET, SIZE};
 
 use super::image::Image;
 
-/// The label of a program that starts at `start`; `None` where there is none, or a damaged one.
+/// The label of a program that starts at `start`; `None` if it is missing or damaged.
 #[must_use]
 pub fn label_of(image: &Image, start: u32) -> Option<Label> {
     image.bytes::<SIZE>(start.checked_add(OFFSET)?).as_ref().and_then(Label::parse)
 }
 
-/// A label in words.
+/// A label as text.
 #[derive(Clone, Copy, Debug)]
 pub struct Words<'l>(pub &'l Label);
 

@@ -1,4 +1,4 @@
-//! Files have a limit: what is no regular file, or is larger than any firmware, is not read.
+//! The size limit of files: only regular files of a plausible size are read.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -6,8 +6,8 @@ use std::path::Path;
 
 use super::fault::Cause;
 
-/// The most bytes that a firmware file may have: 64 MiB. The largest flash of the family has 2 MiB,
-/// which is some 6 MiB of text; the rest is room for the symbols of an ELF file.
+/// The most bytes of a firmware file: 64 MiB. The largest flash of the family has 2 MiB, which
+/// takes about 6 MiB as text; the rest is for the symbols of an ELF file.
 pub const MAX_FILE_SIZE: u64 = 64 * 1024 * 1024;
 
 /// Reads a whole regular file of at most [`MAX_FILE_SIZE`] bytes.
@@ -19,7 +19,7 @@ pub fn read(path: &Path) -> Result<Vec<u8>, Cause> {
 }
 
 fn read_at_most(path: &Path, most: u64) -> Result<Vec<u8>, Cause> {
-    // Before it is opened: to open a FIFO waits for its writer.
+    // Checked before opening: to open a FIFO waits for its writer.
     let told = std::fs::metadata(path).map_err(Cause::Io)?;
     if !told.is_file() {
         return Err(Cause::NoRegularFile(if told.is_dir() {
@@ -32,7 +32,7 @@ fn read_at_most(path: &Path, most: u64) -> Result<Vec<u8>, Cause> {
         return Err(Cause::TooLarge { size: told.len(), most });
     }
     let mut bytes = Vec::new();
-    // The file may be another one by now, or grow while it is read.
+    // The file may be another one by now, or it may grow during the read.
     File::open(path).and_then(|file| file.take(most + 1).read_to_end(&mut bytes)).map_err(Cause::Io)?;
     match bytes.len() as u64 {
         size if size > most => Err(Cause::TooLarge { size, most }),
@@ -40,13 +40,13 @@ fn read_at_most(path: &Path, most: u64) -> Result<Vec<u8>, Cause> {
     }
 }
 
-/// The most bytes that a file of settings may have.
+/// The most bytes of a settings file.
 const MAX_TEXT_SIZE: u64 = 1024 * 1024;
 
-/// Reads a file of settings, of at most 1 MiB. It may come out of a pipe.
+/// Reads a settings file of at most 1 MiB. It may be a pipe.
 ///
 /// # Errors
-/// Those of [`std::fs::read_to_string`], and [`io::ErrorKind::InvalidData`] for a longer one.
+/// The errors of [`std::fs::read_to_string`], and [`io::ErrorKind::InvalidData`] for a longer file.
 pub fn read_text(path: &Path) -> io::Result<String> {
     let mut text = String::new();
     File::open(path)?.take(MAX_TEXT_SIZE + 1).read_to_string(&mut text)?;

@@ -1,4 +1,4 @@
-//! Firmware files: read, checked, converted and written. No device, and no bus.
+//! Reads, checks, converts and writes firmware files, without a device or a bus.
 
 pub mod block_file;
 pub use coboot_linker::board;

@@ -4,7 +4,7 @@ use std::fmt;
 
 use shared_abi::geometry::Region;
 
-/// A range of addresses with both ends in it, so that it can reach the end of the address space.
+/// A range of addresses that includes both ends, so that it can reach the end of the address space.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct AddressRange {
     /// First address.
@@ -17,7 +17,7 @@ impl AddressRange {
     /// Every address.
     pub const ALL: Self = Self { first: 0, last: u32::MAX };
 
-    /// How many addresses.
+    /// The number of addresses.
     #[must_use]
     pub const fn len(&self) -> u64 {
         (self.last as u64 + 1).saturating_sub(self.first as u64)

@@ -1,13 +1,13 @@
-//! Raw binary: the bytes of the flash and nothing else.
+//! Raw binary: the bytes of the flash alone.
 
 use super::fault::{Cause, Place, ReadError};
 use super::image::{Image, Pieces};
 
-/// Takes the bytes as they are.
+/// Reads the bytes unchanged.
 ///
 /// # Errors
-/// [`Cause::NoAddress`] without an address, [`Cause::AddressOverflow`] where the bytes do not fit
-/// behind it.
+/// [`Cause::NoAddress`] without an address, [`Cause::AddressOverflow`] if the bytes exceed the
+/// address space.
 pub fn read(bytes: &[u8], address: Option<u32>) -> Result<Image, ReadError> {
     let address = address.ok_or(Place::File.fault(Cause::NoAddress))?;
     if u64::from(address) + bytes.len() as u64 > 1 << 32 {

@@ -1,5 +1,5 @@
-//! Readers of firmware files: bytes in, [`Image`] or [`BlockFile`] out. No reader touches a device
-//! or the file system except [`load`].
+//! Readers of firmware files: from bytes to [`Image`] or [`BlockFile`]. Only [`load`] uses the file
+//! system, and no reader needs a device.
 
 use std::fmt;
 use std::path::Path;
@@ -10,7 +10,7 @@ use super::image::Image;
 use super::sealed::{blocks, Sealed};
 use super::{elf, ihex, limit, raw, srec};
 
-/// What a firmware file can be.
+/// The formats of a firmware file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
     /// Intel HEX.
@@ -21,15 +21,15 @@ pub enum Format {
     Elf,
     /// Block file, ready for 1F50h.
     BlockFile,
-    /// Sealed image: goes to the device as it is, and only the device's keys open it.
+    /// Sealed image: sent to the device unchanged; only the device's keys decrypt it.
     Sealed,
-    /// The bytes of the flash and nothing else; where they go must be told.
+    /// The bytes of the flash alone; the address must be given.
     Raw,
 }
 
 impl Format {
-    /// Finds out by the first bytes. A raw file looks like nothing in particular and is never
-    /// found.
+    /// Detects the format from the first bytes. A raw file has no distinctive bytes and is never
+    /// detected.
     #[must_use]
     pub fn detect(bytes: &[u8]) -> Option<Self> {
         let text = bytes.trim_ascii_start();
@@ -59,18 +59,19 @@ impl fmt::Display for Format {
     }
 }
 
-/// What a firmware file turned out to hold.
+/// The contents of a firmware file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Firmware {
-    /// Memory contents that have yet to be [converted](super::convert::convert).
+    /// Memory contents that must still be [converted](super::convert::convert).
     Image(Image),
-    /// Blocks ready for the device; every CRC was checked.
+    /// Blocks for the device; every CRC was checked.
     Blocks(BlockFile),
 }
 
 /// Reads a firmware file that is already in memory.
 ///
-/// `format` overrides what the first bytes say. `raw_address` is where a [`Format::Raw`] file goes.
+/// `format` replaces the detection by the first bytes. `raw_address` is the address of a
+/// [`Format::Raw`] file.
 ///
 /// # Errors
 /// The first fault, with its place.
@@ -78,7 +79,7 @@ pub fn read(bytes: &[u8], format: Option<Format>, raw_address: Option<u32>) -> R
     read_telling(bytes, format, raw_address).map(|(firmware, _)| firmware)
 }
 
-/// Reads a firmware file from disk; otherwise as [`read`].
+/// Reads a firmware file from disk, like [`read`].
 ///
 /// # Errors
 /// The first fault, with file and place.
@@ -86,7 +87,7 @@ pub fn load(path: &Path, format: Option<Format>, raw_address: Option<u32>) -> Re
     load_telling(path, format, raw_address).map(|(firmware, _)| firmware)
 }
 
-/// The same, and which format it turned out to be.
+/// Reads a firmware file from disk; also returns its format.
 ///
 /// # Errors
 /// The first fault, with file and place.
@@ -116,7 +117,7 @@ fn read_telling(
         Format::Elf => elf::read(bytes).map(Firmware::Image),
         Format::Raw => raw::read(bytes, raw_address).map(Firmware::Image),
         Format::BlockFile if !blocks::looks_like(bytes) => BlockFile::parse(bytes).map(Firmware::Blocks),
-        // What its blocks carry is no program for the flash.
+        // The contents of the blocks are not a program for the flash.
         Format::BlockFile | Format::Sealed => Err(Place::File.fault(Cause::Sealed)),
     };
     Ok((firmware?, format))

@@ -4,7 +4,7 @@ use super::fault::{Cause, Place, ReadError};
 use super::image::{Image, Pieces};
 use super::text::{bytes_of, check_length, lines};
 
-/// Reads a whole file.
+/// Parses a whole file.
 ///
 /// # Errors
 /// The first fault, with its line.
@@ -18,11 +18,11 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
         }
         let Record { kind, address, data } = record(place, line)?;
         match kind {
-            // The header is a text for people. No checksum covers the type: a damaged one would
-            // drop a record.
+            // The header is a text for people. The checksum does not cover the record type, so a
+            // damaged data record could look like a header and be lost.
             b'0' if counted > 0 => {
                 return Err(
-                    place.fault(Cause::Malformed("a header (S0) behind data records; the line is damaged"))
+                    place.fault(Cause::Malformed("a header (S0) after data records; the line is damaged"))
                 )
             }
             b'0' => {}
@@ -61,7 +61,7 @@ fn record(place: Place, line: &[u8]) -> Result<Record, ReadError> {
     let (kind, digits) = match line {
         [b'S', kind, digits @ ..] => (*kind, digits),
         [b'S'] => return Err(place.fault(Cause::CutOff { what: "the record", needed: 2, found: 0 })),
-        _ => return Err(place.fault(Cause::Malformed("the line has no 'S' in front"))),
+        _ => return Err(place.fault(Cause::Malformed("the line does not begin with 'S'"))),
     };
     let address_size = match kind {
         b'0' | b'1' | b'5' | b'9' => 2,
@@ -73,7 +73,7 @@ fn record(place: Place, line: &[u8]) -> Result<Record, ReadError> {
         }
     };
     let bytes = bytes_of(digits, 2, place)?;
-    // The count covers address, data and checksum, not itself.
+    // The count includes address, data and checksum, but not itself.
     let count = bytes.first().copied().map_or(0, usize::from);
     check_length(bytes.len(), 1 + count, place)?;
     if count < address_size + 1 {
@@ -144,8 +144,8 @@ mod tests {
             (format!("{good}S\n"), "line 2: the record is cut off"),
             (format!("{good}S1040001AA5000\n"), "line 2: the record has 6 bytes but announces 5"),
             (format!("{good}S1040001AA5\n"), "line 2: the last byte has only one digit"),
-            (format!("{good}S104000xAA50\n"), "line 2: character 8 is no hexadecimal digit"),
-            (format!("{good}X104\n"), "line 2: the line has no 'S' in front"),
+            (format!("{good}S104000xAA50\n"), "line 2: character 8 is not a hexadecimal digit"),
+            (format!("{good}X104\n"), "line 2: the line does not begin with 'S'"),
             (format!("{good}S4040001AA50\n"), "line 2: unknown record type S4"),
             (format!("{good}S\u{e9}04\n"), "line 2: unknown record type S\\u{c3}"),
             (format!("{good}S10200FD\n"), "line 2: the record is too short"),
@@ -154,14 +154,14 @@ mod tests {
                 format!("{good}S5030002FA\n"),
                 "line 2: the file has 1 data records and its count record says 2",
             ),
-            (format!("{good}{end}{good}"), "line 3: there is more text behind the end record"),
-            (format!("{good}S00600004844521B\n"), "line 2: a header (S0) behind data records"),
+            (format!("{good}{end}{good}"), "line 3: there is more text after the end record"),
+            (format!("{good}S00600004844521B\n"), "line 2: a header (S0) after data records"),
             (good.to_string(), "the file: the file ends without its end record"),
             (end.to_string(), "the file: holds no data"),
             (format!("{good}{good}{end}"), "line 2: the data at 0x00000000 overlaps that of line 1"),
             (
                 format!("S307FFFFFFFF0102F9\n{end}"),
-                "line 1: the data from 0xffffffff on runs over the end of the address space",
+                "line 1: the data from 0xffffffff on exceeds the end of the address space",
             ),
         ] {
             assert!(fault(&text).starts_with(words), "{text:?}\n gave {}\n not  {words}", fault(&text));

@@ -1,4 +1,4 @@
-//! What the two text formats share: lines and hexadecimal digits.
+//! Common code of the two text formats: lines and hexadecimal digits.
 
 use super::fault::{Cause, Place, ReadError};
 
@@ -23,7 +23,8 @@ pub(super) fn lines(bytes: &[u8]) -> impl Iterator<Item = (Place, &[u8])> {
     .filter(|(_, line)| !line.is_empty())
 }
 
-/// The bytes of pairs of hexadecimal digits. `skipped` characters of the line stand before them.
+/// The bytes of pairs of hexadecimal digits. `skipped` is the number of characters before them in
+/// the line.
 pub(super) fn bytes_of(digits: &[u8], skipped: usize, place: Place) -> Result<Vec<u8>, ReadError> {
     let nibble = |(index, digit): (usize, &u8)| {
         char::from(*digit)
@@ -39,7 +40,7 @@ pub(super) fn bytes_of(digits: &[u8], skipped: usize, place: Place) -> Result<Ve
     Ok(nibbles.chunks_exact(2).map(|pair| pair[0] << 4 | pair[1]).collect())
 }
 
-/// Checks that a record of `found` bytes is as long as it announces.
+/// Checks that a record of `found` bytes has the announced length.
 pub(super) fn check_length(found: usize, needed: usize, place: Place) -> Result<(), ReadError> {
     match found {
         _ if found < needed => Err(place.fault(Cause::CutOff { what: "the record", needed, found })),

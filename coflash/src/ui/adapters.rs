@@ -1,4 +1,4 @@
-//! The adapters that a page can offer: what this machine has.
+//! The adapters that the page offers.
 
 use std::time::Duration;
 
@@ -6,16 +6,16 @@ use serde::Serialize;
 
 use crate::bus::{self, Found, Kind};
 
-/// One of them.
+/// An adapter.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(super) struct Listed {
-    /// What goes into the field; where the adapter sets the bit rate, the user corrects it.
+    /// The URL for the field of the page; if the adapter sets the bit rate, the user adjusts it.
     url: String,
     words: String,
 }
 
-/// Those of these kinds, but for servers on the network: they are heard after 3 s only, and the page
-/// does not wait for them.
+/// The adapters of these kinds, except servers on the network: their beacons take up to 3 s, and
+/// the page does not wait for them.
 pub(super) fn list(kinds: &[Kind]) -> Vec<Listed> {
     let kinds: Vec<Kind> = kinds.iter().copied().filter(|kind| *kind != Kind::Socketcand).collect();
     bus::list(&kinds, Duration::ZERO).found.into_iter().map(listed).collect()

@@ -1,9 +1,9 @@
-//! The stream of events to a page: the whole state whenever it has changed, seconds for the plot, and
-//! frames in words for who wants them.
+//! The stream of events to a page: the whole state after each change, the seconds of the plot, and
+//! frames in words for pages that show them.
 //!
-//! Nothing is queued for a reader: each pass takes what is there by then. One that reads slowly
-//! misses states that others have replaced, and frames that are too old; one that stops reading is
-//! dropped by its connection's time-out.
+//! There is no queue for a reader: each pass sends the current data. A slow reader misses states
+//! that were replaced meanwhile and frames that are too old; a reader that stops reading is dropped
+//! by the time-out of its connection.
 
 use std::convert::Infallible;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -21,12 +21,12 @@ use super::shared::{lock, Shared};
 
 /// The shortest time between two events.
 const PACE: Duration = Duration::from_millis(150);
-/// The longest: from silence a page concludes that the connection is lost.
+/// The longest time between two events: without events the page reports a lost connection.
 const BEAT: Duration = Duration::from_secs(1);
-/// Readers at a time.
+/// The most readers at the same time.
 const READERS: usize = 32;
 
-/// How many read.
+/// The number of readers.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Readers(Arc<AtomicUsize>);
 
@@ -36,7 +36,7 @@ impl Readers {
     }
 }
 
-/// One of them, as long as it lives.
+/// The place of one reader; dropping it frees the place.
 struct Place(Readers);
 
 impl Drop for Place {
@@ -49,16 +49,16 @@ struct Reader {
     shared: Arc<Shared>,
     changed: watch::Receiver<u64>,
     arrived: watch::Receiver<u64>,
-    /// The number of the last frame that it has, if it wants frames.
+    /// The number of the last frame that was sent to this reader, if it wants frames.
     frames: Option<u64>,
-    /// The last second of the plot that it has.
+    /// The last second of the plot that was sent to this reader.
     second: u64,
-    /// The version of the state that it has; 0 for none.
+    /// The version of the state that was sent to this reader; 0 for none.
     version: u64,
     _place: Place,
 }
 
-/// A stream for one more reader; `None` where there are too many.
+/// A stream for one more reader; `None` if there are too many.
 pub(super) fn stream(
     shared: Arc<Shared>,
     readers: &Readers,
@@ -85,12 +85,12 @@ pub(super) fn stream(
 }
 
 impl Reader {
-    /// Waits until there is something to tell, or it is time to say that there is not.
+    /// Waits for new data, or until the next empty event is due.
     async fn next(&mut self) -> Value {
         if self.version != 0 {
             sleep(PACE).await;
             let wants_frames = self.frames.is_some();
-            // Should the other side of a watch go, the beat goes on.
+            // If the other side of a watch ends, the empty events continue.
             tokio::select! {
                 Ok(()) = self.changed.changed() => {}
                 Ok(()) = self.arrived.changed(), if wants_frames => {}

@@ -1,4 +1,4 @@
-//! The firmware file that was dropped on the page.
+//! The firmware file that the user dropped on the page.
 
 use std::sync::Arc;
 
@@ -13,21 +13,21 @@ use crate::file::sealed::SealedFile;
 use crate::file::{self, label, AddressRange, BlockFile, Format};
 use crate::update::{Program, Target};
 
-/// The most bytes of a file: an ELF of the largest program with all that a debugger wants to know.
+/// The most bytes of a file: an ELF file of the largest program with all debug information.
 pub(super) const FILE_MAX: usize = 32 * 1024 * 1024;
 /// The longest name that is shown.
 const NAME_MAX: usize = 120;
 
-/// A file that was read, checked and, unless it is sealed, cut into blocks.
+/// A file that was read, checked and, unless it is sealed, converted into blocks.
 #[derive(Debug)]
 pub(super) struct Loaded {
-    /// The file itself: other settings make other blocks of it.
+    /// The file itself: after a change of the settings it is converted again.
     pub(super) bytes: Arc<Vec<u8>>,
     pub(super) program: Program,
     pub(super) shown: Firmware,
 }
 
-/// Reads a file and makes its blocks; a sealed image stays as it is.
+/// Reads a file and converts it into blocks; a sealed image stays unchanged.
 pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Result<Loaded, Notice> {
     let name = printable(name);
     let bad = |error: &dyn std::fmt::Display| {
@@ -44,13 +44,14 @@ pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Resu
     if Format::detect(&bytes) == Some(Format::Sealed) {
         return sealed(bytes, name, settings);
     }
-    // A raw file looks like nothing in particular: its name tells it, and the board its place.
+    // A raw file has no distinctive bytes: its name shows the format, and the board gives its
+    // address.
     let raw = name.to_lowercase().ends_with(".bin");
     let (format, place) = match (Format::detect(&bytes), region) {
         (Some(format), _) => (Some(format), None),
         (None, Some(region)) if raw => (Some(Format::Raw), Some(region.first)),
         (None, _) if raw && !bytes.is_empty() => {
-            let words = format!("{name}: a raw binary does not say where it belongs");
+            let words = format!("{name}: a raw binary does not contain its address");
             return Err(Notice::failed(words, "choose the board"));
         }
         (None, _) => (None, None),
@@ -82,7 +83,7 @@ pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Resu
     Ok(Loaded { bytes, program: Arc::new(blocks).into(), shown })
 }
 
-/// Takes a sealed image, which only the device's keys open.
+/// Reads a sealed image. Only the device's keys decrypt it.
 fn sealed(bytes: Arc<Vec<u8>>, name: String, settings: &Settings) -> Result<Loaded, Notice> {
     let file = SealedFile::for_program(bytes.to_vec(), settings.program);
     let file = file.map_err(|refusal| Notice::failed(format!("{name}: {refusal}"), refusal.advice()))?;
@@ -108,8 +109,8 @@ fn sealed(bytes: Arc<Vec<u8>>, name: String, settings: &Settings) -> Result<Load
     Ok(Loaded { bytes, program: Arc::new(file).into(), shown })
 }
 
-/// For whom the program is: vendor-ID, product code and version, out of block 0 or behind the
-/// vectors.
+/// The target of the program: vendor-ID, product code and version, from block 0 or from the label
+/// after the vectors.
 fn label_of(file: &BlockFile) -> Option<(u32, u32, Option<String>)> {
     use shared_abi::block_file::Control;
     match *file.control() {
@@ -124,7 +125,7 @@ fn label_of(file: &BlockFile) -> Option<(u32, u32, Option<String>)> {
     }
 }
 
-/// Where the board has the program, if a board is named.
+/// The region of the program on the selected board, if there is one.
 fn region(settings: &Settings) -> Result<Option<AddressRange>, Notice> {
     let Some(layout) = settings.board.and_then(layout::by_name) else { return Ok(None) };
     match layout.program(settings.program) {
@@ -136,7 +137,8 @@ fn region(settings: &Settings) -> Result<Option<AddressRange>, Notice> {
     }
 }
 
-/// A name from outside: one line, not too long, nothing that moves a cursor or turns text around.
+/// A name from outside as safe text: one line of limited length, without control or direction
+/// characters.
 fn printable(name: &str) -> String {
     let base = name.rsplit(['/', '\\']).next().unwrap_or(name);
     let visible = |c: char| if c.is_alphanumeric() || c.is_ascii_graphic() || c == ' ' { c } else { '_' };
@@ -167,7 +169,8 @@ mod tests {
         assert!(words(b":020000040801F1\n", "app.hex").starts_with("app.hex: "));
     }
 
-    /// Four bytes of Intel HEX at 0801_0000h; the CRC is what GNU `gzip` says of EFh BEh ADh DEh.
+    /// Four bytes of Intel HEX at 0801_0000h; the CRC is the output of GNU `gzip` for EFh BEh ADh
+    /// DEh.
     #[test]
     fn a_program_is_read_and_a_board_judges_its_place() {
         let hex = b":020000040801F1\n:04000000EFBEADDEC4\n:00000001FF\n".to_vec();

@@ -1,4 +1,4 @@
-//! What goes over the bus: kept for the page, counted for the plot, and saved as a log.
+//! The frames of the bus: stored for the page, counted for the plot, and saved as a log.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -13,42 +13,42 @@ use crate::bus::candump::Line;
 use crate::bus::decode::Decoder;
 use crate::bus::{Adapter, AdapterError};
 
-/// Frames in words that a page can still get.
+/// The most frames in words that the page can request.
 const ROWS: usize = 2000;
-/// Frames that the log can hold: the transfer of a megabyte in segments, twice. They take 16 MB.
+/// The most frames in the log: twice the segmented transfer of a megabyte. They take 16 MB.
 pub(super) const TRACE: usize = 400_000;
-/// Seconds of the plot.
+/// The seconds of the plot.
 const SECONDS: usize = 600;
 
-/// A frame as the page shows it.
+/// A frame in the form for the page.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Row {
-    /// Counts all frames since the start.
+    /// The frame's number since the start.
     pub(super) number: u64,
     /// Seconds since 1970, UTC.
     time: f64,
-    /// Whether it was sent from here.
+    /// Whether this tool sent the frame.
     own: bool,
     frame: String,
     words: String,
 }
 
-/// What went over the bus within one second.
+/// The traffic of the bus within one second.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub(super) struct Second {
-    /// Which, since 1970.
+    /// The second, counted from 1970.
     pub(super) second: u64,
     frames: u32,
     /// Bits on the wire.
     bits: u32,
 }
 
-/// All of it. Its size is limited: the oldest goes first.
+/// All recorded frames. The size is limited: the oldest are dropped first.
 #[derive(Debug, Default)]
 pub(super) struct Frames {
     rows: VecDeque<Row>,
     trace: VecDeque<(Duration, Frame)>,
-    /// Frames that the log had no more room for.
+    /// The number of frames that were dropped from the log.
     forgotten: u64,
     seconds: VecDeque<Second>,
     decoder: Decoder,
@@ -72,33 +72,33 @@ impl Frames {
         }
     }
 
-    /// The frames behind this one, oldest first.
+    /// The frames after this one, oldest first.
     pub(super) fn rows_after(&self, number: u64) -> Vec<Row> {
         let fresh = self.rows.iter().rev().take_while(|row| row.number > number).count();
         self.rows.iter().skip(self.rows.len() - fresh).cloned().collect()
     }
 
-    /// How many frames there were.
+    /// The number of frames so far.
     pub(super) fn count(&self) -> u64 {
         self.count
     }
 
-    /// The seconds behind this one that are over.
+    /// The complete seconds after this one.
     pub(super) fn seconds_after(&self, second: u64, now: u64) -> Vec<Second> {
         self.seconds.iter().filter(|past| past.second > second && past.second < now).copied().collect()
     }
 
-    /// The log, and how many frames at its beginning are missing.
+    /// The log, and the number of frames that are missing at its beginning.
     pub(super) fn log(&self) -> (VecDeque<(Duration, Frame)>, u64) {
         (self.trace.clone(), self.forgotten)
     }
 }
 
-/// The text of a log, as `candump -L` writes it.
+/// The log as text in the format of `candump -L`.
 pub(super) fn candump(log: &VecDeque<(Duration, Frame)>, forgotten: u64) -> String {
     let mut text = String::with_capacity(log.len() * 56);
     if forgotten > 0 {
-        text += &format!("# {forgotten} frames before these were more than the log holds\n");
+        text += &format!("# {forgotten} earlier frames were dropped: the log is full\n");
     }
     for (time, frame) in log {
         let line = Line { time: *time, interface: "can0".to_string(), frame: *frame };
@@ -107,7 +107,7 @@ pub(super) fn candump(log: &VecDeque<(Duration, Frame)>, forgotten: u64) -> Stri
     text
 }
 
-/// Appends, and tells whether the oldest had to go for it.
+/// Appends an item; returns whether the oldest one was dropped.
 fn push<T>(queue: &mut VecDeque<T>, room: usize, item: T) -> bool {
     let full = queue.len() >= room;
     if full {
@@ -122,7 +122,7 @@ pub(super) fn wall() -> Duration {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default()
 }
 
-/// An adapter whose frames, sent and received, are noted.
+/// An adapter that records its frames, sent and received.
 pub(super) struct Tap {
     adapter: Box<dyn Adapter + Send>,
     frames: Arc<Mutex<Frames>>,

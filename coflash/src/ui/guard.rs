@@ -1,7 +1,8 @@
-//! Who may ask: a page of this server, opened by the one who started it.
+//! Checks who sends a request: only a page of this server, opened by the user who started it, is
+//! accepted.
 //!
-//! The token stands in the path of the URL and not in a cookie: cookies do not tell ports apart, so
-//! that another server on this machine would be sent it.
+//! The token is a part of the URL's path and not a cookie: browsers send a cookie to all ports of a
+//! host, so another server on this computer would get it.
 
 use std::time::Duration;
 
@@ -12,10 +13,10 @@ use axum::response::{IntoResponse, Response};
 
 use super::firmware::FILE_MAX;
 
-/// How long a request with a body may take to arrive and to be answered.
+/// How long a request with a body may take until it is answered.
 const WITHIN: Duration = Duration::from_secs(60);
 
-/// What a request has to show.
+/// The data that a request must contain.
 #[derive(Clone, Debug)]
 pub(super) struct Guard {
     pub(super) token: String,
@@ -23,14 +24,14 @@ pub(super) struct Guard {
 }
 
 impl Guard {
-    /// A token that nobody guesses: 128 bits of the system's randomness.
+    /// A token that cannot be guessed: 128 bits of the system's random numbers.
     pub(super) fn token() -> Result<String, getrandom::Error> {
         let mut bytes = [0; 16];
         getrandom::fill(&mut bytes)?;
         Ok(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
     }
 
-    /// Why a request is turned away, if it is.
+    /// Why a request is refused, if it is.
     fn objection(
         &self,
         method: &Method,
@@ -39,21 +40,21 @@ impl Guard {
     ) -> Option<(StatusCode, &'static str)> {
         let hosts = [format!("127.0.0.1:{}", self.port), format!("localhost:{}", self.port)];
         let text = |name| headers.get(name).map(|value: &HeaderValue| value.to_str().unwrap_or_default());
-        // A name that somebody has pointed at 127.0.0.1 is not ours.
+        // A foreign name that resolves to 127.0.0.1 is refused.
         let host = text(header::HOST).or(uri.authority().map(|authority| authority.as_str()));
         if !host.is_some_and(|host| hosts.iter().any(|own| own == host)) {
-            return Some((StatusCode::FORBIDDEN, "this server is 127.0.0.1 alone"));
+            return Some((StatusCode::FORBIDDEN, "this server is only available as 127.0.0.1"));
         }
         let own_origin = |origin: &str| {
             origin.strip_prefix("http://").is_some_and(|origin| hosts.iter().any(|own| own == origin))
         };
         if text(header::ORIGIN).is_some_and(|origin| !own_origin(origin)) {
-            return Some((StatusCode::FORBIDDEN, "a page of another origin may not ask"));
+            return Some((StatusCode::FORBIDDEN, "requests from pages of another origin are refused"));
         }
-        // Browsers say who asks: this page, or (none) the person.
+        // Browsers name the origin of a request: this page, or (none) the user.
         let site = headers.get("sec-fetch-site").map(|value| value.as_bytes());
         if site.is_some_and(|site| !matches!(site, b"same-origin" | b"none")) {
-            return Some((StatusCode::FORBIDDEN, "a page of another origin may not ask"));
+            return Some((StatusCode::FORBIDDEN, "requests from pages of another origin are refused"));
         }
         let shown = uri.path().strip_prefix('/').and_then(|path| path.split('/').next()).unwrap_or_default();
         if !same(shown.as_bytes(), self.token.as_bytes()) {
@@ -62,25 +63,25 @@ impl Guard {
                 "the token is missing or wrong: open the URL that coflash ui printed",
             ));
         }
-        // A body that says how long it is need not be heard first.
+        // A body with an announced length that is too large is refused before it is read.
         let long = text(header::CONTENT_LENGTH).and_then(|len| len.parse::<u64>().ok());
         if long.is_some_and(|len| len > FILE_MAX as u64) {
-            return Some((StatusCode::PAYLOAD_TOO_LARGE, "this is more than any program has"));
+            return Some((StatusCode::PAYLOAD_TOO_LARGE, "the file is larger than any program"));
         }
         if !matches!(*method, Method::GET | Method::POST) {
-            return Some((StatusCode::METHOD_NOT_ALLOWED, "GET and POST alone are answered"));
+            return Some((StatusCode::METHOD_NOT_ALLOWED, "only GET and POST are supported"));
         }
         None
     }
 }
 
-/// Compares without telling by its time where they differ.
+/// Compares in constant time.
 fn same(one: &[u8], other: &[u8]) -> bool {
     one.len() == other.len() && one.iter().zip(other).fold(0, |all, (a, b)| all | (a ^ b)) == 0
 }
 
-/// In front of everything: turns away who may not ask, and gives each answer the headers that keep
-/// the page to itself.
+/// The first layer of the server: refuses requests without permission, and adds the headers that
+/// protect the page to each answer.
 pub(super) async fn guard(State(guard): State<Guard>, request: Request, next: Next) -> Response {
     let objection = guard.objection(request.method(), request.uri(), request.headers());
     let mut response = match objection {
@@ -105,7 +106,7 @@ const HEADERS: [(&str, &str); 7] = [
     ),
     ("x-content-type-options", "nosniff"),
     ("x-frame-options", "DENY"),
-    // The URL has the token in it.
+    // The URL contains the token.
     ("referrer-policy", "no-referrer"),
     ("cross-origin-resource-policy", "same-origin"),
     ("cross-origin-opener-policy", "same-origin"),

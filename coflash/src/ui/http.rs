@@ -1,4 +1,4 @@
-//! What the server answers to which request.
+//! The requests of the page and their answers.
 
 use std::sync::Arc;
 
@@ -29,21 +29,21 @@ use crate::bus::Kind;
 use crate::device::lss::{BitRate, LssAddress};
 use crate::update::FlashOptions;
 
-/// The most bytes of a request that is no file.
+/// The most bytes of a request without a file.
 const BODY_MAX: usize = 64 * 1024;
 
-/// What the handlers share.
+/// The state that the handlers share.
 #[derive(Clone)]
 pub(super) struct Site {
     pub(super) shared: Arc<Shared>,
     pub(super) readers: Readers,
-    /// The kinds of adapters that are offered.
+    /// The kinds of adapters on offer.
     pub(super) kinds: Vec<Kind>,
-    /// One file is read at a time: it may be large.
+    /// Only one file is read at a time: it may be large.
     pub(super) reading: Arc<Semaphore>,
 }
 
-/// What is answered in place of what was asked for.
+/// An error in place of the requested answer.
 struct Refused(StatusCode, Notice);
 
 impl IntoResponse for Refused {
@@ -72,8 +72,8 @@ impl From<Refusal> for Refused {
             Refusal::Busy(words) => Self(
                 StatusCode::CONFLICT,
                 Notice::failed(
-                    format!("not now, this is under way: {words}"),
-                    "wait until it is done, or cancel it",
+                    format!("another task is running: {words}"),
+                    "wait until it has finished, or cancel it",
                 ),
             ),
             Refusal::NotReady(words) => {
@@ -83,7 +83,7 @@ impl From<Refusal> for Refused {
     }
 }
 
-/// The files of the page: part of the program, so that nothing has to be installed or fetched.
+/// The files of the page. They are part of the program, so nothing must be installed or downloaded.
 const FILES: [(&str, &str, &str); 11] = [
     ("", HTML, include_str!("page/index.html")),
     ("icon.svg", "image/svg+xml", include_str!("page/icon.svg")),
@@ -101,7 +101,7 @@ const HTML: &str = "text/html; charset=utf-8";
 const CSS: &str = "text/css; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 
-/// All of it, for who may ask.
+/// All routes, behind the guard.
 pub(super) fn router(site: Site, who: Guard) -> Router {
     let at = |name: &str| format!("/{}/{name}", who.token);
     let mut router = Router::new();
@@ -130,13 +130,13 @@ pub(super) fn router(site: Site, who: Guard) -> Router {
         .with_state(site)
 }
 
-/// A body of JSON. No form of another page can send one.
+/// Parses a JSON body. A form of a foreign page cannot send one.
 fn body<T: DeserializeOwned>(headers: &HeaderMap, bytes: &Bytes) -> Result<T, Refused> {
     let kind = headers.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok()).unwrap_or_default();
     if kind.split(';').next() != Some("application/json") {
         return Err(Refused(
             StatusCode::UNSUPPORTED_MEDIA_TYPE,
-            Notice::failed("the request is no JSON", "send it as application/json"),
+            Notice::failed("the request is not JSON", "send it as application/json"),
         ));
     }
     serde_json::from_slice(bytes)
@@ -172,7 +172,7 @@ async fn list(State(site): State<Site>) -> Response {
     json_response(StatusCode::OK, &value)
 }
 
-/// A file for the user to keep.
+/// A file for the user to save.
 fn download(name: &str, kind: &'static str, content: impl IntoResponse) -> Response {
     let disposition = format!("attachment; filename=\"{name}\"");
     ([(header::CONTENT_TYPE, kind.to_string()), (header::CONTENT_DISPOSITION, disposition)], content)
@@ -181,7 +181,7 @@ fn download(name: &str, kind: &'static str, content: impl IntoResponse) -> Respo
 
 async fn trace(State(site): State<Site>) -> Response {
     let text = tokio::task::spawn_blocking(move || {
-        // Not with the lock: the bus goes on.
+        // Formatted without the lock, so that the bus continues.
         let (log, forgotten) = lock(&site.shared.frames).log();
         candump(&log, forgotten)
     });
@@ -203,7 +203,7 @@ struct Open {
     url: String,
 }
 
-/// The adapter is not changed under a task's feet.
+/// Refuses to change the adapter during a task.
 fn idle(site: &Site) -> Result<(), Refused> {
     match site.shared.look(|state| state.task.as_ref().map(|task| task.words.clone())) {
         Some(words) => Err(Refusal::Busy(words).into()),
@@ -241,7 +241,7 @@ struct Choice {
     program: u8,
 }
 
-/// Other settings make other blocks of the file that is there.
+/// After a change of the settings, the file is converted again.
 async fn settings(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
     let Choice { board, program } = body(&headers, &bytes)?;
     idle(&site)?;
@@ -267,14 +267,17 @@ async fn settings(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) ->
     }
 }
 
-/// Reads a file, away from the thread that serves the pages.
+/// Reads a file on a separate thread, so that the pages stay responsive.
 async fn load(site: &Site, bytes: Arc<Vec<u8>>, name: String, settings: Settings) -> Answer {
     let Ok(_turn) = site.reading.try_acquire() else {
         return Err(Refusal::Busy("another file is being read".to_string()).into());
     };
     let read = tokio::task::spawn_blocking(move || firmware::load(bytes, &name, &settings)).await;
     let fault = |_| {
-        Notice::failed("the file cannot be read: coflash has a fault of its own", "report it, with the file")
+        Notice::failed(
+            "the file cannot be read because of an internal error of coflash",
+            "report it, with the file",
+        )
     };
     match read.map_err(fault).and_then(|read| read) {
         Ok(loaded) => {
@@ -287,7 +290,7 @@ async fn load(site: &Site, bytes: Arc<Vec<u8>>, name: String, settings: Settings
             done()
         }
         Err(notice) => {
-            // What was there before is not what the person has in mind any more.
+            // The previous file is no longer the one that the user means.
             *lock(&site.shared.firmware) = None;
             site.shared.change(|state| {
                 state.firmware = None;
@@ -311,7 +314,7 @@ struct Update {
 }
 
 fn node_id(number: u8) -> Result<NodeId, Refused> {
-    NodeId::new(number).ok_or_else(|| bad(format!("{number} is no node-ID"), "node-IDs are 1 to 127"))
+    NodeId::new(number).ok_or_else(|| bad(format!("{number} is not a node-ID"), "node-IDs are 1 to 127"))
 }
 
 async fn update(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
@@ -340,7 +343,7 @@ async fn update(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> A
     });
     if let Some(words) = misfit {
         let notice =
-            Notice::failed(words, "choose the file that is made for this device; nothing was touched");
+            Notice::failed(words, "choose the file that is made for this device; no device was changed");
         return Err(Refused(StatusCode::UNPROCESSABLE_ENTITY, notice));
     }
     site.shared.begin(Job::Update { nodes: wanted, file, program, trial, start })?;
@@ -354,7 +357,7 @@ struct Single {
     step: Name,
 }
 
-/// What a step is called in a request.
+/// The name of a step in a request.
 #[derive(Clone, Copy, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Name {
@@ -406,7 +409,7 @@ async fn assign(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> A
     let rate = |kbits: u32| {
         let known = (0..=8).filter_map(BitRate::from_index);
         let found = known.into_iter().find(|rate| rate.bits_per_second() == kbits.checked_mul(1000));
-        found.ok_or_else(|| bad(format!("LSS knows no bit rate of {kbits} kbit/s"), "choose another"))
+        found.ok_or_else(|| bad(format!("LSS has no bit rate of {kbits} kbit/s"), "choose another"))
     };
     let bit_rate = bit_rate.map(rate).transpose()?;
     if node.is_none() && bit_rate.is_none() {
@@ -418,7 +421,7 @@ async fn assign(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> A
             (device.answers && device.identity != address_of(&address)).then_some(())
         });
         if taken.is_some() {
-            return Err(bad(format!("node-ID {node} has another device already"), "choose a free one"));
+            return Err(bad(format!("another device already has node-ID {node}"), "choose a free one"));
         }
     }
     site.shared.begin(Job::Assign { address, node, bit_rate, store })?;

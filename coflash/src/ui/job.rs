@@ -1,4 +1,4 @@
-//! What the page can have done.
+//! The tasks of the page.
 
 use std::sync::Arc;
 
@@ -8,17 +8,17 @@ use super::firmware::Loaded;
 use super::state::{State, Task, Update};
 use crate::device::lss::{BitRate, LssAddress};
 
-/// One thing to do.
+/// A task.
 pub(super) enum Job {
-    /// Who is on the bus.
+    /// Search the nodes on the bus.
     Scan,
-    /// The file into these devices.
+    /// Download the file into these devices.
     Update { nodes: Vec<NodeId>, file: Arc<Loaded>, program: u8, trial: bool, start: bool },
     /// A single step with one device.
     Step { node: NodeId, program: u8, step: Step },
-    /// One of the devices without node-ID.
+    /// Find one of the devices without a node-ID.
     Fastscan,
-    /// Node-ID and bit rate for the device with this address.
+    /// Set node-ID and bit rate of the device with this address.
     Assign { address: LssAddress, node: Option<NodeId>, bit_rate: Option<BitRate>, store: bool },
 }
 
@@ -40,7 +40,7 @@ pub(super) enum Step {
 }
 
 impl Job {
-    /// Enters it as the task that runs.
+    /// Enters the task as the running one.
     pub(super) fn enter(&self, state: &mut State) {
         let (kind, words) = match self {
             Self::Scan => ("scan", "searching the bus".to_string()),
@@ -60,8 +60,8 @@ impl Job {
                 };
                 ("step", words)
             }
-            Self::Fastscan => ("lss", "searching for a device without node-ID".to_string()),
-            Self::Assign { .. } => ("lss", "giving node-ID and bit rate".to_string()),
+            Self::Fastscan => ("lss", "searching for a device without a node-ID".to_string()),
+            Self::Assign { .. } => ("lss", "setting node-ID and bit rate".to_string()),
         };
         state.notice = None;
         state.task = Some(Task { kind, words, cancelling: false, percent: None });

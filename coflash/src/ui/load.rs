@@ -29,11 +29,12 @@ pub(super) fn bits(frame: &Frame) -> u32 {
         frame.data().iter().for_each(|byte| line.bits(u32::from(*byte), 8));
     }
     line.bits(u32::from(line.crc), 15);
-    // What is not stuffed: CRC delimiter, acknowledge and its delimiter, end of frame, intermission.
+    // The bits without stuffing: CRC delimiter, acknowledge slot and delimiter, end of frame,
+    // intermission.
     line.count + 1 + 2 + 7 + 3
 }
 
-/// The part of a frame that has a bit of the other kind put in after five of a kind.
+/// The part of a frame with bit stuffing: after five equal bits an opposite bit is inserted.
 #[derive(Default)]
 struct Stuffed {
     count: u32,
@@ -43,7 +44,7 @@ struct Stuffed {
 }
 
 impl Stuffed {
-    /// The lowest `width` bits of `value`, the highest of them first.
+    /// Adds the lowest `width` bits of `value`, most significant bit first.
     fn bits(&mut self, value: u32, width: u32) {
         for place in (0..width).rev() {
             let bit = value >> place & 1 != 0;
@@ -58,7 +59,7 @@ impl Stuffed {
         self.alike = if self.last == Some(bit) { self.alike + 1 } else { 1 };
         self.last = Some(bit);
         if self.alike == 5 {
-            // The stuff bit begins the next run.
+            // The stuff bit is the first bit of the next run.
             self.count += 1;
             self.last = Some(!bit);
             self.alike = 1;
@@ -76,12 +77,12 @@ mod tests {
         bits(&Frame::new(StandardId::new(id).unwrap(), data).unwrap())
     }
 
-    /// Without stuff bits a frame with an 11-bit identifier and n bytes has 47 + 8 n bits, one with 29
-    /// bits 67 + 8 n, and stuffing adds a quarter of what can be stuffed at most (Tindell, Hansson
-    /// and Wellings 1994, with the intermission counted).
+    /// Without stuff bits, a frame with an 11-bit identifier and n bytes has 47 + 8 n bits, a frame
+    /// with a 29-bit identifier 67 + 8 n. Stuffing adds at most a quarter of the bits that are
+    /// subject to it (Tindell, Hansson and Wellings 1994, with the intermission included).
     #[test]
     fn a_frame_is_as_long_as_the_standard_makes_it() {
-        // 55h has no five bits of a kind; identifier 555h neither.
+        // Neither 55h nor the identifier 555h has five equal bits in a row.
         for len in 0..=8 {
             let least = 47 + 8 * len;
             let most = least + (34 + 8 * len - 1) / 4;
@@ -96,9 +97,9 @@ mod tests {
         assert!((131..=131 + (54 + 64 - 1) / 4).contains(&bits(&long)));
     }
 
-    /// Worked out by hand (long division for the CRC, 7753h): identifier 14h, one byte 01h. What can be
-    /// stuffed is 0 00000010100 000 0001 00000001 111011101010011: five zeros of a kind stand at the start
-    /// of the frame, in front of the length, and in front of the last bit of the data.
+    /// Computed by hand (long division for the CRC, 7753h): identifier 14h, one byte 01h. The bits
+    /// subject to stuffing are 0 00000010100 000 0001 00000001 111011101010011: five zeros in a row
+    /// stand at the start of the frame, before the length, and before the last bit of the data.
     #[test]
     fn stuff_bits_are_those_of_the_frame() {
         assert_eq!(standard(0x14, &[1]), 42 + 3 + 1 + 2 + 7 + 3);

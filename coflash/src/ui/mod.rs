@@ -1,9 +1,10 @@
-//! The page in the browser: a server on 127.0.0.1 for those who do not type (`coflash ui`).
+//! The page in the browser: a server on 127.0.0.1 for users who prefer a page to the command line
+//! (`coflash ui`).
 //!
-//! One thread owns the bus (`worker`) and does one thing after the other; the pages see one state
-//! (`state`), by server-sent events (`events`), and ask for things by requests (`http`), which only
-//! those get through who know the token in the URL (`guard`). The page itself (`page/`) is plain
-//! HTML, CSS and JavaScript, part of the program, and needs neither a build step nor a network.
+//! One thread owns the bus (`worker`) and runs one task at a time. The pages get one common state
+//! (`state`) by server-sent events (`events`) and send requests (`http`). A request must contain
+//! the token of the URL (`guard`). The page itself (`page/`) is plain HTML, CSS and JavaScript and
+//! part of the program; it needs neither a build step nor a network.
 //!
 //! | module | what it does |
 //! |---|---|

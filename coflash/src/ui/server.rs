@@ -22,18 +22,18 @@ use super::shared::{Order, Shared};
 use super::worker;
 use crate::bus::Kind;
 
-/// Connections at a time. A browser has six for each page.
+/// The most connections. A browser opens six for each page.
 const CONNECTIONS: usize = 64;
-/// Bytes that the system keeps for a reader who is slow.
+/// The send buffer of a connection, which limits the data for a slow reader.
 const SEND_BUFFER: u32 = 128 * 1024;
-/// How long the head of a request may take to arrive.
+/// How long the header of a request may take to arrive.
 const HEAD: Duration = Duration::from_secs(10);
-/// How often it looks whether it is to end.
+/// How often the server checks whether it must end.
 const LOOK: Duration = Duration::from_millis(100);
-/// How long a task that is cancelled may take to end in order.
+/// How long a cancelled task may take to end.
 const IN_ORDER: Duration = Duration::from_secs(10);
 
-/// How to serve.
+/// The options of the server.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct Options {
@@ -41,11 +41,12 @@ pub struct Options {
     pub bus: Option<String>,
     /// The port on 127.0.0.1; 0 for a free one.
     pub port: u16,
-    /// COB-IDs of SDO requests and answers, without the node-ID, where they are not the usual ones.
+    /// The base COB-IDs of SDO requests and answers, without the node-ID, if they differ from the
+    /// predefined ones.
     pub sdo_ids: Option<(u16, u16)>,
     /// The kinds of adapters that the page offers.
     pub kinds: Vec<Kind>,
-    /// How long a reader may take nothing of what it is sent until it is dropped.
+    /// How long a reader may accept no data before it is dropped.
     pub write_timeout: Duration,
 }
 
@@ -61,7 +62,7 @@ impl Default for Options {
     }
 }
 
-/// A server that listens already.
+/// A server with an open port.
 pub struct Server {
     runtime: tokio::runtime::Runtime,
     listener: TcpListener,
@@ -79,17 +80,17 @@ impl std::fmt::Debug for Server {
 }
 
 impl Server {
-    /// Takes the port. Nothing is served before [`run`](Self::run).
+    /// Opens the port. The server answers no request before [`run`](Self::run).
     ///
     /// # Errors
-    /// The port is taken, or the system has no randomness.
+    /// The port is in use, or the system provides no random numbers.
     pub fn new(options: Options) -> io::Result<Self> {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let listener = runtime.block_on(async {
             let socket = TcpSocket::new_v4()?;
-            // What is accepted inherits it.
+            // Accepted connections inherit this size.
             socket.set_send_buffer_size(SEND_BUFFER)?;
-            // On Windows this would let another program take the port as well.
+            // On Windows this option would let another program use the same port.
             #[cfg(unix)]
             socket.set_reuseaddr(true)?;
             socket.bind(SocketAddr::from((Ipv4Addr::LOCALHOST, options.port)))?;
@@ -110,22 +111,23 @@ impl Server {
         })
     }
 
-    /// Where the page is. Who knows it may do all that the page can.
+    /// The URL of the page. Anyone with the URL can do everything that the page offers.
     #[must_use]
     pub fn url(&self) -> String {
         format!("http://127.0.0.1:{}/{}/", self.guard.port, self.guard.token)
     }
 
-    /// How many pages get events, for tests.
+    /// The number of pages that get events, for tests.
     pub fn readers(&self) -> impl Fn() -> usize + Send + 'static {
         let readers = self.readers.clone();
         move || readers.count()
     }
 
-    /// Serves until `end` is set. A task that runs then is cancelled first: its transfer is aborted,
-    /// and what state that leaves the device in is told.
+    /// Serves until `end` is set. A running task is cancelled first: its transfer is aborted, and
+    /// the result describes the state of the devices.
     ///
     /// # Errors
+    /// The thread of the bus does not start.
     /// The thread for the bus does not start.
     pub fn run(mut self, end: &AtomicBool) -> io::Result<Option<String>> {
         let shared = self.shared.clone();
@@ -136,7 +138,7 @@ impl Server {
             thread::Builder::new().name("bus".to_string()).spawn(work)?
         };
         if let Some(bus) = self.options.bus.take() {
-            // It is the first: there is room for it.
+            // This is the first order, so there is room for it.
             let _ = shared.order(Order::Open(bus));
         }
         let site = Site {
@@ -154,7 +156,7 @@ impl Server {
             }
             end_in_order(&shared).await
         });
-        // The adapter is closed in order; one who hangs in a task that does not end is left behind.
+        // The adapter is closed normally; a thread that hangs in a task is abandoned.
         if shared.order(Order::End).is_ok() && shared.look(|state| state.task.is_none()) {
             let _ = worker.join();
         }
@@ -162,7 +164,7 @@ impl Server {
     }
 }
 
-/// Cancels the task that runs, and tells what became of an update's devices.
+/// Cancels the running task, and returns the state of an update's devices.
 async fn end_in_order(shared: &Shared) -> Option<String> {
     let busy = || shared.look(|state| state.task.is_some());
     if !busy() {
@@ -174,7 +176,7 @@ async fn end_in_order(shared: &Shared) -> Option<String> {
             tokio::time::sleep(LOOK).await;
         }
     };
-    // One that does not listen any more is left behind.
+    // A task that does not react is abandoned.
     let _ = tokio::time::timeout(IN_ORDER, ended).await;
     let words = shared.look(|state| {
         let devices = state.updates.iter().map(|update| format!("node {}: {}", update.node, update.words));
@@ -183,21 +185,21 @@ async fn end_in_order(shared: &Shared) -> Option<String> {
     Some(words).filter(|words| !words.is_empty())
 }
 
-/// Until the flag is set.
+/// Returns when the flag is set.
 async fn set(flag: &AtomicBool) {
     while !flag.load(Ordering::Relaxed) {
         tokio::time::sleep(LOOK).await;
     }
 }
 
-/// Takes connections, for ever.
+/// Accepts connections without end.
 async fn accept(listener: TcpListener, app: axum::Router, write_timeout: Duration) {
     let places = Arc::new(Semaphore::new(CONNECTIONS));
     loop {
-        // It is never closed.
+        // The semaphore is never closed.
         let Ok(place) = places.clone().acquire_owned().await else { return };
         let Ok((stream, _)) = listener.accept().await else {
-            // Out of descriptors, say: that passes.
+            // The error may be temporary, for example if no descriptor is free.
             tokio::time::sleep(LOOK).await;
             continue;
         };
@@ -209,7 +211,7 @@ async fn accept(listener: TcpListener, app: axum::Router, write_timeout: Duratio
     }
 }
 
-/// One connection. How it ends is the browser's affair.
+/// Serves one connection. An error of the connection is the browser's concern.
 async fn serve(stream: TcpStream, app: axum::Router, write_timeout: Duration) {
     let _ = stream.set_nodelay(true);
     let mut stream = TimeoutStream::new(stream);

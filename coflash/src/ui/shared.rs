@@ -1,4 +1,4 @@
-//! What the server and the thread that owns the bus share.
+//! The state that the server and the thread of the bus share.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::SyncSender;
@@ -11,43 +11,44 @@ use super::frames::Frames;
 use super::job::Job;
 use super::state::{Connection, State};
 
-/// What the thread that owns the bus is told.
+/// An order for the thread of the bus.
 pub(super) enum Order {
-    /// Open this adapter, and stay with it.
+    /// Open this adapter and keep it.
     Open(String),
-    /// Let go of the adapter.
+    /// Close the adapter.
     Close,
-    /// That is all.
+    /// End.
     End,
-    /// Do this. [`Shared::begin`] has entered it as the task that runs.
+    /// Run this task. [`Shared::begin`] has entered it as the running one.
     Run(Job),
 }
 
-/// Why something is not begun. The words are for people.
+/// Why a task does not start, in words for people.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Refusal {
-    /// Something else is being done.
+    /// Another task is running.
     Busy(String),
-    /// There is no adapter, or no file.
+    /// An adapter or a file is missing.
     NotReady(&'static str),
 }
 
-/// What the server and the thread that owns the bus share.
+/// The state that the server and the thread of the bus share.
 pub(super) struct Shared {
     state: Mutex<State>,
-    /// Counts the changes of the state.
+    /// The number of changes of the state.
     pub(super) changed: watch::Sender<u64>,
     pub(super) frames: Arc<Mutex<Frames>>,
     /// The number of the last frame.
     pub(super) arrived: watch::Sender<u64>,
-    /// Ends the task that runs.
+    /// Cancels the running task.
     pub(super) cancelled: Arc<AtomicBool>,
     pub(super) firmware: Mutex<Option<Arc<Loaded>>>,
     pub(super) readback: Mutex<Option<Arc<Vec<u8>>>>,
     orders: SyncSender<Order>,
 }
 
-/// A panic of another thread leaves what is behind a lock whole: it is changed value by value.
+/// Locks the mutex even after a panic of another thread: each value is changed as a whole, so it is
+/// valid.
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -66,19 +67,19 @@ impl Shared {
         }
     }
 
-    /// Changes the state, and has all pages told.
+    /// Changes the state, and notifies all pages.
     pub(super) fn change<R>(&self, change: impl FnOnce(&mut State) -> R) -> R {
         let result = change(&mut lock(&self.state));
         self.changed.send_modify(|version| *version += 1);
         result
     }
 
-    /// Looks at the state.
+    /// Reads the state.
     pub(super) fn look<R>(&self, look: impl FnOnce(&State) -> R) -> R {
         look(&lock(&self.state))
     }
 
-    /// Begins a job, if nothing else is being done.
+    /// Starts a job if no other task is running.
     ///
     /// # Errors
     /// [`Refusal`]; then nothing has changed.
@@ -96,15 +97,15 @@ impl Shared {
         })
     }
 
-    /// Tells the thread that owns the bus something.
+    /// Sends an order to the thread of the bus.
     ///
     /// # Errors
-    /// [`Refusal::Busy`] where it has not yet got to what it was told before.
+    /// [`Refusal::Busy`] if the thread has not yet read the previous order.
     pub(super) fn order(&self, order: Order) -> Result<(), Refusal> {
         self.orders.try_send(order).map_err(|_| Refusal::Busy("the adapter is being opened".to_string()))
     }
 
-    /// Ends the task that runs, if one does: its transfer is aborted.
+    /// Cancels the running task, if there is one: its transfer is aborted.
     pub(super) fn cancel(&self) {
         self.change(|state| {
             if let Some(task) = &mut state.task {

@@ -1,4 +1,4 @@
-//! What all pages show: one state, which each change sends to each of them.
+//! The state that all pages show. Each change is sent to every page.
 
 use std::collections::BTreeMap;
 
@@ -13,34 +13,34 @@ use crate::device::scan::Found;
 use crate::device::Error;
 use crate::update::Event;
 
-/// Reports that are kept; the oldest goes first.
+/// The most reports; the oldest are dropped first.
 const REPORTS: usize = 500;
-/// Lines of one device's update that are kept.
+/// The most lines of one device's update.
 const LINES: usize = 60;
 
-/// All of it, as the page gets it.
+/// The complete state in the form for the page.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct State {
     pub(super) adapter: Adapter,
-    /// `None` until the bus has been searched.
+    /// `None` until the bus was scanned.
     pub(super) devices: Option<BTreeMap<u8, Device>>,
     pub(super) settings: Settings,
     pub(super) firmware: Option<Firmware>,
-    /// What is being done; one thing at a time.
+    /// The running task; only one runs at a time.
     pub(super) task: Option<Task>,
-    /// The devices of the update that runs, or of the last one.
+    /// The devices of the running update, or of the last one.
     pub(super) updates: Vec<Update>,
-    /// How the last task, or the last try to open the adapter, went.
+    /// The result of the last task, or of the last attempt to open the adapter.
     pub(super) notice: Option<Notice>,
-    /// How many notices there were: tells a new one with the same words.
+    /// The number of notices: distinguishes a new notice with the same text.
     pub(super) notices: u64,
-    /// The device that fastscan has found.
+    /// The device found by fastscan.
     pub(super) lss: Option<Lss>,
     pub(super) readback: Option<Readback>,
     pub(super) reports: Vec<Report>,
 }
 
-/// The way to the bus.
+/// The access to the bus.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Adapter {
     pub(super) url: String,
@@ -49,7 +49,7 @@ pub(super) struct Adapter {
     pub(super) words: Option<String>,
     /// A gateway shows no frames.
     pub(super) gateway: bool,
-    /// In bit/s, as far as the URL tells it.
+    /// In bit/s, if the URL contains it.
     pub(super) bit_rate: Option<u32>,
 }
 
@@ -60,14 +60,14 @@ pub(super) enum Connection {
     Closed,
     Opening,
     Open,
-    /// It was open, and is tried again and again.
+    /// It was open, and the worker tries to open it again.
     Lost,
 }
 
-/// How files are read, and which program is meant.
+/// The settings for reading files, and the program number.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Settings {
-    /// The board that tells where a program may lie.
+    /// The board that gives the region of a program.
     pub(super) board: Option<&'static str>,
     /// Sub-index of 1F50h.
     pub(super) program: u8,
@@ -79,14 +79,14 @@ impl Default for Settings {
     }
 }
 
-/// A node that was seen or heard.
+/// A node that answered or was heard.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Device {
     pub(super) node: u8,
     pub(super) answers: bool,
     /// Whether the bootloader runs.
     pub(super) bootloader: bool,
-    /// What runs, in words.
+    /// The words for what runs.
     pub(super) runs: String,
     pub(super) name: Option<String>,
     pub(super) hardware: Option<String>,
@@ -97,7 +97,7 @@ pub(super) struct Device {
     pub(super) heartbeat: Option<&'static str>,
     pub(super) dialect: Option<&'static str>,
     pub(super) programs: Vec<Program>,
-    /// What the firmware file's label says against this device.
+    /// The comparison of the firmware file's label with this device.
     pub(super) verdict: Option<Verdict>,
 }
 
@@ -105,11 +105,11 @@ pub(super) struct Device {
 pub(super) struct Program {
     pub(super) number: u8,
     pub(super) crc: Option<u32>,
-    /// None, stopped, running; and what the flash status says.
+    /// The state (none, stopped or running) and the flash status.
     pub(super) words: String,
 }
 
-/// A file against a device.
+/// The comparison of a file with a device.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(super) struct Verdict {
     pub(super) fits: Fits,
@@ -121,16 +121,16 @@ pub(super) struct Verdict {
 pub(super) enum Fits {
     Yes,
     No,
-    /// File or device does not say it.
+    /// File or device does not give its identity.
     Unknown,
 }
 
-/// The firmware file that was chosen.
+/// The chosen firmware file.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Firmware {
     pub(super) name: String,
     pub(super) size: usize,
-    /// What `inspect` says.
+    /// The output of `inspect`.
     pub(super) inspection: String,
     /// Bytes of the program in flash.
     pub(super) program_size: u32,
@@ -140,32 +140,32 @@ pub(super) struct Firmware {
     pub(super) version: Option<String>,
     /// Bytes that the conversion left out.
     pub(super) left_out: u64,
-    /// What a sealed image says beside.
+    /// Further properties of a sealed image.
     pub(super) seal: Option<Seal>,
 }
 
-/// What a sealed image says of itself; the device judges whether it is true.
+/// The properties of a sealed image from its manifest; the device checks whether they are valid.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(super) struct Seal {
     /// The program's number on the board.
     pub(super) program: u8,
     /// The security counter.
     pub(super) counter: u32,
-    /// The keys that have signed it, by their ids.
+    /// The ids of the keys that have signed it.
     pub(super) signed_by: Vec<u32>,
-    /// The key-encryption keys of which each opens it; none where it is not encrypted.
+    /// The ids of the key-encryption keys that decrypt it; empty if it is not encrypted.
     pub(super) opened_by: Vec<u32>,
     /// Its flags in words.
     pub(super) flags: Vec<&'static str>,
 }
 
-/// What is being done.
+/// The running task.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Task {
     pub(super) kind: &'static str,
     pub(super) words: String,
     pub(super) cancelling: bool,
-    /// Of 100, where that is known.
+    /// In percent, if it is known.
     pub(super) percent: Option<u32>,
 }
 
@@ -176,7 +176,7 @@ pub(super) struct Update {
     pub(super) phase: Phase,
     pub(super) done: usize,
     pub(super) total: usize,
-    /// The last thing that happened.
+    /// The last event.
     pub(super) words: String,
     pub(super) advice: Option<String>,
     pub(super) lines: Vec<String>,
@@ -191,7 +191,7 @@ pub(super) enum Phase {
     Failed,
 }
 
-/// How something went.
+/// The result of a task.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Notice {
     pub(super) ok: bool,
@@ -200,7 +200,7 @@ pub(super) struct Notice {
     pub(super) advice: Option<String>,
 }
 
-/// A device without node-ID.
+/// A device without a node-ID.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(super) struct Lss {
     pub(super) vendor_id: u32,
@@ -217,11 +217,11 @@ pub(super) struct Readback {
     pub(super) size: usize,
 }
 
-/// What a run did to a device, to print.
+/// The result of an update of one device, for printing.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Report {
     pub(super) number: u64,
-    /// Which run; the devices of one update have the same number.
+    /// The number of the run; the devices of one update have the same number.
     pub(super) run: u64,
     /// Seconds since 1970, UTC.
     pub(super) date: u64,
@@ -231,13 +231,13 @@ pub(super) struct Report {
     pub(super) device: Option<String>,
     pub(super) serial_number: Option<u32>,
     pub(super) file: String,
-    /// Of the program that the device has, as it tells it.
+    /// The CRC of the program in the device, as the device reports it.
     pub(super) crc: Option<u32>,
-    /// Of the file.
+    /// The CRC of the program in the file.
     pub(super) file_crc: u32,
-    /// What the device tells in 100Ah afterwards.
+    /// The value of 100Ah after the update.
     pub(super) version: Option<String>,
-    /// What the file says.
+    /// The file's software version.
     pub(super) file_version: Option<String>,
     pub(super) seconds: f64,
     pub(super) adapter: String,
@@ -245,7 +245,7 @@ pub(super) struct Report {
 }
 
 impl State {
-    /// Takes what a scan has found in place of what was known.
+    /// Replaces the known devices by the result of a scan.
     pub(super) fn found(&mut self, found: &BTreeMap<NodeId, Found>) {
         let devices = found.iter().map(|(node, found)| {
             let device = match &found.info {
@@ -260,7 +260,7 @@ impl State {
         self.judge();
     }
 
-    /// Takes what one device has told anew.
+    /// Updates one device.
     pub(super) fn told(&mut self, info: &DeviceInfo) {
         let devices = self.devices.get_or_insert_default();
         let heartbeat = devices.get(&info.node.get()).and_then(|device| device.heartbeat);
@@ -268,7 +268,7 @@ impl State {
         self.judge();
     }
 
-    /// A device that answers no more, or has another node-ID now.
+    /// Marks a device that no longer answers, or has a new node-ID.
     pub(super) fn silent(&mut self, node: NodeId) {
         if let Some(device) = self.devices.as_mut().and_then(|devices| devices.get_mut(&node.get())) {
             device.answers = false;
@@ -276,7 +276,7 @@ impl State {
         }
     }
 
-    /// Holds the file against each device.
+    /// Compares the file with each device.
     pub(super) fn judge(&mut self) {
         let number = self.settings.program;
         for device in self.devices.iter_mut().flat_map(BTreeMap::values_mut) {
@@ -320,7 +320,7 @@ impl Device {
         }
     }
 
-    /// What 1018h/1 and 1018h/2 read, where they say something: 0 is nobody.
+    /// The values of 1018h/1 and 1018h/2, if they are not 0.
     pub(super) fn product(&self) -> Option<(u32, u32)> {
         match (self.identity[0], self.identity[1]) {
             (Some(vendor), Some(product)) if vendor != 0 || product != 0 => Some((vendor, product)),
@@ -340,13 +340,13 @@ impl Program {
         const RUNNING: u32 = ProgramState::Running as u32;
         const ABSENT: u32 = ProgramState::Absent as u32;
         let mut words = match info.control {
-            // 1F56h reads 0 where there is no program that could be stopped.
+            // 1F56h reads 0 if there is no program.
             Some(STOPPED) if info.crc == Some(0) => "none".to_string(),
             Some(STOPPED) => "stopped".to_string(),
             Some(RUNNING) => "running".to_string(),
             Some(ABSENT) => "none".to_string(),
             Some(other) => format!("state {other:02X}h"),
-            None => "not told".to_string(),
+            None => "not reported".to_string(),
         };
         match info.status {
             Some(status) if status.busy => words += ", busy",
@@ -365,7 +365,7 @@ impl Program {
 }
 
 impl Firmware {
-    /// What the file says against a device.
+    /// Compares the file with a device.
     fn against(&self, device: &Device, number: u8) -> Verdict {
         let verdict = |fits, words: String| Verdict { fits, words };
         let told = match (self.vendor_id, self.product_code) {
@@ -383,8 +383,8 @@ impl Firmware {
                 verdict(Fits::Yes, "in the device already (same CRC)".to_string())
             }
             (Some(_), Some(_)) => verdict(Fits::Yes, "made for this product".to_string()),
-            (None, _) => verdict(Fits::Unknown, "the file does not say for which device it is".to_string()),
-            (_, None) => verdict(Fits::Unknown, "the device does not say which product it is".to_string()),
+            (None, _) => verdict(Fits::Unknown, "the file does not name its target device".to_string()),
+            (_, None) => verdict(Fits::Unknown, "the device does not report its product".to_string()),
         }
     }
 }
@@ -402,7 +402,7 @@ impl Update {
         }
     }
 
-    /// Takes what happens to it.
+    /// Records an event.
     pub(super) fn event(&mut self, event: &Event) {
         self.phase = Phase::Running;
         if let Event::Progress { done, total } = *event {
@@ -410,7 +410,7 @@ impl Update {
             self.words = "sending the program".to_string();
             return;
         }
-        // The result tells it, with what was left behind.
+        // The result reports it, together with the state of the device.
         if let Event::Done(_) = event {
             return;
         }

@@ -1,4 +1,4 @@
-//! What the page can have done: the only place of the page's server that calls the rest of the
+//! Runs the tasks of the page: the only module of the page's server that calls the rest of the
 //! library.
 
 use std::sync::Arc;
@@ -18,10 +18,10 @@ use crate::device::{info, scan, Error, ScanOptions, Session, Timing};
 use crate::update::many::{Failed, Job as One};
 use crate::update::{self, steps, Event, FlashOptions, ManyOptions, Target};
 
-/// Devices at work at the same time.
+/// The most devices in an update at the same time.
 const AT_ONCE: usize = 8;
 
-/// Does it, and tells how it went.
+/// Runs a job and returns its result.
 pub(super) fn run(job: Job, link: &mut Link, shared: &Shared) -> Notice {
     let done = match job {
         Job::Scan => search(link, shared),
@@ -38,9 +38,9 @@ pub(super) fn run(job: Job, link: &mut Link, shared: &Shared) -> Notice {
     done.unwrap_or_else(|error| Notice::error(&error))
 }
 
-/// Behind a gateway there are no frames.
+/// The notice for a task that needs frames behind a gateway.
 fn no_bus(what: &str) -> Notice {
-    let words = format!("a gateway carries SDO alone: {what} needs the CAN bus itself");
+    let words = format!("a gateway carries only SDO: {what} needs the CAN bus itself");
     Notice::failed(words, "choose an adapter on the bus")
 }
 
@@ -49,21 +49,22 @@ fn search(link: &mut Link, shared: &Shared) -> Result<Notice, Error> {
     let found = scan(&mut **adapter, &ScanOptions::default(), &shared.cancelled)?;
     shared.change(|state| state.found(&found));
     Ok(Notice::done(match found.len() {
-        0 => "nobody answers, and nobody is heard; fastscan below finds devices without node-ID".to_string(),
+        0 => "no node answers, and no node was heard; fastscan below finds devices without a node-ID"
+            .to_string(),
         1 => "1 device found".to_string(),
         count => format!("{count} devices found"),
     }))
 }
 
-/// A conversation that the page can end.
+/// A session that the page can cancel.
 fn session<'l>(link: &'l mut Link, shared: &Shared, node: NodeId) -> Session<'l> {
     let mut session = Session::on(link, node, Timing::default());
     session.cancel_by(shared.cancelled.clone());
     session
 }
 
-/// Asks a device anew, so that the table is right. What it does not answer is no failure of what was
-/// done before.
+/// Reads a device again, so that the table is right. An error here does not change the result of
+/// the previous task.
 fn look_again(link: &mut Link, shared: &Shared, node: NodeId) {
     let mut session = Session::on(link, node, Timing::default().boot(Duration::from_secs(1)));
     let told = info(&mut session);
@@ -99,13 +100,13 @@ fn single(session: &mut Session<'_>, shared: &Shared, number: u8, step: Step) ->
         Step::Release => {
             tell(Event::Found(session.find()?));
             steps::release(session, number, &mut tell)?;
-            format!("program {number} is released for autostart: it starts by itself from now on")
+            format!("program {number} is released for autostart: it starts by itself after a reset")
         }
         Step::Withhold => {
             tell(Event::Found(session.find()?));
             steps::withdraw(session, number)?;
             format!(
-                "program {number} is not released any more: the device stays in the bootloader after a reset"
+                "program {number} is no longer released: the device stays in the bootloader after a reset"
             )
         }
         Step::Start => {
@@ -130,7 +131,7 @@ fn single(session: &mut Session<'_>, shared: &Shared, number: u8, step: Step) ->
     Ok(Notice::done(format!("node {node}: {words}")))
 }
 
-/// The file into many devices, and a report about each.
+/// Downloads the file into many devices, and makes a report of each.
 fn update_all(
     link: &mut Link,
     shared: &Shared,
@@ -180,7 +181,7 @@ fn update_all(
     }
 }
 
-/// The device has to be the one that the file is for, where both say what they are.
+/// Adds the check that the device is the target of the file, if both give their identity.
 fn for_node(shared: &Shared, file: &Loaded, node: NodeId, options: FlashOptions) -> FlashOptions {
     let told = shared.look(|state| {
         let device = state.devices.as_ref().and_then(|devices| devices.get(&node.get()))?;
@@ -245,17 +246,18 @@ fn fastscan(link: &mut Link, shared: &Shared) -> Result<Notice, Error> {
         let percent = bits * 100 / 128;
         shared.change(|state| state.task.as_mut().map(|task| task.percent = Some(percent)));
     });
-    // It is selected again for what it is to get: nobody else may listen meanwhile.
+    // Switch back first: the device is selected again for its settings, and no other device may
+    // listen then.
     let back = master.switch_all(false);
     let found = found?;
     back?;
     shared.change(|state| state.lss = found.map(Into::into));
     Ok(match found {
         Some(address) => Notice::done(format!(
-            "found a device without node-ID, serial number {:08X}h: give it one below",
+            "found a device without a node-ID, serial number {:08X}h: set one below",
             address.serial_number
         )),
-        None => Notice::done("there is no device without node-ID on the bus"),
+        None => Notice::done("there is no device without a node-ID on the bus"),
     })
 }
 
@@ -278,7 +280,7 @@ fn assign(
     back?;
     let mut words = Vec::new();
     if let Some(node) = node {
-        // One that had another takes the new one when its communication is reset.
+        // A device with another node-ID takes the new one when its communication is reset.
         if let Some(old) = old.filter(|old| *old != node) {
             adapter.send(&NmtCommand::ResetCommunication.emit(Some(old))).map_err(Error::Adapter)?;
         }
@@ -290,9 +292,10 @@ fn assign(
         });
     }
     if let Some(rate) = bit_rate.and_then(BitRate::bits_per_second) {
-        words.push(format!("it changes over to {} kbit/s with its next start", rate / 1000));
+        words.push(format!("it switches to {} kbit/s at its next start", rate / 1000));
     }
-    words.push(if store { "stored" } else { "not stored: lost with the next start" }.to_string());
+    words
+        .push(if store { "stored" } else { "not stored: the setting is lost at the next start" }.to_string());
     shared.change(|state| state.lss = None);
     if let Some(node) = node {
         look_again(link, shared, node);
@@ -300,7 +303,7 @@ fn assign(
     Ok(Notice::done(words.join("; ")))
 }
 
-/// Tells the selected device what it gets; gives the node-ID that it had.
+/// Sends the settings to the selected device; returns its previous node-ID.
 fn give(
     master: &mut Master<'_>,
     node: Option<NodeId>,

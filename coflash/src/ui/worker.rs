@@ -1,5 +1,5 @@
-//! The thread that owns the bus: it opens the adapter, listens while nothing is to be done, and does
-//! one thing after the other. Pages come and go; it stays.
+//! The thread that owns the bus: it opens the adapter, listens while no task is running, and runs
+//! one task at a time. Pages come and go; the thread stays.
 
 use std::panic::{catch_unwind, AssertUnwindSafe};
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
@@ -12,12 +12,12 @@ use super::state::{Adapter, Connection, Notice};
 use super::work;
 use crate::bus::{bit_rate_of, AdapterError, Link, SdoIds};
 
-/// How long it listens before it looks whether it was told something.
+/// How long the thread listens before it checks for an order.
 const SLICE: Duration = Duration::from_millis(50);
-/// How long a lost adapter is left alone until it is tried again.
+/// The pause before a lost adapter is opened again.
 const AGAIN: Duration = Duration::from_secs(1);
 
-/// COB-IDs of SDO requests and answers, without the node-ID.
+/// The base COB-IDs of SDO requests and answers, without the node-ID.
 type SdoBases = (u16, u16);
 
 /// The adapter.
@@ -27,19 +27,19 @@ enum Bus {
         url: String,
         link: Link,
     },
-    /// It is gone; when it is tried next.
+    /// It is lost; the time of the next attempt.
     Lost {
         url: String,
         next: Instant,
     },
 }
 
-/// Works until it is told to end.
+/// Works until the order to end.
 pub(super) fn run(shared: &Arc<Shared>, orders: &Receiver<Order>, sdo_ids: Option<SdoBases>) {
     let mut bus = Bus::Closed;
     loop {
         let order = match &mut bus {
-            // Its wait is the adapter's.
+            // The wait of the adapter serves as the pause.
             Bus::Open { link: Link::Bus(_), .. } => orders.recv_timeout(Duration::ZERO),
             Bus::Closed | Bus::Lost { .. } | Bus::Open { .. } => orders.recv_timeout(SLICE),
         };
@@ -51,10 +51,13 @@ pub(super) fn run(shared: &Arc<Shared>, orders: &Receiver<Order>, sdo_ids: Optio
                 Bus::Closed
             }
             (Ok(Order::Run(job)), Bus::Open { url, mut link }) => {
-                // A fault of ours must not leave the page waiting for ever.
+                // After an internal error the page must not wait forever.
                 let done = catch_unwind(AssertUnwindSafe(|| work::run(job, &mut link, shared)));
                 let notice = done.unwrap_or_else(|_| {
-                    Notice::failed("coflash has a fault of its own", "start coflash ui again and report it")
+                    Notice::failed(
+                        "there was an internal error of coflash",
+                        "start coflash ui again and report it",
+                    )
                 });
                 shared.change(|state| {
                     state.task = None;
@@ -78,7 +81,7 @@ pub(super) fn run(shared: &Arc<Shared>, orders: &Receiver<Order>, sdo_ids: Optio
     }
 }
 
-/// Opens an adapter, frames noted.
+/// Opens an adapter with a tap for its frames.
 fn link(shared: &Shared, url: &str, sdo_ids: Option<SdoBases>) -> Result<Link, AdapterError> {
     Ok(match Link::open(url, None)? {
         Link::Bus(adapter) => {
@@ -135,13 +138,13 @@ fn reopen(shared: &Shared, url: String, sdo_ids: Option<SdoBases>) -> Bus {
     }
 }
 
-/// Takes what the bus says by itself. The tap notes it.
+/// Receives the frames of the bus. The tap records them.
 fn listen(shared: &Shared, url: String, mut link: Link) -> Bus {
     let Link::Bus(adapter) = &mut link else { return Bus::Open { url, link } };
     match adapter.receive(SLICE) {
         Ok(_) => Bus::Open { url, link },
         Err(error) => {
-            // Its place must be free before it is opened again.
+            // Close the adapter before it is opened again.
             drop(link);
             lost(shared, url, &error)
         }

@@ -1,5 +1,5 @@
-//! What is judged before anything is done to a device: whether the image can be a program, whom it is
-//! for, and where the device has room for it.
+//! Checks before the tool changes a device: whether the image can be a program, whether it is for
+//! this device, and whether it is linked for the device's region.
 
 use canopen::program::IDENTITY;
 use canopen::Address;
@@ -16,12 +16,12 @@ use crate::file::judge::{judge, judge_place, Fault};
 use crate::file::sealed::{Refusal, SealedFile};
 use crate::file::{AddressRange, BlockFile};
 
-/// Judges what is to go into a device that speaks this dialect. Tells whether there is nothing left
-/// to ask: an application may not know its region, and its bootloader does.
+/// Checks a file for a device with this dialect. Returns whether the check is complete: an
+/// application may not know its region, and then the bootloader is asked later.
 ///
 /// # Errors
-/// [`Error::NoProgram`], [`Error::WrongTarget`], [`Error::OtherRegion`], and what a
-/// [read](Session::read) has.
+/// [`Error::NoProgram`], [`Error::WrongTarget`], [`Error::OtherRegion`], and the errors of a
+/// [read](Session::read).
 pub(super) fn admit(
     session: &mut Session<'_>,
     file: Content<'_>,
@@ -45,7 +45,7 @@ pub(super) fn admit(
     admit_place(session, file, &image, dialect, options.program)
 }
 
-/// Judges the place alone; tells whether the device has told where it has its program.
+/// Checks only the region; returns whether the device has reported its region.
 ///
 /// # Errors
 /// As [`admit`].
@@ -62,7 +62,7 @@ pub(super) fn admit_to_bootloader(
     }
 }
 
-/// Judges a sealed image: its program, its device, and its size.
+/// Checks a sealed image: its program number, its device and its size.
 fn admit_sealed(session: &mut Session<'_>, file: &SealedFile, program: u8) -> Result<bool, Error> {
     let head = file.head();
     if head.program() != program {
@@ -71,20 +71,20 @@ fn admit_sealed(session: &mut Session<'_>, file: &SealedFile, program: u8) -> Re
     for (sub, image, what) in
         [(1, head.vendor_id(), Mismatch::VendorId), (2, head.product_code(), Mismatch::ProductCode)]
     {
-        // 0 is no device's here, but that of one whose identity is 0.
+        // 0 is a normal value here: it only matches a device with the identity 0.
         compare_identity(session, sub, image, what)?;
     }
     admit_capable(session, file, program)
 }
 
-/// Judges what a bootloader knows and an application may not: whether the device takes sealed images,
-/// and its room. Tells whether the device has told both.
+/// Checks what the bootloader reports and an application may not: whether the device accepts sealed
+/// images, and its room. Returns whether the device has reported both.
 fn admit_capable(session: &mut Session<'_>, file: &SealedFile, program: u8) -> Result<bool, Error> {
     let challenge = told_challenge(session)?;
     if challenge.is_some_and(|challenge| !challenge.is_sealed()) {
-        let why = "cannot be taken: the device is not sealed, it has no keys to check it with";
+        let why = "cannot be installed: the device is not sealed and has no keys to check the image";
         let advice =
-            "write keys into the device by the probe (coflash provision makes the file), or flash the \
+            "write keys into the device with a debug probe (coflash provision makes the file), or flash the \
                       program as it is, not sealed";
         return Err(Error::NoProgram { why: why.to_string(), advice });
     }
@@ -92,7 +92,7 @@ fn admit_capable(session: &mut Session<'_>, file: &SealedFile, program: u8) -> R
     Ok(room && challenge.is_some())
 }
 
-/// Judges the size of a sealed image; tells whether the device has told its room.
+/// Checks the size of a sealed image; returns whether the device has reported its room.
 fn admit_room(session: &mut Session<'_>, size: u32, program: u8) -> Result<bool, Error> {
     match program_region(session, program)? {
         None => Ok(false),
@@ -118,7 +118,7 @@ fn admit_place(
     let region = AddressRange { first: told.base, last: told.last() };
     let (start, size) = (file.program_start(), u64::from(file.program_size()));
     let fits = match dialect {
-        // The CRC over the program counts from the region's start.
+        // The CRC of the program counts from the region's start.
         Dialect::Block => file.check_region(region).is_ok(),
         Dialect::Hex | Dialect::EsAcademy => region.contains(&file.span()),
         Dialect::Raw | Dialect::Lift if start == 0 => {
@@ -142,8 +142,8 @@ fn admit_place(
     })
 }
 
-/// Compares what the file tells with 1018h. 0 in the file is any device, as it is for a bootloader;
-/// what a device does not tell cannot differ.
+/// Compares the identity in the file with 1018h. 0 in the file stands for any device, as it does
+/// for a bootloader; a value that the device does not report cannot differ.
 fn check_identity(session: &mut Session<'_>, target: Option<Target>) -> Result<(), Error> {
     let Some(Target { vendor_id, product_code }) = target else { return Ok(()) };
     for (sub, file, what) in [(1, vendor_id, Mismatch::VendorId), (2, product_code, Mismatch::ProductCode)] {

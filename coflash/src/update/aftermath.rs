@@ -1,4 +1,5 @@
-//! What a failed update leaves behind: the device is asked, and not only what was done to it is told.
+//! The state of a device after a failed update: the tool asks the device, in addition to what it
+//! knows itself.
 
 use std::time::Duration;
 
@@ -10,11 +11,11 @@ use super::left::{DeviceState, Left, Look, Seen};
 use crate::device::error::{optional, Error};
 use crate::device::{DeviceType, Session, Timing};
 
-/// How long the device may take for its answer, which is asked for twice.
+/// How long the device may take for its answer; there are two attempts.
 const ANSWER: Duration = Duration::from_millis(500);
 
-/// Asks the device in what state the update has left it, `original` being the node-ID that this was
-/// begun with, and `crc` that of the file.
+/// Asks the device for its state after the update. `original` is the node-ID at the start of the
+/// update, and `crc` the CRC of the file.
 pub(super) fn look(
     session: &mut Session<'_>,
     error: &Error,
@@ -46,7 +47,7 @@ pub(super) fn look(
 fn ask(session: &mut Session<'_>, number: u8) -> Result<Seen, Error> {
     let running = DeviceType(session.read_number(Address::new(program::DEVICE_TYPE, 0))?);
     let mut object = |index| match optional(session.read_number(Address::new(index, number))) {
-        // What is refused in another way, or of another length, is not told.
+        // Any other refusal, or a value of another length, counts as not reported.
         Err(Error::Refused { .. } | Error::Protocol { .. }) => Ok(None),
         told => told,
     };
@@ -55,13 +56,13 @@ fn ask(session: &mut Session<'_>, number: u8) -> Result<Seen, Error> {
     Ok(Seen { running, control, crc })
 }
 
-/// What is in a device that was last known as the course has it, and tells this.
+/// The state of a device, from the course of the update and the device's answers.
 fn judge(course: &Course<'_>, seen: &Seen, crc: u32) -> DeviceState {
     match course.state {
-        // It was called, and its application stays, or is back.
+        // The application was called and has stayed, or is back.
         DeviceState::Called if !seen.running.is_bootloader() => DeviceState::Untouched,
         DeviceState::Erased if !seen.empty() => match seen.crc {
-            // A device that erases with the first block that it finds good has found none.
+            // A device that erases with the first good block has received none.
             told @ Some(_) if !course.wrote && told == course.before => course.resting,
             Some(told) if course.wrote && told == crc && seen.control.is_some() => DeviceState::Unreleased,
             _ => DeviceState::Erased,

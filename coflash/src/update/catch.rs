@@ -1,7 +1,8 @@
-//! Knocking: a device that is switched on is caught in its bootloader before its program starts.
+//! Catches a device when it is switched on: holds it in its bootloader before its program starts.
 //!
-//! A program that was never confirmed is held back for 300 ms, and an SDO request to the node, or any
-//! layer setting service, keeps the device in its bootloader. So it is asked ten times a second.
+//! The bootloader holds back a program that was never confirmed for 300 ms. An SDO request to the
+//! node, or any layer setting service, during this time keeps the device in its bootloader. The
+//! tool therefore sends a request ten times a second.
 
 use std::time::Duration;
 
@@ -12,24 +13,24 @@ use super::event::{Event, Phase};
 use super::steps::call_back;
 use crate::device::{DeviceType, Doing, Error, Session, Timing};
 
-/// The longest pause between two knocks, waiting for the answer included: a rescue window is three
-/// times as long.
+/// The longest pause between two requests, including the wait for the answer: a third of the rescue
+/// window.
 const KNOCK: Duration = Duration::from_millis(100);
 
-/// "Identify non-configured remote slave" (CiA 305): a device without node-ID answers it by 50h, and
-/// all others pass over it; it changes nothing in any of them.
+/// "Identify non-configured remote slave" (CiA 305): a device without a node-ID answers it with
+/// 50h, and all other devices ignore it. It changes nothing in a device.
 const ANYBODY: [u8; 8] = [0x4C, 0, 0, 0, 0, 0, 0, 0];
 /// The answer.
 const NOBODY_YET: u8 = 0x50;
 
-/// Whom to catch, and for how long.
+/// The device to catch, and the time limit.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct CatchOptions {
-    /// Whichever device comes up, and not the session's node alone. It knocks by a layer setting
-    /// service, which holds every device that comes up meanwhile in its bootloader.
+    /// Catch any device, not only the node of the session. The requests are then a layer setting
+    /// service, which holds every device that starts meanwhile in its bootloader.
     pub any: bool,
-    /// Gives up after this time; `None` for never.
+    /// Give up after this time; `None` for no limit.
     pub within: Option<Duration>,
 }
 
@@ -44,14 +45,15 @@ impl CatchOptions {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Caught {
-    /// Its node-ID; `None` where it has none.
+    /// Its node-ID; `None` if it has none.
     pub node: Option<NodeId>,
-    /// What its bootloader says it is; `None` without a node-ID, where it says nothing.
+    /// Its device type; `None` for a device without a node-ID, which cannot report it.
     pub running: Option<DeviceType>,
 }
 
-/// Knocks until a device answers in its bootloader, and stays there. One whose application answers is
-/// called back, again and again; with [`any`](CatchOptions::any) no application is called.
+/// Sends requests until a device answers in its bootloader and stays there. A device whose
+/// application answers is called back, again and again; with [`any`](CatchOptions::any) no
+/// application is called.
 ///
 /// # Errors
 /// [`Error::NoAnswer`] or [`Error::NoBootloader`] when [`within`](CatchOptions::within) has passed,
@@ -90,8 +92,7 @@ pub fn catch(
     }
 }
 
-/// Asks until something answers; gives what that says it is.
-///
+/// Sends requests until a device answers; returns its device type.
 /// # Errors
 /// [`Error::NoAnswer`] at the deadline, [`Error::Adapter`], [`Error::Cancelled`].
 pub(super) fn knock(
@@ -118,7 +119,7 @@ pub(super) fn knock(
     }
 }
 
-/// What is heard while everybody is knocked at.
+/// The answers while the requests go to all devices.
 enum Heard {
     BootUp(NodeId),
     WithoutNodeId,
@@ -129,7 +130,7 @@ fn catch_anybody(
     deadline: Option<Duration>,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Caught, Error> {
-    tell(Phase::Searching { reason: "no device has come up".to_string() }.into());
+    tell(Phase::Searching { reason: "no device has started".to_string() }.into());
     loop {
         session.send(&Frame::of(CobId::LSS_REQUEST, &ANYBODY))?;
         let mut heard = None;

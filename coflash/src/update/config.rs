@@ -1,24 +1,24 @@
-//! The configuration file: defaults for options, so that they need not be typed.
+//! The configuration file, which contains defaults for options.
 
 use std::fmt;
 
 use super::toml_line::line_of;
 
-/// A setting's value.
+/// The value of a setting.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Setting {
-    /// A number or a text, as the command line would have it.
+    /// A number or a text, in the form of the command line.
     Value(String),
-    /// An option without a value: whether it is given.
+    /// An option without a value: whether it is set.
     Switch(bool),
 }
 
-/// What is wrong with a configuration file.
+/// An error in a configuration file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Fault {
-    /// It is no TOML, in this line.
+    /// The file is not TOML; with the number of the line.
     Line(usize, String),
-    /// It says what it may not say.
+    /// A setting is not permitted.
     Setting(String),
 }
 
@@ -33,11 +33,11 @@ impl fmt::Display for Fault {
 
 impl std::error::Error for Fault {}
 
-/// Takes a configuration file apart: options with their values. `is_switch` tells of an option
-/// whether it has none; `None` for one that there is not.
+/// Parses a configuration file into options with their values. `is_switch` returns whether an
+/// option is a switch without a value, or `None` for an unknown option.
 ///
 /// # Errors
-/// The first thing that is wrong with it.
+/// The first error in the file.
 pub fn parse(text: &str, is_switch: &dyn Fn(&str) -> Option<bool>) -> Result<Vec<(String, Setting)>, Fault> {
     let table: toml::Table = text
         .parse()

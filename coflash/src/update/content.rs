@@ -1,5 +1,4 @@
-//! What an update brings into a device: blocks that a program was cut into, or a sealed image, which is
-//! sent as it is.
+//! The content of an update: a program in blocks, or a sealed image, which is sent unchanged.
 
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -11,7 +10,7 @@ use crate::device::error::flash_error_number;
 use crate::file::sealed::{Refusal, SealedFile};
 use crate::file::{judge, BlockFile};
 
-/// What an update brings into a device.
+/// The content of an update.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Content<'f> {
     /// A program in blocks.
@@ -21,7 +20,7 @@ pub(super) enum Content<'f> {
 }
 
 impl<'f> Content<'f> {
-    /// Bytes of the program as it lies in flash.
+    /// Size of the program in flash in bytes.
     pub(super) fn program_size(self) -> u32 {
         match self {
             Self::Blocks(file) => file.program_size(),
@@ -29,7 +28,7 @@ impl<'f> Content<'f> {
         }
     }
 
-    /// What 1F56h reads when the program is in the device.
+    /// The value of 1F56h after the download.
     pub(super) fn program_crc(self) -> u32 {
         match self {
             Self::Blocks(file) => file.program_crc(),
@@ -37,8 +36,8 @@ impl<'f> Content<'f> {
         }
     }
 
-    /// What a device gets that takes all of it with one download: what this makes of blocks, or a sealed
-    /// image as it is.
+    /// The data for a device that takes everything in one download: the result of `of_blocks`, or
+    /// the sealed image unchanged.
     pub(super) fn stream(self, of_blocks: impl FnOnce(&BlockFile) -> Vec<u8>) -> Cow<'f, [u8]> {
         match self {
             Self::Blocks(file) => Cow::Owned(of_blocks(file)),
@@ -47,7 +46,7 @@ impl<'f> Content<'f> {
     }
 }
 
-/// The same, shared by the devices that get it.
+/// The content of an update, shared by several devices.
 #[derive(Clone, Debug)]
 pub enum Program {
     /// A program in blocks.
@@ -57,7 +56,7 @@ pub enum Program {
 }
 
 impl Program {
-    /// The device that it names, if it names one.
+    /// The target device, if the content names one.
     #[must_use]
     pub fn target(&self) -> Option<Target> {
         match self {
@@ -74,8 +73,8 @@ impl Program {
     }
 }
 
-/// The stable number of a sealed image that is refused without a device: the one that a device with the
-/// same keys would have brought about, or that of what is no program.
+/// The stable error number of a sealed image that is refused without a device: the number that a
+/// device with the same keys would cause, or that of a file without a program.
 #[must_use]
 pub fn refusal_number(refusal: &Refusal) -> u32 {
     match refusal {

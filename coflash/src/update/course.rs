@@ -1,30 +1,30 @@
-//! An update under way: what it has done to the device so far, and who hears of it.
+//! A running update: what it has done to the device, and the function that gets its events.
 
 use super::event::Event;
 use super::left::DeviceState;
 use crate::device::flying_master::Mastership;
 
-/// An update under way.
+/// A running update.
 pub(super) struct Course<'t> {
-    /// What has become of the device so far.
+    /// The state of the device so far.
     pub(super) state: DeviceState,
-    /// Whether anything was done that might have changed the device.
+    /// Whether any action may have changed the device.
     pub(super) touched: bool,
-    /// What it was before the erasure.
+    /// The state before the erase.
     pub(super) resting: DeviceState,
-    /// What 1F56h read before the erasure, where it was asked.
+    /// The value of 1F56h before the erase, if it was read.
     pub(super) before: Option<u32>,
-    /// Whether any of the new program may be in the device.
+    /// Whether the device may contain a part of the new program.
     pub(super) wrote: bool,
-    /// The NMT mastership, while the tool has it.
+    /// The NMT mastership, while the tool holds it.
     pub(super) mastership: Option<Mastership>,
     tell: &'t mut dyn FnMut(Event),
-    /// What was told already, for as long as each thing is told once.
+    /// The events that were reported, if each event is reported only once.
     told: Option<Vec<Event>>,
 }
 
 impl<'t> Course<'t> {
-    /// An update that has done nothing yet.
+    /// An update that has not done anything yet.
     pub(super) fn new(tell: &'t mut dyn FnMut(Event)) -> Self {
         Self {
             state: DeviceState::Untouched,
@@ -38,7 +38,7 @@ impl<'t> Course<'t> {
         }
     }
 
-    /// The erasure is about to begin; 1F56h reads this before it, where it was asked.
+    /// Records that the erase is about to start; `before` is the value of 1F56h, if it was read.
     pub(super) fn erases(&mut self, before: Option<u32>) {
         self.touched = true;
         if self.state != DeviceState::Erased {
@@ -47,14 +47,14 @@ impl<'t> Course<'t> {
         }
     }
 
-    /// It was refused, so that nothing is erased.
+    /// Records that the device has refused the erase.
     pub(super) fn erases_not(&mut self) {
         if !self.wrote {
             self.state = self.resting;
         }
     }
 
-    /// Tells what happens.
+    /// Reports an event.
     pub(super) fn tell(&mut self, event: Event) {
         if let Some(told) = &mut self.told {
             if told.contains(&event) {
@@ -65,7 +65,7 @@ impl<'t> Course<'t> {
         (self.tell)(event);
     }
 
-    /// From now on each thing is told once, or, again, as often as it happens.
+    /// Sets whether repeated events are reported only once.
     pub(super) fn tell_once(&mut self, once: bool) {
         self.told = once.then(Vec::new);
     }

@@ -1,9 +1,8 @@
-//! What happens during an update, for whoever watches it: one vocabulary for people, programs and
-//! pages.
+//! The events of an update, with one set of names for people, programs and pages.
 //!
-//! Each event has words for people (`Display`), and a form for programs ([`Event::line`]): one
-//! object with the node, the kind of the event as `event`, what belongs to it under names that
-//! stay, and the words as `text`.
+//! Each event has a text for people (`Display`) and a form for programs ([`Event::line`]): one
+//! object with the node, the kind of the event as `event`, its data under stable names, and the
+//! text as `text`.
 
 use std::fmt;
 
@@ -17,47 +16,47 @@ pub use super::retry::{RepeatReason, Retry};
 use crate::device::{DeviceType, Error};
 use crate::json;
 
-/// What happens during an update. `Display` has words for people.
+/// An event of an update. `Display` has the text for people.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum Event {
-    /// Step 2: this is running on the device.
+    /// Step 2: the device type of what runs on the device.
     Found(DeviceType),
-    /// The update has come to here.
+    /// The update has entered this phase.
     Phase(Phase),
-    /// Steps 6 to 9: so far the transfer has come.
+    /// Steps 6 to 9: the progress of the transfer.
     Progress {
-        /// Bytes that are in the device.
+        /// Bytes that have arrived in the device.
         done: usize,
-        /// Bytes in all.
+        /// Total number of bytes.
         total: usize,
     },
-    /// A block, or the whole program, is sent again.
+    /// A block or the whole program is sent again.
     Retry(Retry),
-    /// Something about the device that is good to know.
+    /// Useful information about the device.
     Note(Note),
-    /// Something that may go wrong because of it.
+    /// A problem that may make the update fail.
     Warning(Warning),
-    /// The end, good or bad. Nothing comes behind it.
+    /// The end, successful or not. No event follows it.
     Done(Box<Done>),
 }
 
-/// How an update ended. `Display` says, of one that failed, how it leaves the device.
+/// How an update ended. After a failure, `Display` describes the state of the device.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct Done {
-    /// How the device is left.
+    /// The state of the device.
     #[serde(flatten)]
     pub left: Left,
-    /// What was done, if all of it was.
+    /// The results of a successful update.
     pub report: Option<Report>,
-    /// What went wrong otherwise.
+    /// The error of a failed update.
     pub error: Option<Problem>,
 }
 
 impl Done {
-    /// The end of an update that has come to this result, and leaves the device like this.
+    /// The end of an update with this result, and this state of the device.
     pub(super) fn new(left: Left, result: &Result<Report, Error>) -> Self {
         match result {
             Ok(report) => Self { left, report: Some(*report), error: None },
@@ -66,7 +65,7 @@ impl Done {
     }
 }
 
-/// An [`Error`] that is told on.
+/// An [`Error`] in the form for events.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct Problem {
@@ -80,14 +79,14 @@ pub struct Problem {
 }
 
 impl Problem {
-    /// What this error says of itself.
+    /// The data of this error.
     #[must_use]
     pub fn of(error: &Error) -> Self {
         Self { number: error.number(), what: error.to_string(), advice: error.advice() }
     }
 }
 
-/// An event as one line for programs has it.
+/// An event in the form of one line for programs.
 #[derive(Debug, Serialize)]
 pub struct Line<'e> {
     #[serde(serialize_with = "json::node")]
@@ -103,13 +102,13 @@ fn words<S: Serializer>(event: &&Event, serializer: S) -> Result<S::Ok, S::Error
 }
 
 impl Event {
-    /// The event for programs: with the node that it is about, and with its words.
+    /// The event for programs, with its node and its text.
     #[must_use]
     pub fn line(&self, node: NodeId) -> Line<'_> {
         Line { node, event: self, text: self }
     }
 
-    /// How a failed update leaves the device, if this is the end of one.
+    /// The state of the device, if this event is the end of a failed update.
     #[must_use]
     pub fn left(&self) -> Option<Left> {
         match self {

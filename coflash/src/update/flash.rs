@@ -1,8 +1,8 @@
-//! The update of a device: the procedure of the manual (L-1112d_10, "Prinzipieller Ablauf"), steps
-//! 2 to 15.
+//! The update of a device: steps 2 to 15 of the procedure in the manual (L-1112d_10, "Prinzipieller
+//! Ablauf").
 //!
-//! Step 1, making the blocks, is [`convert`](mod@crate::file::convert). Everything that can be judged
-//! before the device is touched is judged there and in `admission`.
+//! Step 1, making the blocks, is [`convert`](mod@crate::file::convert). All checks that are
+//! possible before the device is changed are made there and in `admission`.
 
 use std::cell::RefCell;
 
@@ -20,12 +20,12 @@ use crate::device::{flying_master, Error, Session};
 use crate::file::sealed::SealedFile;
 use crate::file::BlockFile;
 
-/// Puts a program into a device: finds out what runs there, calls the bootloader, erases, sends the
-/// blocks, compares the CRC, tries the program, releases it for autostart and starts it.
+/// Downloads a program into a device: detects what runs there, calls the bootloader, erases, sends
+/// the blocks, compares the CRC, tries the program, releases it for autostart and starts it.
 ///
-/// `tell` hears what happens; the last it hears is [`Event::Done`], however it ends.
+/// `tell` gets the events; the last event is always [`Event::Done`].
 ///
-/// A run that was interrupted at any point can be started again at once.
+/// An update that was interrupted at any point can be started again at once.
 ///
 /// # Errors
 /// The first step that fails ends the procedure. Until the program is released for autostart, the
@@ -39,8 +39,8 @@ pub fn flash(
     flash_content(session, Content::Blocks(file), options, tell)
 }
 
-/// [`flash`] with a sealed image, which is sent as it is, with one download. Whether the device takes
-/// it is the device's to say; what can be judged without its keys is judged before it is sent.
+/// [`flash`] with a sealed image, which is sent unchanged in one download. Only the device can
+/// check the signature; all checks that need no keys are made before the download.
 ///
 /// # Errors
 /// Those of [`flash`].
@@ -87,7 +87,7 @@ fn flash_content(
         Err(error) => look(&mut inner, error, &course, original, options.program, file.program_crc()),
     };
     if let Some(taken) = course.mastership.take() {
-        // What became of the update stands, whatever becomes of this.
+        // The result of the update stands, even if this fails.
         if let Ok(master) = flying_master::give_back(&mut inner, taken) {
             course.tell(match master {
                 Some(master) => Note::MasterBack { node: master.node }.into(),
@@ -96,14 +96,14 @@ fn flash_content(
         }
     }
     course.tell(Event::Done(Box::new(Done::new(left, &result))));
-    // It may have followed the device to another node-ID.
+    // The session may have followed the device to another node-ID.
     let (node, transfers) = (inner.node(), inner.transfers());
     session.talk_to(node);
     session.transfer_by(transfers);
     result
 }
 
-/// [`flash`], but for what has to be done however it ends.
+/// [`flash`] without the actions that are necessary after success and failure alike.
 fn procedure(
     session: &mut Session<'_>,
     file: Content<'_>,

@@ -1,7 +1,8 @@
-//! Whether a device holds the program of a sealed image, by all that the device tells: its identity,
-//! its keys, CRC and version of the program, and what it has recorded.
+//! Checks whether a device holds the program of a sealed image, from the device's answers: its
+//! identity, its keys, CRC and version of the program, and its event log.
 //!
-//! These are a device's own words. One that runs somebody else's code says whatever that code says.
+//! The answers come from the device's own software. A device with foreign software may give any
+//! answers.
 
 use std::fmt;
 
@@ -18,34 +19,34 @@ use crate::device::{DeviceType, Session};
 use crate::file::sealed::show::digits;
 use crate::file::sealed::SealedFile;
 
-/// What a device tells of the program of a sealed image.
+/// The result of comparing a device with a sealed image.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Held {
-    /// Whether its bootloader runs, or an application.
+    /// The device type of what runs: the bootloader or an application.
     pub running: DeviceType,
     /// Whether the program runs.
     pub runs: bool,
-    /// In what it is another device, or has another program. Without any it holds the program, as far
-    /// as it tells.
+    /// The differences between device and file. If there is none, the device holds the program,
+    /// according to its own answers.
     pub differences: Vec<Difference>,
-    /// The objects that it does not have, and that could not be compared therefore. An application
-    /// may lack some that the bootloader has.
+    /// The objects that the device does not have, and that could therefore not be compared. An
+    /// application may lack objects that the bootloader has.
     pub untold: Vec<Address>,
 }
 
-/// One thing in which device and file differ.
+/// A difference between device and file.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Difference {
-    /// What it is.
+    /// The compared property.
     pub what: Part,
-    /// What the file says.
+    /// The file's value.
     pub file: String,
-    /// What the device tells.
+    /// The device's value.
     pub device: String,
 }
 
-/// What is compared.
+/// The compared properties.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Part {
@@ -55,7 +56,7 @@ pub enum Part {
     ProductCode,
     /// 1018h/3, low 5 bits.
     Hardware,
-    /// The chip's, in 2002h/1.
+    /// The unique ID of the chip, in 2002h/1.
     UniqueId,
     /// Whether the device has keys: bit 31 of the last word of 2002h/1.
     Keys,
@@ -63,9 +64,9 @@ pub enum Part {
     Crc,
     /// 2005h.
     Version,
-    /// That of the last installation of this program in 2003h.
+    /// The security counter of this program's last installation in 2003h.
     InstalledCounter,
-    /// The same.
+    /// The version of this program's last installation in 2003h.
     InstalledVersion,
 }
 
@@ -93,7 +94,7 @@ impl fmt::Display for Difference {
 }
 
 impl Held {
-    /// Whether the device differs in nothing that it tells.
+    /// Whether no reported value differs.
     #[must_use]
     pub fn is_same(&self) -> bool {
         self.differences.is_empty()
@@ -110,10 +111,11 @@ impl Held {
     }
 }
 
-/// Compares what a device tells with what a sealed image says, in the bootloader or in an application.
-/// Nothing is changed in the device.
+/// Compares a device's answers with a sealed image, in the bootloader or in an application. Changes
+/// nothing in the device.
 ///
 /// # Errors
+/// [`Error::NoAnswer`] and others; a missing object is not an error.
 /// [`Error::NoAnswer`] and the like; an object that the device does not have is no error.
 pub fn held(session: &mut Session<'_>, file: &SealedFile) -> Result<Held, Error> {
     const RUNNING: u32 = ProgramState::Running as u32;
@@ -151,8 +153,8 @@ pub fn held(session: &mut Session<'_>, file: &SealedFile) -> Result<Held, Error>
     match number(&mut held, Address::new(PROGRAM_ID, program))? {
         Some(0) if head.crc() != 0 => held.differs(Part::Crc, hexadecimal(head.crc()), "no program"),
         Some(device) => held.compare(Part::Crc, head.crc(), device, hexadecimal),
-        // Nothing else would tell the program.
-        None => held.differs(Part::Crc, hexadecimal(head.crc()), "tells none"),
+        // No other object identifies the program.
+        None => held.differs(Part::Crc, hexadecimal(head.crc()), "reports none"),
     }
     if let Some(device) = number(&mut held, Address::new(PROGRAM_VERSION, program))? {
         held.compare(Part::Version, head.version(), device, release);
@@ -162,7 +164,7 @@ pub fn held(session: &mut Session<'_>, file: &SealedFile) -> Result<Held, Error>
     Ok(held)
 }
 
-/// 2002h: which chip it is, and whether it is sealed.
+/// 2002h: compares the unique ID, and checks whether the device is sealed.
 fn compare_access(session: &mut Session<'_>, file: &SealedFile, held: &mut Held) -> Result<(), Error> {
     match told_challenge(session)? {
         Some(challenge) => {
@@ -171,11 +173,11 @@ fn compare_access(session: &mut Session<'_>, file: &SealedFile, held: &mut Held)
                 held.compare(Part::UniqueId, only_for, challenge.unique_id(), |id| digits(&id));
             }
             if !challenge.is_sealed() {
-                held.differs(Part::Keys, "a signature to be checked", "is not sealed, it has no keys");
+                held.differs(Part::Keys, "a signature to be checked", "is not sealed and has no keys");
             }
         }
         None if held.running.is_bootloader() => {
-            let device = "has a bootloader that knows no sealed images";
+            let device = "has a bootloader without support for sealed images";
             held.differs(Part::Keys, "a signature to be checked", device);
         }
         None => held.untold.push(Address::new(ACCESS, 1)),
@@ -183,8 +185,8 @@ fn compare_access(session: &mut Session<'_>, file: &SealedFile, held: &mut Held)
     Ok(())
 }
 
-/// 2003h: what was installed as this program last. One that is not among the last eight events is not
-/// told.
+/// 2003h: compares the last installation of this program. An installation that is not among the
+/// last eight events counts as not reported.
 fn compare_events(session: &mut Session<'_>, file: &SealedFile, held: &mut Held) -> Result<(), Error> {
     let head = file.head();
     let installed = event::INSTALLED | u32::from(head.program());

@@ -1,4 +1,4 @@
-//! The job file of `coflash flash --job`: which devices get what.
+//! The job file of `coflash flash --job`: the devices and their programs.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use serde::Deserialize;
 use super::toml_line::line_of;
 use crate::device::lss::LssAddress;
 
-/// A job file. What is said at its top holds for every device that does not say otherwise.
+/// A job file. The settings at its top apply to every device without a setting of its own.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 struct File {
@@ -19,18 +19,18 @@ struct File {
     devices: Vec<Device>,
 }
 
-/// What can be said for all devices and for each of them.
+/// The settings for all devices, or for one device.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
 pub struct Settings {
-    /// The firmware, from the job file's folder.
+    /// The firmware file, relative to the job file's folder.
     pub image: Option<PathBuf>,
     /// The board, by its name.
     pub board: Option<String>,
     /// The program's number, 1 to 254.
     pub program: Option<u8>,
-    /// Compare the device's identity first.
+    /// Compare the device's identity before the update.
     pub check_target: Option<bool>,
     /// Start the program once and call it back before it is released for autostart.
     pub trial_run: Option<bool>,
@@ -46,7 +46,7 @@ struct Device {
     lss: Option<Lss>,
     #[serde(flatten)]
     settings: Settings,
-    /// What nobody knows: flattened structures cannot refuse it by themselves.
+    /// Unknown settings: serde cannot refuse them in flattened structures.
     #[serde(flatten)]
     unknown: toml::Table,
 }
@@ -60,19 +60,19 @@ struct Lss {
     serial: u32,
 }
 
-/// One device of a job file, with the file's defaults.
+/// One device of a job file, with the file's defaults applied.
 #[derive(Debug)]
 #[non_exhaustive]
 pub struct Entry {
-    /// Its node-ID, or the one that it is to get.
+    /// Its node-ID, or the node-ID to set.
     pub node: Option<NodeId>,
-    /// Its LSS address, if it is named by that.
+    /// Its LSS address, if the file names it by that.
     pub address: Option<LssAddress>,
-    /// How to treat it.
+    /// The settings of its update.
     pub settings: Settings,
 }
 
-/// Where a job file is wrong, and what about it.
+/// An error in a job file, with its place.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Fault {
     /// In this line.
@@ -92,11 +92,11 @@ impl fmt::Display for Fault {
 
 impl std::error::Error for Fault {}
 
-/// Takes a job file apart that lies in this folder. There is at least one device in it; each has an
-/// image, and a node-ID or an LSS address that no other one has.
+/// Parses a job file in this folder. The result has at least one device. Each device has an image,
+/// and a unique node-ID or LSS address.
 ///
 /// # Errors
-/// The first thing that is wrong with it.
+/// The first error in the file.
 pub fn parse(text: &str, folder: &Path) -> Result<Vec<Entry>, Fault> {
     let file: File = toml::from_str(text)
         .map_err(|error| Fault::Line(line_of(text, &error), error.message().to_string()))?;
@@ -126,7 +126,7 @@ pub fn parse(text: &str, folder: &Path) -> Result<Vec<Entry>, Fault> {
             (node.is_some() && entry.node == node) || (address.is_some() && entry.address == address)
         };
         if entries.iter().any(same) {
-            return Err(wrong("it is in the list already".to_string()));
+            return Err(wrong("the list contains it twice".to_string()));
         }
         let own = device.settings;
         let image = own.image.or_else(|| defaults.image.clone());
@@ -150,7 +150,7 @@ pub fn parse(text: &str, folder: &Path) -> Result<Vec<Entry>, Fault> {
     Ok(entries)
 }
 
-/// The names of [`Settings`]: serde hands these to the table of the unknown, too.
+/// The names of [`Settings`]: serde also puts these into the table of unknown settings.
 const SETTINGS: [&str; 7] = ["image", "board", "program", "check-target", "trial-run", "start", "verify"];
 
 #[cfg(test)]
@@ -202,7 +202,7 @@ mod tests {
             ("image = 'a'\nprogram = 255\n[[device]]\nnode = 1\n", "device 1: programs are 1 to 254"),
             (
                 "image = 'a'\n[[device]]\nnode = 1\n[[device]]\nnode = 1\n",
-                "device 2: it is in the list already",
+                "device 2: the list contains it twice",
             ),
             ("image = 'a'\n[[device]]\nnode = 1\nspeed = 2\n", "device 1: there is no setting 'speed'"),
             ("speed = 2\nimage = 'a'\n[[device]]\nnode = 1\n", "speed"),

@@ -1,4 +1,4 @@
-//! What came of a download, and whether sending it again may help.
+//! The result of a download, and whether a repetition may help.
 
 use canopen::program::FlashError;
 use canopen::AbortCode;
@@ -6,20 +6,20 @@ use canopen::AbortCode;
 use super::event::RepeatReason;
 use crate::device::{Doing, Error};
 
-/// What came of a download.
+/// The result of a download.
 pub(crate) enum Judgement {
-    /// It arrived, and the device is content.
+    /// The data arrived, and the device reports no error.
     Good,
-    /// It did not, or it is not.
+    /// The data did not arrive, or the device reports an error.
     Bad {
-        /// Why sending it again may help, if it may.
+        /// The reason for a repetition, if a repetition may help.
         why: Option<RepeatReason>,
-        /// What it is called if it is not sent again.
+        /// The error if it is not repeated.
         error: Error,
     },
 }
 
-/// Judges a download by its outcome and by what the device's status says, with its detail.
+/// Judges a download by its result and by the device's status with its detail.
 pub(crate) fn judge(sent: Result<(), Error>, status: Option<(FlashError, u16)>, doing: Doing) -> Judgement {
     let (why, error) = match (sent, status) {
         (Ok(()), None) => return Judgement::Good,
@@ -40,7 +40,7 @@ pub(crate) fn judge(sent: Result<(), Error>, status: Option<(FlashError, u16)>, 
     Judgement::Bad { why, error }
 }
 
-/// Whether sending a block again can help against this error.
+/// The reason for a repetition, if it can help against this error.
 fn repeatable(error: FlashError) -> Option<RepeatReason> {
     match error {
         FlashError::Crc => Some(RepeatReason::Crc),

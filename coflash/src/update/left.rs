@@ -1,4 +1,4 @@
-//! How a failed update leaves a device, for people and programs.
+//! The state of a device after a failed update.
 
 use std::fmt;
 
@@ -8,25 +8,25 @@ use serde::{Serialize, Serializer};
 
 use crate::device::DeviceType;
 
-/// What a procedure that failed leaves in the device.
+/// The contents of a device after a failed procedure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DeviceState {
     /// Nothing was changed.
     Untouched,
-    /// The bootloader was called; the old program is whole.
+    /// The bootloader was called; the old program is intact.
     Called,
-    /// The erasure was begun: there is no program, or an incomplete one, as far as is known.
+    /// The erase was started: as far as is known, there is no program, or an incomplete one.
     Erased,
-    /// The new program is in, in a dialect that has no release for autostart.
+    /// The new program is complete, in a dialect without a release for autostart.
     Written,
-    /// The new program is in and right, but not released for autostart.
+    /// The new program is complete and correct, but not released for autostart.
     Unreleased,
-    /// The new program is in and released for autostart.
+    /// The new program is complete and released for autostart.
     Released,
 }
 
 impl DeviceState {
-    /// Its name for programs, which stays.
+    /// Its stable name for programs.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -49,59 +49,59 @@ impl Serialize for DeviceState {
 impl fmt::Display for DeviceState {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            Self::Untouched => "nothing was changed in it",
-            Self::Called => "it was called back to the bootloader, and its program is as it was",
-            Self::Erased => "there is no complete program in it",
-            Self::Written => "the new program is in it: it starts after a reset",
+            Self::Untouched => "it was not changed",
+            Self::Called => "it was called back to the bootloader, and its program is unchanged",
+            Self::Erased => "it contains no complete program",
+            Self::Written => "it contains the new program, which starts after a reset",
             Self::Unreleased => {
-                "the new program is in it, not released for autostart: after a reset the bootloader waits for the next attempt"
+                "it contains the new program, not released for autostart: after a reset the bootloader waits for the next attempt"
             }
-            Self::Released => "the new program is in it and released for autostart: it starts after a reset",
+            Self::Released => "it contains the new program, released for autostart: it starts after a reset",
         })
     }
 }
 
-/// How an update that failed leaves the device. `Display` has words for people.
+/// The state of a device after a failed update. `Display` has the text for people.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Left {
-    /// What is in the device: as it told, otherwise as it was last known.
+    /// The device's contents: from its own answers if it answered, otherwise the last known state.
     pub state: DeviceState,
-    /// What the device told when it was asked afterwards.
+    /// The device's answers after the failure.
     pub look: Look,
 }
 
-/// What came of asking the device how it is.
+/// The result of asking the device for its state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Look {
-    /// It was not asked: nothing had been done to it, or there is no way to it any more.
+    /// It was not asked: it was not changed, or the connection is lost.
     NotAsked,
     /// It does not answer.
     Silent,
-    /// It told this.
+    /// It has answered.
     Seen(Seen),
 }
 
-/// What a device told.
+/// The answers of a device.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Seen {
     /// 1000h.
     pub running: DeviceType,
-    /// 1F51h of the program, if there is such an object.
+    /// 1F51h of the program, if the object exists.
     pub control: Option<u32>,
-    /// 1F56h of the program, if there is such an object.
+    /// 1F56h of the program, if the object exists.
     pub crc: Option<u32>,
 }
 
 impl Seen {
-    /// Whether the device says that it has no program.
+    /// Whether the device reports that it has no program.
     pub(super) fn empty(&self) -> bool {
         self.control == Some(ProgramState::Absent as u32) || self.crc == Some(0)
     }
 }
 
-/// `state`, and as `seen` what the device told, if it did.
+/// `state`, and the device's answers as `seen`, if there are any.
 impl Serialize for Left {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let seen = match &self.look {

@@ -13,38 +13,38 @@ use super::options::FlashOptions;
 use crate::bus::{hub, Adapter, Gateway};
 use crate::device::{Error, Session, Timing, Transfers};
 
-/// What one device is to get.
+/// The update of one device.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct Job {
-    /// Which device.
+    /// The device.
     pub node: NodeId,
     /// The program.
     pub file: Program,
-    /// How.
+    /// The options.
     pub options: FlashOptions,
 }
 
 impl Job {
-    /// This program for this device.
+    /// An update of this device with this program.
     #[must_use]
     pub fn new(node: NodeId, file: impl Into<Program>, options: FlashOptions) -> Self {
         Self { node, file: file.into(), options }
     }
 }
 
-/// How to treat all of them.
+/// The options for all updates.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct ManyOptions {
-    /// How long to wait for what. Answers wait behind those of other devices: the SDO time-out is
-    /// taken as many times as there are devices at once.
+    /// The time limits. Answers wait behind those of other devices, so the SDO time-out is
+    /// multiplied by the number of devices that are updated at the same time.
     pub timing: Timing,
-    /// How to write.
+    /// The form of downloads.
     pub transfers: Transfers,
-    /// How many devices are at work at the same time.
+    /// How many devices are updated at the same time.
     pub at_once: usize,
-    /// Ends all of them as soon as it is set.
+    /// Ends all updates when it is set.
     pub cancelled: Arc<AtomicBool>,
 }
 
@@ -68,17 +68,17 @@ impl Default for ManyOptions {
     }
 }
 
-/// A device that failed, and how it was left.
+/// A failed update, and the state of the device.
 #[derive(Debug)]
 pub struct Failed {
-    /// What went wrong.
+    /// The error.
     pub error: Error,
-    /// How it was left.
+    /// The state of the device.
     pub left: Left,
 }
 
-/// Updates all devices; a failure of one does not stop the others. `tell` hears what happens to
-/// which job, in threads of their own. The results are in the order of the jobs.
+/// Updates all devices; if one fails, the others continue. `tell` gets the events of each job, on
+/// separate threads. The results are in the order of the jobs.
 pub fn flash_many(
     adapter: &mut dyn Adapter,
     jobs: &[Job],
@@ -101,7 +101,8 @@ pub fn flash_many(
     hub::run(adapter, conversations, at_once)
 }
 
-/// The same behind a gateway, which does one thing at a time: one device after the other.
+/// Updates the devices behind a gateway one after the other, because a gateway does one transfer at
+/// a time.
 pub fn flash_in_turn(
     gateway: &mut dyn Gateway,
     jobs: &[Job],
@@ -115,7 +116,7 @@ pub fn flash_in_turn(
     jobs.iter().enumerate().map(one).collect()
 }
 
-/// Updates one of them.
+/// Updates one of the devices.
 fn update(
     session: &mut Session<'_>,
     job: &Job,

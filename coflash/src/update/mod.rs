@@ -1,5 +1,5 @@
-//! The update of devices: the procedure with its events, what each dialect makes of it, its single
-//! steps, and the same for many devices at once.
+//! The update of devices: the procedure with its events, its dialects, its single steps, and the
+//! update of many devices at once.
 
 mod admission;
 mod aftermath;

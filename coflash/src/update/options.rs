@@ -1,4 +1,4 @@
-//! What to do in an update beyond the download itself.
+//! The options of an update.
 
 use serde::Serialize;
 use shared_abi::block_file::Control;
@@ -11,44 +11,45 @@ use crate::file::label::label_of;
 use crate::file::sealed::SealedFile;
 use crate::file::BlockFile;
 
-/// What to do beyond the download itself.
+/// The options of an update.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct FlashOptions {
     /// The program: sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
     pub program: u8,
-    /// How often one block is sent again after a CRC error or a broken transfer.
+    /// How many times one block is sent again after a CRC error or a broken transfer.
     pub repeats: u32,
-    /// Compare the device's identity with this before anything is erased, and once more with that
-    /// of the program on trial.
+    /// Compare the device's identity with this target before anything is erased, and the identity
+    /// of the program on trial again.
     pub check_target: Option<Target>,
-    /// Start the program once and call it back before it is released for autostart (steps 10 to 13),
-    /// where the dialect has such a release and the program is to be started.
+    /// Start the program once and call it back before it is released for autostart (steps 10 to
+    /// 13), if the dialect has such a release and `start` is set.
     pub trial_run: bool,
-    /// Start the program at the end (step 15). One that is not to be started is not tried and not
-    /// released for autostart either.
+    /// Start the program at the end (step 15). If this is off, the program is neither tried nor
+    /// released for autostart.
     pub start: bool,
-    /// Compare the CRC once more at the very end: the one that the program itself tells when it
-    /// runs.
+    /// At the very end, compare the CRC that the running program reports.
     pub verify: bool,
-    /// The dialect that the device speaks; `None` to find it out.
+    /// The dialect of the device; `None` to detect it.
     pub dialect: Option<Dialect>,
-    /// What opens the device, in dialects that ask for it.
+    /// The password of the device, in dialects that need one.
     pub unlock: Option<Password>,
-    /// Whether the session can follow a device to another node-ID, which lifts need. One of several
-    /// at once cannot.
+    /// Whether the session can follow a device to another node-ID, which lift devices need. One of
+    /// several parallel sessions cannot.
     pub follow: bool,
-    /// Search until the bootloader is there or the user gives up (manual, chapter 5.2, step 1):
+    /// Search until the bootloader answers or the user cancels (manual, chapter 5.2, step 1):
     /// neither silence nor an application that stays ends the procedure.
     pub wait: bool,
-    /// Stop before anything is changed where somebody else speaks to the device.
+    /// Stop before anything is changed if another tool talks to the device.
     pub alone: bool,
-    /// Ask for the NMT mastership around a lift's update, and give it back (CiA 814-1 clause 6.3).
+    /// Take the NMT mastership during the update of a lift device, and give it back (CiA 814-1
+    /// clause 6.3).
     pub mastership: bool,
-    /// Send a sealed image in blocks of so many bytes, framing included, and not with one download.
+    /// Send a sealed image in blocks of at most this size, including framing, instead of in one
+    /// download.
     pub blocks: Option<usize>,
-    /// Leave it to the device to judge the image: without that, what can be no program, or is for
-    /// another device or another place, is refused before anything is done.
+    /// Let the device alone judge the image. If this is off, the tool refuses an image that cannot
+    /// be a program, or that is for another device or another region, before it changes the device.
     pub force: bool,
 }
 
@@ -71,7 +72,7 @@ impl FlashOptions {
     }
 }
 
-/// The device that a program is for: what 1018h/1 and 1018h/2 have to read.
+/// The target device of a program: the values that 1018h/1 and 1018h/2 must have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct Target {
     /// Vendor-ID.
@@ -81,7 +82,7 @@ pub struct Target {
 }
 
 impl Target {
-    /// The device that a file names in its block 0, or in the program's label, if it names one.
+    /// The device that a file names in its block 0 or in the program's label, if it does.
     #[must_use]
     pub fn of(file: &BlockFile) -> Option<Self> {
         Self::of_control(file).or_else(|| Self::of_label(&file.image(), file.program_start()))
@@ -94,7 +95,7 @@ impl Target {
         Self { vendor_id: head.vendor_id(), product_code: head.product_code() }
     }
 
-    /// The device that the label of a program names which starts at `start`.
+    /// The device named by the label of a program that starts at `start`.
     pub(super) fn of_label(image: &Image, start: u32) -> Option<Self> {
         let Label { vendor_id, product_code, .. } = label_of(image, start)?;
         Some(Self { vendor_id, product_code })

@@ -1,11 +1,11 @@
-//! What opens a device for an update.
+//! The password of a locked device.
 
 use std::fmt;
 
 /// The longest password.
 const PASSWORD_MAX: usize = 64;
 
-/// What opens a device for an update. `Debug` does not show it.
+/// The password of a locked device. `Debug` does not show it.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Password {
     bytes: [u8; PASSWORD_MAX],
@@ -13,7 +13,7 @@ pub struct Password {
 }
 
 impl Password {
-    /// From its text; `None` for an empty one, and for one of more than 64 bytes.
+    /// A password from its text; `None` for an empty text, and for more than 64 bytes.
     #[must_use]
     pub fn new(text: &str) -> Option<Self> {
         let mut bytes = [0; PASSWORD_MAX];
@@ -27,7 +27,7 @@ impl Password {
         &self.bytes[..self.len]
     }
 
-    /// The number, for 7F50h: `0x494E4954`, or its four characters, the highest first, `INIT`.
+    /// The number, for 7F50h: `0x494E4954`, or its four characters, most significant first, `INIT`.
     #[must_use]
     pub fn number(&self) -> Option<u32> {
         let text = std::str::from_utf8(self.text()).ok()?;

@@ -1,4 +1,4 @@
-//! Where an update has come to, and what it has learned on the way.
+//! The phases of an update, and the information found on the way.
 
 use std::fmt;
 use std::time::Duration;
@@ -11,114 +11,114 @@ use crate::device::info::Nameplate;
 use crate::device::{DeviceType, Dialect, Doing};
 use crate::json;
 
-/// An erasure that is over sooner than this was put off, or had little to do. Erasing a sector of
-/// flash takes longer.
+/// An erase that ends within this time was postponed by the device, or had nothing to do: to erase
+/// a flash sector takes longer.
 pub(super) const PUT_OFF: Duration = Duration::from_millis(100);
 
-/// Where an update has come to.
+/// The phase of an update.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(tag = "phase", rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum Phase {
-    /// Step 1: nothing of a bootloader yet; it is looked for until it is there.
+    /// Step 1: the bootloader does not answer yet; the tool searches for it.
     Searching {
-        /// Why it is not there yet.
+        /// Why it does not answer yet.
         reason: String,
     },
-    /// Step 3: the application is asked to go back to the bootloader.
+    /// Step 3: the application gets the call to return to the bootloader.
     CallingBack,
-    /// Step 3 has worked.
+    /// Step 3 was successful.
     InBootloader,
     /// Step 4: the program is being erased.
     Erasing,
-    /// Step 5: it is erased.
+    /// Step 5: the program is erased.
     Erased {
-        /// How long that took.
+        /// How long the erase took.
         #[serde(rename = "seconds", serialize_with = "json::seconds")]
         took: Duration,
     },
-    /// The bootloader computed the CRC that the file says.
+    /// The CRC computed by the bootloader matches the file's.
     Verified {
         /// The CRC.
         crc: u32,
     },
     /// Step 10: the program starts for a trial.
     TrialStarting,
-    /// Step 13: it ran, and came back when called.
+    /// Step 13: the program ran, and returned when it was called.
     TrialPassed(DeviceType),
     /// Step 14: the program is released for autostart (83h).
     Released,
-    /// The program is left as it is, not released for autostart, because it is not to be started.
+    /// The program is not released for autostart, because it is not to be started.
     NotReleased,
     /// Step 15: the program starts.
     Starting,
-    /// It runs.
+    /// The program runs.
     Started(DeviceType),
-    /// After its end, the procedure's last look: the CRC is still the file's.
+    /// After the end of the procedure, the CRC still matches the file's.
     VerifiedAgain {
         /// The CRC.
         crc: u32,
     },
 }
 
-/// Something about the device that is good to know.
+/// Useful information about the device.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(tag = "note", rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum Note {
-    /// What the device tells of itself.
+    /// The device's name, versions and identity.
     Nameplate(Box<Nameplate>),
-    /// It is the device that the file is for.
+    /// The device is the target of the file.
     TargetRight(Target),
     /// The bootloader speaks this dialect.
     Dialect {
-        /// Which one.
+        /// The dialect.
         dialect: Dialect,
     },
-    /// The password was right.
+    /// The password was accepted.
     Unlocked,
-    /// The device goes on under another node-ID.
+    /// The device now has another node-ID.
     Moved {
-        /// This one.
+        /// The new node-ID.
         #[serde(rename = "to", serialize_with = "json::node")]
         node: NodeId,
     },
     /// The NMT mastership was taken over.
     MasterTaken {
-        /// From this node.
+        /// The previous master.
         #[serde(rename = "master", serialize_with = "json::node")]
         node: NodeId,
     },
     /// The NMT mastership was given back.
     MasterBack {
-        /// This node has it now.
+        /// The new master.
         #[serde(rename = "master", serialize_with = "json::node")]
         node: NodeId,
     },
 }
 
-/// Something because of which the update, or what comes behind it, may go wrong.
+/// A problem that may make the update, or a later step, fail.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(tag = "warning", rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum Warning {
     /// Another node keeps the NMT mastership.
     MasterKept {
-        /// This one.
+        /// The node.
         #[serde(rename = "master", serialize_with = "json::node")]
         node: NodeId,
     },
-    /// The NMT mastership was given back, and no node says that it has it.
+    /// The NMT mastership was given back, but no node has announced that it is the master.
     MasterMissing,
-    /// The device has not answered for a while, and is waited for.
+    /// The device has not answered for a while, and the tool waits for it.
     Silent {
-        /// What it was told.
+        /// The action that it was asked to do.
         #[serde(serialize_with = "json::words")]
         doing: Doing,
-        /// How long nothing has been heard of it.
+        /// How long it has been silent.
         #[serde(rename = "seconds", serialize_with = "json::seconds")]
         silent: Duration,
-        /// How long it is waited for in all.
+        /// How long the tool waits in total.
         #[serde(rename = "limit_seconds", serialize_with = "json::seconds")]
         limit: Duration,
     },
@@ -128,20 +128,22 @@ impl fmt::Display for Phase {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Searching { reason } => {
-                write!(f, "searching for the bootloader, Ctrl-C ends it ({reason})")
+                write!(f, "searching for the bootloader, Ctrl-C ends the search ({reason})")
             }
             Self::CallingBack => f.write_str("calling the application back to the bootloader"),
             Self::InBootloader => f.write_str("the bootloader is running"),
-            Self::Erasing => f.write_str("telling it to erase the old program"),
+            Self::Erasing => f.write_str("commanding the device to erase the old program"),
             Self::Erased { took } if *took < PUT_OFF => {
-                f.write_str("it will, with the first block that it finds good")
+                f.write_str("the device has postponed the erase until the first good block")
             }
             Self::Erased { took } => write!(f, "erased in {:.1} s", took.as_secs_f64()),
             Self::Verified { crc } => write!(f, "verified: CRC {crc:08X}h"),
             Self::TrialStarting => f.write_str("starting the program for a trial"),
-            Self::TrialPassed(running) => write!(f, "the trial went well: {running} came up and came back"),
+            Self::TrialPassed(running) => {
+                write!(f, "the trial was successful: {running} started and returned to the bootloader")
+            }
             Self::Released => {
-                f.write_str("released for autostart (83h): the program starts by itself from now on")
+                f.write_str("released for autostart (83h): the program starts by itself after a reset")
             }
             Self::NotReleased => f.write_str(
                 "not released for autostart: the device stays in the bootloader; coflash start tries the \
@@ -149,7 +151,7 @@ impl fmt::Display for Phase {
             ),
             Self::Starting => f.write_str("starting the program"),
             Self::Started(running) => write!(f, "running: {running}"),
-            Self::VerifiedAgain { crc } => write!(f, "verified once more: CRC {crc:08X}h"),
+            Self::VerifiedAgain { crc } => write!(f, "verified again: CRC {crc:08X}h"),
         }
     }
 }
@@ -161,12 +163,12 @@ impl fmt::Display for Note {
             Self::TargetRight(Target { vendor_id, product_code }) => {
                 write!(
                     f,
-                    "it is the right device: vendor-ID {vendor_id:08X}h, product code {product_code:08X}h"
+                    "the device matches the file: vendor-ID {vendor_id:08X}h, product code {product_code:08X}h"
                 )
             }
-            Self::Dialect { dialect } => write!(f, "its dialect: {dialect}"),
+            Self::Dialect { dialect } => write!(f, "dialect: {dialect}"),
             Self::Unlocked => f.write_str("unlocked"),
-            Self::Moved { node } => write!(f, "it answers as node {node} now"),
+            Self::Moved { node } => write!(f, "the device now answers as node {node}"),
             Self::MasterTaken { node } => write!(f, "NMT mastership taken over from node {node}"),
             Self::MasterBack { node } => {
                 write!(f, "NMT mastership given back: node {node} is the master")
@@ -182,7 +184,7 @@ impl fmt::Display for Warning {
                 write!(f, "node {node} keeps the NMT mastership: it may disturb the update")
             }
             Self::MasterMissing => {
-                f.write_str("NMT mastership given back, and nobody has said that it is the master")
+                f.write_str("NMT mastership given back, but no node has announced that it is the master")
             }
             Self::Silent { doing, silent, limit } => write!(
                 f,

@@ -10,8 +10,8 @@ use super::options::FlashOptions;
 use super::steps::{check_target, CALL_BACK};
 use crate::device::{recognise, Dialect, Error, Session};
 
-/// Steps 2 and 3: finds the device, and brings it into its bootloader; again and again until it
-/// works or the user gives up, if that is asked for. Gives what the bootloader speaks.
+/// Steps 2 and 3: finds the device and brings it into its bootloader; with `wait`, tries again
+/// until this works or the user cancels. Returns the dialect of the bootloader.
 pub(super) fn reach(
     session: &mut Session<'_>,
     file: Content<'_>,
@@ -19,8 +19,9 @@ pub(super) fn reach(
     course: &mut Course<'_>,
 ) -> Result<Dialect, Error> {
     if options.alone && !options.wait {
-        // Before the first question, which would disturb a transfer that somebody else has under way.
-        // Who knocks cannot wait: a rescue window is as short.
+        // Check before the first request, which would disturb another tool's running transfer.
+        // While the tool catches a device, there is no time for this: a rescue window is as short
+        // as the check.
         session.ensure_alone()?;
     }
     if !options.wait {
@@ -43,7 +44,7 @@ pub(super) fn reach(
     }
 }
 
-/// Steps 2 and 3, once.
+/// One attempt of steps 2 and 3.
 fn attempt(
     session: &mut Session<'_>,
     file: Content<'_>,
@@ -68,7 +69,7 @@ fn attempt(
         (true, true) => session.ensure_alone()?,
     }
     let dialect = dialect::of(found).enter(session, running, options, course)?;
-    // The bootloader may have told more than the application did.
+    // The bootloader may have reported more than the application.
     check_way(file, dialect, options)?;
     if !admitted && !running.is_bootloader() {
         admit_to_bootloader(session, file, dialect, options)?;
@@ -76,14 +77,14 @@ fn attempt(
     Ok(dialect)
 }
 
-/// Whether the dialect has the way in which the file is to be sent.
+/// Checks that the dialect supports the way in which the file is to be sent.
 fn check_way(file: Content<'_>, dialect: Dialect, options: &FlashOptions) -> Result<(), Error> {
     match (file, dialect) {
         (Content::Sealed(_), Dialect::Block) | (Content::Blocks(_), _) => Ok(()),
         (Content::Sealed(_), _) if options.blocks.is_none() => Ok(()),
         (Content::Sealed(_), dialect) => Err(Error::NotInDialect {
             dialect,
-            what: "a sealed image goes with one download, and not in blocks",
+            what: "a sealed image is sent in one download, not in blocks",
         }),
     }
 }

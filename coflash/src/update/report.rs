@@ -1,4 +1,4 @@
-//! What an update did.
+//! The results of an update.
 
 use std::fmt;
 use std::time::Duration;
@@ -8,38 +8,38 @@ use serde::{Serialize, Serializer};
 use crate::device::{DeviceType, Dialect, Transfers};
 use crate::json;
 
-/// What an update did.
+/// The results of an update.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct Report {
-    /// Bytes of the program, from its region's start on.
+    /// Size of the program in bytes, from the start of its region.
     #[serde(rename = "size")]
     pub program_size: u32,
-    /// CRC of the program in the device: what 1F56h reads.
+    /// CRC of the program in the device: the value of 1F56h.
     #[serde(rename = "crc")]
     pub program_crc: u32,
     /// Blocks that had to be sent again.
     #[serde(rename = "blocks_repeated")]
     pub repeats: u32,
-    /// How long all of it took, on the bus's clock.
+    /// The total time, on the bus's clock.
     #[serde(rename = "seconds", serialize_with = "json::seconds")]
     pub took: Duration,
-    /// How long the blocks took.
+    /// The time for the blocks.
     #[serde(rename = "transfer_seconds", serialize_with = "json::seconds")]
     pub transfer: Duration,
-    /// How the blocks were written at the end.
+    /// The form of downloads at the end.
     #[serde(rename = "transfer")]
     pub transfers: Transfers,
-    /// What runs now, if the program was started.
+    /// The device type of what runs now, if the program was started.
     #[serde(serialize_with = "running")]
     pub running: Option<DeviceType>,
-    /// Whether the program is released for autostart (83h); `None` in a dialect that knows no release.
+    /// Whether the program is released for autostart (83h); `None` in a dialect without a release.
     pub released: Option<bool>,
-    /// The dialect that the device speaks.
+    /// The dialect of the device.
     pub dialect: Dialect,
 }
 
-/// The device type alone: that an application runs is known.
+/// Only the device type: it is known that an application runs.
 fn running<S: Serializer>(running: &Option<DeviceType>, serializer: S) -> Result<S::Ok, S::Error> {
     running.map(|running| running.0).serialize(serializer)
 }

@@ -1,4 +1,4 @@
-//! What is sent again, and why.
+//! Repetitions of blocks and programs, and their reasons.
 
 use std::fmt;
 
@@ -6,29 +6,29 @@ use canopen::AbortCode;
 use serde::ser::SerializeStruct as _;
 use serde::{Serialize, Serializer};
 
-/// A block, or the whole program, is sent again.
+/// A block or the whole program is sent again.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct Retry {
     /// The block's number; `None` for the whole program.
     pub block: Option<u32>,
-    /// How often it has been sent again, this time included.
+    /// The number of this repetition, counted from 1.
     pub repeat: u32,
-    /// How often it may be.
+    /// The number of permitted repetitions.
     pub of: u32,
-    /// Why.
+    /// The reason.
     #[serde(flatten)]
     pub why: RepeatReason,
 }
 
 impl Retry {
-    /// A block is sent again: for this `repeat`th time, of as many.
+    /// Repetition number `repeat` of at most `of` for a block.
     #[must_use]
     pub const fn block(block: u32, repeat: u32, of: u32, why: RepeatReason) -> Self {
         Self { block: Some(block), repeat, of, why }
     }
 
-    /// The same of the whole program.
+    /// Repetition number `repeat` of at most `of` for the whole program.
     #[must_use]
     pub const fn program(repeat: u32, of: u32, why: RepeatReason) -> Self {
         Self { block: None, repeat, of, why }
@@ -45,14 +45,14 @@ impl fmt::Display for Retry {
     }
 }
 
-/// Why a block is sent again.
+/// The reason for a repetition.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RepeatReason {
-    /// The bootloader found its CRC wrong.
+    /// The bootloader found a wrong CRC.
     Crc,
-    /// The bootloader was still busy with something else.
+    /// The bootloader was busy with another command.
     Busy,
-    /// The transfer was aborted by the device with a code that speaks of lost frames.
+    /// The device aborted the transfer with a code that means lost frames.
     Broken(AbortCode),
     /// The transfer got no answer.
     NoAnswer,
@@ -61,16 +61,16 @@ pub enum RepeatReason {
 impl fmt::Display for RepeatReason {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Crc => f.write_str("its CRC arrived wrong"),
+            Self::Crc => f.write_str("the CRC of the received data is wrong"),
             Self::Busy => f.write_str("the bootloader was busy"),
-            Self::Broken(code) => write!(f, "the transfer broke: {code}"),
+            Self::Broken(code) => write!(f, "the transfer failed: {code}"),
             Self::NoAnswer => f.write_str("no answer"),
         }
     }
 }
 
 impl RepeatReason {
-    /// Its name for programs, which stays.
+    /// Its stable name for programs.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -83,7 +83,7 @@ impl RepeatReason {
 }
 
 impl Serialize for RepeatReason {
-    /// `reason`, and the abort code where there is one.
+    /// `reason`, and the abort code if there is one.
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let abort = match self {
             Self::Broken(code) => Some(code.0),

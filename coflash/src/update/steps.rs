@@ -1,4 +1,4 @@
-//! The single steps of an update, for the procedure and for whoever wants just one of them.
+//! The single steps of an update, for the procedure and for users of single steps.
 
 use std::time::Duration;
 
@@ -11,20 +11,21 @@ use super::phase::PUT_OFF;
 use crate::device::error::{absent, Error, Mismatch};
 use crate::device::{DeviceType, Doing, Session, Timing};
 
-/// How often an application is asked to go back to the bootloader. A program that was started right
-/// behind its download may take the first time for a confirmation.
+/// How many times an application is called back. A program that was started directly after its
+/// download may take the first call for a confirmation.
 const CALLS: u32 = 3;
-/// How long an application that was called may go on before it leaves, and is not asked again.
+/// How long an application may continue after the call before it leaves; the call is not repeated
+/// meanwhile.
 const LEAVES_WITHIN: Duration = Duration::from_secs(2);
-/// The sub-index of 1F51h that takes the call, whichever program runs (manual, step 3). An application
-/// of another maker has no other.
+/// The sub-index of 1F51h for the call, whichever program runs (manual, step 3). An application of
+/// another manufacturer has no other sub-index.
 pub(super) const CALL_BACK: u8 = 1;
 
-/// Compares the device's identity with that of the file's target. Bootloader and application have
-/// the same one.
+/// Compares the device's identity with the file's target. Bootloader and application have the same
+/// identity.
 ///
 /// # Errors
-/// [`Error::WrongTarget`], and what a [read](Session::read) has.
+/// [`Error::WrongTarget`], and the errors of a [read](Session::read).
 pub fn check_target(session: &mut Session<'_>, target: Target) -> Result<(), Error> {
     let wanted = [(1, target.vendor_id), (2, target.product_code)];
     for (sub, file) in wanted {
@@ -37,11 +38,11 @@ pub fn check_target(session: &mut Session<'_>, target: Target) -> Result<(), Err
     Ok(())
 }
 
-/// Steps 2 and 3: afterwards the bootloader is running.
+/// Steps 2 and 3: makes the bootloader run.
 ///
 /// # Errors
-/// [`Error::NoAnswer`] where nothing answers, [`Error::NoBootloader`] where the application does
-/// not go back.
+/// [`Error::NoAnswer`] if nothing answers, [`Error::NoBootloader`] if the application does not
+/// return.
 pub fn enter_bootloader(session: &mut Session<'_>, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
     let running = session.find()?;
     tell(Event::Found(running));
@@ -54,9 +55,9 @@ pub fn enter_bootloader(session: &mut Session<'_>, tell: &mut dyn FnMut(Event)) 
     Ok(())
 }
 
-/// Steps 3 and 12, 13: asks the application to go back to the bootloader and waits until it has.
+/// Steps 3 and 12, 13: calls the application back to the bootloader and waits for the bootloader.
 ///
-/// Gives what the bootloader says it is.
+/// Returns the bootloader's device type.
 ///
 /// # Errors
 /// [`Error::NoBootloader`].
@@ -65,7 +66,7 @@ pub fn call_back(session: &mut Session<'_>) -> Result<DeviceType, Error> {
     let mut seen = None;
     for call in 1..=CALLS {
         match session.command(CALL_BACK, ProgramControl::StartBootloader) {
-            // A device that resets at once may not get its answer out.
+            // A device that resets at once may not send its answer.
             Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
             Err(Error::Refused { code, .. }) => {
                 let running = session.device_type()?;
@@ -74,14 +75,14 @@ pub fn call_back(session: &mut Session<'_>) -> Result<DeviceType, Error> {
             Err(error) => return Err(error),
         }
         let timing = *session.timing();
-        // An application that goes on as before has taken the first call for a confirmation.
+        // An application that continues has taken the first call for a confirmation.
         let first = Timing { boot: timing.boot.min(LEAVES_WITHIN), ..timing };
         seen = settle(
             &mut session.with(node, if call == 1 { first } else { timing }),
             DeviceType::is_bootloader,
         )?;
         if call == 1 && seen.is_none() {
-            // It restarts.
+            // The device restarts.
             seen = settle(session, DeviceType::is_bootloader)?;
         }
         if let Some(running) = seen.filter(|running| running.is_bootloader()) {
@@ -91,8 +92,8 @@ pub fn call_back(session: &mut Session<'_>) -> Result<DeviceType, Error> {
     Err(Error::NoBootloader { node, running: seen, code: None })
 }
 
-/// Waits for a restarting device, [`Timing::boot`] at most, until what it runs is what is `wanted`;
-/// gives what answered last.
+/// Waits for a restarting device, at most [`Timing::boot`], until `wanted` accepts its device type;
+/// returns the last device type.
 fn settle(
     session: &mut Session<'_>,
     wanted: impl Fn(DeviceType) -> bool,
@@ -100,8 +101,8 @@ fn settle(
     let (began, boot) = (session.now(), session.timing().boot);
     let deadline = began + boot;
     loop {
-        // The boot-up message says when to look; without it (it may get lost) a look now and then
-        // does.
+        // The boot-up message ends the pause early; if it gets lost, the device is still asked at
+        // intervals.
         let pause = session.timing().sdo;
         session.await_boot_up(pause)?;
         let seen = session.device_type()?;
@@ -115,7 +116,7 @@ fn settle(
 /// Steps 4 and 5: erases the program.
 ///
 /// # Errors
-/// [`Error::Failed`] with what 1F57h says, [`Error::Busy`], [`Error::NoAnswer`].
+/// [`Error::Failed`] with the error in 1F57h, [`Error::Busy`], [`Error::NoAnswer`].
 pub fn erase(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
     tell(Phase::Erasing.into());
     let began = session.now();
@@ -124,8 +125,7 @@ pub fn erase(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event))
     Ok(())
 }
 
-/// Steps 4 and 5 on a device that may have no 1F57h to tell how it goes, and may answer when it has
-/// erased.
+/// Steps 4 and 5 on a device that may not have 1F57h, and may answer only after the erase.
 pub(super) fn clear_and_wait(
     session: &mut Session<'_>,
     number: u8,
@@ -145,9 +145,9 @@ pub(super) fn clear_and_wait(
     Ok(())
 }
 
-/// Gets rid of the program, without another one in its place. A bootloader that puts the erasure
-/// off until the first block comes (figure 12 of the manual) is told a second time, which there
-/// means at once; elsewhere that erases what is erased already.
+/// Erases the program without writing another one. A bootloader that postpones the erase until the
+/// first block (figure 12 of the manual) gets the command a second time, which makes it erase at
+/// once; other bootloaders then erase empty flash.
 ///
 /// # Errors
 /// As [`erase`].
@@ -160,7 +160,7 @@ pub fn erase_at_once(session: &mut Session<'_>, number: u8) -> Result<(), Error>
     Ok(())
 }
 
-/// Step 14: releases the program for autostart (83h): from then on it starts by itself.
+/// Step 14: releases the program for autostart (83h): it then starts by itself after a reset.
 ///
 /// # Errors
 /// As [`erase`].
@@ -170,7 +170,7 @@ pub fn release(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event
     Ok(())
 }
 
-/// Withdraws the release for autostart (84h): the program does not start by itself any more.
+/// Withdraws the release for autostart (84h): the program no longer starts by itself.
 ///
 /// # Errors
 /// As [`erase`].
@@ -178,7 +178,7 @@ pub fn withdraw(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
     execute(session, number, ProgramControl::ClrSignature)
 }
 
-/// Sets 1F57h back to "no error".
+/// Sets 1F57h to "no error".
 ///
 /// # Errors
 /// As [`erase`].
@@ -186,7 +186,7 @@ pub fn reset_status(session: &mut Session<'_>, number: u8) -> Result<(), Error> 
     execute(session, number, ProgramControl::ResetStat)
 }
 
-/// Gives a command that may be repeated, and waits until it is carried out.
+/// Sends a command that may be repeated, and waits until it is carried out.
 fn execute(session: &mut Session<'_>, number: u8, command: ProgramControl) -> Result<(), Error> {
     let doing = Doing::Command(command);
     let mut attempt = 1;
@@ -195,8 +195,8 @@ fn execute(session: &mut Session<'_>, number: u8, command: ProgramControl) -> Re
             Ok(()) => break,
             Err(Error::NoAnswer { .. } | Error::Protocol { .. }) if attempt < session.timing().attempts => {
                 attempt += 1;
-                // The command may have arrived, and the device may be silent because it carries it
-                // out.
+                // The command may have arrived, and the device may be silent while it carries the
+                // command out.
                 session.await_idle(number, doing)?;
             }
             Err(Error::Refused { code, .. }) => return Err(explain(session, number, doing, code)),
@@ -210,7 +210,7 @@ fn execute(session: &mut Session<'_>, number: u8, command: ProgramControl) -> Re
     }
 }
 
-/// What an SDO abort means: 1F57h tells it best, if it tells something.
+/// The meaning of an SDO abort: 1F57h gives the best explanation, if it reports an error.
 fn explain(session: &mut Session<'_>, number: u8, doing: Doing, code: AbortCode) -> Error {
     match session.status(number) {
         Ok(status) => match status.error {
@@ -236,18 +236,17 @@ pub fn verify(
     Ok(())
 }
 
-/// 1F56h: the CRC over the program that is in the device, 0 for none.
+/// 1F56h: the CRC of the program in the device, 0 for none.
 pub(super) fn identification(session: &mut Session<'_>, number: u8) -> Result<u32, Error> {
     session.read_number(Address::new(program::PROGRAM_ID, number))
 }
 
-/// What 1F56h reads before the erasure, if it tells something: what it reads behind a failure can be
-/// compared with it.
+/// The value of 1F56h before the erase, if the device reports it, for a comparison after a failure.
 pub(super) fn told_before(session: &mut Session<'_>, number: u8) -> Result<Option<u32>, Error> {
     match identification(session, number) {
         Ok(crc) => Ok(Some(crc)),
         Err(error @ (Error::Adapter(_) | Error::Cancelled)) => Err(error),
-        // It is no reason to fail: what comes next will tell.
+        // Not a reason to fail: the next step shows the problem.
         Err(_) => Ok(None),
     }
 }
@@ -260,7 +259,7 @@ pub(super) fn compare_crc(session: &mut Session<'_>, number: u8, crc: u32) -> Re
     Ok(())
 }
 
-/// Steps 10, 11 and 15: starts the program and waits until it answers; gives what it says it is.
+/// Steps 10, 11 and 15: starts the program and waits until it answers; returns its device type.
 ///
 /// # Errors
 /// [`Error::StartFailed`].
@@ -268,7 +267,7 @@ pub fn start(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Error>
     let node = session.node();
     let failed = |running, status| Error::StartFailed { node, running, status };
     match session.command(number, ProgramControl::Start) {
-        // A device that resets at once may not get its answer out.
+        // A device that resets at once may not send its answer.
         Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
         Err(Error::Refused { .. }) => {
             let running = session.device_type()?;
@@ -283,7 +282,7 @@ pub fn start(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Error>
     }
 }
 
-/// Waits for an application, `time` at most; gives what it says it is.
+/// Waits for an application for at most `time`; returns its device type.
 pub(super) fn await_application(
     session: &mut Session<'_>,
     time: Duration,

@@ -21,7 +21,7 @@ pub(super) fn run(
         Some(target) => check_target(session, target),
         None => Ok(()),
     });
-    // A program that is not the right one does not stay, either.
+    // Even a wrong program must not keep running.
     let back = call_back(session).map_err(failed);
     right?;
     back?;
@@ -29,7 +29,7 @@ pub(super) fn run(
     Ok(())
 }
 
-/// The same error, where it is one of a program that was just tried.
+/// The same error, in the form for a program on trial.
 fn failed(error: Error) -> Error {
     let (node, how) = match error {
         Error::StartFailed { node, running: Some(_), status } => (node, TrialFailure::NotStarted(status)),
@@ -41,9 +41,9 @@ fn failed(error: Error) -> Error {
     Error::TrialFailed { node, how }
 }
 
-/// Compares what the application on trial tells as its identity with what its bootloader told
-/// (manual, chapter 5.2, step 6). The revision is the program's own; 0 of what is optional says
-/// nothing (CiA 301, 1018h).
+/// Compares the identity that the application on trial reports with the bootloader's (manual,
+/// chapter 5.2, step 6). The revision belongs to the program and may differ; 0 in an optional value
+/// means that it is not supported (CiA 301, 1018h).
 fn same_identity(session: &mut Session<'_>, bootloader: Identity) -> Result<(), Error> {
     let application = identity(session)?;
     for (sub, optional) in [(1, false), (2, true), (4, true)] {

@@ -1,6 +1,6 @@
-//! Nodes and hosts as programs of their own, and the folder of a test.
+//! Nodes and hosts as separate processes, and the folder of a test.
 
-// Each test uses its part of it.
+// Each test uses a part of this module.
 #![allow(dead_code)]
 
 use std::cell::RefCell;
@@ -18,14 +18,14 @@ use serde_json::Value;
 /// How long a program may take before it counts as hanging.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// How the program of [`Folder::with_program`] is flashed.
+/// The command that flashes the program of [`Folder::with_program`].
 pub const FLASH: &[&str] = &["flash", "program.bin", "-I", "binary", "--board", "stm32f407g-disc1"];
 
-/// What a bootloader looks at in a program: initial stack pointer in RAM, reset vector inside, Thumb
-/// bit set.
+/// The part of a program that a bootloader checks: initial stack pointer in RAM, reset vector
+/// inside, Thumb bit set.
 pub const VECTORS: [u8; 8] = [0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x01, 0x08];
 
-/// A folder of one test, away at the end.
+/// A folder for one test, deleted at the end.
 pub struct Folder(PathBuf);
 
 impl Folder {
@@ -36,7 +36,7 @@ impl Folder {
         Self(path)
     }
 
-    /// With `program.bin` in it.
+    /// A folder that contains `program.bin`.
     pub fn with_program(test: &str, program: &[u8]) -> Self {
         let folder = Self::new(test);
         folder.write("program.bin", program);
@@ -62,14 +62,14 @@ impl Drop for Folder {
     }
 }
 
-/// What a program said, once it has ended.
+/// The output of a program that has ended.
 pub struct Done {
     pub exit: i32,
     pub out: String,
     pub err: String,
 }
 
-/// A program at work; killed when it is dropped.
+/// A running program; killed when this value is dropped.
 pub struct Running {
     child: Child,
     err: thread::JoinHandle<String>,
@@ -96,12 +96,12 @@ impl Running {
         Self { child, err, out, said: RefCell::default() }
     }
 
-    /// The number of its process.
+    /// The process id.
     pub fn id(&self) -> u32 {
         self.child.id()
     }
 
-    /// Its next line; `None` when there will be none.
+    /// The next line; `None` after the last one.
     fn line(&self) -> Option<String> {
         match self.out.recv_timeout(PATIENCE) {
             Ok(line) => {
@@ -113,7 +113,7 @@ impl Running {
         }
     }
 
-    /// Waits until it says a line with this in it.
+    /// Waits for a line that contains this text.
     #[track_caller]
     pub fn await_text(&self, text: &str) {
         while let Some(line) = self.line() {
@@ -124,9 +124,9 @@ impl Running {
         panic!("it never says {text:?}, but: {}", self.said.borrow());
     }
 
-    /// Waits until it has ended by itself.
+    /// Waits until the program has ended by itself.
     pub fn wait(mut self) -> Done {
-        // Nobody types any more.
+        // Closes standard input.
         drop(self.child.stdin.take());
         while self.line().is_some() {}
         let exit = self.child.wait().unwrap().code().unwrap_or(-1);
@@ -148,14 +148,14 @@ pub fn node(folder: &Folder, arguments: &[&str]) -> Running {
     Running::start(Command::new(env!("CARGO_BIN_EXE_coboot-node")).args(arguments).current_dir(&folder.0))
 }
 
-/// Nodes at work.
+/// Running nodes.
 pub struct Nodes {
     running: Running,
     url: String,
 }
 
 impl Nodes {
-    /// With a bus of their own.
+    /// Nodes with their own bus.
     pub fn start(folder: &Folder, arguments: &[&str]) -> Self {
         let running = node(folder, &[&["--listen", "127.0.0.1:0"], arguments].concat());
         let line = running.line().unwrap_or_default();
@@ -165,7 +165,7 @@ impl Nodes {
         Self { running, url }
     }
 
-    /// On a bus of somebody else.
+    /// Nodes on an existing bus.
     pub fn join(folder: &Folder, url: &str, arguments: &[&str]) -> Self {
         let running = node(folder, &[&["--bus", url], arguments].concat());
         Self { running, url: url.to_owned() }
@@ -179,19 +179,19 @@ impl Nodes {
         self.url.trim_start_matches("socketcand://").trim_end_matches("/can0")
     }
 
-    /// Waits until they say this.
+    /// Waits for this line of the nodes.
     #[track_caller]
     pub fn await_line(&self, line: &str) {
         self.running.await_text(line);
     }
 
-    /// Waits until they have ended by themselves.
+    /// Waits until the nodes have ended by themselves.
     pub fn ended(self) -> Done {
         self.running.wait()
     }
 }
 
-/// The host tool, in the folder of a test, with a bus.
+/// The host tool in the folder of a test, with a bus.
 pub struct Coflash<'a> {
     folder: &'a Folder,
     url: &'a str,
@@ -206,7 +206,7 @@ impl<'a> Coflash<'a> {
         self.spawn_at(arguments, &self.folder.0)
     }
 
-    /// The same, with its locks in this folder, as on another computer.
+    /// The same with its locks in another folder, as on another computer.
     pub fn spawn_at(&self, arguments: &[&str], locks: &Path) -> Running {
         let nowhere = self.folder.path("nowhere");
         Running::start(
@@ -225,14 +225,14 @@ impl<'a> Coflash<'a> {
         self.spawn(arguments).wait()
     }
 
-    /// Runs it and types this.
+    /// Runs the tool with this text on standard input.
     pub fn typed(&self, arguments: &[&str], text: &str) -> Done {
         let mut running = self.spawn(arguments);
         running.child.stdin.take().unwrap().write_all(text.as_bytes()).unwrap();
         running.wait()
     }
 
-    /// What it says when all goes well.
+    /// The output of a successful call.
     #[track_caller]
     pub fn done(&self, arguments: &[&str]) -> String {
         let done = self.run(arguments);
@@ -240,7 +240,7 @@ impl<'a> Coflash<'a> {
         done.out
     }
 
-    /// The same as JSON.
+    /// The output of a successful call as JSON.
     #[track_caller]
     pub fn json(&self, arguments: &[&str]) -> Value {
         let out = self.done(&[arguments, &["--json"]].concat());
@@ -248,7 +248,7 @@ impl<'a> Coflash<'a> {
     }
 }
 
-/// `COBOOT_COFLASH`, or what was built beside the nodes.
+/// `COBOOT_COFLASH`, or the program built beside the nodes.
 fn program() -> OsString {
     env::var_os("COBOOT_COFLASH").unwrap_or_else(|| {
         let name = Path::new("coflash").with_extension(env::consts::EXE_EXTENSION);

@@ -1,5 +1,4 @@
-//! `cargo xtask bench`: how fast a program gets into the device, beside the limits of wire and
-//! flash.
+//! `cargo xtask bench`: the speed of a download, compared with the limits of wire and flash.
 
 use std::process::ExitCode;
 
@@ -8,7 +7,7 @@ use coboot_tests::throughput::{load, measure, measure_form, Form, Load, Measurem
 
 const RATES: [BitRate; 4] = [BitRate::K125, BitRate::K250, BitRate::K500, BitRate::K1000];
 const SIZES: [u32; 3] = [64, 256, 900];
-/// The default of `coflash`, and the one of the downloads above.
+/// The default of `coflash`, which the downloads above use.
 const BLOCK_SIZES: [usize; 2] = [1024, 4096];
 
 fn main() -> ExitCode {
@@ -16,7 +15,7 @@ fn main() -> ExitCode {
         None => false,
         Some("--json") => true,
         Some(other) => {
-            eprintln!("bench: {other:?} is no option; there is --json.");
+            eprintln!("bench: {other:?} is not an option; the only option is --json.");
             return ExitCode::FAILURE;
         }
     };

@@ -1,6 +1,7 @@
-//! The main job for people to watch: `cargo xtask demo`, and with `--sealed` the sealed device.
+//! The main job as a demonstration: `cargo xtask demo`, and with `--sealed` the sealed device.
 //!
-//! Host tool, bus and chip run in this process, in virtual time; the firmware is the one that goes
+//! Host tool, bus and chip run in this process, in virtual time; the firmware is the firmware for
+//! the board.
 //! onto the board.
 
 #[path = "demo/sealed.rs"]
@@ -127,7 +128,7 @@ fn print_line(at: Time, what: &str) {
     println!("  {:>9.3} s  {what}", at.0 as f64 / 1e12);
 }
 
-/// What the device says of itself.
+/// The device's information.
 fn introduce(bench: &mut Bench) -> Outcome<()> {
     let mut session = bench.session();
     let Some(running) = session.device_type()? else { return Err("the device does not answer".into()) };
@@ -139,7 +140,7 @@ fn introduce(bench: &mut Bench) -> Outcome<()> {
     Ok(())
 }
 
-/// Waits for a heartbeat and says what it says.
+/// Waits for a heartbeat and prints it.
 fn heartbeat(bench: &mut Bench) -> Outcome<()> {
     let from = bench.time();
     bench.run_ms(1100);
@@ -155,7 +156,7 @@ fn heartbeat(bench: &mut Bench) -> Outcome<()> {
     Ok(())
 }
 
-/// An application's ELF, as the blocks that the device takes.
+/// An application's ELF file as the blocks for the device.
 fn convert(image: &str) -> BlockFile {
     let file = firmware::blocks(image);
     let (size, crc) = (file.program_size(), file.program_crc());
@@ -166,10 +167,10 @@ fn convert(image: &str) -> BlockFile {
     file
 }
 
-/// The whole procedure, told step by step.
+/// The whole procedure, printed step by step.
 fn install(bench: &mut Bench, file: &BlockFile) -> Outcome<()> {
     let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stdout());
-    // The rate and the remaining time are those of the watcher's clock.
+    // The rate and the remaining time use the wall clock.
     let style = ProgressStyle::with_template(
         "               {bar:36} {bytes} of {total_bytes}, {bytes_per_sec}, {eta} left",
     )?;
@@ -186,7 +187,7 @@ fn install(bench: &mut Bench, file: &BlockFile) -> Outcome<()> {
                 print_line(clock.get(), &format!("all {total} bytes are in the device"));
             }
         }
-        // The report below tells the end.
+        // The report below shows the end.
         Event::Done(_) => {}
         event => print_line(clock.get(), &event.to_string()),
     });

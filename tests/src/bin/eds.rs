@@ -1,4 +1,4 @@
-//! Writes the EDS files into a folder: `cargo xtask eds`.
+//! Writes the EDS files to a folder: `cargo xtask eds`.
 
 use std::path::Path;
 use std::process::ExitCode;

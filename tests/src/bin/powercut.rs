@@ -1,5 +1,5 @@
-//! `cargo xtask powercut`: the power cut at every flash operation, and what is there when it comes
-//! back.
+//! `cargo xtask powercut`: cuts the power at every flash operation, and checks the device after the
+//! power returns.
 
 use std::fmt::Display;
 use std::process::ExitCode;
@@ -8,7 +8,7 @@ use std::str::FromStr;
 use coboot_tests::powercut::board::{self, Effort, Story};
 use coboot_tests::powercut::{reproduce, run, Point, Report, SCENARIOS};
 
-/// So many points of level 2 between the first and the last ones, without `--full`.
+/// The number of points of level 2 between the first and the last ones, without `--full`.
 const SAMPLE: u64 = 24;
 
 /// A point of one of the levels.

@@ -1,9 +1,9 @@
-//! Level 2: the built firmware on the emulated chip, updated by `coflash`, its power cut at flash
-//! operations.
+//! Level 2: the built firmware on the emulated chip, updated by `coflash`, with the power cut at
+//! flash operations.
 //!
-//! A point starts from a copy of the flash of a board that runs version 1, so that points depend on
-//! nothing before them and run beside each other. What must be in the flash in the end is taken
-//! from the ELF files by the emulator's own loader.
+//! A point starts with a copy of the flash of a board that runs version 1, so points are
+//! independent and run in parallel. The emulator's own loader gives the expected final contents of
+//! the flash from the ELF files.
 
 use std::fmt;
 use std::panic::{catch_unwind, AssertUnwindSafe};
@@ -21,19 +21,19 @@ use crate::bench::{Bench, NODE, RESCUE_WINDOW_MS};
 use crate::firmware;
 
 const VERSION: Address = Address::new(0x100A, 0);
-/// As fast as the bus can be. It is stored in the device, and is not what a device without
-/// parameters uses: one that answers has kept them.
+/// The highest bit rate. It is stored in the device and differs from the default, so a device that
+/// answers has kept its parameters.
 const RATE: BitRate = BitRate::K1000;
 const BIT_RATE: u32 = 1_000_000;
-/// A board with a program, confirmed or not, runs it within this time; in ms.
+/// A board with a program, confirmed or not, runs it within this time, in ms.
 const BOOT_MS: u64 = RESCUE_WINDOW_MS + 250;
-/// The name before the numbers of a point.
+/// The prefix of the name of a point.
 pub const NAME: &str = "board";
-/// The first and last operations of an update, which are those on the parameters: a sample has all
+/// The first and last operations of an update, which concern the parameters: a sample includes all
 /// of them.
 const EDGE: u64 = 10;
 
-/// In which way an operation is cut.
+/// The way in which an operation is cut.
 const KINDS: [(&str, Cut); 4] = [
     ("before", Cut::Before),
     ("after", Cut::After),
@@ -54,7 +54,7 @@ impl At {
     }
 }
 
-/// A cut in the update, and perhaps another one in the recovery. Written as `board:37:torn` or
+/// A cut in the update, and possibly another one in the recovery. Written as `board:37:torn` or
 /// `board:37:torn:12:after`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Point {
@@ -96,17 +96,17 @@ impl FromStr for Point {
     }
 }
 
-/// Which points are run.
+/// The set of points to run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Effort {
-    /// The first and last operations, and about so many in between, each in one way; some with a
+    /// The first and last operations, and about this many in between, each in one way; some with a
     /// cut in the recovery.
     Sample(u64),
     /// Each operation in every way, and a cut in each recovery.
     Full,
 }
 
-/// What answers when the power is back.
+/// The program that answers after the power returns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Outcome {
     Bootloader,
@@ -124,7 +124,7 @@ impl Outcome {
     }
 }
 
-/// What all points have in common.
+/// The common data of all points.
 pub struct Story {
     /// The flash of a board that runs version 1.
     start: Vec<u8>,
@@ -134,7 +134,7 @@ pub struct Story {
     operations: u64,
 }
 
-/// A stretch of the story that ends with the cut, or without one.
+/// A part of the procedure that ends with the cut, or without one.
 struct Run {
     cut: bool,
     operations: u64,
@@ -142,10 +142,10 @@ struct Run {
 }
 
 impl Story {
-    /// Installs version 1, as a host does, and counts the operations of an update to version 2.
+    /// Installs version 1 like a host, and counts the operations of an update to version 2.
     ///
     /// # Errors
-    /// If that does not even work without a cut.
+    /// If this fails without a cut.
     pub fn new() -> Result<Self, String> {
         let mut bench = Bench::new();
         let board = bench.boards()[0];
@@ -171,7 +171,7 @@ impl Story {
         }
     }
 
-    /// The power comes on, and the host updates. The cut is counted from the power-on.
+    /// The power returns, and the host updates. The cut is counted from the power-on.
     fn power_on_and_update(&self, bench: &mut Bench, cut: Option<At>) -> Run {
         bench.events();
         bench.machine().cut_power_at(cut.map(At::flash_cut));
@@ -185,10 +185,10 @@ impl Story {
         Run { cut, operations, outcome }
     }
 
-    /// What the device does when the power comes on.
+    /// The state of the device after power-on.
     fn inspect(&self, bench: &mut Bench) -> Result<Outcome, String> {
-        // A request that the cut left on its way would hold the device in a rescue window: it is
-        // taken now, and the power goes once more.
+        // A request in progress at the cut would keep the device in a rescue window: it is consumed
+        // now, and the power is cut again.
         bench.power_on();
         bench.run_ms(50);
         bench.power_off();
@@ -197,7 +197,7 @@ impl Story {
         let from = bench.time();
         bench.power_on();
         bench.run_ms(BOOT_MS);
-        // A program that was never confirmed starts by a reset, at the end of the rescue window.
+        // A program that was never confirmed starts after a reset, at the end of the rescue window.
         let resets = bench.events();
         if !matches!(resets[..], [] | [(_, Stop::Reset(ResetCause::Software))]) {
             return Err(format!("it starts with {resets:?}"));
@@ -234,7 +234,7 @@ impl Story {
         Ok(outcome)
     }
 
-    /// Runs a point, looks behind each cut and at the end, and gives what the device did behind
+    /// Runs a point, checks the device after each cut and at the end, and returns its state after
     /// each cut.
     fn at(&self, point: Point) -> Result<Vec<Outcome>, String> {
         let mut bench = board_with(&self.start)?;
@@ -243,7 +243,7 @@ impl Story {
         for at in [Some(point.first), point.second].into_iter().flatten() {
             let run = self.power_on_and_update(&mut bench, Some(at));
             if !run.cut {
-                // A recovery may be shorter than the update: then it has to have worked.
+                // A recovery may be shorter than the update: then it must have been successful.
                 run.outcome.map_err(|error| format!("no cut at {}, and yet: {error}", at.operation))?;
             }
             let found = self.inspect(&mut bench)?;
@@ -274,7 +274,7 @@ impl Story {
             (0..self.operations)
                 .flat_map(|operation| (0..KINDS.len()).map(move |kind| At { operation, kind }))
         };
-        // The second cut wanders through the recovery, which is about as long as the update.
+        // The second cut moves through the recovery, which is about as long as the update.
         let twice = |first: At| Point {
             first,
             second: Some(At {
@@ -338,7 +338,7 @@ impl Story {
         total.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 
-    /// One point, in words.
+    /// One point as text.
     #[must_use]
     pub fn reproduce(&self, point: Point) -> String {
         match self.at(point) {
@@ -359,7 +359,7 @@ fn write(bench: &mut Bench, file: &BlockFile) -> Result<(), String> {
     }
 }
 
-/// A board with this flash, and no power yet.
+/// A board with this flash, still without power.
 fn board_with(flash: &[u8]) -> Result<Bench, String> {
     let mut bench = Bench::new();
     bench.set_host_bit_rate(BIT_RATE);
@@ -378,7 +378,7 @@ fn program_flash(machine: &Machine) -> &[u8] {
     &machine.flash()[(board.programs[0].base - board.chip.flash.base) as usize..]
 }
 
-/// What the program's flash begins with when this image is in it, by the emulator's own ELF loader.
+/// The first bytes of the program's flash with this image, from the emulator's own ELF loader.
 fn program_of(image: &str) -> Result<Vec<u8>, String> {
     let chip = firmware::board().chip;
     let mut machine = Machine::new(chip, Options::default()).map_err(|error| error.to_string())?;

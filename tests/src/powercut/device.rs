@@ -1,4 +1,4 @@
-//! A device of `boot-core` and the flash model: power on, boot stage, bootloader; and the same with
+//! A device of `boot-core` and the flash model: power-on, boot stage, bootloader; and the same with
 //! a bug in it.
 
 use core::task::Poll;
@@ -22,7 +22,7 @@ use shared_abi::layout::Layout;
 
 use super::model::{ModelFlash, CHIP, TWO_PROGRAMS};
 
-/// Two programs; what has one uses the first.
+/// Two programs; setups with one program use the first.
 pub static LAYOUT: Layout = TWO_PROGRAMS;
 
 const PROGRAMS: usize = 2;
@@ -31,7 +31,7 @@ static ENTRIES: [Entry; entry_count(PROGRAMS as u8, Extras::NONE)] =
 /// 6005h/1.
 const LIFT_PASSWORD: Address = Address::new(0x6005, 1);
 
-/// Whom the programs are for.
+/// The target of the programs.
 pub const VENDOR_ID: u32 = 0x0000_0319;
 /// See [`VENDOR_ID`].
 pub const PRODUCT_CODE: u32 = 0x0004_0001;
@@ -63,7 +63,7 @@ static LIFT: Config = Config {
     download: Policy { data: Some(2), replaces: true, read_back: true, ..CONFIG.download },
     ..CONFIG
 };
-/// A lift that wants its password.
+/// A lift that requires its password.
 static LOCKED_LIFT: Config = Config {
     entries: {
         static ENTRIES: [Entry; entry_count(PROGRAMS as u8, Profile::LIFT.extras)] =
@@ -74,7 +74,7 @@ static LOCKED_LIFT: Config = Config {
     password: Profile::LIFT.password,
     ..CONFIG
 };
-/// A password for each program, which voids it.
+/// A password for each program, which makes it invalid.
 static ESACADEMY: Config = Config {
     entries: {
         static ENTRIES: [Entry; entry_count(PROGRAMS as u8, Profile::ESACADEMY.extras)] =
@@ -87,7 +87,7 @@ static ESACADEMY: Config = Config {
 };
 static HASTY: Config = Config { download: Policy { erase: |_| Erase::AtOnce, ..CONFIG.download }, ..CONFIG };
 
-/// How a device of these tests decides what starts: program 1 by itself, and no rescue window.
+/// The boot decision of these tests: program 1 starts by itself, and there is no rescue window.
 pub const DECISION: decision::Policy = decision::Policy {
     autostart: Some(1),
     max_crash_resets: 3,
@@ -97,25 +97,25 @@ pub const DECISION: decision::Policy = decision::Policy {
     start_allowed: |_| true,
 };
 
-/// Node-ID and bit rate of a device that was never told others.
+/// Node-ID and bit rate of a device without stored values.
 pub const BOARD_NODE: NodeParameters = NodeParameters { id: NodeId::new(1), bit_rate: BitRate::K125 };
 
-/// A mistake that somebody could make, and that the proof has to find.
+/// A possible bug, which the proof must detect.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Bug {
-    /// The record of the new program is stored, signed, before its data are there.
+    /// The record of the new program is stored and released before its data are complete.
     SignatureBeforeData,
-    /// The sectors are erased while the record still stands.
+    /// The sectors are erased while the record is still valid.
     EraseBeforeInvalidating,
-    /// The program is erased before anybody knows whom the new one is for.
+    /// The program is erased before the target of the new one is known.
     EraseBeforeCheck,
     /// Records carry no CRC.
     JournalWithoutCrc,
-    /// A full journal is erased first, and written again then.
+    /// A full journal is erased first and then written again.
     CompactionInPlace,
-    /// A sector that begins blank is taken for erased.
+    /// A sector whose first bytes are blank is taken for erased.
     BlankAtFirstSight,
-    /// Nobody keeps which sectors may be half erased.
+    /// Half erased sectors are not recorded.
     TouchedForgotten,
 }
 
@@ -132,16 +132,16 @@ impl Bug {
     ];
 }
 
-/// What the device does when it is switched on.
+/// The state of the device after power-on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Outcome {
-    /// It answers as bootloader.
+    /// The bootloader answers.
     Bootloader,
-    /// It runs this program, byte for byte; told by its seed.
+    /// This program runs, byte for byte; identified by its seed.
     Runs(u8),
 }
 
-/// A device with flash in it. Whatever else it has is lost with the power.
+/// A device with its flash. Everything else is lost with the power.
 #[derive(Clone)]
 pub struct Device {
     /// Its flash.
@@ -150,7 +150,7 @@ pub struct Device {
 }
 
 impl Device {
-    /// With an empty flash.
+    /// A device with empty flash.
     pub fn new(bug: Option<Bug>) -> Self {
         Self { flash: ModelFlash::new(&CHIP), bug }
     }
@@ -159,10 +159,10 @@ impl Device {
         Store::open(&self.flash, self.bug)
     }
 
-    /// What the boot stage would do with this flash, without doing it.
+    /// The decision of the boot stage with this flash, without any effect.
     ///
     /// # Errors
-    /// If a program would run that is not one of ours, whole.
+    /// If a program would run that is not one of the tests' complete programs.
     pub fn decision(&self) -> Result<Outcome, String> {
         let parameters = self.parameters();
         let node = NodeParameters::load(&parameters, &self.flash, BOARD_NODE, |_| true);
@@ -190,11 +190,11 @@ impl Device {
         }
     }
 
-    /// Whether each program with a record is what the record says: nothing may vouch for a program
-    /// that is not there.
+    /// Checks that each program with a record matches its record: there must be no record for a
+    /// program that is not there.
     ///
     /// # Errors
-    /// The program that is not.
+    /// The program that does not match.
     pub fn records_are_true(&self) -> Result<(), String> {
         let parameters = self.parameters();
         for (number, region) in (1..).zip(LAYOUT.programs) {
@@ -207,24 +207,24 @@ impl Device {
         Ok(())
     }
 
-    /// What program `number` is by its record: its seed, and whether it is signed.
+    /// Program `number` according to its record: its seed, and whether it is released.
     pub fn installed(&self, number: u8) -> Option<(u8, bool)> {
         let record = ProgramRecord::load(&self.parameters(), &self.flash, number)?;
         Some((self.flash.cells(LAYOUT.programs[usize::from(number) - 1])[8], record.signed))
     }
 
-    /// Node-ID and bit rate in force after the next reset.
+    /// The node-ID and bit rate after the next reset.
     pub fn node(&self) -> NodeParameters {
         NodeParameters::load(&self.parameters(), &self.flash, BOARD_NODE, |_| true)
     }
 
-    /// The power comes back.
+    /// The power returns.
     pub fn power_on(&mut self) {
         self.flash.power_on();
         self.flash.touched.clear();
     }
 
-    /// The boot stage with what it writes.
+    /// The boot stage, including its writes.
     pub fn boot(&mut self) {
         let mut parameters = self.parameters();
         if parameters.get(&self.flash, Key::CrashCount).is_some_and(|[count, ..]| count > 0) {
@@ -250,7 +250,7 @@ impl Device {
         self.host_of(&LIFT, talk)
     }
 
-    /// The same for the bootloader of a lift that wants its password.
+    /// The same for the bootloader of a lift that requires its password.
     pub fn host_of_locked_lift<R>(&mut self, talk: impl FnOnce(&mut Host<'_, '_>) -> R) -> R {
         self.host_of(&LOCKED_LIFT, talk)
     }
@@ -271,13 +271,13 @@ impl Device {
     }
 }
 
-/// What the host does by SDO and LSS, through the same calls that the protocol makes.
+/// The host's actions by SDO and LSS, through the calls that the protocol makes.
 pub struct Host<'b, 'f> {
     node: Bootloader<'b, Chip<'f>, Store, PROGRAMS>,
 }
 
 impl Host<'_, '_> {
-    /// Until there is no work.
+    /// Runs until there is no work.
     pub fn settle(&mut self) {
         for _ in 0..1_000_000 {
             if self.node.step() == Step::Idle {
@@ -304,7 +304,7 @@ impl Host<'_, '_> {
         self.ended(program)
     }
 
-    /// A block, or a whole program, in SDO segments, and what becomes of it.
+    /// Sends a block, or a whole program, in SDO segments, and returns the result.
     ///
     /// # Errors
     /// The abort or the status.
@@ -325,8 +325,8 @@ impl Host<'_, '_> {
         self.ended(program)
     }
 
-    /// The password that opens 1F50h of a program, as the profile has it. The work that is under way
-    /// is not waited for.
+    /// Sends the password that unlocks 1F50h of a program, as the profile defines it, without
+    /// waiting for running work.
     ///
     /// # Errors
     /// The abort.
@@ -339,8 +339,8 @@ impl Host<'_, '_> {
         }
     }
 
-    /// A whole program of which only the first `sent` bytes come, and so many steps of work behind
-    /// them; then the client is gone.
+    /// Sends only the first `sent` bytes of a program, then runs this many steps of work; then the
+    /// client is gone.
     ///
     /// # Errors
     /// The abort.
@@ -373,7 +373,7 @@ impl Host<'_, '_> {
     /// LSS: configure node-ID and bit rate, and store them.
     ///
     /// # Errors
-    /// That they could not be stored.
+    /// The values could not be stored.
     pub fn store_node(&mut self, node: NodeParameters) -> Result<(), String> {
         let mut outcome = LssDevice::store(&mut self.node, node.id, Some(node.bit_rate));
         while outcome.is_pending() {
@@ -391,7 +391,7 @@ fn abort_text(abort: AbortCode) -> String {
     format!("abort {abort:?}")
 }
 
-/// Program `number` with this seed: a plausible vector table, and data that tell it from any other.
+/// Program `number` with this seed: a plausible vector table, and distinct data.
 pub fn image(number: u8, seed: u8) -> Vec<u8> {
     let base = LAYOUT.programs[usize::from(number) - 1].base;
     let len = 150 + usize::from(seed % 16) * 8;
@@ -402,7 +402,7 @@ pub fn image(number: u8, seed: u8) -> Vec<u8> {
     bytes
 }
 
-/// A chip as `boot-core` sees it, one bug included.
+/// A chip as `boot-core` sees it, possibly with a bug.
 struct Chip<'f> {
     flash: &'f mut ModelFlash,
     bug: Option<Bug>,
@@ -431,15 +431,15 @@ impl Flash for Chip<'_> {
     }
 }
 
-/// The journal, or something that somebody took for one.
+/// The journal, or a faulty replacement of it.
 enum Store {
     Journal(Journal),
-    /// Stores this record where it should take one away, or none at all.
+    /// Stores this record instead of removing one, or does not remove it.
     Instead(Journal, Option<Value>),
     /// Forgets which sectors may be half erased.
     Forgetful(Journal),
-    /// One region, record behind record; a word in front of each tells what it is about. `checked`:
-    /// with a CRC behind it.
+    /// One region with consecutive records; a word before each record identifies it. `checked`: a
+    /// CRC follows.
     Naive {
         checked: bool,
         work: Vec<(u32, u32)>,
@@ -472,7 +472,7 @@ impl Store {
     }
 }
 
-/// Words of a naive record: its key, four of value, its CRC.
+/// The words of a naive record: its key, four words of value, its CRC.
 const NAIVE: usize = 6;
 
 fn naive_key(key: Key) -> u32 {
@@ -490,7 +490,7 @@ fn naive_crc(words: &[u32]) -> u32 {
     crc32(&words.iter().flat_map(|word| word.to_le_bytes()).collect::<Vec<_>>())
 }
 
-/// The records of the naive store, and where the next one goes.
+/// The records of the naive store, and the place of the next one.
 fn naive_records<F: Flash>(flash: &F, checked: bool) -> (Vec<[u32; NAIVE]>, u32) {
     let region = LAYOUT.parameters[0];
     let mut records = Vec::new();
@@ -539,7 +539,7 @@ impl Parameters for Store {
             Self::Naive { work, .. } => {
                 let mut record = vec![naive_key(key), value[0], value[1], value[2], value[3]];
                 record.push(naive_crc(&record));
-                // The address is found when the flash can be read.
+                // The address is determined when the flash can be read.
                 *work = record.into_iter().map(|word| (u32::MAX, word)).collect();
             }
         }
@@ -559,7 +559,7 @@ impl Parameters for Store {
         if let Some(&(u32::MAX, key)) = work.first() {
             let (mut records, mut end) = naive_records(flash, *checked);
             if end + 4 * NAIVE as u32 > region.end() {
-                // The bug: until all is written again there is nothing.
+                // The bug: until everything is written again, the region is empty.
                 let new: Vec<u32> = work.iter().map(|(_, word)| *word).collect();
                 records.retain(|record| record[0] != key);
                 let mut latest: Vec<[u32; NAIVE]> = Vec::new();

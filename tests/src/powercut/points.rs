@@ -1,4 +1,4 @@
-//! Cuts the power, looks what is there, and counts.
+//! Cuts the power, checks the state of the device, and counts.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -11,12 +11,12 @@ use super::device::{Bug, Device, Outcome};
 use super::model::{quiet_power_cuts, until_power_cut, Cut};
 use super::scenario::{Allowed, Scenario, Tell, SCENARIOS};
 
-/// How many violations a report tells in words.
+/// The number of violations that a report describes.
 pub(super) const TOLD: usize = 10;
-/// How often a device is looked at: bits between 0 and 1 read differently each time.
+/// How many times a device is checked: bits between 0 and 1 read differently each time.
 const LOOKS: usize = 4;
 
-/// In which way an operation is cut.
+/// The way in which an operation is cut.
 const KINDS: [(&str, Cut); 6] = [
     ("before", Cut::Before),
     ("after", Cut::After),
@@ -33,7 +33,7 @@ struct At {
     kind: usize,
 }
 
-/// A point of the proof: a scenario, a cut, and perhaps another one in the recovery. Written as
+/// A point of the proof: a scenario, a cut, and possibly another one in the recovery. Written as
 /// `update:37:torn` or `update:37:torn:12:after`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Point {
@@ -82,22 +82,22 @@ impl FromStr for Point {
     }
 }
 
-/// What a scenario has shown.
+/// The results of a scenario.
 #[derive(Clone, Debug)]
 pub struct Report<P = Point> {
     /// Flash operations of the scenario without a cut.
     pub operations: u64,
     /// Cuts, single and double.
     pub points: u64,
-    /// What the device did when the power came back, and how often.
+    /// The states of the device after the power returned, with their counts.
     pub outcomes: BTreeMap<String, u64>,
-    /// Points at which something was found that must not be.
+    /// The number of points with a violation.
     pub violations: u64,
-    /// The first of them: where, and what.
+    /// The first of them: the point and the violation.
     pub told: Vec<(P, String)>,
 }
 
-// Derived, it would want a point to have a default.
+// A derived implementation would require a default for points.
 impl<P> Default for Report<P> {
     fn default() -> Self {
         Self { operations: 0, points: 0, outcomes: BTreeMap::new(), violations: 0, told: Vec::new() }
@@ -144,11 +144,11 @@ type Script = fn(&Scenario, &mut Device, &Allowed, Tell<'_>) -> Result<(), Strin
 struct Run {
     cut: bool,
     operations: u32,
-    /// Where the cut struck.
+    /// The place of the cut.
     struck: String,
-    /// What may be found now.
+    /// The permitted states now.
     allowed: Allowed,
-    /// What the device refused.
+    /// The device's refusals.
     outcome: Result<(), String>,
 }
 
@@ -172,7 +172,7 @@ fn run_script(
     Run { cut, operations, struck, allowed, outcome }
 }
 
-/// What the device does now, if that is allowed, whenever one looks.
+/// Checks several times that the present state of the device is permitted.
 fn inspect(device: &Device, allowed: &Allowed) -> Result<Outcome, String> {
     let mut last = Outcome::Bootloader;
     for _ in 0..LOOKS {
@@ -193,7 +193,7 @@ fn inspect(device: &Device, allowed: &Allowed) -> Result<Outcome, String> {
     Ok(last)
 }
 
-/// What is exactly so.
+/// The exact state.
 fn exactly(device: &Device) -> Result<Allowed, String> {
     Ok(Allowed {
         outcomes: vec![device.decision()?],
@@ -202,7 +202,7 @@ fn exactly(device: &Device) -> Result<Allowed, String> {
     })
 }
 
-/// The recovery, to its end.
+/// The recovery, until its end.
 fn completes(scenario: &Scenario, device: &Device, from: &Allowed) -> Result<(Outcome, u32), String> {
     let mut device = device.clone();
     let run = run_script(scenario, Scenario::recover, &mut device, from.clone(), None);
@@ -245,10 +245,11 @@ fn at_operation(scenario: &Scenario, device: &Device, operation: u32, every_kind
 }
 
 /// Cuts the power at every operation of a scenario, in every way, and at every operation of the
-/// recovery; there in one way that changes from operation to operation, or in `every_kind`.
+/// recovery; there in one way that changes from operation to operation, or in every way with
+/// `every_kind`.
 ///
 /// # Errors
-/// If the scenario does not even work without a cut.
+/// If the scenario fails without a cut.
 pub fn run(scenario: &Scenario, every_kind: bool) -> Result<Report, String> {
     run_until(scenario, None, every_kind, u64::MAX)
 }
@@ -258,13 +259,13 @@ pub fn run(scenario: &Scenario, every_kind: bool) -> Result<Report, String> {
 pub enum Shown {
     /// Not at all.
     No,
-    /// The scenario fails although the power stays: no power cut is needed to find this bug.
+    /// The scenario fails without a power cut: no cut is needed to find this bug.
     Uncut(String),
     /// At this point, which is the first.
     ByCut(Point, String),
 }
 
-/// How a bug shows in this scenario. Looks no further than to the first time.
+/// How a bug shows in this scenario. Stops at the first violation.
 #[must_use]
 pub fn shows(scenario: &Scenario, bug: Bug) -> Shown {
     match run_until(scenario, Some(bug), false, 1) {
@@ -294,8 +295,8 @@ fn run_until(
 
     let next = AtomicU32::new(1);
     let total = Mutex::new(Report { operations: operations.into(), ..Report::default() });
-    // One that is to stop early goes through the operations in order: what it tells is the first,
-    // whoever asks.
+    // A run that must stop early processes the operations in order, so that it always reports the
+    // same first violation.
     let threads =
         if violations == 1 { 1 } else { std::thread::available_parallelism().map_or(1, usize::from) };
     std::thread::scope(|scope| {
@@ -329,7 +330,7 @@ fn run_until(
     Ok(total.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
 }
 
-/// One point, in words.
+/// One point as text.
 #[must_use]
 pub fn reproduce(point: &Point) -> String {
     quiet_power_cuts_once();

@@ -1,4 +1,4 @@
-//! What is done to the device, and what may be found after a cut at any time.
+//! The actions on the device, and the permitted states after a cut at any time.
 
 use boot_core::canopen::{BitRate, NodeId};
 use boot_core::crc32;
@@ -9,9 +9,9 @@ use crate::ihex::intel_hex;
 
 use super::device::{image, Device, Outcome, BOARD_NODE, LAYOUT, PRODUCT_CODE, VENDOR_ID};
 
-/// Seed of the program that is there before an update.
+/// Seed of the program before an update.
 pub const OLD: u8 = 0xA3;
-/// Seed of the program that comes.
+/// Seed of the new program.
 pub const NEW: u8 = 0xB7;
 
 const START_OLD: Outcome = Outcome::Runs(OLD);
@@ -22,39 +22,39 @@ const CLEAR: u8 = 0x03;
 const SET_SIGNATURE: u8 = 0x83;
 const CLR_SIGNATURE: u8 = 0x84;
 
-/// What may be found when the power comes back.
+/// The permitted states after the power returns.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Allowed {
-    /// What the device may do.
+    /// The permitted behaviour of the device.
     pub outcomes: Vec<Outcome>,
-    /// What its node-ID and bit rate may be.
+    /// The permitted node-ID and bit rate.
     pub nodes: Vec<NodeParameters>,
-    /// What program 2 may be: its seed and whether it is signed.
+    /// The permitted program 2: its seed, and whether it is released.
     pub second: Vec<Option<(u8, bool)>>,
 }
 
-/// Told by a script as it goes on.
+/// The function through which a script reports its progress.
 pub type Tell<'a> = &'a mut dyn FnMut(Allowed);
 
-/// A story: how the device is before, what is done to it, and what brings it to the end after a
+/// A scenario: the device before, the actions, and the actions that complete the scenario after a
 /// cut.
 pub struct Scenario {
     /// Its name on the command line.
     pub name: &'static str,
-    /// What it is about.
+    /// Its description.
     pub about: &'static str,
-    /// The device before.
+    /// Prepares the device.
     prepare: fn(&mut Device),
-    /// What is done; tells what may be found from now on.
+    /// The actions; they report the states that are permitted from now on.
     act: fn(&mut Device, Tell<'_>) -> Result<(), String>,
-    /// What a host does after a cut, with what may be found before.
+    /// The host's actions after a cut, given the states that were permitted before.
     recover: fn(&mut Device, &Allowed, Tell<'_>) -> Result<(), String>,
-    /// What must be found in the end.
+    /// The state at the end.
     end: fn() -> Allowed,
 }
 
 impl Scenario {
-    /// The device as it is before.
+    /// The prepared device.
     pub fn device(&self, bug: Option<super::Bug>) -> Device {
         let mut device = Device::new(bug);
         (self.prepare)(&mut device);
@@ -62,25 +62,25 @@ impl Scenario {
         device
     }
 
-    /// Power on, and the story.
+    /// Switches the power on and runs the scenario.
     ///
     /// # Errors
-    /// What the device refused.
+    /// The device's refusal.
     pub fn act(&self, device: &mut Device, _: &Allowed, tell: Tell<'_>) -> Result<(), String> {
         device.boot();
         (self.act)(device, tell)
     }
 
-    /// Power on, and what a host does then.
+    /// Switches the power on and runs the host's actions after a cut.
     ///
     /// # Errors
-    /// What the device refused.
+    /// The device's refusal.
     pub fn recover(&self, device: &mut Device, from: &Allowed, tell: Tell<'_>) -> Result<(), String> {
         device.boot();
         (self.recover)(device, from, tell)
     }
 
-    /// What must be found in the end.
+    /// The state at the end.
     pub fn end(&self) -> Allowed {
         (self.end)()
     }
@@ -115,7 +115,7 @@ fn words(words: &[u32]) -> Vec<u8> {
     words.iter().flat_map(|word| word.to_le_bytes()).collect()
 }
 
-/// The blocks of a program; `crc` is what the last one says.
+/// The blocks of a program; `crc` is the CRC in the last one.
 fn blocks(number: u8, image: &[u8], product_code: u32, crc: u32) -> Vec<Vec<u8>> {
     let base = LAYOUT.programs[usize::from(number) - 1].base;
     let size = image.len() as u32;
@@ -132,7 +132,7 @@ fn good(number: u8, seed: u8) -> Vec<Vec<u8>> {
     blocks(number, &image, PRODUCT_CODE, crc32(&image))
 }
 
-/// CLEAR and the blocks. `begun` is called before the first one is.
+/// CLEAR and the blocks. `begun` is called before the first block.
 fn download(
     device: &mut Device,
     number: u8,
@@ -176,14 +176,14 @@ fn erase_and_install(device: &mut Device, tell: Tell<'_>) -> Result<(), String> 
     Ok(())
 }
 
-/// An update of program 1 in one go.
+/// An update of program 1 in one transfer.
 fn update_at_once(device: &mut Device, data: Vec<u8>, tell: Tell<'_>) -> Result<(), String> {
     download(device, 1, &[data], || tell(allowed(&[START_OLD, STAY, START_NEW])))?;
     tell(allowed(&[START_NEW]));
     Ok(())
 }
 
-/// Any bytes, but for the one that tells them apart.
+/// Arbitrary bytes, except the byte that identifies them.
 fn parameter_set(seed: u8) -> Vec<u8> {
     (0..150_u8).map(|i| if i == 8 { seed } else { i.wrapping_mul(3) }).collect()
 }
@@ -196,7 +196,7 @@ fn hex() -> Vec<u8> {
     intel_hex(LAYOUT.programs[0].base, &image(1, NEW)).into_bytes()
 }
 
-/// The same after a cut, when nobody knows what is there.
+/// The same after a cut, in an unknown state.
 fn update_after_a_cut(device: &mut Device, _: &Allowed, tell: Tell<'_>) -> Result<(), String> {
     download(device, 1, &good(1, NEW), || tell(allowed(&[START_OLD, STAY, START_NEW])))?;
     tell(allowed(&[STAY, START_NEW]));
@@ -511,7 +511,7 @@ pub const SCENARIOS: &[Scenario] = &[
     },
 ];
 
-/// Steps in which a sector is erased and some words are programmed.
+/// The number of steps in which a sector is erased and some words are programmed.
 const WORK: u32 = 60;
 
 fn install_in_lift(device: &mut Device) {
@@ -523,7 +523,7 @@ fn install_in_lift(device: &mut Device) {
     installed.expect("a sound device takes a good program");
 }
 
-/// Password, program and set of parameters, whatever is there.
+/// Password, program and set of parameters, whatever the state is.
 fn lift_from_anything(device: &mut Device, tell: Tell<'_>) -> Result<(), String> {
     const ANY: [Option<(u8, bool)>; 3] = [Some((OLD, true)), None, Some((NEW, true))];
     tell(with_second(&[START_OLD, STAY, START_NEW], &ANY));
@@ -537,7 +537,7 @@ fn lift_from_anything(device: &mut Device, tell: Tell<'_>) -> Result<(), String>
     Ok(())
 }
 
-/// Password and program, in one go.
+/// Password and program in one transfer.
 fn esacademy(device: &mut Device, program: u8, seed: u8) -> Result<(), String> {
     device.host_of_esacademy(|host| {
         host.password(program)?;
@@ -546,7 +546,7 @@ fn esacademy(device: &mut Device, program: u8, seed: u8) -> Result<(), String> {
     })
 }
 
-/// Both programs, whatever is there.
+/// Both programs, whatever the state is.
 fn esacademy_from_anything(device: &mut Device, tell: Tell<'_>) -> Result<(), String> {
     const ANY: [Option<(u8, bool)>; 3] = [Some((OLD, true)), None, Some((NEW, true))];
     tell(with_second(&[START_OLD, STAY, START_NEW], &ANY));
@@ -557,7 +557,7 @@ fn esacademy_from_anything(device: &mut Device, tell: Tell<'_>) -> Result<(), St
     Ok(())
 }
 
-/// The node-ID and bit rate of this number.
+/// The node-ID and bit rate with this number.
 fn node(id: u8) -> NodeParameters {
     let bit_rate = if id.is_multiple_of(2) { BitRate::K250 } else { BitRate::K500 };
     NodeParameters { id: NodeId::new(id), bit_rate }

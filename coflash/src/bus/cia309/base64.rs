@@ -1,9 +1,9 @@
-//! Bytes as text, as CiA 309-3 has domains: base64 (RFC 2045) in one line.
+//! base64 (RFC 2045) in one line, the form in which CiA 309-3 sends domains.
 
 const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
 const PAD: u8 = b'=';
 
-/// Three bytes are four digits; what is missing at the end is padded.
+/// Encodes three bytes as four digits and pads the end.
 pub(super) fn encode(bytes: &[u8]) -> String {
     let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
     for group in bytes.chunks(3) {
@@ -17,8 +17,8 @@ pub(super) fn encode(bytes: &[u8]) -> String {
     text
 }
 
-/// `None` for what is not base64: a digit that there is none of, a length that four does not divide,
-/// padding elsewhere than at the end.
+/// Decodes base64. `None` if the text has an invalid digit, if its length is not a multiple of
+/// four, or if padding stands anywhere but at the end.
 pub(super) fn decode(text: &[u8]) -> Option<Vec<u8>> {
     if !text.len().is_multiple_of(4) {
         return None;
@@ -45,7 +45,7 @@ pub(super) fn decode(text: &[u8]) -> Option<Vec<u8>> {
 mod tests {
     use super::*;
 
-    /// RFC 4648, chapter 10, whose alphabet and padding are the same.
+    /// The test vectors of RFC 4648, chapter 10, which has the same alphabet and padding.
     #[test]
     fn the_vectors_of_the_standard() {
         for (bytes, text) in [

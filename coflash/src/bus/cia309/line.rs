@@ -1,10 +1,10 @@
-//! The lines of a CiA 309-3 gateway, taken apart.
+//! Parses the lines of a CiA 309-3 gateway.
 
 use canopen::NodeId;
 
-/// What an answer, or an event, that is an error begins with.
+/// The first word of an answer or an event that reports an error.
 pub(super) const ERROR: &str = "ERROR";
-/// Event: a node has booted up.
+/// The event code of a boot-up message.
 const BOOT_UP: u32 = 205;
 
 /// A line of the gateway.
@@ -12,20 +12,20 @@ const BOOT_UP: u32 = 205;
 pub(super) enum Line {
     /// The answer to the command with this number.
     Answer(u32, String),
-    /// The rest of an answer that was begun and could not be finished (CANopenNode).
+    /// The rest of an answer that the gateway began and could not finish (CANopenNode).
     Broken(String),
     /// A node of this network has booted up.
     BootUp(u32, NodeId),
-    /// Something else that happens in the network.
+    /// Another event of the network.
     Event,
 }
 
-/// Takes a line apart; `None` for what no gateway says.
+/// Parses a line; `None` if no gateway sends such a line.
 pub(super) fn parse(text: &str) -> Option<Line> {
     let text = text.trim();
     if let Some(rest) = text.strip_prefix('[') {
         let (number, answer) = rest.split_once(']')?;
-        // `parse` would take a sign.
+        // `parse` would accept a sign.
         let number = number.trim();
         let number = number.parse().ok().filter(|_| number.bytes().all(|digit| digit.is_ascii_digit()))?;
         return Some(Line::Answer(number, answer.trim().to_string()));
@@ -33,7 +33,7 @@ pub(super) fn parse(text: &str) -> Option<Line> {
     if let Some(error) = text.strip_prefix("...").filter(|rest| rest.starts_with(ERROR)) {
         return Some(Line::Broken(error.to_string()));
     }
-    // An event: network and node as far as it has them, and a word.
+    // An event: network and node if the event has them, and a word.
     let words: Vec<&str> = text.split_ascii_whitespace().collect();
     let number = |at: usize| words.get(at).and_then(|word| word.parse::<u32>().ok());
     let (network, node) = (number(0), number(0).and(number(1)));
@@ -49,8 +49,8 @@ pub(super) fn parse(text: &str) -> Option<Line> {
     })
 }
 
-/// The code of an answer that is an error: `None` for an answer that is none, `Some(None)` for an
-/// error without a code.
+/// The error code of an answer: `None` if the answer is not an error, `Some(None)` for an error
+/// without a code.
 pub(super) fn error(answer: &str) -> Option<Option<u32>> {
     let rest = answer.strip_prefix(ERROR)?.trim_start_matches([':', ' ']);
     let word = rest.split([' ', '#', '(']).next().unwrap_or_default();

@@ -8,12 +8,12 @@
 //! | `[10] 1 set sdo_timeout 500` | `[10] OK` |
 //! | any | `[7] ERROR:0x06020000`, an SDO abort; `[7] ERROR:106`, an error of the gateway |
 //!
-//! A number in front goes with each command and comes back with its answer; then come network and
-//! node. Values are read as domains (`d`), which are base64, whatever they are: so the bytes are those
-//! of the SDO transfer. Lines without a number are events of the network, such as `1 5 ERROR 205`, a
-//! boot-up. Lines end with CR LF.
+//! Each command begins with a number, and its answer begins with the same number; then come network
+//! and node. Every value is read as a domain (`d`) in base64, whatever its type, so the bytes are
+//! those of the SDO transfer. Lines without a number are events of the network, such as the boot-up
+//! message `1 5 ERROR 205`. Lines end with CR LF.
 //!
-//! Spoken so by CANopenNode's `canopend` and by Lely's `coctl` tools.
+//! CANopenNode's `canopend` and Lely's `coctl` tools speak this form.
 
 use std::collections::BTreeSet;
 use std::io::{self, ErrorKind, Read, Write};
@@ -30,19 +30,19 @@ use super::tcp;
 mod base64;
 mod line;
 
-/// Of canopend; the standard names none.
+/// canopend's default port; the standard defines none.
 const DEFAULT_PORT: u16 = 60_000;
-/// How long a read or write of the socket waits in one piece.
+/// How long one read or write of the socket waits at most.
 const SLICE: Duration = Duration::from_millis(50);
-/// So much of a long command is handed over in one piece.
+/// A long command is sent in pieces of this many bytes.
 const PIECE: usize = 4096;
-/// A gateway that answers a command about itself does so at once.
+/// How long the gateway may take to answer a command that concerns the gateway alone.
 const AT_ONCE: Duration = Duration::from_secs(5);
-/// More than any value that is read as a whole has as text.
+/// Longer than the text of any value that is read as a whole.
 const LONGEST_LINE: usize = 100 * 1024 * 1024;
-/// No time-out of SDO is longer: 16 bits of milliseconds.
+/// The longest SDO time-out: 16 bits of milliseconds.
 const LONGEST_TIMEOUT: u128 = 0xFFFF;
-/// From here on a code is that of an SDO abort.
+/// Codes from this value on are SDO abort codes.
 const ABORTS: u32 = 0x0503_0000;
 
 /// A connection to a gateway, and one network behind it.
@@ -54,17 +54,17 @@ pub struct Cia309 {
     opened: Instant,
     /// The number of the last command.
     sequence: u32,
-    /// Commands that were given up: their answers may still come.
+    /// Commands that were given up. Their answers may still arrive.
     given_up: BTreeSet<u32>,
-    /// What has come and was not looked at yet.
+    /// Received bytes that were not parsed yet.
     inbox: Vec<u8>,
-    /// How much of it is known to have no end of a line.
+    /// The number of bytes at the beginning of `inbox` that are known to contain no end of line.
     searched: usize,
-    /// The SDO time-out that the gateway was told last.
+    /// The SDO time-out that the gateway was given last.
     timeout: Option<Duration>,
 }
 
-/// `//HOST:PORT/NET`, where NET is 1 unless told otherwise.
+/// `//HOST:PORT/NET`. NET is 1 if it is left out.
 pub(super) fn open(url: &str, rest: &str) -> Result<Cia309, AdapterError> {
     let bad = |why: &str| AdapterError::Url { url: url.to_string(), why: why.to_string() };
     let rest = rest.strip_prefix("//").ok_or_else(|| bad("it must be cia309://HOST:PORT/NET"))?;
@@ -116,7 +116,7 @@ impl Cia309 {
         AdapterError::Gateway { adapter: self.name.clone(), what }
     }
 
-    /// Sends a command; its number is in front.
+    /// Sends a command with its number in front.
     fn command(
         &mut self,
         words: &str,
@@ -148,20 +148,22 @@ impl Cia309 {
             }
             if Instant::now() >= deadline {
                 let seconds = ask.patience.as_secs_f64();
-                return Err(self.failed(format!("it has taken nothing for {seconds:.1} s")).into());
+                return Err(self.failed(format!("it has accepted no data for {seconds:.1} s")).into());
             }
         }
         Ok(sequence)
     }
 
-    /// Ends the connection in the middle of a command: nothing else ends a transfer of the gateway.
+    /// Closes the connection in the middle of a command: this is the only way to end a transfer of
+    /// the gateway.
     fn hang_up(&self) -> GatewayError {
-        // Whether it is gone already is all the same.
+        // The result does not matter: the connection may be closed already.
         let _ = self.stream.shutdown(std::net::Shutdown::Both);
         GatewayError::Cancelled
     }
 
-    /// Waits for the answer to a command. `arrived` is told how much of it is here.
+    /// Waits for the answer to a command. Calls `arrived` with the number of bytes of the answer
+    /// that have arrived.
     fn answer(
         &mut self,
         sequence: u32,
@@ -181,7 +183,7 @@ impl Cia309 {
                         self.given_up.remove(&sequence);
                         return Ok(answer);
                     }
-                    // Half a line: what broke it off follows.
+                    // The first part of a line; the error that interrupted it follows.
                     Line::Answer(number, answer) if number == sequence => begun = Some(answer),
                     Line::Broken(error) if begun.is_some() => {
                         self.given_up.remove(&sequence);
@@ -212,12 +214,12 @@ impl Cia309 {
         }
     }
 
-    /// Takes what the socket has, and waits a little for it.
+    /// Reads the data that the socket has; waits a short time for them.
     fn receive(&mut self) -> Result<(), AdapterError> {
         let mut bytes = [0; 16 * 1024];
         match self.stream.read(&mut bytes) {
             Ok(0) => Err(self.lost(ErrorKind::UnexpectedEof.into())),
-            Ok(len) if self.inbox.len() + len > LONGEST_LINE => Err(self.protocol("a line without end")),
+            Ok(len) if self.inbox.len() + len > LONGEST_LINE => Err(self.protocol("a line without an end")),
             Ok(len) => {
                 self.inbox.extend_from_slice(&bytes[..len]);
                 Ok(())
@@ -240,7 +242,7 @@ impl Cia309 {
             line.pop();
             let ended = line.pop_if(|byte| *byte == b'\r').is_some();
             let Ok(text) = String::from_utf8(line) else {
-                return Err(self.protocol("bytes that are no text"));
+                return Err(self.protocol("bytes that are not text"));
             };
             if !text.trim().is_empty() {
                 return Ok(Some((text, ended)));
@@ -252,7 +254,7 @@ impl Cia309 {
         line::parse(text).ok_or_else(|| self.protocol(text))
     }
 
-    /// What an answer says that is an error.
+    /// The error that an answer reports, if it does.
     fn error(&self, answer: &str) -> Option<GatewayError> {
         Some(match line::error(answer)? {
             Some(103) => GatewayError::NoAnswer,
@@ -263,25 +265,26 @@ impl Cia309 {
         })
     }
 
-    /// The error codes of CiA 309-3 that a command of this tool can draw.
+    /// The CiA 309-3 error codes that a command of this tool can cause.
     fn refusal(&self, code: u32) -> String {
         let what = match code {
             100 => "it does not support the request".to_string(),
             101 => "it does not understand the request".to_string(),
             102 => "its state does not allow the request".to_string(),
-            104 => "it wants a default network".to_string(),
-            105 => "it wants a default node".to_string(),
+            104 => "it needs a default network".to_string(),
+            105 => "it needs a default node".to_string(),
             106 => format!("it has no network {}", self.network),
             107 => "it does not reach this node-ID".to_string(),
             301 => "it is off the bus".to_string(),
             303 => "its buffer for CAN frames has overflowed".to_string(),
             600 => "it has no memory left".to_string(),
-            _ => "it refuses".to_string(),
+            _ => "it refuses the request".to_string(),
         };
         format!("{what} (error {code} of CiA 309-3)")
     }
 
-    /// Tells the gateway how long a node may take. One that cannot be told keeps its own time.
+    /// Tells the gateway how long a node may take. A gateway without this command keeps its own
+    /// time-out.
     fn set_timeout(&mut self, ask: &Ask<'_>) -> Result<(), GatewayError> {
         if self.timeout == Some(ask.sdo) {
             return Ok(());
@@ -298,7 +301,7 @@ impl Cia309 {
         Ok(())
     }
 
-    /// What came of a command that gives no value.
+    /// Checks the answer to a command that returns no value.
     fn done(&self, answer: &str) -> Result<(), GatewayError> {
         match self.error(answer) {
             Some(error) => Err(error),
@@ -320,7 +323,7 @@ impl<'c> From<&Ask<'c>> for Wait<'c> {
     }
 }
 
-/// Whether the socket has nothing to say at present.
+/// Whether the error only means that the socket has no data at present.
 fn waits(error: &io::Error) -> bool {
     matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
 }
@@ -336,7 +339,7 @@ impl Gateway for Cia309 {
             return Err(error);
         }
         base64::decode(answer.as_bytes()).ok_or_else(|| {
-            let said = format!("'{answer}', which is no domain in base64");
+            let said = format!("'{answer}', which is not a domain in base64");
             self.protocol(&said).into()
         })
     }
@@ -378,7 +381,7 @@ impl Gateway for Cia309 {
                         return Ok(Some(node))
                     }
                     Line::Answer(number, _) if !self.given_up.remove(&number) => {
-                        return Err(self.protocol(&format!("'{text}', which nobody asked")).into())
+                        return Err(self.protocol(&format!("'{text}', which answers no command")).into())
                     }
                     Line::Answer(..) | Line::Broken(_) | Line::BootUp(..) | Line::Event => {}
                 }

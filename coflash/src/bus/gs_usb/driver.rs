@@ -1,4 +1,4 @@
-//! The driver: what goes over USB when.
+//! The driver: the order of the transfers over USB.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -9,45 +9,46 @@ use super::wire::{self, request, Constants, Said};
 use crate::bus::driven::{Driver, Fault, Sent};
 use crate::bus::health::Health;
 
-/// Frames that may be under way in the device (`GS_MAX_TX_URBS`).
+/// The most frames that may be in the device's queue (`GS_MAX_TX_URBS`).
 pub(super) const MOST_UNDER_WAY: usize = 10;
 
-/// What the protocol needs of USB.
+/// The USB functions that the protocol needs.
 pub(super) trait Usb {
-    /// A vendor request to the interface that reads `len` bytes at most.
+    /// A vendor request to the interface that reads at most `len` bytes.
     fn read_control(&mut self, request: u8, value: u16, len: u16) -> Result<Vec<u8>, String>;
     /// A vendor request to the interface that writes.
     fn write_control(&mut self, request: u8, value: u16, data: &[u8]) -> Result<(), String>;
-    /// Hands a transfer to the bulk endpoint. Does not wait; `false` where it has no room.
+    /// Puts a transfer into the queue of the bulk endpoint. Does not wait; returns `false` if there
+    /// is no room.
     fn write(&mut self, data: &[u8]) -> Result<bool, String>;
-    /// The next transfer of the bulk endpoint, after `wait` at most.
+    /// Returns the next transfer of the bulk endpoint. Waits for at most `wait`.
     fn read(&mut self, wait: Duration) -> Result<Option<Vec<u8>>, String>;
 }
 
-/// A channel of a device that is reached by `U`.
+/// A channel of a device. `U` is the access to USB.
 pub(super) struct GsUsb<U> {
     usb: U,
     channel: u8,
-    /// Echoes that the device still owes.
+    /// Echoes that the device has not sent yet.
     under_way: BTreeSet<u32>,
     health: Health,
 }
 
 impl<U: Usb> GsUsb<U> {
-    /// Asks the device what it can do, and switches the channel on.
+    /// Reads the device's abilities and switches the channel on.
     pub(super) fn start(mut usb: U, channel: u8, rate: u32) -> Result<Self, String> {
         usb.write_control(request::HOST_FORMAT, 1, &wire::LITTLE_ENDIAN)?;
         let config = usb.read_control(request::DEVICE_CONFIG, 1, wire::DEVICE_CONFIG)?;
-        let channels = wire::channels(&config).ok_or("it tells no number of channels")?;
+        let channels = wire::channels(&config).ok_or("it does not report its number of channels")?;
         if channel >= channels {
             return Err(format!("it has {channels} channel(s), counted from 0"));
         }
         let constants = usb.read_control(request::CONSTANTS, channel.into(), wire::CONSTANTS)?;
-        let constants = Constants::parse(&constants).ok_or("it tells no timing of its controller")?;
+        let constants = Constants::parse(&constants).ok_or("it does not report its controller's timing")?;
         let timing = constants.timing(rate).ok_or_else(|| {
-            format!("its controller's clock of {} Hz does not come to {rate} bit/s", constants.clock)
+            format!("its controller's clock of {} Hz cannot produce {rate} bit/s", constants.clock)
         })?;
-        // Whatever was under way before.
+        // Ends a session that was active before.
         usb.write_control(request::MODE, channel.into(), &wire::RESET)?;
         usb.write_control(request::BIT_TIMING, channel.into(), &timing.emit())?;
         usb.write_control(request::MODE, channel.into(), &wire::START)?;
@@ -71,7 +72,7 @@ impl<U: Usb> Driver for GsUsb<U> {
         let Some(bytes) = self.usb.read(wait).map_err(Fault::Lost)? else { return Ok(None) };
         match wire::parse(&bytes, self.channel).map_err(|what| Fault::Nonsense(format!("it sends {what}")))? {
             Said::Frame(frame) => Ok(Some(frame)),
-            // An echo that it does not owe means nothing.
+            // Ignore an echo that the device does not owe.
             Said::Sent(echo) => {
                 self.under_way.remove(&echo);
                 Ok(None)

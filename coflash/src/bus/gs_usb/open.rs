@@ -1,4 +1,4 @@
-//! Opens devices, and lists them.
+//! Opens and lists devices.
 
 use super::driver::GsUsb;
 use super::usb;
@@ -20,7 +20,7 @@ pub(in crate::bus) fn open(which: Which, rate: u32) -> Result<Driven, AdapterErr
     })
 }
 
-/// The devices that are there, or what the system says instead.
+/// The connected devices, or the system's error.
 pub(in crate::bus) fn list() -> Result<Vec<Found>, String> {
     let devices = usb::list()?;
     let found = devices.iter().enumerate().map(|(place, device)| {
@@ -33,7 +33,7 @@ pub(in crate::bus) fn list() -> Result<Vec<Found>, String> {
         let found = Found::new(Kind::GsUsb, format!("gs_usb:{}", shown(which.as_bytes())), about);
         match device.kernel {
             true => {
-                let state = Some("the kernel has it: see socketcan".to_string());
+                let state = Some("the kernel uses it: see socketcan".to_string());
                 Found { state, certain: false, ..found }
             }
             false => found,

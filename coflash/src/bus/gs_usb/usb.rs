@@ -1,4 +1,4 @@
-//! gs_usb's way over USB, by `nusb`.
+//! Access to USB with `nusb`.
 
 use std::io;
 use std::time::Duration;
@@ -10,20 +10,20 @@ use super::driver::{Usb, MOST_UNDER_WAY};
 use super::which::Choice;
 use crate::bus::adapter::AdapterError;
 
-/// USB vendor and product of such adapters (the Linux driver's list, and CANnectivity).
+/// USB vendor and product IDs of gs_usb adapters (the list of the Linux driver, and CANnectivity).
 const DEVICES: [(u16, u16); 5] =
     [(0x1D50, 0x606F), (0x1209, 0x2323), (0x1CD2, 0x606F), (0x16D0, 0x10B8), (0x1209, 0xCA01)];
 
-/// How long a request may take (as the kernel's driver has it).
+/// How long a request may take (the limit of the kernel's driver).
 const REQUEST: Duration = Duration::from_secs(1);
-/// Transfers that wait for what the device sends.
+/// The number of transfers that wait for data from the device.
 const READS: usize = 8;
 
-/// What is known of a device before it is opened.
+/// What is known about a device before it is opened.
 pub(super) struct Listed {
     pub(super) serial: Option<String>,
     pub(super) product: Option<String>,
-    /// Whether the kernel's own driver has it: it is a CAN interface then.
+    /// Whether the kernel's own driver uses it. The device is a CAN interface then.
     pub(super) kernel: bool,
 }
 
@@ -32,7 +32,7 @@ fn devices() -> Result<Vec<DeviceInfo>, String> {
     Ok(all.filter(|device| DEVICES.contains(&(device.vendor_id(), device.product_id()))).collect())
 }
 
-/// The devices that are there, in the system's order.
+/// The connected devices, in the system's order.
 pub(super) fn list() -> Result<Vec<Listed>, String> {
     let text = |text: Option<&str>| text.map(str::to_string);
     let listed = |device: &DeviceInfo| Listed {
@@ -70,10 +70,10 @@ pub(super) fn open(name: &str, which: &Choice) -> Result<Device, AdapterError> {
     };
     let device = device.ok_or_else(|| {
         let what = match devices.len() {
-            0 => "there is no such adapter on USB".to_string(),
-            count => format!("it is not there ({count} other(s) are)"),
+            0 => "no such adapter is connected to USB".to_string(),
+            count => format!("it is not connected ({count} other(s) are)"),
         };
-        unusable(what, "plug it in; coflash adapters lists those that are there")
+        unusable(what, "plug it in; coflash adapters lists the adapters of this computer")
     })?;
     let refused = |error: nusb::Error| {
         let advice = match error.kind() {
@@ -82,7 +82,7 @@ pub(super) fn open(name: &str, which: &Choice) -> Result<Device, AdapterError> {
                  TAG+=\"uaccess\" into /etc/udev/rules.d/70-candlelight.rules, and plug the adapter in again"
             }
             ErrorKind::Busy => {
-                "the kernel's driver or another program has it: on Linux use the interface that the kernel made of it \
+                "the kernel's driver or another program uses it: on Linux use the interface that the kernel made of it \
                  (socketcan:can0; coflash adapters lists it)"
             }
             ErrorKind::Unsupported => {
@@ -103,7 +103,7 @@ pub(super) fn open(name: &str, which: &Choice) -> Result<Device, AdapterError> {
     Device::new(interface).map_err(|what| unusable(what, "it must speak gs_usb (candleLight)"))
 }
 
-/// A device that is open.
+/// An open device.
 pub(super) struct Device {
     interface: Interface,
     incoming: Endpoint<Bulk, In>,
@@ -142,7 +142,7 @@ impl Device {
     }
 }
 
-/// The words for a transfer that failed.
+/// The message for a transfer that failed.
 fn words(error: TransferError) -> String {
     match error {
         TransferError::Disconnected => "it was unplugged".to_string(),

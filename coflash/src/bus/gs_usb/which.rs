@@ -1,8 +1,8 @@
-//! Which device is meant.
+//! The part of the URL that selects the device.
 
 use std::fmt;
 
-/// Which device, and which channel of it.
+/// The device, and its channel.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(in crate::bus) struct Which {
     pub(super) device: Choice,
@@ -11,14 +11,15 @@ pub(in crate::bus) struct Which {
 
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Choice {
-    /// Its place in the list.
+    /// Its place in the list of devices.
     Place(usize),
     /// Its serial number.
     Serial(String),
 }
 
 impl Which {
-    /// `0`, `0/1`, `0030003A3438511834353732`: a number below 100 is a place, all else a serial number.
+    /// Parses `0`, `0/1` or `0030003A3438511834353732`. A number below 100 is a place, any other
+    /// text a serial number.
     pub(in crate::bus) fn parse(text: &str) -> Option<Self> {
         let (device, channel) = match text.split_once('/') {
             Some((device, channel)) => (device, Some(channel)),

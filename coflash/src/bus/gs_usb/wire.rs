@@ -1,7 +1,7 @@
 //! The bytes of gs_usb: requests, device constants, bit timing and frames. No USB here.
 //!
-//! Structures and values are those of the Linux driver `drivers/net/can/usb/gs_usb.c`. Everything is
-//! little-endian: that is what the host asks for, and what candleLight does in any case.
+//! Structures and values are those of the Linux driver `drivers/net/can/usb/gs_usb.c`. All numbers
+//! are little-endian: the host requests this order, and candleLight always uses it.
 
 use canopen::Frame;
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
@@ -20,7 +20,7 @@ pub mod request {
     pub const DEVICE_CONFIG: u8 = 5;
 }
 
-/// `struct gs_host_config`: the byte order, told by a number of known bytes.
+/// `struct gs_host_config`: a number with known bytes, which tells the device the byte order.
 pub const LITTLE_ENDIAN: [u8; 4] = 0x0000_BEEF_u32.to_le_bytes();
 /// `struct gs_device_mode` with `GS_CAN_MODE_RESET`.
 pub const RESET: [u8; 8] = [0; 8];
@@ -41,38 +41,38 @@ const EXTENDED: u32 = 0x8000_0000;
 const REMOTE: u32 = 0x4000_0000;
 const ERROR: u32 = 0x2000_0000;
 
-/// The little-endian word at this place.
+/// The little-endian word at offset `at`.
 fn word(bytes: &[u8], at: usize) -> Option<u32> {
     let bytes = bytes.get(at..at.checked_add(4)?)?;
     Some(u32::from_le_bytes(bytes.try_into().ok()?))
 }
 
-/// How many channels a device has (`struct gs_device_config`: `icount` is one less).
+/// The number of channels of a device (`struct gs_device_config`: `icount` is one less).
 pub fn channels(bytes: &[u8]) -> Option<u8> {
     let last = bytes.get(..usize::from(DEVICE_CONFIG))?[3];
     last.checked_add(1)
 }
 
-/// What a device's controller can do (`struct gs_device_bt_const`).
+/// The abilities of a device's controller (`struct gs_device_bt_const`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Constants {
     /// The controller's clock in Hz.
     pub clock: u32,
-    /// Time segment 1 (propagation and phase 1), in quanta: least and most.
+    /// Time segment 1 (propagation and phase 1), in quanta: minimum and maximum.
     pub segment_1: (u32, u32),
-    /// Time segment 2, in quanta: least and most.
+    /// Time segment 2, in quanta: minimum and maximum.
     pub segment_2: (u32, u32),
-    /// The widest jump, in quanta.
+    /// The maximum jump width, in quanta.
     pub jump_most: u32,
-    /// The divider of the clock: least, most, and the step.
+    /// The divider of the clock: minimum, maximum and step.
     pub divider: (u32, u32, u32),
 }
 
 impl Constants {
-    /// Reads them; `None` where there are too few bytes.
+    /// Parses the structure; `None` if `bytes` is too short.
     pub fn parse(bytes: &[u8]) -> Option<Self> {
         let at = |place: usize| word(bytes, 4 * place);
-        // The first word has the features; none of them is needed.
+        // The first word holds the features; this driver needs none of them.
         Some(Self {
             clock: at(1)?,
             segment_1: (at(2)?, at(3)?),
@@ -82,8 +82,8 @@ impl Constants {
         })
     }
 
-    /// The timing that comes to `rate` (bit/s) exactly and is sampled nearest to where CANopen wants it
-    /// (CiA 301: 87.5 %; above 500 kbit/s earlier, as Linux has it). `None` where there is none.
+    /// The timing that gives exactly `rate` (bit/s) with the sample point nearest to CANopen's (CiA
+    /// 301: 87.5 %; earlier above 500 kbit/s, as in Linux). `None` if no timing gives this rate.
     pub fn timing(&self, rate: u32) -> Option<Timing> {
         let wanted = match rate {
             800_001.. => 750,
@@ -93,7 +93,7 @@ impl Constants {
         let most = u64::from(self.segment_1.1) + u64::from(self.segment_2.1) + 1;
         let (least_divider, most_divider, step) = self.divider;
         let mut best: Option<(u32, Timing)> = None;
-        // CAN allows 8 to 25 quanta; controllers for CAN FD have more.
+        // CAN allows 8 to 25 quanta; controllers for CAN FD allow more.
         for quanta in (4..=u32::try_from(most.min(512)).ok()?).rev() {
             let per_second = rate.checked_mul(quanta).filter(|product| *product > 0)?;
             let divider = self.clock / per_second;
@@ -103,7 +103,7 @@ impl Constants {
             {
                 continue;
             }
-            // The sample point lies behind the synchronisation quantum and segment 1.
+            // The sample point follows the synchronisation quantum and segment 1.
             let ideal = quanta - (quanta * wanted + 500) / 1000;
             let behind_least = self.segment_2.0.max(1).max((quanta - 1).saturating_sub(self.segment_1.1));
             let behind_most = self.segment_2.1.min((quanta - 1).saturating_sub(self.segment_1.0.max(1)));
@@ -122,14 +122,14 @@ impl Constants {
     }
 }
 
-/// A bit's timing, in quanta, and the clock's divider.
+/// The timing of a bit, in quanta, and the divider of the clock.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Timing {
     /// Propagation and phase 1.
     pub segment_1: u32,
     /// Phase 2.
     pub segment_2: u32,
-    /// The widest jump.
+    /// The jump width.
     pub jump: u32,
     /// The divider.
     pub divider: u32,
@@ -148,8 +148,8 @@ impl Timing {
     }
 }
 
-/// `struct gs_host_frame` for a frame that is to be sent on a channel. The device gives `echo` back when
-/// it has been sent.
+/// `struct gs_host_frame` for a frame to send on a channel. The device returns `echo` after it has
+/// sent the frame.
 pub fn emit(frame: &Frame, channel: u8, echo: u32) -> [u8; FRAME] {
     let mut id = match frame.id() {
         Id::Standard(id) => u32::from(id.as_raw()),
@@ -168,7 +168,7 @@ pub fn emit(frame: &Frame, channel: u8, echo: u32) -> [u8; FRAME] {
     bytes
 }
 
-/// What a device says.
+/// A message from a device.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Said {
     /// A frame came from the bus.
@@ -181,10 +181,10 @@ pub enum Said {
     Other,
 }
 
-/// Reads one transfer.
+/// Parses one transfer.
 ///
 /// # Errors
-/// What is wrong with it.
+/// What is wrong with the transfer.
 pub fn parse(bytes: &[u8], channel: u8) -> Result<Said, String> {
     let short = || format!("a transfer of {} bytes", bytes.len());
     let (echo, id) = (word(bytes, 0).ok_or_else(short)?, word(bytes, 4).ok_or_else(short)?);
@@ -225,8 +225,8 @@ mod tests {
 
     use super::*;
 
-    /// What a candleLight with an STM32F072 says: tseg1 1..16, tseg2 1..8, sjw 1..4, brp 1..1024, step 1,
-    /// clock 48 MHz (its bit timing constants, as `ip -details` shows them).
+    /// The constants of a candleLight with an STM32F072: tseg1 1..16, tseg2 1..8, sjw 1..4, brp
+    /// 1..1024, step 1, clock 48 MHz (its bit timing constants, as `ip -details` shows them).
     const CANDLELIGHT: [u8; 40] = [
         0x53, 0, 0, 0, 0x00, 0x6C, 0xDC, 0x02, 1, 0, 0, 0, 16, 0, 0, 0, 1, 0, 0, 0, 8, 0, 0, 0, 4, 0, 0, 0,
         1, 0, 0, 0, 0, 4, 0, 0, 1, 0, 0, 0,
@@ -260,7 +260,7 @@ mod tests {
         assert_eq!(Constants::parse(&CANDLELIGHT[..39]), None);
     }
 
-    /// Bytes laid out by hand as gs_host_frame has them.
+    /// Bytes written by hand from the definition of gs_host_frame.
     #[test]
     fn frames_have_the_drivers_layout() {
         assert_eq!(
@@ -274,7 +274,7 @@ mod tests {
         let answer = frame(0x585, &[0x43, 0x00, 0x10, 0x00, 0, 0, 0, 0x10]);
         assert_eq!(parse(&received, 0), Ok(Said::Frame(answer)));
         assert_eq!(parse(&received, 1), Ok(Said::Other));
-        // With a time stamp behind it.
+        // The same with a time stamp at the end.
         assert_eq!(parse(&[&received[..], &[1, 2, 3, 4]].concat(), 0), Ok(Said::Frame(answer)));
         let mut echo = received;
         echo[..4].copy_from_slice(&[9, 0, 0, 0]);

@@ -1,4 +1,4 @@
-//! What to do about an error.
+//! The advice for an error.
 
 use canopen::program::FlashError;
 use canopen::AbortCode;
@@ -12,7 +12,7 @@ impl Error {
     pub fn advice(&self) -> String {
         match self {
             Self::Adapter(error) => error.advice(),
-            Self::Cancelled => "run the same command again when you like".to_string(),
+            Self::Cancelled => "run the same command again to continue".to_string(),
             Self::NoAnswer { node, .. } => format!(
                 "check that node {node} is the right one, that the device has power, that both sides use the same bit \
                  rate and that the bus is terminated; a slow device may need a longer --sdo-timeout"
@@ -24,12 +24,12 @@ impl Error {
                 debugger_advice(*code).to_string()
             }
             Self::Refused { code, .. } => refusal_advice(*code).to_string(),
-            Self::NotInDialect { .. } => "leave that out, or name another dialect by --dialect".to_string(),
-            Self::NoPassword { .. } => "give the device's password by --unlock; its maker knows it".to_string(),
+            Self::NotInDialect { .. } => "leave out this option, or name another dialect with --dialect".to_string(),
+            Self::NoPassword { .. } => "give the device's password with --unlock; its manufacturer knows it".to_string(),
             Self::Occupied { node } => format!(
-                "finish the update of the device that is node {node} now, or switch that off, and run the command again"
+                "finish the update of the device that is node {node} now, or switch that device off; then run the command again"
             ),
-            Self::NotAlone { .. } => "wait until the other one is done, or end it, and run the command again; coflash flash \
+            Self::NotAlone { .. } => "wait until the other tool has finished, or end it; then run the command again; coflash flash \
                                       --not-alone goes on all the same, at the risk that both fail"
                 .to_string(),
             Self::Protocol { .. } => "look for a second tool or a second device with this node-ID on the bus; a longer \
@@ -38,7 +38,7 @@ impl Error {
             Self::Failed { error, .. } => failure_advice(*error).to_string(),
             Self::WrongTarget { what, .. } => failure_advice(what.error()).to_string(),
             Self::NoProgram { advice, .. } => (*advice).to_string(),
-            Self::OtherRegion { .. } => "link the program for that place, or check --program and --board; \
+            Self::OtherRegion { .. } => "link the program for that address, or check --program and --board; \
                                          --force leaves that to the device"
                 .to_string(),
             Self::OtherIdentity { .. } => "check that the program was made for this device: it is not released for autostart; \
@@ -64,10 +64,10 @@ impl Error {
             }
             .to_string(),
             Self::Lss { failure: LssFailure::None, .. } => {
-                "say which node-ID it is to get, or give it one by coflash lss assign".to_string()
+                "give the node-ID for the device, or set it with coflash lss assign".to_string()
             }
             Self::Lss { doing, failure: LssFailure::Refused { code, .. } } => match (doing, code) {
-                (LssDoing::Store, 1) => "this device cannot store: switches or its application set node-ID and bit rate",
+                (LssDoing::Store, 1) => "this device cannot store node-ID and bit rate: its switches or its application set them",
                 (LssDoing::Store, _) => "run it again; if it happens again, the device's memory is broken",
                 (LssDoing::BitRate, _) => "choose a bit rate that the device supports",
                 _ => "choose a node-ID from 1 to 127",
@@ -106,7 +106,7 @@ impl Error {
 
 fn failure_advice(error: FlashError) -> &'static str {
     match error {
-        FlashError::NoValidProgram => "flash a program, and let it be released for autostart",
+        FlashError::NoValidProgram => "flash a program, and release it for autostart",
         FlashError::Format => "check that the file is a block file for this bootloader, or convert it again",
         FlashError::Crc => "run the command again; if it happens again, check bus and terminators",
         FlashError::NotCleared => {
@@ -115,7 +115,7 @@ fn failure_advice(error: FlashError) -> &'static str {
         FlashError::Write => {
             "run the command again; if it happens again, the flash may be worn out or write-protected"
         }
-        FlashError::Address => "check --board and --program: the file is for another memory map",
+        FlashError::Address => "the file is for another memory map: check --board and --program",
         FlashError::Secured => "the file wants to write into the bootloader: check how the program is linked",
         FlashError::NvData => {
             "run the command again; if it happens again, the device cannot store its parameters"
@@ -123,7 +123,9 @@ fn failure_advice(error: FlashError) -> &'static str {
         FlashError::WrongVendorId | FlashError::WrongProductId => {
             "check that file and device belong together (coflash info shows the device's identity)"
         }
-        FlashError::NoAccess => "the device forbids updates at present: ask its maker how to unlock it",
+        FlashError::NoAccess => {
+            "the device forbids updates at present: ask its manufacturer how to unlock it"
+        }
         FlashError::Busy => {
             "wait a moment and run the command again; another tool may be at work on the device"
         }
@@ -147,12 +149,12 @@ fn failure_advice(error: FlashError) -> &'static str {
 fn unlock_advice(code: AbortCode) -> &'static str {
     match code {
         AbortCode::NO_OBJECT | AbortCode::NO_SUB_INDEX => {
-            "the device knows no password: check --dialect, or leave that out"
+            "the device has no password: check --dialect, or leave out --unlock"
         }
         AbortCode::DEVICE_STATE => {
-            "after a wrong password a device takes none for a while: try the right one again in half a minute"
+            "after a wrong password a device accepts none for a while: try the right one in half a minute"
         }
-        _ => "check the password: the device's maker knows it; after some wrong ones it may take none for a while",
+        _ => "check the password: the device's manufacturer knows it; after wrong passwords the device may accept none for a while",
     }
 }
 
@@ -166,25 +168,25 @@ fn refusal_advice(code: AbortCode) -> &'static str {
         AbortCode::TIMEOUT | AbortCode::TOGGLE | AbortCode::COMMAND => {
             "frames were lost, or a second tool is at work on the device: check the bus and run the command again"
         }
-        _ => "run the command again; if it happens again, the abort code tells what the device objects to",
+        _ => "run the command again; if it happens again, the abort code gives the device's reason",
     }
 }
 
-/// What to do about a refusal of the debugger interface, 1025h.
+/// The advice for a refusal of the debugger interface, 1025h.
 fn debugger_advice(code: AbortCode) -> &'static str {
     match code {
         AbortCode::NO_OBJECT => {
-            "the device has no debugger interface, as no product has; on the bench, build its firmware with the feature \
+            "the device has no debugger interface; no product has one; on the bench, build its firmware with the feature \
              `debugger` (docs/debugger.md)"
         }
         AbortCode::INVALID_VALUE => {
-            "these bytes must not be touched: nothing is there, or it is flash that is to be written, or part of a register \
+            "these bytes cannot be accessed: there is no memory, or the write is to flash, or it covers part of a register \
              (docs/debugger.md)"
         }
         AbortCode::DEVICE_STATE => {
             "the device is secured: its read-out protection (RDP) has to be taken away first, which erases it"
         }
-        AbortCode::LOCAL_CONTROL => "the flash is busy: try again when the erasing is over",
+        AbortCode::LOCAL_CONTROL => "the flash is busy: try again when the erase has ended",
         code => refusal_advice(code),
     }
 }

@@ -1,5 +1,5 @@
-//! A session's attention to what it notices beside its transfers: silence is told, and somebody else
-//! at the node ends what would harm both.
+//! What a session notices besides its transfers: it reports silence of the node, and stops if
+//! another tool uses the node.
 
 use std::sync::{MutexGuard, PoisonError};
 use std::time::Duration;
@@ -9,14 +9,14 @@ use super::Session;
 use crate::device::doing::Doing;
 use crate::device::error::{Error, Intruder};
 
-/// Requests of somebody else are held against the session for so long.
+/// How long a request of another tool counts.
 const FRESH: Duration = Duration::from_secs(2);
-/// Another tool that is at work on a node asks it at least so often: while a sector is erased, four
-/// times a second.
+/// Another tool that is working with a node sends requests at least this often: during the erase of
+/// a sector, four times a second.
 const LISTEN: Duration = Duration::from_millis(300);
 
 impl<'a> Session<'a> {
-    /// Tells silence to `hook` while it lasts, once each time.
+    /// Reports silence to `hook` while it lasts, once for each silence.
     #[must_use]
     pub fn tell_silence(mut self, hook: &'a dyn Fn(Silence)) -> Self {
         self.on_silence = Some(hook);
@@ -24,17 +24,17 @@ impl<'a> Session<'a> {
     }
 
     pub(super) fn watch(&self) -> MutexGuard<'_, Watch> {
-        // Nobody panics while it is held; and if so, what it says is still right.
+        // No thread panics while it holds the lock; and if one did, the contents are still valid.
         self.watch.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// How long nothing has been heard of the node: since `began` where it has never been heard.
+    /// How long the node has been silent; since `began` if it has never been heard.
     pub(super) fn silent_since(&self, began: Duration) -> Duration {
         let heard = self.watch().heard;
         self.now().saturating_sub(heard.unwrap_or(began))
     }
 
-    /// Tells a silence that has lasted since `began` or longer, if it is worth it.
+    /// Reports a silence since `began` or longer, if it is long enough.
     pub(crate) fn note_silence(&self, began: Duration, limit: Duration, doing: Doing) {
         let Some(hook) = self.on_silence else { return };
         let silent = self.silent_since(began);
@@ -44,8 +44,8 @@ impl<'a> Session<'a> {
         hook(Silence { node: self.node, doing, silent, limit });
     }
 
-    /// Looks whether somebody else is at work on the node: listens for a moment, and takes what was
-    /// heard in the last seconds.
+    /// Checks whether another tool is using the node: listens for a moment, and includes the
+    /// requests of the last seconds.
     ///
     /// # Errors
     /// [`Error::NotAlone`], [`Error::Adapter`] or [`Error::Cancelled`].
@@ -56,7 +56,7 @@ impl<'a> Session<'a> {
         self.still_alone()
     }
 
-    /// The same without listening any further.
+    /// The same check without listening any longer.
     ///
     /// # Errors
     /// [`Error::NotAlone`].

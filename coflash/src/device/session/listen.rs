@@ -1,4 +1,4 @@
-//! What a session hears on the bus, and what it says beside SDO.
+//! What a session receives on the bus, and what it sends besides SDO.
 
 use std::time::Duration;
 
@@ -9,11 +9,11 @@ use super::{Session, Way};
 use crate::device::doing::Doing;
 use crate::device::error::{of_gateway, Error};
 
-/// The longest wait in one piece: how soon a cancelled session notices.
+/// The longest single wait: a cancelled session notices within this time.
 pub(super) const SLICE: Duration = Duration::from_millis(100);
 
 impl Session<'_> {
-    /// Lets time pass on the bus. Frames that come are not for anyone.
+    /// Waits on the bus. Frames that arrive are ignored.
     ///
     /// # Errors
     /// [`Error::Adapter`] or [`Error::Cancelled`].
@@ -21,7 +21,7 @@ impl Session<'_> {
         self.listen(time, |_| false).map(|_| ())
     }
 
-    /// Listens to everything on the bus for a time.
+    /// Receives all frames on the bus for `time`.
     ///
     /// # Errors
     /// [`Error::Adapter`] or [`Error::Cancelled`].
@@ -33,8 +33,8 @@ impl Session<'_> {
         .map(|_| ())
     }
 
-    /// Listens to everything on the bus until `enough` says so, `time` at most; tells whether it
-    /// did.
+    /// Receives all frames on the bus until `enough` returns true, for at most `time`; returns
+    /// whether it did.
     ///
     /// # Errors
     /// [`Error::Adapter`] or [`Error::Cancelled`].
@@ -46,7 +46,7 @@ impl Session<'_> {
         self.listen(time, enough)
     }
 
-    /// Waits for the node's boot-up message, `time` at most; tells whether it came.
+    /// Waits for the node's boot-up message for at most `time`; returns whether it came.
     ///
     /// # Errors
     /// [`Error::Adapter`] or [`Error::Cancelled`].
@@ -55,7 +55,7 @@ impl Session<'_> {
         self.listen(time, |frame| *frame == boot_up)
     }
 
-    /// Waits for the boot-up message of any other node, `time` at most; gives which one it was.
+    /// Waits for the boot-up message of any other node for at most `time`; returns the node.
     ///
     /// # Errors
     /// [`Error::Adapter`] or [`Error::Cancelled`].
@@ -69,7 +69,7 @@ impl Session<'_> {
         Ok(other)
     }
 
-    /// Tells the node by network management to restart (NMT reset node); it gives no answer.
+    /// Makes the node restart by network management (NMT reset node). NMT has no answer.
     ///
     /// # Errors
     /// [`Error::Adapter`].
@@ -85,7 +85,8 @@ impl Session<'_> {
         }
     }
 
-    /// Sends a frame that is no SDO. A gateway carries none, and none is sent there.
+    /// Sends a frame that is not SDO. A gateway carries no such frames, and the method does nothing
+    /// there.
     ///
     /// # Errors
     /// [`Error::Adapter`].
@@ -98,8 +99,8 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// The next frame from the bus. Those that somebody else waits for are answered on the way. Of a
-    /// gateway, boot-up messages are all there is to hear.
+    /// Returns the next frame from the bus. Frames that need an answer of
+    /// [`answer_by`](Self::answer_by) are answered here. A gateway reports only boot-up messages.
     pub(super) fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, Error> {
         let adapter = match &mut self.way {
             Way::Bus(adapter) => adapter,
@@ -121,7 +122,7 @@ impl Session<'_> {
         Ok(frame)
     }
 
-    /// Receives until `enough` says so, `time` at most; tells whether it did.
+    /// Receives until `enough` returns true, for at most `time`; returns whether it did.
     pub(super) fn listen(
         &mut self,
         time: Duration,

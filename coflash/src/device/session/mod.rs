@@ -1,4 +1,4 @@
-//! A conversation with one node: SDO reads and writes, commands and their outcome, over any
+//! A conversation with one node: SDO reads and writes, commands and their results, over any
 //! [`Adapter`] or [`Gateway`].
 
 use std::fmt;
@@ -26,14 +26,14 @@ mod watch;
 use self::watch::Watch;
 pub use self::watch::{Silence, SILENCE};
 
-/// The most bytes that are read at all: more than any microcontroller's flash has.
+/// The most bytes of any read: more than the flash of any microcontroller.
 pub const UPLOAD_MAX: usize = 64 * 1024 * 1024;
 
-/// The way to the node.
+/// The access to the node.
 enum Way<'a> {
-    /// Frames: the SDO client is ours.
+    /// By frames: this session has the SDO client.
     Bus(&'a mut dyn Adapter),
-    /// Objects: the SDO client is the gateway's.
+    /// By objects: the gateway has the SDO client.
     Gateway(&'a mut dyn Gateway),
 }
 
@@ -59,17 +59,17 @@ impl fmt::Debug for Session<'_> {
 }
 
 impl<'a> Session<'a> {
-    /// A conversation with `node`. Nothing is sent yet.
+    /// A conversation with `node`. It sends nothing yet.
     pub fn new(adapter: &'a mut dyn Adapter, node: NodeId, timing: Timing) -> Self {
         Self::over(Way::Bus(adapter), node, timing)
     }
 
-    /// The same with a node behind a gateway.
+    /// A conversation with a node behind a gateway.
     pub fn through(gateway: &'a mut dyn Gateway, node: NodeId, timing: Timing) -> Self {
         Self::over(Way::Gateway(gateway), node, timing)
     }
 
-    /// The same over whatever a URL has led to.
+    /// A conversation over the target of a URL.
     pub fn on(link: &'a mut Link, node: NodeId, timing: Timing) -> Self {
         match link {
             Link::Bus(adapter) => Self::new(&mut **adapter, node, timing),
@@ -90,7 +90,8 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// The same conversation with another node, or with other patience, for a while.
+    /// The same conversation with another node or with other time limits, as long as the result
+    /// lives.
     #[must_use]
     pub fn with(&mut self, node: NodeId, timing: Timing) -> Session<'_> {
         let (transfers, cancelled, answer) = (self.transfers, self.cancelled.clone(), self.answer);
@@ -102,33 +103,33 @@ impl<'a> Session<'a> {
         Session { way, node, timing, transfers, cancelled, answer, watch, on_silence }
     }
 
-    /// Goes on with another node.
+    /// Continues with another node.
     pub fn talk_to(&mut self, node: NodeId) {
         self.node = node;
     }
 
-    /// Ends with [`Error::Cancelled`] as soon as `flag` is set: a transfer under way is aborted.
+    /// Ends with [`Error::Cancelled`] when `flag` is set: a running transfer is aborted.
     pub fn cancel_by(&mut self, flag: Arc<AtomicBool>) {
         self.cancelled = Some(flag);
     }
 
-    /// Goes on although the user gave up: for a last question.
+    /// Ignores the cancellation, for a last request.
     pub(crate) fn cancel_by_nobody(&mut self) {
         self.cancelled = None;
     }
 
-    /// Answers by this to frames that come meanwhile, whatever else is under way: what it gives is
-    /// sent.
+    /// Answers frames that arrive during any other action: the session sends the frame that
+    /// `answer` returns.
     pub fn answer_by(&mut self, answer: Option<fn(&Frame) -> Option<Frame>>) {
         self.answer = answer;
     }
 
-    /// Writes this way from now on.
+    /// Sets the form of downloads from now on.
     pub fn transfer_by(&mut self, transfers: Transfers) {
         self.transfers = transfers;
     }
 
-    /// How long values are written at present.
+    /// The present form of downloads.
     #[must_use]
     pub fn transfers(&self) -> Transfers {
         self.transfers
@@ -140,7 +141,7 @@ impl<'a> Session<'a> {
         self.node
     }
 
-    /// How long it waits for what.
+    /// The time limits.
     #[must_use]
     pub fn timing(&self) -> &Timing {
         &self.timing
@@ -155,13 +156,13 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Whether it hears what others say on the bus. Behind a gateway it does not.
+    /// Whether the session receives the frames of other nodes. Behind a gateway it does not.
     #[must_use]
     pub fn hears_the_bus(&self) -> bool {
         matches!(self.way, Way::Bus(_))
     }
 
-    /// What the adapter knows of its bus beyond the frames.
+    /// What the adapter knows about its bus apart from the frames.
     pub fn health(&mut self) -> Option<Health> {
         match &mut self.way {
             Way::Bus(adapter) => adapter.health(),
@@ -169,7 +170,7 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Reads a value of up to 4096 bytes. A read that gets no answer is repeated.
+    /// Reads a value of up to 4096 bytes. A read without an answer is repeated.
     ///
     /// # Errors
     /// [`Error::NoAnswer`], [`Error::Refused`], [`Error::Adapter`] or [`Error::Cancelled`].
@@ -178,8 +179,8 @@ impl<'a> Session<'a> {
         let mut attempt = 1;
         loop {
             match self.read_once(at) {
-                // An answer that came late, to a request given up, spoils the next one: then, too,
-                // ask again.
+                // A late answer to an earlier request can spoil the next one: repeat the read in
+                // this case, too.
                 Err(Error::NoAnswer { .. } | Error::Protocol { .. }) if attempt < attempts => attempt += 1,
                 result => return result,
             }
@@ -195,7 +196,7 @@ impl<'a> Session<'a> {
         number(&bytes).ok_or(Error::Protocol { doing: Doing::Read(at), code: AbortCode::LENGTH })
     }
 
-    /// Reads a text. What is not ASCII, or would move the cursor, is replaced.
+    /// Reads a text. Characters outside ASCII and control characters are replaced.
     ///
     /// # Errors
     /// As [`read`](Self::read).
@@ -206,7 +207,7 @@ impl<'a> Session<'a> {
         Ok(text.iter().map(visible).collect())
     }
 
-    /// Writes a command to 1F51h of a program, once; how it went is in [`status`](Self::status).
+    /// Writes a command to 1F51h of a program, once; [`status`](Self::status) gives its result.
     ///
     /// # Errors
     /// As [`write`](Self::write).
@@ -223,12 +224,12 @@ impl<'a> Session<'a> {
         self.read_number(Address::new(program::FLASH_STATUS, number)).map(FlashStatus::from_word)
     }
 
-    /// Waits until 1F57h of a program is no longer busy, and gives what it says then. Silence
-    /// counts as busy for a while: a device may be unable to answer while it erases.
+    /// Waits until 1F57h of a program is no longer busy, and returns its value. For a while,
+    /// silence counts as busy: a device may be unable to answer while it erases.
     ///
     /// # Errors
-    /// [`Error::Busy`] when [`Timing::command`] has passed, [`Error::NoAnswer`] when nothing has been
-    /// heard for [`Timing::silent`], and what [`read`](Self::read) has.
+    /// [`Error::Busy`] after [`Timing::command`], [`Error::NoAnswer`] after [`Timing::silent`]
+    /// without any answer, and the errors of [`read`](Self::read).
     pub fn await_idle(&mut self, number: u8, doing: Doing) -> Result<FlashStatus, Error> {
         let began = self.now();
         let at = Address::new(program::FLASH_STATUS, number);
@@ -259,10 +260,10 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Reads 1000h once: `None` where no answer comes.
+    /// Reads 1000h once; `None` if no answer comes.
     ///
     /// # Errors
-    /// What [`read`](Self::read) has apart from [`Error::NoAnswer`].
+    /// The errors of [`read`](Self::read) except [`Error::NoAnswer`].
     pub fn device_type(&mut self) -> Result<Option<DeviceType>, Error> {
         let at = Address::new(program::DEVICE_TYPE, 0);
         match self.read_once(at) {
@@ -277,11 +278,11 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// What is running, or [`Error::NoAnswer`]. A device that was just reset misses a few requests,
-    /// so that the question is repeated for as long as a restart may take.
+    /// Returns what runs on the device. A device that was just reset misses a few requests, so the
+    /// request is repeated for as long as a restart may take.
     ///
     /// # Errors
-    /// [`Error::NoAnswer`], and what a [read](Self::read) has.
+    /// [`Error::NoAnswer`], and the errors of a [read](Self::read).
     pub fn find(&mut self) -> Result<DeviceType, Error> {
         let began = self.now();
         let doing = Doing::Read(Address::new(program::DEVICE_TYPE, 0));

@@ -13,11 +13,12 @@ use crate::device::error::{of_gateway, Error};
 
 /// How much longer than its node a gateway may take for a short value.
 const GATEWAY_GRACE: Duration = Duration::from_secs(5);
-/// What the slowest bus carries of a value in a second: 10 kbit/s in segments, and others talk, too.
+/// The bytes of a value that the slowest bus carries in a second: 10 kbit/s, in segments, with
+/// other traffic.
 const GATEWAY_BYTES: u64 = 250;
 
 impl Session<'_> {
-    /// Reads a short value there.
+    /// Reads a short value through the gateway.
     pub(super) fn read_there(&mut self, at: Address) -> Result<Vec<u8>, Error> {
         let value = self.upload_there(at, self.timing.sdo + GATEWAY_GRACE, &mut |_| {})?;
         let long = Error::Protocol { doing: Doing::Read(at), code: AbortCode::OUT_OF_MEMORY };
@@ -28,7 +29,7 @@ impl Session<'_> {
         }
     }
 
-    /// Reads a value of any length there, with this patience for each part of it.
+    /// Reads a value of any length through the gateway, with this time limit for each part of it.
     pub(super) fn upload_there(
         &mut self,
         at: Address,
@@ -38,7 +39,7 @@ impl Session<'_> {
         self.through_gateway(at, Doing::Read(at), patience, |gateway, ask| gateway.upload(ask, progress))
     }
 
-    /// Writes a value there.
+    /// Writes a value through the gateway.
     pub(super) fn write_there(
         &mut self,
         at: Address,
@@ -53,8 +54,8 @@ impl Session<'_> {
         self.through_gateway(at, doing, patience, |gateway, ask| gateway.download(ask, data, progress))
     }
 
-    /// Has a gateway do something with an object, and tells what came of it as a transfer of our own
-    /// does.
+    /// Runs a request of the gateway, and returns its result in the form of a transfer over the
+    /// bus.
     fn through_gateway<T>(
         &mut self,
         at: Address,
@@ -71,7 +72,7 @@ impl Session<'_> {
             Way::Gateway(gateway) => {
                 act(&mut **gateway, &ask).map_err(|error| of_gateway(error, node, doing))
             }
-            // Nobody comes here without one.
+            // Callers have checked that there is a gateway.
             Way::Bus(_) => Err(Error::NoAnswer { node, doing }),
         }
     }

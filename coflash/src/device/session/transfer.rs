@@ -1,4 +1,4 @@
-//! The transfers of a session over the bus: reads and writes of any length by the SDO client.
+//! The transfers of a session over the bus: reads and writes of any length with the SDO client.
 
 use std::time::Duration;
 
@@ -12,9 +12,9 @@ use crate::device::doing::Doing;
 use crate::device::error::Error;
 use crate::device::timing::Transfers;
 
-/// The largest value that is read as a whole. No object of a bootloader comes near it.
+/// The largest value that is read as a whole. All objects of a bootloader are much smaller.
 pub(super) const VALUE_MAX: usize = 4096;
-/// Grows with what really arrives; what a device merely announces takes no memory.
+/// A buffer that grows with the data that really arrive; an announced size reserves no memory.
 struct Grown(Vec<u8>);
 
 impl Sink for Grown {
@@ -27,26 +27,26 @@ impl Sink for Grown {
     }
 }
 
-/// After so long without an abort, no more come for the segments of a transfer that was refused. A
+/// After this time without an abort, no more aborts come for the segments of a refused transfer. A
 /// frame on the slowest bus takes 13 ms.
 const QUIET: Duration = Duration::from_millis(30);
-/// After so many frames in a row, a look whether the node has something against them.
+/// After this many frames in a row, the session checks for an answer of the node.
 const BURST: u32 = 8;
-/// Less is not worth the frames around a block transfer.
+/// For fewer bytes, a block transfer needs more frames than it saves.
 pub(super) const WORTH_BLOCKS: usize = 4 * 7;
 
-/// What [`Timing::command`] limits in a transfer. The SDO time-out alone does not end one: it
-/// counts from answer to answer, and a device that babbles always has one.
+/// What [`Timing::command`] limits in a transfer. The SDO time-out alone does not end every
+/// transfer: it starts again with each answer, and a faulty device may answer without end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Patience {
-    /// The transfer.
+    /// The whole transfer.
     InAll,
     /// The time without progress.
     ForEachStep,
 }
 
 impl Session<'_> {
-    /// Reads a value without repetition; otherwise as [`read`](Self::read).
+    /// Reads a value without repetition; otherwise like [`read`](Self::read).
     ///
     /// # Errors
     /// As [`read`](Self::read).
@@ -56,16 +56,16 @@ impl Session<'_> {
         }
         let mut bytes = [0; VALUE_MAX];
         let mut upload = Upload::new(self.node, at, Buffer::new(&mut bytes), self.config());
-        // A value is short: all of it has to be here in time.
+        // A value is short: all of it must arrive within the time.
         self.run(&mut upload, Doing::Read(at), Patience::InAll, &mut |_| {})?;
         Ok(upload.sink().filled().to_vec())
     }
 
-    /// Reads a value of any length, as blocks where the device knows them. `progress` is told how
-    /// many bytes are here.
+    /// Reads a value of any length, by block transfer if the device supports it. Calls `progress`
+    /// with the number of bytes that have arrived.
     ///
     /// # Errors
-    /// As [`read`](Self::read); [`Error::Protocol`] for more than [`UPLOAD_MAX`] bytes.
+    /// The errors of [`read`](Self::read); [`Error::Protocol`] for more than [`UPLOAD_MAX`] bytes.
     pub fn upload(&mut self, at: Address, progress: &mut dyn FnMut(u32)) -> Result<Vec<u8>, Error> {
         if !self.hears_the_bus() {
             return self.upload_there(at, self.timing.command, progress);
@@ -79,7 +79,8 @@ impl Session<'_> {
         Ok(upload.into_sink().0)
     }
 
-    /// Writes a value, once. `progress` is told how many bytes have arrived.
+    /// Writes a value, once. Calls `progress` with the number of bytes that the device has
+    /// accepted.
     ///
     /// # Errors
     /// [`Error::NoAnswer`], [`Error::Refused`], [`Error::Adapter`] or [`Error::Cancelled`].
@@ -97,7 +98,7 @@ impl Session<'_> {
             let block = Block { fallback: false, ..Block::default() };
             let mut download = Download::as_blocks(self.node, at, data, self.config(), block);
             match self.run(&mut download, doing, Patience::ForEachStep, progress) {
-                // It is no use asking again for each value.
+                // Later values are not tried by block transfer again.
                 Err(Error::Refused { code, .. }) if download.progress() == 0 && means_no_blocks(code) => {
                     self.transfers = Transfers::Segments;
                 }
@@ -112,9 +113,9 @@ impl Session<'_> {
         self.run(&mut download, doing, Patience::ForEachStep, progress)
     }
 
-    /// Waits until the node has said nothing for a while: segments that were on their way when it
-    /// refused a block transfer draw an abort each, and none of these is the answer to what is
-    /// asked next.
+    /// Waits until the node has been silent for a while: the segments that were under way when it
+    /// refused a block transfer cause an abort each, and these aborts do not answer the next
+    /// request.
     fn settle_after_burst(&mut self) -> Result<(), Error> {
         let deadline = self.now() + self.timing.sdo;
         let response = CobId::sdo_response(self.node);
@@ -135,7 +136,7 @@ impl Session<'_> {
         progress: &mut dyn FnMut(u32),
     ) -> Result<(), Error> {
         self.check_cancelled()?;
-        // Answers to requests that were given up are no answers to this one.
+        // Answers to requests that were given up do not belong to this transfer.
         let mut stale = 0;
         while stale < 1000 && self.receive(Duration::ZERO)?.is_some() {
             stale += 1;
@@ -198,15 +199,15 @@ impl Session<'_> {
         }
     }
 
-    /// The bus time as the state machines count it: they compare by difference, so wrapping is
-    /// right.
+    /// The bus time in the form of the state machines: they compare times by difference, so a wrap
+    /// does no harm.
     fn instant(&self) -> Instant {
         Instant::from_millis(self.now().as_millis() as u32)
     }
 }
 
-/// Whether this is how a server says that it does not know block transfer. Some use the general
-/// error for it.
+/// Whether a server refuses block transfer with this code. Some servers use the general error for
+/// it.
 fn means_no_blocks(code: AbortCode) -> bool {
     matches!(code, AbortCode::COMMAND | AbortCode::UNSUPPORTED_ACCESS | AbortCode::GENERAL)
 }

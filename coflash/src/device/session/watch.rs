@@ -1,5 +1,5 @@
-//! What a session notices beside its transfers: how long its node has been silent, and whether
-//! somebody else speaks to it.
+//! What a session observes besides its transfers: how long its node has been silent, and whether
+//! another tool talks to the node.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -8,37 +8,37 @@ use canopen::{Address, CobId, Frame, NodeId};
 
 use crate::device::doing::Doing;
 
-/// Silence of this length is told while it lasts.
+/// A silence of this length is reported while it lasts.
 pub const SILENCE: Duration = Duration::from_secs(2);
-/// Requests of which an adapter may still bring the echo: more than two sub-blocks of a block
-/// download.
+/// The most requests for which an adapter may still return the echo: more than two sub-blocks of a
+/// block download.
 const OWN_MAX: usize = 256;
 
-/// A node that has not answered for a while, and is waited for.
+/// A node that has not answered for a while, while the session waits for it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Silence {
-    /// Which node.
+    /// The node.
     pub node: NodeId,
-    /// What it was told.
+    /// The action that it was asked to do.
     pub doing: Doing,
-    /// How long nothing has been heard of it.
+    /// How long it has been silent.
     pub silent: Duration,
-    /// How long it is waited for in all.
+    /// How long the session waits in total.
     pub limit: Duration,
 }
 
-/// What was noticed so far.
+/// The observations so far.
 #[derive(Debug, Default)]
 pub(super) struct Watch {
-    /// When the node was last heard: an answer, a heartbeat, an emergency.
+    /// The time of the node's last frame: an answer, a heartbeat or an emergency.
     pub(super) heard: Option<Duration>,
-    /// Whether this silence was told.
+    /// Whether this silence was reported.
     pub(super) told: bool,
-    /// Requests of ours of which no echo has come, in their order.
+    /// The session's own requests without an echo, in their order.
     own: VecDeque<Frame>,
-    /// Whether one has come since the last answer.
+    /// Whether an echo has arrived since the last answer.
     echoed: bool,
-    /// When somebody else has last asked the node, and for what.
+    /// The time and the object of the last request of another tool.
     pub(super) foreign: Option<(Duration, Option<Address>)>,
 }
 
@@ -55,7 +55,7 @@ impl Watch {
     pub(super) fn received(&mut self, frame: &Frame, node: NodeId, now: Duration) {
         let Some(id) = frame.cob_id() else { return };
         if id == CobId::sdo_request(node) {
-            // An adapter that brings back what it sends brings all of it, in its order.
+            // An adapter that returns sent frames returns all of them, in their order.
             if let Some(at) = self.own.iter().position(|own| own == frame) {
                 self.own.drain(..=at);
                 self.echoed = true;
@@ -68,8 +68,9 @@ impl Watch {
             (self.heard, self.told) = (Some(now), false);
         }
         if id == CobId::sdo_response(node) {
-            // A request is on the bus before its answer: an echo that has not come by now does not
-            // come any more. Where echoes come, those of frames behind that request may.
+            // A request is on the bus before its answer, so an echo that has not arrived before the
+            // answer will not arrive. If echoes do arrive, echoes of frames sent after that request
+            // may follow.
             if !self.echoed {
                 self.own.clear();
             }
@@ -78,7 +79,7 @@ impl Watch {
     }
 }
 
-/// The object that a request is about; none for a segment, which does not say it.
+/// The object of a request; none for a segment, which does not name it.
 fn object_of(frame: &Frame) -> Option<Address> {
     let [command, low, high, sub, ..] = *frame.exactly::<8>()?;
     let initiates = matches!(command >> 5, 1 | 2 | 4 | 5 | 6) && high >= 0x10;
@@ -100,7 +101,7 @@ mod tests {
         Frame::of(CobId::new(id).unwrap(), &data)
     }
 
-    /// Sent (true) or received frames; the object of the foreign request that was found, if one was.
+    /// Sent (true) or received frames; returns the object of the foreign request, if there was one.
     fn foreign(course: &[(bool, u16, [u8; 8])]) -> Option<Option<Address>> {
         let mut watch = Watch::default();
         for (sent, id, data) in course {
@@ -118,22 +119,23 @@ mod tests {
     fn requests_of_others_are_told_from_echoes() {
         let clear = [0x2F, 0x51, 0x1F, 1, 3, 0, 0, 0];
         let at = |index, sub| Some(Some(Address::new(index, sub)));
-        // Nobody else; with and without echoes; somebody who speaks to another node.
+        // No other tool: without and with echoes; a tool that talks to another node.
         assert_eq!(foreign(&[(true, 0x605, READ), (false, 0x585, ANSWER)]), None);
         assert_eq!(foreign(&[(true, 0x605, READ), (false, 0x605, READ), (false, 0x585, ANSWER)]), None);
         assert_eq!(foreign(&[(true, 0x605, READ), (false, 0x606, READ), (false, 0x585, ANSWER)]), None);
-        // Somebody else: another request, the same one behind the answer, and the same one twice.
+        // Another tool: another request, the same request after the answer, and the same request
+        // twice.
         assert_eq!(foreign(&[(true, 0x605, READ), (false, 0x605, clear)]), at(0x1F51, 1));
         let behind = [(true, 0x605, READ), (false, 0x585, ANSWER), (false, 0x605, READ)];
         assert_eq!(foreign(&behind), at(0x1000, 0));
         let twice = [(true, 0x605, READ), (false, 0x605, READ), (false, 0x605, READ)];
         assert_eq!(foreign(&twice), at(0x1000, 0));
-        // A segment does not say of what.
+        // A segment does not name its object.
         assert_eq!(foreign(&[(false, 0x605, [0x10, 1, 2, 3, 4, 5, 6, 7])]), Some(None));
     }
 
-    /// A node refuses in the middle of a burst; the echoes of what was sent behind that come after
-    /// its abort.
+    /// A node refuses in the middle of a burst; the echoes of the frames sent after that point
+    /// arrive after its abort.
     #[test]
     fn echoes_behind_an_abort_are_still_echoes() {
         let segment = |number| [number, 1, 2, 3, 4, 5, 6, 7];

@@ -1,6 +1,6 @@
-//! A sealed image in a block file: blocks 1 to N carry it piece by piece, as they carry a program,
-//! from the program's first address on; block 0 tells what the manifest tells, and the last block
-//! has size and CRC of the sealed image. For masters that know block files and nothing else.
+//! A sealed image in a block file, for masters that only support block files. Blocks 1 to N carry
+//! the image piece by piece, like a program, from the program's first address on. Block 0 holds the
+//! identity from the manifest, and the last block holds size and CRC of the sealed image.
 //!
 //! [`blocks_of_sealed`](crate::file::convert::blocks_of_sealed) makes such a file.
 
@@ -10,45 +10,46 @@ use super::open::Sealed;
 use crate::file::block_file::{BlockFile, Checksum, FRAMING};
 use crate::file::fault::{Cause, Place, ReadError};
 
-/// So many of a file's first bytes tell whether it is a sealed image, in blocks or not: block 0 has
-/// 24 bytes of data at most.
+/// This many bytes at the beginning of a file show whether it is a sealed image, in blocks or not:
+/// block 0 has at most 24 bytes of data.
 pub const FRONT: usize = FRAMING + 24 + HEADER_SIZE + 4;
 
-/// A sealed image, and the blocks that it came in.
+/// A sealed image, and the blocks that carried it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Carried {
-    /// The sealed image, or what was taken for one.
+    /// The sealed image, or the bytes in its place.
     pub image: Vec<u8>,
     /// The block file that carried it, if one did.
     pub blocks: Option<BlockFile>,
 }
 
-/// Whether a file begins as a sealed image, or as a block file that carries one. [`FRONT`] bytes are
-/// enough.
+/// Whether a file begins as a sealed image, or as a block file that carries one. The first
+/// [`FRONT`] bytes are enough.
 #[must_use]
 pub fn looks_like(bytes: &[u8]) -> bool {
     Sealed::looks_like(bytes) || carries(bytes)
 }
 
-/// Whether it begins as a block file whose first block with data begins as a sealed image.
+/// Whether the bytes begin as a block file with a sealed image in its first data block.
 fn carries(bytes: &[u8]) -> bool {
     let Some(header) = bytes.first_chunk().filter(|_| BlockFile::looks_like(bytes)) else { return false };
     let data = FRAMING + Header::parse(header).size as usize + HEADER_SIZE;
     bytes.get(data..).is_some_and(Sealed::looks_like)
 }
 
-/// Takes a sealed image out of its file: out of the blocks of a block file, after all of their
-/// numbers, sizes, addresses and CRCs were checked, or else all of the file as it is.
+/// Extracts a sealed image from its file: from the blocks of a block file, after a check of all
+/// numbers, sizes, addresses and CRCs, or otherwise the whole file unchanged.
 ///
 /// # Errors
-/// The first fault in the blocks, with its offset. Whether the image is one is not asked here.
+/// The first fault in the blocks, with its offset. This function does not check whether the result
+/// is a sealed image.
 pub fn carried(bytes: Vec<u8>) -> Result<Carried, ReadError> {
     if !carries(&bytes) {
         return Ok(Carried { image: bytes, blocks: None });
     }
     let file = BlockFile::parse(&bytes)?;
     if file.checksum() != Checksum::Crc32 {
-        let words = "its blocks have a CRC-16, and a sealed device takes blocks with CRC-32 alone: seal \
+        let words = "its blocks have a CRC-16, and a sealed device accepts only blocks with CRC-32: seal \
                      the program again with --blocks";
         return Err(Place::File.fault(Cause::Malformed(words)));
     }
@@ -57,14 +58,15 @@ pub fn carried(bytes: Vec<u8>) -> Result<Carried, ReadError> {
     let first = file.span().first;
     for block in file.program_blocks() {
         if u64::from(block.flash_address) != u64::from(first) + image.len() as u64 {
-            let words = "there is a gap in front of this block, and a sealed image has none: a block is \
+            let words = "there is a gap before this block, and a sealed image has no gaps: a block is \
                          missing";
             return Err(Place::Offset(offset).fault(Cause::Malformed(words)));
         }
         image.extend_from_slice(&block.data);
         offset += FRAMING + block.data.len();
     }
-    // A program may begin in front of its first block, or have erased flash at its end.
+    // The region of a program may begin before its first block, or end with erased flash; that of a
+    // sealed image must not.
     if file.program_start() != first || file.program_size() as usize != image.len() {
         let (size, crc) = (file.program_size(), file.program_crc());
         return Err(Place::Offset(offset).fault(Cause::ProgramCrc { size, crc }));

@@ -1,10 +1,10 @@
-//! Certificates: what a root says of a key that signs programs.
+//! Certificates: a root's statement about a key that signs programs.
 
 use seal::wire::{role, CERTIFICATE, CERTIFICATE_MAGIC, CERTIFIED, ED25519};
 
 use super::key::{PublicKey, SigningKey};
 
-/// What a certified key signs.
+/// What a certified key may sign.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Role {
@@ -15,13 +15,13 @@ pub enum Role {
     Test = role::TEST,
 }
 
-/// What a root says of a key.
+/// A root's statement about a key.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Certificate {
-    /// What the key signs.
+    /// What the key may sign.
     pub role: Role,
-    /// A device takes no certificate of a lower epoch than the highest that it has seen: a higher one
-    /// revokes the keys before.
+    /// A device accepts no certificate with an epoch lower than the highest that it has seen: a
+    /// higher epoch revokes the earlier keys.
     pub epoch: u32,
     /// For devices of this vendor (1018h/1).
     pub vendor_id: u32,
@@ -29,14 +29,14 @@ pub struct Certificate {
     pub product_code: u32,
     /// The lowest security counter that the key may sign.
     pub lowest: u32,
-    /// The highest one.
+    /// The highest security counter that the key may sign.
     pub highest: u32,
     /// The key.
     pub key: PublicKey,
 }
 
 impl Certificate {
-    /// What this root has to sign: for a root in a hardware security module.
+    /// The bytes that this root must sign, for a root in a hardware security module.
     #[must_use]
     pub fn tbs(&self, root: PublicKey) -> [u8; CERTIFIED] {
         let mut bytes = [0; CERTIFIED];
@@ -68,7 +68,7 @@ impl Certificate {
 mod tests {
     use super::*;
 
-    /// Field by field as the format's table has it.
+    /// Field by field as in the table of the format.
     #[test]
     fn a_certificate_has_its_fields_where_the_format_says() {
         let (root, key) = (SigningKey::from_seed([1; 32]).unwrap(), SigningKey::from_seed([2; 32]).unwrap());

@@ -1,4 +1,4 @@
-//! Hash, key ids and encryption of sealed images, each by a crate.
+//! Hash, key ids and encryption of sealed images, each implemented by an external crate.
 
 use hmac::{Hmac, Mac as _};
 use sha2::{Digest as _, Sha512, Sha512_256};
@@ -9,9 +9,9 @@ pub fn hash(bytes: &[u8]) -> [u8; 32] {
     Sha512_256::digest(bytes).into()
 }
 
-/// HMAC-SHA-512 (RFC 2104) over the parts, one behind the other.
+/// HMAC-SHA-512 (RFC 2104) over all parts in sequence.
 pub(super) fn hmac(key: &[u8], parts: &[&[u8]]) -> [u8; 64] {
-    // An HMAC takes a key of any length.
+    // An HMAC accepts a key of any length.
     let Ok(mut hmac) = Hmac::<Sha512>::new_from_slice(key) else { return [0; 64] };
     for part in parts {
         hmac.update(part);
@@ -25,8 +25,9 @@ pub(super) fn id_of(key: &[u8; 32]) -> u32 {
     u32::from_le_bytes([a, b, c, d])
 }
 
-/// The key of an image, wrapped for the holders of a key-encryption key: bytes 32 to 39 of the key
-/// stream, which tell a wrong one, and the image's key exclusive-or bytes 0 to 31. The same undoes it.
+/// Wraps the key of an image for the holders of a key-encryption key. Returns bytes 32 to 39 of the
+/// key stream, which reveal a wrong key-encryption key, and the image's key exclusive-or bytes 0 to
+/// 31. The same operation unwraps the key.
 pub(super) fn wrap(kek: &[u8; 32], nonce: &[u8; 16], key: &[u8; 32]) -> ([u8; 8], [u8; 32]) {
     let stream = hmac(kek, &[seal::wire::WRAP_DOMAIN, nonce]);
     let mut wrapped = *key;
@@ -36,10 +37,10 @@ pub(super) fn wrap(kek: &[u8; 32], nonce: &[u8; 16], key: &[u8; 32]) -> ([u8; 8]
     (seal::wire::array(&stream, 32), wrapped)
 }
 
-/// ChaCha20 (RFC 8439) from block 0 on. The same undoes it.
+/// ChaCha20 (RFC 8439) from block 0 on, for encryption and decryption.
 pub(super) fn chacha20(bytes: &mut [u8], key: &[u8; 32], nonce: &[u8; 16]) {
     use chacha20::cipher::{KeyIvInit as _, StreamCipher as _};
     let nonce: [u8; 12] = seal::wire::array(nonce, 0);
-    // A block is some 2^38 bytes away from the end of the stream: no payload has so many.
+    // The end of the stream is 2^38 bytes away: every payload is shorter.
     chacha20::ChaCha20::new(key.into(), (&nonce).into()).apply_keystream(bytes);
 }

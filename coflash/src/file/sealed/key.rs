@@ -1,7 +1,7 @@
-//! Keys and their files: Ed25519 keys as OpenSSL writes them (PKCS#8 and SPKI, PEM), and
+//! Keys and their files: Ed25519 keys in OpenSSL's formats (PKCS#8 and SPKI, PEM), and
 //! key-encryption keys.
 //!
-//! No secret is ever shown: `Debug` tells the id of a key alone.
+//! No output contains a secret: `Debug` shows only the id of a key.
 
 use std::fmt;
 
@@ -14,40 +14,40 @@ use super::cipher::{hmac, id_of};
 
 /// The label of a key-encryption key's PEM file.
 const KEK_LABEL: &str = "COBOOT KEY ENCRYPTION KEY";
-/// What stands in front when a key-encryption key is made of the manual's value.
+/// The text that precedes the manual's value when a key-encryption key is derived from it.
 const VALUE_DOMAIN: &[u8] = b"coboot key of a value 1\0";
 
-/// Why there is no such key.
+/// Why a key is invalid.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum KeyFault {
-    /// No PEM file of an Ed25519 private key.
-    #[error("it is no Ed25519 private key in PKCS#8 PEM: `coflash key new` makes one, `openssl genpkey -algorithm ed25519` too; one with a password must be decrypted first (openssl pkey)")]
+    /// The text is not a PEM file of an Ed25519 private key.
+    #[error("it is not an Ed25519 private key in PKCS#8 PEM: make one with `coflash key new` or `openssl genpkey -algorithm ed25519`; decrypt a key with a password first (openssl pkey)")]
     NoPrivateKey,
-    /// No PEM file of an Ed25519 public key.
-    #[error("it is no Ed25519 public key in PEM (SPKI): `coflash key new` writes it beside the private key, `openssl pkey -pubout` too")]
+    /// The text is not a PEM file of an Ed25519 public key.
+    #[error("it is not an Ed25519 public key in PEM (SPKI): `coflash key new` writes one beside the private key, or use `openssl pkey -pubout`")]
     NoPublicKey,
-    /// The bytes are no public key, or one that every signature fits.
-    #[error("these 32 bytes are no Ed25519 public key: it is damaged, make a new one")]
+    /// The bytes are not a public key, or a key that accepts any signature.
+    #[error("these 32 bytes are not an Ed25519 public key: the key is damaged; make a new one")]
     NoPoint,
-    /// No file of a key-encryption key.
-    #[error("it is no key-encryption key: `coflash key new --role kek` makes one, 64 hexadecimal digits are one, too")]
+    /// The text is not the file of a key-encryption key.
+    #[error("it is not a key-encryption key: make one with `coflash key new --role kek`, or give 64 hexadecimal digits")]
     NoKek,
-    /// The id 0 is that of no key.
-    #[error("the id of this key is 0, which stands for no key: make a new one")]
+    /// The id 0 means "no key".
+    #[error("the id of this key is 0, which is reserved: make a new one")]
     ZeroId,
-    /// The system has no random numbers.
-    #[error("the system gives no random numbers: make the key on another computer")]
+    /// The system provides no random numbers.
+    #[error("the system provides no random numbers: make the key on another computer")]
     NoRandom,
 }
 
-/// 32 random bytes of the system.
+/// 32 random bytes from the system.
 fn random() -> Result<[u8; 32], KeyFault> {
     let mut bytes = [0; 32];
     getrandom::fill(&mut bytes).map_err(|_| KeyFault::NoRandom)?;
     Ok(bytes)
 }
 
-/// An Ed25519 private key (RFC 8032): signs programs, or, as a root, the keys that do.
+/// An Ed25519 private key (RFC 8032): signs programs, or, as a root, certifies other keys.
 #[derive(Clone)]
 pub struct SigningKey {
     key: ed25519_dalek::SigningKey,
@@ -55,7 +55,7 @@ pub struct SigningKey {
 }
 
 impl SigningKey {
-    /// A new one.
+    /// Makes a new key.
     ///
     /// # Errors
     /// [`KeyFault::NoRandom`].
@@ -63,7 +63,7 @@ impl SigningKey {
         Self::from_seed(random()?)
     }
 
-    /// The key of these 32 bytes, which RFC 8032 calls the private key.
+    /// The key with these 32 bytes, which RFC 8032 calls the private key.
     ///
     /// # Errors
     /// [`KeyFault::ZeroId`].
@@ -86,11 +86,11 @@ impl SigningKey {
     #[must_use]
     pub fn to_pem(&self) -> String {
         let pair = KeypairBytes { secret_key: self.key.to_bytes(), public_key: None };
-        // Fails for a key that is too long, and this one has 32 bytes.
+        // This fails only for a key that is too long, and this key has 32 bytes.
         pair.to_pkcs8_pem(LineEnding::LF).map_or_else(|_| String::new(), |text| text.to_string())
     }
 
-    /// What everybody may know of it.
+    /// The public key.
     #[must_use]
     pub fn public(&self) -> PublicKey {
         self.public
@@ -159,7 +159,7 @@ impl PublicKey {
         id_of(&self.0)
     }
 
-    /// Whether it is the key that signed this message.
+    /// Whether this key has signed the message.
     #[must_use]
     pub fn verifies(&self, message: &[u8], signature: &[u8; 64]) -> bool {
         let signature = Signature::from_bytes(signature);
@@ -173,12 +173,12 @@ impl fmt::Debug for PublicKey {
     }
 }
 
-/// A key-encryption key: opens the encryption of the images of a product, or of one device.
+/// A key-encryption key: decrypts the keys of images for a product, or for one device.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Kek([u8; 32]);
 
 impl Kek {
-    /// A new one.
+    /// Makes a new key.
     ///
     /// # Errors
     /// [`KeyFault::NoRandom`], [`KeyFault::ZeroId`].
@@ -197,8 +197,9 @@ impl Kek {
         Ok(Self(bytes))
     }
 
-    /// The key that stands for a value of 128 bits, as the manual's tools take it for encryption:
-    /// the first 32 bytes of HMAC-SHA-512 with the value over `coboot key of a value 1` and a zero.
+    /// The key derived from a value of 128 bits, which the manual's tools use for encryption: the
+    /// first 32 bytes of HMAC-SHA-512 with the value as key over `coboot key of a value 1` and a
+    /// zero.
     ///
     /// # Errors
     /// [`KeyFault::ZeroId`].
@@ -206,7 +207,8 @@ impl Kek {
         Self::new(seal::wire::array(&hmac(&value, &[VALUE_DOMAIN]), 0))
     }
 
-    /// The key in its PEM file, or in one with 64 hexadecimal digits (`openssl rand -hex 32`).
+    /// The key from its PEM file, or from a file with 64 hexadecimal digits (`openssl rand -hex
+    /// 32`).
     ///
     /// # Errors
     /// [`KeyFault::NoKek`], [`KeyFault::ZeroId`].

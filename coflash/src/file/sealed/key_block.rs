@@ -1,4 +1,4 @@
-//! The key block: what makes a device a sealed one. Its form is in [`seal::key_block`].
+//! The key block, which makes a device a sealed device. [`seal::key_block`] defines its format.
 
 use seal::key_block::{
     CHECK, COUNTER, EPOCH, FLAGS, FOR_TESTS, KEKS, KEK_COUNT, KEY, MAGIC, ROOTS, ROOT_COUNT, SIZE,
@@ -7,25 +7,26 @@ use seal::key_block::{
 use super::key::{Kek, PublicKey};
 use crate::file::block_file::CRC;
 
-/// Why there is no such key block.
+/// Why the key block is impossible.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum BlockFault {
-    /// A device without a root would take nothing.
-    #[error("a sealed device needs a root: give --root with a public key")]
+    /// A device without a root would accept no program.
+    #[error("a sealed device needs a root: give a public key with --root")]
     NoRoot,
-    /// There is room for two.
+    /// There is room for two roots.
     #[error("{0} roots are too many: a device has room for {ROOT_COUNT}")]
     TooManyRoots(usize),
-    /// There is room for three.
+    /// There is room for three key-encryption keys.
     #[error("{0} key-encryption keys are too many: a device has room for {KEK_COUNT}")]
     TooManyKeks(usize),
-    /// Two keys with one id: a device would find the first alone.
-    #[error("two of the keys have the id {0:08X}h: it is the same key twice, give each once")]
+    /// Two keys have the same id: a device would find only the first.
+    #[error("two of the keys have the id {0:08X}h: a key was given twice; give each key once")]
     Twice(u32),
 }
 
-/// The key block of a device with these roots and key-encryption keys, which takes no program with a
-/// lower security counter and no certificate of a lower epoch; `for_tests`, if it is to take programs
+/// The key block of a device with these roots and key-encryption keys. The device accepts no
+/// program with a lower security counter and no certificate with a lower epoch. With `for_tests` it
+/// also accepts programs signed with test keys.
 /// that are signed with test keys.
 ///
 /// # Errors
@@ -57,7 +58,7 @@ pub fn key_block(
     Ok(of_ids(&roots, &keks, counter, epoch, for_tests))
 }
 
-/// The same of keys with their ids, as many as there is room for.
+/// The key block for keys with their ids, as many as there is room for.
 pub(super) fn of_ids(
     roots: &[(u32, [u8; 32])],
     keks: &[(u32, [u8; 32])],
@@ -111,7 +112,7 @@ mod tests {
             assert_eq!(block[at + 4..at + 36], *kek.secret());
         }
         assert_eq!(block[196..252], [0; 56]);
-        // The residue of CRC-32 over data with its CRC behind it.
+        // The residue of CRC-32 over data followed by their CRC.
         assert_eq!(CRC.checksum(&block), 0x2144_DF1C);
     }
 

@@ -1,7 +1,8 @@
 //! Compression: raw LZMA with lc 0, lp 1 and pb 1, without header and end marker.
 //!
-//! Positions count from the start of the image. The dictionary, if there is one, lies in front of it;
-//! it keeps the positions even: of one with an odd number of bytes the first is never referred to.
+//! Positions count from the start of the image. The dictionary, if there is one, lies before it. It
+//! keeps the positions even: in a dictionary with an odd number of bytes, the first byte is never
+//! used.
 
 use std::io::{Read as _, Write as _};
 
@@ -12,17 +13,17 @@ const LC_LP_PB: (u32, u32, u32) = (0, 1, 1);
 /// The smallest window that LZMA has.
 const LEAST: usize = 4096;
 
-/// What of a dictionary can be referred to.
+/// The usable part of a dictionary.
 fn even(dictionary: &[u8]) -> &[u8] {
     &dictionary[dictionary.len() % 2..]
 }
 
-/// The window: everything that was there before.
+/// The window: the dictionary and the image.
 fn window(size: usize, dictionary: &[u8]) -> Option<u32> {
     u32::try_from((size + dictionary.len()).max(LEAST)).ok()
 }
 
-/// Compresses an image; `None` where it is larger than any.
+/// Compresses an image; `None` if it is too large.
 pub(super) fn compress(image: &[u8], dictionary: &[u8]) -> Option<Vec<u8>> {
     let dictionary = even(dictionary);
     let (lc, lp, pb) = LC_LP_PB;
@@ -36,12 +37,12 @@ pub(super) fn compress(image: &[u8], dictionary: &[u8]) -> Option<Vec<u8>> {
     writer.finish().ok()
 }
 
-/// Undoes [`compress`], for an image of so many bytes; `None` where that is not what comes out.
+/// Decompresses an image of `size` bytes; `None` if the payload does not give such an image.
 pub(super) fn decompress(payload: &[u8], size: usize, dictionary: &[u8]) -> Option<Vec<u8>> {
     let dictionary = even(dictionary);
     let (lc, lp, pb) = LC_LP_PB;
     let preset = (!dictionary.is_empty()).then_some(dictionary);
-    // The length is kept from the reader, which would shrink the window to it.
+    // The decoder does not get the length, because it would reduce the window to it.
     let window = window(size, dictionary)?;
     let mut reader = LzmaReader::new(payload, u64::MAX, lc, lp, pb, window, preset).ok()?;
     let mut image = vec![0; size];
@@ -57,7 +58,7 @@ mod tests {
 
     use super::*;
 
-    /// Something with repetitions, as programs have them.
+    /// Data with repetitions, like a program.
     fn program(size: usize, seed: u32) -> Vec<u8> {
         let mut state = seed | 1;
         let mut bytes = Vec::with_capacity(size);
@@ -70,8 +71,8 @@ mod tests {
         bytes
     }
 
-    /// `xz` has its own decoder. It looks for an end marker, and may make of the encoder's last bytes
-    /// something that stands behind the image.
+    /// `xz` has an independent decoder. It looks for an end marker, so it may decode the encoder's
+    /// last bytes into data after the image.
     #[test]
     fn xz_decompresses_it() {
         let there = Command::new("xz").arg("--version").stdout(Stdio::null()).status();

@@ -1,7 +1,7 @@
-//! Sealed images: programs that a device takes from nobody but the holder of a key.
+//! Sealed images: programs that a device accepts only from the holder of a key.
 //!
-//! The file `CBS1` and what a device makes of it are in the crate [`seal`]; here is what only the
-//! host does.
+//! The crate [`seal`] defines the file format `CBS1` and the device's side; this module has the
+//! host's side.
 //!
 //! | module | what it is |
 //! |---|---|

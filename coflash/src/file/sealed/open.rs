@@ -1,7 +1,7 @@
-//! Takes a sealed image apart and checks it as a device does: head, identity, counter, keys,
-//! signatures, chain, and then the image itself.
+//! Parses a sealed image and checks it as a device does: head, identity, counter, keys, signatures,
+//! chain, and then the image itself.
 //!
-//! What a device answers with one number is told apart here: each rule has its own words.
+//! A device has one error number for several of these rules; here each rule has its own message.
 
 use seal::judge::judge;
 use seal::wire::{
@@ -14,7 +14,7 @@ use super::key::{Kek, PublicKey};
 use super::{key_block, lzma};
 use crate::file::block_file::{CRC, MAX_PROGRAM_SIZE};
 
-/// A sealed image that has as many bytes as it says; nothing else is known of it.
+/// A sealed image with the size that its head announces; no other property is checked.
 #[derive(Clone, Copy, Debug)]
 pub struct Sealed<'a> {
     /// Manifest, certificate and signatures.
@@ -23,16 +23,16 @@ pub struct Sealed<'a> {
     pub chunks: &'a [u8],
 }
 
-/// A sealed image as a file has it.
+/// A sealed image in a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SealedFile {
     bytes: Vec<u8>,
-    /// Bytes of the head.
+    /// The size of the head in bytes.
     head: usize,
 }
 
 impl SealedFile {
-    /// Takes a file that [`Sealed::parse`] understands.
+    /// Accepts a file that [`Sealed::parse`] accepts.
     ///
     /// # Errors
     /// Those of [`Sealed::parse`].
@@ -41,7 +41,7 @@ impl SealedFile {
         Ok(Self { bytes, head })
     }
 
-    /// The same for a file that is to be written as this program.
+    /// The same for a file that will be written as this program.
     ///
     /// # Errors
     /// Those of [`Self::parse`], and [`Refusal::Program`].
@@ -53,7 +53,7 @@ impl SealedFile {
         }
     }
 
-    /// All of its bytes: what a device gets.
+    /// All bytes of the file, which are sent to the device.
     #[must_use]
     pub fn bytes(&self) -> &[u8] {
         &self.bytes
@@ -65,7 +65,7 @@ impl SealedFile {
         self.parts().head
     }
 
-    /// Its parts.
+    /// The parts of the image.
     #[must_use]
     pub fn parts(&self) -> Sealed<'_> {
         let (head, chunks) = self.bytes.split_at(self.head);
@@ -73,14 +73,15 @@ impl SealedFile {
     }
 }
 
-/// The device that an image is checked for. What is not told is as the image wants it.
+/// The device that an image is checked for. A property that is `None` is assumed to match the
+/// image.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Device<'a> {
-    /// The roots that it knows.
+    /// The roots in its key block.
     pub roots: &'a [PublicKey],
-    /// Its key-encryption keys; without any the payload of an encrypted image is not looked into.
+    /// Its key-encryption keys; without any, the payload of an encrypted image is not checked.
     pub keks: &'a [Kek],
-    /// The other program in it, as in flash: the dictionary of images that have one.
+    /// Its other program as it lies in flash: the dictionary of images that have one.
     pub base: Option<&'a [u8]>,
     /// 1018h/1.
     pub vendor_id: Option<u32>,
@@ -90,47 +91,47 @@ pub struct Device<'a> {
     pub revision: Option<u32>,
     /// The 96-bit unique ID of the chip.
     pub unique_id: Option<[u8; 12]>,
-    /// The number of the program that is written.
+    /// The number of the program to be written.
     pub program: Option<u8>,
-    /// Bytes of its flash.
+    /// The size of the program's flash in bytes.
     pub room: Option<u32>,
-    /// The lowest security counter that it takes.
+    /// The lowest security counter that it accepts.
     pub counter: u32,
-    /// The lowest epoch of a certificate.
+    /// The lowest epoch of a certificate that it accepts.
     pub epoch: u32,
-    /// Whether it takes programs that are signed with a test key.
+    /// Whether it accepts programs signed with a test key.
     pub for_tests: bool,
 }
 
-/// An image that a device would take.
+/// An image that the device accepts.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Opened {
-    /// The image as in flash, if it could be looked at.
+    /// The image as it lies in flash, if it could be decoded.
     pub image: Option<Vec<u8>>,
-    /// Why not, otherwise.
+    /// The reason if it could not.
     pub closed: Option<Closed>,
     /// The key that signed the image.
     pub signed_by: PublicKey,
-    /// The root that it comes from.
+    /// The root of the signature.
     pub root: PublicKey,
-    /// The epoch of the device when the image is installed.
+    /// The device's epoch after the installation.
     pub epoch: u32,
 }
 
-/// Why the image behind a good chain was not looked at.
+/// Why the image of a valid chain was not decoded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Closed {
-    /// It is encrypted, and no key-encryption key was given.
+    /// It is encrypted, and the user gave no key-encryption key.
     Encrypted,
-    /// Its dictionary is the other program, which was not given.
+    /// Its dictionary is the device's other program, which the user did not give.
     Dictionary,
 }
 
-/// Which rule an image breaks.
+/// The rule that an image breaks.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Refusal {
-    /// Another file.
-    #[error("it is no sealed image: its first bytes are not CBS1")]
+    /// It is another kind of file.
+    #[error("it is not a sealed image: its first bytes are not CBS1")]
     NotSealed,
     /// The head has an impossible size.
     #[error("the head is damaged: the size of its manifest or the number of its signatures is impossible")]
@@ -138,137 +139,137 @@ pub enum Refusal {
     /// The file ends too early.
     #[error("it is cut off: it must have {needed} bytes and has {found}")]
     CutOff {
-        /// Bytes that it announces.
+        /// Announced size in bytes.
         needed: u64,
-        /// Bytes that are there.
+        /// Actual size in bytes.
         found: u64,
     },
-    /// The file is longer than it says.
+    /// The file is longer than announced.
     #[error("it has {found} bytes and announces {needed}: something was appended to it")]
     TooLong {
-        /// Bytes that it announces.
+        /// Announced size in bytes.
         needed: u64,
-        /// Bytes that are there.
+        /// Actual size in bytes.
         found: u64,
     },
-    /// A field with a value that it cannot have.
-    #[error("the manifest is not possible: {0}")]
+    /// A field has an impossible value.
+    #[error("the manifest is invalid: {0}")]
     Field(&'static str),
-    /// For devices of another vendor.
+    /// It is for devices of another vendor.
     #[error("it is for vendor-ID {image:08X}h, and the device has {device:08X}h")]
     Vendor {
-        /// What the image says.
+        /// The image's value.
         image: u32,
-        /// What the device has.
+        /// The device's value.
         device: u32,
     },
-    /// For another product.
+    /// It is for another product.
     #[error("it is for product code {image:08X}h, and the device has {device:08X}h")]
     Product {
-        /// What the image says.
+        /// The image's value.
         image: u32,
-        /// What the device has.
+        /// The device's value.
         device: u32,
     },
-    /// For another program.
-    #[error("it is program {image}, and program {device} is written")]
+    /// It is for another program number.
+    #[error("it is for program {image}, and program {device} is to be written")]
     Program {
-        /// What the image says.
+        /// The image's value.
         image: u8,
-        /// What is written.
+        /// The program to be written.
         device: u8,
     },
-    /// For one device alone.
-    #[error("it is for the device with another unique ID alone")]
+    /// It is for a single device.
+    #[error("it is only for a device with another unique ID")]
     UniqueId,
-    /// For other hardware.
+    /// It is for other hardware.
     #[error("it is not for hardware revision {device:08X}h (its revisions have the mask {mask:08X}h)")]
     Hardware {
-        /// What the image says.
+        /// The image's mask of revisions.
         mask: u32,
-        /// What the device has.
+        /// The device's revision.
         device: u32,
     },
-    /// Too large.
+    /// It is too large.
     #[error("the program has {image} bytes, and the device has room for {device}")]
     Room {
-        /// Bytes of the image.
+        /// Size of the image in bytes.
         image: u32,
-        /// Bytes of the flash.
+        /// Size of the flash in bytes.
         device: u32,
     },
-    /// An old program.
-    #[error("its security counter is {image}, and the device takes none below {device}")]
+    /// It is an old program.
+    #[error("its security counter is {image}, and the device accepts none below {device}")]
     Counter {
-        /// What the image says.
+        /// The image's value.
         image: u32,
-        /// The lowest.
+        /// The lowest permitted value.
         device: u32,
     },
-    /// An old certificate.
-    #[error("its certificate is of epoch {image}, and the device takes none below {device}")]
+    /// Its certificate is old.
+    #[error("its certificate has epoch {image}, and the device accepts none below {device}")]
     Epoch {
-        /// What the certificate says.
+        /// The certificate's value.
         image: u32,
-        /// The lowest.
+        /// The lowest permitted value.
         device: u32,
     },
-    /// A certificate that does not allow this image.
-    #[error("its certificate does not hold: {0}")]
+    /// Its certificate does not allow this image.
+    #[error("its certificate is not valid: {0}")]
     Certificate(&'static str),
-    /// No such root.
-    #[error("its root {0:08X}h is none of the roots given")]
+    /// Its root is unknown.
+    #[error("its root {0:08X}h is not one of the given roots")]
     Root(u32),
-    /// No root has signed it, and there is no certificate.
-    #[error("it has no certificate, and none of the roots given has signed it")]
+    /// It has no certificate, and no root has signed it.
+    #[error("it has no certificate, and none of the given roots has signed it")]
     NoCertificate,
-    /// A test key.
+    /// It is signed with a test key.
     #[error("it is signed for tests, and the device is not marked for tests")]
     Test,
-    /// No key for the encryption.
-    #[error("it is encrypted for other keys than those given")]
+    /// No key for its encryption is known.
+    #[error("it is encrypted for other keys than the given ones")]
     Kek,
     /// The root has not signed the certificate.
     #[error("the signature of its certificate is wrong: the root {0:08X}h has not signed these bytes")]
     CertificateSignature(u32),
     /// The certified key has not signed the image.
-    #[error("it has no signature of the key {0:08X}h, whose certificate it carries")]
+    #[error("it contains the certificate of the key {0:08X}h but no signature of this key")]
     NoSignature(u32),
-    /// Another manifest was signed.
+    /// The signature belongs to another manifest.
     #[error("its signature is wrong: the key {0:08X}h has not signed this manifest")]
     Signature(u32),
-    /// A chunk is another one.
+    /// A chunk differs from the signed one.
     #[error("chunk {number} of {of} is not the one that was signed")]
     Chain {
-        /// Its number, from 1 on.
+        /// Its number, counted from 1.
         number: usize,
-        /// How many there are.
+        /// The number of chunks.
         of: usize,
     },
-    /// The key has the right id and does not fit.
-    #[error("the key-encryption key {0:08X}h does not open it: its check is wrong")]
+    /// The key has the right id and the wrong value.
+    #[error("the key-encryption key {0:08X}h does not decrypt it: the check value differs")]
     WrongKek(u32),
-    /// The other program is another one.
-    #[error("its dictionary is another program than the one given")]
+    /// The other program differs.
+    #[error("its dictionary is not the given program")]
     Dictionary,
-    /// The payload is no compressed image.
+    /// The payload is not a compressed image.
     #[error("its payload cannot be decompressed")]
     Compression,
-    /// The image is another one.
-    #[error("the image is not the one that was signed: its hash is another")]
+    /// The image differs from the signed one.
+    #[error("the image is not the one that was signed: its hash differs")]
     Hash,
-    /// The CRC in the manifest is that of another image.
+    /// The CRC in the manifest is wrong.
     #[error("the CRC of the image is {found:08X}h, and its manifest says {said:08X}h")]
     Crc {
-        /// What it is.
+        /// The image's CRC.
         found: u32,
-        /// What the manifest says.
+        /// The manifest's CRC.
         said: u32,
     },
 }
 
 impl Refusal {
-    /// What a device with the same keys would answer (1F57h).
+    /// The error that a device with the same keys reports (1F57h).
     #[must_use]
     pub fn fault(&self) -> Fault {
         match self {
@@ -307,7 +308,9 @@ impl Refusal {
                 "give the file of this device and program, or seal the program for it"
             }
             Self::UniqueId => "seal the program for this device (--device), or for all of the product",
-            Self::Hardware { .. } => "seal the program for this revision (--hardware), if it fits",
+            Self::Hardware { .. } => {
+                "seal the program for this revision (--hardware), if it supports that revision"
+            }
             Self::Room { .. } => {
                 "make the program smaller: --compress makes the file smaller, not the program"
             }
@@ -319,32 +322,32 @@ impl Refusal {
             }
             Self::Certificate(_) => "have the key certified for this program: `coflash key certify`",
             Self::Root(_) | Self::NoCertificate => {
-                "give the public key of the root that certified it (--root); `coflash show` tells its id"
+                "give the public key of the root that certified it (--root); `coflash show` shows its id"
             }
             Self::Test => "sign it with a release key, or check it for a device for tests (--for-tests)",
             Self::Kek | Self::WrongKek(_) => {
-                "give one of the keys that it is encrypted for (--kek); `coflash show` tells their ids"
+                "give one of the keys that it is encrypted for (--kek); `coflash show` shows their ids"
             }
-            Self::CertificateSignature(_) => "do not use this file: nobody knows who made its certificate",
+            Self::CertificateSignature(_) => "do not use this file: the origin of its certificate is unknown",
             Self::NoSignature(_) | Self::Signature(_) => {
-                "do not use this file: nobody knows who made it; seal the program again"
+                "do not use this file: its origin is unknown; seal the program again"
             }
             Self::Dictionary => "give the program that it was sealed with as --base",
             Self::Compression | Self::Hash | Self::Crc { .. } => {
-                "seal the program again: what made this file does not work as it should"
+                "seal the program again: the tool that made this file has a fault"
             }
         }
     }
 }
 
 impl<'a> Sealed<'a> {
-    /// Whether these bytes begin as a sealed image does.
+    /// Whether these bytes begin like a sealed image.
     #[must_use]
     pub fn looks_like(bytes: &[u8]) -> bool {
         bytes.starts_with(&MAGIC)
     }
 
-    /// Takes a file apart.
+    /// Parses a file.
     ///
     /// # Errors
     /// [`Refusal::NotSealed`], [`Refusal::Head`], [`Refusal::Field`], [`Refusal::CutOff`] or
@@ -360,7 +363,7 @@ impl<'a> Sealed<'a> {
         };
         let head = Head(head);
         if !(MIN_CHUNK..=MAX_CHUNK).contains(&head.chunk()) {
-            return Err(Refusal::Field("no device takes chunks of this size"));
+            return Err(Refusal::Field("no device accepts chunks of this size"));
         }
         let payload = u64::from(head.payload());
         let needed = size as u64 + payload + HASH as u64 * payload.div_ceil(1 << head.chunk());
@@ -371,7 +374,7 @@ impl<'a> Sealed<'a> {
         }
     }
 
-    /// For whom it is encrypted: the ids of the keys.
+    /// The recipients of the encryption, with the ids of their keys.
     pub fn recipients(&self) -> impl Iterator<Item = Recipient<'a>> + 'a {
         let records = self.head.records().filter(|(tag, _)| *tag == tag::RECIPIENT);
         records.filter_map(|(_, record)| <&[u8; RECIPIENT]>::try_from(record).ok().map(Recipient))
@@ -389,7 +392,7 @@ impl<'a> Sealed<'a> {
         ids
     }
 
-    /// Chunks, each with the hash of the next.
+    /// The chunks, each with the hash of the next one.
     fn pieces(&self) -> std::slice::Chunks<'a, u8> {
         self.chunks.chunks(HASH + (1 << self.head.chunk()))
     }
@@ -408,7 +411,7 @@ impl<'a> Sealed<'a> {
                 if !root.verifies(certificate.signed(), &certificate.signature()) {
                     return Err(Refusal::CertificateSignature(root.id()));
                 }
-                let bad = Refusal::Certificate("its key is none");
+                let bad = Refusal::Certificate("it contains no valid key");
                 PublicKey::new(certificate.key()).map_err(|_| bad)?
             }
         };
@@ -454,7 +457,7 @@ impl<'a> Sealed<'a> {
         Ok(opened)
     }
 
-    /// The payload, if the chain holds.
+    /// The payload, if the chain of hashes is valid.
     fn payload(&self) -> Result<Vec<u8>, Refusal> {
         let of = self.pieces().len();
         let mut next = self.head.chain();
@@ -466,22 +469,22 @@ impl<'a> Sealed<'a> {
             next = array(piece, 0);
             payload.extend_from_slice(&piece[HASH..]);
         }
-        // The last one has nothing behind it, and says so.
+        // The last chunk has no successor, and its hash field is zero.
         if next != [0; HASH] {
             return Err(Refusal::Chain { number: of, of });
         }
         Ok(payload)
     }
 
-    /// What the device judges before a signature: by its own code. Gives the root, the
-    /// key-encryption key with the recipient's record, and the epoch.
+    /// The rules that a device checks before the signature, with the device's own code. Returns the
+    /// root, the key-encryption key with the recipient's record, and the epoch.
     #[allow(clippy::type_complexity)]
     fn judge(
         &self,
         device: &Device<'_>,
     ) -> Result<(PublicKey, Option<(Kek, [u8; RECIPIENT])>, u32), Refusal> {
         let head = self.head;
-        // A device has room for a few keys only: those are in it that count.
+        // A device has room for only a few keys; the relevant ones are put into it.
         let wanted = |id: u32| match head.certificate() {
             Some(certificate) => certificate.root_id() == id,
             None => head.signature(id).is_some(),
@@ -491,7 +494,7 @@ impl<'a> Sealed<'a> {
         let keks: Vec<&Kek> = device.keks.iter().filter(|kek| ids.contains(&kek.id())).collect();
         let closed = device.keks.is_empty();
         let in_block: Vec<(u32, [u8; 32])> = if closed {
-            // Without a key nothing is decrypted; the id of a recipient is all that is judged.
+            // Without a key nothing is decrypted; the rules only look at the id of a recipient.
             ids.iter().map(|id| (*id, [0; 32])).collect()
         } else {
             keks.iter().map(|kek| (kek.id(), [0; 32])).collect()
@@ -522,7 +525,7 @@ impl<'a> Sealed<'a> {
         Ok((root, recipient, needs.epoch))
     }
 
-    /// Which rule is behind a fault.
+    /// The rule behind a fault.
     fn why(&self, fault: Fault, device: &seal::judge::Device<'_>) -> Refusal {
         let head = self.head;
         match fault {
@@ -556,20 +559,20 @@ impl<'a> Sealed<'a> {
         let has = |which: u8| head.flags() & which != 0;
         match () {
             () if head.flags() & !flag::KNOWN != 0 => "it has an unknown flag",
-            () if head.format() > FORMAT => "it wants a newer bootloader",
+            () if head.format() > FORMAT => "it needs a newer bootloader",
             () if head.size() == 0 || head.payload() == 0 => "it is empty",
             () if !has(flag::COMPRESSED) && head.payload() != head.size() => {
                 "payload and image have different sizes, and it is not compressed"
             }
             () if !has(flag::COMPRESSED) && has(flag::DICTIONARY) => {
-                "it has a dictionary, and is not compressed"
+                "it has a dictionary but is not compressed"
             }
-            () => "it has a record that must be understood and is not known",
+            () => "it has an unknown record that is marked as mandatory",
         }
     }
 
     fn certificate_field(&self, device: &seal::judge::Device<'_>) -> &'static str {
-        let Some(certificate) = self.head.certificate() else { return "there is none" };
+        let Some(certificate) = self.head.certificate() else { return "it is missing" };
         match () {
             () if usize::from(certificate.len()) != CERTIFICATE => "its size is impossible",
             () if u16::from(certificate.algorithm()) != ED25519 => "its key is for another algorithm",

@@ -1,4 +1,4 @@
-//! The bootloader of a sealed device: its image with the key block in its place.
+//! Makes the bootloader image of a sealed device: the bootloader with the key block.
 
 use seal::key_block::SIZE;
 use shared_abi::layout::{Layout, KNOWS_SEALED_IMAGES, MARK_OFFSET};
@@ -7,38 +7,38 @@ use crate::file::fault::Place;
 use crate::file::image::{Image, Pieces};
 use crate::file::range::AddressRange;
 
-/// Why a bootloader cannot get its key block.
+/// Why a bootloader cannot get a key block.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ProvisionFault {
-    /// Another image than a bootloader.
+    /// The image is not in the bootloader's region.
     #[error(
-        "it lies at {found}, and the bootloader of this board at {region}: give the bootloader of this board"
+        "it lies at {found}, but the bootloader of this board lies at {region}: give the bootloader of this board"
     )]
     Elsewhere {
-        /// Where it lies.
+        /// The place of the image.
         found: AddressRange,
-        /// Where it must.
+        /// The place of the bootloader.
         region: AddressRange,
     },
-    /// It does not begin where the CPU starts.
+    /// The image does not begin at the CPU's start address.
     #[error(
-        "it begins at {found:#010x} and not at {start:#010x}, where a reset starts: it is no bootloader"
+        "it begins at {found:#010x} and not at {start:#010x}, where the CPU starts after a reset: it is not a bootloader"
     )]
     Start {
         /// Its first address.
         found: u32,
-        /// Where it must begin.
+        /// The required first address.
         start: u32,
     },
-    /// A bootloader to which keys mean nothing.
-    #[error("it is no bootloader of coboot that knows sealed images, so keys would mean nothing to it, and it would take any program: give one that was built with the feature `sealed` (bootloader-sealed)")]
+    /// The bootloader does not use keys.
+    #[error("it is not a coboot bootloader with support for sealed images: it would ignore the keys and accept any program; give one that was built with the feature `sealed` (bootloader-sealed)")]
     Open,
-    /// Something is where the keys go.
-    #[error("it has data of its own at {0}, where the keys go: give a bootloader without keys")]
+    /// The place of the keys is not empty.
+    #[error("it already has data at {0}, the place of the keys: give a bootloader without keys")]
     Occupied(AddressRange),
 }
 
-/// Puts a key block into its place behind a bootloader.
+/// Adds a key block to a bootloader image.
 ///
 /// # Errors
 /// See [`ProvisionFault`].
@@ -79,7 +79,7 @@ mod tests {
         raw::read(bytes, Some(address)).unwrap()
     }
 
-    /// So many bytes of a bootloader, with this in the place of the mark.
+    /// The first `size` bytes of a bootloader, with these bytes as its mark.
     fn bootloader(mark: &[u8; 4], size: usize) -> Vec<u8> {
         let mut bytes = vec![0x5A; size];
         bytes[0x1C..0x20].copy_from_slice(mark);

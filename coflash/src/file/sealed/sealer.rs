@@ -1,7 +1,7 @@
-//! Makes a sealed image of a program.
+//! Makes a sealed image from a program.
 //!
-//! The image is compressed (if wanted), then encrypted (if wanted), then cut into chunks. The same
-//! image, options and key give the same file, byte for byte.
+//! The image is compressed and encrypted if requested, in this order, and then cut into chunks. The
+//! same image, options and key give the same file, byte for byte.
 
 use seal::wire::{
     flag, tag, CERTIFICATE, CERTIFICATE_MAGIC, DOMAIN, ED25519, FIXED, FORMAT, HASH, MAGIC, MAX_CHUNK,
@@ -14,7 +14,7 @@ use super::key::{Kek, PublicKey, SigningKey};
 use super::lzma;
 use crate::file::block_file::{CRC, MAX_PROGRAM_SIZE};
 
-/// What stands in front when an image's key and nonce are made.
+/// The prefix of the data from which an image's key and nonce are derived.
 const KEY_DOMAIN: &[u8] = b"coboot image key 1\0";
 /// The usual chunk: 4096 bytes of payload.
 pub const CHUNK: u8 = 12;
@@ -22,93 +22,94 @@ pub const CHUNK: u8 = 12;
 /// Why an image cannot be sealed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SealFault {
-    /// No image.
-    #[error("there is nothing to seal: the image is empty")]
+    /// The image is empty.
+    #[error("the image is empty")]
     Empty,
-    /// An image larger than any flash.
+    /// The image is larger than any flash.
     #[error("the image has {0} bytes, more than any flash")]
     TooLarge(usize),
-    /// A chunk that no device takes.
+    /// No device accepts chunks of this size.
     #[error("a chunk of {} bytes is impossible: it must be a power of two from {} to {}", 1_u64 << (.0 & 31), 1 << MIN_CHUNK, 1 << MAX_CHUNK)]
     Chunk(u8),
-    /// A program that has no sub-index in 1F50h.
+    /// The program number is not a sub-index of 1F50h.
     #[error("there is no program {0}: programs are 1 to 254")]
     Program(u8),
-    /// The manifest has no room for the records.
-    #[error("the manifest would have {0} bytes, and has room for {MAX_MANIFEST}: shorten the text, or encrypt for fewer keys")]
+    /// The records do not fit into the manifest.
+    #[error("the manifest would have {0} bytes, and at most {MAX_MANIFEST} are allowed: shorten the text, or encrypt for fewer keys")]
     Manifest(usize),
-    /// The head is more than a device can hold.
-    #[error("the head would have {0} bytes, and a device holds {MAX_HEAD}: shorten the text, or encrypt for fewer keys")]
+    /// The head does not fit into a device's buffer.
+    #[error("the head would have {0} bytes, and a device accepts at most {MAX_HEAD}: shorten the text, or encrypt for fewer keys")]
     Head(usize),
-    /// Two recipients with one key id.
+    /// Two recipients have the same key id.
     #[error("the image would be encrypted twice for the key {0:08X}h: give each key once")]
     Twice(u32),
-    /// No certificate.
-    #[error("the certificate is none: give a file that `coflash key certify` made")]
+    /// The certificate is invalid.
+    #[error("the certificate is invalid: give a file that `coflash key certify` made")]
     NoCertificate,
-    /// A certificate of another key.
-    #[error("the certificate is of another key: give the certificate of the key {0:08X}h, which signs")]
+    /// The certificate belongs to another key.
+    #[error("the certificate belongs to another key: give the certificate of the signing key {0:08X}h")]
     OtherKey(u32),
-    /// What the certificate does not allow.
-    #[error("the certificate allows {what} {allowed}, and this is {wanted}: change it, or have the key certified for it")]
+    /// The certificate does not allow the image.
+    #[error("the certificate allows {what} {allowed}, and the image has {wanted}: change the image, or certify the key for it")]
     NotAllowed {
-        /// Which field.
+        /// The field.
         what: &'static str,
-        /// What the certificate says.
+        /// The certificate's value.
         allowed: String,
-        /// What was asked for.
+        /// The image's value.
         wanted: String,
     },
-    /// A signature that does not fit.
-    #[error("this is no signature of the key {0:08X}h over this image: sign the file that --tbs wrote (pure Ed25519), with this key")]
+    /// The signature is wrong.
+    #[error("this is not a signature of the key {0:08X}h over this image: sign the file that --tbs wrote (pure Ed25519), with this key")]
     Signature(u32),
-    /// Nothing to complete.
-    #[error("it is no sealed image without a signature: give the file that was written with --tbs")]
+    /// The file is not an unsigned sealed image.
+    #[error("it is not a sealed image without a signature: give the file that was written with --tbs")]
     NotUnsigned,
 }
 
-/// How to seal an image. The default is a program for product 0 of vendor 0 that is neither
+/// The parameters for sealing an image. The default is a program for product 0 of vendor 0, neither
 /// compressed nor encrypted.
 #[derive(Clone, Debug)]
 pub struct Sealer<'a> {
-    /// The certificate of the key that signs; `None` for a root that signs itself.
+    /// The certificate of the signing key; `None` for a root key.
     pub certificate: Option<[u8; CERTIFICATE]>,
-    /// Vendor-ID of the devices that it is for (1018h/1).
+    /// Vendor-ID of the devices for which the image is (1018h/1).
     pub vendor_id: u32,
-    /// Their product code (1018h/2).
+    /// Product code of these devices (1018h/2).
     pub product_code: u32,
     /// The program's version: major in bits 0–7, minor in bits 8–15, release in bits 16–31.
     pub version: u32,
-    /// The security counter: a device takes none that is lower than its own.
+    /// The security counter: a device accepts none lower than its own.
     pub counter: u32,
     /// The program's number, 1 to 254: the sub-index of 1F50h.
     pub program: u8,
     /// Binary logarithm of a chunk's payload, 9 to 13.
     pub chunk: u8,
-    /// For whom it is encrypted; for nobody: not at all.
+    /// The recipients of the encryption; an empty list for an image that is not encrypted.
     pub encrypt_for: &'a [Kek],
-    /// Whether it is compressed. One with a [`Self::base`] always is.
+    /// Whether the image is compressed. An image with a [`Self::base`] always is.
     pub compress: bool,
-    /// The other program of the device, as in flash, which becomes the dictionary of the compression.
+    /// The device's other program as it lies in flash: the dictionary of the compression.
     pub base: Option<&'a [u8]>,
-    /// The 96-bit unique ID of the only device that it is for, or zeros.
+    /// The 96-bit unique ID of the only device for which the image is, or zeros.
     pub unique_id: [u8; 12],
-    /// Hardware revisions that it is for: bit n for those whose revision number (1018h/3) has n in its
-    /// five lowest bits; 0 for all.
+    /// The hardware revisions for which the image is: bit n for revision numbers (1018h/3) with n
+    /// in the five lowest bits; 0 for all revisions.
     pub hardware: u32,
-    /// When it was made, in seconds since 1970; 0 where that is not told.
+    /// The time of creation, in seconds since 1970; 0 if unknown.
     pub created: u64,
-    /// Data of the application, no program.
+    /// The image is data of the application, not a program.
     pub data: bool,
-    /// The application writes the flash itself, so that the flash is not locked in front of it.
+    /// The application writes to flash itself: the bootloader does not lock the flash before it
+    /// starts the application.
     pub writes_flash: bool,
-    /// For devices that are marked for tests. A certificate of a test key makes it so, too.
+    /// Only for devices that are marked for tests. The certificate of a test key also sets this.
     pub test: bool,
     /// Text for people.
     pub text: Option<&'a str>,
     /// SHA-512/256 of the software bill of materials.
     pub sbom: Option<[u8; HASH]>,
-    /// Revision of the source.
+    /// Revision of the source code.
     pub source: Option<&'a str>,
 }
 
@@ -138,12 +139,12 @@ impl Default for Sealer<'_> {
     }
 }
 
-/// A sealed image whose signature is still missing.
+/// A sealed image without its signature.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Unsigned {
     /// The file, with zeros for the signature.
     file: Vec<u8>,
-    /// Where the signature goes.
+    /// The position of the signature.
     at: usize,
     key: PublicKey,
 }
@@ -158,11 +159,11 @@ impl Sealer<'_> {
         unsigned.attach(&key.sign(&unsigned.tbs()))
     }
 
-    /// The same for a key that is in a hardware security module: what is to be signed is
-    /// [`Unsigned::tbs`], and [`Unsigned::attach`] completes the file.
+    /// Seals an image for a key in a hardware security module: the module signs [`Unsigned::tbs`],
+    /// and [`Unsigned::attach`] completes the file.
     ///
-    /// Key and nonce of an encrypted image come from the image and from the keys that it is encrypted
-    /// for, as the module's own key cannot be used for that.
+    /// Key and nonce of an encrypted image are derived from the image and from the keys of its
+    /// recipients, because the module's key cannot be used for this.
     ///
     /// # Errors
     /// See [`SealFault`].
@@ -185,8 +186,9 @@ impl Sealer<'_> {
             return Err(SealFault::Manifest(size));
         }
         manifest[4..6].copy_from_slice(&(size as u16).to_le_bytes());
-        // No two payloads have one key and nonce, and what goes into them is all that there is: a key
-        // stream that is used twice would show both.
+        // Two different payloads must never have the same key and nonce: if a key stream is used
+        // twice, both payloads can be recovered. Therefore everything that goes into the file is an
+        // input here.
         let made = hmac(secret, &[KEY_DOMAIN, &manifest, &payload]);
         let image_key: [u8; 32] = seal::wire::array(&made, 0);
         let nonce: [u8; 16] = seal::wire::array(&made, 32);
@@ -238,7 +240,7 @@ impl Sealer<'_> {
         }
     }
 
-    /// Better no file than one that no device takes.
+    /// Refuses a certificate with which no device would accept the image.
     fn check_certificate(&self, bytes: &[u8; CERTIFICATE], key: PublicKey) -> Result<(), SealFault> {
         let certificate = Wire(bytes);
         let known = bytes.starts_with(&CERTIFICATE_MAGIC)
@@ -269,7 +271,7 @@ impl Sealer<'_> {
         Ok(())
     }
 
-    /// The fixed fields, without nonce, chain and size.
+    /// The fixed fields, still without nonce, chain and size.
     fn manifest(&self, image: &[u8], payload: usize) -> Vec<u8> {
         let certified_test = self.certificate.as_ref().is_some_and(|bytes| Wire(bytes).role() == role::TEST);
         let flags = [
@@ -291,7 +293,7 @@ impl Sealer<'_> {
         put(20, &self.counter.to_le_bytes());
         put(24, &[self.program, self.chunk]);
         put(26, &FORMAT.to_le_bytes());
-        // `check` keeps the image, and LZMA with it, far below 4 GiB.
+        // `check` limits the size of the image, and so of the LZMA data, far below 4 GiB.
         put(28, &(image.len() as u32).to_le_bytes());
         put(32, &CRC.checksum(image).to_le_bytes());
         put(36, &(payload as u32).to_le_bytes());
@@ -305,8 +307,8 @@ impl Sealer<'_> {
         bytes
     }
 
-    /// The records that are for people. Zeros behind a text make whole words of it: a manifest has
-    /// nothing between its records.
+    /// The records for people. Zeros fill a text to whole words: there are no gaps between the
+    /// records of a manifest.
     fn notes(&self) -> impl Iterator<Item = (u16, Vec<u8>)> {
         let words = |tag, text: &str| {
             let mut bytes = text.as_bytes().to_vec();
@@ -328,7 +330,7 @@ impl Sealer<'_> {
         let mut add = |tag: u16, parts: &[&[u8]]| {
             let size: usize = parts.iter().map(|part| part.len()).sum();
             manifest.extend_from_slice(&tag.to_le_bytes());
-            // The manifest's own size was checked, which is far less.
+            // The manifest's size was checked, and this is a part of it.
             manifest.extend_from_slice(&(size as u16).to_le_bytes());
             parts.iter().for_each(|part| manifest.extend_from_slice(part));
         };
@@ -343,7 +345,7 @@ impl Sealer<'_> {
 }
 
 impl Unsigned {
-    /// What is to be signed by pure Ed25519: the domain and the manifest.
+    /// The bytes to be signed with pure Ed25519: the domain and the manifest.
     #[must_use]
     pub fn tbs(&self) -> Vec<u8> {
         let manifest = seal::wire::Head(&self.file).manifest();
@@ -356,7 +358,7 @@ impl Unsigned {
         &self.file
     }
 
-    /// Takes up a file that was kept, of an image which this key signs.
+    /// Continues with a stored file of an image for this signing key.
     ///
     /// # Errors
     /// [`SealFault::NotUnsigned`], [`SealFault::OtherKey`].

@@ -1,4 +1,4 @@
-//! What a sealed image says of itself, in words. Nothing of it is checked here.
+//! Describes a sealed image in words. Nothing is checked here.
 
 use std::fmt;
 
@@ -9,7 +9,7 @@ use super::key::PublicKey;
 use super::open::Sealed;
 use crate::file::inspect::Date;
 
-/// What the flags of a manifest say, each with its name.
+/// The flags of a manifest, each with its name.
 pub const FLAGS: [(u8, &str); 6] = [
     (flag::ENCRYPTED, "encrypted"),
     (flag::COMPRESSED, "compressed"),
@@ -19,7 +19,7 @@ pub const FLAGS: [(u8, &str); 6] = [
     (flag::TEST, "for tests"),
 ];
 
-/// The flags that are set, by name.
+/// The names of the flags that are set.
 pub fn flags(flags: u8) -> impl Iterator<Item = &'static str> {
     FLAGS.into_iter().filter(move |(flag, _)| flags & flag != 0).map(|(_, name)| name)
 }
@@ -30,7 +30,7 @@ pub fn digits(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// A text of a record, without the zeros behind it and what would move a cursor.
+/// The text of a record, without trailing zeros and control characters.
 #[must_use]
 pub fn text(bytes: &[u8]) -> String {
     let text = String::from_utf8_lossy(bytes);
@@ -47,7 +47,7 @@ pub fn role_name(role: u8) -> &'static str {
     }
 }
 
-/// What a certificate says, in lines.
+/// A certificate as text.
 #[derive(Clone, Copy, Debug)]
 pub struct CertificateWords<'a>(pub Certificate<'a>);
 
@@ -58,7 +58,7 @@ impl fmt::Display for CertificateWords<'_> {
         write!(f, "{} key ", role_name(certificate.role()))?;
         match PublicKey::new(certificate.key()) {
             Ok(key) => write!(f, "{:08X}h", key.id())?,
-            Err(_) => write!(f, "that is none")?,
+            Err(_) => write!(f, "that is invalid")?,
         }
         write!(f, " of root {:08X}h, epoch {}", certificate.root_id(), certificate.epoch())?;
         write!(f, ", vendor-ID {:08X}h", certificate.vendor_id())?;

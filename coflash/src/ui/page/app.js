@@ -93,7 +93,7 @@ async function take(files) {
     return;
   }
   if (state?.task) {
-    notice(false, "not now: something is being done", "wait until it is done, or cancel it");
+    notice(false, "not now: something is being done", "wait until it has finished, or cancel it");
     return;
   }
   if (await sendFile(given)) notice(true, `the file ${given.name} was read and checked`);

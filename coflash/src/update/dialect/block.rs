@@ -1,4 +1,4 @@
-//! The dialect `block`, of SYS TEC and coboot: a block file, an SDO download for each block.
+//! The dialect `block` of SYS TEC and coboot: a block file, with one SDO download for each block.
 
 use std::time::Duration;
 
@@ -34,9 +34,10 @@ impl Procedure for Block {
         enter_by_call(session, running, Dialect::Block, options, course)
     }
 
-    /// Erases, sends the blocks, compares, tries the program and releases it for autostart. One that
-    /// is not to be started is neither tried nor released. A sealed image goes with one download unless
-    /// blocks were asked for, and needs no release: its signature is one.
+    /// Erases, sends the blocks, compares the CRC, tries the program and releases it for autostart.
+    /// With `start` off, the program is neither tried nor released. A sealed image is sent in one
+    /// download unless the user asked for blocks, and it needs no release: its signature serves as
+    /// the release.
     fn download(
         &self,
         session: &mut Session<'_>,
@@ -75,7 +76,7 @@ impl Procedure for Block {
     }
 }
 
-/// The blocks that carry a sealed image to where this device has the program.
+/// The blocks that carry a sealed image to the program's region of this device.
 fn cut(
     session: &mut Session<'_>,
     sealed: &SealedFile,
@@ -84,15 +85,15 @@ fn cut(
 ) -> Result<BlockFile, Error> {
     let not_cut = |why: &str| Error::NoProgram {
         why: format!("cannot be sent in blocks: {why}"),
-        advice: "send it with one download: leave --blocks out",
+        advice: "send it in one download: leave out --blocks",
     };
     let region = program_region(session, program)?;
     let region =
-        region.ok_or_else(|| not_cut("the device does not tell where its program starts (2004h)"))?;
+        region.ok_or_else(|| not_cut("the device does not report the start of its program (2004h)"))?;
     blocks_of_sealed(sealed, region.base, block_size).map_err(|error| not_cut(&error.to_string()))
 }
 
-/// Steps 4 to 9: erases and sends all blocks; gives how many had to be repeated, and how long they took.
+/// Steps 4 to 9: erases and sends all blocks; returns the number of repetitions and the duration.
 fn send(
     session: &mut Session<'_>,
     file: &BlockFile,
@@ -113,7 +114,7 @@ fn send(
     Ok((repeats, session.now().saturating_sub(began)))
 }
 
-/// Steps 6 to 9: all blocks; gives how many had to be repeated.
+/// Steps 6 to 9: sends all blocks; returns the number of repetitions.
 fn send_blocks(
     session: &mut Session<'_>,
     file: &BlockFile,
@@ -131,8 +132,8 @@ fn send_blocks(
             Event::Progress { done: part, .. } => course.tell(Event::Progress { done: done + part, total }),
             event => course.tell(event),
         });
-        // A device that puts the erasure off begins it with the first good data: with block 0 alone
-        // nothing is lost.
+        // A device that postpones the erase starts it with the first good data: block 0 alone loses
+        // nothing.
         course.wrote |= block.number != 0 && !sent.as_ref().is_err_and(Error::refuses_first_blocks);
         repeats += sent?;
         done += bytes.len();
@@ -141,7 +142,7 @@ fn send_blocks(
     Ok(repeats)
 }
 
-/// Steps 7 and 8 for one block, with repetition; gives how often it was repeated.
+/// Steps 7 and 8 for one block, with repetition; returns the number of repetitions.
 fn send_block(
     session: &mut Session<'_>,
     block: u32,
@@ -152,7 +153,7 @@ fn send_block(
     let doing = Doing::Block(block);
     let at = Address::new(program::PROGRAM_DATA, options.program);
     let mut repeat = 0;
-    // Whether a transfer ended without our knowing how: its block may have arrived.
+    // Whether the result of an earlier transfer is unknown: its block may have arrived.
     let mut in_doubt = false;
     loop {
         let mut progress = |part: u32| tell(Event::Progress { done: part as usize, total: bytes.len() });
@@ -161,8 +162,8 @@ fn send_block(
             return Err(error);
         }
         let status = session.await_idle(options.program, doing)?;
-        // It had arrived, and the bootloader waits for the next one. Should that not be so, the
-        // next one and at the latest the program's CRC will tell.
+        // The earlier block had arrived, and the bootloader waits for the next one. If this is
+        // wrong, the next block, or at the latest the program's CRC, shows it.
         if in_doubt && status.error == Some(FlashError::Sequence) {
             return Ok(repeat);
         }
@@ -174,8 +175,7 @@ fn send_block(
         match why {
             Some(why) if repeat < options.repeats => {
                 repeat += 1;
-                // A device, or an adapter, that cannot cope with block transfers may cope with
-                // segments.
+                // A device or an adapter with problems in block transfer may work with segments.
                 if repeat > 1 && matches!(why, RepeatReason::Broken(_) | RepeatReason::NoAnswer) {
                     session.transfer_by(Transfers::Segments);
                 }

@@ -1,4 +1,4 @@
-//! What the dialects of CiA 302-3 have in common: STOP, CLEAR, one download, START.
+//! Common parts of the dialects of CiA 302-3: STOP, CLEAR, one download, START.
 
 use canopen::program::{self, ProgramControl, ProgramState};
 use canopen::Address;
@@ -13,7 +13,7 @@ use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
 use crate::update::steps::{call_back, clear_and_wait, CALL_BACK};
 
-/// Afterwards the bootloader is running.
+/// Makes the bootloader run.
 pub(super) fn enter(
     session: &mut Session<'_>,
     running: DeviceType,
@@ -29,7 +29,7 @@ pub(super) fn enter(
     Ok(dialect)
 }
 
-/// Erases, and sends this.
+/// Erases, and sends this content.
 pub(super) fn download(
     session: &mut Session<'_>,
     content: &[u8],
@@ -45,15 +45,15 @@ pub(super) fn download(
     whole::download(session, &whole, options, course)
 }
 
-/// Asks an application of a device that knows CiA 302-3 alone for its bootloader: STOP; a
-/// bootloader is what answers then. One that refuses may know coboot's and SYS TEC's call.
+/// Calls the bootloader of a device that only supports CiA 302-3 with STOP: the bootloader then
+/// answers. An application that refuses STOP may support the call of coboot and SYS TEC.
 ///
 /// # Errors
 /// [`Error::NoBootloader`].
 fn stop_program(session: &mut Session<'_>, number: u8, course: &mut Course<'_>) -> Result<(), Error> {
     const RUNNING: u32 = ProgramState::Running as u32;
     let control = |number| Address::new(program::PROGRAM_CONTROL, number);
-    // The one that runs may be another one than the one that is to be written.
+    // The running program may have another number than the program to be written.
     let mut running = None;
     for number in [number, CALL_BACK] {
         if optional(session.read_number(control(number)))? == Some(RUNNING) {
@@ -62,7 +62,7 @@ fn stop_program(session: &mut Session<'_>, number: u8, course: &mut Course<'_>) 
         }
     }
     let Some(running) = running else {
-        // Its bootloader runs already, or nobody can tell.
+        // The bootloader is already running, or the device does not report it.
         return Ok(());
     };
     let at = control(running);

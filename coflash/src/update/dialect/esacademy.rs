@@ -1,4 +1,4 @@
-//! The dialect `esacademy`: Intel HEX text behind a password, which erases.
+//! The dialect `esacademy`: Intel HEX text after a password that erases the program.
 
 use std::time::Duration;
 
@@ -17,11 +17,11 @@ use crate::update::event::Note;
 use crate::update::options::FlashOptions;
 use crate::update::steps::await_application;
 
-/// The password of 7F50h as ESAcademy gives it: "INIT".
+/// ESAcademy's password for 7F50h: "INIT".
 pub const PASSWORD: u32 = 0x494E_4954;
-/// How long a program that starts by itself may take until its bootloader is told to.
+/// How long a program that starts by itself may take before the bootloader gets a command.
 const BY_ITSELF: Duration = Duration::from_secs(1);
-/// Generic error and manufacturer-specific error of 1001h: a flash operation went wrong.
+/// Generic error and manufacturer-specific error of 1001h: a flash operation has failed.
 const ERROR_BITS: u32 = 0x81;
 
 /// See the [module](self).
@@ -62,7 +62,8 @@ impl Procedure for EsAcademy {
     }
 }
 
-/// Writes the password, which erases. It is optional; without it the download alone has to do.
+/// Writes the password, which erases the program. It is optional; without it, the download alone
+/// must be sufficient.
 fn unlock(session: &mut Session<'_>, options: &FlashOptions, course: &mut Course<'_>) -> Result<(), Error> {
     let node = session.node();
     let password = match options.unlock {
@@ -73,7 +74,7 @@ fn unlock(session: &mut Session<'_>, options: &FlashOptions, course: &mut Course
         })?,
     };
     let at = Address::new(program::ENABLE_FLASH, options.program);
-    // It erases before it answers.
+    // The device erases before it answers.
     let patient = session.timing().erasing();
     let written = session.with(node, patient).write(at, &password.to_le_bytes(), Doing::Unlock, &mut |_| {});
     match written {
@@ -84,11 +85,11 @@ fn unlock(session: &mut Session<'_>, options: &FlashOptions, course: &mut Course
     Ok(())
 }
 
-/// What the device says of the download: by 1F57h if it has that, otherwise by 1001h.
+/// The result of the download, from 1F57h if the device has it, otherwise from 1001h.
 fn status(session: &mut Session<'_>, number: u8) -> Result<Said, Error> {
     match session.read(Address::new(program::FLASH_STATUS, number)) {
         Err(Error::Refused { code, .. }) if absent(code) => {}
-        // What took the whole program may restart at once.
+        // A device that has the whole program may restart at once.
         Err(Error::NoAnswer { .. }) => return Ok(None),
         Ok(_) | Err(Error::Protocol { .. }) => return idle(session, number),
         Err(error) => return Err(error),

@@ -21,15 +21,15 @@ use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
 use crate::update::password::Password;
 
-/// The program of a lift; what else 1F50h holds are data, which are not started (CiA 814-1 clause
-/// 6.4).
+/// The program of a lift device; the other sub-indices of 1F50h hold data, which are not started
+/// (CiA 814-1 clause 6.4).
 pub(super) const LIFT_PROGRAM: u8 = 1;
-/// How long a lift bootloader may take to come up (CiA 814-1 clause 6.3).
+/// How long a lift bootloader may take to start (CiA 814-1 clause 6.3).
 const LIFT_WAIT: Duration = Duration::from_secs(10);
-/// How often it is asked for meanwhile: a device that listens for the bit rate needs somebody who
-/// talks.
+/// The pause between two requests meanwhile: a device that detects the bit rate needs traffic on the
+/// bus.
 const LIFT_PAUSE: Duration = Duration::from_millis(125);
-/// How long it takes to hear a heartbeat: they come once a second in most networks.
+/// How long to wait for a heartbeat: in most networks, heartbeats come once a second.
 const HEARTBEAT: Duration = Duration::from_millis(1200);
 
 /// See the [module](self).
@@ -72,7 +72,7 @@ impl Procedure for Lift {
         course: &mut Course<'_>,
     ) -> Result<Downloaded, Error> {
         let (content, crc) = (file.stream(BlockFile::flash_image), file.program_crc());
-        // Unlocked already; what is there is overwritten.
+        // The device is already unlocked; the download overwrites the old program.
         let prepare = |_: &mut Session<'_>, _: &mut Course<'_>| Ok(());
         let whole = Whole { content: &content, crc, prepare: &prepare, status: whole::status };
         whole::download(session, &whole, options, course)
@@ -92,8 +92,8 @@ impl Procedure for Lift {
     }
 }
 
-/// Brings a lift device into its bootloader and unlocks it there (CiA 814-1 clause 6.3). From then
-/// on the session is with node 126. [`check`] comes before.
+/// Calls a lift device into its bootloader and unlocks it there (CiA 814-1 clause 6.3). The session
+/// then talks to node 126. [`check`] must run before.
 ///
 /// # Errors
 /// [`Error::NoPassword`], [`Error::NoBootloader`], and [`Error::Refused`] for a wrong password.
@@ -121,8 +121,8 @@ fn unlock_bootloader(
     Ok(())
 }
 
-/// Looks whether a lift device can be updated, before anything is done to it: a password is there,
-/// and no other device has node-ID 126, be it one that only sends heartbeats (CiA 814-1 clause 6.3).
+/// Checks whether a lift device can be updated, before it is changed: the user gave a password, and
+/// no other device has node-ID 126, not even one that only sends heartbeats (CiA 814-1 clause 6.3).
 ///
 /// # Errors
 /// [`Error::NoPassword`], [`Error::Occupied`], [`Error::NoBootloader`].
@@ -155,7 +155,7 @@ fn lift_node() -> NodeId {
     const { NodeId::new(LIFT_NODE_ID).expect("1 to 127") }
 }
 
-/// Asks once, and not for long.
+/// Time limits for a single, short request.
 fn brief(timing: &Timing) -> Timing {
     Timing { sdo: LIFT_PAUSE.min(timing.sdo), attempts: 1, ..*timing }
 }
@@ -165,7 +165,7 @@ fn await_lift(session: &mut Session<'_>) -> Result<(), Error> {
     let deadline = session.now() + LIFT_WAIT.max(session.timing().boot);
     let timing = brief(session.timing());
     loop {
-        // A boot-up message says when to look; it may get lost.
+        // A boot-up message ends the pause; it may get lost.
         session.await_boot_up(LIFT_PAUSE)?;
         let node = session.node();
         let running = session.with(node, timing).device_type()?;
@@ -189,13 +189,12 @@ fn unlock(session: &mut Session<'_>, password: Password) -> Result<(), Error> {
     }
 }
 
-/// Reads an object of a device that has to be unlocked for it: a lift's program or parameter set,
-/// from its bootloader. A device that was not there before is restarted afterwards, whatever came
-/// of it.
+/// Reads an object of a locked device: a lift's program or parameter set, from its bootloader. If
+/// the device was not in the bootloader before, it is restarted afterwards, also after an error.
 ///
 /// # Errors
-/// [`Error::NotInDialect`] for a device that is no lift, and what [`Error::NoPassword`], [`Error::Occupied`], [`Error::NoBootloader`] and an
-/// [upload](Session::upload) have.
+/// [`Error::NotInDialect`] for a device that is not a lift device, [`Error::NoPassword`],
+/// [`Error::Occupied`], [`Error::NoBootloader`], and the errors of an [upload](Session::upload).
 pub fn read_locked(
     session: &mut Session<'_>,
     at: Address,
@@ -210,8 +209,8 @@ pub fn read_locked(
     };
     let what = match dialect {
         Dialect::Lift => None,
-        Dialect::EsAcademy => Some("the password erases the program, so there is nothing to read behind it"),
-        Dialect::Block | Dialect::Raw | Dialect::Hex => Some("no password opens anything for reading"),
+        Dialect::EsAcademy => Some("the password erases the program, so there is nothing left to read"),
+        Dialect::Block | Dialect::Raw | Dialect::Hex => Some("no password allows reading"),
     };
     if let Some(what) = what {
         return Err(Error::NotInDialect { dialect, what });

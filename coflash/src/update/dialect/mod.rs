@@ -1,4 +1,5 @@
-//! Dialects: what different bootloaders make of the same objects, a file for each.
+//! Dialects: the update procedures of different bootloaders with the same objects, one file for
+//! each.
 //!
 //! | dialect | the program goes as | before | afterwards |
 //! |---|---|---|---|
@@ -8,8 +9,8 @@
 //! | [`EsAcademy`](Dialect::EsAcademy) | Intel HEX text, one download | password in 7F50h, which erases | it runs by itself |
 //! | [`Lift`](Dialect::Lift) | image, one download, at node-ID 126 | password in 6005h, in application and bootloader | "reset program" |
 //!
-//! Another dialect is a file that implements `Procedure`, and a line of `of`. The steps that all
-//! have in common are in [`steps`](super::steps).
+//! To add a dialect, add a file that implements `Procedure` and a line in `of`.
+//! [`steps`](super::steps) has the steps that all dialects share.
 
 use crate::device::Dialect;
 
@@ -27,14 +28,14 @@ pub use self::esacademy::PASSWORD as ESACADEMY_PASSWORD;
 pub use self::lift::read_locked;
 pub(super) use self::procedure::{Downloaded, Procedure};
 
-/// Whether what goes to this number is no program but data, which may be any bytes and are never
-/// started: whatever a lift has besides its program (CiA 814-1 clause 6.4).
+/// Whether this program number is for data, which may be any bytes and are never started: all
+/// programs of a lift device except its program 1 (CiA 814-1 clause 6.4).
 #[must_use]
 pub const fn is_data(dialect: Dialect, program: u8) -> bool {
     matches!(dialect, Dialect::Lift) && program != lift::LIFT_PROGRAM
 }
 
-/// What this dialect makes of the procedure.
+/// The procedure of this dialect.
 pub(super) fn of(dialect: Dialect) -> &'static dyn Procedure {
     match dialect {
         Dialect::Block => &block::Block,

@@ -1,4 +1,4 @@
-//! What a dialect makes of the procedure.
+//! The parts of the update procedure that differ between dialects.
 
 use std::time::Duration;
 
@@ -12,13 +12,13 @@ use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
 use crate::update::steps;
 
-/// The parts of an update that each dialect has its own way of, in their order.
+/// The parts of an update that each dialect implements, in their order.
 pub(in crate::update) trait Procedure {
-    /// Step 3: afterwards the bootloader is running. Gives what that speaks; it may tell more than
-    /// the application did.
+    /// Step 3: makes the bootloader run. Returns the dialect of the bootloader, which may report
+    /// more than the application did.
     ///
     /// # Errors
-    /// [`Error::NoBootloader`], [`Error::NotInDialect`], and what opens the device not.
+    /// [`Error::NoBootloader`], [`Error::NotInDialect`], and the errors of unlocking.
     fn enter(
         &self,
         session: &mut Session<'_>,
@@ -27,10 +27,10 @@ pub(in crate::update) trait Procedure {
         course: &mut Course<'_>,
     ) -> Result<Dialect, Error>;
 
-    /// Steps 4 to 14: afterwards the program is in the device, and starts with the next reset.
+    /// Steps 4 to 14: afterwards the program is in the device and starts at the next reset.
     ///
     /// # Errors
-    /// What the device objects to.
+    /// The device's refusal.
     fn download(
         &self,
         session: &mut Session<'_>,
@@ -39,8 +39,8 @@ pub(in crate::update) trait Procedure {
         course: &mut Course<'_>,
     ) -> Result<Downloaded, Error>;
 
-    /// Step 15: starts the program; afterwards the session is with the node that it runs as.
-    /// `original` is the node that the update was begun with.
+    /// Step 15: starts the program; afterwards the session talks to the program's node. `original`
+    /// is the node at the start of the update.
     ///
     /// # Errors
     /// [`Error::StartFailed`].
@@ -50,18 +50,18 @@ pub(in crate::update) trait Procedure {
     }
 }
 
-/// A program that is in its device.
+/// The result of a download.
 pub(in crate::update) struct Downloaded {
-    /// How often a block, or the whole of it, was sent again.
+    /// The number of repetitions of a block, or of the whole program.
     pub(in crate::update) repeats: u32,
     /// How long the blocks took.
     pub(in crate::update) took: Duration,
-    /// Whether it is released for autostart; `None` in a dialect that knows no release.
+    /// Whether it is released for autostart; `None` in a dialect without a release.
     pub(in crate::update) released: Option<bool>,
 }
 
-/// Asks an application for its bootloader as coboot's and SYS TEC's take it. Gives what the
-/// bootloader speaks: what its device type says, unless the user has named it; otherwise `found`.
+/// Calls an application back with the call of coboot and SYS TEC. Returns the bootloader's dialect:
+/// the user's choice, otherwise the dialect of its device type, otherwise `found`.
 pub(super) fn enter_by_call(
     session: &mut Session<'_>,
     running: DeviceType,

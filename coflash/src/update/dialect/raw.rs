@@ -1,4 +1,4 @@
-//! The dialect `raw`: CiA 302-3 with an image of the program, from its start on.
+//! The dialect `raw`: CiA 302-3 with an image of the program from its start.
 
 use super::cia302;
 use super::procedure::{Downloaded, Procedure};

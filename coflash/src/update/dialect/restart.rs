@@ -1,4 +1,4 @@
-//! The restart into a program in the dialects that have no START.
+//! The restart into a program in the dialects without START.
 
 use canopen::program::{self, ProgramControl};
 use canopen::Address;
@@ -7,12 +7,12 @@ use crate::device::error::absent;
 use crate::device::{DeviceType, Doing, Error, Session};
 use crate::update::steps::await_application;
 
-/// "Reset program" (2 of 1F51h); where there is no such object, NMT reset node.
+/// "Reset program" (2 of 1F51h); NMT reset node if the device does not have this object.
 pub(super) fn reset_program(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
     let at = Address::new(program::PROGRAM_CONTROL, number);
     match session.write(at, &[ProgramControl::ResetStat as u8], Doing::Restart, &mut |_| {}) {
         Err(Error::Refused { code, .. }) if absent(code) => session.reset_node(),
-        // A device that resets at once may not get its answer out.
+        // A device that resets at once may not send its answer.
         Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => Ok(()),
         Err(error) => Err(error),
     }

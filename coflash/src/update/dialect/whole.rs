@@ -1,4 +1,4 @@
-//! A program that goes to its device as one SDO download.
+//! The download of a program in one SDO transfer.
 
 use std::time::Duration;
 
@@ -15,29 +15,29 @@ use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
 use crate::update::steps;
 
-/// A device that takes the whole program at once may erase behind any of its segments: 2 s at
-/// worst, and some more.
+/// A device that takes the whole program in one transfer may erase after any segment: at most 2 s,
+/// plus a margin.
 const SLOW_SEGMENT: Duration = Duration::from_secs(5);
 
-/// What 1F57h says: an error, and its detail.
+/// The result in 1F57h: an error and its detail.
 pub(super) type Said = Option<(FlashError, u16)>;
 
-/// What is sent, and what a dialect does around it.
+/// The data to send, and the dialect's actions around the transfer.
 pub(super) struct Whole<'w> {
     /// All that is sent.
     pub(super) content: &'w [u8],
     /// CRC of the program.
     pub(super) crc: u32,
-    /// What each attempt begins with.
+    /// The action at the start of each attempt.
     pub(super) prepare: &'w dyn Fn(&mut Session<'_>, &mut Course<'_>) -> Result<(), Error>,
-    /// What the device says of the download.
+    /// Reads the device's result of the download.
     pub(super) status: fn(&mut Session<'_>, u8) -> Result<Said, Error>,
 }
 
-/// Steps 4 to 9 with one download.
+/// Steps 4 to 9 in one download.
 ///
 /// # Errors
-/// What the device objects to.
+/// The device's refusal.
 pub(super) fn download(
     session: &mut Session<'_>,
     whole: &Whole<'_>,
@@ -48,15 +48,15 @@ pub(super) fn download(
     let repeats = send(session, whole, options, course)?;
     let took = session.now().saturating_sub(began);
     course.state = DeviceState::Written;
-    // What 1F56h reads is a CRC in this bootloader and its like; elsewhere it is whatever its maker
-    // took.
+    // 1F56h is a CRC in bootloaders of this kind; elsewhere it is whatever the manufacturer has
+    // chosen.
     if knows_crc(session)? {
         steps::verify(session, options.program, whole.crc, &mut |event| course.tell(event))?;
     }
     Ok(Downloaded { repeats, took, released: None })
 }
 
-/// Sends the program, with what each attempt begins with; gives how often it was repeated.
+/// Sends the program, with the preparation before each attempt; returns the number of repetitions.
 fn send(
     session: &mut Session<'_>,
     whole: &Whole<'_>,
@@ -71,7 +71,7 @@ fn send(
         let before = if repeat == 0 { steps::told_before(session, options.program)? } else { None };
         course.erases(before);
         if let Err(error) = (whole.prepare)(session, course) {
-            // A password that is refused erases nothing, and no more does a command.
+            // A refused password erases nothing, and neither does a refused command.
             if error.is_refusal() || matches!(error, Error::NotInDialect { .. }) {
                 course.erases_not();
             }
@@ -88,7 +88,7 @@ fn send(
         let sent = long.write(at, content, Doing::Program, &mut progress);
         let transfers = long.transfers();
         session.transfer_by(transfers);
-        // What got no answer may have arrived.
+        // Data without an answer may have arrived.
         course.wrote |= !matches!(sent, Err(Error::Refused { .. }));
         if let Err(error @ (Error::Adapter(_) | Error::Cancelled)) = sent {
             return Err(error);
@@ -111,7 +111,7 @@ fn send(
     }
 }
 
-/// What the device says of the download by 1F57h; nothing where it has no such object.
+/// The result of the download in 1F57h; `None` if the device does not have this object.
 pub(super) fn status(session: &mut Session<'_>, number: u8) -> Result<Said, Error> {
     match session.read(Address::new(program::FLASH_STATUS, number)) {
         Err(Error::Refused { code, .. }) if absent(code) => Ok(None),
@@ -120,17 +120,17 @@ pub(super) fn status(session: &mut Session<'_>, number: u8) -> Result<Said, Erro
     }
 }
 
-/// What 1F57h says when it is no longer busy.
+/// The value of 1F57h when it is no longer busy.
 pub(super) fn idle(session: &mut Session<'_>, number: u8) -> Result<Said, Error> {
     let status = session.await_idle(number, Doing::Program)?;
     Ok(status.error.map(|error| (error, status.detail)))
 }
 
-/// Whether 1F56h of this bootloader is the CRC of the program, as far as its device type tells:
-/// coboot's, and SYS TEC's.
+/// Whether 1F56h of this bootloader is the CRC of the program, judged by the device type: it is for
+/// coboot and SYS TEC.
 ///
 /// # Errors
-/// What a [read](Session::read) has.
+/// The errors of a [read](Session::read).
 fn knows_crc(session: &mut Session<'_>) -> Result<bool, Error> {
     let running = session.device_type()?;
     Ok(running.is_some_and(|running| running.0 == program::BOOTLOADER_DEVICE_TYPE))

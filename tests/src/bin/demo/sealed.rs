@@ -1,4 +1,4 @@
-//! The sealed device for people to watch: `cargo xtask demo --sealed`.
+//! The sealed device as a demonstration: `cargo xtask demo --sealed`.
 
 use canopen::program::{FlashStatus, ProgramControl};
 use canopen::AbortCode;
@@ -10,7 +10,7 @@ use coflash::file::sealed::Sealer;
 
 use super::{chapter, introduce, print_line, Outcome};
 
-/// Keys go into the board; it takes what is genuine, and refuses what is not.
+/// The board gets its keys; it accepts valid images, and refuses all others.
 pub fn tell(bench: &mut Bench) -> Outcome<()> {
     chapter("Production: keys go into the bootloader's flash, which makes a sealed device of the board");
     let (root, release) = (root().public().id(), self::release().public().id());
@@ -31,7 +31,7 @@ pub fn tell(bench: &mut Bench) -> Outcome<()> {
     let v2 = firmware::raw(firmware::APP_V2);
     let genuine = sealer(COUNTER).seal(&v2, &self::release())?;
     let mut flipped = genuine.clone();
-    // In the hash of the image, which the signature covers.
+    // In the image, whose hash the signature covers.
     flipped[50] ^= 1;
     chapter("Somebody sends version 2 with one bit flipped");
     refuse(bench, &flipped)?;
@@ -55,7 +55,7 @@ fn print_note(what: &str) {
     println!("               {what}");
 }
 
-/// Seals an image, sends it and starts it. It runs and is confirmed in the end.
+/// Seals an image, sends it and starts it. At the end it runs and is confirmed.
 fn install(bench: &mut Bench, image: &str, sealer: &Sealer<'_>) -> Outcome<()> {
     let bytes = firmware::raw(image);
     let file = sealer.seal(&bytes, &release())?;
@@ -78,7 +78,7 @@ fn install(bench: &mut Bench, image: &str, sealer: &Sealer<'_>) -> Outcome<()> {
     introduce(bench)
 }
 
-/// Sends what is to be refused; then the power fails, and the old program starts.
+/// Sends an image that the device must refuse; then the power fails, and the old program starts.
 fn refuse(bench: &mut Bench, file: &[u8]) -> Outcome<()> {
     bench.session().command(1, ProgramControl::StartBootloader)?;
     bench.await_boot_up(1000);

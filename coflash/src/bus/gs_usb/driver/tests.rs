@@ -1,4 +1,4 @@
-//! The driver against a stand-in for USB, which is honest or lies.
+//! The driver against a USB stand-in, which behaves correctly or sends invalid data.
 
 use std::collections::VecDeque;
 
@@ -7,7 +7,7 @@ use canopen::CobId;
 use super::*;
 use crate::bus::health::Trouble;
 
-/// A device: what it says, and what it was told.
+/// A device: the transfers that it sends, and those that it received.
 #[derive(Default)]
 struct Fake {
     config: Vec<u8>,
@@ -85,7 +85,7 @@ fn a_channel_is_set_up_used_and_left() {
 #[test]
 fn a_device_takes_ten_frames_until_it_tells_that_one_was_sent() {
     let mut fake = device();
-    // An echo of another channel, one that is not owed, and one that is.
+    // Three echoes: one of another channel, one that is not owed, and one that is owed.
     fake.incoming.extend([echo(3, 1), echo(77, 0), echo(3, 0)]);
     let mut driver = GsUsb::start(&mut fake, 0, 500_000).unwrap();
     let request = frame(0x605, &[]);
@@ -124,10 +124,10 @@ fn a_device_that_lies_or_goes_is_named() {
         fake
     };
     for (mut fake, words) in [
-        (lie(|fake| fake.config.truncate(5)), "it tells no number of channels"),
-        (lie(|fake| fake.constants.truncate(39)), "it tells no timing of its controller"),
-        (lie(|fake| fake.constants.fill(0)), "clock of 0 Hz does not come to 500000 bit/s"),
-        (lie(|fake| fake.constants.fill(0xFF)), "clock of 4294967295 Hz does not come to"),
+        (lie(|fake| fake.config.truncate(5)), "it does not report its number of channels"),
+        (lie(|fake| fake.constants.truncate(39)), "it does not report its controller's timing"),
+        (lie(|fake| fake.constants.fill(0)), "clock of 0 Hz cannot produce 500000 bit/s"),
+        (lie(|fake| fake.constants.fill(0xFF)), "clock of 4294967295 Hz cannot produce"),
     ] {
         let error = started(&mut fake, 0);
         assert!(error.contains(words), "{error}");
@@ -138,7 +138,7 @@ fn a_device_that_lies_or_goes_is_named() {
         (vec![], "it sends a transfer of 0 bytes"),
     ] {
         let mut fake = device();
-        // Channel 0, and neither of CAN FD nor an error frame.
+        // Channel 0, neither a CAN FD frame nor an error frame.
         let mut transfer = transfer;
         if transfer.len() > 10 {
             (transfer[7], transfer[9], transfer[10]) = (0, 0, 0);
