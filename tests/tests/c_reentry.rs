@@ -1,4 +1,4 @@
-//! The way back in C (`app-c/coboot/reentry.c`) beside that in Rust (`canopen::application`): whatever
+//! The way back in C (`app-c/coboot/reentry.c`) beside that in Rust (`coboot_app::departure`): whatever
 //! comes, in whatever order, both do the same.
 
 use std::fmt::Write as _;
@@ -6,8 +6,7 @@ use std::path::Path;
 use std::process::Command;
 use std::{env, fs};
 
-use canopen::application::{Departure, Next};
-use canopen::time::Instant;
+use coboot_app::departure::{Departure, Next};
 use coboot_tests::random::Random;
 
 /// Reads a script of events, and prints what the program does about each: for `b REQUEST NOW`, a command
@@ -63,11 +62,11 @@ struct Model {
 }
 
 impl Model {
-    fn begin(&mut self, request: u32, now: Instant) -> bool {
+    fn begin(&mut self, request: u32, now: u32) -> bool {
         if self.silent || self.confirms && request != CONFIRM {
             return false;
         }
-        let departure = self.departure.get_or_insert(Departure::NONE);
+        let departure = self.departure.get_or_insert_default();
         if request == OWED {
             departure.begin_silent(request, now);
             self.silent = true;
@@ -78,7 +77,7 @@ impl Model {
         true
     }
 
-    fn proceed(&mut self, quiet: bool, now: Instant) -> Next<u32> {
+    fn proceed(&mut self, quiet: bool, now: u32) -> Next<u32> {
         self.departure.as_mut().map_or(Next::Serve, |departure| departure.proceed(quiet, now))
     }
 }
@@ -98,12 +97,12 @@ fn c_and_rust_leave_at_the_same_time_with_the_same_request() {
             let request = random.chance(8).then(|| random.pick(&REQUESTS));
             let told = if let Some(request) = request {
                 writeln!(script, "b {request} {now}").unwrap();
-                let possible = model.begin(request, Instant::from_millis(now));
+                let possible = model.begin(request, now);
                 if possible { "taken" } else { "refused" }.to_owned()
             } else {
                 let quiet = random.chance(70);
                 writeln!(script, "p {} {now}", u8::from(quiet)).unwrap();
-                match model.proceed(quiet, Instant::from_millis(now)) {
+                match model.proceed(quiet, now) {
                     Next::Serve => "serve".to_owned(),
                     Next::Wait => "wait".to_owned(),
                     Next::Leave(request) => format!("leave {request}"),

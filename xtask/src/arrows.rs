@@ -50,7 +50,17 @@ const RULES: &[Rule] = &[
     Rule { name: "emulator", may_use: &["shared-abi"] },
     Rule {
         name: "coboot-tests",
-        may_use: &["boot-core", "bsp", "canopen", "coboot-node", "coflash", "emulator", "seal", "shared-abi"],
+        may_use: &[
+            "boot-core",
+            "bsp",
+            "canopen",
+            "coboot-app",
+            "coboot-node",
+            "coflash",
+            "emulator",
+            "seal",
+            "shared-abi",
+        ],
     },
     Rule { name: "xtask", may_use: &["shared-abi"] },
 ];
