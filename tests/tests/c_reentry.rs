@@ -52,7 +52,7 @@ const OWED: u32 = 7;
 const CONFIRM: u32 = 10;
 
 /// What an application on `Departure` does: the rules that stand outside of it are those of
-/// `coboot_app::ProgramControl`.
+/// `app-template/src/objects.rs`.
 #[derive(Default)]
 struct Model {
     departure: Option<Departure<u32>>,
@@ -66,7 +66,7 @@ impl Model {
         if self.silent || self.confirms && request != CONFIRM {
             return false;
         }
-        let departure = self.departure.get_or_insert(Departure::Staying);
+        let departure = self.departure.get_or_insert_default();
         if request == OWED {
             departure.begin_silent(request, now);
             self.silent = true;
