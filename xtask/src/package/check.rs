@@ -227,7 +227,7 @@ fn works(root: &Path, program: &str) -> Outcome {
 
 /// A program for 0801_0000h: the initial stack pointer, the reset vector, and no code to speak of.
 fn sample() -> Vec<u8> {
-    let mut image = [0x2002_0000_u32, 0x0801_0201].map(u32::to_le_bytes).concat();
+    let mut image = [0x2001_0000_u32, 0x0801_0201].map(u32::to_le_bytes).concat();
     image.resize(1024, 0xBF);
     image
 }
