@@ -20,17 +20,22 @@ pub struct Link {
     pub heading: Option<String>,
 }
 
-/// Every page, from the root of the repository on.
+/// Every page, from the root of the repository on: those at the root, all in `docs/`, and the README
+/// of each example.
 ///
 /// # Errors
 /// When a folder cannot be read.
 pub fn pages() -> Outcome<Vec<PathBuf>> {
     let mut pages: Vec<PathBuf> = AT_ROOT.iter().map(PathBuf::from).collect();
+    for example in within(Path::new("examples"))? {
+        let page = example.join("README.md");
+        if workspace::root().join(&page).is_file() {
+            pages.push(page);
+        }
+    }
     let mut folders = vec![PathBuf::from("docs")];
     while let Some(folder) = folders.pop() {
-        let entries = fs::read_dir(workspace::root().join(&folder))
-            .map_err(|error| format!("{} cannot be read: {error}.", folder.display()))?;
-        for name in entries.flatten().map(|entry| folder.join(entry.file_name())) {
+        for name in within(&folder)? {
             if workspace::root().join(&name).is_dir() {
                 folders.push(name);
             } else if name.extension().is_some_and(|extension| extension == "md") {
@@ -40,6 +45,13 @@ pub fn pages() -> Outcome<Vec<PathBuf>> {
     }
     pages.sort();
     Ok(pages)
+}
+
+/// What is in a folder, from the root of the repository on.
+fn within(folder: &Path) -> Outcome<Vec<PathBuf>> {
+    let entries = fs::read_dir(workspace::root().join(folder))
+        .map_err(|error| format!("{} cannot be read: {error}.", folder.display()))?;
+    Ok(entries.flatten().map(|entry| folder.join(entry.file_name())).collect())
 }
 
 /// The text of a page.

@@ -43,7 +43,7 @@ pub fn run(mut args: Args) -> Outcome {
     args.none_left()?;
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
     let images = build::images(board, &build::MAIN)?;
-    process::run(process::cargo("build").args(["-p", "emulator", "-p", "coflash", "--bins"]))?;
+    process::run(process::cargo("build").args(["-p", "coboot-emulator", "-p", "coflash", "--bins"]))?;
 
     let mut emulate = Command::new(workspace::target_dir().join("debug/emulate"));
     emulate.args(["--board", board.board, "--socketcand", ADDRESS, "--bootloader"]);
