@@ -313,6 +313,41 @@ impl Cpu {
         let _ = self.uc.reg_write(register, u64::from(value));
     }
 
+    /// r0 to r12, SP, LR, PC, xPSR.
+    pub fn core_registers(&mut self) -> [u32; 17] {
+        self.privileged(|cpu| {
+            std::array::from_fn(|n| match n {
+                0..=12 => cpu.uc.reg_read(RegisterARM::R0 as i32 + n as i32).unwrap_or(0) as u32,
+                13 => cpu.register(RegisterARM::SP),
+                14 => cpu.register(RegisterARM::LR),
+                15 => cpu.pc(),
+                _ => cpu.register(RegisterARM::XPSR),
+            })
+        })
+    }
+
+    /// Sets one of [`Self::core_registers`]; of xPSR the flags alone.
+    pub fn set_core_register(&mut self, number: usize, value: u32) {
+        use RegisterARM as R;
+        const FLAGS: u32 = 0xF80F_0000;
+        match number {
+            0..=12 => {
+                let _ = self.uc.reg_write(R::R0 as i32 + number as i32, u64::from(value));
+            }
+            13 => self.privileged(|cpu| cpu.set(R::SP, value & !3)),
+            14 => self.set(R::LR, value),
+            15 => {
+                let thumb = self.register(R::XPSR) >> 24 & 1;
+                self.set(R::PC, value & !1 | thumb);
+            }
+            16 => {
+                let xpsr = self.register(R::XPSR);
+                self.set(R::XPSR_NZCVQG, xpsr & !FLAGS | value & FLAGS);
+            }
+            _ => panic!("there is no core register {number}"),
+        }
+    }
+
     /// The address of the next instruction.
     #[must_use]
     pub fn pc(&self) -> u32 {
@@ -500,8 +535,9 @@ impl Cpu {
     // --- running
     // -----------------------------------------------------------------------------------------------------
 
-    /// Runs translated code until the chip's slice ends or something else happens.
-    pub fn run(&mut self) -> Exit {
+    /// Runs translated code until the chip's slice ends or something else happens; `single` asks for
+    /// one instruction, wherever breakpoints are.
+    pub fn run(&mut self, single: bool) -> Exit {
         self.drop_stale();
         self.chip_mut().leave = false;
         let masks = self.is_unprivileged().then(|| self.privileged(|cpu| cpu.masks()));
@@ -511,6 +547,9 @@ impl Cpu {
         }
         if self.steps() {
             return self.step();
+        }
+        if single {
+            return self.one_instruction();
         }
         let exit = self.enter(None);
         let Some(address) = self.uc.get_data_mut().notes.fpu_instruction.take() else { return exit };
@@ -527,7 +566,9 @@ impl Cpu {
     }
 
     fn enter(&mut self, until: Option<u32>) -> Exit {
-        let exits: Vec<u64> = self.chip().scs.debug.breakpoints().chain(until).map(u64::from).collect();
+        let chip = self.chip();
+        let stops = chip.scs.debug.breakpoints().chain(chip.stops.iter().copied());
+        let exits: Vec<u64> = stops.chain(until).map(u64::from).collect();
         if !exits.is_empty() {
             let _ = self.uc.ctl_set_exits(&exits);
         }
@@ -538,7 +579,7 @@ impl Cpu {
         match self.why(result) {
             // It came to a breakpoint, which is seen when it wants to go on.
             Exit::WaitForInterrupt
-                if self.has_breakpoint(self.pc()) && self.last_hint(self.pc()) != Some(Hint::Wfi) =>
+                if self.is_stop(self.pc()) && self.last_hint(self.pc()) != Some(Hint::Wfi) =>
             {
                 Exit::Slice
             }
@@ -550,7 +591,13 @@ impl Cpu {
     fn start(&mut self, count: usize) -> Result<(), uc_error> {
         let thumb = self.register(RegisterARM::XPSR) & XPSR_T != 0;
         let begin = self.pc() | u32::from(thumb);
+        self.chip_mut().entries += 1;
         self.uc.emu_start(u64::from(begin), 0, 0, count)
+    }
+
+    /// Whether code stops there, for the program's own comparators or for a debugger.
+    fn is_stop(&self, address: u32) -> bool {
+        self.has_breakpoint(address) || self.chip().stops.contains(&address)
     }
 
     fn has_breakpoint(&self, address: u32) -> bool {
@@ -572,6 +619,23 @@ impl Cpu {
 
     /// Carries out one instruction, which the DebugMonitor exception follows.
     fn step(&mut self) -> Exit {
+        let exit = self.one_instruction();
+        if matches!(exit, Exit::FlashBusy | Exit::Fault(_)) {
+            return exit;
+        }
+        let chip = self.chip_mut();
+        chip.scs.debug.note(DFSR_HALTED);
+        chip.scs.exceptions.pend(DEBUG_MONITOR);
+        chip.check_exceptions = true;
+        match exit {
+            Exit::SupervisorCall | Exit::ExceptionReturn(_) | Exit::Breakpoint => exit,
+            // Who steps does not sleep.
+            _ => Exit::Slice,
+        }
+    }
+
+    /// Carries out one instruction.
+    fn one_instruction(&mut self) -> Exit {
         let chip = self.chip_mut();
         let (cycles, instructions) = (chip.clock.cycles, chip.counters.instructions);
         chip.block = (0, 0);
@@ -582,19 +646,16 @@ impl Cpu {
         let exit = self.why(result);
         let _ = self.uc.ctl_flush_tb();
         self.uc.get_data_mut().notes.single = false;
-        let chip = self.chip_mut();
         if matches!(exit, Exit::FlashBusy | Exit::Fault(_)) {
             return exit;
         }
+        let chip = self.chip_mut();
         chip.clock.cycles = cycles + 1;
         chip.counters.instructions = instructions + 1;
-        chip.scs.debug.note(DFSR_HALTED);
-        chip.scs.exceptions.pend(DEBUG_MONITOR);
-        chip.check_exceptions = true;
         match exit {
-            Exit::SupervisorCall | Exit::ExceptionReturn(_) | Exit::Breakpoint => exit,
-            // Who steps does not sleep.
-            _ => Exit::Slice,
+            // The engine stops behind the instruction as it does behind WFI.
+            Exit::WaitForInterrupt if self.last_hint(self.pc()) != Some(Hint::Wfi) => Exit::Slice,
+            exit => exit,
         }
     }
 

@@ -3,10 +3,13 @@
 pub mod bus;
 pub mod bxcan;
 pub mod candump;
+pub mod control;
 pub mod cortex;
 pub mod cpu;
 pub mod defmt;
 pub mod frame;
+#[cfg(feature = "gdb")]
+pub mod gdb;
 pub mod machine;
 pub mod pacing;
 pub mod periph;

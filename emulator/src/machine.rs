@@ -2,6 +2,7 @@
 
 pub mod chip;
 pub mod clock;
+mod debugger;
 pub mod image;
 pub mod memory;
 pub mod report;
@@ -20,6 +21,8 @@ use crate::peripheral::Peripheral;
 use crate::time::{Span, Time};
 pub use chip::Counters;
 use chip::{Chip, Watch};
+use debugger::Debugger;
+pub use debugger::Halt;
 pub use image::LoadedImage;
 pub use report::{Access, Report};
 
@@ -78,6 +81,8 @@ pub enum Stop {
     /// The CPU has locked up: a fault within the HardFault handler. Only a reset (the watchdog's,
     /// perhaps) helps. Told once; the machine can be run on.
     Lockup,
+    /// A debugger has halted it ([`Machine::halted`]): it comes no further.
+    Halted,
 }
 
 /// What can go wrong with setting up a machine.
@@ -132,6 +137,7 @@ pub struct Machine {
     /// The time while the power is off.
     off_time: Time,
     power_cycles: u64,
+    debugger: Debugger,
 }
 
 impl Machine {
@@ -141,7 +147,14 @@ impl Machine {
     /// [`Error::Engine`] where the CPU emulation cannot be set up.
     pub fn new(chip: &'static Geometry, options: Options) -> Result<Self, Error> {
         let cpu = Cpu::new(Chip::new(chip, &options))?;
-        Ok(Self { cpu, options, activity: Activity::Off, off_time: Time(0), power_cycles: 0 })
+        Ok(Self {
+            cpu,
+            options,
+            activity: Activity::Off,
+            off_time: Time(0),
+            power_cycles: 0,
+            debugger: Debugger::default(),
+        })
     }
 
     /// Stores an ELF file in flash as a debug probe does: what it does not cover stays.
@@ -254,6 +267,7 @@ impl Machine {
 
     fn start(&mut self) {
         self.cpu.reset();
+        self.debugger.restarted();
         self.activity = Activity::Runs;
     }
 
@@ -282,6 +296,9 @@ impl Machine {
     pub fn run_until(&mut self, deadline: Time) -> Stop {
         self.cpu.chip_mut().deadline = deadline;
         loop {
+            if let Some(held) = self.is_held() {
+                return held;
+            }
             if !self.is_powered() {
                 self.off_time = self.off_time.max(deadline);
                 return Stop::Deadline;
@@ -304,6 +321,7 @@ impl Machine {
             }
             if self.step() == Entry::Lockup {
                 self.activity = Activity::LockedUp;
+                self.debugger.locked_up();
                 return Stop::Lockup;
             }
         }
@@ -360,10 +378,12 @@ impl Machine {
             if self.flash_holds(self.cpu.vector_address(exception)) {
                 return Entry::Taken;
             }
-            return self.settle(|cpu| cpu.enter_exception(exception));
+            let entry = self.settle(|cpu| cpu.enter_exception(exception));
+            return self.note_exception(entry);
         }
         self.cpu.chip_mut().limit_slice();
-        match self.cpu.run() {
+        let Some(exit) = self.run_code() else { return Entry::Taken };
+        match exit {
             Exit::Slice => Entry::Taken,
             Exit::WaitForInterrupt => {
                 let chip = self.cpu.chip_mut();
@@ -562,6 +582,12 @@ impl Machine {
     pub fn counters(&self) -> Counters {
         let chip = self.cpu.chip();
         Counters { cycles: chip.clock.cycles, ..chip.counters.clone() }
+    }
+
+    /// How often translated code was entered: what an idle machine costs the host.
+    #[must_use]
+    pub fn entries(&self) -> u64 {
+        self.cpu.chip().entries
     }
 
     /// The core clock that the program has set up, in Hz.

@@ -35,6 +35,8 @@ const MIN_TIMES: f64 = 0.001;
 const MAX_TIMES: f64 = 1000.0;
 /// The world is never sent further than this in one go, so that clients are heard in time.
 const MOST: Span = Span::from_millis(2);
+/// How long an idle world sleeps on the wall clock before it goes on.
+pub const NAP: Duration = Duration::from_millis(2);
 /// In one go at [`Speed::Max`].
 const MOST_AT_MAX: Span = Span::from_millis(10);
 /// What a client gets of wall-clock time to react to a frame at [`Speed::Max`].
@@ -85,8 +87,65 @@ impl Pacer {
         due.max(now).min(now + MOST)
     }
 
+    /// Whether a world in which nobody is about to answer anybody should go on to `target` now. If
+    /// not, there is more to do at once after [`NAP`]: what comes every millisecond is done by twos.
+    #[must_use]
+    pub fn is_worth_it(&self, now: Time, target: Time) -> bool {
+        match self.speed {
+            Speed::Times(times) => target - now >= MOST.min(scaled(NAP, times)),
+            Speed::Max => target > now,
+        }
+    }
+
     fn due(&self, wall: Instant, times: f64) -> Time {
         self.anchor.1 + scaled(wall.saturating_duration_since(self.anchor.0), times)
+    }
+}
+
+/// Notices when the world does not keep the speed that is asked for.
+#[derive(Clone, Debug)]
+pub struct Lag {
+    speed: Speed,
+    /// Where the present window began.
+    since: Option<(Instant, Time)>,
+    /// What was said last, in tenths of the speed asked for.
+    said: u32,
+}
+
+/// How long the world is watched before anything is said.
+const WINDOW: Duration = Duration::from_secs(2);
+
+impl Lag {
+    /// Begins to watch.
+    #[must_use]
+    pub fn new(speed: Speed) -> Self {
+        Self { speed, since: None, said: 10 }
+    }
+
+    /// The world has come to `now`: a text where the pace has changed since the last one. At
+    /// [`Speed::Max`] there is none to keep.
+    pub fn look(&mut self, wall: Instant, now: Time) -> Option<String> {
+        let Speed::Times(times) = self.speed else { return None };
+        let (began, start) = *self.since.get_or_insert((wall, now));
+        let took = wall.saturating_duration_since(began);
+        if took < WINDOW {
+            return None;
+        }
+        self.since = Some((wall, now));
+        let wanted = scaled(took, times).0.max(1) as f64;
+        let tenths = (((now - start).0 as f64 / wanted * 10.0).round() as u32).min(10);
+        // A tenth more or less is no news, but being in time again is.
+        if tenths.abs_diff(self.said) < 2 && (tenths < 10 || self.said == 10) {
+            return None;
+        }
+        self.said = tenths;
+        Some(match tenths {
+            10 => format!("the emulation keeps up again: {times} of real time"),
+            _ => format!(
+                "the host is too slow: the emulation runs at {:.1} of real time, not {times}",
+                f64::from(tenths) / 10.0 * times
+            ),
+        })
     }
 }
 
@@ -153,6 +212,55 @@ mod tests {
         let now = pacer.target(woken, Time(0));
         assert_eq!(now, Time(0) + MOST);
         assert_eq!(pacer.target(woken, now), now, "and waits for the wall clock again");
+    }
+
+    /// What is said of a world that makes so many milliseconds in each of so many seconds.
+    fn lags(speed: Speed, paces: &[u64]) -> Vec<(usize, String)> {
+        let start = Instant::now();
+        let mut lag = Lag::new(speed);
+        let (mut now, mut said) = (Time(0), Vec::new());
+        for (second, pace) in paces.iter().enumerate() {
+            for tenth in 0..10_u64 {
+                let wall = start + Duration::from_millis(1_000 * second as u64 + 100 * tenth);
+                said.extend(lag.look(wall, now).map(|text| (second, text)));
+                now = now + Span::from_millis(pace / 10);
+            }
+        }
+        said
+    }
+
+    /// A loop that does nothing but look would let the world go on at every look, and keep a core
+    /// busy with that.
+    #[test]
+    fn an_idle_world_goes_on_five_hundred_times_a_second_at_most() {
+        for (speed, most) in [(1.0, 501), (0.25, 501), (10.0, 5_001)] {
+            let start = Instant::now();
+            let mut pacer = Pacer::new(Speed::Times(speed), start, Time(0));
+            let (mut now, mut runs) = (Time(0), 0);
+            for micros in (0..=1_000_000).step_by(10) {
+                let target = pacer.target(start + Duration::from_micros(micros), now);
+                if pacer.is_worth_it(now, target) {
+                    now = target;
+                    runs += 1;
+                }
+            }
+            assert!(runs <= most && runs > most / 2, "{runs} times at speed {speed}");
+            assert!(Time((speed * 1e12) as u64) - now <= MOST, "{now} at speed {speed}");
+        }
+    }
+
+    #[test]
+    fn a_slow_host_is_said_once_per_change() {
+        let slow = lags(Speed::Times(1.0), &[1000, 1000, 600, 600, 600, 600, 600, 600, 1000, 1000, 1000]);
+        let texts: Vec<&str> = slow.iter().map(|(_, text)| text.as_str()).collect();
+        assert_eq!(texts.len(), 2, "{texts:?}");
+        assert!(texts[0].contains("0.6 of real time"), "{texts:?}");
+        assert!(texts[1].contains("keeps up again"), "{texts:?}");
+        assert_eq!(lags(Speed::Times(1.0), &[1000; 20]), []);
+        assert_eq!(lags(Speed::Max, &[10; 20]), []);
+        let half = lags(Speed::Times(0.5), &[250; 20]);
+        assert_eq!(half.len(), 1);
+        assert!(half[0].1.contains("0.2 of real time") || half[0].1.contains("0.3 of"), "{half:?}");
     }
 
     #[test]

@@ -23,7 +23,7 @@ use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream, ToSocketAddrs};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc::{sync_channel, Receiver, RecvTimeoutError, SyncSender, TrySendError};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
-use std::thread;
+use std::thread::{self, Thread};
 use std::time::Duration;
 
 use crate::frame::Frame;
@@ -53,6 +53,23 @@ enum Event {
     Frame { id: ClientId, frame: Frame },
     Frames { id: ClientId, on: bool },
     Gone { id: ClientId },
+}
+
+/// The way of the connections' threads to the world's thread.
+#[derive(Clone)]
+struct Events {
+    sender: SyncSender<Event>,
+    /// The thread that made the server; it may sleep.
+    owner: Thread,
+}
+
+impl Events {
+    /// Hands in an event; whether anybody will look at it.
+    fn send(&self, event: Event) -> bool {
+        let sent = self.sender.send(event).is_ok();
+        self.owner.unpark();
+        sent
+    }
 }
 
 /// What a client's writing thread has to do.
@@ -123,7 +140,8 @@ pub struct Server {
 }
 
 impl Server {
-    /// Listens. `bus` is the name that clients have to open, as a rule `can0`.
+    /// Listens. `bus` is the name that clients have to open, as a rule `can0`. The calling thread is
+    /// unparked when a client wants something.
     ///
     /// # Errors
     /// What the operating system says, for instance that the address is in use.
@@ -131,6 +149,7 @@ impl Server {
         let listener = TcpListener::bind(address)?;
         let address = listener.local_addr()?;
         let (sender, events) = sync_channel(EVENTS);
+        let sender = Events { sender, owner: thread::current() };
         let stop = Arc::new(AtomicBool::new(false));
         let (bus, stopped) = (bus.to_owned(), stop.clone());
         thread::Builder::new()
@@ -256,7 +275,7 @@ impl Drop for Server {
     }
 }
 
-fn accept(listener: &TcpListener, bus: &str, events: &SyncSender<Event>, stop: &AtomicBool) {
+fn accept(listener: &TcpListener, bus: &str, events: &Events, stop: &AtomicBool) {
     let connected = Arc::new(AtomicUsize::new(0));
     let mut next_id: ClientId = 1;
     while !stop.load(Ordering::Relaxed) {
@@ -285,7 +304,7 @@ fn serve(
     peer: SocketAddr,
     id: ClientId,
     bus: &str,
-    events: &SyncSender<Event>,
+    events: &Events,
     connected: &Arc<AtomicUsize>,
 ) -> io::Result<()> {
     stream.set_nodelay(true)?;
@@ -299,13 +318,13 @@ fn serve(
     thread::Builder::new().name(format!("client {id} out")).spawn(move || write(writing, &texts))?;
     thread::Builder::new().name(format!("client {id} in")).spawn(move || {
         connected.fetch_add(1, Ordering::Relaxed);
-        if events.send(connection).is_ok() {
+        if events.send(connection) {
             read(&stream, id, session, &out, &credit, &events);
         }
         credit.close();
         connected.fetch_sub(1, Ordering::Relaxed);
         // If the world is gone, nobody needs to know.
-        let _ = events.send(Event::Gone { id });
+        events.send(Event::Gone { id });
     })?;
     Ok(())
 }
@@ -318,7 +337,7 @@ fn read(
     mut session: Session,
     out: &SyncSender<Out>,
     credit: &Credit,
-    events: &SyncSender<Event>,
+    events: &Events,
 ) {
     let mut splitter = Splitter::default();
     let mut buffer = [0; 4096];
@@ -354,7 +373,7 @@ fn read(
                 // The writing thread ends the connection when all is said.
                 Effect::Close => return,
             };
-            if events.send(event).is_err() {
+            if !events.send(event) {
                 return;
             }
         }

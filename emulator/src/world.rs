@@ -32,6 +32,11 @@ pub trait Computer {
     /// attention, or to say that something happened.
     fn run_until(&mut self, deadline: Time) -> Self::Stop;
 
+    /// Whether a debugger holds it, and all time with it.
+    fn is_halted(&self) -> bool {
+        false
+    }
+
     /// Its CAN controller.
     fn can(&mut self) -> &mut BxCan;
 
@@ -146,12 +151,16 @@ impl Computer for Machine {
         self.run_until(deadline)
     }
 
+    fn is_halted(&self) -> bool {
+        self.halted().is_some()
+    }
+
     fn can(&mut self) -> &mut BxCan {
         self.wired_can_mut()
     }
 
     fn is_news(stop: &Stop) -> bool {
-        !matches!(stop, Stop::Deadline | Stop::Attention)
+        !matches!(stop, Stop::Deadline | Stop::Attention | Stop::Halted)
     }
 }
 
@@ -277,9 +286,15 @@ impl<M: Computer> World<M> {
         self.news.pop_front()
     }
 
-    /// Lets everything happen up to and including `time`.
+    /// Whether a debugger has halted a machine. Time stands still then, for all.
+    #[must_use]
+    pub fn is_halted(&self) -> bool {
+        self.slots.iter().any(|slot| matches!(&slot.plug, Plug::Machine(machine) if machine.is_halted()))
+    }
+
+    /// Lets everything happen up to and including `time`, or until a debugger halts a machine.
     pub fn run_until(&mut self, time: Time) {
-        while self.now < time {
+        while self.now < time && !self.is_halted() {
             self.step(time);
         }
     }
@@ -296,7 +311,7 @@ impl<M: Computer> World<M> {
             if let Some(received) = self.receive(port) {
                 return Some(received);
             }
-            if self.now >= deadline {
+            if self.now >= deadline || self.is_halted() {
                 return None;
             }
             self.step(deadline);

@@ -164,3 +164,274 @@ fn a_reader_that_leaves_is_no_error() {
     assert!(output.status.success());
     assert_eq!(String::from_utf8_lossy(&output.stderr), "");
 }
+
+/// An emulator that runs until it is dropped, and what it says.
+struct Running {
+    child: std::process::Child,
+    lines: std::io::Lines<BufReader<std::process::ChildStdout>>,
+}
+
+impl Running {
+    fn start(args: &[&str]) -> Self {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_emulate"))
+            .args(args)
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        Self { child, lines }
+    }
+
+    /// The rest of the first line that begins so.
+    fn after(&mut self, prefix: &str) -> String {
+        let mut lines = self.lines.by_ref().map_while(Result::ok);
+        lines.find_map(|line| line.strip_prefix(prefix).map(str::to_owned)).unwrap()
+    }
+
+    /// The first line that contains this.
+    fn line_with(&mut self, words: &str) -> String {
+        let mut lines = self.lines.by_ref().map_while(Result::ok);
+        lines.find(|line| line.contains(words)).unwrap()
+    }
+
+    /// Ctrl-C, and the end.
+    fn interrupt(mut self) {
+        assert!(Command::new("kill")
+            .args(["-INT", &self.child.id().to_string()])
+            .status()
+            .unwrap()
+            .success());
+        assert!(self.child.wait().unwrap().success());
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// A client of the control socket.
+struct Control(BufReader<TcpStream>);
+
+impl Control {
+    fn connect(address: &str) -> Self {
+        Self(BufReader::new(TcpStream::connect(address).unwrap()))
+    }
+
+    fn ask(&mut self, bytes: &[u8]) -> String {
+        self.0.get_mut().write_all(bytes).unwrap();
+        let mut line = String::new();
+        self.0.read_line(&mut line).unwrap();
+        line.trim_end().to_owned()
+    }
+}
+
+const COMMANDS_AT: &str = "commands are taken at ";
+
+#[test]
+#[cfg(unix)]
+fn the_control_socket_switches_power_and_takes_no_rubbish() {
+    let image = program(&folder("control"), FOREVER);
+    let mut board = Running::start(&[&image, "--control", "127.0.0.1:0"]);
+    let address = board.after(COMMANDS_AT);
+    let (mut one, mut other) = (Control::connect(&address), Control::connect(&address));
+    let status = one.ask(b"status\n");
+    assert!(status.starts_with("ok ") && status.contains("board: runs, pc 08000008h"), "{status}");
+    assert!(other.ask(b"\x00\xFF rubbish\n").starts_with("error: "));
+    assert!(other.ask(&[&[b'x'; 100_000][..], b"\n"].concat()).starts_with("error: a line has 255"));
+    assert_eq!(one.ask(b"power off\n"), "ok power off");
+    assert!(one.ask(b"status\n").contains("power off"));
+    assert!(one.ask(b"reset\n").starts_with("error: its power is off"));
+    assert!(one.ask(b"board 2 power on\n").starts_with("error: there is no board 2"));
+    assert_eq!(one.ask(b"power on\n"), "ok power on");
+    assert_eq!(one.ask(b"pin PC13 low\n"), "ok PC13 is low from outside");
+    assert_eq!(one.ask(b"reset\n"), "ok reset by the pin NRST");
+    board.line_with("board: reset by the pin NRST");
+    board.interrupt();
+}
+
+/// Unlocks the flash (RM0090 section 3.5.1), sets PG with a width of a byte, and stores 0 at
+/// 0801_0000h: ldr r0, [pc, #20]; ldr r1, [pc, #24]; ldr r2, [pc, #24]; str r1, [r0, #4]; str r2, [r0,
+/// #4]; movs r1, #1; str r1, [r0, #16]; ldr r3, [pc, #20]; movs r4, #0; strb r4, [r3]; b .; nop; the
+/// flash interface, two keys, the address
+const PROGRAMS_A_BYTE: &[u16] = &[
+    0x4805, 0x4906, 0x4A06, 0x6041, 0x6042, 0x2101, 0x6101, 0x4B05, 0x2400, 0x701C, 0xE7FE, 0xBF00, 0x3C00,
+    0x4002, 0x0123, 0x4567, 0x89AB, 0xCDEF, 0x0000, 0x0801,
+];
+
+#[test]
+#[cfg(unix)]
+fn the_flash_file_keeps_what_was_programmed() {
+    let folder = folder("flash");
+    let file = folder.join("flash.bin");
+    let _ = std::fs::remove_file(&file);
+    let path = file.to_str().unwrap();
+    let image = program(&folder, PROGRAMS_A_BYTE);
+    let output = emulate(&[&image, "--flash", path, "--speed", "max", "--for", "0.01"]);
+    assert!(output.status.success(), "{output:?}");
+    let kept = std::fs::read(&file).unwrap();
+    assert_eq!(kept.len(), 1 << 20);
+    assert_eq!(kept[..4], 0x2000_1000_u32.to_le_bytes());
+    assert_eq!(kept[0x1_0000..0x1_0002], [0x00, 0xFF], "the program has programmed a byte");
+    // The file alone is enough now; Ctrl-C and power off write it too.
+    std::fs::write(&file, [&kept[..0x1_0000], &[0xFF; 0xF_0000]].concat()).unwrap();
+    let mut board = Running::start(&["--flash", path, "--control", "127.0.0.1:0"]);
+    let address = board.after(COMMANDS_AT);
+    board.line_with("power on");
+    let mut control = Control::connect(&address);
+    while control.ask(b"status\n").starts_with("ok 0.00") {}
+    assert_eq!(control.ask(b"power off\n"), "ok power off");
+    assert!(std::fs::read(&file).unwrap() == kept, "at power off");
+    board.interrupt();
+    assert!(std::fs::read(&file).unwrap() == kept, "at the end");
+    assert!(!folder.join("flash.bin.new").exists());
+    // What is no flash of this chip stays as it is.
+    std::fs::write(&file, [0; 1000]).unwrap();
+    let output = emulate(&["--flash", path]);
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert!(!output.status.success() && text.contains("1000 bytes") && text.contains("1048576"), "{text}");
+    assert_eq!(std::fs::read(&file).unwrap(), [0; 1000]);
+    let output = emulate(&["--flash", "/nowhere/flash.bin", &image]);
+    assert!(String::from_utf8(output.stderr).unwrap().contains("/nowhere/flash.bin cannot be written"));
+}
+
+/// What gdb prints.
+#[cfg(feature = "gdb")]
+fn gdb(address: &str, commands: &[&str]) -> String {
+    let mut gdb = Command::new("gdb-multiarch");
+    gdb.args(["-nx", "-batch", "-ex", "set architecture arm", "-ex", &format!("target remote {address}")]);
+    for command in commands {
+        gdb.args(["-ex", command]);
+    }
+    let output = gdb.stdin(Stdio::null()).output().unwrap_or_else(|error| {
+        panic!("gdb-multiarch: {error}. `cargo xtask test` installs it (Debian's package gdb-multiarch).")
+    });
+    // What `monitor` answers goes to the standard error.
+    [output.stderr, output.stdout].map(|text| String::from_utf8_lossy(&text).into_owned()).concat()
+}
+
+/// movs r0, #0; ldr r1, [pc, #16]; loop: adds r0, #1; str r0, [r1]; bl add; b loop; add: adds r2, #3; bx
+/// lr; nop; .word 2000_0000
+#[cfg(feature = "gdb")]
+const COUNTS: &[u16] =
+    &[0x2000, 0x4904, 0x3001, 0x6008, 0xF000, 0xF801, 0xE7FA, 0x3203, 0x4770, 0xBF00, 0x0000, 0x2000];
+
+/// gdb itself: breakpoints, steps, memory, registers, a reset, and time that stands still.
+#[test]
+#[cfg(all(unix, feature = "gdb"))]
+fn gdb_stops_steps_looks_and_changes() {
+    let image = program(&folder("gdb"), COUNTS);
+    let mut board = Running::start(&[&image, "--gdb", "127.0.0.1:0", "--control", "127.0.0.1:0"]);
+    let control = board.after(COMMANDS_AT);
+    let address = board.after("gdb reaches the board by `target remote ").trim_end_matches('`').to_owned();
+    let said = gdb(
+        &address,
+        &[
+            "monitor reset",
+            "maintenance flush register-cache",
+            "p/x $pc",
+            "break *0x0800000c",
+            "continue",
+            "continue",
+            "p $r0",
+            "x/wx 0x20000000",
+            "delete",
+            "hbreak *0x08000016",
+            "continue",
+            "p/x $lr",
+            "stepi",
+            "p/x $pc",
+            "stepi",
+            "p/x $pc",
+            "set var $r0 = 1000",
+            "set var *(int*)0x20000010 = 0x12345678",
+            "x/wx 0x20000010",
+            "x/wx 0xe000ed00",
+            "delete",
+            "break *0x0800000c",
+            "continue",
+            "p $r0",
+            "monitor rubbish",
+            "detach",
+        ],
+    );
+    let mut rest = said.as_str();
+    for words in [
+        "halted at 08000008h",
+        "known command: reset",
+        "$1 = 0x8000008",
+        "Breakpoint 1, 0x0800000c",
+        "Breakpoint 1, 0x0800000c",
+        "$2 = 1",
+        "0x20000000:\t0x00000001",
+        "Breakpoint 2, 0x08000016",
+        "$3 = 0x8000015",
+        "$4 = 0x8000018",
+        "$5 = 0x8000014",
+        "0x20000010:\t0x12345678",
+        // CPUID of the Cortex-M4 r0p1 (PM0214 section 4.4.2).
+        "0xe000ed00:\t0x410fc241",
+        "Breakpoint 3, 0x0800000c",
+        "$6 = 1000",
+        "detached",
+    ] {
+        let at =
+            rest.find(words).unwrap_or_else(|| panic!("{words:?} is missing behind {rest:?} in\n{said}"));
+        rest = &rest[at + words.len()..];
+    }
+    let mut control = Control::connect(&control);
+    assert!(control.ask(b"status\n").contains("board: runs"), "it goes on without its debugger");
+    board.interrupt();
+}
+
+/// What packets of gdb's protocol are made of.
+#[cfg(feature = "gdb")]
+const NOISE: &[u8] = b"$#+-cmMgGsXZzvqk,;:0123456789abcdef\x03\xFF}*";
+
+/// While it is halted no time goes by; who goes away in the middle of it all lets it go on; rubbish does
+/// no harm.
+#[test]
+#[cfg(all(unix, feature = "gdb"))]
+fn a_debugger_that_hangs_up_or_sends_rubbish_does_no_harm() {
+    let image = program(&folder("gdb-rubbish"), COUNTS);
+    let mut board = Running::start(&[&image, "--gdb", "127.0.0.1:0", "--control", "127.0.0.1:0"]);
+    let control = board.after(COMMANDS_AT);
+    let address = board.after("gdb reaches the board by `target remote ").trim_end_matches('`').to_owned();
+    let mut control = Control::connect(&control);
+    let mut door = TcpStream::connect(&address).unwrap();
+    board.line_with("time stands still");
+    let status = control.ask(b"status\n");
+    assert!(status.contains("halted by the debugger"), "{status}");
+    assert_eq!(control.ask(b"status\n"), status, "time and all stand still");
+    // A second one waits.
+    let second = TcpStream::connect(&address).unwrap();
+    // A step, and gone before its answer.
+    door.write_all(b"$s#73").unwrap();
+    drop(door);
+    board.line_with("the board goes on");
+    board.line_with("time stands still");
+    drop(second);
+    board.line_with("the board goes on");
+    let mut random = 1_u32;
+    for packet in
+        [&b"$m08000000,ffffffff#00"[..], b"$G00#a7", b"$Z0,zz,9#11", b"$vCont;s:9;c#xx", b"\x03\x03$", b""]
+    {
+        let mut door = TcpStream::connect(&address).unwrap();
+        board.line_with("time stands still");
+        let noise: Vec<u8> = (0..4096)
+            .map(|_| {
+                random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                NOISE[(random >> 16) as usize % NOISE.len()]
+            })
+            .collect();
+        // It may hang up on us.
+        let _ = door.write_all(packet).and_then(|()| door.write_all(&noise));
+        drop(door);
+        board.line_with("the board goes on");
+    }
+    assert!(control.ask(b"status\n").contains("board: runs"));
+    board.interrupt();
+}

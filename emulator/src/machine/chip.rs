@@ -260,6 +260,10 @@ pub struct Chip {
     guarded: bool,
     /// Translations go on where code has to stop now, or stop where it has not any more.
     pub breakpoints_changed: bool,
+    /// Where a debugger wants code to stop.
+    pub stops: BTreeSet<u32>,
+    /// How often translated code was entered.
+    pub entries: u64,
     /// The block that runs: address and length in bytes.
     pub block: (u32, u32),
     /// Code that is watched.
@@ -332,6 +336,8 @@ impl Chip {
             flush_tlb: false,
             guarded: false,
             breakpoints_changed: false,
+            stops: BTreeSet::new(),
+            entries: 0,
             block: (0, 0),
             watch: None,
             lines: Vec::new(),

@@ -110,6 +110,23 @@ fn systick_comes_once_a_millisecond() {
     assert_eq!(words(&machine, 2), [1_000, 1_000]);
 }
 
+/// What a waiting program costs: a tick enters its handler and goes back to WFI. How often the
+/// machine is looked at meanwhile makes no difference.
+#[test]
+fn a_sleeping_program_is_entered_for_its_ticks_alone() {
+    let entries = |slice: u64| {
+        let mut machine = machine(&programs::SYSTICK);
+        for end in (slice..=1_000 * MS).step_by(slice as usize) {
+            machine.run_until(Time(end));
+        }
+        assert_eq!(word(&machine, OUT) / 10, 99, "1000 ticks, or one less");
+        machine.entries()
+    };
+    let (whole, often) = (entries(1_000 * MS), entries(MS / 50));
+    assert!(whole <= 2 * 1_000 + 10, "{whole} entries in a second");
+    assert!(often <= whole + 10, "{often} entries where it is looked at 50 000 times");
+}
+
 #[test]
 fn two_runs_are_the_same_however_they_are_cut_into_slices() {
     let run = |slice: u64| {

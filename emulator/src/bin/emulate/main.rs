@@ -1,11 +1,12 @@
 //! `emulate`: boards on a virtual CAN bus, for other programs to talk to.
 
+mod flash_file;
 mod words;
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{self, BufWriter, Write};
+use std::io::{self, BufWriter, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::rc::Rc;
@@ -17,15 +18,17 @@ use anyhow::{bail, Context, Result};
 use clap::Parser;
 use emulator::bus::Outcome;
 use emulator::candump::{Handle, Lines};
+use emulator::control::{self, Action, Command};
 use emulator::defmt::Decoder;
 use emulator::machine::{FlashTimes, Machine, Options, ResetCause, Stop};
-use emulator::pacing::{Pacer, Speed};
+use emulator::pacing::{Lag, Pacer, Speed, NAP};
 use emulator::periph::usart::Character;
 use emulator::rtt;
 use emulator::serial::Serial;
 use emulator::socketcand::Server;
 use emulator::time::{Span, Time};
 use emulator::world::{MachineId, World};
+use flash_file::FlashFile;
 use shared_abi::geometry::{Geometry, Region};
 use shared_abi::layout::{self, BOARDS};
 
@@ -70,6 +73,23 @@ struct Args {
     /// address. Without it, what comes out of a UART is shown as text
     #[arg(long, value_name = "pty|HOST:PORT", conflicts_with = "node_count")]
     serial: Option<String>,
+
+    /// Keep the flash in this file from one run to the next: it is read before the images are put
+    /// into flash, created if it is not there, and written at the end and when the power goes off
+    #[arg(long, value_name = "FILE", conflicts_with = "node_count")]
+    flash: Option<PathBuf>,
+
+    /// Take commands at this address, a line each: `power off|on`, `reset`, `pin PC13
+    /// low|high|open`, `status`. On a terminal they can be typed as well, `r` for reset and `p` to
+    /// switch the power over among them
+    #[arg(long, value_name = "HOST:PORT")]
+    control: Option<String>,
+
+    /// Let gdb in at this address (`target remote HOST:PORT`). While it has halted the board, time
+    /// stands still
+    #[cfg(feature = "gdb")]
+    #[arg(long, value_name = "HOST:PORT", conflicts_with = "node_count")]
+    gdb: Option<String>,
 
     /// Bit rate of the adapter that clients talk through, in bit/s
     #[arg(long, default_value_t = 125_000, value_parser = clap::value_parser!(u32).range(1_000..=1_000_000))]
@@ -152,8 +172,11 @@ fn seconds(text: &str) -> Result<Time, String> {
 const LARGEST_IMAGE: u64 = 256 << 20;
 /// How often files are brought up to date.
 const FLUSH: Duration = Duration::from_millis(200);
-/// How long the world sleeps when it is ahead of the wall clock.
-const NAP: Duration = Duration::from_micros(500);
+/// How long the world is looked after without a nap behind something that a client said or got: its
+/// next word is on its way, perhaps.
+const AWAKE: Duration = Duration::from_millis(20);
+/// How long the world sleeps where a client cannot wake it: one at a serial port.
+const SHORT_NAP: Duration = Duration::from_micros(500);
 
 fn main() -> ExitCode {
     match run(&Args::parse()) {
@@ -196,7 +219,8 @@ fn run(args: &Args) -> Result<()> {
     // What has happened is told and written down even if something went wrong.
     let told = bench.print_report();
     let flushed = bench.flush();
-    outcome.and(told).and(flushed)?;
+    let kept = bench.keep_flash();
+    outcome.and(told).and(flushed).and(kept)?;
     bench.sum_up()
 }
 
@@ -269,6 +293,10 @@ struct Bench {
     port: emulator::world::PortId,
     server: Option<Server>,
     serial: Option<Serial>,
+    control: control::Server,
+    #[cfg(feature = "gdb")]
+    gdb: Option<emulator::gdb::Door>,
+    flash: Option<FlashFile>,
     trace: Option<(PathBuf, Handle<BufWriter<File>>)>,
     /// What was to be said and when, not printed yet.
     said: Rc<RefCell<Vec<(Time, String)>>>,
@@ -310,14 +338,19 @@ impl Watched {
     }
 }
 
+/// Steps that a debugger gets before the others are looked after.
+#[cfg(feature = "gdb")]
+const STEPS: usize = 100;
+/// How long a step may take before it waits for the wall clock as everything does.
+#[cfg(feature = "gdb")]
+const STEP: Span = Span::from_micros(10);
+
 /// How often a board's RAM is looked at for what it tells a debug probe.
 const LOOK: Span = Span::from_millis(5);
 
 impl Bench {
     fn new(args: &Args) -> Result<Self> {
-        if images(args).next().is_none() {
-            bail!("the flash would be empty: name at least one image, for example --bootloader FILE");
-        }
+        let mut flash = None;
         let mut world = World::new();
         let mut boards = Vec::new();
         for n in 0..args.node_count {
@@ -336,6 +369,12 @@ impl Bench {
             let mut machine = machine.context("setting up the board")?;
             for &(port, pin) in args.board.pulled_up {
                 machine.set_pin(port, pin, Some(true));
+            }
+            if let Some(path) = &args.flash {
+                flash = Some(FlashFile::open(path, args.board.chip, &mut machine)?);
+            }
+            if images(args).next().is_none() && !flash.as_ref().is_some_and(FlashFile::is_filled) {
+                bail!("the flash would be empty: name at least one image, for example --bootloader FILE");
             }
             for path in images(args) {
                 load(&mut machine, path)?;
@@ -372,7 +411,19 @@ impl Bench {
             let mut said = telling.borrow_mut();
             said.extend(frame.into_iter().chain(text).map(|text| (record.end, text)));
         });
-        Ok(Self { world, boards, port, server: None, serial: None, trace, said })
+        Ok(Self {
+            world,
+            boards,
+            port,
+            server: None,
+            serial: None,
+            control: control::Server::new(),
+            #[cfg(feature = "gdb")]
+            gdb: None,
+            flash,
+            trace,
+            said,
+        })
     }
 
     fn listen(&mut self, args: &Args) -> Result<()> {
@@ -394,6 +445,21 @@ impl Bench {
             };
             print_line(&format!("{usart} is at {}", serial.place()))?;
             self.serial = Some(serial);
+        }
+        if let Some(address) = &args.control {
+            let at = self.control.listen(address.as_str());
+            let at = at.with_context(|| format!("cannot listen at {address}"))?;
+            print_line(&format!("commands are taken at {at}"))?;
+        }
+        if io::stdin().is_terminal() && io::stdout().is_terminal() {
+            self.control.read_terminal().context("reading the terminal")?;
+        }
+        #[cfg(feature = "gdb")]
+        if let Some(address) = &args.gdb {
+            let door = emulator::gdb::Door::bind(address.as_str());
+            let door = door.with_context(|| format!("cannot listen at {address}"))?;
+            print_line(&format!("gdb reaches the board by `target remote {}`", door.address()))?;
+            self.gdb = Some(door);
         }
         Ok(())
     }
@@ -418,18 +484,36 @@ impl Bench {
     fn live(&mut self, args: &Args, end: &AtomicBool) -> Result<()> {
         let last = args.run_for.unwrap_or(Time(u64::MAX));
         let mut pacer = Pacer::new(args.speed, Instant::now(), self.world.now());
+        let mut lag = Lag::new(args.speed);
         let mut flushed = Instant::now();
+        let mut awake_until = flushed;
         while !end.load(Ordering::Relaxed) && self.world.now() < last {
-            let target = pacer.target(Instant::now(), self.world.now()).min(last);
-            if target > self.world.now() {
+            let (wall, now) = (Instant::now(), self.world.now());
+            let halted = self.world.is_halted();
+            if halted {
+                // Time stands still, and nothing of it is caught up on.
+                pacer = Pacer::new(args.speed, wall, now);
+                lag = Lag::new(args.speed);
+            }
+            let target = pacer.target(wall, now).min(last);
+            let awake = wall < awake_until || target == last || pacer.is_worth_it(now, target);
+            if target > now && awake && !halted {
                 self.world.run_until(target);
             } else {
-                match &mut self.server {
-                    Some(server) => server.wait(NAP),
-                    None => std::thread::sleep(NAP),
+                // The threads of the clients unpark this one.
+                let nap = if self.serial.is_some() || wall < awake_until { SHORT_NAP } else { NAP };
+                std::thread::park_timeout(nap);
+                if wall.elapsed() < nap {
+                    awake_until = Instant::now() + AWAKE;
                 }
             }
-            self.exchange(&mut pacer);
+            if let Some(text) = lag.look(wall, now) {
+                self.said.borrow_mut().push((now, text));
+            }
+            if self.exchange(&mut pacer) {
+                awake_until = Instant::now() + AWAKE;
+            }
+            self.obey()?;
             self.print_report()?;
             if flushed.elapsed() > FLUSH {
                 self.flush()?;
@@ -439,23 +523,116 @@ impl Bench {
         Ok(())
     }
 
-    /// Lets the clients take part.
-    fn exchange(&mut self, pacer: &mut Pacer) {
+    /// Lets the clients take part; whether one has got something.
+    fn exchange(&mut self, pacer: &mut Pacer) -> bool {
+        self.debug();
+        let mut delivered = 0;
         if let Some(serial) = &mut self.serial {
-            if serial.exchange(self.world.machine_mut(self.boards[0].id)) > 0 {
-                pacer.delivered(Instant::now());
-            }
+            delivered += serial.exchange(self.world.machine_mut(self.boards[0].id));
         }
-        let Some(server) = &mut self.server else {
+        if let Some(server) = &mut self.server {
+            delivered += server.exchange(&mut self.world, self.port);
+            let now = self.world.now();
+            self.said.borrow_mut().extend(server.notices().into_iter().map(|notice| (now, notice)));
+        } else {
             // Nobody wants the frames.
             while self.world.receive(self.port).is_some() {}
-            return;
-        };
-        if server.exchange(&mut self.world, self.port) > 0 {
+        }
+        if delivered > 0 {
             pacer.delivered(Instant::now());
         }
+        delivered > 0
+    }
+
+    #[cfg(not(feature = "gdb"))]
+    fn debug(&mut self) {}
+
+    /// Lets gdb take part. A step does not wait for the wall clock.
+    #[cfg(feature = "gdb")]
+    fn debug(&mut self) {
+        let Some(door) = &mut self.gdb else { return };
+        let board = self.boards[0].id;
+        for _ in 0..STEPS {
+            let halted = self.world.is_halted();
+            door.exchange(self.world.machine_mut(board));
+            if !halted || self.world.is_halted() {
+                break;
+            }
+            self.world.run_for(STEP);
+        }
         let now = self.world.now();
-        self.said.borrow_mut().extend(server.notices().into_iter().map(|notice| (now, notice)));
+        self.said.borrow_mut().extend(door.notices().into_iter().map(|notice| (now, notice)));
+    }
+
+    /// Does what was asked for at the control socket or the terminal.
+    fn obey(&mut self) -> Result<()> {
+        while let Some(request) = self.control.next() {
+            let outcome = self.act(request.command);
+            // The client hears of a failure; whoever started the emulator does too.
+            let failed = outcome.as_ref().err().map(|error| format!("{error:#}"));
+            request.answer(outcome.map_err(|error| format!("{error:#}")));
+            if let Some(text) = failed {
+                self.said.borrow_mut().push((self.world.now(), format!("a command failed: {text}")));
+            }
+        }
+        Ok(())
+    }
+
+    fn act(&mut self, Command { board, action }: Command) -> Result<String> {
+        let boards = self.boards.len();
+        let Some(id) = self.boards.get(board).map(|board| board.id) else {
+            bail!("there is no board {}: there are {boards}", board + 1);
+        };
+        let on = self.world.machine(id).is_powered();
+        let on = match action {
+            Action::Power(on) => on,
+            Action::TogglePower => !on,
+            Action::Reset | Action::Pin { .. } | Action::Status => on,
+        };
+        let said = match action {
+            Action::Power(_) | Action::TogglePower if on => {
+                self.world.power_on(id);
+                Some("power on".to_owned())
+            }
+            Action::Power(_) | Action::TogglePower => {
+                self.world.power_off(id);
+                self.keep_flash()?;
+                Some("power off".to_owned())
+            }
+            Action::Reset => {
+                if !on {
+                    bail!("its power is off");
+                }
+                self.world.machine_mut(id).reset_pin();
+                Some("reset by the pin NRST".to_owned())
+            }
+            Action::Pin { port, pin, level } => {
+                self.world.machine_mut(id).set_pin(port, pin, level);
+                let level = level.map_or("open", |high| if high { "high" } else { "low" });
+                Some(format!("P{port}{pin} is {level} from outside"))
+            }
+            Action::Status => None,
+        };
+        let now = self.world.now();
+        if let Some(text) = said {
+            let line = format!("{}: {text}", self.name(board));
+            self.said.borrow_mut().push((now, line));
+            return Ok(text);
+        }
+        let machine = self.world.machine(id);
+        let state = match (on, machine.halted()) {
+            (false, _) => "power off",
+            (true, Some(_)) => "halted by the debugger",
+            (true, None) => "runs",
+        };
+        Ok(format!("{now} s, {}: {state}, pc {:08X}h", self.name(board), machine.pc()))
+    }
+
+    fn keep_flash(&mut self) -> Result<()> {
+        match &mut self.flash {
+            Some(file) => file.keep(self.world.machine(self.boards[0].id).flash()),
+            None => Ok(()),
+        }
     }
 
     /// Says what has happened since the last time, in the order in which it did.
@@ -518,7 +695,7 @@ impl Bench {
 /// What happened to a board, in words; nothing where it did not happen to it but was asked for.
 fn happened(stop: Stop, (cfsr, hfsr): (u32, u32)) -> Option<String> {
     Some(match stop {
-        Stop::Deadline | Stop::Attention | Stop::Reset(ResetCause::PowerOn) => return None,
+        Stop::Deadline | Stop::Attention | Stop::Halted | Stop::Reset(ResetCause::PowerOn) => return None,
         Stop::Reset(ResetCause::Pin) => "reset by the pin NRST".into(),
         Stop::Reset(ResetCause::Software) => "reset by its software".into(),
         Stop::Reset(ResetCause::IndependentWatchdog) => "reset by the watchdog".into(),
