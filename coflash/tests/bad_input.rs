@@ -68,7 +68,7 @@ fn a_damaged_text_or_block_file_never_means_something_else() {
 fn an_empty_or_foreign_file_is_named_so() {
     assert_eq!(meaning(b"", None).unwrap_err(), "the file: is empty");
     for bytes in [b"\0".as_slice(), b"PK\x03\x04", b"#!/bin/sh", b"\n\n", &[0; 64], &[0xFF; 64]] {
-        assert!(meaning(bytes, None).unwrap_err().contains("no firmware file"), "{bytes:?}");
+        assert!(meaning(bytes, None).unwrap_err().contains("not a firmware file"), "{bytes:?}");
     }
 }
 

@@ -162,9 +162,9 @@ fn what_is_no_file_or_too_large_is_not_read() {
     let settings = folder.path("large.toml");
     fs::File::create(&settings).unwrap().set_len(2 * 1024 * 1024).unwrap();
     for (file, words) in [
-        ("/dev/zero", "/dev/zero: is a device, pipe or socket and no file"),
-        (&fifo, "fifo: is a device, pipe or socket and no file"),
-        (folder.0.to_str().unwrap(), "endless: is a folder and no file"),
+        ("/dev/zero", "/dev/zero: is a device, pipe or socket and not a file"),
+        (&fifo, "fifo: is a device, pipe or socket and not a file"),
+        (folder.0.to_str().unwrap(), "endless: is a folder and not a file"),
         (&large, "large.elf: has 67108865 bytes, and a firmware file has at most 67108864"),
     ] {
         for command in [&["inspect"][..], &["convert"], &["--bus", NOWHERE, "flash"]] {
@@ -199,7 +199,7 @@ fn what_can_be_no_program_is_refused_without_a_bus() {
         (&bootloader, &["--dialect", "raw"], "bootloader.bin: begins at the start of the flash"),
         (&bootloader, &["--board", "stm32f407g-disc1"], "its reset vector is 08000189h, outside 0x08010000"),
         (&zeros, &["--board", "stm32f407g-disc1"], "zeros.bin: is not a program: all its bytes are 00h"),
-        (&zeros, &["--dialect", "lift", "--unlock", "x"], "zeros.bin: is no program"),
+        (&zeros, &["--dialect", "lift", "--unlock", "x"], "zeros.bin: is not a program"),
     ] {
         let done = flash(file, options);
         assert!(
@@ -327,7 +327,7 @@ fn a_bad_file_is_named_and_no_device_is_touched() {
     let bus = format!("socketcand://{}/can0", listener.local_addr().unwrap());
     for (name, bytes, words) in [
         ("empty.hex", &b""[..], "empty.hex: is empty".to_string()),
-        ("text.txt", b"hello", "text.txt: is no firmware file".to_string()),
+        ("text.txt", b"hello", "text.txt: is not a firmware file".to_string()),
         (
             "cut.hex",
             &hex.as_bytes()[..hex.len() - 20],
@@ -385,7 +385,7 @@ fn wrong_usage_is_explained() {
             &["convert", &hex, "out", "--key", "cf7a7fe196f64c6b8f19e58361d2397e", "--add", "0xA5"],
             "encrypted",
         ),
-        (&["convert", &hex, "out", "--adjust-start", "0xF7FEFFF0"], "over the end of the address space"),
+        (&["convert", &hex, "out", "--adjust-start", "0xF7FEFFF0"], "beyond the end of the address space"),
         (&["-q", "-v", "convert", &hex, "out"], "cannot be used with"),
         (&[], "Usage"),
     ] {

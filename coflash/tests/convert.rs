@@ -294,5 +294,5 @@ fn a_raw_file_goes_where_it_is_told() {
     assert_eq!((file.program_size(), file.program_crc()), (gapless.program_size(), gapless.program_crc()));
     assert!(read(None).unwrap_err().to_string().contains("give --start-address"));
     assert!(read(Some(0xFFFF_FF00)).is_err());
-    assert!(read::read(bytes, None, None).unwrap_err().to_string().contains("no firmware file"));
+    assert!(read::read(bytes, None, None).unwrap_err().to_string().contains("not a firmware file"));
 }

@@ -407,7 +407,7 @@ fn a_gateway_that_answers_something_else_is_an_error_in_words() {
         ("[2] ERROR:106 #Unsupported net.\r\n", "it has no network 1 (error 106 of CiA 309-3)"),
         ("[2] ERROR:107\r\n", "it does not reach this node-ID (error 107"),
         ("[2] ERROR:600\r\n", "it has no memory left (error 600"),
-        ("[2] ERROR:999\r\n", "it refuses (error 999"),
+        ("[2] ERROR:999\r\n", "it refuses the request (error 999"),
         ("[2] ERROR: what\r\n", "answered unexpectedly: ERROR: what"),
         ("[7] kgECAA==\r\n", "answered unexpectedly: '[7] kgECAA==', while command [2] waits for its answer"),
         ("[1] kgECAA==\r\n", "answered unexpectedly: '[1] kgECAA==', while command [2] waits"),

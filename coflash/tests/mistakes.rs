@@ -274,13 +274,13 @@ const MISTAKES: &[Mistake] = &[
         "info -N 5 {quick} --bus {bus}",
         Device(|| heard(0x705, 0x04)),
         5,
-        &["node 5 does not answer", "has been stopped", "coflash reset --node 5"],
+        &["node 5 does not answer", "in state stopped", "coflash reset --node 5"],
     ),
     Mistake(
         "info -N 5 {quick} --bus {bus}",
         Device(|| heard(0x705, 0x05)),
         5,
-        &["heartbeat, operational", "another tool may be at work"],
+        &["heartbeats (operational)", "another tool may be using it"],
     ),
     // The device.
     Mistake(
@@ -336,9 +336,14 @@ const MISTAKES: &[Mistake] = &[
         3,
         &["missing.blk", "No such file", "check the file's name"],
     ),
-    Mistake("flash {folder} --bus {bus}", Device(absent), 3, &["is a folder and no file", "give a file"]),
+    Mistake("flash {folder} --bus {bus}", Device(absent), 3, &["is a folder and not a file", "give a file"]),
     Mistake("flash {empty} --bus {bus}", Device(absent), 3, &["is empty", "build the program again"]),
-    Mistake("flash {html} --bus {bus}", Device(absent), 3, &["no firmware file", "name the linker's output"]),
+    Mistake(
+        "flash {html} --bus {bus}",
+        Device(absent),
+        3,
+        &["not a firmware file", "name the linker's output"],
+    ),
     Mistake("convert {cut} {out}", Nothing, 3, &["line 25", "cut off", "copy the file again"]),
     // The command.
     Mistake("flsh {blk}", Nothing, 2, &["unrecognized subcommand", "flash"]),

@@ -96,7 +96,7 @@ fn the_whole_procedure_from_a_running_application() {
         [
             "calling the application back to the bootloader",
             "the bootloader is running",
-            "its dialect: block (block files, SYS TEC)",
+            "dialect: block (block files, SYS TEC)",
             "commanding the device to erase the old program"
         ]
     );
@@ -305,7 +305,7 @@ fn a_program_that_fails_its_trial_is_not_released() {
     );
     let (number, words, _) = trial(&|fake| fake.on_command = script(0x80, usize::MAX, Outcome::Ignore));
     assert_eq!(number, 0x6000_0010);
-    assert_eq!(words, "it runs in node 5, and does not go back to the bootloader when called");
+    assert_eq!(words, "it runs in node 5 and does not return to the bootloader when called");
     let refused = Outcome::Abort(0x0602_0000);
     let (number, words, advice) = trial(&|fake| fake.on_command = script(0x80, usize::MAX, refused));
     assert_eq!(number, 0x6000_0010);

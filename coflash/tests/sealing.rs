@@ -234,7 +234,7 @@ fn the_converter_encrypts_with_a_value() {
     }
     let junk = room.0.file("junk.bin", &[0x5A; 1000]);
     let done = coflash(&[&["convert", &junk, "-I", "binary"], &signed[2..]].concat());
-    assert!(done.exit == 3 && done.err.contains("is no program"), "{}", done.err);
+    assert!(done.exit == 3 && done.err.contains("is not a program"), "{}", done.err);
     assert!(!Path::new(&room.path("junk.blk")).exists());
 }
 
@@ -480,7 +480,7 @@ fn what_cannot_be_sealed_is_refused_with_what_to_do() {
     let key = room.path("release.pem");
     let words =
         ["seal", &junk, "-I", "binary", "--board", "stm32f407g-disc1", "--key", &key, "--counter", "1"];
-    assert!(coflash(&words).err.contains("is no program"));
+    assert!(coflash(&words).err.contains("is not a program"));
     let done = coflash(&[&words[..], &["--data"]].concat());
     assert!(
         done.err.contains("for which vendor-ID it is") && done.err.contains("give --vendor"),

@@ -93,7 +93,7 @@ fn a_job_file_says_who_gets_what() {
     );
     fs::write(small, b"hello").unwrap();
     let done = coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--job", &job]);
-    assert!(done.exit == 3 && done.err.contains("small.hex: is no firmware file"), "{}", done.err);
+    assert!(done.exit == 3 && done.err.contains("small.hex: is not a firmware file"), "{}", done.err);
     let done = coflash(&["flash", "--job", &job, "--node", "5"]);
     assert!(done.exit == 2 && done.err.contains("cannot be used with"), "{}", done.err);
 }

@@ -319,8 +319,8 @@ fn what_is_no_request_of_the_page_is_refused_with_words() {
 fn files_of_every_kind_are_taken_or_refused_with_their_name() {
     let ui = Ui::new(None);
     for (bytes, words) in [
-        (b"<!doctype html><p>Not found".as_slice(), "page.hex: is no firmware file"),
-        (&[0; 5000], "page.hex: is no firmware file"),
+        (b"<!doctype html><p>Not found".as_slice(), "page.hex: is not a firmware file"),
+        (&[0; 5000], "page.hex: is not a firmware file"),
         (b"\x7fELF", "page.hex"),
         (b":zz", "page.hex, line 1"),
     ] {

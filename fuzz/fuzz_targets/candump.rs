@@ -1,8 +1,7 @@
 //! Lines of a candump log.
 //!
-//! Must hold: any text gives a frame, nothing, or an error that can be shown; a frame that was
-//! understood is written so that it is understood as the same again, with the same decoding into
-//! words.
+//! Must hold: any text gives a frame, nothing, or an error that can be shown; a parsed frame is
+//! written in a form that parses to the same frame, with the same description in words.
 #![no_main]
 
 use coflash::bus::candump::Line;
@@ -20,7 +19,7 @@ fuzz_target!(|bytes: &[u8]| {
                 let again = Line::parse(&found.to_string()).expect("what was written reads back");
                 let again = again.expect("as a frame");
                 assert_eq!((&again.interface, again.frame), (&found.interface, found.frame));
-                // A log has microseconds.
+                // The resolution of a log is microseconds.
                 assert_eq!(again.time.as_micros(), found.time.as_micros());
                 let _ = decoder.decode(&found.frame);
             }

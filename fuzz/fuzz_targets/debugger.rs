@@ -1,8 +1,8 @@
 //! The debugger interface, 1025h, against any frames: commands, data of any length by segments and
-//! blocks, broken off at any place, on a device that is secured now and then.
+//! blocks, aborted anywhere, on a device that is sometimes secured.
 //!
-//! Must hold: memory is touched within what was allowed and never while the device is secured (the
-//! memory of the tests asserts it); and afterwards a correct write and read are served.
+//! Must hold: memory is only accessed with permission, and never while the device is secured (the
+//! memory of the tests asserts it); and afterwards a correct write and read work.
 #![no_main]
 
 use canopen::debugger::{Command, Kind, COMMAND, DATA};
@@ -30,7 +30,8 @@ fn run(target: &mut Target, transfer: &mut impl Transfer, now: u32) -> Result<()
                     transfer.handle(&answer, at(now));
                 }
             }
-            // An answer of before confused the client, which then waits for another one in vain.
+            // An answer to an earlier request has confused the client, which then waits for another
+            // one in vain.
             Step::Wait(_) => return Err(SdoError::NoAnswer),
             Step::Done(result) => return result,
         }
@@ -48,7 +49,7 @@ fuzz_target!(|bytes: &[u8]| {
     let mut now = 0;
     while let Some(action) = input.byte() {
         match action {
-            // Any request about the object, and any bytes.
+            // Any request for the object, and any bytes.
             0..=79 => {
                 let Some([command, sub, a, b, c, d]) = input.array() else { break };
                 target.handle(&request([command, 0x25, 0x10, sub % 6, a, b, c, d]), now);
@@ -57,7 +58,7 @@ fuzz_target!(|bytes: &[u8]| {
                 Some(frame) => target.handle(&request(frame), now),
                 None => break,
             },
-            // A command in full, near what there is.
+            // A complete command, near the existing memory.
             120..=179 => {
                 let Some([kind, low, high, a, b]) = input.array() else { break };
                 let offset = u32::from(u16::from_le_bytes([a, b]) % 0x3000);
@@ -66,7 +67,7 @@ fuzz_target!(|bytes: &[u8]| {
                 let data = Command { kind, address, len }.emit();
                 let _ = run(&mut target, &mut Download::new(node(), COMMAND, &data, Config::default()), now);
             }
-            // Data in full, by blocks or by segments.
+            // Complete data, by blocks or by segments.
             180..=209 => {
                 let Some([low, high, byte]) = input.array() else { break };
                 let data = vec![byte; usize::from(u16::from_le_bytes([low, high % 8]))];

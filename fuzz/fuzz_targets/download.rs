@@ -1,9 +1,9 @@
-//! The program download against any blocks and commands in any order, with the flash's work done or
-//! not in between.
+//! The program download against any blocks and commands in any order, with or without work of the
+//! flash in between.
 //!
 //! Must hold: nothing outside the program's region and the parameters is ever written (the flash
-//! refuses more than the chip would); and afterwards CLEAR and a correct sequence of blocks install
-//! a program.
+//! model refuses more than the chip would); and afterwards CLEAR and a correct sequence of blocks
+//! install a program.
 #![no_main]
 
 use boot_core::control::{Downloader, Policy, Step};
@@ -18,7 +18,7 @@ use shared_abi::layout::Layout;
 
 static LAYOUT: Layout = ONE_PROGRAM;
 
-/// The largest block that the device takes.
+/// The largest block that the device accepts.
 const BUFFER: usize = 256;
 const LAST: u32 = u32::MAX;
 
@@ -31,11 +31,11 @@ fuzz_target!(|bytes: &[u8]| {
         Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer, room.unsealer());
     let mut input = Input::new(bytes);
     let mut next = 0_u32;
-    // Whether the SDO server has a transfer open: it calls nothing else then.
+    // Whether the SDO server has an open transfer: it only makes certain calls then.
     let mut open = false;
     while let Some(action) = input.byte() {
         match action {
-            // A block that may be good: number, place and size as they should be, or not.
+            // A possibly valid block: number, place and size are correct or not.
             0..=89 => {
                 let Some([how, number, place, len]) = input.array() else { break };
                 let number = match how & 3 {
@@ -68,7 +68,7 @@ fuzz_target!(|bytes: &[u8]| {
                     }
                 }
             }
-            // Any bytes, in pieces as the bus brings them.
+            // Any bytes, in pieces as they arrive from the bus.
             120..=139 => {
                 if open {
                     device.download_cancel();
@@ -117,7 +117,7 @@ fuzz_target!(|bytes: &[u8]| {
     device.command(1, ProgramControl::Clear).expect("CLEAR");
     settle(&mut device, &mut flash);
     assert_eq!(device.status(1), FlashStatus::OK);
-    // Initial stack pointer, reset vector, and something to count.
+    // Initial stack pointer, reset vector, and counting bytes.
     let mut program = vec![0; 100];
     program[..8].copy_from_slice(&[0x00, 0xF0, 0x01, 0x20, 0x51, 0x08, 0x00, 0x08]);
     let crc = CRC.checksum(&program);
@@ -136,7 +136,7 @@ fuzz_target!(|bytes: &[u8]| {
     assert!(device.take_boot_request().is_some(), "the program does not start");
 });
 
-/// What the SDO server does with a block.
+/// The calls of the SDO server for a block.
 fn send(device: &mut Downloader<'_, Journal, 1>, block: &[u8]) -> Result<(), canopen::AbortCode> {
     device.download_cancel();
     device.download_start(1, Some(block.len() as u32))?;
@@ -149,7 +149,7 @@ fn send(device: &mut Downloader<'_, Journal, 1>, block: &[u8]) -> Result<(), can
     device.download_end()
 }
 
-/// Lets the flash's work come to its end.
+/// Runs until the flash's work has ended.
 fn settle(device: &mut Downloader<'_, Journal, 1>, flash: &mut ModelFlash) {
     for _ in 0..200_000 {
         if device.step(flash) == Step::Idle && !device.busy() {

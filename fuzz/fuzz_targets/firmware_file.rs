@@ -2,8 +2,8 @@
 //! behind them.
 //!
 //! Must hold: any bytes give an image or an error that can be shown; an image that can be converted
-//! gives a block file that reads back as the same, with every byte of the image in it; a block file
-//! is written as it was read.
+//! gives a block file that reads back equal, with every byte of the image in it; a block file is
+//! written as it was read.
 #![no_main]
 
 use coflash::file::block_file::BlockFile;
@@ -34,7 +34,8 @@ fuzz_target!(|bytes: &[u8]| {
                 assert!(end < u64::from(pair[1].0), "segments touch or overlap");
             }
             let span = image.span();
-            // A few bytes at both ends of the address space: no program, and not worth the memory.
+            // A few bytes at both ends of the address space: not a program, and not worth the
+            // memory.
             if span.last - span.first > 1 << 20 {
                 return;
             }

@@ -1,7 +1,7 @@
 //! The journal of parameters on two sectors of any contents.
 //!
-//! Must hold: opening and reading survive anything; a value that was stored well reads back, now
-//! and after the next start, and the other one stays as it was.
+//! Must hold: opening and reading survive any contents; a successfully stored value reads back, now
+//! and after the next start, and the other value does not change.
 #![no_main]
 
 use boot_core::flash::run;

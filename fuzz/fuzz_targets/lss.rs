@@ -1,8 +1,8 @@
 //! An LSS slave against any frames at any time.
 //!
 //! Must hold: it answers with 8 bytes under the slave's identifier; it is silent while a bit rate
-//! is being activated; what it stores is what was configured; and afterwards a correct master
-//! finds, configures and stores it.
+//! is being activated; it stores what was configured; and afterwards a correct master finds,
+//! configures and stores it.
 #![no_main]
 
 use core::task::Poll;
@@ -54,7 +54,7 @@ fuzz_target!(|bytes: &[u8]| {
                 let Some(frame) = input.array::<8>() else { break };
                 lss.handle(&request(frame), at(now), &mut device);
             }
-            // A request about the device's own address, as a master sends that has it in sight.
+            // A request with the device's own address, as from a master that has nearly found it.
             80..=149 => {
                 let Some([command, part, bits, next]) = input.array() else { break };
                 let number = PARTS[usize::from(part) % 4] & u32::MAX << (bits % 33).min(31);
@@ -76,13 +76,13 @@ fuzz_target!(|bytes: &[u8]| {
         }
     }
 
-    // Two delays of 65.5 s at the most, then the slave is there again.
+    // Two delays of at most 65.5 s, then the slave answers again.
     now += 140_000;
     fetch(&mut lss, now);
     assert!(!lss.is_silent(at(now)));
     device.fails = false;
 
-    // A selective switch finds it, whatever state it was in.
+    // A selective switch finds it in any state.
     ask(&mut lss, &mut device, now, [0x04, 0, 0, 0, 0, 0, 0, 0], None);
     for (i, part) in (0_u8..).zip(PARTS) {
         let [a, b, c, d] = part.to_le_bytes();
@@ -115,7 +115,7 @@ fn request(bytes: [u8; 8]) -> Frame {
     Frame::of(CobId::LSS_REQUEST, &bytes)
 }
 
-/// Fetches all that it has to say.
+/// Fetches all frames that it has to send.
 fn fetch(lss: &mut Lss, now: u32) {
     for _ in 0..ENDLESS {
         let silent = lss.is_silent(at(now));
@@ -133,7 +133,7 @@ fn fetch(lss: &mut Lss, now: u32) {
     panic!("it never stops talking");
 }
 
-/// Sends a request of a correct master; `expected` is the answer, other outputs do not count.
+/// Sends a request of a correct master; `expected` is the answer, other outputs are ignored.
 fn ask(lss: &mut Lss, device: &mut Device, now: u32, bytes: [u8; 8], expected: Option<[u8; 8]>) {
     lss.handle(&request(bytes), at(now), device);
     let mut answers = Vec::new();

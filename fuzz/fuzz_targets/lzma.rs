@@ -1,13 +1,13 @@
-//! The unpacker of sealed images, fed with anything in chunks of any size.
+//! The decompressor of sealed images, with any input in chunks of any size.
 //!
-//! Must hold: it takes no more than there is, gives no more than there is room for, asks for no byte
-//! before the first one, and comes to an end.
+//! Must hold: it consumes no more than the input, gives no more than there is room for, reads no
+//! byte before the first one, and ends.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
 use seal::lzma::Decoder;
 
-/// What the image has at most.
+/// The largest size of the image.
 const IMAGE: usize = 1 << 16;
 
 fuzz_target!(|bytes: &[u8]| {

@@ -1,7 +1,7 @@
 //! A transfer of the SDO client against any answers at any time.
 //!
-//! Must hold: it sends requests of 8 bytes and nothing else; an upload that ends well has delivered
-//! what the server announced; left alone it ends; and the end stays the end.
+//! Must hold: it only sends requests of 8 bytes; a successful upload has delivered the announced
+//! data; without answers it ends; and its result does not change.
 #![no_main]
 
 use canopen::sdo::client::{Block, Config, Download, Sink, Step, Transfer, Upload};
@@ -12,7 +12,7 @@ use libfuzzer_sys::fuzz_target;
 
 const AT: Address = Address::new(0x2000, 0);
 
-/// What an upload delivers.
+/// The data that an upload delivers.
 #[derive(Default)]
 struct Delivered {
     announced: Option<u32>,
@@ -62,7 +62,7 @@ fn check((good, progress): (bool, u32), delivered: &Delivered) {
     }
 }
 
-/// Whether the transfer ended well, and how far it got.
+/// Runs the transfer; returns whether it was successful, and its progress.
 fn drive(transfer: &mut impl Transfer, mut input: Input<'_>) -> (bool, u32) {
     let mut now = 0_u32;
     let mut ended = None;
@@ -72,7 +72,7 @@ fn drive(transfer: &mut impl Transfer, mut input: Input<'_>) -> (bool, u32) {
                 Some(frame) => transfer.handle(&response(frame), at(now)),
                 None => break,
             },
-            // An answer about the right object.
+            // An answer for the right object.
             100..=149 => {
                 let Some([command, a, b, c, d]) = input.array() else { break };
                 transfer.handle(&response([command, 0x00, 0x20, 0, a, b, c, d]), at(now));
@@ -87,7 +87,7 @@ fn drive(transfer: &mut impl Transfer, mut input: Input<'_>) -> (bool, u32) {
             255 => transfer.abort(AbortCode::GENERAL),
         }
     }
-    // A repetition that a sub-block asks for, and the time-out.
+    // A repetition of a sub-block, and the time-out.
     for _ in 0..3 {
         now += 1000;
         send(transfer, now, &mut ended);
@@ -97,7 +97,7 @@ fn drive(transfer: &mut impl Transfer, mut input: Input<'_>) -> (bool, u32) {
     (result.is_ok(), transfer.progress())
 }
 
-/// Fetches what it has to send.
+/// Fetches the frames that it has to send.
 fn send(transfer: &mut impl Transfer, now: u32, ended: &mut Option<Result<(), canopen::sdo::SdoError>>) {
     for _ in 0..ENDLESS {
         match transfer.poll(at(now)) {

@@ -1,10 +1,10 @@
-//! A node with its SDO server against any frames at any time, answers fetched or not, from a
-//! consumer of any speed.
+//! A node with its SDO server against any frames at any time, with answers fetched or not, and a
+//! receiver of any speed.
 //!
-//! Must hold: a domain hears start, data, and exactly one of end and cancel (the device of the
-//! tests asserts it); an answer comes with the server's identifier and 8 bytes; and afterwards the
-//! next correct transfers are served, without and with blocks, at once after an abort by the client
-//! or after the time-out.
+//! Must hold: a domain gets start, data, and exactly one of end and cancel (the device of the tests
+//! asserts it); an answer has the server's identifier and 8 bytes; and afterwards the next correct
+//! transfers work, without and with blocks, at once after an abort by the client or after the
+//! time-out.
 #![no_main]
 
 use canopen::node::{Config, NmtPolicy, Node};
@@ -15,7 +15,7 @@ use coboot_fuzz::device::{at, node, request, Device};
 use coboot_fuzz::{drain, run, Input};
 use libfuzzer_sys::fuzz_target;
 
-/// Objects that exist, of every type and access, for frames that are meant to go deep.
+/// Existing objects of every type and access, for frames that pass the first checks.
 const INDICES: [u16; 10] = [0x1000, 0x1008, 0x1017, 0x1018, 0x1F50, 0x1F51, 0x2000, 0x2001, 0x2002, 0x2003];
 const DOMAIN: Address = Address::new(0x2000, 0);
 
@@ -38,7 +38,7 @@ fuzz_target!(|bytes: &[u8]| {
                 Some(frame) => drop(slave.handle(&request(frame), at(now), &mut device)),
                 None => break,
             },
-            // A command for an object that is there.
+            // A command for an existing object.
             80..=159 => {
                 let Some([command, which, sub, a, b, c, d]) = input.array() else { break };
                 let [low, high] = INDICES[usize::from(which) % INDICES.len()].to_le_bytes();
@@ -63,11 +63,11 @@ fuzz_target!(|bytes: &[u8]| {
         }
     }
 
-    // The consumer gets done, and the client gives up or falls silent.
+    // The receiver finishes, and the client aborts or is silent.
     device.space = None;
     if flags & 4 != 0 {
         slave.handle(&request([0x80, 0, 0, 0, 0, 0, 0, 8]), at(now), &mut device);
-        // What waits to be sent may be an answer of before.
+        // A waiting frame may be an earlier answer.
         drain(&mut slave, at(now), &mut device);
     } else {
         now += 10_000;

@@ -1,7 +1,8 @@
-//! Client and server over a wire that loses and doubles frames as the input says, and later none.
+//! Client and server over a wire that loses and repeats frames according to the input, and later
+//! none.
 //!
-//! Must hold: a transfer that ends well has moved the data unchanged; it ends; and the server comes
-//! to rest.
+//! Must hold: a successful transfer has moved the data unchanged; every transfer ends; and the
+//! server becomes idle.
 #![no_main]
 
 use std::collections::VecDeque;

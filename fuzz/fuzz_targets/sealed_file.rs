@@ -1,8 +1,8 @@
-//! A sealed image from anybody, in front of every signature.
+//! A sealed image from any source, before the check of its signatures.
 //!
-//! Must hold: no bytes make the parser or the judge panic; a head that is complete is no longer than
-//! the bytes; each record lies inside the manifest; what the judge lets pass is for this device and
-//! names keys that it has.
+//! Must hold: no bytes cause a panic of the parser or of the judge; a complete head is not longer
+//! than the bytes; each record lies inside the manifest; an image that passes the judge is for this
+//! device and needs keys that the device has.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
@@ -24,7 +24,7 @@ const DEVICE: Device<'_> = Device {
 };
 
 fuzz_target!(|bytes: &[u8]| {
-    // The first byte is the id of the root, so that the fuzzer can meet it.
+    // The first byte is the id of the root, so that the fuzzer can find it.
     let Some((id, bytes)) = bytes.split_first() else { return };
     let mut keys = [0; SIZE];
     keys[ROOTS] = *id;

@@ -1,8 +1,8 @@
 //! Job file and configuration file.
 //!
-//! Must hold: any text gives a job, settings, or a fault whose place is in the text; each device of
-//! a job has an image and is named, and no two are the same one; each setting is one that there is, with a
-//! value of its kind.
+//! Must hold: any text gives a job, settings, or a fault with a place inside the text; each device
+//! of a job has an image and a name, and no two are equal; each setting exists and has a value of
+//! its kind.
 #![no_main]
 
 use std::path::Path;
@@ -11,7 +11,7 @@ use coflash::update::config::{self, Setting};
 use coflash::update::job;
 use libfuzzer_sys::fuzz_target;
 
-/// Options of a tool, and whether each is a switch.
+/// The options of a tool, and whether each is a switch.
 const KEYS: [(&str, bool); 7] = [
     ("bus", false),
     ("node", false),

@@ -1,7 +1,7 @@
 //! The verifier of sealed images against ed25519-dalek.
 //!
-//! Must hold: for a key, a signature and a message of the fuzzer's, and for good ones that it has
-//! changed, both come to the same verdict; and ours comes to one.
+//! Must hold: for a key, a signature and a message from the fuzzer, and for valid ones that it has
+//! changed, both give the same result; and our verification ends.
 #![no_main]
 
 use ed25519_dalek::{Signature, Signer, SigningKey, VerifyingKey};

@@ -1,10 +1,10 @@
 //! Whole programs in one download: the detection of the format, raw images and Intel HEX, in pieces
-//! of any length, cut off anywhere, with the flash's work done or not in between; and the passwords
-//! in front of them.
+//! of any length, truncated anywhere, with or without work of the flash in between; and the
+//! passwords before them.
 //!
 //! Must hold: nothing outside the programs and the parameters is ever written; the device never
-//! takes more than it said there was room for; and afterwards CLEAR and a good image install a
-//! program. A wrong password never opens anything.
+//! accepts more than the room that it has reported; and afterwards CLEAR and a valid image install
+//! a program. A wrong password never unlocks anything.
 #![no_main]
 
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config};
@@ -74,7 +74,7 @@ fuzz_target!(|bytes: &[u8]| {
         assert!(inside.clone().any(|own| own.contains(region.base, region.size)), "{region:?} was written");
     }
 
-    // What is left of it, a bootloader without passwords makes good.
+    // A bootloader without passwords can use the resulting flash.
     let mut buffer = [0; 1024];
     let mut device = device(config!(Profile::STANDARD), &mut flash, &mut buffer);
     device.write(Address::new(PROGRAM_CONTROL, 1), &[CLEAR]).expect("CLEAR");

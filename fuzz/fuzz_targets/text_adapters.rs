@@ -1,7 +1,7 @@
-//! What CAN adapters say as text: SLCAN over a line, socketcand over TCP in both directions.
+//! The text protocols of CAN adapters: SLCAN over a line, socketcand over TCP in both directions.
 //!
 //! Must hold: any bytes, in any pieces, give frames, nothing, or an error, and never an endless
-//! wait; a frame comes out of what says it as it went in.
+//! wait; a frame survives writing and parsing unchanged.
 #![no_main]
 
 use std::collections::VecDeque;
@@ -15,7 +15,7 @@ use coflash::bus::{Adapter, Line, Slcan};
 use embedded_can::Frame as _;
 use libfuzzer_sys::fuzz_target;
 
-/// A line that says this, in pieces, and then ends; with `echo`, what is written comes back.
+/// A line that gives this text in pieces and then ends; with `echo`, it returns the written text.
 #[derive(Default)]
 struct Script {
     says: VecDeque<Vec<u8>>,
@@ -53,14 +53,14 @@ impl Line for Script {
     }
 }
 
-/// Long enough that it never passes: what has to end, ends by itself.
+/// A time-out that never passes: the code under test must end by itself.
 const FOR_EVER: Duration = Duration::from_secs(3600);
 
 fuzz_target!(|bytes: &[u8]| {
     let mut input = Input::new(bytes);
     let mut pieces = VecDeque::new();
     while let Some(length) = input.byte() {
-        // A piece of no bytes is the end of a connection, and comes at the end.
+        // A piece without bytes means the end of a connection, so it comes last.
         pieces.push_back(input.take(usize::from(length) + 1).to_vec());
     }
     pieces.retain(|piece: &Vec<u8>| !piece.is_empty());
@@ -90,7 +90,7 @@ fuzz_target!(|bytes: &[u8]| {
     }
 });
 
-/// What the adapter writes for a frame, it reads as the same.
+/// The adapter parses what it writes for a frame as the same frame.
 fn comes_back(frame: &Frame) {
     assert!(frame.dlc() <= 8);
     let mut echo = Slcan::opened(Script { says: VecDeque::new(), echo: true }, "echo".into());

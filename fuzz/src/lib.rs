@@ -1,13 +1,13 @@
-//! What the fuzz targets share. `cargo xtask fuzz` runs them; each says in its first lines what
-//! must hold.
+//! Common code of the fuzz targets. `cargo xtask fuzz` runs them; the first lines of each target
+//! say what must hold.
 
-/// The devices and the wire of `canopen`'s own tests.
+/// The devices and the wire of the tests in `canopen`.
 #[path = "../../canopen/tests/common/mod.rs"]
 pub mod device;
-/// The memory of `canopen`'s own tests of the debugger interface.
+/// The memory of the debugger interface's tests in `canopen`.
 #[path = "../../canopen/tests/memory/mod.rs"]
 pub mod memory;
-/// The strict flash of `boot-core`'s own tests.
+/// The strict flash of the tests in `boot-core`.
 #[path = "../../boot-core/tests/model/mod.rs"]
 pub mod model;
 
@@ -17,45 +17,45 @@ use canopen::sdo::SdoError;
 use canopen::Instant;
 use device::Device;
 
-/// The fuzzer's bytes, taken from the front.
+/// The fuzzer's bytes, consumed from the front.
 pub struct Input<'a>(&'a [u8]);
 
 impl<'a> Input<'a> {
-    /// All of them.
+    /// All bytes.
     #[must_use]
     pub fn new(bytes: &'a [u8]) -> Self {
         Self(bytes)
     }
 
-    /// The next byte, until there is none.
+    /// The next byte; `None` at the end.
     pub fn byte(&mut self) -> Option<u8> {
         let (first, rest) = self.0.split_first()?;
         self.0 = rest;
         Some(*first)
     }
 
-    /// The next `N` bytes, until there are not so many.
+    /// The next `N` bytes; `None` if there are fewer.
     pub fn array<const N: usize>(&mut self) -> Option<[u8; N]> {
         let (first, rest) = self.0.split_first_chunk()?;
         self.0 = rest;
         Some(*first)
     }
 
-    /// The next bytes, at most so many.
+    /// At most `most` of the next bytes.
     pub fn take(&mut self, most: usize) -> &'a [u8] {
         let (first, rest) = self.0.split_at(most.min(self.0.len()));
         self.0 = rest;
         first
     }
 
-    /// What is left.
+    /// The remaining bytes.
     #[must_use]
     pub fn rest(self) -> &'a [u8] {
         self.0
     }
 }
 
-/// More frames than anything sends in a row: whoever sends more never comes to an end.
+/// More frames than any correct sender sends in a row: beyond this number, it never ends.
 pub const ENDLESS: usize = 1000;
 
 /// Fetches all frames that a node has to send.
@@ -64,7 +64,7 @@ pub fn drain(node: &mut Node, now: Instant, device: &mut Device) {
     assert!(sent < ENDLESS, "the node never stops sending");
 }
 
-/// Runs a transfer to its end over a wire that loses nothing.
+/// Runs a transfer to its end over a wire without losses.
 pub fn run(
     transfer: &mut impl Transfer,
     node: &mut Node,

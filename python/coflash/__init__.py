@@ -1,7 +1,8 @@
 """Converts firmware and flashes it over CANopen.
 
-``flash`` puts a program into a device, ``info`` asks a device what it is, and ``scan`` who is on the
-bus. A bus is a URL as the command line's ``--bus`` takes it. What goes wrong is an :class:`Error`.
+``flash`` downloads a program into a device, ``info`` reads a device's information, and ``scan`` lists
+the nodes on the bus. A bus is a URL as for the command line's ``--bus``. Errors are raised as
+:class:`Error`.
 """
 
 from ._native import __version__, flash, info, scan

@@ -1,8 +1,8 @@
-"""What can go wrong, with coflash's numbers."""
+"""The errors of the package, with coflash's numbers."""
 
 
 class Error(Exception):
-    """Something went wrong: its stable number, what happened, and what to do next."""
+    """An error: its stable number, what happened, and what to do next."""
 
     number: int
     what: str
@@ -20,16 +20,16 @@ class Error(Exception):
 
 
 class FileError(Error):
-    """The firmware file is no good, or does not fit the board. No device was touched."""
+    """The firmware file is invalid, or does not match the board. No device was changed."""
 
 
 class BusError(Error):
-    """The way to the bus is no good: its URL, the adapter, the server behind it."""
+    """The bus cannot be used: its URL, its adapter or its server has an error."""
 
 
 class DeviceError(Error):
-    """The device does not do what it is told, or is not there."""
+    """The device does not answer, or it does not carry out a command."""
 
 
 class Cancelled(Error):
-    """The update was given up."""
+    """The update was cancelled."""

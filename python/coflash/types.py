@@ -1,4 +1,4 @@
-"""The forms of what the functions give: dictionaries whose names stay."""
+"""The types of the functions' results: dictionaries with stable keys."""
 
 from typing import Any, Dict, List, Optional, TypedDict
 
@@ -23,7 +23,7 @@ class Program(TypedDict):
 
 
 class DeviceInfo(TypedDict):
-    """What a device says about itself; ``None`` for what it does not have."""
+    """What a device reports about itself; ``None`` for an object that it does not have."""
 
     node: int
     device_type: int
@@ -50,7 +50,7 @@ class Found(TypedDict):
 
 
 class Report(TypedDict):
-    """What an update did."""
+    """The results of an update."""
 
     size: int
     crc: int

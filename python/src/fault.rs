@@ -1,4 +1,4 @@
-//! What went wrong, and the exception that Python gets for it (`coflash/errors.py`).
+//! An error of the work, and its Python exception (`coflash/errors.py`).
 
 use coflash::device::Error;
 use coflash::file::sealed::Refusal;
@@ -7,16 +7,16 @@ use coflash::update::refusal_number;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
-/// What went wrong.
+/// An error.
 #[derive(Debug)]
 pub enum Fault {
-    /// An argument is no good.
+    /// An argument is invalid.
     Value(String),
-    /// The file is.
+    /// The file is invalid.
     File(FileError),
-    /// The sealed image of this name is.
+    /// The sealed image with this name is invalid.
     Sealed(String, Refusal),
-    /// Bus or device are.
+    /// An error of the bus or the device.
     Device(Error),
 }
 

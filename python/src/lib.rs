@@ -1,7 +1,7 @@
 //! coflash for Python: the library's procedure, `info` and `scan` as functions of a module.
 //!
-//! The work is done in a thread of its own without Python's lock (GIL). The thread that called
-//! waits for it without the lock, too, and takes it for each event and to look for Ctrl-C.
+//! The work runs in a separate thread without Python's lock (GIL). The calling thread waits without
+//! the lock, too, and takes the lock for each event and to check for Ctrl-C.
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -28,10 +28,11 @@ mod fault;
 
 use self::fault::Fault;
 
-/// How long Ctrl-C may go unnoticed.
+/// The longest time until Ctrl-C is noticed.
 const LOOK: Duration = Duration::from_millis(50);
 
-/// Converts firmware and flashes it over CANopen; the package `coflash` hands these on.
+/// Converts firmware and downloads it over CANopen; the package `coflash` re-exports these
+/// functions.
 #[pymodule]
 mod _native {
     use pyo3::prelude::*;
@@ -45,11 +46,12 @@ mod _native {
     }
 }
 
-/// Puts a program into a device, and starts it.
+/// Downloads a program into a device, and starts it.
 ///
-/// `bus` is a URL as the command line's `--bus` takes it. The file is read and checked before the
-/// bus is opened. `on_event` is called with a dictionary for each thing that happens, the last one
-/// being `done`; what it raises ends the update in order and is raised again.
+/// `bus` is a URL as for the command line's `--bus`. The file is read and checked before the bus is
+/// opened. `on_event` is called with a dictionary for each event, the last one being `done`. If it
+/// raises an exception, the update is cancelled in an orderly way, and the exception is raised
+/// again.
 #[pyfunction]
 #[pyo3(signature = (bus, node, file, on_event=None, *, board=None, address=None, program=1, check_target=false,
                     trial_run=true, start=true, verify=false, repeats=3, dialect=None, unlock=None,
@@ -97,14 +99,14 @@ fn flash<'py>(
         let mut link = Link::open(&bus, None).map_err(device::Error::from)?;
         let mut session = Session::on(&mut link, node, timing);
         session.cancel_by(cancelled);
-        // Who listens is gone only when the update was given up.
+        // The receiver is gone only if the update was cancelled.
         let mut tell = |event: update::Event| drop(events.send(json!(event.line(node))));
         Ok(update::flash_program(&mut session, &content, &options, &mut tell)?)
     })?;
     object(py, &report)
 }
 
-/// Asks a device what it is, and for the state of its programs.
+/// Reads a device's information and the state of its programs.
 #[pyfunction]
 #[pyo3(signature = (bus, node, *, sdo_timeout=0.5))]
 fn info(py: Python<'_>, bus: String, node: u8, sdo_timeout: f64) -> PyResult<Bound<'_, PyAny>> {
@@ -118,8 +120,8 @@ fn info(py: Python<'_>, bus: String, node: u8, sdo_timeout: f64) -> PyResult<Bou
     object(py, &info)
 }
 
-/// Asks who is on the bus, and listens for heartbeats for so many seconds; gives what was found by
-/// node-ID.
+/// Sends requests to all nodes, and listens for heartbeats for this many seconds; returns the nodes
+/// by node-ID.
 #[pyfunction]
 #[pyo3(signature = (bus, nodes=None, *, listen=1.1))]
 fn scan<'py>(
@@ -144,7 +146,7 @@ fn scan<'py>(
     Ok(nodes)
 }
 
-/// Does something in a thread of its own, and hands its events to Python meanwhile.
+/// Runs work in a separate thread, and passes its events to Python meanwhile.
 fn work<T: Send>(
     py: Python<'_>,
     on_event: Option<&Bound<'_, PyAny>>,
@@ -154,7 +156,7 @@ fn work<T: Send>(
     let (events, mut inbox) = channel();
     let (result, raised) = thread::scope(|scope| {
         let flag = cancelled.clone();
-        // `events` moves into the thread: the channel ends when the work does.
+        // `events` moves into the thread: the channel ends when the work ends.
         let worker = scope.spawn(move || act(flag, &events));
         let mut raised: Option<PyErr> = None;
         loop {
@@ -195,13 +197,13 @@ fn tell(py: Python<'_>, on_event: Option<&Bound<'_, PyAny>>, event: &Value) -> P
     }
 }
 
-/// A value as Python has it.
+/// A value as a Python object.
 fn object<'py>(py: Python<'py>, value: &impl Serialize) -> PyResult<Bound<'py, PyAny>> {
     Ok(pythonize::pythonize(py, value)?)
 }
 
-/// A sealed image as it is, or the blocks of any other file, for this board if one is named; a raw
-/// binary goes to its address.
+/// A sealed image unchanged, or the blocks of any other file, for this board if one is named; a raw
+/// binary gets its address.
 fn program_of(
     path: &std::path::Path,
     board: Option<&str>,
@@ -253,7 +255,7 @@ fn timing(sdo: f64) -> PyResult<Timing> {
     Ok(Timing::default().sdo(seconds("sdo_timeout", sdo)?))
 }
 
-/// A time that Python gives in seconds; a day is more than anybody waits.
+/// A time from Python in seconds; a day is the longest permitted time.
 fn seconds(name: &str, time: f64) -> PyResult<Duration> {
     let sound = (0.0..=86_400.0).contains(&time);
     let wrong = || PyValueError::new_err(format!("{name} must be seconds, 0 to 86400"));

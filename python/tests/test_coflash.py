@@ -23,7 +23,7 @@ BOARD = "stm32f407g-disc1"
 
 
 def program() -> bytes:
-    """A program as far as a bootloader looks at one: stack pointer in RAM, reset vector inside."""
+    """The part of a program that a bootloader checks: stack pointer in RAM, reset vector inside."""
     vectors = (0x2001_0000).to_bytes(4, "little") + (BASE + 0x201).to_bytes(4, "little")
     return vectors + bytes([0xA5]) * (20 * 1024 - 8)
 
@@ -34,7 +34,7 @@ def crc32(data: bytes) -> int:
 
 
 class Nodes:
-    """Nodes with a bus of their own."""
+    """Nodes with their own bus."""
 
     def __init__(self, folder, *arguments):
         command = [os.environ["COBOOT_NODE"], "--listen", "127.0.0.1:0", *arguments]
@@ -42,7 +42,7 @@ class Nodes:
         line = self.process.stdout.readline()
         assert line.startswith("bus: "), line
         self.bus = line.removeprefix("bus: ").strip()
-        # Somebody has to read on, lest the pipe fill up.
+        # Keep reading, so that the pipe does not fill up.
         threading.Thread(target=self.process.stdout.read, daemon=True).start()
 
     def __enter__(self):
@@ -140,7 +140,7 @@ def sealed(program=1, cut=0) -> bytes:
 def test_a_sealed_image_is_read_before_the_bus_is_opened(tmp_path):
     nowhere = "socketcand://127.0.0.1:1/can0"
     path = tmp_path / "program.cbs"
-    # What the device would have said: 82h in 1F57h, wrong product, and the manual's number of a wrong format.
+    # The device's errors would be 82h in 1F57h, wrong product, and the manual's number of a wrong format.
     for file, number, words in [
         (sealed(program=2), 0x6000_0182, "it is for program 2, and program 1 is to be written"),
         (sealed(cut=1), 0x6000_0002, "it is cut off"),
@@ -151,7 +151,7 @@ def test_a_sealed_image_is_read_before_the_bus_is_opened(tmp_path):
             coflash.flash(nowhere, 5, path)
         assert caught.value.number == number, hex(caught.value.number)
         assert str(path) in caught.value.what and words in caught.value.what and caught.value.advice
-    # One that is well-formed is taken, whatever the options for other files say.
+    # A well-formed one is accepted; the options for other files have no effect on it.
     path.write_bytes(sealed())
     with pytest.raises(coflash.BusError):
         coflash.flash(nowhere, 5, path, board=BOARD, address=BASE, check_target=True)
@@ -201,7 +201,7 @@ def test_what_the_listener_raises_ends_the_update_and_comes_out(nodes, image):
 
     with pytest.raises(Enough):
         coflash.flash(nodes.bus, 5, image, listen, board=BOARD, address=BASE)
-    # It has heard nothing since, and the device takes the next attempt.
+    # There were no events since, and the device accepts the next attempt.
     assert heard[-1] == "progress"
     assert coflash.info(nodes.bus, 5)["bootloader"] is True
     assert coflash.flash(nodes.bus, 5, image, board=BOARD, address=BASE)["size"] == len(program())
@@ -221,24 +221,24 @@ def test_other_threads_run_while_it_works(nodes):
     try:
         before = ticks.qsize()
         with pytest.raises(coflash.DeviceError):
-            # It asks for five seconds, and gives Python's lock away all that time.
+            # It sends requests for five seconds, and releases Python's lock during that time.
             coflash.info(nodes.bus, 99, sdo_timeout=0.1)
         during = ticks.qsize() - before
     finally:
         stop.set()
         ticker.join()
-    # Five seconds have room for thousands. Without the lock there would be none but by chance.
+    # Five seconds have room for thousands. If the lock were held, there would be almost none.
     assert during > 20, during
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no such signal")
 def test_ctrl_c_ends_it(nodes):
-    # A shell starts what runs in the background with this signal ignored.
+    # A shell starts background processes with this signal ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     main = threading.main_thread().ident
 
     def interrupt():
-        # Once the work has begun: it goes on for five seconds by itself.
+        # After the work has begun: it would last five seconds.
         time.sleep(0.3)
         signal.pthread_kill(main, signal.SIGINT)
 

@@ -1,4 +1,4 @@
-//! The ABI between bootloader, application and tools: byte for byte, and against the real images.
+//! The ABI between bootloader, application and tools: byte for byte, and against the built images.
 
 use std::mem::{align_of, offset_of, size_of};
 
@@ -13,7 +13,7 @@ use shared_abi::layout::Layout;
 use shared_abi::vectors::VectorTable;
 use shared_abi::warm_start::{BootRequest, Owed, WarmStart};
 
-/// The bytes that a structure has in RAM. (The host is little-endian, as the chip is.)
+/// The bytes of a structure in RAM. (The host is little-endian, like the chip.)
 fn bytes<T: Copy>(value: &T) -> Vec<u8> {
     const { assert!(cfg!(target_endian = "little")) };
     // SAFETY: `T` is one of the ABI's `repr(C)` structures without padding (the sizes are checked
@@ -35,7 +35,7 @@ fn warm_start_cell_byte_for_byte() {
         (BootRequest::Trial(1), [b'C', b'B', b'W', b'1', 2, 0, 0, 0, 1, 0, 0, 0, 0xCD, 0x59, 0x20, 0xE5]),
         (BootRequest::Start(1), [b'C', b'B', b'W', b'1', 3, 0, 0, 0, 1, 0, 0, 0, 0xF9, 0x81, 0xE0, 0x52]),
         (BootRequest::Fresh(1), [b'C', b'B', b'W', b'1', 9, 0, 0, 0, 1, 0, 0, 0, 0x5F, 0xD5, 0xAC, 0xE8]),
-        // STOP of program 1, asked of node 5; CLEAR of program 2, asked of node 127.
+        // STOP of program 1, sent to node 5; CLEAR of program 2, sent to node 127.
         (BootRequest::Owed(Owed { program: 1, value: 0, node_id: 5 }),
          [b'C', b'B', b'W', b'1', 7, 0, 0, 0, 1, 0, 5, 0, 0x56, 0xAA, 0x9D, 0xE8]),
         (BootRequest::Owed(Owed { program: 2, value: 3, node_id: 127 }),
@@ -104,7 +104,7 @@ fn callgate_byte_for_byte() {
     assert_eq!(callgate::Selector::Crc32 as u32, 1);
 }
 
-/// DESIGN of the memory map, typed again: the one place where the numbers may stand twice.
+/// The memory map of the design, typed again: the only second copy of these numbers.
 #[test]
 fn the_layout_of_the_stm32f407_is_the_documented_one() {
     let layout = &shared_abi::layout::stm32f407g_disc1::LAYOUT;
@@ -130,7 +130,7 @@ fn the_warm_start_cell_is_the_last_of_the_ram_and_in_no_image() {
     }
 }
 
-/// Every address range that an image occupies while it runs: its segments and its stack.
+/// Every address range that a running image uses: its segments and its stack.
 fn memory_ranges(elf: &[u8]) -> Vec<(u32, u32)> {
     let header = FileHeader32::<Endianness>::parse(elf).unwrap();
     let segments = header.program_headers(Endianness::Little, elf).unwrap();
@@ -195,8 +195,8 @@ fn every_symbol_lies_in_its_own_flash_or_in_the_images_ram() {
         let file = ElfFile32::<Endianness>::parse(&*elf).unwrap();
         let mut count = 0;
         for symbol in file.symbols() {
-            // Numbers (absolute symbols) and names of sections that are not loaded have no place in
-            // memory.
+            // Numbers (absolute symbols) and names of sections that are not loaded have no address
+            // in memory.
             let SymbolSection::Section(section) = symbol.section() else { continue };
             let SectionFlags::Elf { sh_flags } = file.section_by_index(section).unwrap().flags() else {
                 continue;
@@ -205,7 +205,7 @@ fn every_symbol_lies_in_its_own_flash_or_in_the_images_ram() {
                 continue;
             }
             let (address, size) = (symbol.address() as u32 & !1, symbol.size() as u32);
-            // A border symbol may stand right behind the last byte.
+            // A border symbol may be the address directly after the last byte.
             let within = |region: &Region| address >= region.base && address + size <= region.end();
             assert!(within(&flash) || within(&layout.ram), "{image}: {:?} at {address:#x}", symbol.name());
             count += 1;
@@ -240,8 +240,8 @@ fn the_callgate_is_where_the_layout_says() {
     assert!(entry & 1 == 1 && callgate.contains(entry & !1, 2), "{entry:#x} leaves the callgate");
 }
 
-/// The F4 stalls the core on every access to busy flash: what runs in bootloader mode must not be
-/// there.
+/// The F4 stalls the core on every access to busy flash: code that runs in bootloader mode must not
+/// be in flash.
 #[test]
 fn the_bootloader_runs_from_ram() {
     let layout: &Layout = firmware::board();
@@ -254,7 +254,7 @@ fn the_bootloader_runs_from_ram() {
             continue;
         }
         let name = symbol.name().unwrap();
-        // The thunk is the linker's: Reset's way from flash to `main` in RAM.
+        // The thunk comes from the linker: Reset jumps through it from flash to `main` in RAM.
         let start_up = matches!(name, "Reset" | "__pre_init" | "boot_fault" | "__Thumbv7ABSLongThunk_main")
             || name.contains("callgate");
         let address = symbol.address() as u32 & !1;

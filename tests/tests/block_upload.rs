@@ -1,6 +1,6 @@
-//! Block upload of the standard device, bootloader and application: with the frames of a client that asks
-//! with a protocol switch threshold, as CANopenNode does, and by python-canopen, which has none. Frames by
-//! CiA 301 section 7.2.4.3.13 ff.
+//! Block upload of the standard device, bootloader and application: with the frames of a client
+//! that uses a protocol switch threshold, like CANopenNode, and by python-canopen, which uses none.
+//! Frames from CiA 301 section 7.2.4.3.13 ff.
 
 use std::path::Path;
 use std::process::Command;
@@ -31,7 +31,7 @@ fn application() -> Bench {
     bench
 }
 
-/// A request, and what the device says to it.
+/// A request, and the device's answers.
 fn ask(bench: &mut Bench, bytes: [u8; 8]) -> Vec<u8> {
     bench.ask(REQUEST, &bytes, RESPONSE).unwrap_or_else(|| panic!("no answer to {bytes:02X?}"))
 }
@@ -75,7 +75,7 @@ fn small_objects_come_as_an_ordinary_upload_where_the_client_has_a_threshold() {
             assert_eq!(answer, [0xC6, 0x08, 0x10, 0x00, len, 0, 0, 0], "threshold {threshold}");
         }
         assert_eq!(ask(&mut bench, initiate(Address::new(0x1000, 0), 3))[..4], [0xC6, 0x00, 0x10, 0x00]);
-        // What cannot be read is refused in either way.
+        // An object without read access is refused in both ways.
         let absent = [0x80, 0x34, 0x12, 0x00, 0x00, 0x00, 0x02, 0x06];
         assert_eq!(ask(&mut bench, initiate(Address::new(0x1234, 0), 21)), absent);
         bench.assert_nothing_unmodelled();

@@ -1,4 +1,4 @@
-//! How long a device takes from its reset to the first instruction of its application.
+//! The time from a device's reset to the first instruction of its application.
 
 use canopen::program::ProgramControl;
 use coboot_tests::bench::Bench;
@@ -28,7 +28,7 @@ fn large_program() -> BlockFile {
     blocks_of(large, &options).expect("it fits").file
 }
 
-/// The budget of the design: 5 ms, with a CRC over all of a program of 400 KiB that was confirmed.
+/// The budget of the design: 5 ms, with a CRC of the whole confirmed program of 400 KiB.
 #[test]
 fn a_program_of_400_kib_is_checked_and_started_within_5_ms() {
     let mut bench = Bench::new();
@@ -42,12 +42,12 @@ fn a_program_of_400_kib_is_checked_and_started_within_5_ms() {
     let took = bench.power_on_to_first_instruction();
     println!("reset to the first instruction of a program of 400 KiB: {} us", took.0 / 1_000_000);
     assert!(took <= Span::from_millis(5), "{} us", took.0 / 1_000_000);
-    // The CRC takes its part of it: without one it would be there in no time.
+    // The CRC takes a part of the time: without it the application would start much earlier.
     assert!(took >= Span::from_millis(1), "{} us", took.0 / 1_000_000);
 }
 
-/// How soon the bootloader is there: from power-on to the end of its boot-up message, and from the
-/// answer to 1F51h = 80h. The RAM image is unpacked on the way.
+/// The start time of the bootloader: from power-on, and from the answer to 1F51h = 80h, to the end
+/// of its boot-up message. This includes the decompression of the RAM image.
 #[test]
 fn the_bootloader_is_there_soon_after_a_power_on_and_a_call_back() {
     let mut bench = Bench::new();
@@ -69,6 +69,6 @@ fn the_bootloader_is_there_soon_after_a_power_on_and_a_call_back() {
         call_back.0 / 1_000_000
     );
     assert!(power_on <= Span::from_millis(15), "{} us", power_on.0 / 1_000_000);
-    // 11 ms of it are the application's (SYS TEC manual L-1112d_10, 4.5: 10 at least).
+    // The application takes 11 ms of it (SYS TEC manual L-1112d_10, 4.5: at least 10).
     assert!(call_back <= Span::from_millis(30), "{} us", call_back.0 / 1_000_000);
 }

@@ -1,5 +1,5 @@
-//! More than one device on the bus, and more on the bus than the device's own frames. All in
-//! virtual time; frames are written by hand from CiA 301 and CiA 305.
+//! Several devices on the bus, and foreign frames on the bus. All in virtual time; frames are
+//! written by hand from CiA 301 and CiA 305.
 
 use std::collections::BTreeSet;
 
@@ -23,7 +23,7 @@ const LSS_RESPONSE: u32 = 0x7E4;
 const BIT: Span = Span::from_micros(1);
 const INTERMISSION: Span = Span(3 * BIT.0);
 
-/// A board in its bootloader, with nothing installed, at 1 Mbit/s.
+/// A board in its bootloader, without a program, at 1 Mbit/s.
 fn fast_board() -> Bench {
     let mut bench = Bench::new();
     bench.commission(bench.device, NODE, BitRate::K1000);
@@ -34,7 +34,7 @@ fn fast_board() -> Bench {
     bench
 }
 
-/// Whether a node is there, and what runs on it.
+/// Whether a node answers, and what runs on it.
 fn running(bench: &mut Bench, node: u8) -> Option<&'static str> {
     let device_type = bench.session_with(node).device_type().unwrap()?;
     Some(if device_type.is_bootloader() { "bootloader" } else { "application" })
@@ -48,8 +48,7 @@ fn install(session: &mut Session<'_>, image: &str) {
     report.unwrap();
 }
 
-/// Three boards; two have node-IDs, the third has none until the master gives it one, picked by its
-/// identity.
+/// Three boards; two have node-IDs, the third gets one from the master, selected by its identity.
 #[test]
 fn three_devices_are_updated_one_after_the_other_and_one_of_them_had_no_node_id() {
     let mut bench = Bench::of_boards(3);
@@ -74,10 +73,10 @@ fn three_devices_are_updated_one_after_the_other_and_one_of_them_had_no_node_id(
     install(&mut bench.session_with(2), firmware::APP_V1);
     install(&mut bench.session_with(3), firmware::APP_V1);
 
-    // Is anybody without a node-ID? Then the one with this identity gets the next one that is free.
+    // Does any device have no node-ID? Then the device with this identity gets the next free one.
     let unconfigured = bench.ask(LSS_REQUEST, &[0x4C, 0, 0, 0, 0, 0, 0, 0], LSS_RESPONSE);
     assert_eq!(unconfigured.as_deref(), Some(&[0x50, 0, 0, 0, 0, 0, 0, 0][..]));
-    // Vendor, product and revision as the board file has them.
+    // Vendor, product and revision from the board file.
     let identity = &bsp::IDENTITY;
     for (command, part) in
         [(0x40, identity.vendor_id), (0x41, identity.product_code), (0x42, identity.revision)]
@@ -98,7 +97,7 @@ fn three_devices_are_updated_one_after_the_other_and_one_of_them_had_no_node_id(
     bench.await_boot_up_of(4, 100);
     install(&mut bench.session_with(4), firmware::APP_V1);
 
-    // Each again, the last first, with another program: the others go on running theirs.
+    // Each again, the last first, with another program: the other devices continue to run theirs.
     for (done, node) in [4, 3, 2].into_iter().enumerate() {
         install(&mut bench.session_with(node), firmware::APP_V2);
         for (n, other) in [4, 3, 2].into_iter().enumerate() {
@@ -119,14 +118,14 @@ fn three_devices_are_updated_one_after_the_other_and_one_of_them_had_no_node_id(
         assert_eq!(session.read_text(VERSION).unwrap(), "2.0.0", "node {node}");
     }
     assert_eq!(running(&mut bench, NODE), None, "nobody has the board file's node-ID any more");
-    // But for a frame that was on its way when the power went.
+    // Except for a frame that was being sent when the power was cut.
     let mut disturbed = bench.records();
     disturbed.retain(|record| record.outcome != Outcome::Good && !(record.start..=record.end).contains(&off));
     assert!(disturbed.is_empty(), "nobody disturbed anybody: {disturbed:?}");
     bench.assert_nothing_unmodelled();
 }
 
-/// Frames of others, as they occur: none is for the device, some come close.
+/// Foreign frames that occur on a bus: none is for the device, some are similar to its frames.
 fn foreign(n: usize) -> Frame {
     let byte = n as u8;
     let data = [byte, !byte, 0x55, byte ^ 0x0F, 0x33, byte, 0, byte];
@@ -136,20 +135,21 @@ fn foreign(n: usize) -> Frame {
         1 => Frame::standard(0x080, &[]),
         // The SDO channel of the next node.
         2 => Frame::standard(0x602, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]),
-        // 29 bits that begin as, or are, the number of the device's SDO request.
+        // 29-bit identifiers that begin like, or are equal to, the identifier of the device's SDO
+        // request.
         3 => Frame::extended(0x601 << 18, &data),
         4 => Frame::extended(0x601, &data),
-        // Heartbeats of nodes that are far away.
+        // Heartbeats of other nodes.
         5 => Frame::standard(0x77F, &[0x05]),
-        // What LSS slaves say.
+        // Answers of LSS slaves.
         6 => Frame::standard(0x7E4, &data),
         _ => Frame::standard(0x6FF, &data),
     };
     frame.expect("an identifier and its data")
 }
 
-/// What went over the device's SDO channel, apart from the looks at 1F57h, of which there are as
-/// many as there is time.
+/// The frames on the device's SDO channel without the reads of 1F57h; their number depends on the
+/// time.
 fn sdo_trace(records: &[Record], from: Time) -> Vec<(u32, Vec<u8>)> {
     let of_channel = |record: &&Record| {
         let id = record.frame.raw_id();
@@ -163,8 +163,8 @@ fn sdo_trace(records: &[Record], from: Time) -> Vec<(u32, Vec<u8>)> {
         .collect()
 }
 
-/// A whole update at 1 Mbit/s, while others leave no gap between two frames: exactly the same
-/// frames go over the SDO channel as on a quiet bus.
+/// A whole update at 1 Mbit/s, while other nodes leave no gap between two frames: the SDO channel
+/// has exactly the same frames as on a quiet bus.
 #[test]
 fn a_bus_full_of_foreign_frames_costs_no_sdo_frame() {
     let mut quiet = fast_board();
@@ -204,19 +204,19 @@ fn a_bus_full_of_foreign_frames_costs_no_sdo_frame() {
     bench.assert_nothing_unmodelled();
 }
 
-/// How often the device was interrupted for a frame received: CAN1_RX0 is interrupt 20 (RM0090
-/// table 62), and thus exception 36.
+/// The number of receive interrupts of the device: CAN1_RX0 is interrupt 20 (RM0090 table 62), and
+/// thus exception 36.
 fn receive_interrupts(bench: &mut Bench) -> u64 {
     bench.machine().counters().exceptions[16 + 20]
 }
 
-/// Emergencies that tell of lost frames: 8110h.
+/// Emergencies that report lost frames: 8110h.
 fn lost_frames(bench: &Bench, from: Time) -> usize {
     let emergencies = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == 0x80 + u32::from(NODE));
     emergencies.filter(|(.., data)| data[..2] == [0x10, 0x81]).count()
 }
 
-/// The most that a client may send without waiting, as fast as the wire carries it.
+/// The most frames that a client may send without waiting, as fast as the wire carries them.
 #[test]
 fn a_burst_of_127_segments_back_to_back_at_1_mbit_is_taken_without_loss() {
     let mut bench = fast_board();
@@ -225,13 +225,13 @@ fn a_burst_of_127_segments_back_to_back_at_1_mbit_is_taken_without_loss() {
     bench.session().write(DATA, &block(0, 0, &[0; 8]), Doing::Block(0), &mut |_| {}).unwrap();
     bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
 
-    // Two sub-blocks of 127 segments; the bits of the data change so often that no stuff bit makes
-    // the frames longer.
+    // Two sub-blocks of 127 segments; the data bits change so often that no stuff bit makes the
+    // frames longer.
     let data = firmware::made_up(2 * 127 * 7 - 16, |n| if n % 64 == 0 { (n / 64) as u8 } else { 0x55 });
     let block = block(1, firmware::board().programs[0].base, &data);
     assert_eq!(block.len(), 1778);
-    // The first burst meets the device's own heartbeat, which finds no room on the bus: that keeps
-    // nobody waiting.
+    // During the first burst the device's own heartbeat finds no room on the bus: this delays
+    // nothing else.
     let from = bench.time();
     while heartbeats(&bench, from).is_empty() {
         bench.run_ms(1);
@@ -251,7 +251,7 @@ fn a_burst_of_127_segments_back_to_back_at_1_mbit_is_taken_without_loss() {
         let (last, before) = frames.split_last().expect("127 segments");
         before.iter().for_each(|frame| bench.post(REQUEST, frame));
         let answer = bench.ask(REQUEST, last, RESPONSE);
-        // All were taken, and as many may follow.
+        // All were accepted, and as many may follow.
         assert_eq!(answer.as_deref(), Some(&[0xA2, 127, 127, 0, 0, 0, 0, 0][..]));
         let records = bench.records();
         let burst: Vec<&Record> = records
@@ -275,14 +275,14 @@ fn a_burst_of_127_segments_back_to_back_at_1_mbit_is_taken_without_loss() {
     let ended = bench.ask(REQUEST, &[0xC1, low, high, 0, 0, 0, 0, 0], RESPONSE);
     assert_eq!(ended.as_deref(), Some(&[0xA1, 0, 0, 0, 0, 0, 0, 0][..]));
     assert_eq!(bench.session().await_idle(1, Doing::Read(STATUS)).unwrap().to_word(), 0);
-    // The status is free as soon as there is room for the next block; the flash has yet to erase
-    // and to program.
+    // The status is not busy as soon as there is room for the next block; the flash must still
+    // erase and program.
     bench.run_ms(2000);
     assert!(bench.machine().flash()[0x1_0000..].starts_with(&data));
     assert_eq!(lost_frames(&bench, from), 0);
 }
 
-/// When the device's heartbeats were on the bus.
+/// The times of the device's heartbeats on the bus.
 fn heartbeats(bench: &Bench, from: Time) -> Vec<Time> {
     let beats = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == 0x700 + u32::from(NODE));
     beats.map(|(at, ..)| at).collect()

@@ -1,4 +1,4 @@
-//! A board whose transceiver is at CAN2: the same job through the other controller.
+//! A board with its transceiver at CAN2: the same job through the other controller.
 
 use canopen::program::ProgramControl;
 use canopen::Address;
@@ -11,7 +11,7 @@ use coflash::update::{flash, FlashOptions};
 use emulator::peripheral::Peripheral;
 use shared_abi::layout::stm32f407g_disc1_can2::LAYOUT;
 
-/// Whether the bench has the chip of the board: it is that of the board the tests are run for.
+/// Whether the tests run for the chip of this board.
 fn is_its_chip() -> bool {
     let same = firmware::board().chip == LAYOUT.chip;
     if !same {
@@ -42,15 +42,15 @@ const GPIOD_MODER: u32 = 0x4002_0C00;
 const CAN1: u32 = 0x4000_6400;
 const CAN2: u32 = 0x4000_6800;
 
-/// What the program that runs has set up: CAN2 on its pins, CAN1 with a clock and asleep, and of
-/// the filters the first bank of CAN2 alone. `priorities` are those of the interrupts of
-/// transmission and of reception, as the core has them.
+/// The settings of the running program: CAN2 on its pins, CAN1 with a clock and in sleep mode, and
+/// only the first filter bank of CAN2. `priorities` are the transmit and receive interrupts'
+/// priorities in the core.
 fn assert_set_up(bench: &mut Bench, priorities: [u32; 2]) {
     let machine = bench.machine();
     let mut register = |address: u32| machine.register(address).expect("a register that is modelled");
     assert_eq!(register(APB1ENR) >> 25 & 3, 3, "CAN1EN and CAN2EN");
-    // Alternate function (10b) 9 on PB12 and PB13; PD0 and PD1, where the other board has CAN1, are
-    // inputs as after a reset.
+    // Alternate function (10b) 9 on PB12 and PB13; PD0 and PD1, the pins of CAN1 on the other
+    // board, are inputs as after a reset.
     assert_eq!(register(GPIOB_MODER) >> 24 & 0xF, 0b1010);
     assert_eq!(register(GPIOB_AFRH) >> 16 & 0xFF, 0x99);
     assert_eq!(register(GPIOD_MODER) & 0xF, 0);
@@ -72,8 +72,8 @@ fn assert_set_up(bench: &mut Bench, priorities: [u32; 2]) {
     listed.sort_unstable();
     listed.dedup();
     assert_eq!(listed, [0x0000, 0xC020, 0xFCA0]);
-    // NVIC_IPR, a byte for each interrupt. The handlers of CAN2 are those of CAN1: one of another
-    // priority would interrupt itself.
+    // NVIC_IPR, a byte for each interrupt. CAN1 and CAN2 have the same handlers: with another
+    // priority one of them would interrupt itself.
     let mut priority = |line: u32| register(0xE000_E400 + (line & !3)) >> (8 * (line & 3)) & 0xFF;
     assert_eq!([priority(19), priority(63)], [priorities[0]; 2], "CAN1_TX, CAN2_TX");
     assert_eq!([priority(20), priority(64)], [priorities[1]; 2], "CAN1_RX0, CAN2_RX0");
@@ -93,7 +93,7 @@ fn an_update_and_the_way_back_through_can2() {
     bench.power_on();
     bench.await_boot_up(100);
     assert!(bench.is_bootloader(1));
-    // Tasks of priority 2 and 3 out of 16, in the upper four bits, 0 the most urgent.
+    // Tasks of priority 2 and 3 out of 16, in the upper four bits, where 0 is the highest.
     assert_set_up(&mut bench, [0xE0, 0xD0]);
 
     let report = flash(
@@ -110,7 +110,7 @@ fn an_update_and_the_way_back_through_can2() {
     // Priorities 3 and 4.
     assert_set_up(&mut bench, [0xD0, 0xC0]);
 
-    // Back, and on again without a download.
+    // Back to the bootloader, and to the program again without a download.
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
     assert!(bench.is_bootloader(1));
@@ -140,7 +140,7 @@ fn an_update_and_the_way_back_through_can2() {
     bench.assert_nothing_unmodelled();
 }
 
-/// What the test above hears comes from CAN2.
+/// The frames that the test above receives come from CAN2.
 #[test]
 fn nothing_comes_out_of_can1() {
     if !is_its_chip() {
@@ -153,7 +153,8 @@ fn nothing_comes_out_of_can1() {
     bench.assert_nothing_unmodelled();
 }
 
-/// An application may have CAN1 for itself: when the filters of CAN2 change, those below CAN2SB stay.
+/// An application may use CAN1 for itself: when the filters of CAN2 change, the banks below CAN2SB
+/// stay unchanged.
 #[test]
 fn the_filters_of_can1_stay() {
     if !is_its_chip() {
@@ -174,8 +175,8 @@ fn the_filters_of_can1_stay() {
     }
     can1.write(0x200, 0x2A1C_0E00, now).unwrap();
 
-    // Another node-ID by layer setting services (CiA 305), in force after a reset of communication:
-    // other filters.
+    // A new node-ID by layer setting services (CiA 305), effective after a reset of communication,
+    // changes the filters.
     bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
     assert_eq!(bench.ask(0x7E5, &[0x11, 5, 0, 0, 0, 0, 0, 0], 0x7E4), Some(vec![0x11, 0, 0, 0, 0, 0, 0, 0]));
     bench.post(0x7E5, &[0x04, 0, 0, 0, 0, 0, 0, 0]);

@@ -1,5 +1,5 @@
-//! Programs that we did not write, unmodified, and our own command line as a person runs it:
-//! against the emulated device through the socketcand endpoint.
+//! Foreign programs, unmodified, and our own command line: against the emulated device through the
+//! socketcand endpoint.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -34,7 +34,7 @@ fn script(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("python").join(name)
 }
 
-/// A block file of the application, for clients that take files.
+/// A block file of the application, for clients that read files.
 fn block_file(image: &str) -> PathBuf {
     let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(image).with_extension("blk");
     fs::write(&path, firmware::blocks(image).emit()).unwrap();
@@ -64,8 +64,8 @@ fn python_canopen_identifies_flashes_and_starts_the_device() {
     endpoint.bench.assert_nothing_unmodelled();
 }
 
-/// A master with nothing of ours: a raw image in segments into an empty device, and in blocks into
-/// one that runs.
+/// A foreign master: a raw image in segments into an empty device, and by block transfer into a
+/// device with a running program.
 #[test]
 fn python_canopen_updates_the_device_by_raw_images() {
     let mut endpoint = endpoint();
@@ -84,7 +84,8 @@ fn python_canopen_updates_the_device_by_raw_images() {
     endpoint.bench.assert_nothing_unmodelled();
 }
 
-/// The asyncio port of the same client, by its own calls: in segments, with an SDO time-out of 2 s.
+/// The asyncio port of the same client, with its own calls: in segments, with an SDO time-out of 2
+/// s.
 #[test]
 fn canopen_asyncio_updates_the_device_by_raw_images() {
     let mut endpoint = endpoint();
@@ -103,7 +104,7 @@ fn canopen_asyncio_updates_the_device_by_raw_images() {
     endpoint.bench.assert_nothing_unmodelled();
 }
 
-/// The command line that `cargo xtask test` has built.
+/// The command line built by `cargo xtask test`.
 fn coflash() -> Command {
     let coflash = env::var_os("COBOOT_COFLASH")
         .unwrap_or_else(|| panic!("COBOOT_COFLASH is not set: run the tests by `cargo xtask test`"));
@@ -124,12 +125,12 @@ fn the_coflash_command_does_the_main_job_through_a_socket() {
     };
     flash(&mut endpoint, firmware::APP_V1);
     assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), "1.0.0");
-    // Now an application runs: it is called back.
+    // An application runs now: it is called back.
     flash(&mut endpoint, firmware::APP_V2);
     assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), "2.0.0");
 }
 
-/// A file that cannot be flashed is refused before anything of the device is touched.
+/// A file that cannot be flashed is refused before the device is changed.
 #[test]
 fn a_bad_file_touches_no_device() {
     let mut endpoint = endpoint();

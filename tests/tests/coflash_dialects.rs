@@ -1,5 +1,5 @@
-//! `coflash` finds out what the firmware speaks, and updates it so: images and Intel HEX into the
-//! standard bootloader, the profiles of ESAcademy and lifts.
+//! `coflash` detects the dialect of the firmware and updates it accordingly: images and Intel HEX
+//! into the standard bootloader, the profiles of ESAcademy and lifts.
 
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
@@ -25,10 +25,10 @@ const APP_LIFT: &str = "app-lift.elf";
 const APP_LIFT_V2: &str = "app-lift-v2.elf";
 /// The node-ID of every lift bootloader (CiA 814-1 clause 5).
 const LIFT_NODE: u8 = 126;
-/// What the firmware of this repository has for a password.
+/// The passwords of this repository's firmware.
 const PASSWORD: &str = "coboot";
 
-/// For so long the firmware takes no password behind the first wrong one, and some more; in ms.
+/// How long the firmware refuses passwords after the first wrong one, plus a margin; in ms.
 const PENALTY_MS: u64 = 600;
 
 fn update(
@@ -60,7 +60,7 @@ fn images_and_intel_hex_update_the_standard_firmware() {
         bench.power_on();
         bench.await_boot_up(100);
         let options = FlashOptions::default().dialect(Some(dialect)).verify(true);
-        // Into an empty device, and into one whose application runs.
+        // Into an empty device, and into a device with a running application.
         for (image, expected) in [(firmware::APP_V1, "1.0.0"), (firmware::APP_V2, "2.0.0")] {
             let blocks = firmware::blocks(image);
             let (result, events) = update(&mut bench, NODE, &blocks, &options);
@@ -89,7 +89,7 @@ fn the_profile_of_esacademy_is_recognised_and_updated() {
     let (result, events) = update(&mut bench, ESACADEMY_NODE, &firmware::blocks(firmware::APP_V1), &wrong);
     assert!(matches!(result, Err(Error::Refused { doing: Doing::Unlock, .. })), "{result:?}");
     assert_eq!(events.last().and_then(Event::left).map(|left| left.state), Some(DeviceState::Untouched));
-    // The next attempt has to wait.
+    // The next attempt must wait.
     bench.run_ms(PENALTY_MS);
 
     for (image, expected) in [(firmware::APP_V1, "1.0.0"), (firmware::APP_V2, "2.0.0")] {
@@ -105,12 +105,12 @@ fn the_profile_of_esacademy_is_recognised_and_updated() {
     bench.assert_nothing_unmodelled();
 }
 
-/// A lift bootloader needs a board with room for its set of parameters.
+/// A lift bootloader needs a board with a region for its set of parameters.
 #[test]
 fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
     let layout = &stm32f407g_disc1_two::LAYOUT;
     if firmware::board().chip != layout.chip {
-        // The bench is that of another chip.
+        // The tests run for another chip.
         return;
     }
     let blocks = |name: &str| {
@@ -122,7 +122,7 @@ fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
     bench.power_on();
     bench.await_boot_up_of(LIFT_NODE, 1000);
     let options = FlashOptions::default().unlock(Password::new(PASSWORD));
-    // A device without a program is in its bootloader, and nobody knows its own node-ID.
+    // A device without a program is in its bootloader, and its own node-ID is not visible.
     for (from, image, expected) in [(LIFT_NODE, APP_LIFT, "1.0.0"), (NODE, APP_LIFT_V2, "2.0.0")] {
         let (result, events) = update(&mut bench, from, &blocks(image), &options);
         let report = result.unwrap_or_else(|error| panic!("{error}: {events:?}"));
@@ -140,7 +140,7 @@ fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
     bench.await_boot_up(2000);
     assert!(version(&mut bench, NODE).contains("2.0.0"), "it runs again");
 
-    // Its set of parameters (CiA 814-1 clause 6.4): any bytes, kept and given back.
+    // Its set of parameters (CiA 814-1 clause 6.4): any bytes, stored and read back.
     let set: Vec<u8> = (0..3001_u32).map(|i| (i * i / 7) as u8).collect();
     let raw = read(&set, Some(Format::Raw), Some(layout.programs[1].base)).unwrap();
     let blocks_of_set = blocks_of(raw, &Options::default()).unwrap().file;

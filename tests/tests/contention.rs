@@ -1,6 +1,6 @@
-//! What somebody else's transfer, or one that was given up, may cost the next client: the built firmware
-//! in virtual time, with frames written by hand from CiA 301 sections 7.2.4.3 and 7.2.8.3 and the SYS TEC
-//! manual.
+//! The effect of another client's transfer, or of an abandoned one, on the next client: the built
+//! firmware in virtual time, with frames written by hand from CiA 301 sections 7.2.4.3 and 7.2.8.3
+//! and the SYS TEC manual.
 
 use std::time::Duration;
 
@@ -20,7 +20,7 @@ const READ_STATUS: [u8; 8] = [0x40, 0x57, 0x1F, 1, 0, 0, 0, 0];
 const CLEAR: [u8; 8] = [0x2F, 0x51, 0x1F, 1, 3, 0, 0, 0];
 const MAN_BUSY: [u8; 8] = [0x80, 0x51, 0x1F, 1, 0x22, 0x00, 0x00, 0x08];
 
-/// A board in its bootloader, with nothing installed, at this bit rate.
+/// A board in its bootloader, without a program, at this bit rate.
 fn board(rate: BitRate) -> Bench {
     let mut bench = Bench::new();
     if rate != BitRate::K125 {
@@ -46,16 +46,16 @@ fn running_board() -> Bench {
     bench
 }
 
-/// What the device says on its SDO channel, and how long after `from`.
+/// The device's frames on its SDO channel, with their time after `from`.
 fn said(bench: &Bench, from: Time) -> Vec<(Span, Vec<u8>)> {
     let frames = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == RESPONSE);
     frames.map(|(at, _, data)| (at - from, data)).collect()
 }
 
-/// A block download of 1000h bytes is granted, and its first segments are sent. When the last one was on
-/// the bus.
+/// A block download of 1000h bytes is granted, and its first segments are sent. Returns the time of
+/// the last one on the bus.
 fn abandon(bench: &mut Bench, at: Address, segments: u8) -> Time {
-    // What came before was looked at on the bus.
+    // Earlier frames were already checked.
     while bench.receive(Duration::ZERO).is_ok_and(|frame| frame.is_some()) {}
     let [low, high] = at.index.to_le_bytes();
     let granted = bench.ask(REQUEST, &[0xC0, low, high, at.sub, 0, 0, 0, 0], RESPONSE).expect("an answer");
@@ -102,7 +102,7 @@ fn a_lost_last_segment_is_acknowledged_before_clients_give_up() {
     }
 }
 
-/// The frames of the complaint: 40 00 10 00 every 0.1 to 2.2 s, bootloader and application.
+/// The frames of a bug report: 40 00 10 00 every 0.1 to 2.2 s, bootloader and application.
 #[test]
 fn an_abandoned_block_download_locks_nobody_out() {
     let mut bootloader = board(BitRate::K125);
@@ -122,11 +122,11 @@ fn an_abandoned_block_download_locks_nobody_out() {
                 let said = said(bench, asked);
                 assert_eq!(said.len(), 3, "{at}, {segments} segments, every {every} ms: {said:X?}");
                 assert!(said.iter().all(|(_, data)| *data == device_type), "{said:X?}");
-                // The frame itself takes 1 ms, and the application looks at its clock every 5 ms.
+                // The frame itself takes 1 ms, and the application reads its clock every 5 ms.
                 assert!(said[0].0 <= Span::from_millis(59), "{:?}", said[0].0);
             }
         }
-        // An abort in front of it, and the answer comes at once.
+        // With an abort before it, the answer comes at once.
         abandon(bench, at, 3);
         bench.post(REQUEST, &[0x80, 0, 0, 0, 0, 0, 0, 8]);
         let asked = bench.time();
@@ -136,7 +136,8 @@ fn an_abandoned_block_download_locks_nobody_out() {
     }
 }
 
-/// Nobody goes on with a transfer, and somebody asks once a second: NMT reset node is carried out.
+/// A transfer is abandoned, and a client sends a request every second: NMT reset node is carried
+/// out.
 #[test]
 fn reset_node_waits_for_no_transfer() {
     let mut bench = running_board();
@@ -168,7 +169,8 @@ fn reset_node_waits_for_no_transfer() {
     }
 }
 
-/// Somebody begins an upload every 30 ms and never goes on with it. START was acknowledged: it comes.
+/// A client starts an upload every 30 ms and never continues it. START was acknowledged and is
+/// carried out.
 #[test]
 fn uploads_that_are_never_ended_do_not_keep_the_program_from_starting() {
     let mut bench = running_board();
@@ -193,8 +195,8 @@ fn uploads_that_are_never_ended_do_not_keep_the_program_from_starting() {
     assert!(!bench.is_bootloader(NODE));
 }
 
-/// A raw image is cut off while a sector is erased for it: as long as commands are refused for that the
-/// status says busy, and not longer.
+/// A raw image is aborted while a sector is erased for it: the status is busy exactly as long as
+/// commands are refused for this reason.
 #[test]
 fn behind_a_cut_raw_image_the_status_says_busy_while_commands_are_refused() {
     for command in [0x01, 0x02, 0x83] {
@@ -223,7 +225,7 @@ fn behind_a_cut_raw_image_the_status_says_busy_while_commands_are_refused() {
             let answer =
                 bench.ask(REQUEST, &[0x2F, 0x51, 0x1F, 1, command, 0, 0, 0], RESPONSE).expect("an answer");
             assert!(bench.time() - asked <= Span::from_millis(5));
-            // It may end between the two questions.
+            // The erase may end between the two requests.
             if !busy || answer[0] == 0x60 {
                 assert_eq!(answer[..], [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0], "{command:02X}h behind {refused}");
                 break;
@@ -237,7 +239,7 @@ fn behind_a_cut_raw_image_the_status_says_busy_while_commands_are_refused() {
     }
 }
 
-/// CLEAR twice; how long that takes, and the longest that an answer took.
+/// CLEAR twice; returns its duration, and the longest time until an answer.
 fn clear(bench: &mut Bench) -> (Span, Span) {
     let mut slowest = Span(0);
     let mut ask = |bench: &mut Bench, bytes: &[u8; 8]| {
@@ -262,7 +264,7 @@ fn clear(bench: &mut Bench) -> (Span, Span) {
     }
 }
 
-/// What was never written takes no time to be erased; and the bus is served while it is looked for.
+/// Flash that was never written takes no time to erase; and the bus works during the check.
 #[test]
 fn a_second_clear_takes_as_long_as_there_is_something_to_erase() {
     let mut bench = board(BitRate::K125);
@@ -270,7 +272,7 @@ fn a_second_clear_takes_as_long_as_there_is_something_to_erase() {
     println!("a new device: {took:?}, slowest answer {slowest:?}");
     assert!(took <= Span::from_millis(100), "a new device: {took:?}");
     assert!(slowest <= Span::from_millis(5), "{slowest:?}");
-    // Some 20 KiB: one sector, of 64 KiB on the F407 (550 ms; 128 KiB, 1 s).
+    // About 20 KiB: one sector, of 64 KiB on the F407 (550 ms; 128 KiB, 1 s).
     bench.session().transfer_by(Transfers::Blocks);
     let image = firmware::raw(firmware::APP_V1);
     bench.session().write(DATA, &image, Doing::Block(0), &mut |_| {}).expect("a good program");
@@ -279,12 +281,12 @@ fn a_second_clear_takes_as_long_as_there_is_something_to_erase() {
     println!("{} bytes: {took:?}, slowest answer {slowest:?}", image.len());
     assert!(took <= Span::from_millis(1150), "{} bytes: {took:?}", image.len());
     assert!(slowest <= Span::from_millis(5), "{slowest:?}");
-    // Behind a reset.
+    // After a reset.
     bench.post(0x000, &[0x81, 0]);
     bench.await_boot_up(100);
     bench.run_ms(20);
     assert!(clear(&mut bench).0 <= Span::from_millis(100));
-    // A debugger's work in the last sector.
+    // A debugger has written to the last sector.
     let end = firmware::board().programs[0].end();
     bench.machine().load_bin(end - 1, &[0]).expect("it is in flash");
     let (took, slowest) = clear(&mut bench);

@@ -1,5 +1,5 @@
-//! The debugger interface, 1025h, of the real images: memory through the bus in bootloader and
-//! application, and breakpoints while the bus goes on.
+//! The debugger interface, 1025h, of the built images: memory access over the bus in bootloader and
+//! application, and breakpoints while the bus continues.
 
 use std::process::Command;
 use std::time::Duration;
@@ -37,17 +37,17 @@ const STOPPED: u32 = 0x0008_0000;
 const INVALID_VALUE: Option<u32> = Some(0x0609_0030);
 const DEVICE_STATE: Option<u32> = Some(0x0800_0022);
 
-/// A board in a bootloader with the interface.
+/// A board with a bootloader that has the interface.
 fn bootloader() -> Bench {
     let mut bench = Bench::of_image(firmware::BOOTLOADER_DEBUGGER);
     bench.power_on();
     bench.await_boot_up(100);
-    // The emergency behind the boot-up.
+    // The emergency after the boot-up message.
     bench.run_ms(10);
     bench
 }
 
-/// A board that runs the application with the interface, under a standard bootloader.
+/// A board with an application that has the interface, and a standard bootloader.
 fn application() -> Bench {
     let mut bench = Bench::new();
     bench.power_on();
@@ -75,7 +75,7 @@ fn code(outcome: Result<(), Error>) -> Option<u32> {
     }
 }
 
-/// Sends a command; gives the abort code.
+/// Sends a command; returns the abort code.
 fn command(bench: &mut Bench, kind: u8, address: u32, len: u16) -> Option<u32> {
     let [low, high] = len.to_le_bytes();
     let [a, b, c, d] = address.to_le_bytes();
@@ -116,13 +116,13 @@ fn emergencies(bench: &Bench, from: Time) -> Vec<Vec<u8>> {
         .collect()
 }
 
-/// 6200h, no error in the error register, the type, the address (the document's table of the five
-/// bytes).
+/// 6200h, no error in the error register, the type, the address (the table of the five bytes in the
+/// document).
 fn stop_of_type(kind: u8, address: u32) -> Vec<u8> {
     [&[0x00, 0x62, 0x00, kind], &address.to_le_bytes()[..]].concat()
 }
 
-/// Breaks at this address by comparator 0; gives the time before.
+/// Sets a breakpoint at this address with comparator 0; returns the time before.
 fn break_at(bench: &mut Bench, address: u32) -> Time {
     let from = bench.time();
     let half = if address & 2 == 0 { 1 << 30 } else { 1 << 31 };
@@ -131,7 +131,7 @@ fn break_at(bench: &mut Bench, address: u32) -> Time {
     from
 }
 
-/// Runs until there is an emergency since then, for two seconds at most.
+/// Runs until an emergency is sent, for at most two seconds.
 fn await_stop(bench: &mut Bench, from: Time) -> Vec<u8> {
     for _ in 0..1000 {
         if let Some(stop) = emergencies(bench, from).pop() {
@@ -147,7 +147,7 @@ fn the_bootloader_reads_and_writes_what_there_is() {
     let mut bench = bootloader();
     let board = firmware::board();
     // Flash, over several pieces, and from an odd address; the unique identifier; RAM at the end of
-    // the images' part.
+    // the images' region.
     for (address, len) in [
         (board.bootloader.base, 700),
         (board.bootloader.base + 0x201, 5),
@@ -157,23 +157,23 @@ fn the_bootloader_reads_and_writes_what_there_is() {
         let expected = seen(&mut bench, address, len);
         assert_eq!(read(&mut bench, address, len as u16), expected, "{address:08X}");
     }
-    // The handoff is nobody's while the bootloader runs. An odd address, an odd length, both its
-    // neighbours left alone.
+    // The handoff is unused while the bootloader runs. An odd address and an odd length, with both
+    // neighbours unchanged.
     let at = board.handoff.base + 1;
     let mut expected = seen(&mut bench, at - 1, 16);
     expected[1..14].copy_from_slice(b"thirteen long");
     write(&mut bench, at, b"thirteen long");
     assert_eq!(seen(&mut bench, at - 1, 16), expected);
     assert_eq!(bench.session().read_number(STATUS).unwrap(), 0);
-    // Registers: CPUID of the Cortex-M4 r0p1; GPIOE has no clock, and reads all the same.
+    // Registers: CPUID of the Cortex-M4 r0p1; GPIOE has no clock, but can be read.
     assert_eq!(read_word(&mut bench, 0xE000_ED00), 0x410F_C241);
     bench.assert_nothing_unmodelled();
     assert_eq!(read(&mut bench, 0x4002_1000, 4).len(), 4);
     assert_eq!(bench.events(), [], "no reset");
 }
 
-/// Nothing there, or not to be written: the bootloader, the parameters, a program, and the
-/// registers by which they could be erased.
+/// Missing memory, and memory without write access: the bootloader, the parameters, a program, and
+/// the registers with which they could be erased.
 #[test]
 fn what_must_not_be_touched_is_refused_and_faults_nothing() {
     let board = firmware::board();
@@ -212,18 +212,18 @@ fn what_must_not_be_touched_is_refused_and_faults_nothing() {
         assert!(bench.machine().flash() == before);
         assert_eq!(bench.events(), [], "no reset");
         bench.assert_nothing_unmodelled();
-        // The next one is served.
+        // The next command works.
         assert_eq!(read_word(&mut bench, 0xE000_ED00), 0x410F_C241);
     }
 }
 
-/// 08000021h, local control: the CPU would stand still until the sector is erased, or the memory
-/// has no clock.
+/// 08000021h, local control: the CPU would stall until the sector is erased, or the memory has no
+/// clock.
 #[test]
 fn memory_that_does_not_answer_now_is_refused_now() {
     let mut bench = bootloader();
     let board = firmware::board();
-    // Twice, it is carried out at once: what is not blank is erased.
+    // The second CLEAR is carried out at once: it erases what is not blank.
     bench.soil_programs();
     for _ in 0..2 {
         bench.session().command(1, canopen::program::ProgramControl::Clear).unwrap();
@@ -236,7 +236,7 @@ fn memory_that_does_not_answer_now_is_refused_now() {
     assert_eq!(status.to_word(), 0);
     let expected = seen(&mut bench, board.bootloader.base, 4);
     assert_eq!(read(&mut bench, board.bootloader.base, 4), expected);
-    // RCC_AHB1ENR bit 20 is the clock of the CCM, where there is one.
+    // RCC_AHB1ENR bit 20 is the clock of the CCM, if the chip has one.
     let ccm = board.chip.ccm;
     if ccm.size == 0 {
         return;
@@ -308,7 +308,7 @@ fn the_scripts_of_the_document_are_played() {
     bench.assert_nothing_unmodelled();
 }
 
-/// The standard images have no such object.
+/// The standard images do not have this object.
 #[test]
 fn without_the_feature_there_is_no_interface() {
     let mut bench = Bench::new();
@@ -325,14 +325,14 @@ fn without_the_feature_there_is_no_interface() {
     assert_eq!(command(&mut bench, 0, 0x2000_0000, 4), Some(0x0602_0000));
 }
 
-/// A variable at run-time, while nothing stands still.
+/// A variable at run time, without stopping the program.
 #[test]
 fn the_application_is_looked_at_while_it_runs() {
     let mut bench = application();
     let calls = symbol("DEBUGGER_EXAMPLE_CALLS");
     let first = read_word(&mut bench, calls);
     bench.run_ms(6000);
-    // It counts twice a second, and a little less.
+    // It counts a little less than twice a second.
     let counted = read_word(&mut bench, calls) - first;
     assert!((10..=12).contains(&counted), "{counted}");
     write_word(&mut bench, calls, 1000);
@@ -354,7 +354,7 @@ fn a_breakpoint_stops_the_program_and_not_the_bus() {
         let stopped_with = read_word(&mut bench, calls);
         from = bench.time();
         bench.run_ms(3000);
-        // The program stands still; heartbeats (every 500 ms), SDO and memory go on.
+        // The program is stopped; heartbeats (every 500 ms), SDO and memory access continue.
         assert_eq!(read_word(&mut bench, calls), stopped_with);
         let beats: Vec<Time> = bench
             .frames_since(from)
@@ -369,7 +369,7 @@ fn a_breakpoint_stops_the_program_and_not_the_bus() {
         }
         assert_eq!(bench.session().read_text(Address::new(0x100A, 0)).unwrap(), "1.0.0");
         assert_eq!(emergencies(&bench, from), Vec::<Vec<u8>>::new());
-        // It goes on behind the instruction at which it stands, and comes back half a second later.
+        // It continues after the current instruction, and returns half a second later.
         from = bench.time();
         write_word(&mut bench, DEMCR, GO_ON);
         bench.run_ms(300);
@@ -377,7 +377,7 @@ fn a_breakpoint_stops_the_program_and_not_the_bus() {
         assert_eq!(read_word(&mut bench, calls), stopped_with + 1);
         assert_eq!(emergencies(&bench, from), Vec::<Vec<u8>>::new());
     }
-    // Without the breakpoint it runs.
+    // Without the breakpoint the program runs.
     write_word(&mut bench, FP_COMP0, 0);
     write_word(&mut bench, DEMCR, GO_ON);
     let before = read_word(&mut bench, calls);
@@ -387,7 +387,8 @@ fn a_breakpoint_stops_the_program_and_not_the_bus() {
     bench.assert_nothing_unmodelled();
 }
 
-/// The registers of a stopped program lie where `DCRDR` says, and are what it goes on with.
+/// The registers of a stopped program are at the address in `DCRDR`, and the program continues with
+/// them.
 #[test]
 fn registers_are_read_and_changed_and_steps_are_steps() {
     let mut bench = application();
@@ -400,7 +401,8 @@ fn registers_are_read_and_changed_and_steps_are_steps() {
     assert_eq!(read_word(&mut bench, frame + 24), at, "the stacked PC");
     let lr = read_word(&mut bench, frame + 20);
     assert!(firmware::board().programs[0].contains(lr & !1, 2) && lr & 1 == 1, "{lr:08X}");
-    // Step by step up to the return: each time one instruction further, and at last where LR says.
+    // Single steps up to the return: each step one instruction further, and at the end at the
+    // address in LR.
     let mut last = at;
     let mut steps = 0;
     loop {
@@ -420,7 +422,7 @@ fn registers_are_read_and_changed_and_steps_are_steps() {
         }
     }
     assert!(steps >= 4, "{steps}");
-    // Now back to the beginning of the function: the program continues from there, and counts once
+    // Back to the beginning of the function: the program continues from there, and counts once
     // more.
     let before = read_word(&mut bench, calls);
     let frame = {
@@ -436,7 +438,7 @@ fn registers_are_read_and_changed_and_steps_are_steps() {
     assert_eq!(bench.events(), [], "no reset");
 }
 
-/// Whatever runs at the time: `idle`, as a rule.
+/// Breaks in whatever runs at the time, usually `idle`.
 #[test]
 fn a_program_is_stopped_on_request_and_goes_on() {
     let mut bench = application();
@@ -458,8 +460,8 @@ fn a_program_is_stopped_on_request_and_goes_on() {
     assert_eq!(bench.events(), [], "no reset");
 }
 
-/// `idle` sleeps, and what interrupts it has long been due when it goes on: the instruction with
-/// the breakpoint is carried out first nevertheless, and the next one comes next.
+/// `idle` sleeps, and its interrupts are long overdue when it continues: the instruction with the
+/// breakpoint is still executed first, and the next instruction is the next stop.
 #[test]
 fn a_step_over_a_breakpoint_is_not_lost_to_an_interrupt() {
     let mut bench = application();
@@ -478,7 +480,7 @@ fn a_step_over_a_breakpoint_is_not_lost_to_an_interrupt() {
     let half = if next & 2 == 0 { 1 << 30 } else { 1 << 31 };
     write_word(&mut bench, FP_COMP0 + 4, half | next & !3 | 1);
     for round in 0..4 {
-        // Time for the task of `tick` to become due.
+        // Enough time for the task of `tick` to become due.
         bench.run_ms(20);
         for at in [next, wfi] {
             let from = bench.time();
@@ -491,8 +493,8 @@ fn a_step_over_a_breakpoint_is_not_lost_to_an_interrupt() {
     bench.assert_nothing_unmodelled();
 }
 
-/// The interrupt that serves the bus cannot be stopped: breakpoints are off then, it is told, and
-/// everything goes on.
+/// The interrupt that serves the bus cannot be stopped: breakpoints are then disabled, the device
+/// reports it, and everything continues.
 #[test]
 fn a_breakpoint_out_of_reach_harms_nothing() {
     let mut bench = application();
@@ -507,15 +509,15 @@ fn a_breakpoint_out_of_reach_harms_nothing() {
     let before = read_word(&mut bench, calls);
     bench.run_ms(2000);
     assert!(read_word(&mut bench, calls) >= before + 3);
-    // The next one, in reach, works.
+    // The next breakpoint, which is possible, works.
     let at = symbol("debugger_example");
     let from = break_at(&mut bench, at);
     assert_eq!(await_stop(&mut bench, from), stop_of_type(1, at));
     assert_eq!(bench.events(), [], "no reset");
 }
 
-/// A fault that is none of the debugger's restarts the device, as it does without it: here the
-/// program is sent where no code is.
+/// A fault that does not concern the debugger restarts the device, as without the interface: here
+/// the program jumps to an address without code.
 #[test]
 fn a_fault_restarts_the_device_as_ever() {
     let mut bench = application();
@@ -525,7 +527,7 @@ fn a_fault_restarts_the_device_as_ever() {
     let saved = read_word(&mut bench, DCRDR);
     let frame = read_word(&mut bench, saved);
     write_word(&mut bench, frame + 24, 0x6000_0000);
-    // Its answer does not get onto the bus any more.
+    // Its answer no longer reaches the bus.
     assert_eq!(command(&mut bench, 1, DEMCR, 4), None);
     let [a, b, c, d] = GO_ON.to_le_bytes();
     bench.post(0x600 + u16::from(NODE), &[0x23, 0x25, 0x10, 0x04, a, b, c, d]);
@@ -538,7 +540,7 @@ fn a_fault_restarts_the_device_as_ever() {
     assert!(read_word(&mut bench, calls) >= 2);
 }
 
-/// A stopped program is reset, goes back to the bootloader, and neither start stumbles over the
+/// A stopped program is reset, or returns to the bootloader, and neither start is affected by the
 /// breakpoint, which the core keeps over a reset.
 #[test]
 fn a_stopped_program_can_be_reset_and_called_back() {
@@ -567,7 +569,7 @@ fn a_stopped_program_can_be_reset_and_called_back() {
 // --- coflash
 // ---------------------------------------------------------------------------------------------------------
 
-/// The library: what `coflash debug` does, in virtual time.
+/// The library: the functions of `coflash debug`, in virtual time.
 #[test]
 fn the_host_library_sets_breakpoints_and_shows_registers() {
     let mut bench = application();
@@ -590,7 +592,7 @@ fn the_host_library_sets_breakpoints_and_shows_registers() {
     assert_eq!(debugger.break_at(at + 1).unwrap(), Err(NoBreakpoint::Address));
     assert_eq!(debugger.break_at(board.ram.base).unwrap(), Err(NoBreakpoint::Address));
     debugger.break_at(at).unwrap().unwrap();
-    // Set twice, it is one.
+    // A breakpoint that is set twice counts once.
     debugger.break_at(at).unwrap().unwrap();
     assert_eq!(debugger.breakpoints().unwrap(), [at]);
     let at_breakpoint = Some(Stopped { stop: DebugStop::Breakpoint, address: at });
@@ -611,7 +613,7 @@ fn the_host_library_sets_breakpoints_and_shows_registers() {
         assert_eq!(debugger.await_stop(Duration::from_millis(300)).unwrap(), None);
         assert_eq!(word(&mut debugger, calls), counted + 1);
     }
-    // Six there are.
+    // There are six comparators.
     for n in 1..6 {
         debugger.break_at(board.programs[0].end() - 2 * n).unwrap().unwrap();
     }
@@ -619,7 +621,7 @@ fn the_host_library_sets_breakpoints_and_shows_registers() {
     assert!(debugger.clear(at).unwrap() && !debugger.clear(at).unwrap());
     debugger.clear_all().unwrap();
     assert!(debugger.breakpoints().unwrap().is_empty());
-    // It may have come there once more.
+    // The program may have reached it once more.
     debugger.resume().unwrap();
     assert_eq!(debugger.await_stop(second).unwrap(), None);
     debugger.stop().unwrap();
@@ -628,7 +630,7 @@ fn the_host_library_sets_breakpoints_and_shows_registers() {
     debugger.break_at(out_of_reach).unwrap().unwrap();
     let missed = Some(Stopped { stop: DebugStop::OutOfReach, address: out_of_reach });
     assert_eq!(debugger.await_stop(second).unwrap(), missed);
-    // What was left behind does not come back with the next one.
+    // Old comparator values do not return with the next breakpoint.
     debugger.break_at(at).unwrap().unwrap();
     assert_eq!(debugger.breakpoints().unwrap(), [at]);
     assert_eq!(debugger.await_stop(second).unwrap(), at_breakpoint);
@@ -637,7 +639,7 @@ fn the_host_library_sets_breakpoints_and_shows_registers() {
     bench.assert_nothing_unmodelled();
 }
 
-/// Runs `coflash debug`; gives exit code, standard output and standard error.
+/// Runs `coflash debug`; returns exit code, standard output and standard error.
 fn debug(endpoint: &mut Endpoint, words: &[&str]) -> (Option<i32>, String, String) {
     let coflash = std::env::var_os("COBOOT_COFLASH")
         .unwrap_or_else(|| panic!("COBOOT_COFLASH is not set: run the tests by `cargo xtask test`"));
@@ -648,7 +650,7 @@ fn debug(endpoint: &mut Endpoint, words: &[&str]) -> (Option<i32>, String, Strin
     (done.status.code(), text(&done.stdout), text(&done.stderr))
 }
 
-/// The command line as a person types it.
+/// The command line of a user.
 #[test]
 fn coflash_debug_reads_writes_breaks_and_continues() {
     let mut endpoint = Endpoint::new(application());
@@ -673,7 +675,7 @@ fn coflash_debug_reads_writes_breaks_and_continues() {
     let said = done(debug(&mut endpoint, &["step"]));
     assert!(said.starts_with("node 1: stopped at 08"), "{said}");
     assert_eq!(done(debug(&mut endpoint, &["break"])), format!("node 1: breakpoints at {at:08X}h\n"));
-    // Once round: it stops there again, and has counted one.
+    // After one round it stops there again, and has counted one.
     let said = done(debug(&mut endpoint, &["continue", "--wait", "3000"]));
     assert_eq!(said, format!("node 1: stopped at a breakpoint at {at:08X}h\n"));
     let said = done(debug(&mut endpoint, &["read", &calls]));
@@ -696,7 +698,7 @@ fn coflash_debug_reads_writes_breaks_and_continues() {
     assert_eq!(endpoint.bench.events(), [], "no reset");
 }
 
-/// A product's firmware, and a bootloader.
+/// The firmware of a product, and a bootloader.
 #[test]
 fn coflash_debug_tells_what_a_device_lacks() {
     let mut endpoint = Endpoint::new(bootloader());

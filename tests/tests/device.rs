@@ -1,4 +1,4 @@
-//! The device seen from the bus: what it refuses, what it survives, and that it is never silent.
+//! The device on the bus: its refusals, its robustness, and its answer times.
 
 use canopen::program::{FlashError, ProgramControl};
 use canopen::Address;
@@ -17,7 +17,7 @@ const CONTROL: Address = Address::new(0x1F51, 1);
 const STATUS: Address = Address::new(0x1F57, 1);
 const VERSION: Address = Address::new(0x100A, 0);
 
-/// A board in its bootloader, with nothing installed.
+/// A board in its bootloader, without a program.
 fn empty_board() -> Bench {
     let mut bench = Bench::new();
     bench.power_on();
@@ -42,12 +42,12 @@ fn call_back(bench: &mut Bench) {
     bench.await_boot_up(1000);
 }
 
-/// Puts the flash of program 1 aside, to see whether anything touches it.
+/// Saves the flash of program 1, to detect changes.
 fn program_flash(bench: &mut Bench) -> Vec<u8> {
     bench.machine().flash()[(program_start() - firmware::board().chip.flash.base) as usize..].to_vec()
 }
 
-/// Where the flash of program 1 begins.
+/// The address of program 1.
 fn program_start() -> u32 {
     firmware::board().programs[0].base
 }
@@ -69,7 +69,7 @@ fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// Sends a block; gives the abort code and, when all is done, the status.
+/// Sends a block; returns the abort code and the status after all work.
 fn send(bench: &mut Bench, block: &[u8]) -> (Option<u32>, u32) {
     let mut session = bench.session();
     let outcome = session.write(DATA, block, Doing::Block(0), &mut |_| {});
@@ -145,16 +145,15 @@ fn a_transfer_that_breaks_off_does_not_block_the_next_one() {
     let mut bench = empty_board();
     bench.session().command(1, ProgramControl::Clear).unwrap();
     bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
-    // Initiate a segmented download of 24 bytes (21h, size indicated), send one segment, fall
-    // silent.
+    // Initiate a segmented download of 24 bytes (21h, size indicated), send one segment, then
+    // nothing.
     let initiated = bench.ask(REQUEST, &[0x21, 0x50, 0x1F, 0x01, 24, 0, 0, 0], RESPONSE);
     assert_eq!(initiated.as_deref(), Some(&[0x60, 0x50, 0x1F, 0x01, 0, 0, 0, 0][..]));
     let segment = bench.ask(REQUEST, &[0x00, 0, 0, 0, 0, 0, 0, 0], RESPONSE);
     assert_eq!(segment.as_deref(), Some(&[0x20, 0, 0, 0, 0, 0, 0, 0][..]));
-    // Somebody else begins at once, and is served.
+    // Another client begins at once, and gets answers.
     assert_eq!(send(&mut bench, &block(0, 0, &[0; 8])), (None, 0));
-    // Once more, and this time the server's time-out frees the transfer: abort 05040000h for
-    // 1F50h/1.
+    // Again, and this time the server's time-out ends the transfer: abort 05040000h for 1F50h/1.
     bench.ask(REQUEST, &[0x21, 0x50, 0x1F, 0x01, 24, 0, 0, 0], RESPONSE);
     let from = bench.time();
     bench.run_ms(5000);
@@ -164,8 +163,8 @@ fn a_transfer_that_breaks_off_does_not_block_the_next_one() {
     assert_eq!(send(&mut bench, &block(1, program_start(), &firmware::made_up(1000, |_| 7))), (None, 0));
 }
 
-/// The power goes at eleven points of an update: before anything is lost, during the erase, between
-/// blocks, in the middle of one.
+/// The power is cut at eleven points of an update: before anything is lost, during the erase,
+/// between blocks, in the middle of one.
 #[test]
 fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
     let mut untouched = 0;
@@ -173,14 +172,14 @@ fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
         let mut bench = running_board();
         call_back(&mut bench);
         let file = firmware::blocks(firmware::APP_V2);
-        // The host pulls the plug by its own clock: the update is given up at that time, then the
-        // power goes.
+        // The host cuts the power by its own clock: the update is abandoned at that time, then the
+        // power is cut.
         let deadline = bench.time() + Span::from_millis(after_ms);
         let clock = bench.clock();
         let flag = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
         let mut session = bench.session();
         session.cancel_by(std::sync::Arc::clone(&flag));
-        // Without listening first, so that the times are those of the update itself.
+        // Without the initial listening, so that the times are those of the update itself.
         let options = FlashOptions::default().alone(false);
         let outcome = flash(&mut session, &file, &options, &mut |_| {
             if clock.get() >= deadline {
@@ -217,7 +216,7 @@ fn a_trial_run_comes_back_to_the_bootloader_and_an_unsigned_program_does_not_sta
     })
     .unwrap();
     assert!(trial_passed);
-    // It runs, and is called back for what follows.
+    // It runs, and is called back for the next part.
     enter_bootloader(&mut bench.session(), &mut |_| {}).unwrap();
     bench.session().command(1, ProgramControl::ClrSignature).unwrap();
     bench.session().await_idle(1, Doing::Command(ProgramControl::ClrSignature)).unwrap();
@@ -255,8 +254,8 @@ fn the_answer_to_the_call_back_is_on_the_bus_well_before_the_reset() {
     assert!(boot_up.0 > reset);
 }
 
-/// Asks for 1F57h every 7 ms until it is not busy any more; gives the longest that an answer took,
-/// and how many said busy.
+/// Reads 1F57h every 7 ms until it is not busy; returns the longest time until an answer, and the
+/// number of busy values.
 fn slowest_answer(bench: &mut Bench) -> (Span, u32) {
     let mut slowest = Span(0);
     let mut busy = 0;
@@ -273,8 +272,8 @@ fn slowest_answer(bench: &mut Bench) -> (Span, u32) {
     (slowest, busy)
 }
 
-/// While all of the program's flash is being erased: each SDO is answered within 5 ms, and the
-/// heartbeat keeps its period within 10 %.
+/// While the whole flash of the program is erased, each SDO request is answered within 5 ms, and
+/// the heartbeat keeps its period within 10 %.
 #[test]
 fn never_silent_during_an_erase() {
     let mut bench = running_board();
@@ -294,7 +293,7 @@ fn never_silent_during_an_erase() {
         .filter(|(_, id, _)| *id == HEARTBEAT)
         .map(|(at, ..)| at)
         .collect();
-    // Typical erase times (DS8626 table 39 and its like): a second for 128 KiB.
+    // Typical erase times (DS8626 table 39 and similar): a second for 128 KiB.
     let seconds = (firmware::board().programs[0].size / (128 * 1024)) as usize;
     assert!(beats.len() >= seconds, "{beats:?}");
     for pair in beats.windows(2) {
@@ -327,7 +326,7 @@ fn nmt_resets_restart_the_device_or_the_communication() {
     let mut bench = running_board();
     call_back(&mut bench);
     bench.events();
-    // Reset communication (82h) to this node: a boot-up, and no reset of the chip.
+    // Reset communication (82h) to this node: a boot-up message, and no reset of the chip.
     let boot_up = bench.ask(0, &[0x82, NODE], HEARTBEAT);
     assert_eq!(boot_up.as_deref(), Some(&[0][..]));
     assert_eq!(bench.events(), []);
@@ -336,7 +335,8 @@ fn nmt_resets_restart_the_device_or_the_communication() {
     let from = bench.time();
     bench.run_ms(1100);
     assert!(bench.frames_since(from).iter().any(|(_, id, data)| *id == HEARTBEAT && data[..] == [0x7F]));
-    // Reset node (81h) to another node is not for us; to all it is, and then the autostart applies.
+    // Reset node (81h) to another node has no effect; to all nodes it resets the device, and then
+    // the autostart applies.
     bench.post(0, &[0x81, NODE + 1]);
     bench.run_ms(100);
     assert_eq!(bench.events(), []);
@@ -345,8 +345,7 @@ fn nmt_resets_restart_the_device_or_the_communication() {
     assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0");
 }
 
-/// Whatever the RAM holds at power-on (the warm-start cell and the handoff among it), it asks for
-/// nothing.
+/// Noise in the RAM at power-on (including the warm-start cell and the handoff) is not a request.
 #[test]
 fn noise_in_the_ram_is_no_request() {
     let mut installed = running_board();
@@ -361,8 +360,8 @@ fn noise_in_the_ram_is_no_request() {
     }
 }
 
-/// The callgate runs without the bootloader's RAM: all that the application does not use is garbage
-/// when it calls.
+/// The callgate works without the bootloader's RAM: all RAM that the application does not use
+/// contains garbage at the call.
 #[test]
 fn the_callgate_needs_nothing_of_the_bootloaders_ram() {
     let mut bench = running_board();
@@ -371,7 +370,7 @@ fn the_callgate_needs_nothing_of_the_bootloaders_ram() {
     let program = layout.programs[0];
     bench.power_off();
     bench.power_on();
-    // Stop at the application's first instructions, and spoil the RAM that the bootloader was in.
+    // Stop at the application's first instructions, and overwrite the RAM of the bootloader.
     while !program.contains(bench.machine().pc(), 2) {
         let next = bench.time() + Span::from_micros(10);
         bench.world.run_until(next);
@@ -387,16 +386,15 @@ fn the_callgate_needs_nothing_of_the_bootloaders_ram() {
 }
 
 /// The proof of the test above: with eight bytes of code left in flash it fails. The CAN interrupt
-/// goes by way of a jump there, as it would if its handler had not been copied to RAM.
+/// jumps through these bytes, as it would if its handler had not been copied to RAM.
 #[test]
 fn code_left_in_flash_would_not_answer_in_time() {
     let mut bench = running_board();
     call_back(&mut bench);
-    // Behind the bootloader's image, in its own flash. ARMv7-M A7.7.44: ldr.w pc, [pc, #0], and the
-    // address behind it.
+    // After the bootloader's image, in its own flash. ARMv7-M A7.7.44: ldr.w pc, [pc, #0], and the
+    // address after it.
     let stub_address = firmware::board().bootloader.end() - 0x100;
-    // CAN1_TX is interrupt 19 (RM0090 table 61); the table of vectors lies at the beginning of the
-    // RAM.
+    // CAN1_TX is interrupt 19 (RM0090 table 61); the vector table is at the beginning of the RAM.
     let vector = firmware::board().ram.base + (16 + 19) * 4;
     let mut handler = [0; 4];
     bench.machine().read_memory(vector, &mut handler).unwrap();

@@ -1,4 +1,4 @@
-//! The dialects of 1F50h and 1F51h (docs/dialects.md): scripted sessions with the frames of their
+//! The dialects of 1F50h and 1F51h (docs/dialects.md): scripted sessions with the frames from their
 //! documents.
 
 use canopen::program::ProgramControl;
@@ -41,7 +41,7 @@ fn a_master_that_knows_the_boot_loader_of_esacademy() {
     bench.assert_nothing_unmodelled();
 }
 
-/// The boards with room for a set of parameters have the chip of one board.
+/// The boards with a region for a set of parameters have the chip of one board.
 fn lift() -> Option<Bench> {
     if firmware::board().chip != LAYOUT.chip {
         println!("not run: {} has the chip of another board", LAYOUT.board);
@@ -73,14 +73,14 @@ fn write(bench: &mut Bench, node: u8, sub: u8, data: &[u8]) {
     assert_eq!(status.to_word(), 0);
 }
 
-/// CiA 814-1 clause 6.3, and what comes after: the update, the backup of what was stored, and the
-/// way back to the own node-ID.
+/// CiA 814-1 clause 6.3 and the following steps: the update, the backup of the stored data, and the
+/// return to the device's own node-ID.
 #[test]
 fn a_lift_tool() {
     let Some(mut bench) = lift() else { return };
     script::play(&mut bench, "lift.candump");
 
-    // The backup is what was stored, to the byte.
+    // The backup is equal to the stored data.
     let backup = bench.session_with(LIFT).upload(Address::new(0x1F50, 1), &mut |_| {}).unwrap();
     assert_eq!(backup, app(0));
     let parameters: Vec<u8> = (0..5000_u32).map(|i| (i * 7) as u8).collect();
@@ -94,7 +94,7 @@ fn a_lift_tool() {
     bench.await_boot_up_of(NODE, 2000);
     assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
 
-    // The parameters outlive all that.
+    // The parameters survive all of this.
     unlock(&mut bench, NODE);
     bench.post(0, &[0x81, NODE]);
     bench.await_boot_up_of(LIFT, 2000);
@@ -103,8 +103,8 @@ fn a_lift_tool() {
     bench.assert_nothing_unmodelled();
 }
 
-/// A program of another vendor, for another product, or without a label: 08000020h, and the old one
-/// stays.
+/// A program of another vendor, for another product, or without a label: 08000020h, and the old
+/// program stays.
 #[test]
 fn a_lift_takes_what_is_for_it_alone() {
     let Some(mut bench) = lift() else { return };
@@ -143,13 +143,13 @@ fn a_lift_takes_what_is_for_it_alone() {
     }
 }
 
-/// The tool asks node 126 for 1000h every 125 ms, on a bus where nobody else is: the device finds
-/// the bit rate by that and answers within 10 s.
+/// The tool reads 1000h of node 126 every 125 ms, on a bus without other nodes: the device detects
+/// the bit rate from this and answers within 10 s.
 #[test]
 fn a_lift_device_alone_with_the_tool_finds_the_bit_rate() {
     let Some(mut bench) = lift() else { return };
     // By layer setting services of the application (CiA 305): configuration state, bit timing 9 of
-    // table 0 (found out), store.
+    // table 0 (detect), store.
     for (request, answer) in [
         (&[0x04, 0x01, 0, 0, 0, 0, 0, 0], None),
         (&[0x13, 0x00, 0x09, 0, 0, 0, 0, 0], Some(&[0x13, 0, 0, 0, 0, 0, 0, 0][..])),
@@ -157,7 +157,7 @@ fn a_lift_device_alone_with_the_tool_finds_the_bit_rate() {
     ] {
         assert_eq!(bench.ask(0x7E5, request, 0x7E4).as_deref(), answer);
     }
-    // No program: it is voided, so that the device stays.
+    // The program is made invalid, so that the device stays in the bootloader.
     bench.session().write(Address::new(0x2001, 0), &[0], Doing::Block(0), &mut |_| {}).unwrap();
     bench.power_off();
     for rate in [250_000, 10_000, 1_000_000] {

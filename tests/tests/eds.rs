@@ -1,5 +1,4 @@
-//! The EDS files against a checker, an importer and a client that we did not write, and against the
-//! device.
+//! The EDS files against a foreign checker, importer and client, and against the device.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -19,7 +18,7 @@ fn images() -> [Image; 6] {
 /// The board whose files are committed in `docs/eds/`.
 const COMMITTED_BOARD: &str = "stm32f407g-disc1";
 
-/// The file of this board, for programs that take files. Each test has a folder of its own.
+/// The file of this board, for programs that read files. Each test has its own folder.
 fn written(image: &Image, test: &str) -> PathBuf {
     let folder = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("eds-{}-{test}", bsp::LAYOUT.board));
     fs::create_dir_all(&folder).unwrap();
@@ -39,9 +38,9 @@ fn text(output: &Output) -> String {
     format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }
 
-/// dcfchk of dcf-tools: whether it finds no fault, and what it says.
+/// dcfchk of dcf-tools: returns whether it finds no fault, and its output.
 fn dcfchk(eds: &Path) -> (bool, String) {
-    // Installed beside the interpreter, whose name may be a link: it is not resolved.
+    // It is installed beside the interpreter, whose path may be a link and is not resolved.
     let output = Command::new(python().with_file_name("dcfchk")).arg(eds).output().expect("dcfchk starts");
     (output.status.success(), text(&output))
 }
@@ -109,7 +108,7 @@ fn board_with_application() -> Bench {
     bench
 }
 
-/// python-canopen imports the file, reads every value of the device and compares.
+/// python-canopen imports the file, reads every value of the device and compares it.
 fn compare(image: &Image, bench: Bench) {
     let mut endpoint = Endpoint::new(bench);
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/eds_client.py");
@@ -133,7 +132,7 @@ fn python_canopen_finds_the_application_as_its_file_says() {
     compare(&eds::application(), board_with_application());
 }
 
-/// The other direction: the device has nothing that the file does not name.
+/// The other direction: the device has only objects that the file names.
 fn survey(image: &Image, mut bench: Bench) {
     let there: Vec<u16> = (0x1000_u16..0x2000)
         .filter(|index| {
@@ -164,7 +163,7 @@ fn the_application_has_no_object_that_its_file_does_not_name() {
     survey(&eds::application(), board_with_application());
 }
 
-/// A new object is explained where people look for it.
+/// A new object is documented on the page for it.
 #[test]
 fn the_protocol_page_names_every_object() {
     let page = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/protocol.md");
@@ -179,7 +178,7 @@ fn the_protocol_page_names_every_object() {
     }
 }
 
-/// Names and defaults are for the files; on the chip they would be paid for in flash.
+/// Names and defaults are only for the files; on the chip they would take flash.
 #[test]
 fn the_firmware_does_not_carry_the_names() {
     for elf in [firmware::BOOTLOADER, firmware::APP_V1] {

@@ -1,5 +1,5 @@
-//! The flash lock: what a sealed program finds, and what it gets when it tries the keys of flash and
-//! option bytes.
+//! The flash lock: the state that a sealed program finds, and the effect of writing the keys of
+//! flash and option bytes.
 
 use canopen::program::ProgramControl;
 use canopen::Address;
@@ -11,13 +11,13 @@ use coflash::file::sealed::Sealer;
 use emulator::machine::{ResetCause, Stop};
 
 const DATA: Address = Address::new(0x1F50, 1);
-/// The program logs here.
+/// The address of the program's log.
 const OUT: u32 = 0x2000_0000;
 
-/// Runs at 200h of the program's flash. Logs from 2000_0004h on ACTLR, CCR, SHCSR, CFSR, ICSR,
-/// FAULTMASK and PRIMASK as it finds them; confirms itself by the callgate (at 0800_0040h; the
+/// Runs at offset 200h of the program's flash. Logs from 2000_0004h on the values of ACTLR, CCR,
+/// SHCSR, CFSR, ICSR, FAULTMASK and PRIMASK; confirms itself by the callgate (at 0800_0040h; the
 /// answer goes to 2000_002Ch); writes the right keys to FLASH_KEYR and FLASH_OPTKEYR; logs FLASH_CR
-/// and FLASH_OPTCR, and 1 behind them. The handler of HardFault counts at 2000_0000h.
+/// and FLASH_OPTCR, and then 1. The handler of HardFault counts at 2000_0000h.
 #[rustfmt::skip]
 const TRIES_THE_KEYS: &[u16] = &[
     0xF04F, 0x5600,      // 200 start:   mov.w r6, #536870912
@@ -82,10 +82,10 @@ const TRIES_THE_KEYS: &[u16] = &[
     0x2A3B, 0x0819,      // 2A0  .word 0x08192a3b
     0x6E7F, 0x4C5D,      // 2A4  .word 0x4c5d6e7f
 ];
-/// Where the handler is.
+/// The address of the handler.
 const HANDLER: u32 = 0x288;
 
-/// The program as it lies in flash.
+/// The program in flash.
 fn program() -> Vec<u8> {
     let layout = firmware::board();
     let base = layout.programs[0].base;
@@ -97,7 +97,7 @@ fn program() -> Vec<u8> {
     table.iter().flat_map(|word| word.to_le_bytes()).chain(code).collect()
 }
 
-/// What the program has logged.
+/// The program's log.
 struct Log {
     faults: u32,
     /// ACTLR, CCR, SHCSR, CFSR.
@@ -121,7 +121,7 @@ fn installed(mut bench: Bench, file: &[u8]) -> Bench {
     bench
 }
 
-/// Waits for the program, and reads what it has logged since the reset.
+/// Waits for the program, and reads its log since the reset.
 fn log(bench: &mut Bench) -> Log {
     let word = |bench: &mut Bench, at: u32| {
         let mut bytes = [0; 4];
@@ -146,8 +146,8 @@ fn log(bench: &mut Bench) -> Log {
     }
 }
 
-/// RM0090 sections 3.5.1 and 3.6.2: locked until the next reset, and a bus error for every key, the
-/// right ones included. The core's registers are as after a reset (PM0214 section 4.4: CCR has
+/// RM0090 sections 3.5.1 and 3.6.2: locked until the next reset, and a bus error for every key,
+/// even the right one. The core's registers are as after a reset (PM0214 section 4.4: CCR has
 /// STKALIGN, the others are 0).
 #[test]
 fn a_sealed_program_cannot_open_flash_and_option_bytes() {
@@ -159,7 +159,8 @@ fn a_sealed_program_cannot_open_flash_and_option_bytes() {
         assert_eq!(log.masks, [0, 0], "{start}");
         assert_eq!(log.faults, 4, "{start}: a fault for each key");
         assert_eq!(log.locks, [0x8000_0000, 0x0FFF_AAED], "{start}");
-        // Locked: nothing can be stored before the next reset, and asking is no fault.
+        // Locked: nothing can be stored before the next reset, and a request to store causes no
+        // fault.
         assert_eq!(log.callgate, -8, "{start}");
         bench.machine().write_ram(OUT, &[0; 48]).unwrap();
         bench.power_off();
@@ -167,14 +168,14 @@ fn a_sealed_program_cannot_open_flash_and_option_bytes() {
     }
 }
 
-/// Back by a jump: the flash is locked then, and the boot stage makes a reset of it.
+/// Return by a jump: the flash is locked, and the boot stage does a reset.
 #[test]
 fn a_sealed_program_that_jumps_back_can_be_updated() {
     let image = firmware::raw(firmware::APP_V1);
     let file = |counter| sealer(counter).seal(&image, &release()).unwrap();
     let mut bench = installed(board(), &file(COUNTER));
     bench.await_boot_up(2000);
-    // Not fresh any more: 80h is a call.
+    // No longer fresh: 80h is a call.
     bench.power_off();
     bench.power_on();
     bench.await_program(1000);
@@ -194,7 +195,7 @@ fn a_sealed_program_that_jumps_back_can_be_updated() {
     bench.assert_nothing_unmodelled();
 }
 
-/// The manifest says that the application writes the flash itself.
+/// The manifest says that the application writes to flash itself.
 #[test]
 fn a_sealed_program_that_writes_flash_is_not_locked_out() {
     let file = Sealer { writes_flash: true, ..sealer(COUNTER) }.seal(&program(), &release()).unwrap();
@@ -204,7 +205,7 @@ fn a_sealed_program_that_writes_flash_is_not_locked_out() {
     assert_eq!(log.callgate, 0);
 }
 
-/// A device without keys is an open one.
+/// A device without keys is not sealed.
 #[test]
 fn a_program_that_is_not_sealed_is_not_locked_out() {
     let mut bench = installed(open_board(), &program());

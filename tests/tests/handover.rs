@@ -1,4 +1,4 @@
-//! What a program finds when it is jumped to: a chip as after a reset, register by register.
+//! The state of the chip at the jump to a program: as after a reset, register by register.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -13,7 +13,7 @@ use coflash::file::read::{read, Format};
 use coflash::update::steps::release;
 use coflash::update::{flash, FlashOptions};
 
-/// The application template's way back (object 2000h), and that of the three which is a jump.
+/// The application template's return (object 2000h): the value for the jump.
 const REENTRY_PATH: Address = Address::new(0x2000, 0);
 const JUMP: u8 = 2;
 
@@ -31,12 +31,12 @@ const SYST_CSR: u32 = 0xE000_E010;
 const NVIC_ISER: u32 = 0xE000_E100;
 const VTOR: u32 = 0xE000_ED08;
 
-/// What a reset does not set, or sets to what the way to it was: the flags of the reset's cause
-/// (RCC_CSR), and reload and current value of SysTick (ARMv7-M B3.3: unknown).
+/// Registers that a reset does not set, or that depend on the cause of the reset: the flags of the
+/// reset cause (RCC_CSR), and reload and current value of SysTick (ARMv7-M B3.3: unknown).
 const LEFT_OUT: [u32; 3] = [RCC + 0x74, 0xE000_E014, 0xE000_E018];
 
-/// All registers that the emulator models, of peripherals and core, with or without clock. Not what
-/// tells time: the cycle counter lies outside.
+/// All registers that the emulator models, of peripherals and core, with or without clock, except
+/// the cycle counter, which depends on time.
 fn registers(bench: &mut Bench) -> BTreeMap<u32, u32> {
     let addresses = (0x4000_0000..0x4008_0000).chain(0xE000_E000..0xE000_F000).step_by(4);
     addresses
@@ -45,7 +45,7 @@ fn registers(bench: &mut Bench) -> BTreeMap<u32, u32> {
         .collect()
 }
 
-/// Puts an endless loop in the place of a program's first instruction; gives its address.
+/// Replaces a program's first instruction by an endless loop; returns its address.
 fn stop_at_reset_of(bench: &mut Bench, table: u32) -> u32 {
     let mut vector = [0; 4];
     bench.machine().read_memory(table + 4, &mut vector).unwrap();
@@ -54,7 +54,7 @@ fn stop_at_reset_of(bench: &mut Bench, table: u32) -> u32 {
     first
 }
 
-/// The registers in which two chips differ, in words.
+/// The registers that differ between two chips, as text.
 fn differences(found: &BTreeMap<u32, u32>, reset: &BTreeMap<u32, u32>) -> Vec<String> {
     assert_eq!(found.len(), reset.len(), "the same registers are there");
     let differ = found.iter().filter(|(address, value)| reset[address] != **value);
@@ -81,7 +81,7 @@ fn after_a_reset(bench: &mut Bench) -> BTreeMap<u32, u32> {
     registers(bench)
 }
 
-/// An application that jumps leaves everything as a reset does: clocks, pins, peripherals,
+/// An application that jumps restores the state after a reset: clocks, pins, peripherals,
 /// interrupts.
 #[test]
 fn the_bootloader_finds_the_chip_as_after_a_reset() {
@@ -95,8 +95,8 @@ fn the_bootloader_finds_the_chip_as_after_a_reset() {
     assert_eq!(bench.machine().pc(), first);
     let found = registers(&mut bench);
     let reset = after_a_reset(&mut bench);
-    // There was something to put back: the clocks, the controller, a pin, the interrupts, the
-    // timer, the caches.
+    // There was something to restore: the clocks, the controller, a pin, the interrupts, the timer,
+    // the caches.
     for register in [RCC, AHB1ENR, APB1ENR, FLASH_ACR, CAN_MCR, SYST_CSR, NVIC_ISER, VTOR] {
         assert_ne!(running[&register], reset[&register], "{register:08X}");
     }
@@ -105,14 +105,13 @@ fn the_bootloader_finds_the_chip_as_after_a_reset() {
     assert!(differences.is_empty(), "{differences:#?}");
 }
 
-/// And the boot stage, which has looked at the strap and checked the program at full speed, leaves
-/// the same to the application, but for the place of the vector table.
+/// The boot stage, which has read the strap and checked the program at full speed, leaves the same
+/// state to the application, except for the address of the vector table.
 #[test]
 fn the_application_finds_the_chip_as_after_a_reset() {
     let program = firmware::board().programs[0].base;
     let first = program + 0x200;
-    // A program that does nothing: a vector table and a loop. It does nothing to the registers
-    // either.
+    // A program without effects: a vector table and a loop. It does not change any register.
     let mut image = vec![0; 0x400];
     image[..4].copy_from_slice(&firmware::board().ram.end().to_le_bytes());
     image[4..8].copy_from_slice(&(first | 1).to_le_bytes());

@@ -1,5 +1,5 @@
-//! The bootloader's image: what the linker made and what was packed are one, every loader puts it
-//! where it belongs, and one that is damaged in flash does not run.
+//! The bootloader's image: the linker's image and the compressed one are equal, every loader writes
+//! it to the right place, and an image that is damaged in flash does not run.
 
 #[path = "image/gdb.rs"]
 mod gdb;
@@ -20,7 +20,7 @@ use object::{Endianness, Object, ObjectSection};
 use shared_abi::geometry::Region;
 use shared_abi::ram_image::SERVICES_VERSION;
 
-/// Bytes of the header (shared_abi::ram_image, typed again).
+/// The size of the header in bytes (shared_abi::ram_image, typed again).
 const HEADER: usize = 24;
 
 fn words(bytes: &[u8]) -> Vec<u32> {
@@ -31,13 +31,13 @@ fn crc32(bytes: &[u8]) -> u32 {
     Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(bytes)
 }
 
-/// A bootloader as it lies in flash, and where what is in it.
+/// A bootloader in flash, with the places of its parts.
 struct Packed {
-    /// From the start of the flash on.
+    /// The bytes from the start of the flash.
     flash: Vec<u8>,
     /// Offset of the header of the RAM image.
     header: usize,
-    /// What it unpacks to.
+    /// The decompressed image.
     ram: Vec<u8>,
 }
 
@@ -72,24 +72,24 @@ impl Packed {
         words(&self.flash[self.header..self.header + HEADER])[word]
     }
 
-    /// What lies in front of the header.
+    /// The bytes before the header.
     fn front(&self) -> &[u8] {
         &self.flash[..self.header]
     }
 
-    /// What the CRC should be: over the flash without the first two words of the header.
+    /// The correct CRC: of the flash without the first two words of the header.
     fn right_crc(&self) -> u32 {
         crc32(&[self.front(), &self.flash[self.header + 8..]].concat())
     }
 
-    /// Makes the CRC right.
+    /// Corrects the CRC.
     fn seal(&mut self) {
         self.set(CRC, self.right_crc());
     }
 }
 
-/// Takes the address out of the target of each call (`shared_abi::ram_image::Method::Zx0`), as
-/// numbers of 44 bits; gives how many there are.
+/// Removes the address from the target of each call (`shared_abi::ram_image::Method::Zx0`), with
+/// numbers of 44 bits; returns the number of calls.
 fn restore_calls(image: &mut [u8], base: u32) -> usize {
     let (mut at, mut calls) = (0, 0);
     while at + 4 <= image.len() {
@@ -115,7 +115,7 @@ const METHOD: usize = 3;
 const STORED: usize = 4;
 const UNPACKED: usize = 5;
 
-/// With offsets in bytes our reading of the format is that of somebody else's unpacker.
+/// With offsets in bytes, our decoder of the format agrees with a foreign decompressor.
 #[test]
 fn the_format() {
     // Four literals; 5 from two before; one literal; 2 from the last offset; the end.
@@ -135,7 +135,7 @@ fn what_is_packed_is_what_was_linked() {
         assert_eq!([packed.get(SERVICES), packed.get(METHOD)], [SERVICES_VERSION, 1]);
         assert_eq!([packed.get(STORED), packed.get(UNPACKED)], [stored.len() as u32, ram as u32]);
         assert_eq!(packed.get(CRC), packed.right_crc());
-        // By the format's description, with offsets of our own and the calls put back.
+        // By the description of the format, with our own offsets and the calls restored.
         let mut unpacked = zx0::unpack(packed.front(), &stored, zx0::HALF_WORDS).unwrap();
         let calls = restore_calls(&mut unpacked, firmware::board().ram.base);
         assert!(unpacked == packed.ram, "{image}");
@@ -144,7 +144,7 @@ fn what_is_packed_is_what_was_linked() {
     }
 }
 
-/// In flash there are the 16 vectors of the core; the RAM image begins with all of them.
+/// The flash contains the 16 vectors of the core; the RAM image begins with all vectors.
 #[test]
 fn vectors() {
     let board = firmware::board();
@@ -157,7 +157,7 @@ fn vectors() {
     }
     let in_ram = words(&packed.ram[..board.chip.vector_table_size() as usize]);
     assert_eq!(in_ram[..2], in_flash[..2]);
-    // Of the handlers none is in flash, which may be busy. Some interrupts have none.
+    // No handler is in flash, because the flash may be busy. Some interrupts have no handler.
     let handlers: Vec<_> = in_ram[2..].iter().filter(|vector| **vector != 0).collect();
     assert!(handlers.iter().all(|vector| board.ram.contains(**vector & !1, 2)), "{in_ram:x?}");
     assert!(handlers.len() > 80);
@@ -165,8 +165,8 @@ fn vectors() {
     assert_eq!(address, board.ram.base);
 }
 
-/// By the rule of probe-rs: segments with contents, at their physical address, where a section lies
-/// in them.
+/// By the rule of probe-rs: segments with contents, at their physical address, if a section lies in
+/// them.
 #[test]
 fn probe_rs_loads_it() {
     let elf = firmware::elf(firmware::BOOTLOADER);
@@ -192,7 +192,7 @@ fn probe_rs_loads_it() {
     assert!(flash[packed.len()..].iter().all(|byte| *byte == 0xFF));
 }
 
-/// gdb itself, on a stub that has nothing but memory.
+/// gdb itself, connected to a stub that has only memory.
 #[test]
 fn gdb_loads_it_and_finds_symbols_in_ram() {
     let board = firmware::board();
@@ -242,25 +242,25 @@ fn load(bench: &mut Bench, image: &[u8]) {
     bench.machine().load_bin(firmware::board().bootloader.base, image).unwrap();
 }
 
-/// The warm-start cell as a debugger reads it: request and argument, if it is one.
+/// The warm-start cell as a debugger reads it: request and argument, if it is valid.
 fn cell(bench: &Bench) -> Option<(u32, u32)> {
     let mut bytes = [0; 16];
     bench.world.machine(bench.device).read_memory(firmware::board().warm_start.base, &mut bytes).unwrap();
     let [magic, request, argument, check] = words(&bytes)[..] else { unreachable!("16 bytes") };
-    // The fold of the ABI, written again.
+    // The fold of the ABI, implemented again.
     let fold = |fold: u32, word: &u32| (fold.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B1);
     let sound = check == !words(&bytes)[..3].iter().fold(0xC0B0_07A5, fold);
     (magic == u32::from_le_bytes(*b"CBW1") && sound).then_some((request, argument))
 }
 
-/// The request that tells of a damaged image, and its arguments.
+/// The request that reports a damaged image, and its arguments.
 const DAMAGED: u32 = 8;
 const BY_HEADER: u32 = 1;
 const BY_SERVICES: u32 = 2;
 const BY_CRC: u32 = 3;
 const BY_STREAM: u32 = 4;
 
-/// Ways to damage an image, and what the boot stage says of it.
+/// Ways to damage an image, and the boot stage's report.
 fn damages() -> Vec<(&'static str, Packed, u32)> {
     let damaged = |change: &dyn Fn(&mut Packed)| {
         let mut image = Packed::of(firmware::BOOTLOADER);
@@ -282,7 +282,7 @@ fn damages() -> Vec<(&'static str, Packed, u32)> {
         ("one byte less", damaged(&|image| image.set(STORED, image.get(STORED) - 1)), BY_CRC),
         ("a word more in RAM", damaged(&|image| image.set(UNPACKED, image.get(UNPACKED) + 4)), BY_CRC),
         ("the first bit", damaged(&|image| image.stored()[0] ^= 0x80), BY_CRC),
-        // A vector that nobody takes here.
+        // A vector that is not used here.
         ("a bit in front of it", damaged(&|image| image.flash[60] ^= 0x10), BY_CRC),
         (
             "the last bit",
@@ -331,8 +331,8 @@ fn damages() -> Vec<(&'static str, Packed, u32)> {
     ]
 }
 
-/// With a program the device goes on as an application: it runs, the callgate serves it, and who
-/// calls the bootloader gets the application back.
+/// A device with a program continues as an application: it runs, the callgate works, and a call to
+/// the bootloader leads back to the application.
 #[test]
 fn a_damaged_image_does_not_run_and_the_program_does() {
     let mut bench = board_with_a_program();
@@ -351,14 +351,14 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
         // The application reads it through the callgate.
         let crc = bench.session().read_number(Address::new(0x1F56, 1)).unwrap();
         assert_eq!(crc, firmware::blocks(firmware::APP_V1).program_crc(), "{what}");
-        // And it starts as ever, with the cell used up.
+        // It starts as before, with the cell consumed.
         bench.machine().reset_pin();
         bench.await_boot_up(1000);
         assert!(!bench.is_bootloader(NODE), "{what}");
         assert_eq!(cell(&bench), None, "{what}");
         bench.power_off();
     }
-    // Nor does the entry strap keep a program from starting that has no bootloader beside it.
+    // The entry strap does not prevent the start of a program without a working bootloader.
     let (_, image, damage) = damages().swap_remove(0);
     load(&mut bench, &image.flash);
     press(bench.machine(), true);
@@ -378,8 +378,8 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
     assert_eq!(cell(&bench), None);
 }
 
-/// An application that crashes is started again, and the flash is left alone: there is no bootloader
-/// that it could be given up for.
+/// An application that crashes is started again, and the flash is not changed: there is no
+/// bootloader to stay in.
 #[test]
 fn beside_a_damaged_image_a_program_is_not_given_up() {
     let mut bench = board_with_a_program();
@@ -405,8 +405,8 @@ fn beside_a_damaged_image_a_program_is_not_given_up() {
     assert!(parameters(&bench) == before);
 }
 
-/// Without a program there is nothing to run: the chip is reset again and again, which is to be seen
-/// at its NRST pin, and the cell says why.
+/// Without a program nothing can run: the chip resets again and again, which is visible at its NRST
+/// pin, and the cell contains the reason.
 #[test]
 fn a_damaged_image_without_a_program_resets_again_and_again() {
     for (what, image, damage) in damages() {
@@ -421,7 +421,7 @@ fn a_damaged_image_without_a_program_resets_again_and_again() {
                 seen += 1;
             }
         }
-        // A debugger finds it there at nearly any time.
+        // A debugger finds it there at almost any time.
         assert!(seen > 70, "{what}: {seen} times of 80");
         let resets: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
         assert!((3..=6).contains(&resets.len()), "{what}: {} resets in 400 ms", resets.len());
@@ -431,8 +431,8 @@ fn a_damaged_image_without_a_program_resets_again_and_again() {
     }
 }
 
-/// What the boot stage makes of the image, from a power-on that was just now: what it leaves in the
-/// cell about damage, or nothing if the image runs.
+/// The boot stage's result after a power-on: the damage that it reports in the cell, or nothing if
+/// the image runs.
 fn outcome(bench: &mut Bench) -> Option<(u32, u32)> {
     bench.events();
     for _ in 0..200 {
@@ -440,7 +440,7 @@ fn outcome(bench: &mut Bench) -> Option<(u32, u32)> {
         if let Some(damage) = cell(bench).filter(|(request, _)| *request == DAMAGED) {
             return Some(damage);
         }
-        // What runs may be reset by a fault of its own at once.
+        // The running code may be reset at once by its own fault.
         if bench.machine().pc() >= firmware::board().ram.base || !bench.events().is_empty() {
             return None;
         }
@@ -448,8 +448,8 @@ fn outcome(bench: &mut Bench) -> Option<(u32, u32)> {
     panic!("the boot stage does not come to an end");
 }
 
-/// A stream by the format's description: the literals "AB", a copy from so many half-words before,
-/// the end.
+/// A stream by the description of the format: the literals "AB", a copy from this many half-words
+/// before, the end.
 fn one_copy(offset: usize, length: usize) -> Vec<u8> {
     fn number(bits: &mut Vec<bool>, number: usize, inverted: bool) {
         for digit in (0..number.ilog2()).rev() {
@@ -466,7 +466,7 @@ fn one_copy(offset: usize, length: usize) -> Vec<u8> {
     number(&mut bits, length - 1, false);
     bits.push(true);
     number(&mut bits, 256, true);
-    // A byte of bits stands where its first bit is asked for.
+    // A byte of bits is placed where its first bit is read.
     let mut stream = Vec::new();
     for (at, byte) in bits.chunks(8).enumerate() {
         stream.push((0..8).fold(0, |out, i| out << 1 | u8::from(byte.get(i) == Some(&true))));
@@ -481,8 +481,8 @@ fn one_copy(offset: usize, length: usize) -> Vec<u8> {
     stream
 }
 
-/// A copy may come from the flash in front of the header. One from before that is refused, and so is
-/// one that goes on behind it, though the stream ends where it should.
+/// A copy may read from the flash before the header. A copy from before that is refused, and so is
+/// one that continues after it, even if the stream ends correctly.
 #[test]
 fn a_copy_from_in_front_of_the_image() {
     let front = Packed::of(firmware::BOOTLOADER).front().to_vec();
@@ -515,13 +515,13 @@ fn a_copy_from_in_front_of_the_image() {
         let mut found = vec![0; 2 + length];
         bench.machine().read_memory(firmware::board().ram.base, &mut found).unwrap();
         let is_there = unpacked.is_some_and(|unpacked| unpacked == found);
-        // A stream that is refused leaves the literals, and nothing of the copy.
+        // A refused stream leaves the literals, and nothing of the copy.
         assert_eq!(is_there, damage.is_none(), "{length} from {offset}");
         bench.power_off();
     }
 }
 
-/// Zeros are a number without an end, and behind the image there may be more of them.
+/// Zeros are a number without an end, and more zeros may follow the image.
 #[test]
 fn a_number_without_an_end_is_damage() {
     let chip = firmware::board().chip;
@@ -535,8 +535,8 @@ fn a_number_without_an_end_is_damage() {
     assert_eq!(outcome(&mut bench), Some((DAMAGED, BY_STREAM)));
 }
 
-/// The streams that a hostile hand could put there, with a right CRC: whatever they say, the boot
-/// stage writes to the RAM of the image alone, and comes to an end.
+/// Hostile streams with a correct CRC: whatever they contain, the boot stage only writes to the RAM
+/// of the image, and always ends.
 #[test]
 fn no_stream_writes_outside_the_image() {
     let board = firmware::board();
@@ -579,13 +579,13 @@ fn no_stream_writes_outside_the_image() {
             assert!(found == pattern, "round {round} has written behind the image");
             refused += 1;
         }
-        // Else it was a bit of a literal: the stream is whole, and another image runs.
+        // Otherwise it was a bit of a literal: the stream is complete, and another image runs.
         bench.power_off();
     }
     assert!(refused > 80, "{refused}");
 }
 
-/// As the linker makes it, without a CRC: what `cargo build` alone and `--unpacked` give.
+/// The image from the linker, without a CRC: the result of `cargo build` alone and of `--unpacked`.
 #[test]
 fn an_image_that_is_not_packed_runs() {
     let mut image = Packed::of(firmware::BOOTLOADER_LEAST);
@@ -602,7 +602,7 @@ fn an_image_that_is_not_packed_runs() {
     bench.await_boot_up(100);
     assert!(bench.is_bootloader(NODE));
 
-    // One with a CRC is held to it.
+    // An image with a CRC is checked.
     image.seal();
     load(&mut bench, &image.flash);
     bench.power_off();
@@ -616,13 +616,14 @@ fn an_image_that_is_not_packed_runs() {
     assert_eq!(cell(&bench), Some((DAMAGED, BY_CRC)));
 }
 
-/// A fault before the RAM image is there has its handler in flash, by the vectors in flash: it asks
-/// for the bootloader, and resets.
+/// A fault before the RAM image is ready has its handler in flash, by the vectors in flash: it
+/// requests the bootloader and resets.
 #[test]
 fn a_fault_in_the_boot_stage_is_told() {
     let board = firmware::board();
     let mut image = Packed::of(firmware::BOOTLOADER).flash;
-    // The word behind the callgate's table is the boot stage's address. ARMv7-M A7.7.194: udf #0.
+    // The word after the callgate's table is the address of the boot stage. ARMv7-M A7.7.194: udf
+    // #0.
     let at = (board.callgate() - board.bootloader.base) as usize + 16;
     let stage = (words(&image[at..at + 4])[0] & !1) - board.bootloader.base;
     image[stage as usize..][..2].copy_from_slice(&[0x00, 0xDE]);
@@ -637,9 +638,9 @@ fn a_fault_in_the_boot_stage_is_told() {
     assert_eq!(cell(&bench), Some((4, 0)));
 }
 
-/// The way from "call back" to the boot-up message goes by here, and masters wait for an answer
-/// across it: 5 ms at most. A chip with wait states takes 1.3 cycles an instruction (see the
-/// emulator's cpu.rs).
+/// This is a part of the time between "call back" and the boot-up message, during which masters
+/// wait for an answer: 5 ms at most. A chip with wait states takes 1.3 cycles for an instruction
+/// (see the emulator's cpu.rs).
 #[test]
 fn the_image_is_unpacked_within_5_ms() {
     let board = firmware::board();
@@ -648,7 +649,7 @@ fn the_image_is_unpacked_within_5_ms() {
     bench.power_on();
     let from = bench.time();
     let (mut begun, mut done) = (None, None);
-    // By the first word that is there, and the last.
+    // Measured by the first and the last decompressed word.
     let last = packed.ram.len() - 4;
     loop {
         bench.world.run_for(Span::from_micros(10));
@@ -676,6 +677,6 @@ fn the_image_is_unpacked_within_5_ms() {
         all.0 / 1_000_000
     );
     assert!(took.0 / 10 * 13 <= Span::from_millis(5).0, "{} us", took.0 / 1_000_000);
-    // And it was unpacked, which is no matter of microseconds.
+    // It was really decompressed, which takes more than microseconds.
     assert!(took >= Span::from_micros(500));
 }

@@ -1,6 +1,6 @@
-//! The device on its line: node-ID and bit rate by layer setting services, bit rates found by
-//! listening, errors of the bus and how the device comes back from them. Frames are written by hand
-//! from CiA 301 and CiA 305.
+//! The device on its line: node-ID and bit rate by layer setting services, detection of the bit
+//! rate, errors of the bus and the recovery from them. Frames are written by hand from CiA 301 and
+//! CiA 305.
 
 use std::time::Duration;
 
@@ -18,12 +18,12 @@ use emulator::time::{Span, Time};
 const LSS_REQUEST: u16 = 0x7E5;
 const LSS_RESPONSE: u32 = 0x7E4;
 
-/// A board in its bootloader, with nothing installed.
+/// A board in its bootloader, without a program.
 fn empty_board() -> Bench {
     let mut bench = Bench::complete();
     bench.power_on();
     bench.await_boot_up(100);
-    // The emergency behind the boot-up.
+    // The emergency after the boot-up message.
     bench.run_ms(5);
     bench
 }
@@ -34,7 +34,7 @@ fn restart(bench: &mut Bench) {
     bench.power_on();
 }
 
-/// An LSS request that has an answer.
+/// An LSS request with an answer.
 #[track_caller]
 fn lss(bench: &mut Bench, request: [u8; 8]) -> [u8; 8] {
     let answer = bench.ask(LSS_REQUEST, &request, LSS_RESPONSE).expect("an answer");
@@ -45,7 +45,7 @@ fn configuration_state(bench: &mut Bench) {
     bench.post(LSS_REQUEST, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
 }
 
-/// Configures, stores, and says nothing else.
+/// Configures and stores the settings, without other changes.
 fn store(bench: &mut Bench, node: u8, rate: BitRate) {
     configuration_state(bench);
     assert_eq!(lss(bench, [0x11, node, 0, 0, 0, 0, 0, 0]), [0x11, 0, 0, 0, 0, 0, 0, 0]);
@@ -53,7 +53,7 @@ fn store(bench: &mut Bench, node: u8, rate: BitRate) {
     assert_eq!(lss(bench, [0x17, 0, 0, 0, 0, 0, 0, 0]), [0x17, 0, 0, 0, 0, 0, 0, 0]);
 }
 
-/// Whether a node said its boot-up since then, and when.
+/// Whether a node has sent its boot-up message since then, and the time of it.
 fn boot_up(bench: &Bench, node: u8, since: Time) -> Option<Time> {
     let id = 0x700 + u32::from(node);
     let said = |frame: &&(Time, u32, Vec<u8>)| frame.1 == id && frame.2 == [0];
@@ -88,7 +88,7 @@ fn stored_node_id_and_bit_rate_serve_bootloader_and_application_after_a_reset() 
     flash(&mut session(&mut bench, 42), &file, &FlashOptions::default().trial_run(false), &mut |_| {})
         .unwrap();
     assert!(boot_up(&bench, 42, from).is_some());
-    // And the application tells the same by LSS.
+    // The application reports the same by LSS.
     configuration_state(&mut bench);
     assert_eq!(lss(&mut bench, [0x5E, 0, 0, 0, 0, 0, 0, 0]), [0x5E, 42, 0, 0, 0, 0, 0, 0]);
     bench.assert_nothing_unmodelled();
@@ -117,7 +117,7 @@ fn every_bit_rate_of_the_table_is_served_and_the_others_are_refused() {
     }
     let mut bench = empty_board();
     configuration_state(&mut bench);
-    // 800 kbit/s: 42 MHz is no multiple of it, 40 MHz is. Index 10 and table 1 are nobody's.
+    // 42 MHz is not a multiple of 800 kbit/s, 40 MHz is. Index 10 and table 1 are undefined.
     let unserved = (!bsp::CAN_CLOCK.is_multiple_of(800_000)).then_some((0, 1));
     for (table, index) in unserved.into_iter().chain([(0, 10), (0, 255), (1, 4)]) {
         let request = [0x13, table, index, 0, 0, 0, 0, 0];
@@ -132,7 +132,7 @@ fn a_device_without_node_id_is_silent_until_it_gets_one() {
     restart(&mut bench);
     let from = bench.time();
     bench.run_ms(3000);
-    // NMT and SDO are for nodes.
+    // NMT and SDO need a node-ID.
     bench.post(0x000, &[0x81, 0]);
     bench.post(0x000, &[0x01, 0]);
     bench.post(0x600 + u16::from(NODE), &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]);
@@ -165,12 +165,12 @@ fn a_bit_rate_is_activated_after_the_delay() {
     bench.set_host_bit_rate(1_000_000);
     assert!(bench.time() - asked >= Span::from_millis(100));
     bench.run_ms(250);
-    // Stored it was not, and the device did not start anew.
+    // It was not stored, and the device did not restart.
     assert!(is_bootloader(&mut bench.session()));
     assert_eq!(boot_up(&bench, NODE, asked), None);
 }
 
-/// What a device does that is to find out its bit rate: how long until it says its boot-up.
+/// A device that must detect its bit rate: the time until its boot-up message.
 fn found_after(bench: &mut Bench, within_ms: u64) -> Option<Span> {
     let from = bench.time();
     for _ in 0..within_ms / 10 {
@@ -189,7 +189,7 @@ fn finds_the_bit_rate_of_a_bus_with_traffic_and_disturbs_nobody() {
         store(&mut bench, NODE, BitRate::Auto);
         restart(&mut bench);
         bench.set_host_bit_rate(rate);
-        // Another node of that bus acknowledges; the host talks every 20 ms.
+        // Another node of that bus acknowledges; the host sends every 20 ms.
         bench.world.add_host_port(rate);
         let from = bench.time();
         for i in 0..250 {
@@ -215,7 +215,7 @@ fn finds_the_bit_rate_of_a_bus_where_it_is_alone_with_the_master() {
         let from = bench.time();
         bench.run_ms(2000);
         assert!(bench.frames_since(from).is_empty(), "a word before it knows the bit rate");
-        // One request, which nobody acknowledges at first.
+        // One request, which no node acknowledges at first.
         bench.post(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]);
         assert!(found_after(&mut bench, 5000).is_some(), "{rate} bit/s not found");
         assert!(is_bootloader(&mut bench.session()));
@@ -250,7 +250,7 @@ fn the_boot_up_of_the_bootloader_is_followed_by_an_emergency() {
         bench.run_ms(20);
         bench
     };
-    // Device specific, no error in the register, "BOOT", and why: no program.
+    // Device specific, no error in the register, "BOOT", and the reason: no program.
     assert_eq!(emergencies(&bench, Time::default()), [[0x00, 0xFF, 0, b'B', b'O', b'O', b'T', 6]]);
 }
 
@@ -258,18 +258,19 @@ fn the_boot_up_of_the_bootloader_is_followed_by_an_emergency() {
 fn comes_back_from_bus_off_with_growing_patience_and_tells() {
     let mut bench = empty_board();
     let device = bench.device.node();
-    // Whatever the device sends is destroyed: 32 attempts make it bus-off.
+    // Every frame of the device is destroyed: after 32 attempts it is bus-off.
     let mine = FrameMatch { from: Some(device), ..FrameMatch::default() };
     bench.world.inject(Fault { frames: mine, when: When::Always, action: FaultAction::Disturb });
     let from = bench.time();
     bench.post(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]);
     bench.run_ms(4000);
     let bursts = bursts(&bench, from, device);
-    // Each return ends in bus-off again, and each pause is longer than the one before.
+    // Each recovery ends in bus-off again, and each pause is longer than the previous one.
     assert!((3..=6).contains(&bursts.len()), "{bursts:?}");
     let pauses: Vec<Span> = bursts.windows(2).map(|pair| pair[1].0 - pair[0].1).collect();
     assert!(pauses.windows(2).all(|pair| pair[1] > pair[0]), "{pauses:?}");
-    // An error passive node waits a little longer between attempts; 32 make it bus-off in any case.
+    // An error passive node waits a little longer between attempts; after 32 it is bus-off in any
+    // case.
     assert!(bursts.iter().all(|burst| burst.2 == 32), "{bursts:?}");
 
     bench.world.clear_faults();
@@ -279,12 +280,12 @@ fn comes_back_from_bus_off_with_growing_patience_and_tells() {
     assert!(told.iter().any(|bytes| bytes[..3] == [0x40, 0x81, 0x11]), "{told:02X?}");
     assert_eq!(told.last().unwrap()[..3], [0x00, 0x00, 0x00], "and it is over: {told:02X?}");
     assert!(is_bootloader(&mut bench.session()));
-    // 1003h remembers: newest first.
+    // 1003h, newest first.
     let history = bench.ask(0x601, &[0x40, 0x03, 0x10, 1, 0, 0, 0, 0], 0x581).unwrap();
     assert_eq!(history[..6], [0x43, 0x03, 0x10, 1, 0x40, 0x81]);
 }
 
-/// Attempts of a node, as bursts: first start, last end, how many.
+/// The attempts of a node, as bursts: first start, last end, number.
 fn bursts(bench: &Bench, from: Time, node: usize) -> Vec<(Time, Time, u32)> {
     let mut bursts: Vec<(Time, Time, u32)> = Vec::new();
     for record in bench.records() {
@@ -307,7 +308,7 @@ fn error_passive_is_told_and_its_end_too() {
     let mut bench = empty_board();
     let device = bench.device.node();
     let mine = FrameMatch { from: Some(device), ..FrameMatch::default() };
-    // 16 errors and a few: passive, not off.
+    // 16 errors and a few more: error passive, not bus-off.
     let rule = bench.world.inject(Fault { frames: mine, when: When::Always, action: FaultAction::Disturb });
     let from = bench.time();
     bench.post(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]);
@@ -317,7 +318,7 @@ fn error_passive_is_told_and_its_end_too() {
     bench.world.clear_faults();
     bench.run_ms(50);
     assert_eq!(emergencies(&bench, from)[0][..3], [0x20, 0x81, 0x11]);
-    // Each frame that gets through takes one off the counter; heartbeats do in time.
+    // Each successful frame decreases the counter by one; the heartbeats do so in time.
     for _ in 0..64 {
         bench.ask(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0], 0x581).unwrap();
     }
@@ -329,7 +330,7 @@ fn error_passive_is_told_and_its_end_too() {
 fn a_damaged_block_is_told_by_an_emergency_and_the_next_good_one_ends_it() {
     let mut bench = empty_board();
     let from = bench.time();
-    // A control block of 8 zero bytes, with a CRC that does not belong to it.
+    // A control block of 8 zero bytes with a wrong CRC.
     let mut block = [0; 24];
     block[8] = 8;
     let address = canopen::Address::new(0x1F50, 1);
@@ -339,7 +340,7 @@ fn a_damaged_block_is_told_by_an_emergency_and_the_next_good_one_ends_it() {
     assert_eq!(emergencies(&bench, from), [[0x00, 0x63, 0x81, 0x06, 1, 0, 0, 0]]);
     let register = bench.ask(0x601, &[0x40, 0x01, 0x10, 0, 0, 0, 0, 0], 0x581).unwrap();
     assert_eq!(register[4], 0x81);
-    // Twice: that erases, and succeeds.
+    // Twice: this erases, and succeeds.
     bench.session().command(1, canopen::program::ProgramControl::Clear).unwrap();
     bench.session().command(1, canopen::program::ProgramControl::Clear).unwrap();
     bench.session().await_idle(1, doing).unwrap();
@@ -349,7 +350,7 @@ fn a_damaged_block_is_told_by_an_emergency_and_the_next_good_one_ends_it() {
 
 #[test]
 fn frames_lost_in_a_flood_are_told_once() {
-    // It computes a CRC over 64 KiB in one step, without the chip's unit: frames are lost meanwhile.
+    // It computes a CRC of 64 KiB in one step, without the chip's unit: frames are lost meanwhile.
     let mut bench = Bench::of_image(firmware::BOOTLOADER_CRC_16);
     bench.power_on();
     bench.await_boot_up(100);
@@ -362,8 +363,8 @@ fn frames_lost_in_a_flood_are_told_once() {
     let data = Address::new(0x1F50, 1);
     bench.session().write(data, &image, Doing::Block(0), &mut |_| {}).unwrap();
     let from = bench.time();
-    // Until it is verified, a flood of the shortest frames that it lets in: NMT commands without
-    // data, which are nobody's.
+    // Until the verification ends, a flood of the shortest frames that pass its filters: NMT
+    // commands without data, which are invalid.
     let flood = bench.world.add_host_port(1_000_000);
     for _ in 0..20 {
         for _ in 0..500 {
@@ -380,7 +381,7 @@ fn frames_lost_in_a_flood_are_told_once() {
         lost.iter().all(|bytes| matches!((bytes[5], bytes[6]), (0x20, 0) | (0, 0x10) | (0x20, 0x10))),
         "{lost:02X?}"
     );
-    // The abort of the block, which nobody has taken yet.
+    // The abort of the block, which was not read yet.
     while bench.receive(Duration::ZERO).unwrap().is_some() {}
     assert!(is_bootloader(&mut bench.session()));
 }

@@ -1,5 +1,4 @@
-//! What the bootloader tells whoever ports it, by each of its ways, and that a release tells
-//! nothing.
+//! The bootloader's log for developers of ports, in each of its forms; and a release has no log.
 
 use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE};
@@ -10,7 +9,7 @@ use emulator::defmt::Decoder;
 use emulator::peripheral::Peripheral;
 use object::{Object, ObjectSection, ObjectSymbol};
 
-/// The images that tell, with who listens to each.
+/// The images with a log, and the reader of each.
 fn ways() -> [(&'static str, Listener); 3] {
     [
         (firmware::BOOTLOADER_LOG_RTT, Listener::probe()),
@@ -57,8 +56,8 @@ fn it_tells_why_it_stayed_what_it_refuses_and_that_it_leaves() {
     }
 }
 
-/// Without a probe nobody takes the lines away, and a UART is slower than the bus: what finds no
-/// room is left out, and the device goes on.
+/// Without a probe the lines are not read, and a UART is slower than the bus: lines without room
+/// are left out, and the device continues.
 #[test]
 fn nobody_waits_for_who_reads_it() {
     for (image, mut listener) in ways() {
@@ -68,15 +67,15 @@ fn nobody_waits_for_who_reads_it() {
         bench.await_boot_up(100);
         bench.set_host_bit_rate(125_000);
         for _ in 0..100 {
-            // Two lines of some 40 characters, which a UART needs 7 ms for.
+            // Two lines of about 40 characters, which take 7 ms on a UART.
             bench.post(0x600 + u16::from(NODE), &[0x2F, 0x51, 0x1F, 0x01, 0x7F, 0, 0, 0]);
             bench.run_ms(2);
         }
         bench.run_ms(200);
         let lines = listener.told(&mut bench);
-        // 202 were said; a kibibyte of text holds some 25 of them, of frames 150.
+        // 202 lines were logged; a kibibyte holds about 25 of them as text, and 150 as frames.
         assert!((20..190).contains(&lines.len()), "{}", lines.len());
-        // None of them is cut.
+        // None of them is truncated.
         let whole = |line: &String| {
             line.len() > 9 && line.split_at(line.len() - 9).1.bytes().skip(1).all(|c| c.is_ascii_hexdigit())
         };
@@ -86,8 +85,8 @@ fn nobody_waits_for_who_reads_it() {
     }
 }
 
-/// The UART is served from RAM: what is said while a sector is erased is on the line at once, and
-/// the erase holds nothing up.
+/// The UART is served from RAM: a line during the erase of a sector is sent at once, and the erase
+/// does not wait.
 #[test]
 fn the_uart_speaks_while_the_flash_erases() {
     let mut bench = Bench::of_image(firmware::BOOTLOADER_LOG_UART);
@@ -122,7 +121,7 @@ fn the_uart_speaks_while_the_flash_erases() {
     assert_eq!(bench.machine().counters().flash_stalls, 0);
 }
 
-/// A viewer that is given the wrong ELF file, or gets into the middle of a frame.
+/// A viewer with the wrong ELF file, or one that starts in the middle of a frame.
 #[test]
 fn frames_that_mean_nothing_are_told_as_such() {
     let mut decoder = decoder(firmware::BOOTLOADER_LOG_DEFMT);

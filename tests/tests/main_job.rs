@@ -1,4 +1,4 @@
-//! The main job, with the real images on the emulated chip: flash, start, call back, flash again,
+//! The main job, with the built images on the emulated chip: flash, start, call back, flash again,
 //! survive a power cut.
 
 use canopen::Address;

@@ -1,5 +1,5 @@
-//! Masters that know CiA 302-3 and not coboot update a device whose program runs: the sequences of
-//! requests of Zephyr's runner and of Lely's NMT master, with their timing.
+//! Masters that support CiA 302-3 and do not know coboot update a device with a running program:
+//! the sequences of requests of Zephyr's runner and of Lely's NMT master, with their timing.
 
 use std::time::Duration;
 
@@ -11,10 +11,10 @@ use coboot_tests::masters::{lely, zephyr, Master};
 use coboot_tests::node::NodeBus;
 use coflash::update::{flash, FlashOptions};
 
-/// Applications that a running device may have.
+/// The applications that run on the device.
 const APPLICATIONS: [&str; 2] = [firmware::APP_V1, firmware::APP_C];
 
-/// Which bit rate the bench has.
+/// The index of the bench's bit rate.
 fn board_at(rate: BitRate, bits: u32, image: &str) -> Bench {
     let mut bench = Bench::new();
     if rate != BitRate::K125 {
@@ -43,7 +43,7 @@ fn crc32(bytes: &[u8]) -> u32 {
     })
 }
 
-/// The whole procedure, from one application to the next, confirmed in the end: the device runs the
+/// The whole procedure, from one application to the next, confirmed at the end: the device runs the
 /// new program, and starts it by itself.
 #[test]
 fn zephyrs_runner_updates_and_confirms_a_running_device() {
@@ -78,15 +78,15 @@ fn lelys_master_updates_a_running_device() {
     }
 }
 
-/// A program as far as a bootloader looks at one: initial stack pointer in RAM, reset vector inside,
-/// Thumb bit set.
+/// The part of a program that a bootloader checks: initial stack pointer in RAM, reset vector
+/// inside, Thumb bit set.
 fn program(first: u8) -> Vec<u8> {
     let mut bytes = vec![first; 20 * 1024];
     bytes[..8].copy_from_slice(&[0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x01, 0x08]);
     bytes
 }
 
-/// Both against `coboot-node`, whose stand-in answers for the program.
+/// Both against `coboot-node` with its stand-in for the program.
 #[test]
 fn both_masters_update_a_node_without_a_chip() {
     let mut node = NodeBus::new("masters");
@@ -103,7 +103,8 @@ fn both_masters_update_a_node_without_a_chip() {
     assert_eq!((done.repeated, done.stop_answered), (0, true));
 }
 
-/// From the request to its answer, as a client sees it; the bootloader has sent its boot-up before.
+/// From the request to its answer, as a client sees it; the bootloader sends its boot-up message
+/// before.
 #[test]
 fn stop_and_clear_are_answered_by_the_bootloader_within_25_ms() {
     for image in APPLICATIONS {
@@ -116,7 +117,7 @@ fn stop_and_clear_are_answered_by_the_bootloader_within_25_ms() {
             assert!(took <= Duration::from_millis(25), "{image}, {command}: {took:?}");
             bench.run_ms(2);
             let frames = bench.frames_since(from);
-            // The emergency that tells of the bootloader may come in between: its identifier is lower.
+            // The emergency of the bootloader may come in between: its identifier is lower.
             let frames = frames.iter().filter(|(_, id, _)| *id != 0x80 + u32::from(NODE));
             let of_node: Vec<_> = frames.map(|(_, id, data)| (*id, &data[..])).collect();
             let expected: [(u32, &[u8]); 3] = [
@@ -130,16 +131,17 @@ fn stop_and_clear_are_answered_by_the_bootloader_within_25_ms() {
     }
 }
 
-/// At every bit rate: the device needs the same few milliseconds, and the rest is frames on the wire:
-/// request, boot-up, emergency and answer. From 50 kbit/s on that is within 25 ms.
+/// At every bit rate, the device needs the same few milliseconds, and the rest is the time of the
+/// frames on the wire: request, boot-up message, emergency and answer. From 50 kbit/s on the sum is
+/// at most 25 ms.
 #[test]
 fn stop_is_answered_as_soon_as_the_wire_allows_at_every_bit_rate() {
-    /// The longest frames with 8, 1, 8 and 8 bytes, stuff bits and the space behind them included
-    /// (CiA 301 has 11-bit identifiers: 47 bits and the data, a stuff bit behind each 4 of 34 and the
-    /// data).
+    /// The longest frames with 8, 1, 8 and 8 bytes, including stuff bits and the following
+    /// intermission (CiA 301 uses 11-bit identifiers: 47 bits and the data, and a stuff bit after
+    /// each 4 of 34 bits and the data).
     const BITS: u32 = 3 * (47 + 64 + (34 + 64 - 1) / 4) + 47 + 8 + (34 + 8 - 1) / 4;
     const DEVICE: Duration = Duration::from_millis(15);
-    // Not 800 kbit/s, which the clocks of these boards cannot make.
+    // Not 800 kbit/s, which these boards' clocks do not support.
     let rates = [BitRate::K10, BitRate::K20, BitRate::K50, BitRate::K250, BitRate::K500, BitRate::K1000];
     for rate in rates {
         let bits = rate.bits_per_second().unwrap();

@@ -1,5 +1,5 @@
-//! What a product may put together: each dialect with each log, with CAN over UART, with LSS, HEX
-//! and two programs. The sessions of `tests/expected` are played on the board with two programs,
+//! The possible combinations of a product: each dialect with each log, with CAN over UART, with
+//! LSS, HEX and two programs. The sessions of `tests/expected` run on the board with two programs,
 //! which has room for all of them.
 
 use canopen::program::ProgramControl;
@@ -17,7 +17,7 @@ use coflash::update::{flash, FlashOptions};
 use emulator::time::{Span, Time};
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
 
-/// A dialect: what its images are called, what it plays, and the node-ID of its device.
+/// A dialect: the names of its images, its session, and the node-ID of its device.
 struct Dialect {
     name: &'static str,
     session: &'static str,
@@ -32,7 +32,7 @@ const DIALECTS: [Dialect; 4] = [
     LIFT,
 ];
 
-/// A board with this bootloader, switched on; none where the tests are for another chip.
+/// A running board with this bootloader; none if the tests run for another chip.
 fn board(bootloader: &str) -> Option<Bench> {
     if firmware::board().chip != LAYOUT.chip {
         println!("not run: {} has the chip of another board", LAYOUT.board);
@@ -45,12 +45,12 @@ fn board(bootloader: &str) -> Option<Bench> {
     Some(bench)
 }
 
-/// An image for CAN.
+/// An image with CAN.
 fn image(name: &str) -> String {
     firmware::of_board(LAYOUT.board, name)
 }
 
-/// The one for UART in its place.
+/// The image with UART in its place.
 fn serial_image(name: &str) -> String {
     let name = match name {
         firmware::APP_V1 => "app-virtual-can.elf",
@@ -64,8 +64,8 @@ fn write(session: &mut Session, index: u16, sub: u8, data: &[u8]) {
     session.write(Address::new(index, sub), data, Doing::Block(0), &mut |_| {}).unwrap();
 }
 
-/// Plays the session of a dialect. A lift device has to be one that runs: `application` is what it
-/// gets first.
+/// Runs the session of a dialect. A lift device must have a running application: it first gets
+/// `application`.
 fn play(wire: &mut dyn Wire, dialect: &Dialect, application: &str, image: &dyn Fn(&str) -> String) {
     if dialect.name == LIFT.name {
         let program =
@@ -80,7 +80,7 @@ fn play(wire: &mut dyn Wire, dialect: &Dialect, application: &str, image: &dyn F
     play_on(wire, dialect.session, &LAYOUT, image);
 }
 
-/// Each dialect tells by each log, and its session is what it is without.
+/// Each dialect writes each kind of log, and its session is the same as without a log.
 fn logs(way: &str, listener: impl Fn(&str) -> Listener) {
     for dialect in &DIALECTS {
         let name = format!("bootloader-log-{way}{}", dialect.name);
@@ -90,7 +90,7 @@ fn logs(way: &str, listener: impl Fn(&str) -> Listener) {
         let told = listener.told(&mut bench);
         assert_eq!(told.first().map(String::as_str), Some("stayed in the bootloader; why 00000006"));
         play(&mut bench, dialect, "app-lift.elf", &image);
-        // A session ends in the application or in the bootloader, which then tells what it refuses.
+        // A session ends in the application or in the bootloader, which then logs its refusal.
         if bench.is_bootloader(dialect.node) {
             listener.told(&mut bench);
             // 1F51h/1 = 7Fh (CiA 301 section 7.2.4.3.3: expedited, one byte).
@@ -118,8 +118,8 @@ fn each_dialect_tells_a_terminal() {
     logs("uart", |_| Listener::terminal());
 }
 
-/// CAN over UART: the same sessions, and nothing on the CAN bus. A UART has no bit rate to be found
-/// out, and no arbitration; none of the sessions has either.
+/// CAN over UART: the same sessions, and no frame on the CAN bus. A UART has no bit rate to detect,
+/// and no arbitration; no session uses either.
 #[test]
 fn each_dialect_plays_its_session_over_uart() {
     for dialect in &DIALECTS {
@@ -135,7 +135,7 @@ fn each_dialect_plays_its_session_over_uart() {
 fn a_lift_takes_hex_and_a_set_of_parameters_and_speaks_lss() {
     let Some(mut bench) = board("bootloader-lift") else { return };
     play_on(&mut bench, "lift_lss_hex.candump", &LAYOUT, &image);
-    // What was stored of the text is the image.
+    // The received text was stored as the image.
     let mut session = bench.session();
     write(&mut session, 0x6005, 1, shared_abi::LIFT_PASSWORD);
     session.command(1, ProgramControl::ResetStat).unwrap();
@@ -155,7 +155,7 @@ fn the_boot_loader_of_esacademy_has_two_programs() {
 }
 
 /// Bit timing 9 of table 0 (CiA 305), stored: the device without a program listens, and answers a
-/// master that is alone with it, under the node-ID of this dialect.
+/// single master under the node-ID of this dialect.
 #[test]
 fn the_boot_loader_of_esacademy_finds_the_bit_rate() {
     let Some(mut bench) = board("bootloader-esacademy") else { return };
@@ -177,7 +177,7 @@ fn the_boot_loader_of_esacademy_finds_the_bit_rate() {
             answer.as_deref() == Some(&[0x43, 0x00, 0x10, 0, 0x54, 0x4F, 0x4F, 0x42])
         });
         assert!(answered, "{rate} bit/s: no answer within 10 s");
-        // The way to a program is open at this rate: "INIT".
+        // A program can be downloaded at this rate: "INIT".
         let password = [0x23, 0x50, 0x7F, 0x02, 0x54, 0x49, 0x4E, 0x49];
         let from = bench.time();
         bench.post(0x640, &password);
@@ -190,7 +190,7 @@ fn the_boot_loader_of_esacademy_finds_the_bit_rate() {
     bench.assert_nothing_unmodelled();
 }
 
-/// The interface shows what was made of the text.
+/// The interface shows the data decoded from the text.
 #[test]
 fn a_bootloader_with_the_debugger_takes_hex() {
     let Some(mut bench) = board("bootloader-debugger") else { return };
@@ -200,7 +200,7 @@ fn a_bootloader_with_the_debugger_takes_hex() {
     session.command(1, ProgramControl::Clear).unwrap();
     write(&mut session, 0x1F50, 1, intel_hex(base, &program).as_bytes());
     assert_eq!(session.await_idle(1, Doing::Block(0)).unwrap().to_word(), 0);
-    // 1025h/1: read 64 bytes of the program; 1025h/4: they are these.
+    // 1025h/1: read 64 bytes of the program; 1025h/4 returns them.
     let [a, b, c, d] = base.to_le_bytes();
     write(&mut session, 0x1025, 1, &[0, 0, 64, 0, a, b, c, d]);
     let seen = session.upload(Address::new(0x1025, 4), &mut |_| {}).unwrap();
@@ -212,8 +212,8 @@ fn a_bootloader_with_the_debugger_takes_hex() {
 }
 
 /// A product with CRC-16: `coflash convert --crc16` makes its files. A file with the other CRC is
-/// refused by its first block (CRC, 06h), 1F56h reads 16 bits, and the boot stage finds the program
-/// good.
+/// refused at its first block (CRC, 06h), 1F56h reads 16 bits, and the boot stage accepts the
+/// program.
 #[test]
 fn a_product_with_crc_16_is_updated_by_block_file() {
     use coflash::file::block_file::Checksum;
@@ -237,14 +237,15 @@ fn a_product_with_crc_16_is_updated_by_block_file() {
     coflash::update::steps::release(&mut session, 1, &mut |_| {}).unwrap();
     assert_eq!(session.read_number(Address::new(0x1F56, 1)).unwrap(), crc);
 
-    // Nobody confirmed it yet: boot-up of the bootloader, and that of the program 300 ms later.
+    // It is not confirmed yet: boot-up message of the bootloader, and of the program 300 ms later.
     bench.power_off();
     bench.run_ms(10);
     bench.power_on();
     bench.await_boot_up(100);
     bench.await_boot_up(400);
     assert!(!bench.is_bootloader(NODE));
-    // Called back, it is confirmed; START, and the next power-on is the program's alone.
+    // Called back, it is confirmed; after START, and after the next power-on, only the program
+    // sends a boot-up message.
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(500);
     assert!(bench.is_bootloader(NODE));
@@ -258,7 +259,7 @@ fn a_product_with_crc_16_is_updated_by_block_file() {
     assert!(!bench.is_bootloader(NODE));
     assert_eq!(bench.session().read_number(Address::new(0x1F56, 1)).unwrap(), crc);
 
-    // One bit of it, and the boot stage finds it out.
+    // The boot stage detects one changed bit.
     bench.power_off();
     let at = LAYOUT.programs[0].base + 0x1000;
     let byte = bench.machine().flash()[(at - LAYOUT.chip.flash.base) as usize];

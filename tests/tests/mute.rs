@@ -1,5 +1,5 @@
-//! A program that never answers: it is not released for autostart, and one that was released by force
-//! is caught in its rescue window. The built firmware, in virtual time.
+//! A program that never answers: it is not released for autostart, and if it was released by force,
+//! it is caught in its rescue window. The built firmware, in virtual time.
 
 use std::time::Duration;
 
@@ -16,10 +16,10 @@ use coflash::Error;
 
 /// A jump to itself, in Thumb.
 const HERE: [u8; 2] = [0xFE, 0xE7];
-/// For so long nobody has power while it is knocked already.
+/// The time without power at the beginning, while the host already sends requests.
 const DARK: Duration = Duration::from_millis(2345);
 
-/// A vector table, and a reset handler that does nothing for ever.
+/// A vector table, and a reset handler with an endless loop.
 fn mute() -> BlockFile {
     let program = firmware::board().programs[0].base;
     let mut image = vec![0; 0x400];
@@ -47,7 +47,7 @@ fn fails(bench: &mut Bench, options: &FlashOptions) -> (Error, Left) {
     (error.unwrap_err(), left.expect("how it was left"))
 }
 
-/// A bench whose boards get power at this time, while somebody knocks.
+/// A bench with boards that get power at this time, while the host sends requests.
 struct Later<'b> {
     bench: &'b mut Bench,
     on: Option<Duration>,
@@ -85,7 +85,7 @@ impl Adapter for Later<'_> {
     }
 }
 
-/// Switches the board off, begins to knock, and switches it on.
+/// Switches the board off, starts the requests, and switches the board on.
 fn caught(bench: &mut Bench, options: CatchOptions) -> Caught {
     bench.power_off();
     bench.run_ms(100);
@@ -120,8 +120,9 @@ fn a_mute_program_that_was_released_by_force_is_caught_in_its_rescue_window() {
         let (error, left) = fails(&mut bench, &FlashOptions::default().trial_run(false));
         assert!(matches!(error, Error::StartFailed { running: None, .. }), "{error}");
         assert_eq!((left.state, left.look), (DeviceState::Released, Look::Silent));
-        // It starts by itself: behind a power-on nobody answers. The first one is held back by what the
-        // host's controller still has to send, as nobody has acknowledged it.
+        // It starts by itself: after a power-on nothing answers. The first start is delayed by the
+        // frames that the host's controller still has to send, because no node has acknowledged
+        // them.
         for _ in 0..2 {
             bench.power_off();
             bench.run_ms(100);
@@ -131,7 +132,7 @@ fn a_mute_program_that_was_released_by_force_is_caught_in_its_rescue_window() {
         assert!(bench.session().device_type().unwrap().is_none(), "the program runs");
         let caught = caught(&mut bench, options);
         assert_eq!(caught.node.map(canopen::NodeId::get), Some(NODE));
-        // It stays, however long nobody asks.
+        // It stays, also after a long time without requests.
         bench.run_ms(5000);
         assert!(bench.is_bootloader(NODE));
         bench.assert_nothing_unmodelled();

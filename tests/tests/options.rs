@@ -1,6 +1,6 @@
-//! The options of a product that are not its default: node-ID and bit rate by switches, COB-IDs of its
-//! own, no boot-up message, layer setting services that begin in configuration state and store nothing,
-//! an erasure at once, and a pin that says whether a program is valid.
+//! Options of a product that differ from the default: node-ID and bit rate by switches, other
+//! COB-IDs, no boot-up message, layer setting services that start in configuration state and store
+//! nothing, an immediate erase, and a pin that shows whether a program is valid.
 
 use canopen::program::ProgramControl;
 use canopen::BitRate;
@@ -11,8 +11,8 @@ use coflash::device::{Doing, Session, Timing};
 use coflash::update::{flash, FlashOptions};
 use emulator::time::Time;
 
-/// Pins of port E that the product `switches` reads: the node-ID on 8 to 14, the bit rate's index on
-/// 4 to 7.
+/// Pins of port E that the product `switches` reads: the node-ID on 8 to 14, the index of the bit
+/// rate on 4 to 7.
 fn set_switches(bench: &mut Bench, node: u8, rate: BitRate) {
     let pins = u16::from(node) << 8 | (rate as u16) << 4;
     for pin in 4..15 {
@@ -20,7 +20,7 @@ fn set_switches(bench: &mut Bench, node: u8, rate: BitRate) {
     }
 }
 
-/// A device with these switches, switched on and listened to at 500 kbit/s.
+/// A running device with these switches, on a bus with 500 kbit/s.
 fn switched_on(node: u8, rate: BitRate) -> Bench {
     let mut bench = Bench::of_image(firmware::BOOTLOADER_SWITCHES);
     bench.set_host_bit_rate(500_000);
@@ -30,8 +30,8 @@ fn switched_on(node: u8, rate: BitRate) -> Bench {
     bench
 }
 
-/// A request of 1000h on 680h and the node-ID is answered on 480h and the node-ID, and the predefined
-/// COB-IDs are nobody's.
+/// A request for 1000h on 680h plus the node-ID is answered on 480h plus the node-ID, and the
+/// predefined COB-IDs are unused.
 #[test]
 fn node_id_bit_rate_and_cob_ids_are_the_products() {
     for (node, rate) in [(2, BitRate::K500), (42, BitRate::K500), (100, BitRate::K500)] {
@@ -43,7 +43,7 @@ fn node_id_bit_rate_and_cob_ids_are_the_products() {
         assert_eq!(answer.unwrap(), [0x43, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x10]);
         assert_eq!(bench.ask(0x600 + u16::from(node), &request, 0x580 + id), None);
         bench.run_ms(1000);
-        // The heartbeat is there, and says PRE-OPERATIONAL.
+        // The heartbeat is sent, with state PRE-OPERATIONAL.
         assert!(bench
             .frames_since(Time::default())
             .iter()
@@ -52,8 +52,8 @@ fn node_id_bit_rate_and_cob_ids_are_the_products() {
     }
 }
 
-/// A bit rate out of the product's range (1 Mbit/s; 20 kbit/s) and switches that are none stand for the
-/// board's 125 kbit/s; a node-ID that is none waits for LSS, and says so.
+/// A bit rate outside the product's range (1 Mbit/s; 20 kbit/s) and invalid switches select the
+/// board's 125 kbit/s; with an invalid node-ID the device waits for LSS, and announces it.
 #[test]
 fn switches_out_of_range_stand_for_the_boards() {
     for index in [0, 7, 15] {
@@ -68,17 +68,18 @@ fn switches_out_of_range_stand_for_the_boards() {
         assert!(answer.is_some(), "index {index}: at 125 kbit/s");
     }
     let bench = switched_on(0, BitRate::K500);
-    // 50h, "non-configured slave" (CiA 305): what the product announces in place of the boot-up.
+    // 50h, "non-configured slave" (CiA 305): the product's announcement in place of the boot-up
+    // message.
     let announced = bench.frames_since(Time::default());
     assert_eq!(announced.len(), 1, "{announced:x?}");
     assert_eq!((announced[0].1, announced[0].2[0]), (0x7E4, 0x50));
 }
 
-/// Layer setting services start in configuration state, give a node-ID, and store nothing.
+/// Layer setting services start in configuration state, set a node-ID, and store nothing.
 #[test]
 fn lss_starts_in_configuration_and_stores_nothing() {
     let mut bench = switched_on(42, BitRate::K500);
-    // 5Eh: inquire node-ID, without having been selected.
+    // 5Eh: inquire node-ID, without a selection.
     let answer = bench.ask(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0], 0x7E4).unwrap();
     assert_eq!(answer[..2], [0x5E, 42]);
     // 17h: store configuration; 1: storing is not supported.
@@ -86,7 +87,7 @@ fn lss_starts_in_configuration_and_stores_nothing() {
     assert_eq!(answer[..2], [0x17, 1]);
 }
 
-/// A signed program starts while PC0 is high alone; CLEAR of this product erases at once.
+/// A released program only starts while PC0 is high; CLEAR of this product erases at once.
 #[test]
 fn a_pin_says_whether_a_program_is_valid() {
     let mut bench = switched_on(42, BitRate::K500);
@@ -112,7 +113,7 @@ fn a_pin_says_whether_a_program_is_valid() {
     bench.run_ms(600);
     assert!(bench.ask(0x6AA, &request, 0x4AA).is_some());
     assert!(!restart(&mut bench, true), "high: behind the rescue window the program runs");
-    // The first CLEAR already leaves nothing of the program.
+    // The first CLEAR erases the whole program.
     bench.power_off();
     bench.machine().set_pin('C', 0, Some(false));
     bench.power_on();
@@ -127,7 +128,7 @@ fn a_pin_says_whether_a_program_is_valid() {
     assert!(bench.machine().flash()[at..at + 4096].iter().all(|byte| *byte == 0xFF));
 }
 
-/// The page of the choices has every field of the struct, and no other.
+/// The page of the choices describes every field of the struct, and no other.
 #[test]
 fn the_page_has_every_choice() {
     let source = include_str!("../../bootloader/src/product.rs");

@@ -13,7 +13,7 @@ use emulator::bus::Outcome;
 
 const NODES: [u8; 3] = [10, 11, 12];
 
-/// The script at work on the endpoint; gives what it said.
+/// Runs the script on the endpoint; returns its output.
 fn master(endpoint: &mut Endpoint, arguments: &[&str]) -> String {
     let python = env::var_os("COBOOT_PYTHON")
         .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
@@ -27,8 +27,8 @@ fn master(endpoint: &mut Endpoint, arguments: &[&str]) -> String {
     said
 }
 
-/// Three devices come without node-ID, are found by fastscan and get node-ID and bit rate; after
-/// the power was off they are a bus at that bit rate, on which one is updated.
+/// Three devices without node-ID are found by fastscan and get node-ID and bit rate; after a
+/// power-off they form a bus at that bit rate, on which one is updated.
 #[test]
 fn python_canopen_commissions_three_devices_and_works_with_them() {
     let mut bench = Bench::of_boards(3);
@@ -37,7 +37,7 @@ fn python_canopen_commissions_three_devices_and_works_with_them() {
         boards.into_iter().map(|board| bench.commission(board, 0xFF, BitRate::K125)).collect();
     bench.power_on();
     let mut endpoint = Endpoint::new(bench);
-    // 800 kbit/s (index 1) where the clock is no multiple of it; index 10 is nobody's.
+    // 800 kbit/s (index 1) if the clock is not a multiple of it; index 10 is undefined.
     let refused = if bsp::CAN_CLOCK.is_multiple_of(800_000) { "10" } else { "1" };
     let said = master(&mut endpoint, &["commission", "--refused-bit-rate", refused]);
     // Fastscan finds the lowest number first.
@@ -68,7 +68,7 @@ fn python_canopen_commissions_three_devices_and_works_with_them() {
         let running = session.device_type().unwrap().expect("an answer");
         assert_eq!(running.is_bootloader(), *node != 12, "node {node}");
     }
-    // But for a frame that was on its way when the power went.
+    // Except for a frame that was being sent when the power was cut.
     let mut disturbed = bench.records();
     disturbed.retain(|record| record.outcome != Outcome::Good && !(record.start..=record.end).contains(&off));
     assert!(disturbed.is_empty(), "nobody disturbed anybody: {disturbed:?}");

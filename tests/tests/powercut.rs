@@ -24,14 +24,14 @@ fn no_cut_bricks_the_device_or_starts_half_a_program() {
     assert!(points > 20_000, "{points}");
 }
 
-/// By a power cut, and in the scenario that is there for it: a scenario that fails anyhow would
-/// prove nothing about cuts.
+/// By a power cut, and in the scenario for this bug: a scenario that fails anyway would prove
+/// nothing about cuts.
 #[test]
 fn a_cut_shows_every_seeded_bug_where_it_should() {
     for bug in Bug::ALL {
         let (name, within) = match bug {
             Bug::SignatureBeforeData | Bug::EraseBeforeInvalidating => ("update", "is not what it says"),
-            // CLEAR alone costs nothing: a cut in it leaves the old program.
+            // CLEAR alone loses nothing: a cut in it leaves the old program.
             Bug::EraseBeforeCheck => ("update", "Bootloader, where [Runs(163)] may be"),
             Bug::JournalWithoutCrc | Bug::CompactionInPlace => ("compaction", ", where "),
             Bug::BlankAtFirstSight => ("update", "the recovery does not complete: status 00000008h"),
@@ -46,8 +46,8 @@ fn a_cut_shows_every_seeded_bug_where_it_should() {
     }
 }
 
-/// What is refused in time costs no flash operation, so there is nothing to cut; an erase ahead of
-/// the check is seen at once.
+/// A refusal in time needs no flash operation, so there is nothing to cut; an erase before the
+/// check is detected at once.
 #[test]
 fn a_program_for_another_product_costs_nothing() {
     let scenario = scenario("wrong-product");

@@ -10,7 +10,7 @@ fn no_cut_of_the_sample_bricks_the_board_or_starts_half_a_program() {
     let told: Vec<_> = report.told.iter().map(|(point, what)| format!("{point}: {what}")).collect();
     assert_eq!(report.violations, 0, "\n{}", told.join("\n"));
     assert!(report.operations > 1000 && report.points >= 40, "{report:?}");
-    // Nothing lost yet, something lost, and all there: the sample has seen each.
+    // Nothing lost yet, something lost, and all complete: the sample has met each state.
     assert_eq!(report.outcomes.len(), 3, "{:?}", report.outcomes);
 }
 

@@ -1,6 +1,6 @@
-//! 1F51h of a running device: what is answered by whom, what happens between an answer and the reset,
-//! and what 80h means to a program that has just been downloaded. For the application in Rust and the
-//! one in C alike.
+//! 1F51h of a running device: the sender of each answer, the time between an answer and the reset,
+//! and the meaning of 80h for a program that was just downloaded. For the applications in Rust and
+//! C.
 
 use canopen::program::ProgramControl;
 use coboot_tests::bench::{
@@ -24,7 +24,7 @@ fn running_board(image: &str) -> Bench {
     bench
 }
 
-/// When the chip was reset, once.
+/// The time of the chip's single reset.
 fn reset(bench: &mut Bench) -> Time {
     let events = bench.events();
     let [(at, Stop::Reset(_))] = events[..] else { panic!("{events:?}") };
@@ -43,8 +43,8 @@ fn power_cycle(bench: &mut Bench) {
     bench.power_on();
 }
 
-/// Requests of every kind that come in the 10 ms between the answer and the reset are served; what
-/// none is gets none. Each acknowledged command has its 10 ms.
+/// All kinds of requests during the 10 ms between the answer and the reset are answered; frames
+/// that are not requests are not. Each acknowledged command has its 10 ms.
 #[test]
 fn requests_between_the_answer_and_the_reset_are_served() {
     for image in APPLICATIONS {
@@ -52,12 +52,12 @@ fn requests_between_the_answer_and_the_reset_are_served() {
             let mut bench = running_board(image);
             let from = bench.time();
             assert_eq!(bench.ask(REQUEST, &control(leaving), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
-            // What is no request, and what is for somebody else.
+            // Frames that are not requests, or are for other nodes.
             bench.post(REQUEST, &[0x40, 0, 0x10]);
             bench.post(REQUEST, &[0x80, 0, 0x10, 0, 0, 0, 0, 0]);
             bench.post(REQUEST + 1, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]);
             bench.post(0x000, &[0x81, NODE + 1]);
-            // Start remote node: the state changes, and the heartbeat would tell.
+            // Start remote node: the state changes, and the heartbeat would show it.
             bench.post(0x000, &[0x01, NODE]);
             let read = bench.ask(REQUEST, &[0x40, 0, 0x10, 0, 0, 0, 0, 0], RESPONSE);
             assert_eq!(read.as_deref(), Some(&[0x43, 0, 0x10, 0, 0, 0, 0, 0][..]), "{image}");
@@ -77,8 +77,8 @@ fn requests_between_the_answer_and_the_reset_are_served() {
     }
 }
 
-/// 80h, again and again: each is acknowledged, the reset comes 10 ms behind the last one, and somebody
-/// who never stops does not keep the device.
+/// Repeated 80h: each is acknowledged, the reset comes 10 ms after the last one, and a client that
+/// never stops does not delay the device for ever.
 #[test]
 fn a_call_in_quick_succession_is_acknowledged_each_time() {
     for image in APPLICATIONS {
@@ -106,12 +106,12 @@ fn a_call_in_quick_succession_is_acknowledged_each_time() {
     }
 }
 
-/// The second master's command comes while the first one's is being carried out.
+/// The second master's command arrives while the first one's is being carried out.
 #[test]
 fn two_masters_are_both_answered() {
     for image in APPLICATIONS {
-        // STOP or CLEAR behind the answer to 80h: the first has its 10 ms, the second its answer by the
-        // bootloader within 25 ms.
+        // STOP or CLEAR after the answer to 80h: the first has its 10 ms, the second is answered by
+        // the bootloader within 25 ms.
         for second in [0x00, 0x03] {
             let mut bench = running_board(image);
             let from = bench.time();
@@ -127,8 +127,8 @@ fn two_masters_are_both_answered() {
             assert!(reset(&mut bench) - answers[0].0 >= Span::from_millis(10), "{image}, {second}");
             assert!(bench.is_bootloader(NODE), "{image}");
         }
-        // Whoever was promised the bootloader gets it, although somebody restarts the device: by 2 of
-        // 1F51h, and by NMT reset node.
+        // A client that was promised the bootloader gets it, even if another one restarts the
+        // device: by 2 of 1F51h, and by NMT reset node.
         for nmt in [false, true] {
             let mut bench = running_board(image);
             assert_eq!(bench.ask(REQUEST, &control(0x80), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
@@ -143,12 +143,12 @@ fn two_masters_are_both_answered() {
     }
 }
 
-/// A heartbeat that is on its way is not cut off by a departure at once, and no half frame disturbs
-/// the bus.
+/// A heartbeat that is being sent is not cut off by an immediate departure, and no incomplete frame
+/// disturbs the bus.
 #[test]
 fn a_frame_on_its_way_is_not_cut_off() {
     for image in APPLICATIONS {
-        // The request at many distances to the heartbeat, over more than a frame's time.
+        // The request at many distances from the heartbeat, over more than the time of a frame.
         for offset in 0..8 {
             let mut bench = running_board(image);
             let next = loop {
@@ -160,7 +160,7 @@ fn a_frame_on_its_way_is_not_cut_off() {
                 }
             };
             let before = bench.records().len();
-            // The request takes 1 ms on the bus; the heartbeat begins about then.
+            // The request takes 1 ms on the bus; the heartbeat begins at about this time.
             let asked = Time(next.0 - Span::from_micros(2000 - 250 * offset).0);
             bench.world.run_until(asked);
             bench.post(REQUEST, &control(0x00));
@@ -177,8 +177,8 @@ fn a_frame_on_its_way_is_not_cut_off() {
     }
 }
 
-/// The answer is an application's where the bootloader could not take its place: the sub-index does
-/// not exist, the value does not, or it is another's to do.
+/// The application answers if the bootloader could not answer in its place: the sub-index or the
+/// value does not exist, or the command concerns another program.
 #[test]
 fn what_the_application_can_refuse_it_refuses_itself() {
     for image in APPLICATIONS {
@@ -198,11 +198,11 @@ fn what_the_application_can_refuse_it_refuses_itself() {
     }
 }
 
-/// CLEAR in the application is CLEAR in the bootloader: its refusal, too, is the bootloader's. Here
-/// 1F50h is locked by a password (ESAcademy).
+/// CLEAR in the application is CLEAR in the bootloader: a refusal also comes from the bootloader.
+/// Here 1F50h is locked by a password (ESAcademy).
 #[test]
 fn a_clear_that_the_bootloader_refuses_is_aborted_by_it() {
-    /// What a boot loader of ESAcademy has where nobody has told another one.
+    /// The default of a boot loader of ESAcademy.
     const ESACADEMY: u8 = 64;
     let (request, answer) = (0x600 + u16::from(ESACADEMY), 0x580 + u32::from(ESACADEMY));
     for image in APPLICATIONS {
@@ -213,7 +213,7 @@ fn a_clear_that_the_bootloader_refuses_is_aborted_by_it() {
         let password = [0x23, 0x50, 0x7F, 1, b'T', b'I', b'N', b'I'];
         assert_eq!(bench.ask(request, &password, answer).unwrap()[0], 0x60);
         raw_download(&mut bench, ESACADEMY, image);
-        // It starts what it has taken.
+        // It starts the downloaded program.
         bench.run_ms(2000);
         assert!(!bench.is_bootloader(ESACADEMY));
         let clear = bench.ask(request, &control(0x03), answer);
@@ -225,8 +225,8 @@ fn a_clear_that_the_bootloader_refuses_is_aborted_by_it() {
     }
 }
 
-/// A client that writes a byte in segments has its answer in the segment's end, which only the
-/// application can acknowledge: STOP is a call back, CLEAR is refused.
+/// The answer to a client that writes a byte in segments is the end of the segment, which only the
+/// application can acknowledge: STOP is a call, CLEAR is refused.
 #[test]
 fn commands_in_segments_are_answered_by_the_application() {
     let initiate = [0x21, 0x51, 0x1F, 1, 1, 0, 0, 0];
@@ -240,13 +240,13 @@ fn commands_in_segments_are_answered_by_the_application() {
     }
 }
 
-/// A warm-start cell with an owed answer that is damaged asks for nothing, and nothing is sent. One
-/// that is whole and asks for what there is not gets the abort that 1F51h gives for it; one of another
-/// node is not answered in its place.
+/// A damaged warm-start cell with an owed answer is not a request, and nothing is sent. A valid one
+/// with an impossible command gets the abort of 1F51h for it; a command for another node gets no
+/// answer.
 #[test]
 fn an_owed_answer_in_a_damaged_cell_is_not_sent() {
     let magic = u32::from_le_bytes(*b"CBW1");
-    // The fold of the ABI, written again.
+    // The fold of the ABI, implemented again.
     let check = |words: [u32; 3]| {
         let fold = |fold: u32, word: &u32| (fold.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B1);
         !words.iter().fold(0xC0B0_07A5_u32, fold)
@@ -282,7 +282,7 @@ fn an_owed_answer_in_a_damaged_cell_is_not_sent() {
         let sent: Vec<_> = answers(&bench, from).into_iter().map(|(_, data)| data).collect();
         assert_eq!(sent, answer.into_iter().collect::<Vec<_>>(), "{what}");
         assert_eq!(bench.is_bootloader(NODE), stays, "{what}");
-        // Used up: the next reset starts the program.
+        // Consumed: the next reset starts the program.
         bench.machine().reset_pin();
         bench.await_boot_up(1000);
         bench.run_ms(RESCUE_WINDOW_MS + 100);
@@ -291,7 +291,7 @@ fn an_owed_answer_in_a_damaged_cell_is_not_sent() {
     }
 }
 
-/// Downloads an application in one go, by the segments of any client.
+/// Downloads an application in one transfer, by the segments of any client.
 fn raw_download(bench: &mut Bench, node: u8, image: &str) {
     let mut session = bench.session_with(node);
     session.transfer_by(coflash::device::Transfers::Segments);
@@ -301,7 +301,7 @@ fn raw_download(bench: &mut Bench, node: u8, image: &str) {
     let _ = session.await_idle(1, doing);
 }
 
-/// A board whose program was downloaded in one go, and started.
+/// A board with a program that was downloaded in one transfer and started.
 fn fresh_board(image: &str) -> Bench {
     let mut bench = Bench::new();
     bench.power_on();
@@ -315,12 +315,12 @@ fn fresh_board(image: &str) -> Bench {
     bench
 }
 
-/// The first 80h confirms it; the second one calls it back.
+/// The first 80h confirms it; the second one calls the bootloader.
 #[test]
 fn the_first_80h_to_a_fresh_program_confirms_it() {
     for image in APPLICATIONS {
         let mut bench = fresh_board(image);
-        // Whatever else is asked before: it stays fresh.
+        // After any other request it stays fresh.
         bench.post(0x000, &[0x80, NODE]);
         assert_eq!(bench.session().read_number(canopen::Address::new(0x1F51, 1)).unwrap(), 1);
         assert_eq!(bench.ask(REQUEST, &control(0x01), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
@@ -333,7 +333,7 @@ fn the_first_80h_to_a_fresh_program_confirms_it() {
     }
 }
 
-/// What was confirmed by 80h is so for good: it starts without a rescue window.
+/// A confirmation by 80h is permanent: the program starts without a rescue window.
 #[test]
 fn a_program_that_80h_has_confirmed_has_no_rescue_window() {
     for image in APPLICATIONS {
@@ -355,8 +355,8 @@ fn a_program_that_80h_has_confirmed_has_no_rescue_window() {
     }
 }
 
-/// Fresh is what was started right behind its download: not behind a power-off, an NMT reset or a
-/// restart by 2, not in a trial run of block files, not when it was signed by 83h before.
+/// A program is fresh if it was started directly after its download: not after a power-off, an NMT
+/// reset or a restart by 2, not in a trial run of block files, not after a release by 83h.
 #[test]
 fn every_other_80h_is_a_call() {
     type Step = fn(&mut Bench);
@@ -384,7 +384,7 @@ fn every_other_80h_is_a_call() {
             bench.await_boot_up(1000);
             assert!(bench.is_bootloader(NODE), "{image}, {what}");
         }
-        // A trial run of our own dialect: blocks, START, 80h, signature.
+        // A trial run of our own dialect: blocks, START, 80h, release.
         let mut bench = Bench::new();
         bench.power_on();
         bench.await_boot_up(100);
@@ -392,7 +392,7 @@ fn every_other_80h_is_a_call() {
         let began = bench.time();
         flash(&mut bench.session(), &firmware::blocks(image), &options, &mut |_| {}).unwrap();
         assert!(bench.time() - began < Span::from_millis(3000), "{image}: nobody was asked twice");
-        // Signed by SYS TEC's command behind a download in one go.
+        // Released by SYS TEC's command after a download in one transfer.
         bench.session().command(1, ProgramControl::StartBootloader).unwrap();
         bench.await_boot_up(1000);
         for value in [0x03, 0x83] {
@@ -411,8 +411,8 @@ fn every_other_80h_is_a_call() {
     }
 }
 
-/// A confirmation that cannot be stored is told by an abort (06060000h, hardware), and does not shut
-/// the way back: the next 80h is a call.
+/// A confirmation that cannot be stored is reported by an abort (06060000h, hardware), and does not
+/// prevent the return: the next 80h is a call.
 #[test]
 fn a_confirmation_that_fails_is_told_and_leaves_the_way_back_open() {
     for image in APPLICATIONS {
@@ -435,7 +435,7 @@ fn a_confirmation_that_fails_is_told_and_leaves_the_way_back_open() {
     }
 }
 
-/// The host tool's call, when the first one confirmed.
+/// The call of the host tool, when the first one was a confirmation.
 #[test]
 fn coflash_calls_a_fresh_program_back() {
     for image in APPLICATIONS {

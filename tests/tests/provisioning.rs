@@ -1,4 +1,4 @@
-//! Which of the built bootloaders gets keys: the one for sealed images, and no other.
+//! Which of the built bootloaders accepts keys: only the one for sealed images.
 
 use coboot_tests::firmware;
 use coflash::file::sealed::provision::{provision, ProvisionFault};

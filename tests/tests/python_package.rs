@@ -1,5 +1,5 @@
-//! The Python package (`python/`): its wheel is built and installed as a user has it, and its own
-//! tests are run against `coboot-node` over TCP; and it updates the emulated sealed board.
+//! The Python package (`python/`): its wheel is built and installed like a user's, its own tests
+//! run against `coboot-node` over TCP, and it updates the emulated sealed board.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -36,20 +36,20 @@ fn folder(name: &str) -> PathBuf {
     path
 }
 
-/// The one file in a folder.
+/// The only file in a folder.
 fn only(folder: &Path) -> PathBuf {
     let files: Vec<_> = fs::read_dir(folder).unwrap().map(|file| file.unwrap().path()).collect();
     let [file] = files.as_slice() else { panic!("{files:?}") };
     file.clone()
 }
 
-/// The package as a user has it, in a folder of its own.
+/// The package as a user has it, in its own folder.
 static PACKAGE: LazyLock<PathBuf> = LazyLock::new(|| {
     let wheels = folder("python-wheels");
     let maturin = ["-m", "maturin", "build", "--profile", "dev", "--manifest-path"];
     done(python().args(maturin).arg(source().join("Cargo.toml")).arg("--out").arg(&wheels));
     let wheel = only(&wheels);
-    // One for every Python from 3.9 on.
+    // One wheel for every Python from 3.9 on.
     let name = wheel.file_name().unwrap().to_string_lossy().into_owned();
     assert!(name.starts_with("coflash-") && name.contains("-cp39-abi3-"), "{name}");
 
@@ -67,7 +67,7 @@ fn source() -> PathBuf {
     root().join("python")
 }
 
-/// A python that has the package.
+/// A Python with the package.
 fn with_package() -> Command {
     let mut python = python();
     python.current_dir(&*PACKAGE).env("PYTHONPATH", &*PACKAGE).env("PYTHONDONTWRITEBYTECODE", "1");
@@ -89,7 +89,7 @@ fn the_wheel_is_built_installed_and_passes_its_tests() {
     assert!(said.contains(" passed") && !said.contains("skipped"), "{said}");
 }
 
-/// What a test bench would write: one line for each file, with the error's number.
+/// The script of a test bench: one line for each file, with the number of the error.
 const SEALED: &str = "
 import sys, coflash
 bus, *files = sys.argv[1:]
@@ -101,7 +101,7 @@ for file in files:
         print(f'{error.number:#010x}: {error.what}')
 ";
 
-/// A sealed device takes the genuine file and refuses another, by the number of 1F57h.
+/// A sealed device accepts the valid file and refuses another one with its number in 1F57h.
 #[test]
 fn a_sealed_device_is_updated_from_python() {
     let mut bench = sealed_board::board();
@@ -111,12 +111,12 @@ fn a_sealed_device_is_updated_from_python() {
     let image = firmware::raw(firmware::APP_V1);
     let genuine = sealed_board::sealer(sealed_board::COUNTER).seal(&image, &sealed_board::release()).unwrap();
     let mut flipped = genuine.clone();
-    // In the hash of the image, which the signature covers.
+    // In the image, whose hash the signature covers.
     flipped[50] ^= 1;
     let folder = folder("python-sealed");
     let mut python = with_package();
     python.args(["-c", SEALED]).arg(endpoint.url());
-    // A bad signature makes the device wait, so that one comes last.
+    // A bad signature makes the device wait, so it comes last.
     for (name, bytes) in [("genuine.cbs", &genuine), ("flipped.cbs", &flipped)] {
         let path = folder.join(name);
         fs::write(&path, bytes).unwrap();

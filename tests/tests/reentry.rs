@@ -1,4 +1,4 @@
-//! From the application back into the bootloader, and what the application may ask of it.
+//! The return from the application to the bootloader, and the application's requests.
 
 use canopen::program::ProgramControl;
 use canopen::{AbortCode, Address, BitRate};
@@ -12,7 +12,7 @@ use emulator::time::Span;
 use shared_abi::ram_image;
 
 const VERSION: Address = Address::new(0x100A, 0);
-/// The application template's own: the way back, and its confirmation.
+/// Objects of the application template: the return, and its confirmation.
 const REENTRY_PATH: Address = Address::new(0x2000, 0);
 const CONFIRMATION: Address = Address::new(0x2001, 0);
 const INSTALLED: u32 = 1;
@@ -51,7 +51,7 @@ fn power_cycle(bench: &mut Bench) {
     bench.events();
 }
 
-/// Each way leads into a bootloader that does its whole work.
+/// Each way leads to a bootloader with all its functions.
 #[test]
 fn three_ways_lead_back_and_the_bootloader_is_whole_behind_each() {
     for (way, expected) in [
@@ -74,7 +74,7 @@ fn three_ways_lead_back_and_the_bootloader_is_whole_behind_each() {
 
         install(&mut bench, NODE, firmware::APP_V2);
         assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0", "way {way}");
-        // A request is good for once.
+        // A request is valid once.
         power_cycle(&mut bench);
         assert!(!bench.is_bootloader(NODE), "way {way}");
         bench.assert_nothing_unmodelled();
@@ -83,14 +83,14 @@ fn three_ways_lead_back_and_the_bootloader_is_whole_behind_each() {
     assert!(write(&mut bench, REENTRY_PATH, 3).is_err(), "there is no fourth way");
 }
 
-/// A jump out of thousands of interrupts, and again: no stray one reaches the other program.
+/// Jumps during thousands of interrupts, repeated: no stray interrupt reaches the other program.
 #[test]
 fn both_programs_take_interrupts_in_turn_and_none_goes_astray() {
     let mut bench = running_board();
     for round in 0..10 {
         write(&mut bench, REENTRY_PATH, 2).unwrap();
-        // SDO requests back to back keep both CAN vectors busy until the last moment; SysTick never
-        // rests.
+        // SDO requests without pauses keep both CAN vectors busy until the last moment; SysTick
+        // always runs.
         for _ in 0..100 {
             bench.session().read_text(VERSION).unwrap();
         }
@@ -102,7 +102,7 @@ fn both_programs_take_interrupts_in_turn_and_none_goes_astray() {
         bench.session().command(1, ProgramControl::Start).unwrap();
         bench.await_boot_up(1000);
     }
-    // Nothing but the resets behind START: no fault, no watchdog.
+    // Only the resets after START: no fault, no watchdog.
     let events = bench.events();
     assert_eq!(events.len(), 10, "{events:?}");
     assert!(events.iter().all(|(_, stop)| *stop == Stop::Reset(ResetCause::Software)), "{events:?}");
@@ -112,7 +112,7 @@ fn both_programs_take_interrupts_in_turn_and_none_goes_astray() {
     for exception in [15, 16 + 19, 16 + 20] {
         assert!(taken(exception) > 2000, "exception {exception}: {}", taken(exception));
     }
-    // Vectors of this program and the other, and no other.
+    // Vectors of this program and the other one only.
     let expected = [15, 16 + 19, 16 + 20, 16 + 35];
     let stray: Vec<_> = (0..counters.exceptions.len())
         .filter(|exception| taken(*exception) > 0 && !expected.contains(exception))
@@ -127,8 +127,8 @@ fn the_answer_comes_before_the_departure_at_every_bit_rate() {
     call_back::at_every_bit_rate(firmware::APP_V1, |_, _| {});
 }
 
-/// A program without signature is on trial: it confirms itself, or the next reset ends in the
-/// bootloader.
+/// A program without a release is on trial: it confirms itself, or the device stays in the
+/// bootloader after the next reset.
 #[test]
 fn a_trial_confirms_itself_through_the_callgate() {
     let mut bench = Bench::new();
@@ -156,8 +156,8 @@ fn a_trial_confirms_itself_through_the_callgate() {
     assert!(bench.is_bootloader(NODE), "it has taken that back");
 }
 
-/// Gives a node another node-ID and, if told, bit rate by layer setting services (CiA 305), and
-/// stores them.
+/// Sets another node-ID and optionally another bit rate of a node by layer setting services (CiA
+/// 305), and stores them.
 fn store_by_lss(bench: &mut Bench, node: u8, rate: Option<BitRate>) {
     bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
     let rate = rate.map(|rate| [0x13, 0, rate as u8]);
@@ -170,9 +170,8 @@ fn store_by_lss(bench: &mut Bench, node: u8, rate: Option<BitRate>) {
     bench.power_on();
 }
 
-/// Node-ID and bit rate set in the application are the bootloader's as well, and the other way
-/// round (SYS TEC manual L-1112d_10, 3.4.4): where both serve LSS, and where the application alone
-/// does.
+/// Node-ID and bit rate set in the application also apply in the bootloader, and the other way
+/// round (SYS TEC manual L-1112d_10, 3.4.4): if both support LSS, and if only the application does.
 #[test]
 fn node_id_and_bit_rate_are_shared() {
     for bootloader in [firmware::BOOTLOADER, firmware::BOOTLOADER_LEAST] {
@@ -193,7 +192,7 @@ fn node_id_and_bit_rate_are_shared() {
         if bootloader == firmware::BOOTLOADER_LEAST {
             continue;
         }
-        // And from the bootloader: the program has it from the handoff.
+        // And from the bootloader: the program gets it from the handoff.
         store_by_lss(&mut bench, 21, None);
         bench.await_boot_up_of(21, 1000);
         assert!(!bench.is_bootloader(21));
@@ -201,8 +200,8 @@ fn node_id_and_bit_rate_are_shared() {
     }
 }
 
-/// Puts the bootloader's RAM image into the flash as it is in RAM, without a CRC: a packed one copies
-/// from what lies in front of it, and is damaged when that is changed.
+/// Writes the bootloader's RAM image to flash uncompressed, without a CRC: a compressed one copies
+/// from the flash before it, and is damaged when that is changed.
 fn store_unpacked(bench: &mut Bench) {
     let elf = firmware::elf(firmware::BOOTLOADER);
     let (header, _) = firmware::section(&elf, ".ram_image");
@@ -212,12 +211,12 @@ fn store_unpacked(bench: &mut Bench) {
     bench.machine().load_bin(header + size_of::<ram_image::Header>() as u32, &ram).unwrap();
 }
 
-/// On a bootloader with another version of the ABI, or with none, the application does without, and
-/// can be called back.
+/// With a bootloader with another version of the ABI, or without a callgate, the application works
+/// without it, and can be called back.
 #[test]
 fn an_application_on_a_bootloader_with_another_abi_does_without_it() {
     let table = firmware::board().callgate();
-    // The version of the ABI (a half-word behind the magic), and the magic itself.
+    // The version of the ABI (a half-word after the magic), and the magic itself.
     for (at, value) in [(table + 4, 9_u16), (table, 0)] {
         let mut bench = running_board();
         bench.power_off();
@@ -241,8 +240,8 @@ fn an_application_on_a_bootloader_with_another_abi_does_without_it() {
     }
 }
 
-/// An application that ends again and again without being asked to is given up, and stays so; a
-/// request is a new beginning.
+/// The bootloader stops starting an application that ends again and again without a request; a
+/// request resets the count.
 #[test]
 fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
     let mut bench = running_board();
@@ -257,13 +256,13 @@ fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
     bench.session().command(1, ProgramControl::Start).unwrap();
     bench.await_boot_up(1000);
     assert!(!bench.is_bootloader(NODE), "a request does");
-    // NMT reset node is asked for, and counts as no crash.
+    // NMT reset node is a request, and does not count as a crash.
     for _ in 0..5 {
         bench.post(0x000, &[0x81, NODE]);
         bench.await_boot_up(1000);
         assert!(!bench.is_bootloader(NODE));
     }
-    // What confirms itself has not crashed.
+    // A confirmed program has not crashed.
     for _ in 0..2 {
         bench.machine().start_watchdog(64);
         bench.run_ms(300);
@@ -276,8 +275,8 @@ fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
     }
 }
 
-/// A program has to show once that the device can be called back from it, or to confirm itself; the
-/// next program anew.
+/// A program must prove once that the device can be called back from it, or confirm itself; each
+/// new program again.
 #[test]
 fn a_program_that_was_confirmed_starts_without_a_rescue_window() {
     let boot_ups = |bench: &mut Bench| {
@@ -304,8 +303,8 @@ fn a_program_that_was_confirmed_starts_without_a_rescue_window() {
     bench.assert_nothing_unmodelled();
 }
 
-/// With a rescue window a program that never answers is no dead end: whoever speaks to the device
-/// in time has it.
+/// With a rescue window, a device with a program that never answers can still be reached: a client
+/// that sends a request in time keeps it in the bootloader.
 #[test]
 fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     let mut bench = Bench::of_image(firmware::BOOTLOADER);
@@ -314,7 +313,7 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     install(&mut bench, NODE, firmware::APP_V1);
     bench.events();
 
-    // Nobody speaks: 300 ms, then the program, by way of a reset.
+    // Without a request: 300 ms, then the program, after a reset.
     bench.power_off();
     bench.run_ms(100);
     let from = bench.time();
@@ -332,7 +331,7 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     // 8: the rescue window.
     assert_eq!(told[0].2, [0x00, 0xFF, 0x00, b'B', b'O', b'O', b'T', 8]);
 
-    // Network management is for everybody, and holds nothing.
+    // Network management concerns all nodes, and keeps no device in the bootloader.
     bench.power_off();
     bench.power_on();
     bench.await_boot_up(100);
@@ -340,7 +339,7 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     bench.await_boot_up(1000);
     assert!(!bench.is_bootloader(NODE));
 
-    // An SDO does, and so does a layer setting service.
+    // An SDO request does, and so does a layer setting service.
     for (id, data) in
         [(0x600 + u16::from(NODE), [0x40, 0, 0x10, 0, 0, 0, 0, 0]), (0x7E5, [0x4C, 0, 0, 0, 0, 0, 0, 0])]
     {
@@ -359,7 +358,7 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     let at = bench.await_boot_up(1000);
     assert!(at - from < Span::from_millis(200));
 
-    // The window is no new beginning for what crashes.
+    // The window does not reset the count of crashes.
     for reset in 1..=3 {
         bench.machine().start_watchdog(64);
         bench.run_ms(1200);
@@ -368,14 +367,14 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     bench.assert_nothing_unmodelled();
 }
 
-/// What a broken application, or noise, may leave in the warm-start cell: it asks for nothing, or
-/// for what cannot be had.
+/// Contents of the warm-start cell from a faulty application, or noise: no request, or an
+/// impossible one.
 #[test]
 fn a_cell_that_asks_for_what_is_not_there_does_no_harm() {
     let magic = u32::from_le_bytes(*b"CBW1");
     let check = |words: [u32; 3]| {
-        // The fold of the ABI, written again: rotate by 5, exclusive or, multiply; inverted in the
-        // end.
+        // The fold of the ABI, implemented again: rotate by 5, exclusive or, multiply; inverted at
+        // the end.
         !words
             .iter()
             .fold(0xC0B0_07A5_u32, |fold, word| (fold.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B1))
@@ -398,7 +397,7 @@ fn a_cell_that_asks_for_what_is_not_there_does_no_harm() {
         bench.machine().reset_pin();
         bench.await_boot_up(1000);
         assert_eq!(bench.is_bootloader(NODE), stays, "{what}");
-        // Used up: the next reset starts the program.
+        // Consumed: the next reset starts the program.
         bench.machine().reset_pin();
         bench.await_boot_up(1000);
         assert!(!bench.is_bootloader(NODE), "{what}");

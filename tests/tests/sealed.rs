@@ -1,5 +1,6 @@
-//! The sealed device: the built bootloader with keys in its flash, on the emulated bus. What it
-//! takes, what it refuses, and that the old program starts whatever was refused.
+//! The sealed device: the built bootloader with keys in its flash, on the emulated bus. It tests
+//! which images the device accepts and refuses, and that the old program starts after every
+//! refusal.
 
 #[path = "sealed/limits.rs"]
 mod limits;
@@ -41,7 +42,7 @@ fn seal(sealer: &Sealer<'_>, image: &str) -> Vec<u8> {
     sealer.seal(&firmware::raw(image), &release()).expect("it can be sealed")
 }
 
-/// Starts what was downloaded, and looks whether it is that.
+/// Starts the downloaded program, and checks that it is the right one.
 fn start(bench: &mut Bench, image: &str, version: &str) {
     let crc = bench.session().read_number(CRC_OF_PROGRAM).unwrap();
     assert_eq!(crc, crc32(&firmware::raw(image)));
@@ -52,15 +53,15 @@ fn start(bench: &mut Bench, image: &str, version: &str) {
     assert_eq!(bench.session().read_number(CRC_OF_PROGRAM).unwrap(), crc);
 }
 
-/// Stops the program: the device comes back to the bootloader, which confirms the program. (The first
-/// 80h to a program that was just downloaded as a whole would mean "confirm".)
+/// Stops the program: the device returns to the bootloader, which confirms the program. (The first
+/// 80h after a download in one transfer would mean "confirm".)
 fn call_back(bench: &mut Bench) {
     bench.session().command(1, ProgramControl::Stop).unwrap();
     bench.run_ms(100);
     assert!(bench.is_bootloader(NODE));
 }
 
-/// A sealed device, in its bootloader, with version 1 installed, started once and confirmed.
+/// A sealed device in its bootloader, with version 1 installed, started once and confirmed.
 fn board_with_a_program() -> Bench {
     let mut bench = board();
     bench.power_on();
@@ -72,7 +73,8 @@ fn board_with_a_program() -> Bench {
     bench
 }
 
-/// The power goes and comes back: the old program, version 1, starts by itself. It is called back.
+/// The power is cut and returns: the old program, version 1, starts by itself. It is then called
+/// back.
 fn assert_old_program_starts(bench: &mut Bench, what: &str) {
     bench.power_off();
     bench.run_ms(100);
@@ -86,7 +88,8 @@ fn assert_old_program_starts(bench: &mut Bench, what: &str) {
     assert!(bench.is_bootloader(NODE), "{what}");
 }
 
-/// Every kind, written blindly by either transfer; each one over the one before.
+/// Every kind, written by either transfer without checks by the host; each one replaces the
+/// previous one.
 #[test]
 fn sealed_programs_are_taken_and_started() {
     let mut bench = board();
@@ -107,8 +110,8 @@ fn sealed_programs_are_taken_and_started() {
     bench.assert_nothing_unmodelled();
 }
 
-/// What is not genuine is refused, by the code that tells why, and costs nothing: the flash of the program
-/// stays as it was, and the program starts.
+/// An invalid image is refused with the code of the reason, and has no other effect: the flash of
+/// the program does not change, and the program starts.
 #[test]
 fn what_is_not_genuine_is_refused_and_the_old_program_starts() {
     let mut bench = board_with_a_program();
@@ -150,13 +153,13 @@ fn what_is_not_genuine_is_refused_and_the_old_program_starts() {
             assert_old_program_starts(&mut bench, what);
         }
     }
-    // And the genuine one is taken after all that.
+    // The valid image is accepted after all of this.
     assert_eq!(write(&mut bench, &genuine, Transfers::Segments), (None, status::OK));
     start(&mut bench, firmware::APP_V2, "2.0.0");
     bench.assert_nothing_unmodelled();
 }
 
-/// A program that was installed with a higher counter leaves no way back to a lower one.
+/// After the installation of a program with a higher counter, a lower one is refused.
 #[test]
 fn the_counter_goes_up_and_never_back() {
     let mut bench = board_with_a_program();
@@ -174,7 +177,8 @@ fn the_counter_goes_up_and_never_back() {
     start(&mut bench, firmware::APP_V2, "2.0.0");
 }
 
-/// Without keys the same bootloader is as open as any, and takes no sealed program: it knows no root.
+/// Without keys the same bootloader accepts programs like any other, and refuses sealed programs:
+/// it has no root.
 #[test]
 fn without_keys_the_device_is_open() {
     let mut bench = open_board();
@@ -191,8 +195,8 @@ fn without_keys_the_device_is_open() {
     bench.assert_nothing_unmodelled();
 }
 
-/// The demonstration for people tells its story to the end, which it does not if the device takes or
-/// refuses what it should not.
+/// The demonstration runs to its end, which it does not if the device accepts or refuses the wrong
+/// image.
 #[test]
 fn the_demonstration_succeeds() {
     let output = Command::new(env!("CARGO_BIN_EXE_demo")).arg("--sealed").output().unwrap();
@@ -205,8 +209,8 @@ fn the_demonstration_succeeds() {
     assert_eq!(told.matches("the old program starts").count(), 5, "{told}");
 }
 
-/// What destroys is for the holder of the root key: asked for by 2002h, granted until the next reset,
-/// and recorded in 2003h over power-off.
+/// Destructive actions need the root key: they are requested by 2002h, permitted until the next
+/// reset, and recorded in 2003h, which survives a power-off.
 #[test]
 fn the_holder_of_the_root_key_gets_rights_and_the_device_remembers() {
     let mut bench = board_with_a_program();
@@ -226,7 +230,7 @@ fn the_holder_of_the_root_key_gets_rights_and_the_device_remembers() {
     };
     let stranger = key(99);
     assert!(ask_by(&mut bench, &stranger, &stranger).is_err(), "not a root of the device");
-    // Each wrong signature makes the next wait twice as long; each try here takes two seconds.
+    // Each wrong signature doubles the next wait; each attempt here takes two seconds.
     for _ in 0..3 {
         let granted = ask_by(&mut bench, &stranger, &root()).unwrap();
         assert!(!granted, "a root's id, and another one's signature");
@@ -253,8 +257,8 @@ fn the_holder_of_the_root_key_gets_rights_and_the_device_remembers() {
     assert_eq!(told, [event::UNLOCKED | right::ERASE, event::INSTALLED | 1]);
 }
 
-/// Who has the root key opens the device for good: unsealed programs are taken and started from the
-/// next reset on, over power-off, and sealed ones as before. Nobody else does.
+/// The holder of the root key can open the device permanently: from the next reset on, it accepts
+/// and starts unsealed programs, also after a power-off, and sealed ones as before.
 #[test]
 fn the_holder_of_the_root_key_opens_the_device_for_good() {
     let mut bench = board_with_a_program();

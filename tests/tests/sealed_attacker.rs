@@ -1,9 +1,9 @@
-//! A seeded attacker of sealed devices: good images, wrong ones, unsealed ones, broken off anywhere,
-//! with commands, passwords, LSS, resets, power cuts and flash faults in between. Whatever is done,
-//! what the boot stage would start is an authentic image, whole; the counter never goes back; and in
-//! the end a good image can be installed.
+//! A seeded attacker of sealed devices: valid images, wrong ones and unsealed ones, aborted
+//! anywhere, with commands, passwords, LSS, resets, power cuts and flash faults in between. After
+//! any action, a program that the boot stage would start is authentic and complete; the counter
+//! never decreases; and at the end a valid image can be installed.
 //!
-//! The same seed plays the same attack:
+//! The same seed gives the same attack:
 //!
 //! ```sh
 //! COBOOT_ATTACKS=20000 cargo test --release -p coboot-tests --test sealed_attacker   # seeds per setup
@@ -32,7 +32,7 @@ use coflash::file::sealed::{Certificate, Sealer};
 use random::Random;
 use seal::access::right;
 
-/// What the owner of the key has sealed for a program.
+/// An image that the owner of the key has sealed for a program.
 struct Made {
     program: u8,
     image: Vec<u8>,
@@ -41,7 +41,7 @@ struct Made {
     version: u32,
 }
 
-/// All of a setup; the last one of each program has the highest counter.
+/// All images of a setup; the last one of each program has the highest counter.
 fn made(setup: &Setup) -> Vec<Made> {
     let mut all = Vec::new();
     for program in 1..=setup.programs() {
@@ -71,9 +71,9 @@ fn world(setup: usize) -> &'static [Made] {
     &WORLDS.get_or_init(|| SETUPS.iter().map(|setup| made(setup)).collect())[setup]
 }
 
-// --- what is sent
+// --- the data that is sent
 
-/// A file that is good, or is made of good ones.
+/// A valid file, or one made from valid files.
 fn file(random: &mut Random, setup: &Setup, world: &[Made], program: u8) -> (String, Vec<u8>) {
     let one = &world[random.below(world.len())];
     let fitting: Vec<&Made> = world.iter().filter(|made| made.program == program).collect();
@@ -98,14 +98,14 @@ fn file(random: &mut Random, setup: &Setup, world: &[Made], program: u8) -> (Str
             (format!("image {name} and {more} bytes"), [good, vec![0x5A; more]].concat())
         }
         8 => {
-            // The head of one, chunks of another.
+            // The head of one image with chunks of another.
             let other =
                 Parts::of(&random.pick(&fitting.iter().copied().chain([one]).collect::<Vec<_>>()).file);
             let head = parts();
             (format!("head of {name} with other chunks"), Parts { chunks: other.chunks, ..head }.bytes())
         }
         9 => {
-            // A chunk twice, or left out.
+            // A chunk repeated or left out.
             let head = parts();
             let size = 32 + (1 << head.manifest[25]);
             let mut chunks: Vec<&[u8]> = head.chunks.chunks(size).collect();
@@ -119,7 +119,7 @@ fn file(random: &mut Random, setup: &Setup, world: &[Made], program: u8) -> (Str
             (format!("image {name} with chunk {at} twice or not"), Parts { chunks, ..head.clone() }.bytes())
         }
         10 => {
-            // What a stranger makes, with a certificate that he wrote himself.
+            // An image of a stranger, with a certificate made by himself.
             let Some(stranger) = keys().stranger.public().into() else { unreachable!() };
             let own = Certificate { key: stranger, ..certificate() };
             let mut bytes = own.signed_by(&keys().stranger);
@@ -143,14 +143,14 @@ fn file(random: &mut Random, setup: &Setup, world: &[Made], program: u8) -> (Str
 
 // --- the attack
 
-/// What is known of the devices's past.
+/// The history of the device.
 #[derive(Default)]
 struct Past {
-    /// Counters that the store told, by program.
+    /// The counters in the store, by program.
     stored: [u32; 3],
     /// The highest counter of a program that had proved itself.
     proved: [u32; 3],
-    /// What was installed when somebody looked last.
+    /// The installed programs at the last check.
     was: [Option<(u32, u32)>; 3],
 }
 
@@ -160,9 +160,9 @@ struct Attack<'w> {
     random: Random,
     told: Vec<String>,
     past: Past,
-    /// Cuts and faults of the flash.
+    /// Whether cuts and faults of the flash are included.
     hostile_flash: bool,
-    /// The flash has said that all is well where it was not.
+    /// Whether the flash has reported a success that was none.
     was_weak: bool,
     installed: u32,
 }
@@ -172,7 +172,7 @@ impl Attack<'_> {
         self.told.push(what);
     }
 
-    /// What must hold whatever is done. Looks at a copy, as after a reset.
+    /// Checks the rules that must hold after any action, on a copy, as after a reset.
     fn look(&mut self, device: &Device) {
         let device = device.copy();
         for program in 1..=self.setup.programs() {
@@ -185,7 +185,7 @@ impl Attack<'_> {
                 continue;
             };
             assert!(record.is_sealed(), "program {program}: a record of an unsealed program");
-            // A reset may find bits between 0 and 1; the boot stage looks at the CRC then.
+            // A reset may find bits between 0 and 1; the boot stage then checks the CRC.
             let mut authentic = self.world.iter().filter(|made| {
                 made.program == program
                     && (made.image.len() as u32, made.version) == (record.size, record.version)
@@ -220,10 +220,10 @@ impl Attack<'_> {
         }
     }
 
-    /// Something that gets in between.
+    /// A disturbance.
     fn disturb(&mut self, host: &mut Host<'_>) {
         if self.random.chance(5) {
-            // By who may, and by who may not.
+            // With the right to do so, and without.
             let right =
                 self.random.pick(&[right::ERASE, right::CLEAR_SIGNATURE, right::STORE, right::READ_BACK]);
             let key = self.random.pick(&[&keys().root, &keys().root, &keys().stranger, &keys().release]);
@@ -341,8 +341,8 @@ impl Attack<'_> {
         }
     }
 
-    /// A block file: a transfer for each block, and now and then one that is not in its turn, twice
-    /// there, or damaged.
+    /// A block file: a transfer for each block, sometimes with a block out of order, repeated or
+    /// damaged.
     fn send_in_blocks(
         &mut self,
         host: &mut Host<'_>,
@@ -413,7 +413,7 @@ impl Attack<'_> {
         self.look(host.device);
     }
 
-    /// Until a reset, a start or a power cut.
+    /// Actions until a reset, a start or a power cut.
     fn boot(&mut self, device: &Device) {
         let outcome = catch_unwind(AssertUnwindSafe(|| {
             device.run(|host| {
@@ -424,7 +424,7 @@ impl Attack<'_> {
                         self.tell(format!("{request:?} starts {:?}", device.starts(Some(request))));
                         return;
                     }
-                    // A reset in the middle of it all.
+                    // A reset in the middle of the actions.
                     if self.random.chance(15) {
                         return;
                     }
@@ -445,7 +445,7 @@ impl Attack<'_> {
         for _ in 0..1 + self.random.below(4) {
             self.boot(&device);
         }
-        // The flash does what it is told again, and the owner comes.
+        // The flash works again, and the owner sends an image.
         {
             let mut model = device.chip.model();
             (model.fail, model.weak, model.cut) = (None, None, None);
@@ -460,7 +460,7 @@ impl Attack<'_> {
     }
 }
 
-/// The attack of a seed on a setup; its actions with what broke, if anything did.
+/// The attack of a seed on a setup; returns its actions and the broken rule, if any.
 fn attack(setup: usize, seed: u64) -> Result<u32, String> {
     let mut random = Random(seed ^ (setup as u64) << 48);
     let hostile_flash = random.chance(50);
@@ -510,6 +510,6 @@ fn whatever_is_done_what_starts_is_authentic() {
     }
     assert!(broken.is_empty(), "{}", broken.join("\n\n"));
     println!("{installed} images were installed meanwhile");
-    // It is an attack on what works.
+    // The attack is on a working device.
     assert!(seeds.end - seeds.start < 300 || installed > 1000, "{installed}");
 }

@@ -1,5 +1,5 @@
-//! A sealed image inside a block file, block by block, for masters that know block files and nothing
-//! else: what the sealed device takes, what it refuses, and that the old program stays.
+//! A sealed image in a block file, block by block, for masters that only support block files: the
+//! blocks that the sealed device accepts and refuses, and that the old program stays.
 
 use canopen::program::ProgramControl;
 use canopen::Address;
@@ -29,7 +29,7 @@ fn blocks(file: &[u8], size: usize) -> Vec<Vec<u8>> {
     blocks.blocks().iter().map(|block| block.emit_with(blocks.checksum())).collect()
 }
 
-/// Sends a block, and waits until the device is not busy any more; 1F57h.
+/// Sends a block, and waits until the device is not busy; returns 1F57h.
 fn send(bench: &mut Bench, block: &[u8]) -> u32 {
     let mut session = bench.session();
     match session.write(DATA, block, Doing::Program, &mut |_| {}) {
@@ -45,7 +45,7 @@ fn clear(bench: &mut Bench) {
     session.await_idle(1, Doing::Command(ProgramControl::Clear)).expect("1F57h is answered");
 }
 
-/// Sends all of them; the first answer that is not OK.
+/// Sends all blocks; returns the first status that is not OK.
 fn send_all(bench: &mut Bench, blocks: &[Vec<u8>]) -> u32 {
     clear(bench);
     blocks.iter().map(|block| send(bench, block)).find(|word| *word != status::OK).unwrap_or(status::OK)
@@ -62,7 +62,7 @@ fn assert_runs(bench: &mut Bench, version: &str, what: &str) {
     assert!(bench.is_bootloader(NODE), "{what}");
 }
 
-/// A sealed board in its bootloader, with version 1, which has come as one download.
+/// A sealed board in its bootloader, with version 1 from a download in one transfer.
 fn board_with_a_program() -> Bench {
     let mut bench = board();
     bench.power_on();
@@ -90,7 +90,7 @@ fn sealed_images_in_blocks_are_installed() {
     bench.assert_nothing_unmodelled();
 }
 
-/// The host tool's way.
+/// By the host tool.
 #[test]
 fn coflash_sends_a_sealed_image_in_blocks() {
     let mut bench = board_with_a_program();
@@ -105,7 +105,7 @@ fn coflash_sends_a_sealed_image_in_blocks() {
 #[test]
 fn what_is_not_authentic_costs_nothing() {
     type Spoil = fn(&mut Vec<Vec<u8>>);
-    /// A block with other data, and the CRC that it has to have.
+    /// A block with other data and a matching CRC.
     fn with_data(block: &[u8], change: impl Fn(&mut [u8])) -> Vec<u8> {
         let mut block = block.to_vec();
         let end = block.len() - 4;
@@ -149,8 +149,9 @@ fn what_is_not_authentic_costs_nothing() {
     bench.assert_nothing_unmodelled();
 }
 
-/// Between two blocks others come: a block again, one that arrives damaged, a sealed image as one
-/// download, a reset. The download goes on, or begins anew behind CLEAR, and nothing else is started.
+/// Between two blocks there are others: a repeated block, a damaged one, a sealed image in one
+/// download, a reset. The download continues, or begins again after CLEAR, and no other program is
+/// started.
 #[test]
 fn blocks_among_other_work() {
     let mut bench = board_with_a_program();
@@ -163,17 +164,17 @@ fn blocks_among_other_work() {
             damaged[100] ^= 8;
             assert_eq!(send(&mut bench, &damaged), status::CRC);
             assert_eq!(send(&mut bench, &blocks[4]), status::SEQUENCE, "that one is there");
-            // A second client with the same image in one go.
+            // A second client with the same image in one transfer.
             assert_ne!(send(&mut bench, &file), status::OK);
         }
         assert_eq!(send(&mut bench, block), status::OK, "block {at}");
     }
     assert_runs(&mut bench, "2.0.0", "the download went on");
-    // Broken off, by CLEAR and by the power.
+    // Aborted by CLEAR, and by a power cut.
     for (power, image, version) in [(false, firmware::APP_V1, "1.0.0"), (true, firmware::APP_V2, "2.0.0")] {
         let blocks = self::blocks(&seal(&sealer(COUNTER), image), 512);
         clear(&mut bench);
-        // Behind the first chunk.
+        // After the first chunk.
         for block in &blocks[..14] {
             assert_eq!(send(&mut bench, block), status::OK);
         }

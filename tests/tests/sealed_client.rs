@@ -1,4 +1,4 @@
-//! An unmodified python-canopen writes sealed images into the emulated device, in real time.
+//! An unmodified python-canopen writes sealed images to the emulated device, in real time.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -15,7 +15,7 @@ use coflash::file::sealed::Sealer;
 /// 100Ah, software version.
 const VERSION: Address = Address::new(0x100A, 0);
 
-/// One client at a time: another one would only take the processor away from it.
+/// One client at a time: a second one would only slow down both.
 static ALONE: Mutex<()> = Mutex::new(());
 
 fn endpoint() -> Endpoint {
@@ -25,8 +25,8 @@ fn endpoint() -> Endpoint {
     Endpoint::new(bench)
 }
 
-/// By either transfer; a flipped bit is refused. The time-out is a generous one: it is on the clock of a
-/// machine that may have other work.
+/// By either transfer; an image with a flipped bit is refused. The time-out is long, because it
+/// uses the clock of a possibly busy machine.
 #[test]
 fn an_unmodified_python_canopen_writes_a_sealed_image() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
@@ -56,8 +56,9 @@ fn an_unmodified_python_canopen_writes_a_sealed_image() {
     endpoint.bench.assert_nothing_unmodelled();
 }
 
-/// The client as it comes: its own SDO time-out of 0.3 s, its own size of blocks. On the clock of a machine
-/// that has other work an answer may come late, which is nobody's fault here; then it is tried again.
+/// The client with its defaults: its own SDO time-out of 0.3 s, its own block size. On the clock of
+/// a busy machine an answer may come late without a fault of the device; then the test repeats the
+/// transfer.
 #[test]
 fn a_python_canopen_as_it_comes_writes_a_sealed_image_by_block_transfer() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
@@ -76,7 +77,7 @@ fn a_python_canopen_as_it_comes_writes_a_sealed_image_by_block_transfer() {
     endpoint.bench.assert_nothing_unmodelled();
 }
 
-/// Has python-canopen write these bytes, by a file of this name.
+/// Makes python-canopen write these bytes from a file with this name.
 fn python_canopen(endpoint: &mut Endpoint, name: &str, bytes: &[u8], ways: &[&str]) -> Output {
     let python = env::var_os("COBOOT_PYTHON")
         .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));

@@ -1,5 +1,5 @@
-//! What a sealed program lets be stored: the flash is locked while it runs, so its confirmation goes
-//! through the warm-start cell and a reset (`shared_abi::warm_start::BootRequest::Confirm`).
+//! Storing by a sealed program: the flash is locked while it runs, so its confirmation goes through
+//! the warm-start cell and a reset (`shared_abi::warm_start::BootRequest::Confirm`).
 
 use canopen::program::ProgramControl;
 use canopen::Address;
@@ -17,7 +17,7 @@ const CRC: Address = Address::new(0x1F56, 1);
 /// 1F51h/1, refused because of the device's state (CiA 301, 7.2.4.3.17).
 const REFUSED: [u8; 8] = [0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 0x08];
 
-/// A sealed board whose sealed program was downloaded in one go, and started.
+/// A sealed board with a sealed program that was downloaded in one transfer and started.
 fn fresh_board(image: &str) -> Bench {
     let mut bench = board();
     bench.power_on();
@@ -30,8 +30,8 @@ fn fresh_board(image: &str) -> Bench {
     bench
 }
 
-/// How often the device says boot-up when the power comes back: the bootloader of an unconfirmed
-/// program does for its rescue window, before the program does.
+/// The number of boot-up messages after power-on: for an unconfirmed program, the bootloader sends
+/// one for its rescue window, before the program's own.
 fn boot_ups_after_power_off(bench: &mut Bench) -> usize {
     bench.power_off();
     bench.run_ms(100);
@@ -46,8 +46,8 @@ fn ask(bench: &mut Bench, value: u8) -> Option<Vec<u8>> {
     bench.ask(REQUEST, &control(value), RESPONSE)
 }
 
-/// As on an open device, but for the reset: acknowledged, confirmed for good, and the next 80h calls
-/// the program back.
+/// As on a device that is not sealed, except for the reset: acknowledged, confirmed permanently,
+/// and the next 80h is a call.
 #[test]
 fn the_first_80h_confirms_a_sealed_program_through_a_reset() {
     for image in APPLICATIONS {
@@ -67,8 +67,8 @@ fn the_first_80h_confirms_a_sealed_program_through_a_reset() {
     }
 }
 
-/// Between the answer and the reset: who repeats the 80h gets the same answer, nobody takes the
-/// confirmation away, and the device leaves all the same.
+/// Between the answer and the reset: a repeated 80h gets the same answer, no command removes the
+/// confirmation, and the device still resets.
 #[test]
 fn nothing_takes_the_confirmation_away() {
     for image in APPLICATIONS {
@@ -95,7 +95,7 @@ fn nothing_takes_the_confirmation_away() {
     }
 }
 
-/// A power cut before the reset costs the confirmation and nothing else.
+/// A power cut before the reset only loses the confirmation.
 #[test]
 fn a_power_cut_before_the_reset_leaves_an_unconfirmed_program() {
     for image in APPLICATIONS {
@@ -106,7 +106,7 @@ fn a_power_cut_before_the_reset_leaves_an_unconfirmed_program() {
     }
 }
 
-/// The other two requests, as an application may leave them, and what makes no sense.
+/// The other two requests of an application, and invalid ones.
 #[test]
 fn the_boot_stage_stores_what_the_callgate_could_not() {
     let leave = |bench: &mut Bench, request: BootRequest| {
@@ -128,7 +128,7 @@ fn the_boot_stage_stores_what_the_callgate_could_not() {
         bench.await_boot_up(1000);
         bench.run_ms(RESCUE_WINDOW_MS + 100);
         if nonsense == BootRequest::Confirm(200) {
-            // A start that was asked for, of a program that is not there.
+            // A requested start of a missing program.
             assert!(bench.is_bootloader(NODE), "{nonsense:?}");
         } else {
             assert!(!bench.is_bootloader(NODE), "{nonsense:?}");

@@ -1,4 +1,4 @@
-//! Two programs: an update whose dictionary is the other program of the device.
+//! Two programs: an update with the other program of the device as dictionary.
 
 use coboot_tests::sealed::{image, keys, sealer, Device, Parts, STANDARD_1, STANDARD_2};
 use coflash::file::sealed::Sealer;
@@ -6,17 +6,19 @@ use coflash::file::sealed::Sealer;
 /// 1F57h: for another product, program or state of the device.
 const WRONG_PRODUCT: u32 = 0x82;
 
-/// An image for program 2 that is program 1 but for some bytes, with program 1 as dictionary.
+/// An image for program 2 that is equal to program 1 except for some bytes, with program 1 as
+/// dictionary.
 fn update(base: &[u8], new: &[u8], encrypted: bool) -> Vec<u8> {
     let sealer = Sealer { program: 2, base: Some(base), ..sealer((encrypted, true)) };
     sealer.seal(new, &keys().release).expect("it can be sealed")
 }
 
-/// What program 1 is, and program 2 shall be. `length` of the dictionary may be odd.
+/// The contents of program 1, and the new contents of program 2. `length` of the dictionary may be
+/// odd.
 fn programs(length: usize) -> (Vec<u8>, Vec<u8>) {
     let base = image(STANDARD_2.region(1), length, 1);
     let own = image(STANDARD_2.region(2), 2000, 2);
-    // The start is program 2's, since its vectors have to be; then comes program 1.
+    // The start is program 2's own, because of its vectors; then the contents of program 1 follow.
     let mut new = own[..700].to_vec();
     new.extend_from_slice(&base[700..]);
     (base, new)
@@ -55,7 +57,7 @@ fn without_the_right_dictionary_nothing_is_touched() {
         device.run(|host| assert_eq!(host.update(2, &file, 7).1, WRONG_PRODUCT));
         assert!(!device.was_touched(2) && !device.was_touched(1));
     }
-    // A device with one program has no other one.
+    // A device with one program has no other program.
     let sealer = Sealer { base: Some(&base), ..sealer((false, true)) };
     let file = sealer.seal(&image(STANDARD_1.region(1), 2000, 3), &keys().release).unwrap();
     let device = Device::sealed(&STANDARD_1);

@@ -1,5 +1,5 @@
-//! Sealed images on the flash model: what is installed, what a sealed device refuses and an open one
-//! takes, and the security counter.
+//! Sealed images on the flash model: installations, the refusals of a sealed device, the programs
+//! of a device that is not sealed, and the security counter.
 
 use boot_core::canopen::{AbortCode, BitRate, NodeId};
 use boot_core::program::Invalid;
@@ -28,7 +28,7 @@ fn of_counter(counter: u32, version: u32, image: &[u8]) -> Vec<u8> {
     seal(&Sealer { counter, version, ..sealer((false, false)) }, image)
 }
 
-/// What holds of an image that was just installed.
+/// The properties of an image that was just installed.
 fn is_installed(host: &mut Host<'_>, number: u8, image: &[u8]) {
     let device = host.device;
     assert_eq!(host.state(number), 0, "stopped");
@@ -57,7 +57,7 @@ fn a_good_image_of_every_form_is_installed() {
                 let device = Device::sealed(&STANDARD_1);
                 device.run(|host| {
                     assert_eq!(host.update(1, &file, piece), (Ok(()), 0), "{told}");
-                    // What the manifest says.
+                    // The size in the manifest.
                     assert_eq!(host.identification(1).to_le_bytes(), file[32..36], "{told}");
                     is_installed(host, 1, &image);
                 });
@@ -68,7 +68,7 @@ fn a_good_image_of_every_form_is_installed() {
     }
 }
 
-/// The end of such an image is one symbol, which leads to more than is unpacked at a time.
+/// The end of such an image is one symbol that gives more bytes than are decompressed at a time.
 #[test]
 fn an_image_that_ends_in_a_long_run_is_installed() {
     for run in [0, 1, 200, 273, 274, 511, 512, 513, 600, 3000] {
@@ -86,7 +86,8 @@ fn an_image_that_ends_in_a_long_run_is_installed() {
     }
 }
 
-/// Over another program, by every number of bytes at a time, with the smallest buffer and a large one.
+/// Replaces another program, with any number of bytes at a time, with the smallest buffer and a
+/// large one.
 #[test]
 fn however_it_is_cut_into_segments() {
     let (old, new) = (program(3000, 1), program(2600, 2));
@@ -110,7 +111,7 @@ fn however_it_is_cut_into_segments() {
     }
 }
 
-/// Without a certificate; by the second root; by a certificate for this product alone.
+/// Without a certificate; by the second root; by a certificate for only this product.
 #[test]
 fn each_way_to_be_signed_is_taken() {
     let image = program(700, 3);
@@ -138,7 +139,7 @@ fn each_way_to_be_signed_is_taken() {
     }
 }
 
-/// What a manifest may say of the device that it is for.
+/// The device properties in a manifest.
 #[test]
 fn an_image_for_this_very_device_is_taken() {
     let image = program(700, 3);
@@ -189,14 +190,15 @@ fn the_same_image_again_costs_nothing() {
             });
         }
         assert_eq!((device.record(1), device.counter(1)), (record, 5));
-        // It is looked at all the same.
+        // It is checked all the same.
         let mut damaged = file.clone();
         *damaged.last_mut().unwrap() ^= 1;
         device.run(|host| {
             assert_eq!(host.update(1, &damaged, 7).1, SIGNATURE);
             assert!(device.holds(1, &image) && !device.was_touched(1));
         });
-        // Another version with the same counter is another image, though every byte is the same.
+        // Another version with the same counter is another image, even if all program bytes are
+        // equal.
         let other = seal(&Sealer { version: 2, chunk: 10, ..sealer(form) }, &image);
         device.run(|host| {
             host.install(1, &other);
@@ -209,8 +211,8 @@ fn the_same_image_again_costs_nothing() {
 
 // --- sealed devices and open ones
 
-/// The same program in every unsealed form: the transfer that is refused, and the one before it that
-/// is not, because it says nothing yet of what comes.
+/// The same program in every unsealed form: the refused transfer, and the transfer before it, which
+/// is not refused because it does not show the format yet.
 fn unsealed(setup: &Setup, number: u8, image: &[u8]) -> [(Option<Vec<u8>>, Vec<u8>); 3] {
     let base = setup.region(number).base;
     let control = (!setup.is_data(number)).then(|| block(0, 0, &[0; 8]));
@@ -243,7 +245,8 @@ fn a_sealed_device_takes_nothing_unsealed() {
                             };
                             assert_eq!((abort, status), (Err(AbortCode::STORE), NO_ACCESS), "{}", setup.name);
                             assert!(!device.was_touched(number));
-                            // A download of blocks that has begun is no program to be signed.
+                            // A download of blocks that has begun is not a program that can be
+                            // released.
                             if !installed && before.is_none() {
                                 host.node.take_boot_request();
                                 assert_eq!(host.commanded(number, SET_SIGNATURE), NO_PROGRAM);
@@ -265,7 +268,7 @@ fn a_sealed_device_takes_nothing_unsealed() {
     }
 }
 
-/// A device that was open when its program came.
+/// A device that was not sealed when it got its program.
 #[test]
 fn a_program_from_before_the_keys_has_no_rights() {
     let image = program(900, 1);
@@ -290,7 +293,7 @@ fn a_program_from_before_the_keys_has_no_rights() {
     assert_eq!(device.starts(None), Some(1));
 }
 
-/// An unsealed program that was signed, and one that was not, and the request of a trial.
+/// An unsealed program with and without a release, and the request of a trial.
 #[test]
 fn an_open_device_is_as_before_and_takes_no_sealed_image() {
     let image = program(900, 1);
@@ -315,7 +318,7 @@ fn an_open_device_is_as_before_and_takes_no_sealed_image() {
     }
 }
 
-/// Without CLEAR, as every other format.
+/// Without CLEAR, like every other format.
 #[test]
 fn an_installed_program_stays_without_clear() {
     let device = Device::sealed(&STANDARD_1);
@@ -351,7 +354,7 @@ fn the_counter_never_goes_back() {
             refused(&device, lower, ROLLBACK);
         }
         assert!(device.holds(1, &image));
-        // Not by taking the program away either.
+        // Erasing the program does not help either.
         let emptied = device.copy();
         emptied.run(|host| host.erase(1));
         assert!(emptied.record(1).is_none());
@@ -359,7 +362,7 @@ fn the_counter_never_goes_back() {
         assert_eq!(emptied.counter(1), counter);
         emptied.run(|host| host.install(1, &of_counter(counter, 1, &image)));
     }
-    // What no certificate allows any more.
+    // No certificate permits this counter any more.
     let root = Sealer { certificate: None, counter: u32::MAX, ..sealer((false, false)) };
     let image = program(900, 1);
     let file = root.seal(&image, &keys().root).unwrap();
@@ -382,7 +385,7 @@ fn constants_of_the_bootloader_and_of_production_count_too() {
     refused(&device, 5, ROLLBACK);
 }
 
-/// A certificate of a higher epoch revokes those before.
+/// A certificate with a higher epoch revokes the earlier ones.
 #[test]
 fn the_epoch_never_goes_back() {
     let device = Device::sealed(&STANDARD_1);
@@ -400,20 +403,20 @@ fn the_epoch_never_goes_back() {
         assert_eq!(device.take_touched(), []);
         host.install(1, &of_epoch(6, &one));
     });
-    // The same image with a certificate of a higher epoch revokes as well.
+    // The same image with a certificate of a higher epoch revokes them as well.
     device.run(|host| {
         host.install(1, &of_epoch(7, &one));
         assert_eq!(host.update(1, &of_epoch(6, &two), 7).1, ROLLBACK);
     });
 }
 
-/// Raised when the program has brought the device back, and not before.
+/// Raised when the program has returned the device, and not before.
 #[test]
 fn with_confirmation_the_counter_waits_for_it() {
     let device = Device::sealed(&CONFIRMED_1);
     let (one, two) = (program(900, 1), program(900, 2));
     device.run(|host| host.install(1, &of_counter(5, 1, &one)));
-    // One that does not come up can be replaced by the one before.
+    // A program that does not start can be replaced by the previous one.
     device.run(|host| {
         host.install(1, &of_counter(9, 2, &two));
         host.install(1, &of_counter(5, 1, &one));
@@ -426,7 +429,7 @@ fn with_confirmation_the_counter_waits_for_it() {
         assert!(device.record(1).unwrap().confirmed);
     });
     refused(&device, 8, ROLLBACK);
-    // Whatever becomes of the program that has proved itself.
+    // Whatever happens to the program that has proved itself.
     let voided = device.copy();
     voided.run(|host| host.erase(1));
     refused(&voided, 8, ROLLBACK);
@@ -473,7 +476,7 @@ fn each_program_has_its_own_images_and_its_own_counter() {
     });
 }
 
-/// A lift: any bytes, and the program's images are none of them.
+/// A lift: its parameters are any bytes, and images of its program are not parameters.
 #[test]
 fn data_of_the_application_are_sealed_as_data() {
     let device = Device::sealed(&LIFT_2);
@@ -500,8 +503,9 @@ fn data_of_the_application_are_sealed_as_data() {
 
 // --- in between
 
-/// Commands, passwords, LSS, rights and another transfer at every stage of an update: it ends as it
-/// would have, or it is refused; and nothing but authentic bytes gets into the flash of the program.
+/// Commands, passwords, LSS, rights and another transfer at every stage of an update: it ends as
+/// without them, or it is refused; and only authentic bytes are written to the flash of the
+/// program.
 #[test]
 fn nothing_that_comes_in_between_gets_past_the_signature() {
     let places = [STANDARD_2.region(1), STANDARD_2.region(2)];

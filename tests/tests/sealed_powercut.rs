@@ -1,6 +1,6 @@
-//! Proof by power cut for sealed images: at every flash operation of a story, in every way, and once
-//! more in what comes after it. There is the old program, none or the new one, whole; the counter
-//! never goes back; and the same once more succeeds.
+//! Proof by power cut for sealed images: at every flash operation of a scenario, in every way, and
+//! again in the recovery. Afterwards there is the old program, none, or the new one, complete; the
+//! counter never decreases; and a repetition succeeds.
 
 use std::sync::Once;
 
@@ -9,7 +9,7 @@ use coboot_tests::sealed::{image, seal, sealer, Device, Host, Setup, CONFIRMED_1
 use coflash::file::sealed::Sealer;
 use shared_abi::geometry::Region;
 
-/// How often one looks: bits that are between 0 and 1 read differently each time.
+/// The number of checks: bits between 0 and 1 read differently each time.
 const LOOKS: usize = 3;
 const CUTS: [Cut; 6] =
     [Cut::Before, Cut::After, Cut::Torn(7), Cut::Torn(8), Cut::Unstable(7), Cut::Unstable(8)];
@@ -27,19 +27,19 @@ fn made(setup: &Setup, form: (bool, bool), len: usize, seed: u8, counter: u32) -
     Made { file: seal(&sealer, &image), image, counter }
 }
 
-/// What is done to a device with `old` in it (or nothing), what it brings, and what may be found.
+/// The actions on a device with `old` in it (or nothing), their result, and the permitted states.
 struct Story<'a> {
     before: Device,
     old: Option<&'a Made>,
     new: Option<&'a Made>,
     act: &'a dyn Fn(&mut Host<'_>),
-    /// The counter is raised when the program is confirmed.
+    /// Whether the counter is raised at the confirmation of the program.
     with_confirmation: bool,
-    /// Whether what comes after the cut is cut, too.
+    /// Whether the recovery is cut, too.
     twice: bool,
 }
 
-/// What was found.
+/// The state that was found.
 #[derive(Default, Debug)]
 struct Seen {
     points: u32,
@@ -51,9 +51,8 @@ struct Seen {
 }
 
 impl Story<'_> {
-    /// What holds at any time; `floor` is the counter that was there before.
-    /// A bit of the new counter that is between 0 and 1 may make it read as if it were there: it counts
-    /// from the time on when its program is.
+    /// The properties at any time; `floor` is the previous counter. With a bit between 0 and 1, the
+    /// new counter may read as if it were stored: it only counts after its program is stored.
     fn look(&self, device: &Device, floor: u32, seen: &mut Seen, told: &str) -> u32 {
         let mut lowest = u32::MAX;
         let news = seen.new;
@@ -72,7 +71,7 @@ impl Story<'_> {
                 Ok(_) => panic!("{told}: a program would start that is neither"),
                 Err(_) => seen.none += 1,
             }
-            // Once more: a bit of the record may be between 0 and 1.
+            // Again: a bit of the record may be between 0 and 1.
             let starts = device.starts(None).is_none() || is(self.new) || is(self.old);
             assert!(starts, "{told}: a program would start that is neither");
             if let (true, Some(made), false) = (new, self.new, self.with_confirmation) {
@@ -82,7 +81,7 @@ impl Story<'_> {
             if !new && raised && self.old.is_none_or(|old| old.counter < counter) {
                 seen.raised_first += 1;
             }
-            // A record that stands is true.
+            // A valid record matches the flash.
             if let Some(record) = device.record(1) {
                 let place = Region::new(device.setup.region(1).base, record.size);
                 let cells = device.chip.model().cells(place).to_vec();
@@ -98,8 +97,8 @@ impl Story<'_> {
         }
     }
 
-    /// Runs it on a copy of this flash with a cut; gives the device without power, and whether the cut
-    /// struck.
+    /// Runs it on a copy of this flash with a cut; returns the device without power, and whether
+    /// the cut occurred.
     fn cut(&self, flash: &ModelFlash, at: Option<(u32, Cut)>) -> (Device, bool) {
         let mut flash = flash.clone();
         flash.power_on();
@@ -143,7 +142,8 @@ impl Story<'_> {
                 let floor = self.look(&device, floor, &mut seen, &told);
                 let after = device.chip.model().clone();
                 let rest = self.ends(&after, &told);
-                // And once more, at an operation of the second try that differs from point to point.
+                // And again, at an operation of the second attempt that differs from point to
+                // point.
                 if rest > 0 && self.twice {
                     let second = 1 + (operation * 7 + kind as u32 * 13) % rest;
                     let cut = CUTS[(kind + 3) % CUTS.len()];
@@ -162,7 +162,7 @@ impl Story<'_> {
     }
 }
 
-/// A device with this in it.
+/// A device with this program.
 fn with(setup: &'static Setup, made: Option<&Made>) -> Device {
     let device = Device::sealed(setup);
     if let Some(made) = made {
@@ -190,7 +190,7 @@ fn an_update_leaves_the_old_program_none_or_the_new_one() {
     }
 }
 
-/// So often that the journal changes over to its other region meanwhile, wherever it was before.
+/// Often enough that the journal changes to its other region meanwhile, wherever it was before.
 #[test]
 fn and_while_the_journal_changes_over() {
     let old = made(&STANDARD_2, (false, false), 64, 0xA3, 5);
@@ -259,7 +259,7 @@ fn the_same_image_again_can_be_cut_anywhere() {
     assert_eq!((seen.none, seen.old), (0, 0), "{seen:?}");
 }
 
-/// The program before has proved itself: its counter stays, whatever the update comes to.
+/// The previous program has proved itself: its counter stays, whatever the result of the update.
 #[test]
 fn with_confirmation_a_proved_counter_stays() {
     let old = made(&CONFIRMED_1, (false, false), 300, 0xA3, 5);
@@ -271,7 +271,7 @@ fn with_confirmation_a_proved_counter_stays() {
         device
     };
     let older = made(&CONFIRMED_1, (false, false), 64, 0xC1, 4);
-    // What is older than the proved program is refused at every point, whatever the store holds.
+    // A program older than the proved one is refused at every point, whatever the store contains.
     let refused = |device: &Device, told: &str| {
         let device = device.copy();
         device.run(|host| assert_eq!(host.update(1, &older.file, 7).1, 0x8C, "{told}"));

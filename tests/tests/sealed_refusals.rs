@@ -1,6 +1,6 @@
-//! Sealed images that are wrong: every bit of the head, many of the chunks, every length, every field.
-//! Each is refused with the code that says why, and nothing is erased or written before the
-//! signatures are good.
+//! Invalid sealed images: every bit of the head, many bits of the chunks, every length, every
+//! field. Each is refused with the code of the reason, and nothing is erased or written before the
+//! signatures are found good.
 
 #[path = "../src/random.rs"]
 #[allow(dead_code, reason = "the tests need some of it")]
@@ -24,7 +24,7 @@ const SIGNATURE: u32 = 0x8A;
 const ROLLBACK: u32 = 0x8C;
 const KEY: u32 = 0x8E;
 
-/// What is installed before: counter 5, epoch 4.
+/// The installed program: counter 5, epoch 4.
 fn installed() -> (Device, Vec<u8>) {
     let device = Device::sealed(&STANDARD_1);
     let old = image(STANDARD_1.region(1), 700, 0xA3);
@@ -33,7 +33,7 @@ fn installed() -> (Device, Vec<u8>) {
     (device, old)
 }
 
-/// The image that comes: counter 7.
+/// The new image: counter 7.
 fn next(form: (bool, bool), len: usize) -> (Vec<u8>, Vec<u8>) {
     let image = image(STANDARD_1.region(1), len, 0xB7);
     let sealer = Sealer { counter: 7, version: 2, chunk: 9, text: Some("a text to be read"), ..sealer(form) };
@@ -41,7 +41,7 @@ fn next(form: (bool, bool), len: usize) -> (Vec<u8>, Vec<u8>) {
     (file, image)
 }
 
-/// Refused with one of these codes, and nothing is lost.
+/// Checks a refusal with one of these codes, without any loss.
 fn costs_nothing(device: &Device, old: &[u8], file: &[u8], codes: &[u32], told: &str) {
     device.run(|host| {
         let (abort, status) = host.update(1, file, 7);
@@ -53,8 +53,8 @@ fn costs_nothing(device: &Device, old: &[u8], file: &[u8], codes: &[u32], told: 
     assert!(device.holds(1, old), "{told}");
 }
 
-/// Refused behind good signatures: there is no program, nothing but `authentic` bytes of it are in
-/// the flash, and a good one can be installed.
+/// Checks a refusal after good signatures: there is no program, only `authentic` bytes of it are in
+/// the flash, and a valid image can be installed.
 fn costs_the_program(device: &Device, file: &[u8], codes: &[u32], authentic: &[u8], told: &str) {
     let device = device.copy();
     device.run(|host| {
@@ -94,7 +94,7 @@ fn code_of_flip(good: &[u8], at: usize, bit: u8) -> Vec<u32> {
     let in_signature = at.wrapping_sub(manifest + 152);
     let code = match at {
         0..4 => return vec![NO_ACCESS, FORMAT],
-        // Something else is taken for the certificate and the signatures.
+        // Other bytes are taken for the certificate and the signatures.
         4..6 => return vec![FORMAT, SIGNATURE, KEY],
         6 => return vec![FORMAT, SIGNATURE],
         7 => match bit {
@@ -132,14 +132,14 @@ fn code_of_flip(good: &[u8], at: usize, bit: u8) -> Vec<u32> {
                     let text = if encrypted { 224 } else { 176 };
                     match at - text {
                         1 if bit == 7 => FORMAT,
-                        // What is left behind it, or in front of it, may be a record or none.
+                        // The bytes left after it, or before it, may form a record or not.
                         2 | 3 => return vec![FORMAT, SIGNATURE],
                         _ => SIGNATURE,
                     }
                 }
             }
         }
-        // It is none then, and the first half of it is no signature.
+        // There is then no certificate, and the first half of it is not a signature.
         _ if in_certificate < 4 => return vec![FORMAT, KEY],
         _ if (8..12).contains(&in_certificate) && word(&flipped, manifest + 8) < EPOCH => ROLLBACK,
         _ if (60..64).contains(&in_certificate) => KEY,
@@ -176,7 +176,7 @@ fn every_byte_of_the_chunks_counts() {
         let (good, image) = next(form, 1700);
         let head = Parts::of(&good).head();
         for at in head..good.len() {
-            // All bytes of the hashes, and others now and then.
+            // All bytes of the hashes, and some others.
             let (chunk, within) = ((at - head) / 544, (at - head) % 544);
             if within >= 32 && !random.chance(4) {
                 continue;
@@ -187,7 +187,7 @@ fn every_byte_of_the_chunks_counts() {
             if chunk == 0 {
                 costs_nothing(&device, &old, &file, &[SIGNATURE], &told);
             } else if form.1 {
-                // How much a chunk unpacks to, the decoder of another tells.
+                // The size of a decompressed chunk, from an independent decoder.
                 let device = device.copy();
                 device.run(|host| assert_eq!(host.update(1, &file, 7).1, SIGNATURE, "{told}"));
                 assert!(device.record(1).is_none(), "{told}");
@@ -211,7 +211,7 @@ fn every_prefix_is_refused() {
         let (device, old) = installed();
         let (good, image) = next(form, 1100);
         let first_chunk = Parts::of(&good).head() + 544;
-        // Ended, aborted, and left for a reset.
+        // Ended, aborted, and abandoned by a reset.
         for len in 0..good.len() {
             if len < first_chunk {
                 if len >= 8 {
@@ -250,7 +250,7 @@ fn every_prefix_is_refused() {
                         assert_eq!(host.start(1), None);
                     }
                 });
-                // What was in the queue still when it was broken off has cost nothing.
+                // Data that were still in the queue at the abort had no effect.
                 assert!(device.record(1).is_none() || device.holds(1, &old), "{len}");
                 device.run(|host| host.install(1, &good));
                 assert!(device.holds(1, &image));
@@ -273,12 +273,12 @@ fn bytes_behind_the_end_are_refused() {
 
 // --- fields
 
-/// Who makes a certificate, for what.
+/// The issuer and the contents of a certificate.
 fn certified(certificate: Certificate, root: &coflash::file::sealed::SigningKey) -> Parts {
     Parts::of(&next((false, false), 600).0).certified(&certificate.signed_by(root))
 }
 
-/// Files that are signed as they should be, and are not for this device, or not possible.
+/// Correctly signed files that are for another device, or impossible.
 fn signed_and_wrong() -> Vec<(String, u32, Vec<u8>)> {
     let plain = Parts::of(&next((false, false), 600).0);
     let packed = Parts::of(&next((false, true), 600).0);
@@ -395,7 +395,7 @@ fn signed_and_wrong() -> Vec<(String, u32, Vec<u8>)> {
     let claims = |certificate: Certificate, change: &dyn Fn(&mut [u8; 152])| {
         let mut bytes = certificate.signed_by(root);
         change(&mut bytes);
-        // Signed once more, as the root would sign what is wrong.
+        // Signed again, as if the root had signed wrong contents.
         let signature = root.sign(&bytes[..88]);
         bytes[88..].copy_from_slice(&signature);
         plain.clone().certified(&bytes).signed()
@@ -452,13 +452,13 @@ fn signed_and_wrong() -> Vec<(String, u32, Vec<u8>)> {
         parts.signatures.resize(8 + usize::from(bytes), 0x5A);
         add(&format!("a signature of {bytes} bytes"), FORMAT, parts.bytes());
     }
-    // Two signatures with the id of the key: the first counts, and it is bad.
+    // Two signatures with the id of the key: the first one counts, and it is bad.
     let mut two = plain.clone().with(6, &[2]).signed_by(release);
     let mut bad = two.signatures.clone();
     bad[20] ^= 1;
     two.signatures = [bad, two.signatures].concat();
     add("a bad signature in front of a good one", SIGNATURE, two.bytes());
-    // S + L in place of S (RFC 8032 section 5.1.7 takes no S of L or more).
+    // S + L in place of S (RFC 8032 section 5.1.7 accepts no S of L or more).
     let mut malleable = plain.clone().signed_by(release);
     let order = [
         0xed, 0xd3, 0xf5, 0x5c, 0x1a, 0x63, 0x12, 0x58, 0xd6, 0x9c, 0xf7, 0xa2, 0xde, 0xf9, 0xde, 0x14, 0, 0,
@@ -493,7 +493,7 @@ fn a_good_signature_does_not_make_a_wrong_field_right() {
     for (what, code, file) in files {
         costs_nothing(&device, &old, &file, &[code], &what);
     }
-    // Beside signatures that this device knows nothing of, the good one is found.
+    // The good one is found beside signatures that this device does not know.
     let (good, image) = next((true, true), 600);
     let mut parts = Parts::of(&good).with(6, &[3]).signed_by(&keys().release);
     let strange = Parts::signature(&keys().stranger, &parts.manifest);
@@ -516,7 +516,7 @@ fn a_wrong_key_is_told_before_anything_is_lost() {
     device.run(|host| host.install(1, &seal(&sealer((false, false)), &old)));
     device.take_touched();
     costs_nothing(&device, &old, &next((true, false), 600).0, &[KEY], "another key with our id");
-    // And for three keys, of which the second is ours.
+    // For three keys, the second of which is ours.
     let (first, third) = (Kek::new([7; 32]).unwrap(), Kek::new([8; 32]).unwrap());
     let for_three = [first, keks[0].clone(), third];
     let (device, _) = installed();
@@ -526,7 +526,7 @@ fn a_wrong_key_is_told_before_anything_is_lost() {
     assert!(device.holds(1, &image));
 }
 
-/// No root, or a key block that is damaged.
+/// No root, or a damaged key block.
 #[test]
 fn a_device_without_the_root_takes_nothing() {
     let (good, _) = next((false, false), 600);
@@ -538,8 +538,8 @@ fn a_device_without_the_root_takes_nothing() {
 
 // --- what is compressed
 
-/// Authentic, and unpacked to something else than the manifest says: there is no program then, and
-/// nothing outside of its flash is touched.
+/// Authentic, but its decompressed contents differ from the manifest: there is then no program, and
+/// nothing outside its flash is changed.
 #[test]
 fn a_stream_that_is_wrong_ends_without_a_program() {
     let (device, old) = installed();
@@ -564,7 +564,7 @@ fn a_stream_that_is_wrong_ends_without_a_program() {
         ("another CRC".to_string(), parts.clone().with(32, &[1, 2, 3, 4])),
         ("another hash".to_string(), parts.clone().with(40, &[1, 2, 3, 4])),
     ];
-    // A match in front of the first byte: what LZMA has behind 0, and then bits that are 1.
+    // A match before the first byte: a 0 as LZMA requires, and then bits that are 1.
     files.push((
         "a match with nothing".to_string(),
         parts.clone().with_payload(&[&[0][..], &[0xFE; 90]].concat()),
@@ -585,12 +585,12 @@ fn a_stream_that_is_wrong_ends_without_a_program() {
         let device = device.copy();
         device.run(|host| {
             let (_, status) = host.update(1, &parts.signed(), 7);
-            // Bits at the end of a stream may say nothing.
+            // The last bits of a stream may have no meaning.
             let sound = status == 0 && device.holds(1, &image);
             assert!(sound || [FORMAT, SIGNATURE, 0x02].contains(&status), "{what}: {status:02X}h");
             refused += u32::from(!sound);
         });
-        // Where not a byte came out of it, nothing was lost.
+        // If it gave no byte, nothing was lost.
         let whole = device.holds(1, &old) || device.holds(1, &image);
         assert!(device.record(1).is_none() || whole, "{what}");
         for touched in device.take_touched() {
@@ -603,8 +603,8 @@ fn a_stream_that_is_wrong_ends_without_a_program() {
     assert!(refused > 140, "{refused}");
 }
 
-/// An image that was packed with the other program as its dictionary, for a device that has none: it
-/// must not cost the program.
+/// An image that was compressed with the other program as dictionary, for a device without one: the
+/// installed program must not be lost.
 #[test]
 fn a_dictionary_that_is_not_here_costs_nothing() {
     let (device, old) = installed();
@@ -614,8 +614,8 @@ fn a_dictionary_that_is_not_here_costs_nothing() {
     costs_nothing(&device, &old, &seal(&sealer, &new), &[FORMAT, SIGNATURE, KEY, PRODUCT], "a dictionary");
 }
 
-/// Who cannot sign tries again and again: the device stays reachable, the next try waits longer each
-/// time, up to half a minute, and the flash does not wear out.
+/// Repeated attempts without a valid signature: the device stays reachable, the wait grows with
+/// each attempt up to half a minute, and the flash does not wear out.
 #[test]
 fn ten_thousand_bad_signatures_in_a_row_slow_down_and_cost_nothing() {
     let (device, old) = installed();
@@ -625,7 +625,7 @@ fn ten_thousand_bad_signatures_in_a_row_slow_down_and_cost_nothing() {
     bad[signature] ^= 1;
     device.run(|host| {
         for tries in 0..10_000 {
-            // At first; then no longer than the longest wait.
+            // Each wait at first; then no longer than the longest wait.
             host.now += 64_000;
             host.node.set_time(Instant::from_millis(host.now));
             host.clear(1);
@@ -645,7 +645,7 @@ fn ten_thousand_bad_signatures_in_a_row_slow_down_and_cost_nothing() {
     assert!(touched
         .iter()
         .all(|region| journal.iter().any(|place| place.contains(region.base, region.size))));
-    // The header once more, and one event.
+    // The header again, and one event.
     assert!(touched.len() <= 12, "{} operations for 10000 refusals", touched.len());
     assert!(device.holds(1, &old));
     device.run(|host| host.install(1, &good));

@@ -1,11 +1,11 @@
-//! CAN over UART, the adapter's end (`bsp::slcan`): what the manuals of Lawicel's CAN232 and CANUSB
-//! say, and what nobody should send.
+//! CAN over UART, the adapter's end (`bsp::slcan`): the commands in the manuals of Lawicel's CAN232
+//! and CANUSB, and invalid ones.
 
 use bsp::slcan::{text_of, Slcan, FRAME_TEXT};
 use canopen::Frame;
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 
-/// Says text to an adapter; gives its answers and the frames.
+/// Sends text to an adapter; returns its answers and the frames.
 fn say(slcan: &mut Slcan, text: &[u8]) -> (String, Vec<Frame>) {
     let (mut answers, mut frames) = (String::new(), Vec::new());
     for &byte in text {
@@ -37,7 +37,7 @@ fn extended(id: u32) -> Id {
     ExtendedId::new(id).unwrap().into()
 }
 
-/// The examples of the CAN232 manual, one way and the other.
+/// The examples of the CAN232 manual, in both directions.
 #[test]
 fn frames_are_those_of_the_manual() {
     let frames = [
@@ -73,7 +73,8 @@ fn digits_may_be_small() {
     assert_eq!(say(&mut open(), b"T18abcdef1fe\r"), ("Z\r".to_owned(), vec![frame]));
 }
 
-/// The commands and what the manuals say of them: which need a closed channel, which an open one.
+/// The commands and their descriptions in the manuals: some need a closed channel, some an open
+/// one.
 #[test]
 fn commands_are_those_of_the_manual() {
     const BEL: &str = "\x07";
@@ -97,7 +98,7 @@ fn commands_are_those_of_the_manual() {
         ("Z0", "\r", BEL),
         ("X1", "\r", BEL),
         ("", "\r", "\r"),
-        // No time stamps, polling, filters or storing.
+        // Time stamps, polling, filters and storing are not supported.
         ("Z1", BEL, BEL),
         ("X0", BEL, BEL),
         ("P", BEL, BEL),
@@ -119,8 +120,8 @@ fn a_channel_that_only_listens_sends_nothing() {
     assert!(slcan.is_heard());
 }
 
-/// The device was reset, and the host does not know: frames pass. Or it does, and opens the
-/// channel.
+/// The device was reset without the host's knowledge: frames pass. Or the host knows it, and opens
+/// the channel.
 #[test]
 fn after_a_reset_the_channel_is_whatever_the_host_thinks() {
     let mut slcan = Slcan::new(1);
@@ -172,12 +173,12 @@ fn what_is_no_frame_is_refused_and_the_next_line_is_taken() {
         );
         assert_eq!(say(&mut slcan, b"t1000\r").0, "z\r", "{:?}", bad.escape_ascii().to_string());
     }
-    // As text files end their lines.
+    // The line ends of text files.
     assert_eq!(say(&mut open(), b"\nt1000\r\nt1000\r\n").0, "z\rz\r");
 }
 
-/// A mark stands where bytes were lost: two halves of two lines must not make one, and the host is
-/// told when it asks.
+/// A mark stands where bytes were lost: the halves of two lines must not form one line, and the
+/// host gets an error when it asks.
 #[test]
 fn a_line_with_a_gap_is_refused() {
     let mut slcan = open();
@@ -187,8 +188,8 @@ fn a_line_with_a_gap_is_refused() {
     assert_eq!(say(&mut slcan, b"F\rF\r").0, "F08\rF00\r");
 }
 
-/// Noise, with many line ends and many good lines in it: each end of a line gets one answer, and a
-/// good line behind it is understood.
+/// Noise with many line ends and many valid lines in it: each line end gets one answer, and a valid
+/// line after it is recognised.
 #[test]
 fn noise_is_answered_line_by_line() {
     let mut state = 0x9E37_79B9_7F4A_7C15_u64;

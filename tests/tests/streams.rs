@@ -1,5 +1,5 @@
-//! A whole program in one SDO download, with the real images: raw and Intel HEX, segmented and in
-//! blocks.
+//! A whole program in one SDO download, with the built images: raw and Intel HEX, segmented and by
+//! block transfer.
 
 use canopen::{Address, BitRate};
 use coboot_tests::bench::{Bench, HEARTBEAT, NODE, REQUEST, RESPONSE};
@@ -38,8 +38,8 @@ fn crc32(bytes: &[u8]) -> u32 {
     crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(bytes)
 }
 
-/// A master that knows CiA 302-3 alone: clear, one download, and 1F51h = 2 right behind it, without
-/// asking for 1F57h.
+/// A master that only supports CiA 302-3: clear, one download, and 1F51h = 2 directly after it,
+/// without reading 1F57h.
 #[test]
 fn a_program_in_one_download_starts_by_reset_program() {
     let raw = throughput::program(20);
@@ -60,7 +60,7 @@ fn a_program_in_one_download_starts_by_reset_program() {
         assert_eq!(session.read_text(VERSION).unwrap(), "1.0.0");
         assert_eq!(session.read_number(CONTROL).unwrap(), 1, "running");
         assert_eq!(session.read_number(IDENTIFICATION).unwrap(), crc32(&raw));
-        // Valid without a signature: it starts by itself.
+        // Valid without a release: it starts by itself.
         bench.power_off();
         bench.power_on();
         bench.await_program(1000);
@@ -69,7 +69,7 @@ fn a_program_in_one_download_starts_by_reset_program() {
     }
 }
 
-/// The same with NMT reset node right behind the last segment.
+/// The same with NMT reset node directly after the last segment.
 #[test]
 fn a_reset_right_behind_the_download_does_not_lose_it() {
     let raw = throughput::program(20);
@@ -81,8 +81,8 @@ fn a_reset_right_behind_the_download_does_not_lose_it() {
     assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0");
 }
 
-/// At 1 Mbit/s with a flash as slow as the data sheet allows, which the bus is twice as fast as:
-/// each answer comes within 5 ms nevertheless, and the heartbeat keeps its period within 10 %.
+/// At 1 Mbit/s with a flash as slow as the data sheet permits, half as fast as the bus: each answer
+/// still comes within 5 ms, and the heartbeat keeps its period within 10 %.
 #[test]
 fn never_silent_while_the_flash_is_slower_than_the_bus() {
     let raw = throughput::program(300);
@@ -105,7 +105,7 @@ fn never_silent_while_the_flash_is_slower_than_the_bus() {
             }
         }
         assert!(slowest <= Span::from_millis(5), "{transfers:?}: {} us", slowest.0 / 1_000_000);
-        // Three sectors of 128 KiB and smaller ones, 2 s and more each.
+        // Three sectors of 128 KiB and smaller ones, at least 2 s each.
         assert!(to - from > Span::from_millis(8000), "{transfers:?}: the flash was not the slower one");
         assert!(beats.len() >= 7, "{beats:?}");
         for pair in beats.windows(2) {
@@ -119,15 +119,15 @@ fn never_silent_while_the_flash_is_slower_than_the_bus() {
     }
 }
 
-/// A master as CiA 302-2 and 302-3 describe it, which knows nothing of coboot, updates a running
-/// device: it compares 1F56h, stops the program, clears it, sends the new one, waits for 1F57h,
-/// compares, starts, and finds 1F51h and 1F56h of the application.
+/// A master as in CiA 302-2 and 302-3, which knows nothing of coboot, updates a running device: it
+/// compares 1F56h, stops the program, clears it, sends the new one, waits for 1F57h, compares,
+/// starts, and reads 1F51h and 1F56h of the application.
 #[test]
 fn a_cia_302_master_updates_a_running_device() {
     let old = throughput::program(20);
     let mut new = throughput::program(21);
     new.truncate(20 * 1024 + 333);
-    // Whether it stops the program first, or clears it at once.
+    // It either stops the program first, or clears it at once.
     for stop in [true, false] {
         let mut bench = board_at_1_mbit(Options::default());
         let by = Transfers::Segments;
@@ -137,7 +137,7 @@ fn a_cia_302_master_updates_a_running_device() {
         bench.await_boot_up(2000);
 
         assert_ne!(bench.session().read_number(IDENTIFICATION).unwrap(), crc32(&new), "it needs an update");
-        // The bootloader answers whichever comes first, behind its boot-up.
+        // The bootloader answers the first of these commands after its boot-up message.
         if stop {
             write(&mut bench, CONTROL, &[0], by);
             assert_eq!(bench.session().read_number(CONTROL).unwrap(), 0, "stopped");
@@ -155,8 +155,8 @@ fn a_cia_302_master_updates_a_running_device() {
     }
 }
 
-/// Reset program, written to the application, starts it anew; what was cleared by the application's
-/// own hand needs no second CLEAR.
+/// Reset program, written to the application, restarts it; after a CLEAR to the application no
+/// second CLEAR is necessary.
 #[test]
 fn reset_program_starts_the_application_anew() {
     let mut bench = board_at_1_mbit(Options::default());

@@ -1,5 +1,5 @@
-//! A device with two programs: each has its own place, record and signature, and one is never at
-//! the mercy of the other.
+//! A device with two programs: each has its own region, record and release, and neither affects the
+//! other.
 
 use canopen::program::ProgramControl;
 use canopen::{Address, NodeId};
@@ -14,8 +14,7 @@ use coflash::Error;
 use emulator::time::Span;
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
 
-/// Whether the bench has the chip of the board with two programs: it is that of the board the tests
-/// are run for.
+/// Whether the tests run for the chip of the board with two programs.
 fn is_its_chip() -> bool {
     let same = firmware::board().chip == LAYOUT.chip;
     if !same {
@@ -73,7 +72,7 @@ fn two_programs_are_installed_started_and_erased_each_by_itself() {
 
     let (first, second) = (blocks(firmware::APP_V1, 1), blocks(firmware::PROGRAM_2, 2));
     install(&mut bench, 2, &second);
-    // The autostart is the first program's; the second starts when it is asked for.
+    // The autostart applies to the first program; the second one starts on request.
     restart(&mut bench);
     assert!(bench.session().device_type().unwrap().unwrap().is_bootloader());
     assert_eq!(identification(&mut bench, 1), 0);
@@ -91,7 +90,7 @@ fn two_programs_are_installed_started_and_erased_each_by_itself() {
     bench.await_boot_up(1000);
     bench.run_ms(20);
 
-    // Erasing one leaves the other whole, to the byte.
+    // Erasing one leaves every byte of the other unchanged.
     let place = (LAYOUT.programs[1].base - LAYOUT.chip.flash.base) as usize;
     let before = bench.machine().flash()[place..].to_vec();
     for _ in 0..2 {

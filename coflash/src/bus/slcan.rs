@@ -529,7 +529,7 @@ mod tests {
         for (answers, rate, words) in [
             (vec![("S4\r", &b"\x07"[..])], 125_000, "it refuses the bit rate"),
             (vec![("O\r", &b"\x07"[..])], 125_000, "it refuses to open the bus"),
-            (vec![], 123_456, "123456 bit/s is none of its bit rates"),
+            (vec![], 123_456, "it does not support 123456 bit/s"),
         ] {
             let mut played = Played { answers: answers.into(), ..Played::default() };
             let error = open(&mut played, Some(rate)).map(|_| ()).unwrap_err();

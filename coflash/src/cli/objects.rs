@@ -164,7 +164,7 @@ mod tests {
         assert_eq!(all("1018/4").unwrap(), ["1018/4"]);
         assert_eq!(all("1018/0..255").unwrap().len(), 256);
         for wrong in ["1018/3..1", "1018/..4", "1018/1..", "1018/1..256", "1018/1..4..5"] {
-            assert!(all(wrong).unwrap_err().contains("is no range"), "{wrong}");
+            assert!(all(wrong).unwrap_err().contains("is not a range"), "{wrong}");
         }
     }
 }

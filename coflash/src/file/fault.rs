@@ -85,7 +85,7 @@ pub enum Cause {
     #[error("cannot be read: {0}")]
     Io(#[source] std::io::Error),
     /// A device, pipe or the like, with an unknown or infinite size.
-    #[error("is {0} and not a file: save the data to a file first")]
+    #[error("is {0} and not a file: give a file, or save the data to one first")]
     NoRegularFile(&'static str),
     /// A file larger than any firmware.
     #[error("has {size} bytes, and a firmware file has at most {most}: check that it is the right file, or strip the symbols of the ELF file")]

@@ -150,10 +150,7 @@ mod tests {
             (format!("{good}S\u{e9}04\n"), "line 2: unknown record type S\\u{c3}"),
             (format!("{good}S10200FD\n"), "line 2: the record is too short"),
             (format!("{good}S9040000AA51\n"), "line 2: this record type has no data"),
-            (
-                format!("{good}S5030002FA\n"),
-                "line 2: the file has 1 data records and its count record says 2",
-            ),
+            (format!("{good}S5030002FA\n"), "line 2: the file has 1 data records and its count record has 2"),
             (format!("{good}{end}{good}"), "line 3: there is more text after the end record"),
             (format!("{good}S00600004844521B\n"), "line 2: a header (S0) after data records"),
             (good.to_string(), "the file: the file ends without its end record"),

@@ -164,8 +164,8 @@ mod tests {
     #[test]
     fn what_is_no_firmware_is_refused_with_its_name() {
         assert_eq!(words(b"", "a.hex"), "a.hex: is empty");
-        assert!(words(b"<!doctype html><p>404", "app.hex").starts_with("app.hex: is no firmware file"));
-        assert!(words(&[0; 100], "app.bin").contains("a raw binary does not say where it belongs"));
+        assert!(words(b"<!doctype html><p>404", "app.hex").starts_with("app.hex: is not a firmware file"));
+        assert!(words(&[0; 100], "app.bin").contains("a raw binary does not contain its address"));
         assert!(words(b":020000040801F1\n", "app.hex").starts_with("app.hex: "));
     }
 

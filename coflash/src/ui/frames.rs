@@ -215,6 +215,6 @@ mod tests {
         frames.note(Duration::new(1_436_509_052, 249_713_000), &frame(), false);
         let (log, _) = frames.log();
         assert_eq!(candump(&log, 0), "(1436509052.249713) can0 701#05\n");
-        assert!(candump(&log, 3).starts_with("# 3 frames"));
+        assert!(candump(&log, 3).starts_with("# 3 earlier frames"));
     }
 }

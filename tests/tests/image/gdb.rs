@@ -1,4 +1,4 @@
-//! gdb on a stub of a target that has nothing but memory (the GDB manual, appendix E: Remote Serial
+//! gdb with a stub of a target that has only memory (the GDB manual, appendix E: Remote Serial
 //! Protocol).
 
 use std::collections::BTreeMap;
@@ -10,15 +10,15 @@ use std::thread;
 
 use coboot_tests::firmware;
 
-/// What a run of gdb left.
+/// The results of a run of gdb.
 pub struct Run {
-    /// What it printed.
+    /// Its output.
     pub said: String,
     memory: BTreeMap<u32, u8>,
 }
 
 impl Run {
-    /// The memory from an address on; what was not written reads as erased flash.
+    /// The memory from an address on; unwritten bytes read as erased flash.
     pub fn memory(&self, address: u32, len: usize) -> Vec<u8> {
         read(&self.memory, address, len)
     }
@@ -33,7 +33,7 @@ fn read(memory: &BTreeMap<u32, u8>, address: u32, len: usize) -> Vec<u8> {
     (address..).take(len).map(|address| memory.get(&address).copied().unwrap_or(0xFF)).collect()
 }
 
-/// Runs gdb with an ELF file on a target, and these commands.
+/// Runs gdb with an ELF file, these commands and a target.
 pub fn run(elf: &Path, commands: &[&str]) -> Run {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap();
@@ -59,7 +59,7 @@ struct Stub {
     memory: BTreeMap<u32, u8>,
 }
 
-/// A Cortex-M without anything that `load` does not need.
+/// A Cortex-M with only the features that `load` needs.
 const TARGET: &str = r#"<target><architecture>arm</architecture><feature name="org.gnu.gdb.arm.m-profile">
 <reg name="r0" bitsize="32"/><reg name="r1" bitsize="32"/><reg name="r2" bitsize="32"/><reg name="r3" bitsize="32"/>
 <reg name="r4" bitsize="32"/><reg name="r5" bitsize="32"/><reg name="r6" bitsize="32"/><reg name="r7" bitsize="32"/>
@@ -68,7 +68,7 @@ const TARGET: &str = r#"<target><architecture>arm</architecture><feature name="o
 <reg name="xpsr" bitsize="32"/></feature></target>"#;
 
 impl Stub {
-    /// Serves one gdb until it goes; gives the memory.
+    /// Serves one gdb until it disconnects; returns the memory.
     fn serve(listener: &TcpListener) -> BTreeMap<u32, u8> {
         let (to, _) = listener.accept().unwrap();
         to.set_nodelay(true).unwrap();
@@ -89,7 +89,7 @@ impl Stub {
         self.from.read_exact(&mut byte).ok().map(|()| byte[0])
     }
 
-    /// The contents of the next packet, with what is escaped in it unescaped.
+    /// The contents of the next packet, unescaped.
     fn packet(&mut self) -> Option<Vec<u8>> {
         while self.byte()? != b'$' {}
         let mut packet = Vec::new();
@@ -100,7 +100,7 @@ impl Stub {
                 byte => packet.push(byte),
             }
         }
-        // The checksum: the line is a good one.
+        // The checksum is not checked: the connection is reliable.
         self.byte()?;
         self.byte()?;
         Some(packet)
@@ -146,7 +146,7 @@ impl Stub {
                 let [address, len] = numbers(&text[1..])[..] else { return "E01".into() };
                 read(&self.memory, address, len as usize).iter().map(|byte| format!("{byte:02x}")).collect()
             }
-            // Memory is written in binary; flash has packets of its own.
+            // Memory is written in binary; flash has its own packets.
             Some(b'X') => {
                 let data = packet.splitn(2, |byte| *byte == b':').nth(1).unwrap_or_default();
                 let address = numbers(&text[1..])[0];
@@ -159,7 +159,7 @@ impl Stub {
             Some(b'P' | b'G' | b'H' | b'D' | b'k') => "OK".into(),
             _ if text == "vFlashDone" => "OK".into(),
             _ if text == "qAttached" => "1".into(),
-            // Everything else is not known here, which an empty answer says.
+            // Everything else is unsupported, which an empty answer means.
             _ => String::new(),
         }
     }

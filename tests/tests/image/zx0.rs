@@ -1,23 +1,23 @@
-//! The packed image's format by its description, slowly: a ZX0 stream, or one whose offsets count
-//! half-words, behind other bytes.
+//! The format of the compressed image by its description, implemented for clarity: a ZX0 stream, or
+//! one with offsets in half-words, after other bytes.
 
-/// How a stream tells offsets.
+/// The form of offsets in a stream.
 #[derive(Clone, Copy)]
 pub struct Offsets {
-    /// Bytes that they count.
+    /// The unit of offsets in bytes.
     unit: usize,
-    /// Whether the lowest bit of the lower part's byte is the first one of the length: whether that
-    /// is 1.
+    /// Whether the lowest bit of the lower part's byte is the first bit of the length: whether the
+    /// length is 1.
     shares_byte: bool,
 }
 
-/// As in the format.
+/// The original format.
 pub const BYTES: Offsets = Offsets { unit: 1, shares_byte: true };
-/// As in the bootloader.
+/// The format in the bootloader.
 pub const HALF_WORDS: Offsets = Offsets { unit: 2, shares_byte: false };
 
-/// What a stream unpacks to behind `front`; `None` when it ends too early, reads what is not there,
-/// copies over the end of `front`, or goes on behind its end.
+/// The decompressed stream, with `front` before it; `None` if it ends too early, reads missing
+/// data, copies beyond the end of `front`, or continues after its end.
 pub fn unpack(front: &[u8], stream: &[u8], Offsets { unit, shares_byte }: Offsets) -> Option<Vec<u8>> {
     let mut bits = Bits { stream: stream.iter(), byte: 0, left: 0 };
     let (mut out, mut offset) = (Vec::new(), 1);
@@ -89,7 +89,7 @@ impl Bits<'_> {
         self.digits(so_far, inverted)
     }
 
-    /// The same behind a 0.
+    /// The same with a leading 0.
     fn digits(&mut self, so_far: usize, inverted: bool) -> Option<usize> {
         let digit = self.bit()? != inverted;
         self.number(so_far.checked_mul(2)? + usize::from(digit), inverted)

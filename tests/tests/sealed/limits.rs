@@ -1,5 +1,5 @@
-//! What signatures and ciphers may cost: time on the bus, time before the start, stack, and no trace
-//! of a secret. All times are virtual.
+//! The cost of signatures and ciphers: time on the bus, time before the start, stack, and no copy
+//! of a secret in RAM. All times are virtual.
 
 use canopen::program::ProgramControl;
 use canopen::BitRate;
@@ -34,8 +34,8 @@ fn board_at(rate: BitRate) -> Bench {
     bench
 }
 
-/// Sends a file in segments as fast as they are answered, and then asks for 1000h and 1F57h by turns
-/// until the device is idle; `look` sees the board between the requests of the latter. Gives the word of
+/// Sends a file in segments as fast as they are answered, and then reads 1000h and 1F57h in turn
+/// until the device is idle; `look` gets the board between the latter requests. Returns the word of
 /// 1F57h.
 fn send_and_ask(bench: &mut Bench, file: &[u8], look: &mut dyn FnMut(&Bench)) -> u32 {
     let request = |bench: &mut Bench, data: [u8; 8]| {
@@ -67,15 +67,15 @@ fn send_and_ask(bench: &mut Bench, file: &[u8], look: &mut dyn FnMut(&Bench)) ->
     }
 }
 
-/// The four kinds of payload, each with a counter of its own: the same image once more would be
-/// thrown away.
+/// The four kinds of payload, each with its own counter: a repetition of the same image would be
+/// discarded.
 fn kinds_one_by_one() -> impl Iterator<Item = (&'static str, Sealer<'static>)> {
     let kinds = (COUNTER..).zip(kinds(COUNTER));
     kinds.map(|(counter, (what, sealer))| (what, Sealer { counter, ..sealer }))
 }
 
-/// How long each request on the SDO channel waited for its answer, from the end of the one frame to the
-/// end of the other.
+/// The time between each request on the SDO channel and its answer, from the end of one frame to
+/// the end of the other.
 fn answers(bench: &Bench, from: Time) -> Vec<Span> {
     let mut asked = None;
     let mut all = Vec::new();
@@ -89,8 +89,8 @@ fn answers(bench: &Bench, from: Time) -> Vec<Span> {
     all
 }
 
-/// While signatures are looked at, chunks hashed, deciphered and unpacked, sectors erased and words
-/// written: no SDO request waits longer than 5 ms for its answer.
+/// While signatures are checked, chunks hashed, decrypted and decompressed, sectors erased and
+/// words written, every SDO request is answered within 5 ms.
 #[test]
 fn no_answer_takes_longer_than_5_ms() {
     let image = code(24);
@@ -129,7 +129,7 @@ fn busy_with(bench: &mut Bench, head: &[u8], expected: u32) -> Span {
     bench.time() - from.expect("it was looked at")
 }
 
-/// One signature is the difference between a head with one and a head with two, both of which are cut
+/// One signature is the difference between a head with one and a head with two signatures, both cut
 /// off there.
 #[test]
 fn a_signature_takes_less_than_a_second() {
@@ -141,7 +141,7 @@ fn a_signature_takes_less_than_a_second() {
     let mut took = Vec::new();
     for (file, head) in [(&by_the_root, 176 + 72), (&certified, 176 + 152 + 72)] {
         let mut bench = board_at(BitRate::K1000);
-        // What it works out while it is idle is ready.
+        // The constants that it computes while it is idle are ready.
         bench.run_ms(1000);
         took.push(busy_with(&mut bench, &file[..head], status::FORMAT));
     }
@@ -156,8 +156,8 @@ fn a_signature_takes_less_than_a_second() {
     assert!(one >= Span::from_millis(20), "nothing was looked at: {} us", micros(one));
 }
 
-/// The budget of the design: 5 ms, with a CRC over all of a program of 400 KiB. The signature was looked
-/// at when it was installed.
+/// The budget of the design: 5 ms, with a CRC of a whole program of 400 KiB. The signature was
+/// checked at the installation.
 #[test]
 fn a_sealed_program_of_400_kib_is_started_within_5_ms() {
     let mut bench = board_at(BitRate::K1000);
@@ -174,7 +174,7 @@ fn a_sealed_program_of_400_kib_is_started_within_5_ms() {
     assert!(took >= Span::from_millis(1), "its CRC takes a part of it: {} us", micros(took));
 }
 
-/// As soon as without the feature: 15 ms after power-on, 30 ms after the answer to 80h.
+/// As fast as without the feature: 15 ms after power-on, 30 ms after the answer to 80h.
 #[test]
 fn the_bootloader_is_there_as_soon_as_an_open_one() {
     let mut bench = board();
@@ -198,7 +198,7 @@ fn the_bootloader_is_there_as_soon_as_an_open_one() {
     assert!(call_back <= Span::from_millis(30), "{} us", micros(call_back));
 }
 
-/// Bytes of RAM behind the statics of an image: its stack.
+/// The bytes of RAM after the statics of an image: its stack.
 fn stack(image: &str) -> u32 {
     let elf = firmware::elf(image);
     let file = ElfFile32::<Endianness>::parse(&*elf).expect("an ELF file");
@@ -208,8 +208,8 @@ fn stack(image: &str) -> u32 {
     ram.end() - ends.filter(|end| ram.contains(end - 1, 1)).max().expect("statics in RAM")
 }
 
-/// No update of any kind takes more than 4 KiB of the stack: a pattern is laid below them, and all of it
-/// is there when all is done.
+/// No update of any kind uses more than 4 KiB of the stack: a pattern is written below them, and is
+/// unchanged at the end.
 #[test]
 fn updates_take_4_kib_of_the_stack_at_most() {
     const MOST: u32 = 4096;
@@ -230,8 +230,8 @@ fn updates_take_4_kib_of_the_stack_at_most() {
     assert_eq!(unused, pattern.len(), "more than {MOST} bytes of the stack are used");
 }
 
-/// Eight bytes of the key as they are, or as HMAC takes them (RFC 2104: exclusive-or 36h and 5Ch),
-/// in the order of memory or of SHA-512's words (FIPS 180-4: most significant byte first).
+/// Eight bytes of the key, plain or as HMAC uses them (RFC 2104: exclusive-or 36h and 5Ch), in the
+/// order of memory or of SHA-512's words (FIPS 180-4: most significant byte first).
 fn traces_of_the_key() -> Vec<[u8; 8]> {
     let mut traces = Vec::new();
     for mask in [0, 0x36, 0x5C] {
@@ -250,7 +250,7 @@ fn holds_a_trace(memory: &[u8], traces: &[[u8; 8]]) -> bool {
     memory.windows(8).any(|window| traces.iter().any(|trace| trace == window))
 }
 
-/// The key-encryption key stands in the flash alone: RAM can be read out of a chip whose flash cannot.
+/// The key-encryption key is only in flash: RAM can be read out of a chip with protected flash.
 #[test]
 fn the_key_encryption_key_leaves_no_trace_in_ram() {
     let traces = traces_of_the_key();
