@@ -520,8 +520,10 @@ impl Machine {
     /// have are ignored.
     pub fn set_pin(&mut self, port: char, pin: u8, level: Option<bool>) {
         if let Some(index) = port_index(port) {
-            if let Some(port) = self.cpu.chip_mut().gpio.get_mut(index) {
+            let chip = self.cpu.chip_mut();
+            if let Some(port) = chip.gpio.get_mut(index) {
                 port.set_outside(pin, level);
+                chip.show_pins();
             }
         }
     }

@@ -15,12 +15,14 @@ use crate::cortex::debug::Debug;
 use crate::cortex::exceptions::SYS_TICK;
 use crate::cortex::scs::{Effect, Scs};
 use crate::periph::crc::Crc;
+use crate::periph::exti::Exti;
 use crate::periph::flash::{Flash, Store};
 use crate::periph::gpio::Gpio;
 use crate::periph::iwdg::Iwdg;
 use crate::periph::pwr::Pwr;
 use crate::periph::rcc::{self, Clocks, Rcc, HSI_HZ};
 use crate::periph::syscfg::Syscfg;
+use crate::periph::tim::{self, Tim};
 use crate::periph::usart::{self, Usart};
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::Time;
@@ -61,9 +63,11 @@ enum Block {
     Iwdg,
     Pwr,
     Syscfg,
+    Exti,
     Can1,
     Can2,
     Usart(usize),
+    Tim(usize),
 }
 
 /// Where in RAM a piece of code goes.
@@ -92,7 +96,16 @@ enum Place {
 type ClockEnable = Option<(u32, u32)>;
 
 /// Start, block, and its clock.
-const BLOCKS: [(u32, Block, ClockEnable); 25] = [
+const BLOCKS: [(u32, Block, ClockEnable); 38] = [
+    (0x4000_0000, Block::Tim(0), Some((rcc::APB1ENR, 0))),
+    (0x4000_0400, Block::Tim(1), Some((rcc::APB1ENR, 1))),
+    (0x4000_0800, Block::Tim(2), Some((rcc::APB1ENR, 2))),
+    (0x4000_0C00, Block::Tim(3), Some((rcc::APB1ENR, 3))),
+    (0x4000_1000, Block::Tim(4), Some((rcc::APB1ENR, 4))),
+    (0x4000_1400, Block::Tim(5), Some((rcc::APB1ENR, 5))),
+    (0x4000_1800, Block::Tim(9), Some((rcc::APB1ENR, 6))),
+    (0x4000_1C00, Block::Tim(10), Some((rcc::APB1ENR, 7))),
+    (0x4000_2000, Block::Tim(11), Some((rcc::APB1ENR, 8))),
     (0x4000_3000, Block::Iwdg, None),
     (0x4000_4400, Block::Usart(1), Some((rcc::APB1ENR, 17))),
     (0x4000_4800, Block::Usart(2), Some((rcc::APB1ENR, 18))),
@@ -104,6 +117,10 @@ const BLOCKS: [(u32, Block, ClockEnable); 25] = [
     (0x4001_1000, Block::Usart(0), Some((rcc::APB2ENR, 4))),
     (0x4001_1400, Block::Usart(5), Some((rcc::APB2ENR, 5))),
     (0x4001_3800, Block::Syscfg, Some((rcc::APB2ENR, 14))),
+    (0x4001_3C00, Block::Exti, None),
+    (0x4001_4000, Block::Tim(6), Some((rcc::APB2ENR, 16))),
+    (0x4001_4400, Block::Tim(7), Some((rcc::APB2ENR, 17))),
+    (0x4001_4800, Block::Tim(8), Some((rcc::APB2ENR, 18))),
     (0x4002_0000, Block::Gpio(0), Some((rcc::AHB1ENR, 0))),
     (0x4002_0400, Block::Gpio(1), Some((rcc::AHB1ENR, 1))),
     (0x4002_0800, Block::Gpio(2), Some((rcc::AHB1ENR, 2))),
@@ -124,16 +141,7 @@ const BLOCK_SIZE: u32 = 0x400;
 const RCC_CFGR: u32 = 0x4002_3808;
 
 /// Names of blocks that are not modelled, for reports (RM0090 table 1).
-const UNMODELLED: [(u32, &str); 37] = [
-    (0x4000_0000, "TIM2"),
-    (0x4000_0400, "TIM3"),
-    (0x4000_0800, "TIM4"),
-    (0x4000_0C00, "TIM5"),
-    (0x4000_1000, "TIM6"),
-    (0x4000_1400, "TIM7"),
-    (0x4000_1800, "TIM12"),
-    (0x4000_1C00, "TIM13"),
-    (0x4000_2000, "TIM14"),
+const UNMODELLED: [(u32, &str); 24] = [
     (0x4000_2800, "RTC"),
     (0x4000_2C00, "WWDG"),
     (0x4000_3400, "I2S2ext"),
@@ -149,10 +157,6 @@ const UNMODELLED: [(u32, &str); 37] = [
     (0x4001_2000, "ADC"),
     (0x4001_2C00, "SDIO"),
     (0x4001_3000, "SPI1"),
-    (0x4001_3C00, "EXTI"),
-    (0x4001_4000, "TIM9"),
-    (0x4001_4400, "TIM10"),
-    (0x4001_4800, "TIM11"),
     (0x4002_4000, "the backup SRAM"),
     (0x4002_6000, "DMA1"),
     (0x4002_6400, "DMA2"),
@@ -208,9 +212,12 @@ pub struct Chip {
     pub can: [BxCan; 2],
     /// The USARTs, as in [`usart::INSTANCES`].
     pub usarts: [Usart; 6],
+    /// The timers, as in [`tim::INSTANCES`].
+    tims: [Tim; 12],
     pwr: Pwr,
     crc: Crc,
     syscfg: Syscfg,
+    exti: Exti,
     dbgmcu: [u32; 3],
     /// SRAM1, SRAM2 and (where there is one) SRAM3, contiguous.
     pub sram: HostMemory,
@@ -290,9 +297,11 @@ impl Chip {
             gpio: ('A'..='K').take(geometry.ports.into()).map(Gpio::new).collect(),
             can: [BxCan::new(), BxCan::slave()],
             usarts: usart::INSTANCES.each_ref().map(Usart::new),
+            tims: tim::INSTANCES.each_ref().map(Tim::new),
             pwr: Pwr::new(variant),
             crc: Crc::default(),
             syscfg: Syscfg::default(),
+            exti: Exti::default(),
             dbgmcu: [0; 3],
             sram: HostMemory::new(geometry.sram.size, 0),
             ccm: HostMemory::new(geometry.ccm.size.max(PAGE), 0),
@@ -340,7 +349,7 @@ impl Chip {
         self.rcc.note_reset(cause);
         let (crc, pwr, syscfg): (&mut dyn Peripheral, _, _) =
             (&mut self.crc, &mut self.pwr, &mut self.syscfg);
-        for block in [crc, pwr, syscfg, &mut self.rcc, &mut self.flash, &mut self.iwdg] {
+        for block in [crc, pwr, syscfg, &mut self.exti, &mut self.rcc, &mut self.flash, &mut self.iwdg] {
             block.reset();
         }
         for can in &mut self.can {
@@ -351,6 +360,9 @@ impl Chip {
         }
         for usart in &mut self.usarts {
             usart.reset();
+        }
+        for tim in &mut self.tims {
+            tim.reset();
         }
         self.wire_usarts();
         let option_bytes = self.flash.option_bytes();
@@ -395,12 +407,17 @@ impl Chip {
         for (_, block, enable) in BLOCKS {
             let clock_of = |clock: u32| if self.has_clock(enable) { clock } else { 0 };
             let (pclk1, pclk2) = (clock_of(self.clocks.pclk1), clock_of(self.clocks.pclk2));
+            let (timclk1, timclk2) = (clock_of(self.clocks.timclk1), clock_of(self.clocks.timclk2));
             match block {
                 Block::Can1 => self.can[0].set_clock(pclk1),
                 Block::Can2 => self.can[1].set_clock(pclk1),
                 Block::Usart(index) => {
                     let usart = &mut self.usarts[index];
                     usart.set_clock(if usart.instance().apb2 { pclk2 } else { pclk1 });
+                }
+                Block::Tim(index) => {
+                    let tim = &mut self.tims[index];
+                    tim.set_clock(if tim.instance().apb2 { timclk2 } else { timclk1 }, now);
                 }
                 _ => {}
             }
@@ -431,7 +448,7 @@ impl Chip {
     /// Reports a clock tree that the chip cannot follow. The model runs on; silicon would read
     /// rubbish or hang.
     fn check_clocks(&mut self) {
-        let Clocks { hclk, pclk1, pclk2 } = self.clocks;
+        let Clocks { hclk, pclk1, pclk2, .. } = self.clocks;
         let latency = self.flash.latency();
         // RM0090 table 10: one wait state for each 30 MHz at 2.7 to 3.6 V.
         let needed = (hclk - 1) / 30_000_000;
@@ -480,6 +497,9 @@ impl Chip {
         for usart in &mut self.usarts {
             usart.advance(now);
         }
+        for tim in &mut self.tims {
+            tim.advance(now);
+        }
         if self.iwdg.has_expired() {
             self.reset_request = Some(ResetCause::IndependentWatchdog);
             self.leave = true;
@@ -500,6 +520,10 @@ impl Chip {
         for usart in &self.usarts {
             usart.interrupts(&mut lines);
         }
+        for tim in &self.tims {
+            tim.interrupts(&mut lines);
+        }
+        self.exti.interrupts(&mut lines);
         self.scs.exceptions.set_levels(&lines);
         self.lines = lines;
         self.check_exceptions = self.scs.exceptions.any_pending();
@@ -529,6 +553,7 @@ impl Chip {
         ]
         .into_iter()
         .chain(self.usarts.iter().map(Peripheral::next_event))
+        .chain(self.tims.iter().map(Peripheral::next_event))
         .flatten()
         .min()
     }
@@ -647,9 +672,11 @@ impl Chip {
             Block::Iwdg => &mut self.iwdg,
             Block::Pwr => &mut self.pwr,
             Block::Syscfg => &mut self.syscfg,
+            Block::Exti => &mut self.exti,
             Block::Can1 => &mut self.can[0],
             Block::Can2 => &mut self.can[1],
             Block::Usart(index) => &mut self.usarts[index],
+            Block::Tim(index) => &mut self.tims[index],
         }
     }
 
@@ -733,6 +760,10 @@ impl Chip {
 
     fn store_block(&mut self, block: Block, offset: u32, value: u32, now: Time) -> Result<(), Unmodelled> {
         let resets_before = self.reset_bits();
+        if block == Block::Exti && !self.exti.listens() {
+            let levels = self.exti_levels();
+            self.exti.settle(levels);
+        }
         let result = self.block_mut(block).write(offset, value, now);
         match block {
             Block::Rcc => {
@@ -750,7 +781,11 @@ impl Chip {
             Block::Flash => {
                 self.settle_flash();
             }
-            Block::Gpio(_) => self.wire_usarts(),
+            Block::Gpio(_) => {
+                self.wire_usarts();
+                self.show_pins();
+            }
+            Block::Syscfg => self.show_pins(),
             Block::Can1 | Block::Can2 => {
                 if block == Block::Can1 {
                     self.tell_slave();
@@ -763,6 +798,22 @@ impl Chip {
             _ => {}
         }
         result
+    }
+
+    /// The levels at the pins that EXTI lines 0 to 15 follow.
+    fn exti_levels(&self) -> u16 {
+        (0..16).fold(0, |levels, line| {
+            let port = self.gpio.get(self.syscfg.port_of(line));
+            levels | u16::from(port.is_some_and(|port| port.level(line))) << line
+        })
+    }
+
+    /// Levels at pins may have changed.
+    pub fn show_pins(&mut self) {
+        if self.exti.listens() {
+            let levels = self.exti_levels();
+            self.exti.show(levels);
+        }
     }
 
     /// After anything that may have started, ended or waited for a flash operation.
@@ -802,6 +853,10 @@ impl Chip {
     fn after_write(&mut self) {
         self.update_lines();
         self.limit_slice();
+        // What came due within the block that writes has not happened yet, and no slice would end
+        // for it any more.
+        let now = self.now();
+        self.leave |= self.tims.iter().filter_map(Peripheral::next_event).any(|event| event <= now);
     }
 
     /// The reset bits of the modelled blocks: each sits 20h before the enable bit.

@@ -1,10 +1,12 @@
 //! The chip's peripherals but CAN, each after its section of RM0090.
 
 pub mod crc;
+pub mod exti;
 pub mod flash;
 pub mod gpio;
 pub mod iwdg;
 pub mod pwr;
 pub mod rcc;
 pub mod syscfg;
+pub mod tim;
 pub mod usart;

@@ -52,6 +52,10 @@ pub struct Clocks {
     pub pclk1: u32,
     /// APB2.
     pub pclk2: u32,
+    /// The timers at APB1.
+    pub timclk1: u32,
+    /// The timers at APB2.
+    pub timclk2: u32,
 }
 
 /// An oscillator or PLL: off, or on and ready at a time.
@@ -91,6 +95,9 @@ const PLLCFGR: u32 = 0x04;
 pub const AHB1ENR: u32 = 0x30;
 /// Offset of RCC_AHB2ENR.
 pub const AHB2ENR: u32 = 0x34;
+/// Offset of RCC_DCKCFGR, on the chips that have it.
+const DCKCFGR: u32 = 0x8C;
+const DCKCFGR_TIMPRE: u32 = 1 << 24;
 /// Offset of RCC_AHB3ENR.
 pub const AHB3ENR: u32 = 0x38;
 /// Offset of RCC_APB1ENR.
@@ -199,10 +206,17 @@ impl Rcc {
         };
         let apb_shift = |field: u32| if field & 4 != 0 { (field & 3) + 1 } else { 0 };
         let hclk = (sysclk >> ahb_shift).max(1);
+        let (apb1, apb2) = (apb_shift(self.cfgr >> 10 & 7), apb_shift(self.cfgr >> 13 & 7));
+        // A timer gets twice the clock of its bus, but not more than HCLK; four times it with TIMPRE
+        // (sections 6.2 and 6.3.25).
+        let doubled = if self.plain(DCKCFGR) & DCKCFGR_TIMPRE != 0 { 2 } else { 1 };
+        let divided = |shift: u32| (hclk >> shift).max(1);
         Clocks {
             hclk,
-            pclk1: (hclk >> apb_shift(self.cfgr >> 10 & 7)).max(1),
-            pclk2: (hclk >> apb_shift(self.cfgr >> 13 & 7)).max(1),
+            pclk1: divided(apb1),
+            pclk2: divided(apb2),
+            timclk1: divided(apb1.saturating_sub(doubled)),
+            timclk2: divided(apb2.saturating_sub(doubled)),
         }
     }
 
@@ -366,7 +380,7 @@ impl Peripheral for Rcc {
 
 #[cfg(test)]
 mod tests {
-    use shared_abi::geometry::{STM32F407VG, STM32F446RE};
+    use shared_abi::geometry::{STM32F407VG, STM32F429ZI, STM32F446RE};
 
     use super::*;
     use crate::machine::variant;
@@ -382,7 +396,8 @@ mod tests {
     #[test]
     fn the_pll_makes_168_mhz_from_an_8_mhz_crystal() {
         let mut rcc = f407(8_000_000);
-        assert_eq!(rcc.clocks(), Clocks { hclk: 16_000_000, pclk1: 16_000_000, pclk2: 16_000_000 });
+        let hsi = 16_000_000;
+        assert_eq!(rcc.clocks(), Clocks { hclk: hsi, pclk1: hsi, pclk2: hsi, timclk1: hsi, timclk2: hsi });
         rcc.write(0x00, CR_RESET | CR_HSEON, Time(0)).unwrap();
         assert_eq!(rcc.read(0x00, Time(2 * MS - 1)).unwrap() & CR_HSERDY, 0);
         assert_eq!(rcc.read(0x00, Time(2 * MS)).unwrap() & CR_HSERDY, CR_HSERDY);
@@ -393,7 +408,17 @@ mod tests {
         assert_eq!(rcc.clocks().hclk, 16_000_000);
         assert_eq!(rcc.next_event(), Some(Time(2 * MS) + PLL_LOCK));
         rcc.advance(Time(3 * MS));
-        assert_eq!(rcc.clocks(), Clocks { hclk: 168_000_000, pclk1: 42_000_000, pclk2: 84_000_000 });
+        let mhz = 1_000_000;
+        assert_eq!(
+            rcc.clocks(),
+            Clocks {
+                hclk: 168 * mhz,
+                pclk1: 42 * mhz,
+                pclk2: 84 * mhz,
+                timclk1: 84 * mhz,
+                timclk2: 168 * mhz
+            }
+        );
         assert_eq!(rcc.read(0x08, Time(3 * MS)).unwrap() & 0b1100, 0b1000);
         // Neither the PLL nor its source can be switched off now.
         rcc.write(0x00, CR_RESET, Time(3 * MS)).unwrap();
@@ -401,6 +426,17 @@ mod tests {
         assert!(rcc.write(PLLCFGR, 0, Time(3 * MS)).is_err());
         rcc.reset();
         assert_eq!(rcc.clocks().hclk, 16_000_000);
+    }
+
+    /// Section 6.3.25: without TIMPRE twice the bus's clock, with it four times, HCLK at most.
+    #[test]
+    fn timpre_gives_the_timers_four_times_the_clock_of_their_bus() {
+        let mut rcc = Rcc::new(variant::of(&STM32F429ZI), 8_000_000);
+        // PPRE2 /8, PPRE1 /4.
+        rcc.write(0x08, 0b110 << 13 | 0b101 << 10, Time(0)).unwrap();
+        assert_eq!((rcc.clocks().timclk1, rcc.clocks().timclk2), (8_000_000, 4_000_000));
+        rcc.write(DCKCFGR, DCKCFGR_TIMPRE, Time(0)).unwrap();
+        assert_eq!((rcc.clocks().timclk1, rcc.clocks().timclk2), (16_000_000, 8_000_000));
     }
 
     #[test]

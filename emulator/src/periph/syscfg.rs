@@ -1,5 +1,4 @@
-//! System configuration controller and external interrupts, as plain registers (RM0090 sections 9
-//! and 12).
+//! System configuration controller (RM0090 section 9).
 
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::Time;
@@ -11,6 +10,14 @@ pub struct Syscfg {
     pmc: u32,
     exticr: [u32; 4],
     cmpcr: u32,
+}
+
+impl Syscfg {
+    /// The port whose pin an EXTI line from 0 to 15 follows; 0 is port A (section 9.2.3).
+    #[must_use]
+    pub fn port_of(&self, line: u8) -> usize {
+        (self.exticr[usize::from(line / 4 % 4)] >> (4 * u32::from(line % 4)) & 0xF) as usize
+    }
 }
 
 impl Peripheral for Syscfg {

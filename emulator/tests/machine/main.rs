@@ -157,6 +157,52 @@ fn ram_is_noise_at_power_on_and_kept_over_a_reset() {
     assert!(snapshot(&other) != first);
 }
 
+// --- timers and pins
+// -------------------------------------------------------------------------------------------------
+
+/// 1 s of microseconds has 15 overflows of 65 536 and 15 times its middle. RM0090 section 18.3.2.
+#[test]
+fn a_timer_interrupts_at_halves_of_its_range_and_the_cpu_sleeps_between() {
+    let mut machine = machine(&programs::TIMER_HALVES);
+    machine.run_until(Time(1_000 * MS));
+    assert_eq!(words(&machine, 2), [15, 15]);
+    assert_eq!(machine.counters().exceptions[45], 30);
+    assert!(machine.counters().instructions < 30 * 20 + 40, "{}", machine.counters().instructions);
+    assert_eq!(machine.reports(), []);
+}
+
+/// A register that is written in the very block in which the period ends does not hide its end.
+#[test]
+fn no_period_of_a_timer_is_lost_while_the_program_writes_registers() {
+    let mut machine = machine(&programs::TIMER_PERIOD);
+    machine.run_until(Time(200 * MS + MS / 2));
+    assert_eq!(word(&machine, OUT), 200);
+    let latency = word(&machine, OUT + 4);
+    assert!(latency < 60, "the interrupt comes a block late at most: {latency} cycles");
+    assert_eq!(machine.counters().exceptions[44], 200);
+    machine.reset_pin();
+    machine.run_until(Time(202 * MS));
+    assert_eq!(word(&machine, OUT), 1, "a reset starts it anew");
+}
+
+/// RM0090 sections 9.2.6 and 12.2: SYSCFG_EXTICR4 gives line 13 to port C.
+#[test]
+fn a_falling_edge_at_a_pin_wakes_the_program() {
+    let mut machine = machine(&programs::BUTTON);
+    machine.set_pin('C', 13, Some(true));
+    machine.run_until(ms(1));
+    assert_eq!(word(&machine, OUT), 0);
+    for (at, port, level, edges) in
+        [(2, 'C', false, 1), (3, 'C', true, 1), (4, 'B', true, 1), (5, 'B', false, 1), (6, 'C', false, 2)]
+    {
+        machine.set_pin(port, 13, Some(level));
+        machine.run_until(ms(at));
+        assert_eq!(word(&machine, OUT), edges, "at {at} ms");
+    }
+    assert_eq!(word(&machine, OUT + 4), 1 << 13);
+    assert_eq!(machine.reports(), []);
+}
+
 // --- exceptions
 // ------------------------------------------------------------------------------------------------------
 

@@ -1191,3 +1191,143 @@ pub const BREAKPOINTS: Program = Program {
         0xED2C, 0xE000,      // 298 .word 0xe000ed2c
     ],
 };
+
+/// TIM3 counts microseconds in its 16 bits. The handler counts the overflows at 2000_0000h and the
+/// matches of channel 1, in the middle of the range, at 2000_0004h.
+pub const TIMER_HALVES: Program = Program {
+    base: 0x0800_0200,
+    vectors: &[(45, 0x0800_023D)],
+    code: &[
+        0xF04F, 0x5400,      // 200  mov.w r4, #536870912
+        0x2000,              // 204  movs r0, #0
+        0x6020,              // 206  str r0, [r4, #0]
+        0x6060,              // 208  str r0, [r4, #4]
+        0x4D15,              // 20A  ldr r5, [pc, #84]
+        0x2002,              // 20C  movs r0, #2
+        0x6428,              // 20E  str r0, [r5, #64]
+        0x4E14,              // 210  ldr r6, [pc, #80]
+        0x200F,              // 212  movs r0, #15
+        0x62B0,              // 214  str r0, [r6, #40]
+        0x2004,              // 216  movs r0, #4
+        0x6030,              // 218  str r0, [r6, #0]
+        0x2001,              // 21A  movs r0, #1
+        0x6170,              // 21C  str r0, [r6, #20]
+        0xF44F, 0x4000,      // 21E  mov.w r0, #32768
+        0x6370,              // 222  str r0, [r6, #52]
+        0x2003,              // 224  movs r0, #3
+        0x60F0,              // 226  str r0, [r6, #12]
+        0xF04F, 0x21E0,      // 228  mov.w r1, #3758153728
+        0xF04F, 0x5000,      // 22C  mov.w r0, #536870912
+        0xF8C1, 0x0100,      // 230  str.w r0, [r1, #256]
+        0x2001,              // 234  movs r0, #1
+        0x6030,              // 236  str r0, [r6, #0]
+        0xBF30,              // 238  wfi
+        0xE7FD,              // 23A  b.n 8000238
+        0x4909,              // 23C tick:  ldr r1, [pc, #36]
+        0xF04F, 0x5200,      // 23E  mov.w r2, #536870912
+        0x6908,              // 242  ldr r0, [r1, #16]
+        0x43C3,              // 244  mvns r3, r0
+        0x610B,              // 246  str r3, [r1, #16]
+        0x07C3,              // 248  lsls r3, r0, #31
+        0xD502,              // 24A  bpl.n 8000252
+        0x6813,              // 24C  ldr r3, [r2, #0]
+        0x3301,              // 24E  adds r3, #1
+        0x6013,              // 250  str r3, [r2, #0]
+        0x0783,              // 252  lsls r3, r0, #30
+        0xD502,              // 254  bpl.n 800025c
+        0x6853,              // 256  ldr r3, [r2, #4]
+        0x3301,              // 258  adds r3, #1
+        0x6053,              // 25A  str r3, [r2, #4]
+        0x4770,              // 25C  bx lr
+        0x0000,              // 25E  .short 0x0000
+        0x3800, 0x4002,      // 260  .word 0x40023800
+        0x0400, 0x4000,      // 264  .word 0x40000400
+    ],
+};
+
+/// TIM2 has a period of 16 000 cycles; the handler counts at 2000_0000h and leaves the counter at
+/// 2000_0004h. The program writes to port D all the time and never sleeps.
+pub const TIMER_PERIOD: Program = Program {
+    base: 0x0800_0200,
+    vectors: &[(44, 0x0800_023B)],
+    code: &[
+        0xF04F, 0x5400,      // 200  mov.w r4, #536870912
+        0x2000,              // 204  movs r0, #0
+        0x6020,              // 206  str r0, [r4, #0]
+        0x4D12,              // 208  ldr r5, [pc, #72]
+        0x2008,              // 20A  movs r0, #8
+        0x6328,              // 20C  str r0, [r5, #48]
+        0x2001,              // 20E  movs r0, #1
+        0x6428,              // 210  str r0, [r5, #64]
+        0xF04F, 0x4680,      // 212  mov.w r6, #1073741824
+        0xF643, 0x607F,      // 216  movw r0, #15999
+        0x62F0,              // 21A  str r0, [r6, #44]
+        0x2001,              // 21C  movs r0, #1
+        0x60F0,              // 21E  str r0, [r6, #12]
+        0xF04F, 0x21E0,      // 220  mov.w r1, #3758153728
+        0xF04F, 0x5080,      // 224  mov.w r0, #268435456
+        0xF8C1, 0x0100,      // 228  str.w r0, [r1, #256]
+        0x2001,              // 22C  movs r0, #1
+        0x6030,              // 22E  str r0, [r6, #0]
+        0x4F09,              // 230  ldr r7, [pc, #36]
+        0x6178,              // 232  str r0, [r7, #20]
+        0x6178,              // 234  str r0, [r7, #20]
+        0x6178,              // 236  str r0, [r7, #20]
+        0xE7FB,              // 238  b.n 8000232
+        0xF04F, 0x4180,      // 23A tick:  mov.w r1, #1073741824
+        0xF04F, 0x5200,      // 23E  mov.w r2, #536870912
+        0x2300,              // 242  movs r3, #0
+        0x610B,              // 244  str r3, [r1, #16]
+        0x6813,              // 246  ldr r3, [r2, #0]
+        0x3301,              // 248  adds r3, #1
+        0x6013,              // 24A  str r3, [r2, #0]
+        0x6A4B,              // 24C  ldr r3, [r1, #36]
+        0x6053,              // 24E  str r3, [r2, #4]
+        0x4770,              // 250  bx lr
+        0x0000,              // 252  .short 0x0000
+        0x3800, 0x4002,      // 254  .word 0x40023800
+        0x0C00, 0x4002,      // 258  .word 0x40020c00
+    ],
+};
+
+/// Falling edges at PC13 through EXTI line 13. The handler counts them at 2000_0000h and leaves the
+/// pending lines at 2000_0004h.
+pub const BUTTON: Program = Program {
+    base: 0x0800_0200,
+    vectors: &[(56, 0x0800_0237)],
+    code: &[
+        0xF04F, 0x5400,      // 200  mov.w r4, #536870912
+        0x2000,              // 204  movs r0, #0
+        0x6020,              // 206  str r0, [r4, #0]
+        0x4D10,              // 208  ldr r5, [pc, #64]
+        0x2004,              // 20A  movs r0, #4
+        0x6328,              // 20C  str r0, [r5, #48]
+        0xF44F, 0x4080,      // 20E  mov.w r0, #16384
+        0x6468,              // 212  str r0, [r5, #68]
+        0x4E0E,              // 214  ldr r6, [pc, #56]
+        0x2020,              // 216  movs r0, #32
+        0x6170,              // 218  str r0, [r6, #20]
+        0xF506, 0x6680,      // 21A  add.w r6, r6, #1024
+        0xF44F, 0x5000,      // 21E  mov.w r0, #8192
+        0x60F0,              // 222  str r0, [r6, #12]
+        0x6030,              // 224  str r0, [r6, #0]
+        0xF04F, 0x21E0,      // 226  mov.w r1, #3758153728
+        0xF44F, 0x7080,      // 22A  mov.w r0, #256
+        0xF8C1, 0x0104,      // 22E  str.w r0, [r1, #260]
+        0xBF30,              // 232  wfi
+        0xE7FD,              // 234  b.n 8000232
+        0x4907,              // 236 edge:  ldr r1, [pc, #28]
+        0xF04F, 0x5200,      // 238  mov.w r2, #536870912
+        0x694B,              // 23C  ldr r3, [r1, #20]
+        0x614B,              // 23E  str r3, [r1, #20]
+        0x6053,              // 240  str r3, [r2, #4]
+        0x6813,              // 242  ldr r3, [r2, #0]
+        0x3301,              // 244  adds r3, #1
+        0x6013,              // 246  str r3, [r2, #0]
+        0x4770,              // 248  bx lr
+        0x0000,              // 24A  .short 0x0000
+        0x3800, 0x4002,      // 24C  .word 0x40023800
+        0x3800, 0x4001,      // 250  .word 0x40013800
+        0x3C00, 0x4001,      // 254  .word 0x40013c00
+    ],
+};
