@@ -159,7 +159,7 @@ impl Server {
     }
 
     /// The oldest request that waits.
-    pub fn next(&mut self) -> Option<Request> {
+    pub fn take(&mut self) -> Option<Request> {
         self.requests.try_recv().ok()
     }
 
@@ -319,7 +319,7 @@ mod tests {
         });
         let mut actions = Vec::new();
         while !client.is_finished() {
-            match server.next() {
+            match server.take() {
                 Some(request) => {
                     actions.push(request.command.action);
                     request.answer(Ok("done".into()));
