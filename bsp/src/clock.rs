@@ -183,6 +183,7 @@ mod registers {
             set(rcc, PLLON);
             latency(self.wait_states);
             while rcc.cr().read().bits() & PLLRDY == 0 {}
+            await_voltage();
             // SAFETY: dividers of the buses and the PLL as system clock.
             rcc.cfgr().write(|w| unsafe {
                 w.bits((prescaler(self.apb1) << 10) | (prescaler(self.apb2) << 13) | 0b10)
@@ -219,6 +220,14 @@ mod registers {
         if NEEDS_SCALE_1 {
             voltage(rcc, VOS);
         }
+    }
+
+    /// Waits until the regulator has reached its scale, which it does when the PLL runs.
+    fn await_voltage() {
+        /// PWR_CSR.
+        const VOSRDY: u32 = 1 << 14;
+        // SAFETY: reading this register changes nothing.
+        while NEEDS_SCALE_1 && unsafe { pac::PWR::steal() }.csr().read().bits() & VOSRDY == 0 {}
     }
 
     /// The regulator as after a reset. While the PLL is off.

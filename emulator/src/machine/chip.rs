@@ -456,18 +456,20 @@ impl Chip {
     fn check_clocks(&mut self) {
         let Clocks { hclk, pclk1, pclk2, .. } = self.clocks;
         let latency = self.flash.latency();
-        // RM0090 table 10: one wait state for each 30 MHz at 2.7 to 3.6 V.
-        let needed = (hclk - 1) / 30_000_000;
+        let limits = self.geometry.line.limits();
+        let needed = (hclk - 1) / limits.per_wait_state;
         let mut wrong = Vec::new();
         if latency < needed {
             wrong.push(format!(
                 "HCLK is {hclk} Hz with {latency} flash wait states: it needs {needed}, to be set before (FLASH_ACR)"
             ));
         }
-        // Datasheet, general operating conditions; those of all chips, as over-drive is not
-        // modelled.
+        if hclk > limits.sysclk_after_reset && !self.pwr.is_at_scale_1() {
+            wrong.push(format!("HCLK is {hclk} Hz: that needs the regulator at scale 1 (PWR_CR.VOS)"));
+        }
+        // Over-drive is not modelled.
         for (name, hz, most) in
-            [("HCLK", hclk, 168_000_000), ("PCLK1", pclk1, 42_000_000), ("PCLK2", pclk2, 84_000_000)]
+            [("HCLK", hclk, limits.sysclk), ("PCLK1", pclk1, limits.apb1), ("PCLK2", pclk2, limits.apb2)]
         {
             if hz > most {
                 wrong.push(format!("{name} is {hz} Hz, the chip's limit is {most}"));

@@ -28,6 +28,13 @@ impl Pwr {
         Self { variant, cr: variant.voltage_scale.1, csr: 0 }
     }
 
+    /// CR.VOS: whether the regulator is at scale 1, which the fastest clocks need.
+    #[must_use]
+    pub fn is_at_scale_1(&self) -> bool {
+        let (scale, _) = self.variant.voltage_scale;
+        self.cr & scale == scale
+    }
+
     /// CR.DBP: whether the backup domain may be written.
     #[must_use]
     pub fn backup_writable(&self) -> bool {
