@@ -5,7 +5,7 @@
 //! ```
 //!
 //! Each line gets one line back, which begins with `ok` or `error`. `board 2` in front names another
-//! board than the first one. Who owns the boards answers ([`Server::next`]); the threads only carry
+//! board than the first one. Who owns the boards answers ([`Server::take`]); the threads only carry
 //! lines.
 
 use std::io::{self, BufRead, BufReader, Read, Write};
@@ -159,7 +159,7 @@ impl Server {
     }
 
     /// The oldest request that waits.
-    pub fn next(&mut self) -> Option<Request> {
+    pub fn take(&mut self) -> Option<Request> {
         self.requests.try_recv().ok()
     }
 
@@ -319,7 +319,7 @@ mod tests {
         });
         let mut actions = Vec::new();
         while !client.is_finished() {
-            match server.next() {
+            match server.take() {
                 Some(request) => {
                     actions.push(request.command.action);
                     request.answer(Ok("done".into()));

@@ -141,7 +141,7 @@ impl SingleThreadBase for Machine {
         let mut word = None;
         for (n, byte) in data.iter_mut().enumerate().skip(read) {
             let address = start.wrapping_add(n as u32);
-            if word.is_none() || address % 4 == 0 {
+            if word.is_none() || address.is_multiple_of(4) {
                 word = self.register(address & !3);
             }
             let Some(value) = word else { break };

@@ -20,6 +20,9 @@ Sets the machine up, builds a bootloader and runs the emulated board with it in 
                   --app FILE                      an application in flash, as a debug probe puts it there
                   --serial pty                    where other programs reach the board's UART
                   --trace FILE                    the bus as a candump log
+                  --flash FILE                    keeps the flash from one run to the next
+                  --control 127.0.0.1:29600       where commands for power, reset and pins are taken
+                  --gdb 127.0.0.1:3333            where gdb is let in
                   --bootloader FILE               another bootloader than the one built here
 ";
 

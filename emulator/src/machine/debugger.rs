@@ -117,7 +117,7 @@ impl Machine {
         }
         let nothing = || Error::Address { address, len: bytes.len(), wanted: "memory or registers" };
         let &[a, b, c, d] = bytes else { return Err(nothing()) };
-        if address % 4 != 0 || self.register(address).is_none() {
+        if !address.is_multiple_of(4) || self.register(address).is_none() {
             return Err(nothing());
         }
         let chip = self.cpu.chip_mut();

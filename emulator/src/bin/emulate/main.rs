@@ -594,7 +594,7 @@ impl Bench {
 
     /// Does what was asked for at the control socket or the terminal.
     fn obey(&mut self) -> Result<()> {
-        while let Some(request) = self.control.next() {
+        while let Some(request) = self.control.take() {
             let outcome = self.act(request.command);
             // The client hears of a failure; whoever started the emulator does too.
             let failed = outcome.as_ref().err().map(|error| format!("{error:#}"));
