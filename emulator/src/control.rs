@@ -5,7 +5,7 @@
 //! ```
 //!
 //! Each line gets one line back, which begins with `ok` or `error`. `board 2` in front names another
-//! board than the first one. Who owns the boards answers ([`Server::next`]); the threads only carry
+//! board than the first one. Who owns the boards answers ([`Server::take`]); the threads only carry
 //! lines.
 
 use std::io::{self, BufRead, BufReader, Read, Write};

@@ -22,6 +22,9 @@ Sets the machine up, builds a bootloader and runs the emulated board with it in 
                   --trace FILE                    the bus as a candump log
                   --hse HZ                        the crystal, if it has not 8 MHz
                   --can NUMBER                    the CAN controller that the transceiver is at
+                  --flash FILE                    keeps the flash from one run to the next
+                  --control 127.0.0.1:29600       where commands for power, reset and pins are taken
+                  --gdb 127.0.0.1:3333            where gdb is let in
                   --bootloader FILE               another bootloader than the one built here
 ";
 
