@@ -1,16 +1,17 @@
-//! One station of a production line, to be copied: a program into the one device on the bench.
+//! One station of a production line, as a template: downloads a program into the only device on the
+//! bench.
 //!
 //! ```text
 //! production_line BUS BOARD FILE NODE [--lss]
 //! ```
 //!
-//! `BUS` is a URL as `coflash --bus` takes it, `BOARD` the name of a board, `FILE` the firmware and
-//! `NODE` the node-ID. With `--lss` the device has no node-ID yet: it is found by LSS fastscan, and
-//! given this one.
+//! `BUS` is a URL as for `coflash --bus`, `BOARD` the name of a board, `FILE` the firmware and
+//! `NODE` the node-ID. With `--lss` the device has no node-ID yet: LSS fastscan finds it, and it
+//! gets this node-ID.
 //!
-//! What happens is written to standard output, one JSON object a line (docs/coflash.md has the
-//! names). The exit code says whose turn it is: 0 the device is good, 1 the station is set up wrong
-//! (arguments, file, adapter), 2 the device is bad.
+//! Events are written to standard output, one JSON object on each line (docs/coflash.md has the
+//! names). The exit code shows what to check: 0 the device is good, 1 the station is set up wrong
+//! (arguments, file, adapter), 2 the device is defective.
 
 use std::env;
 use std::path::Path;
@@ -27,12 +28,12 @@ use coflash::update::event::Problem;
 use coflash::update::{flash, FlashOptions};
 use serde_json::json;
 
-/// Why no device left the station.
+/// Why the station has produced no good device.
 #[derive(Debug)]
 pub enum Stop {
     /// The station is set up wrong.
     Station(String),
-    /// The device is bad, or the bus to it.
+    /// The device is defective, or the bus to it.
     Device(Error),
 }
 
@@ -45,19 +46,19 @@ impl From<Error> for Stop {
     }
 }
 
-/// What the station is to do.
+/// The task of the station.
 #[derive(Debug)]
 pub struct Order {
     bus: String,
     node: NodeId,
-    /// Whether the device has yet to be given its node-ID.
+    /// Whether the device must get its node-ID first.
     lss: bool,
     program: BlockFile,
 }
 
 impl Order {
-    /// Takes the arguments, and reads the program. All that can be wrong with it is found here,
-    /// before there is a device.
+    /// Parses the arguments and reads the program. All errors of the set-up are found here, before
+    /// a device is used.
     fn new(arguments: &[String]) -> Result<Self, Stop> {
         let station = |what: String| Stop::Station(what);
         let (bus, board, path, node, lss) = match arguments {
@@ -76,14 +77,14 @@ impl Order {
         Ok(Self { bus: bus.clone(), node, lss, program })
     }
 
-    /// The whole of it; `tell` is given each line.
+    /// The whole task; `tell` gets each line.
     fn carry_out(&self, tell: &mut dyn FnMut(serde_json::Value)) -> Result<(), Stop> {
         let mut bus = bus::open(&self.bus).map_err(Error::from)?;
         if self.lss {
             self.commission(&mut *bus)?;
         }
         let mut session = Session::new(&mut *bus, self.node, Timing::default());
-        // `verify`: the running program tells the CRC of the file, too.
+        // `verify`: the running program must report the CRC of the file, too.
         let options = FlashOptions::default().verify(true);
         flash(&mut session, &self.program, &options, &mut |event| tell(json!(event.line(self.node))))?;
         // For the record of this device: serial number, versions, CRC.
@@ -91,7 +92,7 @@ impl Order {
         Ok(())
     }
 
-    /// Gives the one device without a node-ID this one, for good.
+    /// Sets and stores this node-ID of the only device without one.
     fn commission(&self, bus: &mut dyn Adapter) -> Result<(), Stop> {
         let mut master = Master::new(&mut *bus, ANSWER);
         master.switch_all(false)?;
@@ -104,7 +105,7 @@ impl Order {
     }
 }
 
-/// Does what the arguments say; gives the exit code.
+/// Carries out the task; returns the exit code.
 pub fn run(arguments: &[String], tell: &mut dyn FnMut(serde_json::Value)) -> u8 {
     match Order::new(arguments).and_then(|order| order.carry_out(tell)) {
         Ok(()) => 0,

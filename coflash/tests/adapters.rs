@@ -1,4 +1,4 @@
-//! An update through every adapter, by the tool as a user runs it.
+//! An update through every adapter, with the tool as a separate process.
 
 mod fake;
 mod tool;
@@ -23,7 +23,8 @@ fn device() -> Fake {
     fake
 }
 
-/// The adapter's side of SLCAN (CAN232 manual): commands are acknowledged, `said` notes them.
+/// The adapter's side of SLCAN (CAN232 manual): it acknowledges commands and records them in
+/// `said`.
 fn slcan<S: Write>(text: &mut Vec<u8>, stream: &mut S, said: &mut Vec<String>) -> Vec<Frame> {
     let mut frames = Vec::new();
     while let Some(end) = text.iter().position(|byte| *byte == b'\r') {
@@ -116,7 +117,7 @@ fn slcan_over_a_serial_port() {
         (fake, said)
     });
     let file = data("identity-110.blk");
-    // The bit rate comes from the manual's option, as the URL names none.
+    // The bit rate comes from the manual's option, because the URL contains none.
     let flashed = coflash(&["--bus", &format!("slcan:{name}"), "flash", "-N", "5", "-B", "4", &file]);
     done.store(true, std::sync::atomic::Ordering::Relaxed);
     let (fake, said) = server.join().unwrap();
@@ -126,8 +127,7 @@ fn slcan_over_a_serial_port() {
     assert_eq!(said[2..6], ["C", "V", "S4", "O"]);
 }
 
-/// A line that ends when it is told to: a pseudo-terminal does not notice that nobody has the other
-/// end any more.
+/// A line that ends on request: a pseudo-terminal does not notice that its other end was closed.
 #[cfg(unix)]
 struct Until<L>(L, std::sync::Arc<std::sync::atomic::AtomicBool>);
 
@@ -152,7 +152,7 @@ impl<L: Write> Write for Until<L> {
     }
 }
 
-/// Where the kernel has no CAN a library stands in for it: `shim/can.c`, which is compiled here.
+/// If the kernel has no CAN, a library replaces it: `shim/can.c`, which is compiled here.
 #[cfg(target_os = "linux")]
 #[test]
 fn socketcan() {

@@ -1,5 +1,5 @@
-//! What is refused before anything is done to a device, in every dialect: what can be no program, what is
-//! for another device, and what is for another place in flash.
+//! Refusals before the device is changed, in every dialect: files that cannot be a program, and
+//! programs for another device or for another place in flash.
 
 mod fake;
 
@@ -11,14 +11,14 @@ use coflash::update::{flash, DeviceState, Event, FlashOptions, Password, Report}
 use fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 const START: u32 = 0x0801_0000;
-/// What the fake has in 1018h.
+/// The values of 1018h in the fake.
 const VENDOR: u32 = 0x3F;
 const PRODUCT: u32 = 1234;
 
 const DIALECTS: [Dialect; 5] =
     [Dialect::Block, Dialect::Raw, Dialect::Hex, Dialect::Lift, Dialect::EsAcademy];
 
-/// A program of 1 KiB with a label (`shared-abi/src/label.rs`, written down here from the page about it:
+/// A program of 1 KiB with a label (`shared-abi/src/label.rs`, written here from the page about it:
 /// 32 bytes at 1E0h, "CBL1", vendor-ID, product code, version, three zeros, and a check word).
 fn labelled(vendor_id: u32, product_code: u32) -> Vec<u8> {
     let mut bytes = vec![0x5A; 1024];
@@ -45,7 +45,7 @@ fn run(fake: &mut Fake, file: &BlockFile, options: FlashOptions) -> (Result<Repo
     (result, events)
 }
 
-/// It is refused, and nothing was written: not even a call back.
+/// The update is refused, and nothing was written: not even the call to the bootloader.
 #[track_caller]
 fn refused(fake: &mut Fake, file: &BlockFile, options: FlashOptions) -> Error {
     let (result, events) = run(fake, file, options);
@@ -86,7 +86,7 @@ fn another_devices_label_is_refused_in_every_dialect() {
             }
         }
     }
-    // Block 0 counts, too, where it says something else than the label.
+    // Block 0 counts, too, if it differs from the label.
     let told = Told::Device { vendor_id: VENDOR, product_code: PRODUCT + 1 };
     let file = file(&labelled(VENDOR, PRODUCT), START, told);
     assert_eq!(refused(&mut Fake::new(APPLICATION), &file, FlashOptions::default()).number(), 0x6000_0182);
@@ -110,7 +110,7 @@ fn a_label_that_fits_goes_in_and_is_in_block_0() {
             .collect();
         assert_eq!(words, [1024, vendor_id, product_code, 7, 0, 0]);
     }
-    // A device that does not tell its product code may be any.
+    // A device that does not report its product code may be any product.
     struct Reticent;
     impl Maker for Reticent {
         fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
@@ -162,7 +162,7 @@ fn what_can_be_no_program_is_refused_in_every_dialect() {
     }
 }
 
-/// A device that says where it has its program, while this runs.
+/// A device that reports its program's region while this device type runs.
 struct Told2004 {
     while_running: Vec<u32>,
     value: Vec<u8>,
@@ -209,7 +209,7 @@ fn what_is_for_another_place_than_the_devices_is_refused() {
             }
         }
     }
-    // In the region, but not at its start: size and CRC would not be those that the device counts.
+    // In the region, but not at its start: size and CRC would differ from the device's.
     for dialect in [Dialect::Block, Dialect::Raw, Dialect::Lift] {
         let error = refused(&mut at(START - 0x1000, 0x1_0000, APPLICATION, &BOTH), &file, speaks(dialect));
         assert_eq!(error.number(), 0x6000_0015, "{dialect:?}");
@@ -220,7 +220,8 @@ fn what_is_for_another_place_than_the_devices_is_refused() {
         .unwrap();
 }
 
-/// An application of another maker knows nothing of it: then the bootloader is asked, before it erases.
+/// An application of another manufacturer does not have this object: the bootloader is asked before
+/// it erases.
 #[test]
 fn the_bootloader_is_asked_where_the_application_does_not_know() {
     let file = file(&labelled(VENDOR, PRODUCT), START, Told::default());
@@ -237,7 +238,7 @@ fn the_bootloader_is_asked_where_the_application_does_not_know() {
     }
 }
 
-/// An image that came without addresses is judged by the place that it goes to.
+/// An image without addresses is checked against its target region.
 #[test]
 fn an_image_without_addresses_is_judged_by_the_devices_place() {
     const BOTH: [u32; 2] = [APPLICATION, BOOTLOADER];
@@ -254,8 +255,8 @@ fn an_image_without_addresses_is_judged_by_the_devices_place() {
     assert!(fake.log.contains(&"5: 1F50/1, 1024 bytes".to_string()), "{:?}", fake.log);
 }
 
-/// What a lift has besides its program are any bytes (CiA 814-1 clause 6.4): they are not judged, and the
-/// update goes on to the password.
+/// All programs of a lift except its program 1 are any bytes (CiA 814-1 clause 6.4): they are not
+/// checked, and the update continues with the password.
 #[test]
 fn a_lifts_data_are_not_judged() {
     for bytes in [vec![0; 64], labelled(VENDOR, PRODUCT + 1)] {

@@ -1,5 +1,5 @@
-//! What a failed update says of the device that it leaves: the device is asked, in every dialect and
-//! behind every refusal. And who notices that somebody else is at work on it.
+//! The report of a failed update about the device: the tool asks the device, in every dialect and
+//! after every refusal. Also the detection of another tool that uses the device.
 
 mod fake;
 
@@ -54,12 +54,12 @@ fn nobody_there_and_nothing_done() {
     let nobody = left(BOOTLOADER, &|fake| fake.running = None, FlashOptions::default());
     assert_eq!((nobody.state, nobody.look), (DeviceState::Untouched, Look::NotAsked));
     assert_eq!(nobody.to_string(), "it was not changed");
-    // A run that goes well leaves nothing to tell.
+    // A successful update reports no state.
     let (_, events) = run(&mut Fake::new(BOOTLOADER), &FlashOptions::default());
     assert!(events.iter().all(|event| event.left().is_none()));
 }
 
-/// An application that refuses the call, or takes no notice of it, runs on.
+/// An application that refuses or ignores the call continues.
 #[test]
 fn a_call_that_fails_has_changed_nothing() {
     for outcome in [Outcome::Abort(0x0602_0000), Outcome::Ignore] {
@@ -70,7 +70,7 @@ fn a_call_that_fails_has_changed_nothing() {
     }
 }
 
-/// Nothing is erased by a CLEAR that is refused.
+/// A refused CLEAR erases nothing.
 #[test]
 fn a_refusal_before_the_erasure_leaves_the_old_program() {
     for its in STANDARD {
@@ -90,7 +90,7 @@ fn a_refusal_before_the_erasure_leaves_the_old_program() {
     );
 }
 
-/// A device that erases with the first data that it finds good, and finds none, has its program.
+/// A device that erases with the first good data, and receives none, keeps its program.
 #[test]
 fn what_the_device_still_has_is_told() {
     for its in STANDARD {
@@ -117,7 +117,7 @@ fn what_the_device_still_has_is_told() {
         assert_eq!(gone.state, DeviceState::Erased, "{its}");
         assert_eq!(gone.to_string(), "its bootloader is running; it contains no complete program");
     }
-    // In the middle of the program the CRC of before says nothing any more.
+    // In the middle of the program the previous CRC no longer counts.
     let later = |fake: &mut Fake| {
         fake.crc = Some(0x0BAD_CAFE);
         fake.on_block = Box::new(|number| if number == 2 { Outcome::Status(0x0C) } else { Outcome::Accept });
@@ -168,7 +168,7 @@ fn a_program_that_does_not_answer_is_told_with_its_release() {
     assert_eq!((raw.state, raw.look), (DeviceState::Written, Look::Silent));
 }
 
-/// A request of somebody else to a node: reads 1F57h.
+/// A request of another client to a node: reads 1F57h.
 fn foreign(node: u8) -> Frame {
     let id = CobId::new(0x600 + u16::from(node)).unwrap();
     Frame::of(id, &[0x40, 0x57, 0x1F, 1, 0, 0, 0, 0])
@@ -193,14 +193,14 @@ fn somebody_elses_requests_end_an_update_before_anything_is_done() {
         let mut fake = Fake::new(running);
         fake.inject(foreign(NODE));
         run(&mut fake, &FlashOptions::default().alone(false)).0.unwrap();
-        // Who speaks to another node does not matter.
+        // A client that talks to another node does not matter.
         let mut fake = Fake::new(running);
         fake.noise = vec![foreign(NODE + 1)];
         run(&mut fake, &FlashOptions::default()).0.unwrap();
     }
 }
 
-/// An adapter that brings back what it sends; and somebody else's request, from this frame on.
+/// An adapter that returns sent frames; and another client's requests, from this frame on.
 struct Echo(Fake, Vec<Frame>, Option<usize>);
 
 impl Adapter for Echo {
@@ -234,7 +234,7 @@ fn an_adapters_echo_is_nobody_else() {
             fake.knows_blocks = blocks;
             let mut echo = Echo(fake, Vec::new(), None);
             run(&mut echo, &FlashOptions::default()).0.unwrap();
-            // But somebody else is heard over it.
+            // But another client is detected over it.
             let mut echo = Echo(Fake::new(running), Vec::new(), Some(1));
             let error = run(&mut echo, &FlashOptions::default()).0.unwrap_err();
             assert!(matches!(error, Error::NotAlone { .. }), "{error}");

@@ -1,4 +1,4 @@
-//! No input may make a reader panic, and nothing damaged may pass for firmware.
+//! No input may cause a panic of a reader, and no damaged file may pass as firmware.
 
 use coflash::file::block_file::{BlockFile, Checksum};
 use coflash::file::convert::{blocks_of, GapFill, Options};
@@ -23,7 +23,7 @@ const FILES: [(&str, &[u8]); 9] = [
     data!("crc16-400.blk"),
 ];
 
-/// The file's meaning, or why it has none.
+/// The contents of the file, or the reason why it is invalid.
 fn meaning(bytes: &[u8], format: Option<Format>) -> Result<BlockFile, String> {
     let firmware = read::read(bytes, format, Some(0x0801_0000)).map_err(|error| error.to_string())?;
     blocks_of(firmware, &Options::default()).map(|done| done.file).map_err(|error| error.to_string())
@@ -132,7 +132,7 @@ fn elf(segments: u16, len: usize, segment: impl Fn(u32) -> (u32, u32, u32)) -> V
     bytes
 }
 
-/// Headers are cheap: 20 000 of them that all show the same 2.6 MB would be 52 GB.
+/// Headers are small: 20 000 of them that all refer to the same 2.6 MB would be 52 GB.
 #[test]
 fn the_segments_of_an_elf_file_are_added_up_before_they_are_copied() {
     const LEN: u32 = 2_600_000;
@@ -142,7 +142,7 @@ fn the_segments_of_an_elf_file_are_added_up_before_they_are_copied() {
         error.starts_with("the file: its load segments have more than 67108864 bytes together"),
         "{error}"
     );
-    // So many headers are no fault by themselves.
+    // So many headers are not a fault by themselves.
     let bytes = elf(20_000, 0, |number| (52 + 4 * number, 0x0801_0000 + 4 * number, 4));
     assert_eq!(meaning(&bytes, None).unwrap().program_size(), 80_000);
     // The gap between two segments counts as well.
@@ -190,8 +190,7 @@ proptest! {
         let _ = meaning(lines.join("\n").as_bytes(), None);
     }
 
-    /// What conversion cuts into blocks is the memory that went in, whatever the pieces and the
-    /// block size.
+    /// The blocks contain exactly the memory of the input, for any pieces and any block size.
     #[test]
     fn blocks_hold_exactly_the_image(
         pieces in prop::collection::btree_map(0u32..4000, any::<u8>(), 1..300),

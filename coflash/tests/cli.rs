@@ -1,4 +1,4 @@
-//! The program as a user runs it: files, exit codes, words, and an update over a real socket.
+//! The tool as a separate process: files, exit codes, messages, and an update over a real socket.
 
 mod fake;
 mod tool;
@@ -87,8 +87,8 @@ fn a_build_script_for_the_manuals_converter_works() {
     }
 }
 
-/// Blocks are taken as they are: it is said which CRC they keep, and that options for another one do
-/// nothing.
+/// Blocks are copied unchanged: the tool reports which CRC they keep, and that options for another
+/// one have no effect.
 #[test]
 fn convert_of_a_block_file_says_which_crc_it_keeps() {
     let folder = Folder::new("convert-block");
@@ -147,10 +147,10 @@ fn inspect_tells_what_a_file_holds() {
     assert!(done.exit == 3 && done.err.contains("lies outside"), "{}", done.err);
 }
 
-/// A bus that can be named and is not there.
+/// A bus with a valid URL that does not exist.
 const NOWHERE: &str = "socketcand://127.0.0.1:1/x";
 
-/// What has no end, or is too large for any firmware, is said so and not read.
+/// A file without an end, or larger than any firmware, is reported and not read.
 #[test]
 #[cfg(unix)]
 fn what_is_no_file_or_too_large_is_not_read() {
@@ -180,7 +180,8 @@ fn what_is_no_file_or_too_large_is_not_read() {
     assert!(done.exit == 3 && done.err.contains("has more than 1048576 bytes"), "{}", done.err);
 }
 
-/// The image of a bootloader is refused before anybody looks for the bus, and so is what is none.
+/// The image of a bootloader is refused before the bus is opened, and so is an image that is not a
+/// program.
 #[test]
 fn what_can_be_no_program_is_refused_without_a_bus() {
     let folder = Folder::new("no-program");
@@ -207,7 +208,8 @@ fn what_can_be_no_program_is_refused_without_a_bus() {
             "{}",
             done.err
         );
-        // It may be forced, and then it fails for want of a bus; so do data, which may be anything.
+        // With --force it passes, and fails because there is no bus; so do data, which may be any
+        // bytes.
         let done = flash(file, &[options, &["--force"]].concat());
         assert!(done.exit != 3 && done.err.contains("127.0.0.1:1"), "{}", done.err);
     }
@@ -276,7 +278,7 @@ fn quiet_says_nothing_and_json_says_one_document() {
     let crc = u32::from_le_bytes(fs::read(data("plain-400.blk")).unwrap()[0x36B..0x36F].try_into().unwrap());
     assert_eq!((&json["program"]["size"], &json["program"]["crc"]), (&4001.into(), &crc.into()));
     assert_eq!((&json["blocks"], &json["left_out"]), (&4.into(), &0.into()));
-    // What is left out is warned about beside the document.
+    // A warning about data that are left out appears beside the document.
     let done = coflash(&["--json", "convert", &data("program.elf"), &out, "--end-address", "0x080102C5"]);
     assert!(
         done.exit == 0 && done.err.contains("25 bytes outside the address range were left out [0x60002001]")

@@ -1,4 +1,4 @@
-//! Every command as a user runs it, over a real socket, against devices that are none.
+//! Every command as a separate process, over a real socket, against fake devices.
 
 mod fake;
 mod tool;
@@ -14,7 +14,7 @@ use fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use serde_json::Value;
 use tool::{coflash, data, run, serve, snapshot, Folder};
 
-/// A device that does not take its time.
+/// A device without delays.
 fn quick(running: u32) -> Fake {
     let mut fake = Fake::new(running);
     fake.erase_time = Duration::from_millis(30);
@@ -22,7 +22,7 @@ fn quick(running: u32) -> Fake {
     fake
 }
 
-/// Runs a command on a device; gives what it said, as text and as JSON, and the device.
+/// Runs a command on a device; returns its output as text and as JSON, and the device.
 fn on(fake: impl Fn() -> Fake, arguments: &[&str]) -> (tool::Done, Value, Fake) {
     let go = |json: &[&str]| {
         let (bus, server) = serve(fake());
@@ -55,7 +55,8 @@ fn the_steps_of_an_update_one_by_one() {
     assert!(said.out.starts_with("node 5: program 1 is erased, in "), "{}", said.out);
     assert!(json["seconds"].is_number());
     assert_eq!(fake.writes(), ["command 80", "command 03"]);
-    // One that was done in no time was put off until there is a block; at once is another one.
+    // An erase without duration was postponed until the first block; a second command erases at
+    // once.
     let (_, _, fake) = on(|| quick(BOOTLOADER), &["erase"]);
     assert_eq!(fake.writes(), ["command 03"; 2]);
 
@@ -106,7 +107,7 @@ fn status_shows_and_clears() {
     assert_eq!((&json["status"]["error"], fake.writes()), (&Value::Null, vec!["command 02"]));
 }
 
-/// The device may be named before and behind what `debug` is to do.
+/// The device may be named before and after the subcommand of `debug`.
 #[test]
 fn debug_knows_its_device_wherever_it_is_named() {
     let words = ["debug", "read", "0x20000000", "64", "--node", "5"];
@@ -205,7 +206,7 @@ fn scan_finds_who_answers_and_who_is_heard() {
         bootloader.node = 9;
         bootloader.status(0x02);
         let mut application = quick(APPLICATION);
-        // Node 20 has no SDO server, or another one has it.
+        // Node 20 has no SDO server, or its SDO server uses other COB-IDs.
         application.inject(Frame::of(CobId::new(0x714).unwrap(), &[5]));
         application.inject(Frame::of(CobId::new(0x705).unwrap(), &[0x7F]));
         Bus(vec![application, bootloader])
@@ -230,7 +231,7 @@ fn scan_finds_who_answers_and_who_is_heard() {
     assert!(out.contains("no answer") && bus.0.iter().all(|fake| fake.sent.is_empty()), "{out}");
     let (out, _) = scan(&["-N", "9,11-12"]);
     assert!(out.contains("\n9     bootloader"), "{out}");
-    // What a tool that was closed has left unfinished is ended first: within a block download a question
+    // An unfinished transfer of another tool is aborted first: within a block download, a request
     // can be taken for a segment.
     let folder = Folder::new("scan");
     let trace = folder.path("scan.log");
@@ -265,7 +266,7 @@ fn a_trace_is_shown_again_in_words() {
     );
 }
 
-/// A disk that is full does not stop an update, and is not kept secret.
+/// A full disk does not stop an update, and is reported.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_trace_that_cannot_be_written_is_a_warning() {
@@ -321,7 +322,7 @@ fn monitor_shows_the_bus() {
     server.join().unwrap();
 }
 
-/// `coflash monitor | head`: it ends when nobody reads any more.
+/// `coflash monitor | head`: it ends when standard output is closed.
 #[test]
 fn monitor_ends_with_its_reader() {
     let (bus, server) = serve(Heartbeats(Duration::ZERO));
@@ -388,7 +389,7 @@ fn lss_says_what_it_does() {
     assert_eq!(device.orders, [[0x13, 0, 0], [0x17, 0, 0]]);
     let (done, device) = lss(&["store"]);
     assert_eq!((done.exit, device.orders), (0, vec![[0x17, 0, 0]]));
-    // A device which nobody has.
+    // A device that does not exist.
     let (done, device) =
         lss(&["assign", "-N", "9", "--vendor", "1", "--product", "2", "--revision", "3", "--serial", "4"]);
     assert_eq!((done.exit, device.orders.len()), (5, 0));
@@ -594,7 +595,7 @@ fn the_configuration_gives_defaults_and_the_command_line_wins() {
     assert_eq!(coflash(&["info", "--config", &folder.path("none.toml")]).exit, 3);
 }
 
-/// What a person reads who asks for help.
+/// The help text.
 #[test]
 fn help_is_complete() {
     let mut text = String::new();

@@ -9,7 +9,7 @@ fn frame(text: &str) -> Frame {
     Line::parse(&format!("(0.0) can0 {text}")).unwrap().unwrap().frame
 }
 
-/// Frames in their order, each with its words.
+/// Frames in their order, each with its description.
 #[track_caller]
 fn says(dialogue: &[(&str, &str)]) {
     let mut decoder = Decoder::new();

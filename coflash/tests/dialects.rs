@@ -1,5 +1,5 @@
-//! Devices of other makers, each played from its document: what they are sent, byte for byte, and
-//! what becomes of it.
+//! Devices of other manufacturers, each played from its document: the frames that they receive,
+//! byte for byte, and the results.
 
 mod fake;
 
@@ -66,8 +66,7 @@ fn locked(phrase: &str) -> FlashOptions {
 // --- CiA 417
 // ---------------------------------------------------------------------------------------------------------
 
-/// A lift device (CiA 814-1 clause 6.3). The document leaves the abort codes open but for that of a
-/// wrong file.
+/// A lift device (CiA 814-1 clause 6.3). The document only defines the abort code of a wrong file.
 struct Lift {
     kept: Kept,
     armed: bool,
@@ -217,7 +216,7 @@ fn a_lift_that_refuses_is_left_as_it_was_found() {
     assert!(matches!(result, Err(Error::NoPassword { .. })));
     assert_eq!((left(&events), fake.writes().len()), (DeviceState::Untouched, 0));
 
-    // Another one is in its bootloader already.
+    // Another device is already in its bootloader.
     let (fake, _) = Lift::fake(APPLICATION, |_| {});
     let (other, _) = Lift::fake(LIFT, |_| {});
     let mut bus = Bus(vec![fake, other]);
@@ -259,7 +258,7 @@ fn a_lift_is_read_from_its_bootloader_and_restarted() {
         let mut session = Session::new(&mut fake, node(from), Timing::default());
         let read = read_locked(&mut session, at, None, Password::new(PHRASE), &mut |_| {}).unwrap();
         assert_eq!((&read[..], session.node().get()), (&b"what was stored"[..], from));
-        // One that was in its bootloader before stays there.
+        // A device that was in its bootloader before stays there.
         let resets = fake.count("126: 1F51/1, 1 bytes");
         assert_eq!(resets, usize::from(running == APPLICATION));
     }
@@ -267,7 +266,7 @@ fn a_lift_is_read_from_its_bootloader_and_restarted() {
     let mut session = Session::new(&mut fake, node(NODE), Timing::default());
     let refused = read_locked(&mut session, at, None, Password::new(PHRASE), &mut |_| {}).unwrap_err();
     assert!(matches!(refused, Error::NotInDialect { dialect: Dialect::Block, .. }), "{refused}");
-    // Its password would erase what is to be read.
+    // Its password would erase the program to be read.
     let (mut fake, _) = EsAcademy::fake(|_| {});
     let mut session = Session::new(&mut fake, node(64), Timing::default());
     let refused = read_locked(&mut session, at, None, Password::new("INIT"), &mut |_| {}).unwrap_err();
@@ -283,7 +282,7 @@ struct EsAcademy {
     kept: Kept,
     password: Option<[u8; 4]>,
     enabled: bool,
-    /// The last flash operation went wrong.
+    /// The last flash operation has failed.
     failed: bool,
     fails: bool,
     runs_by_itself: bool,
@@ -358,7 +357,7 @@ fn esacademy_gets_the_password_and_then_intel_hex() {
         assert_eq!(fake.sent.iter().filter(|frame| frame.data() == password).count(), 1);
         let text = kept.lock().unwrap().clone();
         assert_eq!(text, ihex::emit(&file().image()).into_bytes());
-        // A program that runs already is not restarted.
+        // A program that already runs is not restarted.
         assert_eq!(fake.count("64: 1F51/1, 1 bytes"), usize::from(!runs_by_itself));
     }
     // The password is optional.
@@ -388,8 +387,8 @@ fn esacademy_says_what_went_wrong_by_the_error_register_alone() {
 // --- CiA 302-3
 // -------------------------------------------------------------------------------------------------------
 
-/// A device that knows CiA 302-3 and nothing else. Its device type is that of its profile, whatever
-/// runs; 1F51h tells.
+/// A device that only supports CiA 302-3. Its device type is that of its profile in both states;
+/// 1F51h shows what runs.
 struct Standard {
     kept: Kept,
     /// 0 stopped, 1 started.

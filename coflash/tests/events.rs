@@ -1,4 +1,4 @@
-//! The events as programs read them: the names are a contract.
+//! The events in the form for programs: the names are a contract.
 
 mod fake;
 
@@ -17,7 +17,7 @@ fn node() -> NodeId {
     NodeId::new(NODE).unwrap()
 }
 
-/// What a program reads of an update of this device: one line each.
+/// The lines of an update of this device.
 fn lines(fake: &mut Fake, options: &FlashOptions) -> Vec<Value> {
     let file = BlockFile::parse(include_bytes!("data/identity-110.blk")).unwrap();
     let mut lines = Vec::new();
@@ -82,7 +82,7 @@ fn an_update_tells_its_course_and_ends_with_done() {
 #[test]
 fn an_update_that_fails_tells_retries_and_ends_with_done_too() {
     let mut fake = Fake::new(BOOTLOADER);
-    // 1F57h reads 06h, a wrong CRC, behind each attempt at block 2.
+    // 1F57h reads 06h, a wrong CRC, after each attempt at block 2.
     fake.on_block = Box::new(|block| if block == 2 { Outcome::Status(0x06) } else { Outcome::Accept });
     let lines = lines(&mut fake, &FlashOptions::default().repeats(2));
     let retries: Vec<&Value> = lines.iter().filter(|line| line["event"] == "retry").collect();
@@ -100,7 +100,7 @@ fn an_update_that_fails_tells_retries_and_ends_with_done_too() {
     assert!(!done["error"]["advice"].as_str().unwrap().is_empty());
 }
 
-/// Every kind of event, with the names that a program may rely on.
+/// Every kind of event, with the names on which a program may rely.
 #[test]
 fn the_names_stay() {
     let of = |number| NodeId::new(number).unwrap();

@@ -20,14 +20,13 @@ use coflash::Error;
 use fake::{Blocks, Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 use tool::{coflash, data};
 
-/// What a gateway does with a line: what it answers, or nothing. `[7]` of the answer is its own
-/// affair.
+/// The gateway's answer to a line, or none. The gateway adds `[7]` to the answer itself.
 type Play = Box<dyn FnMut(&str) -> Option<String> + Send>;
 
-/// What a gateway was sent.
+/// The lines that a gateway has received.
 type Lines = Arc<Mutex<Vec<String>>>;
 
-/// A gateway for one client; gives its address, and every line that it was sent.
+/// A gateway for one client; returns its address, and every received line.
 fn gateway(mut play: Play) -> (String, Lines, thread::JoinHandle<()>) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap().to_string();
@@ -85,7 +84,7 @@ fn to_base64(bytes: &[u8]) -> String {
     text
 }
 
-/// A gateway in front of network 3 with this device: an SDO client of its own on the bus.
+/// A gateway to network 3 with this device: it has its own SDO client on the bus.
 struct Behind {
     fake: Fake,
     timeout: u64,
@@ -195,7 +194,7 @@ fn block_files_go_through_a_gateway() {
     }
 }
 
-/// What CiA 302-3 devices take: an image in one download.
+/// The data for CiA 302-3 devices: an image in one download.
 struct Standard(Arc<Mutex<Vec<u8>>>);
 
 impl Maker for Standard {
@@ -237,7 +236,7 @@ fn images_go_through_a_gateway() {
     assert!(*image.lock().unwrap() == fs::read(data("program.bin")).unwrap());
 }
 
-/// A set of parameters has no addresses (CiA 814-1 clause 6.4): any bytes, as they are.
+/// A set of parameters has no addresses (CiA 814-1 clause 6.4): any bytes, sent unchanged.
 #[test]
 fn a_binary_without_an_address_goes_to_devices_that_have_none() {
     let file = data("identity-110.blk");
@@ -249,7 +248,7 @@ fn a_binary_without_an_address_goes_to_devices_that_have_none() {
         (bus, (server, image))
     };
     let binary = ["flash", "-N", "5", &file, "-I", "binary"];
-    // This one is no program, and is not taken for one without a word.
+    // This file is not a program, and is refused with a message.
     let done =
         coflash(&[&["--bus", "socketcand://127.0.0.1:1/x"][..], &binary, &["--dialect", "raw"]].concat());
     assert!(done.exit == 3 && done.err.contains("is not a program: its first word"), "{}", done.err);
@@ -303,11 +302,11 @@ fn what_the_device_refuses_has_the_same_words_as_on_the_bus() {
     let done = coflash(&["--bus", &bus, "read", "-N", "6", "1000"]);
     assert_eq!(done.exit, 5, "{}", done.err);
     assert!(done.err.contains("node 6 does not answer"), "{}", done.err);
-    // Nobody has listened to the bus.
+    // The bus was not observed.
     assert!(done.err.contains("what to do: check that node 6 is the right one"), "{}", done.err);
 }
 
-/// What needs frames says so.
+/// Commands that need frames report that they do.
 #[test]
 fn what_listens_to_the_bus_is_refused_in_words() {
     let (bus, ..) = behind(quick(BOOTLOADER));
@@ -319,7 +318,7 @@ fn what_listens_to_the_bus_is_refused_in_words() {
     let file = data("plain-400.blk");
     let done = coflash(&["--bus", &bus, "flash", &file, "--ser_num", "1"]);
     assert!(done.exit == 2 && done.err.contains("LSS address"), "{}", done.err);
-    // The gateway on the CAN bus of the manual's tool is another one.
+    // The gateway on the CAN bus of the manual's tool is a different one.
     for option in ["--gateway_id", "--network_id"] {
         let done = coflash(&["--bus", &bus, "flash", &file, option, "3"]);
         assert_eq!(done.exit, 2, "{}", done.err);
@@ -338,7 +337,8 @@ fn what_listens_to_the_bus_is_refused_in_words() {
     }
 }
 
-/// Asks a gateway that answers like this for 1000h of node 5 in network 1, with little patience.
+/// Reads 1000h of node 5 in network 1 through a gateway with these answers, with a short time
+/// limit.
 fn asked(
     play: impl FnMut(&str) -> Option<String> + Send + 'static,
 ) -> (Result<Vec<u8>, GatewayError>, Cia309) {
@@ -429,7 +429,7 @@ fn a_gateway_that_answers_something_else_is_an_error_in_words() {
     assert!(words(result).contains("it has not answered for 0.3 s"));
 }
 
-/// An answer that comes too late belongs to a command that was given up, and to no other.
+/// A late answer belongs to a command that was given up, and to no other.
 #[test]
 fn a_late_answer_is_not_taken_for_another_ones() {
     let mut count = 0;
@@ -445,13 +445,13 @@ fn a_late_answer_is_not_taken_for_another_ones() {
 
 #[test]
 fn a_gateway_that_goes_away_or_takes_nothing_ends_it() {
-    // It hangs up behind the connection, and in the middle of a command.
+    // It closes the connection directly after the connect, and in the middle of a command.
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let mut gateway = Cia309::connect(&listener.local_addr().unwrap().to_string(), 1).unwrap();
     drop(listener.accept().unwrap());
     assert!(words(ask(&mut gateway)).contains("is gone"));
 
-    // It reads nothing: an image does not fit into the line between.
+    // It reads nothing: an image does not fit into the buffers of the connection.
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let mut gateway = Cia309::connect(&listener.local_addr().unwrap().to_string(), 1).unwrap();
     let (mut stream, _) = listener.accept().unwrap();
@@ -468,7 +468,7 @@ fn a_gateway_that_goes_away_or_takes_nothing_ends_it() {
     let result = gateway.download(&ask, &image, &mut |_| {}).map(|()| Vec::new());
     let found = words(result);
     assert!(found.contains("it has accepted no data for 0.3 s"), "{found}");
-    // The user gives up while it takes nothing.
+    // The user cancels while it accepts nothing.
     let (address, ..) = self::gateway(Box::new(|_| None));
     let mut gateway = Cia309::connect(&address, 1).unwrap();
     let ask = Ask { cancelled: &|| true, patience: Duration::from_secs(600), ..ask };

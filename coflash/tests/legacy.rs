@@ -1,4 +1,4 @@
-//! What the manual's tools (L-1112e_5, L-1112d_10) can do, in their own spelling.
+//! The functions of the manual's tools (L-1112e_5, L-1112d_10), with their own options.
 
 mod fake;
 mod tool;
@@ -161,7 +161,7 @@ fn a_serial_line_has_115200_bits_a_second() {
     assert_eq!(done.exit, 0, "{}", done.err);
     assert!(done.err.contains("--vxd_type is ignored"), "{}", done.err);
     server.join().unwrap();
-    // Without --bus the port is meant that the number names.
+    // Without --bus, the number names the port.
     let done = coflash(&[&["flash", "-F", &file, "--baudrate", "115200"][..], &line].concat());
     let port = if cfg!(windows) { "COM7" } else { "/dev/ttyS6" };
     assert!(done.exit == 4 && done.err.contains(port), "{}", done.err);
@@ -174,7 +174,7 @@ fn a_serial_line_has_115200_bits_a_second() {
     }
 }
 
-/// `FT_DEF_RETRY_TIMEOUT`: how often a request without an answer is sent.
+/// `FT_DEF_RETRY_TIMEOUT`: how many times a request without an answer is sent.
 #[test]
 fn attempts_of_a_request_are_as_many_as_said() {
     for (options, times) in [(&[][..], 3), (&["--sdo-attempts", "1"], 1), (&["--sdo-attempts", "5"], 5)] {

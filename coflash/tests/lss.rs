@@ -22,11 +22,11 @@ fn answer(bytes: [u8; 8]) -> Frame {
     Frame::of(CobId::new(0x7E4).unwrap(), &bytes)
 }
 
-/// A slave with nothing of ours in it: who it is, where it is in fastscan, and what it was told.
+/// An independent slave: its identity, its progress in fastscan, and the received settings.
 struct Slave {
     address: [u32; 4],
     node: u8,
-    /// Given, and not in force yet.
+    /// Set, but not active yet.
     pending: u8,
     selected: usize,
     configured: bool,
@@ -34,7 +34,7 @@ struct Slave {
     bit_rate: Option<u8>,
     activated: Option<u16>,
     stored: Option<u8>,
-    /// What orders are answered with.
+    /// The answers to commands.
     refusal: (u8, u8),
 }
 
@@ -129,7 +129,7 @@ struct Bus {
     now: Duration,
     outbox: VecDeque<Frame>,
     sent: Vec<[u8; 8]>,
-    /// After so many requests the devices are gone.
+    /// The number of requests after which the devices are gone.
     gone_after: Option<usize>,
 }
 
@@ -284,7 +284,8 @@ fn nobody_there_and_refusals_have_words() {
 fn what_others_say_is_passed_over_and_cancelling_ends_it() {
     let mut noisy = bus([Slave::new(ADDRESS, 5)]);
     noisy.slaves[0].configured = true;
-    // Left over from before: forgotten. Too short, and another service's: passed over.
+    // A frame left over from before is dropped. Frames that are too short, or of another service,
+    // are ignored.
     noisy.outbox.push_back(answer([0x5E, 99, 0, 0, 0, 0, 0, 0]));
     assert_eq!(Master::new(&mut noisy, ANSWER).inquire_node_id().unwrap(), NodeId::new(5));
     let flag = Arc::new(AtomicBool::new(true));

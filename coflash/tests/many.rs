@@ -65,7 +65,7 @@ fn one_erases_while_another_receives() {
     }
     let took = bus.0[0].now - before;
     assert!(took < alone * 2, "four took {took:?}, one takes {alone:?}");
-    // All are erasing before the first has got anything.
+    // All devices erase before the first one has received a block.
     let first = events.iter().position(|(_, event)| matches!(event, Event::Progress { .. })).unwrap();
     let erasing = events[..first].iter().filter(|(_, event)| *event == Phase::Erasing.into()).count();
     assert_eq!(erasing, 4);
@@ -85,8 +85,8 @@ fn the_same_devices_give_the_same_course_of_events() {
     }
 }
 
-/// What an adapter promises: nothing means that the time has passed. And each port hears its own
-/// node alone.
+/// An adapter's promise: no frame means that the time has passed. And each port only receives the
+/// frames of its own node.
 #[test]
 fn a_port_waits_as_long_as_it_says_and_hears_its_own_node() {
     let mut bus = Bus(vec![Fake::new(BOOTLOADER)]);
@@ -114,7 +114,7 @@ fn a_port_waits_as_long_as_it_says_and_hears_its_own_node() {
     assert_eq!(ended[2], (ms(30), vec![]));
 }
 
-/// Somebody else speaks to one of the devices: that one is left alone.
+/// Another client talks to one of the devices: that device is not changed.
 #[test]
 fn somebody_else_is_heard_through_the_hub() {
     let mut bus = devices([1, 2, 3]);

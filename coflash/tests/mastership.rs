@@ -1,5 +1,5 @@
-//! Before and around the update of a lift (CiA 814-1 clause 6.3): what the device tells, who has
-//! node-ID 126, and the NMT mastership of flying masters (CiA 302-2).
+//! Before and during the update of a lift (CiA 814-1 clause 6.3): the device's information, another
+//! device with node-ID 126, and the NMT mastership of flying masters (CiA 302-2).
 
 mod fake;
 
@@ -76,7 +76,7 @@ fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Err
     (result, events)
 }
 
-/// Whether an event begins like this, and is not about something else.
+/// Whether an event begins with this text.
 fn told_of_mastership(events: &[Event], words: &str) -> bool {
     events.iter().any(|event| event.to_string().contains(words))
 }
@@ -93,7 +93,7 @@ fn node(id: u8) -> NodeId {
     NodeId::new(id).unwrap()
 }
 
-/// How a flying master takes 076h. Two stacks that are in use differ there.
+/// The reaction of a flying master to 076h. Two existing stacks differ here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Forced {
     /// The active master begins a negotiation at once.
@@ -103,7 +103,7 @@ enum Forced {
     Detects,
     /// It does not know 076h.
     Ignores,
-    /// It answers that it is the master, whatever comes.
+    /// It always answers that it is the master.
     Stays,
 }
 
@@ -115,7 +115,7 @@ struct Network {
     id: u8,
     active: bool,
     forced: Forced,
-    /// When its timer ends, and what it does then: 0x71, 0x72 or 0x73.
+    /// When its timer ends, and its frame then: 0x71, 0x72 or 0x73.
     timer: Option<(Duration, u16)>,
     outbox: VecDeque<Frame>,
     /// Who said what of the protocol: from the tool `>`, from the master `<`.
@@ -223,14 +223,13 @@ fn what_a_lift_tells_of_itself_is_shown_before_anything_is_done_to_it() {
         "device: Door drive, hardware B2, software 1.2.0, vendor-ID 10000001h, product code 10000002h, revision \
          10000003h, serial number 10000004h"
     );
-    // Nobody was asked for the mastership but whoever has it, of whom there is none.
+    // Only the question for the active master was sent, and there is none.
     let protocol: Vec<u16> = fake.sent.iter().filter_map(|frame| frame.cob_id()).map(|id| id.get()).collect();
     let protocol: Vec<u16> = protocol.into_iter().filter(|id| (0x71..=0x76).contains(id)).collect();
     assert_eq!(protocol, [0x73]);
 }
 
-/// A node 126 that serves no SDO and sends heartbeats, once a second, is another device in its
-/// bootloader.
+/// A node 126 without SDO that sends a heartbeat every second is another device in its bootloader.
 #[test]
 fn a_node_126_that_only_sends_heartbeats_is_noticed() {
     struct Beating(Fake, Duration);
@@ -287,12 +286,12 @@ fn the_mastership_is_asked_for_and_given_back_around_the_update() {
         assert!(place(&back) > place(&Note::Moved { node: node(126) }.into()), "{events:?}");
         assert!(network.active);
     }
-    // It is given back when the update fails, too.
+    // The mastership is also given back after a failed update.
     let mut network = Network::new(2, 10, Forced::Negotiates);
     let (result, events) = run(&mut network, &options().unlock(Password::new("no")));
     assert!(result.is_err() && network.active);
     assert!(events.contains(&Note::MasterBack { node: node(10) }.into()), "{events:?}");
-    // And it is left alone where that is asked for.
+    // The option leaves the master alone.
     let mut network = Network::new(1, 3, Forced::Negotiates);
     let (result, events) = run(&mut network, &options().mastership(false));
     assert!(result.is_ok() && network.log.iter().all(|entry| entry == "sdo"), "{events:?}");

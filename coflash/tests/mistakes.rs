@@ -1,7 +1,7 @@
-//! The mistakes that people make, as a table: the command, the situation, how the tool ends, and what its
-//! words must have: what happened, and what to do.
+//! Common mistakes as a table: the command, the situation, the exit code, and the required words of
+//! the message: what happened, and what to do.
 //!
-//! Every row runs the program as a user runs it.
+//! Every row runs the tool as a separate process.
 #![cfg(target_os = "linux")]
 
 mod fake;
@@ -22,22 +22,22 @@ use canopen::{CobId, Frame};
 use fake::{Fake, Outcome, APPLICATION, BOOTLOADER};
 use tool::{data, run, serve, Done, Folder};
 
-/// What is the matter besides the command.
+/// The situation of the command.
 #[derive(Clone, Copy, Debug)]
 enum With {
-    /// Nothing.
+    /// Normal.
     Nothing,
     /// A device on `{bus}`.
     Device(fn() -> Fake),
-    /// A server on `{server}` that says this to whoever connects, and no more.
+    /// A server on `{server}` that sends this to each client, and nothing else.
     Server(&'static [u8]),
-    /// Nobody on `{server}`.
+    /// No server on `{server}`.
     NoServer,
     /// An `open` of `{port}` fails with this error number.
     Port(i32),
     /// No kernel with CAN: a CAN socket fails with this error number.
     Socket(i32),
-    /// `vcan0` takes nothing: this error number; and `ip` says that its controller is in this state.
+    /// `vcan0` accepts no frame: this error number; and `ip` reports its controller in this state.
     Refuses(i32, &'static str),
     /// On `vcan0` each request brings error frames of this class, with these data; `ip` says that the
     /// controller is in this state.
@@ -53,7 +53,7 @@ fn absent() -> Fake {
     fake
 }
 
-/// Nothing but another node's heartbeat, in this state.
+/// Only another node's heartbeat, in this state.
 fn heard(id: u16, state: u8) -> Fake {
     let mut fake = absent();
     fake.deaf_while_busy = true;
@@ -84,7 +84,7 @@ fn refusing_command(command: u8, outcome: Outcome, running: u32) -> Fake {
 }
 
 const MISTAKES: &[Mistake] = &[
-    // The bus as people write it.
+    // The bus in the forms that people write.
     Mistake(
         "scan --bus slcan:/dev/ttyACM0@500",
         Nothing,
@@ -460,7 +460,7 @@ fn say(says: &'static [u8]) -> String {
     address
 }
 
-/// A bus on which each request brings an error frame of Linux, and nothing else.
+/// A bus on which each request causes an error frame of Linux, and no other frame.
 fn errors(class: u32, data: [u8; 8]) -> std::path::PathBuf {
     static COUNT: AtomicUsize = AtomicUsize::new(0);
     let name = format!("coflash-err-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
@@ -487,7 +487,7 @@ fn every_mistake_is_told_with_what_to_do() {
     assert!(MISTAKES.len() >= 42, "42 were tried");
     let room = Room::new();
     let (next, wrong) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
-    // Most of the time is waiting: some at once.
+    // Most of the time is waiting, so several run at the same time.
     thread::scope(|scope| {
         for _ in 0..4 {
             scope.spawn(|| loop {

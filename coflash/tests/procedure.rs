@@ -40,7 +40,7 @@ fn fails(fake: &mut Fake) -> Error {
     run(fake, FlashOptions::default()).0.unwrap_err()
 }
 
-/// The first `times` times that `number` comes the outcome, then all is well.
+/// For the first `times` times of `number` this result, then normal.
 fn script<T: PartialEq + Copy + Send + 'static>(
     number: T,
     times: usize,
@@ -155,7 +155,7 @@ fn a_device_without_blocks_is_asked_once_for_them() {
         assert_eq!((report.transfers, report.repeats), (Transfers::Segments, 0));
         assert_eq!(fake.block_downloads, 1);
     }
-    // Any other abort is about the value, and no reason to write it another way.
+    // Any other abort concerns the value, and is not a reason for another form of download.
     let mut fake = Fake::new(BOOTLOADER);
     fake.knows_blocks = Blocks::Refused(0x0607_0012);
     let error = fails(&mut fake);
@@ -193,8 +193,8 @@ fn lost_segments_of_a_block_are_sent_again_within_the_transfer() {
     }
 }
 
-/// What was on its way then draws an abort for each segment: none of them is taken for an answer to
-/// the next request.
+/// Each segment in transit then causes an abort: none of these is taken for an answer to the next
+/// request.
 #[test]
 fn a_block_transfer_that_is_refused_in_the_middle_is_told_by_its_status() {
     for segment in [1, 2, 9, 30] {
@@ -277,8 +277,8 @@ fn a_trial_run_comes_before_the_release() {
     assert_eq!(fake.writes()[1 + BLOCKS..], ["command 83", "command 01"]);
 }
 
-/// A program that fails its trial, however it does, is never released for autostart; what is said
-/// names that and the way back.
+/// A program that fails its trial in any way is never released for autostart; the message names the
+/// failure and the way to recover.
 #[test]
 fn a_program_that_fails_its_trial_is_not_released() {
     let trial = |change: &dyn Fn(&mut Fake)| {
@@ -506,8 +506,8 @@ fn busy_for_ever_is_given_up() {
     assert_eq!(fails(&mut fake).number(), 0x6000_0013);
 }
 
-/// The power is cut while it erases: that is told after 2 s, and after 10 s it is over. A device that is
-/// busy and answers is waited for as long as a command may take.
+/// The power is cut during the erase: this is reported after 2 s, and the update ends after 10 s.
+/// For a device that is busy and answers, the tool waits for as long as a command may take.
 #[test]
 fn silence_is_told_and_comes_to_an_end_soon() {
     for (silent, end) in [(None, 10), (Some(Duration::from_secs(4)), 4)] {
@@ -542,8 +542,8 @@ fn silence_is_told_and_comes_to_an_end_soon() {
     );
 }
 
-/// A program that was started right behind its download takes the first 80h for "confirm": it answers,
-/// and goes on. It is asked again, and soon.
+/// A program that was started directly after its download takes the first 80h for "confirm": it
+/// answers and continues. It is called again soon.
 #[test]
 fn an_application_that_takes_the_first_call_for_a_confirmation_is_called_again() {
     let mut fake = Fake::new(APPLICATION);
@@ -728,7 +728,7 @@ node 5: an application (device type 00020192h)
     );
 }
 
-/// A bus on which anything may come at any time.
+/// A bus on which any frame may arrive at any time.
 struct Chaos {
     now: Duration,
     frames: Vec<(u16, Vec<u8>)>,
@@ -771,7 +771,7 @@ fn an_upload_without_end_is_given_up() {
     assert!(chaos.now >= Duration::from_secs(60) && chaos.now < Duration::from_secs(61), "{:?}", chaos.now);
 }
 
-/// Answers to other questions for ever.
+/// Endless answers to other requests.
 #[test]
 fn answers_that_never_fit_are_given_up() {
     let answer = (0x585, vec![0x43, 0x00, 0x10, 0, 0, 0, 0, 0x10]);
@@ -781,8 +781,8 @@ fn answers_that_never_fit_are_given_up() {
 }
 
 proptest! {
-    /// No answer of a device makes the host panic or hang, and none makes it believe that a program
-    /// is in.
+    /// No answer of a device causes a panic or a hang of the host, or makes it report a program
+    /// that is not in the device.
     #[test]
     fn no_device_can_break_the_host(
         frames in prop::collection::vec(

@@ -1,5 +1,5 @@
-//! Sealed images: what is made is what the format's page says, and whatever is changed in it is
-//! refused by the rule that it breaks.
+//! Sealed images: the result matches the page of the format, and every change is refused with the
+//! rule that it breaks.
 
 use std::io::Write as _;
 use std::process::{Command, Stdio};
@@ -500,8 +500,8 @@ fn a_key_in_a_module_signs_in_two_steps() {
     }
 }
 
-/// A key stream that is used twice shows both texts: whatever is different in the payload or the
-/// manifest makes another key.
+/// A key stream that is used twice reveals both texts: every difference in the payload or the
+/// manifest gives another key.
 #[test]
 fn no_two_images_have_one_nonce() {
     let keks = [kek(1)];
@@ -522,7 +522,7 @@ fn no_two_images_have_one_nonce() {
     assert_eq!(nonces.len(), count);
 }
 
-/// What a command answers to its input; `None` where this computer has no such command.
+/// The output of a command for this input; `None` if this computer does not have the command.
 fn piped(command: &mut Command, input: &[u8]) -> Option<Vec<u8>> {
     let child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
     let mut child = child.ok()?;
@@ -536,7 +536,7 @@ fn digits(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// The key-encryption key's HMAC and the encryption, by another hand.
+/// The key-encryption key's HMAC and the encryption, computed by other tools.
 #[test]
 fn openssl_unwraps_and_decrypts() {
     let (image, keks) = (image(1500), [kek(0x42)]);
@@ -563,7 +563,7 @@ fn openssl_unwraps_and_decrypts() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(400))]
 
-    /// Whichever bit is wrong: refused.
+    /// Any flipped bit is refused.
     #[test]
     fn no_bit_can_be_changed(place in any::<prop::sample::Index>(), bit in 0..8, kind in 0..3) {
         let keks = [kek(1)];
@@ -586,7 +586,7 @@ proptest! {
         }
     }
 
-    /// Any bytes in place of a few in a block file: what comes out is the image, or nothing.
+    /// Any bytes in place of a few in a block file: the result is the image, or an error.
     #[test]
     fn hostile_blocks_are_refused(
         noise in prop::collection::vec(any::<u8>(), 1..40),
@@ -604,7 +604,7 @@ proptest! {
         prop_assert!(carried(file).is_err());
     }
 
-    /// Cut off anywhere: refused, and told as cut off where the head is whole.
+    /// A truncated file is refused, and reported as cut off if its head is complete.
     #[test]
     fn no_prefix_is_taken(place in any::<prop::sample::Index>()) {
         let file = sealer().seal(&image(900), &release()).unwrap();
@@ -616,8 +616,8 @@ proptest! {
         prop_assert!(expected, "{}: {}", end, refusal);
     }
 
-    /// Any bytes behind the magic, and any change of many bytes: no panic, neither when it is checked
-    /// nor when it is shown.
+    /// Any bytes after the magic, and any change of many bytes: no panic, neither in the check nor
+    /// in the description.
     #[test]
     fn hostile_files_are_refused(
         noise in prop::collection::vec(any::<u8>(), 0..700),

@@ -1,5 +1,5 @@
-//! The commands for sealed images, one behind the other as a user runs them; OpenSSL is asked wherever
-//! it is there.
+//! The commands for sealed images, one after another; OpenSSL checks the results if it is
+//! installed.
 
 mod fake;
 mod tool;
@@ -90,7 +90,7 @@ fn json(words: &[&str]) -> Value {
     serde_json::from_str(&done.out).unwrap_or_else(|error| panic!("{error}: {}{}", done.out, done.err))
 }
 
-/// What OpenSSL says; `None` where it is not there.
+/// The output of OpenSSL; `None` if it is not installed.
 fn openssl(words: &[&str]) -> Option<Vec<u8>> {
     let output = Command::new("openssl").args(words).stdin(Stdio::null()).output().ok()?;
     assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stderr));
@@ -210,7 +210,7 @@ fn the_converter_encrypts_with_a_value() {
     let shown = json(&["show", &room.path("app.blk")]);
     assert_eq!(shown["flags"], serde_json::json!(["encrypted"]));
     assert_eq!(shown["blocks"]["start"], START);
-    // Nothing of the program is to be seen.
+    // No part of the program is visible.
     let first = room.bytes("app.blk");
     let has = |part: &[u8]| first.windows(part.len()).any(|bytes| bytes == part);
     assert!(program()[0x300..].chunks_exact(32).all(|plain| !has(plain)));
@@ -483,14 +483,14 @@ fn what_cannot_be_sealed_is_refused_with_what_to_do() {
     assert!(coflash(&words).err.contains("is not a program"));
     let done = coflash(&[&words[..], &["--data"]].concat());
     assert!(
-        done.err.contains("for which vendor-ID it is") && done.err.contains("give --vendor"),
+        done.err.contains("the program has no vendor-ID of its target device") && done.err.contains("give --vendor"),
         "{}",
         done.err
     );
     let done = coflash(&[&words[..], &["--data", "--vendor", "1", "--product", "2"]].concat());
     assert_eq!(done.exit, 0, "{}", done.err);
     assert_eq!(json(&["show", &room.path("junk.cbs")])["flags"], serde_json::json!(["data"]));
-    // A file that is one already is not sealed again, and not overwritten.
+    // A sealed image is not sealed again, and not overwritten.
     let before = room.bytes("junk.cbs");
     let done = coflash(&["seal", &room.path("junk.cbs"), "--key", &key, "--counter", "1"]);
     assert_eq!((done.exit, room.bytes("junk.cbs")), (2, before));
@@ -624,7 +624,7 @@ fn a_bootloader_gets_its_keys() {
     assert!(done.exit == 2 && done.err.contains("give --board or --layout"), "{}", done.err);
 }
 
-/// Flashes this file; gives what was said, what the device was sent, and what else was written.
+/// Flashes this file; returns the output, the data for the device, and the other writes.
 fn flashed(file: &str, room: u32, status: u32, more: &[&str]) -> (Done, Vec<u8>, Vec<String>) {
     let kept: Arc<Mutex<Vec<u8>>> = Arc::default();
     let mut fake = Fake::new(APPLICATION);
@@ -671,7 +671,7 @@ fn a_sealed_image_goes_into_a_device_as_it_is() {
         }
     }
 
-    // What is told without asking the device's keys: nothing is done to it.
+    // The refusals that do not need the device's keys: the device is not changed.
     let small = flashed(&file, 1000, 0, &[]);
     assert!(small.0.err.contains("the device has room for 1000"), "{}", small.0.err);
     assert_eq!((small.0.exit, small.2.len()), (6, 0));
@@ -801,7 +801,7 @@ fn a_sealed_image_goes_into_a_device_block_by_block() {
     let file = room.path("app.cbs");
     let done = coflash(&["flash", &file, "--blocks", "--block-size", "20"]);
     assert!(done.exit == 2 && done.err.contains("a block size of 20 is impossible"), "{}", done.err);
-    // A device that does not tell where its program starts, and one that takes no blocks.
+    // A device that does not report its program's start, and one that does not accept blocks.
     let untold = Told::sealed(program).but(((0x2004, 1), Vec::new()));
     let (done, fake) = on(BOOTLOADER, untold, &["flash", &file, "--blocks"]);
     assert!(done.exit == 6 && done.err.contains("the start of its program (2004h)"), "{}", done.err);
@@ -827,7 +827,7 @@ fn a_device_without_keys_gets_no_sealed_image() {
     );
     assert!(done.err.contains("it was not changed"), "{}", done.err);
     assert!(fake.writes().is_empty(), "{:?}", fake.writes());
-    // An application does not say it; the bootloader does, before anything is erased.
+    // An application does not report it; the bootloader does, before anything is erased.
     let (done, fake) = on(APPLICATION, open(), &["flash", &file]);
     assert!(done.exit == 6 && done.err.contains("the device is not sealed"), "{}", done.err);
     assert_eq!(fake.writes(), ["command 80"]);
@@ -849,7 +849,7 @@ fn a_device_is_compared_with_a_sealed_image() {
     assert!(done.out.contains("and does not run it") && !done.out.contains("not reported"), "{}", done.out);
     assert!(fake.writes().is_empty());
 
-    // In an application some of it is not told, and that is said.
+    // An application does not report all values, and the command says so.
     let (done, _) = compared(APPLICATION, Told::sealed(&program), &["--json"]);
     assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
     let value: Value = serde_json::from_str(&done.out).unwrap();

@@ -26,8 +26,8 @@ fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Err
     (result, events)
 }
 
-/// A device that is switched on at this time, with a program that starts 300 ms later unless
-/// somebody asks.
+/// A device that is switched on at this time, with a program that starts 300 ms later unless a
+/// client sends a request.
 struct Late {
     fake: Fake,
     on: Duration,
@@ -65,7 +65,7 @@ fn a_device_that_is_switched_on_later_is_waited_for_and_caught_in_its_rescue_win
         let options = FlashOptions::default().wait(true).start(false);
         let (result, events) = run(&mut late, &options);
         assert!(result.is_ok(), "{millis}: {result:?}");
-        // However long it takes, it is said once.
+        // It is reported once, however long it takes.
         let searching =
             events.iter().filter(|event| matches!(event, Event::Phase(Phase::Searching { .. }))).count();
         assert_eq!(searching, usize::from(millis > 0), "{events:?}");
@@ -76,7 +76,7 @@ fn a_device_that_is_switched_on_later_is_waited_for_and_caught_in_its_rescue_win
     assert!(matches!(run(&mut late, &FlashOptions::default()).0, Err(Error::NoAnswer { .. })));
 }
 
-/// The same by itself: it is held, and nothing else is done to it.
+/// The same as a separate function: the device is held, and not changed.
 #[test]
 fn a_device_that_is_switched_on_is_caught() {
     for (millis, within) in [(0, None), (50, None), (60_037, None), (59_000, Some(Duration::from_secs(60)))] {
@@ -132,7 +132,7 @@ fn an_application_that_answers_is_called_back_until_it_goes() {
     }
 }
 
-/// What comes up of which nobody knows the node-ID.
+/// A device whose node-ID is unknown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Kind {
     /// A bootloader that starts its program 300 ms later unless it is asked, or a layer setting
@@ -199,7 +199,7 @@ fn whoever_comes_up_is_caught_under_whatever_node_id() {
         match kind {
             Kind::Bootloader => assert_eq!(caught.unwrap().node, NodeId::new(NODE)),
             Kind::WithoutNodeId => assert_eq!(caught.unwrap().node, None),
-            // It may be another device than the one that is waited for: it is left alone.
+            // It may be another device than the expected one: it is not changed.
             Kind::Application => assert!(matches!(caught, Err(Error::NoAnswer { .. })), "{caught:?}"),
         }
         assert!(unknown.fake.writes().is_empty());
@@ -344,7 +344,7 @@ fn a_program_on_trial_that_is_another_device_is_called_back_and_never_released()
         assert_eq!(commands[commands.len() - 2..], ["command 01", "command 80"]);
         assert_eq!(running, Some(BOOTLOADER));
     }
-    // Without a trial nobody looks.
+    // Without a trial the identity is not compared.
     let other = Told(|sub| (sub == 1).then_some(Ok(0x40)), None);
     assert!(fake(other, &FlashOptions::default().trial_run(false)).0.is_ok());
 }

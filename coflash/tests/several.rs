@@ -1,4 +1,4 @@
-//! Several devices, interruption and diagnosis as a user meets them.
+//! Several devices, interruption and diagnosis, with the tool as a separate process.
 
 mod fake;
 mod tool;
@@ -83,7 +83,7 @@ fn a_job_file_says_who_gets_what() {
     assert_eq!((bus.0[1].blocks[1][20..24].to_vec(), bus.0[1].running), (vec![1, 2, 3, 4], Some(BOOTLOADER)));
     assert_eq!((bus.0[0].count("command 80"), bus.0[2].count("command 80")), (1, 0));
     assert!(done.out.ends_with("3 of 3 devices are done\n"), "{}", done.out);
-    // A bad image, and nobody is touched.
+    // With an invalid image, no device is changed.
     fs::write(&small, b":020000040801F1\n:050000000102030405EC\n:00000001FF\n").unwrap();
     let done = coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--job", &job]);
     assert!(
@@ -235,7 +235,7 @@ fn a_silent_device_is_diagnosed_by_what_the_bus_says() {
     }
 }
 
-/// A bus on which something is said all the time.
+/// A bus with permanent traffic.
 struct Chatter {
     fake: Fake,
     frames: Vec<Frame>,

@@ -1,5 +1,5 @@
-//! The server of `coflash ui` without a browser: who gets in, and what it does with those who mean no
-//! good. Requests are written byte by byte, as no library would send them.
+//! The server of `coflash ui` without a browser: access control, and hostile requests. Requests are
+//! written byte by byte, because no library would send them.
 #![cfg(feature = "ui")]
 
 use std::io::{ErrorKind, Read, Write};
@@ -19,7 +19,7 @@ mod tool;
 use fake::vault::Vault;
 use fake::Fake;
 
-/// How long something may take before it counts as hanging. Nothing is measured with it.
+/// How long something may take before it counts as hanging. It measures nothing.
 const PATIENCE: Duration = Duration::from_secs(120);
 
 /// A server of one test.
@@ -121,7 +121,7 @@ impl Ui {
         self.request("POST", &format!("{}firmware?name={name}", self.path), &[&self.host_line()], bytes)
     }
 
-    /// Follows the events until the state is one that `wanted` likes; gives it.
+    /// Follows the events until `wanted` accepts the state; returns the state.
     #[track_caller]
     fn until(&self, what: &str, wanted: impl Fn(&Value) -> bool) -> Value {
         let mut stream = self.stream();
@@ -300,7 +300,7 @@ fn what_is_no_request_of_the_page_is_refused_with_words() {
         let words = answer.json();
         assert!(words["words"].is_string() && words["advice"].is_string(), "{what} {body}: {words}");
     }
-    // A request of 64 KiB is none of the page's.
+    // A request of 64 KiB does not come from the page.
     let long = json!({ "url": "x".repeat(70_000) }).to_string();
     assert_eq!(send("open", &[kind], long.as_bytes()).status, 413);
     // Nothing can be done without an adapter.
@@ -336,7 +336,7 @@ fn files_of_every_kind_are_taken_or_refused_with_their_name() {
         (&state["firmware"]["name"], &state["firmware"]["program_size"]),
         (&json!("app.hex"), &json!(12))
     );
-    // One that is refused leaves none: what was there is not what the person means.
+    // A refused file also removes the previous one, which the user no longer means.
     ui.file("bad.hex", b"no");
     ui.until("no file", |state| state["firmware"].is_null());
     // Larger than any program: refused by what it announces, before it is sent.
@@ -394,7 +394,7 @@ fn a_sealed_image_shows_what_it_says_or_is_refused_with_what_to_do() {
     }
 }
 
-/// A sealed image goes into the device as it is; one that it refuses is told with what to do.
+/// A sealed image is sent to the device unchanged; a refusal is reported with advice.
 #[test]
 fn a_sealed_image_is_sent_as_it_is_and_the_device_judges_it() {
     let file = sealed(Sealer::default());
@@ -433,7 +433,8 @@ fn slow() -> Fake {
     fake
 }
 
-/// Two tabs that update at once: the second is told no, in words that tell what is under way.
+/// Two tabs start an update at the same time: the second one is refused, with the name of the
+/// running task.
 #[test]
 fn a_second_update_is_refused_while_one_runs() {
     let (bus, _server) = tool::serve(slow());
@@ -466,7 +467,7 @@ fn a_second_update_is_refused_while_one_runs() {
     assert_eq!(state["reports"][0]["ok"], false);
 }
 
-/// Ctrl-C in mid-update ends that in order, and tells what state the device is left in.
+/// Ctrl-C during an update ends it in an orderly way, and reports the state of the device.
 #[test]
 fn the_end_of_the_server_ends_an_update_in_order() {
     let (bus, server) = tool::serve(slow());
@@ -501,7 +502,7 @@ fn flood() -> String {
     bus
 }
 
-/// A page that stops reading its events is dropped, and holds up nobody meanwhile.
+/// A page that stops reading its events is dropped, and does not block the others meanwhile.
 #[test]
 fn a_reader_that_stops_reading_is_dropped() {
     let ui = Ui::new(Some(flood()));
@@ -526,7 +527,7 @@ fn a_reader_that_stops_reading_is_dropped() {
     ui.until("an event", |state| state["adapter"]["state"] == "open");
 }
 
-/// There are places for so many pages; one too many is told so, and nobody else suffers.
+/// The number of pages is limited; one too many gets an error, and the others are not affected.
 #[test]
 fn more_readers_than_there_are_places_are_refused() {
     let ui = Ui::new(None);

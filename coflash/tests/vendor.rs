@@ -1,5 +1,5 @@
-//! PEAK and Kvaser adapters with a library that stands in for the vendor's: honest, missing, old, and
-//! lying. Nothing of this was tried on hardware.
+//! PEAK and Kvaser adapters with a library in place of the vendor's: correct, missing, old, and
+//! faulty. Not tested on hardware.
 #![cfg(target_os = "linux")]
 
 mod fake;
@@ -27,7 +27,7 @@ fn vendor(name: &str, which: &str, options: &[&str]) -> Folder {
     folder
 }
 
-/// Runs the tool where the vendor's library is, with no bus behind it, and with this lie.
+/// Runs the tool with the vendor's library, without a bus, and with this fault.
 fn call(folder: &Folder, lie: &str, arguments: &[&str]) -> Done {
     run(command(folder, lie, arguments).env_remove("FAKE_BUS"))
 }
@@ -68,7 +68,7 @@ fn an_update_goes_over_each_library() {
 
 const READ: [&str; 7] = ["read", "1000", "-N", "5", "--sdo-timeout", "200", "--sdo-attempts"];
 
-/// Bus, lie, exit code, and what the words must have.
+/// Bus, fault, exit code, and the required words.
 const LIES: [(&str, &str, i32, &[&str]); 26] = [
     ("peak:PCAN_USBBUS2@500k", "", 4, &["it does not exist (PCAN_ERROR_ILLHW)", "coflash adapters lists"]),
     ("peak:PCAN_USBBUS1@500k", "in use", 4, &["another program uses it", "close the other program"]),
@@ -113,7 +113,7 @@ const LIES: [(&str, &str, i32, &[&str]); 26] = [
 fn a_library_that_lies_is_named_and_stops_nothing() {
     let (peak, kvaser) = (vendor("peak-lies", "peak", &[]), vendor("kvaser-lies", "kvaser", &[]));
     let next = AtomicUsize::new(0);
-    // Most of the time is waiting: some at once.
+    // Most of the time is waiting, so several run at the same time.
     thread::scope(|scope| {
         for _ in 0..4 {
             scope.spawn(|| loop {

@@ -1,8 +1,7 @@
-//! A device that is none: an adapter with virtual time whose other end plays a bootloader and an
-//! application, written from the manual and from CiA 301 byte by byte, without the product's own
-//! server.
+//! A fake device: an adapter with virtual time that plays a bootloader and an application, written
+//! from the manual and from CiA 301 byte by byte, without the product's own server.
 
-// Each test uses its part of it.
+// Each test uses a part of this module.
 #![allow(dead_code)]
 
 use std::collections::VecDeque;
@@ -13,7 +12,7 @@ use canopen::{CobId, Frame};
 use coflash::bus::{Adapter, AdapterError};
 use coflash::update::{DeviceState, Event};
 
-/// What an update that failed has left in the device, by the events that it told.
+/// The state of the device after a failed update, from its events.
 pub fn left(events: &[Event]) -> DeviceState {
     match events.last() {
         Some(Event::Done(done)) => done.left.state,
@@ -27,50 +26,50 @@ pub const NODE: u8 = 5;
 pub const APPLICATION: u32 = 0x0002_0192;
 pub const BOOTLOADER: u32 = 0x1000_0000;
 
-/// How the device treats a block or a command.
+/// The fake's reaction to a block or a command.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Outcome {
-    /// As it should.
+    /// Normal.
     Accept,
-    /// Acknowledged; then 1F57h reads this.
+    /// Acknowledged; then 1F57h has this value.
     Status(u32),
     /// Refused with an abort.
     Abort(u32),
-    /// Refused with an abort; then 1F57h reads the second.
+    /// Refused with an abort; then 1F57h has the second value.
     AbortStatus(u32, u32),
-    /// Carried out, and the acknowledge is lost.
+    /// Carried out, but the acknowledgement is lost.
     LoseAnswer,
-    /// Never arrived.
+    /// Lost.
     LoseRequest,
-    /// Acknowledged and forgotten.
+    /// Acknowledged, but not carried out.
     Ignore,
 }
 
-/// What the device makes of a block download.
+/// The fake's reaction to a block download.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Blocks {
-    /// It knows them, with so many segments in a sub-block.
+    /// It supports block transfer, with this many segments in a sub-block.
     Known(u8),
-    /// It aborts them with this code.
+    /// It aborts block transfer with this code.
     Refused(u32),
-    /// It has never heard of them and says nothing.
+    /// It does not know block transfer and does not answer.
     Ignored,
 }
 
-/// Objects of another maker in front of those that the fake has.
+/// Objects of another manufacturer, which precede the fake's own.
 pub trait Maker: Send {
-    /// What an object reads while this runs; `None` for the fake's own.
+    /// The value of an object while this device type runs; `None` for the fake's own value.
     fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>>;
-    /// What comes of a value that is written.
+    /// The result of writing a value.
     fn write(&mut self, at: (u16, u8), data: &[u8], running: u32) -> Option<Result<Deed, u32>>;
-    /// What NMT reset node restarts into: node-ID and device type.
+    /// The state after NMT reset node: node-ID and device type.
     fn reset(&mut self, running: u32) -> Option<(u8, u32)>;
 }
 
-/// What a device does when it has answered.
+/// The action of a device after its answer.
 pub enum Deed {
     Nothing,
-    /// It restarts as this node, into what has this device type.
+    /// It restarts with this node-ID and this device type.
     Restart(u8, u32),
 }
 
@@ -79,7 +78,7 @@ type Script<T> = Box<dyn FnMut(T) -> Outcome + Send>;
 pub struct Fake {
     pub node: u8,
     pub now: Duration,
-    /// What runs: device type; `None` while it restarts or is absent.
+    /// The device type of what runs; `None` while it restarts or is absent.
     pub running: Option<u32>,
     restart: Option<(Duration, Option<u32>)>,
     busy_until: Duration,
@@ -88,13 +87,13 @@ pub struct Fake {
     pub crc: Option<u32>,
     /// The same while the application runs.
     pub crc_of_application: Option<u32>,
-    /// Whether the device answers nothing while it is busy.
+    /// Whether the device does not answer while it is busy.
     pub deaf_while_busy: bool,
     /// What 1F50h/1 reads, if the device allows that.
     pub readable: Option<Vec<u8>>,
     pub erase_time: Duration,
     pub restart_time: Duration,
-    /// How long it goes on answering before it restarts.
+    /// How long it still answers before it restarts.
     pub leave_time: Duration,
     leaves_at: Option<Duration>,
     /// What START starts.
@@ -104,28 +103,28 @@ pub struct Fake {
     pub on_block: Script<u32>,
     pub on_command: Script<u8>,
     pub knows_blocks: Blocks,
-    /// Segments of block downloads that are lost, as they are counted from the start.
+    /// Lost segments of block downloads, counted from the start.
     pub lost_segments: Vec<usize>,
-    /// The segment of a block download at which the device has seen enough: it aborts, and from
-    /// then on 1F57h reads this.
+    /// The segment of a block download at which the device aborts; from then on 1F57h has this
+    /// value.
     pub refuses_segment: Option<(usize, u32)>,
     segments: usize,
-    /// Block downloads that were begun.
+    /// The number of block downloads that were started.
     pub block_downloads: usize,
     /// Frames that come before each answer.
     pub noise: Vec<Frame>,
-    /// After so many frames the adapter is gone.
+    /// The number of frames after which the adapter is gone.
     pub frames_left: usize,
-    /// What was asked, in short words.
+    /// The received requests, in short words.
     pub log: Vec<String>,
-    /// The blocks that were taken, without framing of SDO.
+    /// The accepted blocks, without the framing of SDO.
     pub blocks: Vec<Vec<u8>>,
     next_block: u32,
     download: Option<Download>,
     upload: Option<(Vec<u8>, u8)>,
     outbox: VecDeque<(Duration, Frame)>,
     pub sent: Vec<Frame>,
-    /// The maker, if it is another one.
+    /// The other manufacturer's objects, if there are any.
     pub maker: Option<Box<dyn Maker>>,
     next_node: u8,
 }
@@ -180,7 +179,7 @@ impl Fake {
         }
     }
 
-    /// The log without what is read.
+    /// The log without reads.
     pub fn writes(&self) -> Vec<&str> {
         self.log.iter().map(String::as_str).filter(|entry| !entry.starts_with("read")).collect()
     }
@@ -237,7 +236,7 @@ impl Fake {
         }
     }
 
-    /// When it has something to say, `until` at the latest.
+    /// Waits for its next frame, at most until `until`.
     fn next_at(&self, until: Duration) -> Option<Duration> {
         let frame = self.outbox.front().map(|(at, _)| (*at).max(self.now));
         let boot_up = self.restart.filter(|(_, next)| next.is_some()).map(|(at, _)| at.max(self.now));
@@ -257,7 +256,7 @@ impl Fake {
             return false;
         };
         if !*ended {
-            // An abort looks like a segment number 0, which there is none of.
+            // An abort looks like a segment with number 0, which does not exist.
             if bytes[0] == 0x80 {
                 return false;
             }
@@ -273,7 +272,7 @@ impl Fake {
                 *ended = last;
                 data.extend_from_slice(&bytes[1..]);
             }
-            // A sub-block is over with its last segment, whether all of it arrived or not.
+            // A sub-block ends with its last segment, even if segments are missing.
             if number == blksize || last {
                 let ackseq = std::mem::take(seqno);
                 self.answer([0xA2, ackseq, blksize, 0, 0, 0, 0, 0]);
@@ -385,7 +384,7 @@ impl Fake {
                 self.log.push(format!("abort {word:08X}"));
                 (self.download, self.upload) = (None, None);
             }
-            // Segments of a transfer that is no more.
+            // Segments of an ended transfer.
             _ if self.refuses_segment.is_some() => self.abort((0, 0), 0x0504_0001),
             other => panic!("unexpected command {other:02X}"),
         }
@@ -590,13 +589,13 @@ pub struct Bus(pub Vec<Fake>);
 
 impl Adapter for Bus {
     fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        // The frame takes its time once; then all hear it at the same time.
+        // The frame takes its time once; then all devices receive it at the same time.
         self.0.iter_mut().try_for_each(|fake| fake.send(frame))
     }
 
     fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
         let until = self.now() + timeout;
-        // The device with the earliest news speaks first; the others' clocks follow.
+        // The device with the earliest frame sends first; the others' clocks follow.
         let next = (0..self.0.len()).filter_map(|at| self.0[at].next_at(until).map(|when| (when, at))).min();
         let (when, frame) = match next {
             Some((when, at)) => {

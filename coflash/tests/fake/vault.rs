@@ -1,18 +1,18 @@
-//! A device with keys, as far as a host sees it.
+//! A device with keys, as a host sees it.
 
 use std::sync::{Arc, Mutex};
 
 use super::{Deed, Maker};
 
-/// A device that takes sealed images: it keeps what it is sent.
+/// A device that accepts sealed images: it stores the received data.
 pub struct Vault {
-    /// What it was sent.
+    /// The received data.
     pub kept: Arc<Mutex<Vec<u8>>>,
     /// Where the program starts.
     pub start: u32,
     /// Bytes of its flash.
     pub room: u32,
-    /// What 1F57h reads afterwards.
+    /// The value of 1F57h afterwards.
     pub status: u32,
 }
 

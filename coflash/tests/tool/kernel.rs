@@ -1,4 +1,4 @@
-//! Buses and libraries that stand in for those of a computer with adapters.
+//! Buses and libraries that replace those of a computer with adapters.
 
 use std::fs;
 use std::io::{ErrorKind, Read, Write};

@@ -1,6 +1,6 @@
-//! The tool as a program of its own, and what it talks to.
+//! The tool as a separate process, and its counterparts.
 
-// Each test uses its part of it.
+// Each test uses a part of this module.
 #![allow(dead_code)]
 
 pub mod kernel;
@@ -30,7 +30,7 @@ pub fn coflash(arguments: &[&str]) -> Done {
         .env_remove("COFLASH_CONFIG"))
 }
 
-/// Runs it away from the settings of whoever runs the tests.
+/// Runs it without the settings of the user who runs the tests.
 pub fn run(command: &mut Command) -> Done {
     let nowhere = Path::new(env!("CARGO_TARGET_TMPDIR")).join("nowhere");
     // A test that names no bus must not find one of whoever runs it.
@@ -47,8 +47,8 @@ pub fn data(name: &str) -> String {
     format!("{}/tests/data/{name}", env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Compares with `tests/snapshots/NAME.txt`, where a person has read and approved what another
-/// person will read. With `COFLASH_BLESS` in the environment the file is written instead.
+/// Compares with `tests/snapshots/NAME.txt`, which a person has read and approved. With
+/// `COFLASH_BLESS` in the environment the file is written instead.
 #[track_caller]
 pub fn snapshot(name: &str, found: &str) {
     let path = format!("{}/tests/snapshots/{name}.txt", env!("CARGO_MANIFEST_DIR"));
