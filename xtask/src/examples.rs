@@ -26,6 +26,8 @@ target/firmware/stm32f407g-disc1/example-NAME.elf. Without a NAME it builds all 
   no-stack-v2   the same as version 2
   embassy       Rust on Embassy
   embassy-v2    the same as version 2
+  rtic          Rust on RTIC, with a CANopen stack of its own
+  rtic-v2       the same as version 2
 
   --yes         installs what is missing with sudo
 ";
@@ -47,8 +49,8 @@ struct Example {
 enum Tools {
     /// CMake with a toolchain file of `app-c/cmake/`; the version goes into the program's label.
     Cmake { toolchain: &'static str, version: u32 },
-    /// Cargo, with features of the package.
-    Cargo { features: &'static str },
+    /// Cargo: the program of this name, with features of its package.
+    Cargo { program: &'static str, features: &'static str },
 }
 
 const EXAMPLES: &[Example] = &[
@@ -64,10 +66,28 @@ const EXAMPLES: &[Example] = &[
         tools: Tools::Cmake { toolchain: "arm-none-eabi-gcc", version: 1 },
     },
     Example { name: "cpp-v2", folder: "cpp", tools: Tools::Cmake { toolchain: "clang", version: 2 } },
-    Example { name: "no-stack", folder: "no-stack", tools: Tools::Cargo { features: "" } },
-    Example { name: "no-stack-v2", folder: "no-stack", tools: Tools::Cargo { features: "version-2" } },
-    Example { name: "embassy", folder: "embassy", tools: Tools::Cargo { features: "" } },
-    Example { name: "embassy-v2", folder: "embassy", tools: Tools::Cargo { features: "version-2" } },
+    Example {
+        name: "no-stack",
+        folder: "no-stack",
+        tools: Tools::Cargo { program: "no-stack", features: "" },
+    },
+    Example {
+        name: "no-stack-v2",
+        folder: "no-stack",
+        tools: Tools::Cargo { program: "no-stack", features: "version-2" },
+    },
+    Example { name: "embassy", folder: "embassy", tools: Tools::Cargo { program: "embassy", features: "" } },
+    Example {
+        name: "embassy-v2",
+        folder: "embassy",
+        tools: Tools::Cargo { program: "embassy", features: "version-2" },
+    },
+    Example { name: "rtic", folder: "rtic", tools: Tools::Cargo { program: "rtic-example", features: "" } },
+    Example {
+        name: "rtic-v2",
+        folder: "rtic",
+        tools: Tools::Cargo { program: "rtic-example", features: "version-2" },
+    },
 ];
 
 pub fn run(mut args: Args) -> Outcome {
@@ -101,7 +121,7 @@ fn build(example: &Example) -> Outcome {
     let work = workspace::target_dir().join("examples");
     let built = match example.tools {
         Tools::Cmake { toolchain, version } => cmake(&folder, &work.join(example.name), toolchain, version)?,
-        Tools::Cargo { features } => cargo(&folder, &work.join("rust"), features)?,
+        Tools::Cargo { program, features } => cargo(&folder, &work.join("rust"), program, features)?,
     };
     let images = workspace::firmware_dir(BOARD);
     let image = images.join(format!("example-{}.elf", example.name));
@@ -129,16 +149,14 @@ fn cmake(folder: &Path, work: &Path, toolchain: &str, version: u32) -> Outcome<P
     Ok(work.join("app.elf"))
 }
 
-/// Builds a package, which is called as its folder; gives the program. All packages share `work`, and
-/// with it what they depend on.
-fn cargo(folder: &Path, work: &Path, features: &str) -> Outcome<PathBuf> {
+/// Builds a package; gives the program. All packages share `work`, and with it what they depend on.
+fn cargo(folder: &Path, work: &Path, program: &str, features: &str) -> Outcome<PathBuf> {
     let mut cargo = process::cargo_on(folder, "build");
     // Cargo looks for the folder's own settings from where it is called.
     cargo.current_dir(folder).args(["--locked", "--release", "--features", features]);
     cargo.arg("--target-dir").arg(work);
     process::output(&mut cargo)?;
-    let name = folder.file_name().unwrap_or_default();
-    Ok(work.join(workspace::TARGET).join("release").join(name))
+    Ok(work.join(workspace::TARGET).join("release").join(program))
 }
 
 #[cfg(test)]
@@ -182,6 +200,8 @@ mod tests {
             assert!(by_name(example.name).is_ok_and(|found| found.folder == example.folder));
         }
         let unknown = by_name("cmake");
-        assert!(unknown.is_err_and(|problem| problem.contains("there are: c-cmake, c-cmake-v2, cpp, cpp-v2, ")));
+        assert!(
+            unknown.is_err_and(|problem| problem.contains("there are: c-cmake, c-cmake-v2, cpp, cpp-v2, "))
+        );
     }
 }
