@@ -19,8 +19,13 @@ use shared_abi::layout::{stm32f407g_disc1, stm32f407g_disc1_two, Image};
 const CRC: Address = Address::new(0x1F56, 1);
 
 /// Each as version 1, and as version 2, which another compiler may have made.
-const EXAMPLES: [[&str; 2]; 2] =
-    [["example-c-cmake.elf", "example-c-cmake-v2.elf"], ["example-cpp.elf", "example-cpp-v2.elf"]];
+const EXAMPLES: [[&str; 2]; 5] = [
+    ["example-c-cmake.elf", "example-c-cmake-v2.elf"],
+    ["example-cpp.elf", "example-cpp-v2.elf"],
+    ["example-no-stack.elf", "example-no-stack-v2.elf"],
+    ["example-embassy.elf", "example-embassy-v2.elf"],
+    ["example-rtic.elf", "example-rtic-v2.elf"],
+];
 
 /// Whether the tests are about the board that the examples are for.
 fn is_board_of_examples() -> bool {

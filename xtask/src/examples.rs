@@ -22,6 +22,12 @@ target/firmware/stm32f407g-disc1/example-NAME.elf. Without a NAME it builds all 
   c-cmake-v2    the same as version 2, with clang
   cpp           C++17 by CMake, with arm-none-eabi-g++
   cpp-v2        the same as version 2, with clang++
+  no-stack      Rust without a CANopen stack: a main loop
+  no-stack-v2   the same as version 2
+  embassy       Rust on Embassy
+  embassy-v2    the same as version 2
+  rtic          Rust on RTIC, with a CANopen stack of its own
+  rtic-v2       the same as version 2
 
   --yes         installs what is missing with sudo
 ";
@@ -43,6 +49,8 @@ struct Example {
 enum Tools {
     /// CMake with a toolchain file of `app-c/cmake/`; the version goes into the program's label.
     Cmake { toolchain: &'static str, version: u32 },
+    /// Cargo: the program of this name, with features of its package.
+    Cargo { program: &'static str, features: &'static str },
 }
 
 const EXAMPLES: &[Example] = &[
@@ -58,13 +66,35 @@ const EXAMPLES: &[Example] = &[
         tools: Tools::Cmake { toolchain: "arm-none-eabi-gcc", version: 1 },
     },
     Example { name: "cpp-v2", folder: "cpp", tools: Tools::Cmake { toolchain: "clang", version: 2 } },
+    Example {
+        name: "no-stack",
+        folder: "no-stack",
+        tools: Tools::Cargo { program: "no-stack", features: "" },
+    },
+    Example {
+        name: "no-stack-v2",
+        folder: "no-stack",
+        tools: Tools::Cargo { program: "no-stack", features: "version-2" },
+    },
+    Example { name: "embassy", folder: "embassy", tools: Tools::Cargo { program: "embassy", features: "" } },
+    Example {
+        name: "embassy-v2",
+        folder: "embassy",
+        tools: Tools::Cargo { program: "embassy", features: "version-2" },
+    },
+    Example { name: "rtic", folder: "rtic", tools: Tools::Cargo { program: "rtic-example", features: "" } },
+    Example {
+        name: "rtic-v2",
+        folder: "rtic",
+        tools: Tools::Cargo { program: "rtic-example", features: "version-2" },
+    },
 ];
 
 pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     let names = args.rest();
     let chosen = names.iter().map(|name| by_name(name)).collect::<Outcome<Vec<_>>>()?;
-    setup.prepare(&[Part::Examples])?;
+    setup.prepare(&[Part::Examples, Part::Firmware])?;
     if chosen.is_empty() {
         return all();
     }
@@ -88,9 +118,10 @@ fn by_name(name: &str) -> Outcome<&'static Example> {
 
 fn build(example: &Example) -> Outcome {
     let folder = workspace::root().join("examples").join(example.folder);
-    let work = workspace::target_dir().join("examples").join(example.name);
+    let work = workspace::target_dir().join("examples");
     let built = match example.tools {
-        Tools::Cmake { toolchain, version } => cmake(&folder, &work, toolchain, version)?,
+        Tools::Cmake { toolchain, version } => cmake(&folder, &work.join(example.name), toolchain, version)?,
+        Tools::Cargo { program, features } => cargo(&folder, &work.join("rust"), program, features)?,
     };
     let images = workspace::firmware_dir(BOARD);
     let image = images.join(format!("example-{}.elf", example.name));
@@ -118,6 +149,16 @@ fn cmake(folder: &Path, work: &Path, toolchain: &str, version: u32) -> Outcome<P
     Ok(work.join("app.elf"))
 }
 
+/// Builds a package; gives the program. All packages share `work`, and with it what they depend on.
+fn cargo(folder: &Path, work: &Path, program: &str, features: &str) -> Outcome<PathBuf> {
+    let mut cargo = process::cargo_on(folder, "build");
+    // Cargo looks for the folder's own settings from where it is called.
+    cargo.current_dir(folder).args(["--locked", "--release", "--features", features]);
+    cargo.arg("--target-dir").arg(work);
+    process::output(&mut cargo)?;
+    Ok(work.join(workspace::TARGET).join("release").join(program))
+}
+
 #[cfg(test)]
 mod tests {
     use shared_abi::layout::Image;
@@ -128,7 +169,7 @@ mod tests {
     #[test]
     fn the_memory_maps_of_the_examples_are_up_to_date() {
         let map = BOARD.linker_script(Image::Program(1)).to_string();
-        for example in EXAMPLES {
+        for example in EXAMPLES.iter().filter(|example| matches!(example.tools, Tools::Cmake { .. })) {
             let path = workspace::root().join("examples").join(example.folder).join("layout.x");
             let line = format!(
                 "cargo xtask layout --ld program-1 --board {} > {}",
@@ -142,8 +183,7 @@ mod tests {
     /// The interrupt lines that a CMakeLists.txt names are the chip's.
     #[test]
     fn the_examples_name_the_interrupt_lines_of_the_chip() {
-        for example in EXAMPLES {
-            let Tools::Cmake { .. } = example.tools;
+        for example in EXAMPLES.iter().filter(|example| matches!(example.tools, Tools::Cmake { .. })) {
             let path = workspace::root().join("examples").join(example.folder).join("CMakeLists.txt");
             let line = format!("set(INTERRUPT_LINES {} ", BOARD.chip.interrupts);
             assert!(fs::read_to_string(&path).unwrap().contains(&line), "{}: {line}", path.display());
@@ -159,6 +199,9 @@ mod tests {
             assert!(page.exists(), "{}", page.display());
             assert!(by_name(example.name).is_ok_and(|found| found.folder == example.folder));
         }
-        assert!(by_name("rust").is_err_and(|problem| problem.ends_with("c-cmake, c-cmake-v2, cpp, cpp-v2.")));
+        let unknown = by_name("cmake");
+        assert!(
+            unknown.is_err_and(|problem| problem.contains("there are: c-cmake, c-cmake-v2, cpp, cpp-v2, "))
+        );
     }
 }

@@ -2,6 +2,7 @@
 
 use std::env;
 use std::ffi::OsStr;
+use std::path::Path;
 use std::process::{Command, Stdio};
 
 use crate::workspace;
@@ -9,8 +10,13 @@ use crate::Outcome;
 
 /// The cargo that started us, on this workspace, in the caller's folder.
 pub fn cargo(subcommand: &str) -> Command {
+    cargo_on(workspace::root(), subcommand)
+}
+
+/// The cargo that started us, on the package in a folder, in the caller's folder.
+pub fn cargo_on(folder: &Path, subcommand: &str) -> Command {
     let mut command = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-    command.arg(subcommand).arg("--manifest-path").arg(workspace::root().join("Cargo.toml"));
+    command.arg(subcommand).arg("--manifest-path").arg(folder.join("Cargo.toml"));
     if env::var_os("CARGO_TARGET_DIR").is_some() {
         // It may be relative, and a job may start cargo in another folder.
         command.env("CARGO_TARGET_DIR", workspace::target_dir());

@@ -1,0 +1,152 @@
+//! A program without a CANopen stack that its bootloader can always get back: a main loop, and the
+//! responder of `coboot-app`, which is all that an update needs on the bus.
+#![no_std]
+#![no_main]
+
+use core::panic::PanicInfo;
+use core::sync::atomic::{AtomicU32, Ordering};
+
+use bxcan::filter::{BankConfig, ListEntry16};
+use bxcan::{Can, Fifo, Frame, Id, StandardId};
+use coboot_app::layout::Layout;
+use coboot_app::responder::{self, Device, Responder};
+use coboot_app::warm_start::BootRequest;
+use coboot_app::{Bootloader, Defaults, Next, ProgramControl, ReentryPath, Start};
+use cortex_m::peripheral::syst::SystClkSource;
+use cortex_m::peripheral::SCB;
+use cortex_m_rt::{entry, exception, ExceptionFrame};
+use stm32f4xx_hal::can::CanExt;
+use stm32f4xx_hal::pac::{CorePeripherals, Peripherals};
+use stm32f4xx_hal::prelude::*;
+use stm32f4xx_hal::rcc::Config;
+
+/// 1018h/1 to 3: those of the bootloader.
+const VENDOR_ID: u32 = 0;
+const PRODUCT_CODE: u32 = 0x4007_D151;
+const REVISION: u32 = 0x0001_0000;
+const VERSION: u32 = if cfg!(feature = "version-2") { 2 } else { 1 };
+
+/// Where everything is on this board: `build.rs` names it.
+static LAYOUT: Layout = coboot_app::layout!();
+coboot_app::label!(vendor_id: VENDOR_ID, product_code: PRODUCT_CODE, version: VERSION);
+
+/// Time since the start, in ms. It wraps.
+static NOW: AtomicU32 = AtomicU32::new(0);
+
+#[entry]
+fn main() -> ! {
+    let (Some(core), Some(chip)) = (CorePeripherals::take(), Peripherals::take()) else {
+        SCB::sys_reset();
+    };
+    let mut rcc = chip.RCC.freeze(Config::hse(8.MHz()).sysclk(168.MHz()));
+    let can_clock = rcc.clocks.pclk1().raw();
+    let mut systick = core.SYST;
+    systick.set_clock_source(SystClkSource::Core);
+    systick.set_reload(rcc.clocks.sysclk().raw() / 1000 - 1);
+    systick.clear_current();
+    systick.enable_counter();
+    systick.enable_interrupt();
+
+    // The bootloader tells node-ID and bit rate, so that whoever talked to it goes on talking to
+    // this program. The defaults hold where a debugger has started the program.
+    let defaults = Defaults { node_id: Some(32), bit_rate: 125_000, serial_number: 0 };
+    let start = Start::read(&LAYOUT, defaults);
+    let mut bootloader = Bootloader::new(&LAYOUT);
+    let crc = bootloader.program_crc(start.program);
+    let control = ProgramControl::new(&start, LAYOUT.programs.len() as u8, crc);
+    let device = Device {
+        device_type: 0,
+        vendor_id: VENDOR_ID,
+        product_code: PRODUCT_CODE,
+        revision: REVISION,
+        serial_number: start.serial_number,
+        heartbeat_ms: 500,
+    };
+    let responder = start.node_id.and_then(|node_id| Responder::new(device, node_id, control));
+    let (Some(mut responder), Some(timing)) = (responder, bit_timing(can_clock, start.bit_rate)) else {
+        // A node-ID or a bit rate that has to be found out first: the bootloader can.
+        bootloader.leave(ReentryPath::SystemReset, BootRequest::Stay);
+    };
+
+    let port = chip.GPIOD.split(&mut rcc);
+    let mut can =
+        Can::builder(chip.CAN1.can((port.pd1, port.pd0), &mut rcc)).set_bit_timing(timing).leave_disabled();
+    let [nmt, sdo] = responder.identifiers().map(data_frames);
+    can.modify_filters().enable_bank(0, Fifo::Fifo0, BankConfig::List16([nmt, sdo, nmt, sdo]));
+    // It joins as soon as the bus is idle: nothing waits for that here.
+    let _ = can.enable_non_blocking();
+
+    let mut led = port.pd12.into_push_pull_output();
+    loop {
+        let now = NOW.load(Ordering::Relaxed);
+        // An overrun has lost a frame: the client asks again.
+        while let Ok(frame) = can.receive() {
+            let Some(request) = read(&frame) else { continue };
+            if let Some(answer) = responder.handle(&request, now, &mut bootloader) {
+                send(&mut can, &answer);
+            }
+            // It may have asked for the bootloader.
+            responder.proceed(can.is_transmitter_idle(), now);
+        }
+        while let Some(frame) = responder.poll(now) {
+            send(&mut can, &frame);
+        }
+        if let Next::Leave(request) = responder.proceed(can.is_transmitter_idle(), now) {
+            bootloader.leave(ReentryPath::SystemReset, request);
+        }
+
+        // Your own work: whatever does not take longer than some milliseconds.
+        led.set_state((now / 500 % 2 == 0).into());
+
+        // Until the next millisecond.
+        cortex_m::asm::wfi();
+    }
+}
+
+/// `CAN_BTR` for a bit rate in bit/s, sampled at about 7/8 of the bit (CiA 301 table 1). `None` for
+/// one that cannot be made of this clock.
+fn bit_timing(clock: u32, rate: u32) -> Option<u32> {
+    (8..=19).rev().find_map(|quanta: u32| {
+        let prescaler = clock.checked_div(rate * quanta)?;
+        let (second, exact) = (quanta / 8, prescaler * rate * quanta == clock);
+        let first = quanta - 1 - second;
+        ((1..=1024).contains(&prescaler) && exact)
+            .then(|| (second - 1) << 20 | (first - 1) << 16 | (prescaler - 1))
+    })
+}
+
+/// A filter for data frames with this identifier of 11 bits.
+fn data_frames(id: u16) -> ListEntry16 {
+    ListEntry16::data_frames_with_id(StandardId::new(id).unwrap_or(StandardId::ZERO))
+}
+
+/// The frame as the responder takes it; `None` for one that is none of CANopen's.
+fn read(frame: &Frame) -> Option<responder::Frame> {
+    let Id::Standard(id) = frame.id() else { return None };
+    responder::Frame::new(id.as_raw(), frame.data()?)
+}
+
+fn send(can: &mut Can<impl bxcan::Instance>, frame: &responder::Frame) {
+    let (Some(id), Some(data)) = (StandardId::new(frame.id()), bxcan::Data::new(frame.data())) else {
+        return;
+    };
+    // Where nobody acknowledges, heartbeats make room for an answer, which comes first by its
+    // identifier.
+    let _ = can.transmit(&Frame::new_data(id, data));
+}
+
+#[exception]
+fn SysTick() {
+    NOW.fetch_add(1, Ordering::Relaxed);
+}
+
+/// What a fault or a panic comes to is the bootloader's decision.
+#[exception]
+unsafe fn HardFault(_frame: &ExceptionFrame) -> ! {
+    SCB::sys_reset()
+}
+
+#[panic_handler]
+fn panic(_: &PanicInfo) -> ! {
+    SCB::sys_reset()
+}

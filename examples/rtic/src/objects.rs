@@ -1,0 +1,101 @@
+//! The object dictionary: the application's own objects, and those of the bootloader's world. 1F51h,
+//! 1F56h and 1F57h are asked of `coboot-app`.
+
+use core::sync::atomic::{AtomicU16, Ordering};
+
+use coboot_app::program_control::{FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID};
+use coboot_app::warm_start::BootRequest;
+use coboot_app::{Abort, Answer, Bootloader, Next, ProgramControl, Start};
+
+use crate::stack::{AbortCode, Confirmation, Dictionary, Value};
+use crate::{LAYOUT, PRODUCT_CODE, REVISION, VENDOR_ID};
+
+/// 2000h, an object of the application: half the period of the LED, in ms.
+pub static BLINK_MS: AtomicU16 = AtomicU16::new(500);
+
+/// The values behind the dictionary.
+pub struct Objects {
+    control: ProgramControl,
+    bootloader: Bootloader,
+    serial_number: u32,
+    /// The time, which 1F51h needs: in ms, of a counter that wraps.
+    pub now: u32,
+}
+
+impl Objects {
+    /// For a program that came up so. Asks the bootloader for the CRC over this program, once.
+    pub fn new(start: &Start, bootloader: Bootloader) -> Self {
+        let crc = bootloader.program_crc(start.program);
+        Self {
+            control: ProgramControl::new(start, LAYOUT.programs.len() as u8, crc),
+            bootloader,
+            serial_number: start.serial_number,
+            now: 0,
+        }
+    }
+
+    /// NMT reset node came.
+    pub fn reset(&mut self) {
+        self.control.restart(self.now);
+    }
+
+    /// Goes on with the way back. `bus_idle`: all that was sent is on the bus and acknowledged.
+    pub fn proceed(&mut self, bus_idle: bool) -> Next<BootRequest> {
+        self.control.proceed(bus_idle, self.now)
+    }
+}
+
+impl Dictionary for Objects {
+    fn read(&mut self, index: u16, sub: u8) -> Result<Value, AbortCode> {
+        let Self { control, bootloader, .. } = self;
+        Ok(match (index, sub) {
+            (PROGRAM_CONTROL | PROGRAM_ID | FLASH_STATUS, 0) => value(&[control.programs()]),
+            (PROGRAM_CONTROL, sub) => value(&[control.state(sub, bootloader)?]),
+            (PROGRAM_ID, sub) => value(&control.identification(sub, bootloader)?.to_le_bytes()),
+            (FLASH_STATUS, sub) => value(&control.flash_status(sub)?.to_le_bytes()),
+            // The device type: anything but the bootloader's.
+            (0x1000, 0) => value(&[0; 4]),
+            (0x1001, 0) => value(&[0]),
+            (0x1018, 0) => value(&[4]),
+            (0x1018, 1) => value(&VENDOR_ID.to_le_bytes()),
+            (0x1018, 2) => value(&PRODUCT_CODE.to_le_bytes()),
+            (0x1018, 3) => value(&REVISION.to_le_bytes()),
+            (0x1018, 4) => value(&self.serial_number.to_le_bytes()),
+            (0x2000, 0) => value(&BLINK_MS.load(Ordering::Relaxed).to_le_bytes()),
+            _ => return Err(AbortCode::NO_OBJECT),
+        })
+    }
+
+    fn write(&mut self, index: u16, sub: u8, data: &[u8]) -> Result<Confirmation, AbortCode> {
+        match (index, sub) {
+            (PROGRAM_CONTROL, sub) => {
+                match self.control.write(sub, data, self.now, &mut self.bootloader)? {
+                    Answer::Send => Ok(Confirmation::Send),
+                    // The bootloader carries the command out, and answers.
+                    Answer::Withhold(owed) => {
+                        self.control.leave_owed(owed, self.now);
+                        Ok(Confirmation::Withhold)
+                    }
+                }
+            }
+            (0x2000, 0) => {
+                let bytes = data.try_into().map_err(|_| AbortCode::LENGTH)?;
+                // An LED that never waits would leave no time for anything else.
+                BLINK_MS.store(u16::from_le_bytes(bytes).max(1), Ordering::Relaxed);
+                Ok(Confirmation::Send)
+            }
+            _ => self.read(index, sub).and(Err(AbortCode::READ_ONLY)),
+        }
+    }
+}
+
+/// The codes of `coboot-app` are those of the standard.
+impl From<Abort> for AbortCode {
+    fn from(Abort(code): Abort) -> Self {
+        Self(code)
+    }
+}
+
+fn value(bytes: &[u8]) -> Value {
+    Value::from_slice(bytes).unwrap_or_default()
+}
