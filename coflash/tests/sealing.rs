@@ -483,7 +483,8 @@ fn what_cannot_be_sealed_is_refused_with_what_to_do() {
     assert!(coflash(&words).err.contains("is not a program"));
     let done = coflash(&[&words[..], &["--data"]].concat());
     assert!(
-        done.err.contains("the program has no vendor-ID of its target device") && done.err.contains("give --vendor"),
+        done.err.contains("the program has no vendor-ID of its target device")
+            && done.err.contains("give --vendor"),
         "{}",
         done.err
     );
