@@ -19,7 +19,8 @@ pub const HELP: &str = "\
 usage: cargo xtask arrows
 
 Checks the dependencies between the crates against the rules in xtask/src/arrows.rs; that the
-emulator takes nothing but the geometry of the silicon from shared-abi; that the pure crates
+emulator takes nothing but the geometry of the silicon from shared-abi (its program the names of
+the boards, too); that the pure crates
 forbid unsafe code; and that the modules of a crate do not use each other in circles (nor, in
 coflash, its files), those of boot-core and coflash no others than xtask/src/rooms.rs allows.
 ";
