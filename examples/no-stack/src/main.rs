@@ -96,7 +96,7 @@ fn main() -> ! {
         }
 
         // Your own work: whatever does not take longer than some milliseconds.
-        led.set_state((now / 500 % 2 == 0).into());
+        led.set_state((now / 500).is_multiple_of(2).into());
 
         // Until the next millisecond.
         cortex_m::asm::wfi();
