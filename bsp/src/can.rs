@@ -3,66 +3,7 @@
 
 use bxcan::{Can, Data, Instance, Interrupts, OverrunError, RegisterBlock, StandardId};
 use embedded_can::Frame;
-
-/// A bit timing that bxCAN can be set to (RM0090 section 32.7.7).
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct BitTiming {
-    /// Time quanta are this many clock cycles, 1–1024.
-    pub prescaler: u16,
-    /// Quanta from the sync segment to the sample point, 1–16.
-    pub segment_1: u8,
-    /// Quanta from the sample point to the end of the bit, 1–8.
-    pub segment_2: u8,
-}
-
-impl BitTiming {
-    /// The timing that makes `bit_rate` (bit/s) out of `clock` (Hz) exactly, with the sample point
-    /// as near to 87.5 % as it gets (the point that CiA 301 recommends) and as many quanta as fit;
-    /// `None` where the clock cannot make it.
-    #[must_use]
-    pub const fn new(clock: u32, bit_rate: u32) -> Option<Self> {
-        if bit_rate == 0 || !clock.is_multiple_of(bit_rate) {
-            return None;
-        }
-        let cycles = clock / bit_rate;
-        let mut quanta = 25;
-        while quanta >= 8 {
-            if cycles.is_multiple_of(quanta) && cycles / quanta <= 1024 {
-                // 1 quantum of sync, then the segments; 1/8 of the bit, rounded, behind the sample
-                // point.
-                let segment_2 = (quanta + 4) / 8;
-                let segment_1 = quanta - 1 - segment_2;
-                if segment_1 <= 16 {
-                    return Some(Self {
-                        prescaler: (cycles / quanta) as u16,
-                        segment_1: segment_1 as u8,
-                        segment_2: segment_2 as u8,
-                    });
-                }
-            }
-            quanta -= 1;
-        }
-        None
-    }
-
-    /// The timings of several bit rates, worked out at compile time.
-    #[must_use]
-    pub const fn table<const N: usize>(clock: u32, bit_rates: [u32; N]) -> [Option<Self>; N] {
-        let mut table = [None; N];
-        let mut i = 0;
-        while i < N {
-            table[i] = Self::new(clock, bit_rates[i]);
-            i += 1;
-        }
-        table
-    }
-
-    /// The value of `CAN_BTR`; resynchronisation by up to 1 quantum.
-    #[must_use]
-    pub const fn register(&self) -> u32 {
-        (self.prescaler as u32 - 1) | (self.segment_1 as u32 - 1) << 16 | (self.segment_2 as u32 - 1) << 20
-    }
-}
+pub use shared_abi::bit_timing::BitTiming;
 
 /// How the controller takes part in the bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -40,6 +40,7 @@ pub use departure::Next;
 pub use program_control::{Answer, ProgramControl};
 pub use start::{Defaults, Start};
 
+pub use shared_abi::bit_timing::BitTiming;
 pub use shared_abi::{callgate, geometry, handoff, layout, warm_start};
 
 /// The memory map of the board as the build script has written it

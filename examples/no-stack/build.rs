@@ -1,5 +1,6 @@
 //! Links the program for its place behind the bootloader of the board.
 
 fn main() {
-    coboot_linker::Application::of_board("stm32f407g-disc1").emit();
+    // Written by `cargo xtask layout --toml --board stm32f407g-disc1 > board.toml`.
+    coboot_linker::Application::of_file("board.toml").emit();
 }

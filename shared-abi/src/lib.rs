@@ -21,6 +21,7 @@
 //! with it.
 #![no_std]
 
+pub mod bit_timing;
 pub mod block_file;
 pub mod callgate;
 pub mod geometry;

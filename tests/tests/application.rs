@@ -1,8 +1,9 @@
-//! The application that docs/application.md goes through (`examples/plain`): built as a package of its
-//! own, as a stranger's is, and run under the real bootloader; and what happens where an application
-//! gets it wrong.
+//! The application that docs/application.md goes through (`examples/no-stack`): built as a package of
+//! its own, as a stranger's is, and run under the real bootloader; and what happens where an
+//! application gets it wrong.
 
-use std::path::Path;
+use std::fs;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Mutex;
 
@@ -18,27 +19,53 @@ use coflash::update::{flash, FlashOptions};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::layout::toml::Toml;
 
-/// One build at a time: they share a folder.
-static BUILD: Mutex<()> = Mutex::new(());
+/// Where the example is, and where the job that builds the examples has built it.
+fn example() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/no-stack")
+}
 
-/// The ELF of `examples/plain` with these features. `None` where the tests are about another board.
-fn plain(features: &str) -> Option<Vec<u8>> {
+/// The ELF of the example. `None` where the tests are about another board.
+fn built() -> Option<Vec<u8>> {
+    build(&example())
+}
+
+/// The ELF of a copy of the example in which `old` is `new`: what its author could do.
+fn altered(name: &str, old: &str, new: &str) -> Option<Vec<u8>> {
+    let copy = Path::new(env!("CARGO_TARGET_TMPDIR")).join("application").join(name);
+    fs::create_dir_all(copy.join("src")).expect("the folder can be made");
+    for file in ["Cargo.toml", "Cargo.lock", "build.rs", "board.toml", "src/main.rs"] {
+        let text = fs::read_to_string(example().join(file)).expect(file);
+        let text = match file {
+            "Cargo.toml" => text.replace("../../", &format!("{}/../", env!("CARGO_MANIFEST_DIR"))),
+            "src/main.rs" => {
+                assert_eq!(text.matches(old).count(), 1, "{old:?} is to be altered");
+                text.replace(old, new)
+            }
+            _ => text,
+        };
+        fs::write(copy.join(file), text).expect("the copy can be written");
+    }
+    build(&copy)
+}
+
+fn build(folder: &Path) -> Option<Vec<u8>> {
+    /// One build at a time: they share a folder, that of `cargo xtask examples`.
+    static BUILD: Mutex<()> = Mutex::new(());
     if firmware::board().board != LAYOUT.board {
         println!("not run: the example is for {}", LAYOUT.board);
         return None;
     }
     let _one = BUILD.lock();
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-    let target = root.join("target/examples");
+    let target = Path::new(env!("CARGO_TARGET_TMPDIR")).join("../examples/rust");
     let status = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()))
-        .current_dir(root.join("examples/plain"))
+        .current_dir(folder)
         .args(["build", "--quiet", "--locked", "--release", "--target", "thumbv7em-none-eabihf"])
-        .args(["--features", features, "--target-dir"])
+        .arg("--target-dir")
         .arg(&target)
         .status()
         .expect("cargo can be started");
-    assert!(status.success(), "examples/plain does not build");
-    Some(std::fs::read(target.join("thumbv7em-none-eabihf/release/plain")).expect("it was built"))
+    assert!(status.success(), "{} does not build", folder.display());
+    Some(fs::read(target.join("thumbv7em-none-eabihf/release/no-stack")).expect("it was built"))
 }
 
 fn blocks(elf: &[u8]) -> BlockFile {
@@ -67,19 +94,18 @@ fn power_cycle(bench: &mut Bench) {
 /// Step 1: the memory map that is checked in is the one that is printed.
 #[test]
 fn its_memory_map_is_the_boards() {
-    let map = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/plain/board.toml");
     let printed = Toml(&LAYOUT).to_string();
     assert_eq!(
-        std::fs::read_to_string(map).unwrap(),
+        fs::read_to_string(example().join("board.toml")).unwrap(),
         printed,
-        "cargo xtask layout --toml --board stm32f407g-disc1 > examples/plain/board.toml"
+        "cargo xtask layout --toml --board stm32f407g-disc1 > examples/no-stack/board.toml"
     );
 }
 
 /// Steps 2 to 6, and "All of it": the second update begins in the running program.
 #[test]
 fn it_is_updated_twice_and_answers_what_a_host_asks() {
-    let Some(elf) = plain("") else { return };
+    let Some(elf) = built() else { return };
     let blocks = blocks(&elf);
     let mut bench = board();
     for _ in 0..2 {
@@ -106,7 +132,7 @@ fn it_is_updated_twice_and_answers_what_a_host_asks() {
 /// Step 7: without a confirmation the bootloader is there behind a power-off, with one the program.
 #[test]
 fn a_trial_confirms_itself_when_its_master_has_started_it() {
-    let Some(elf) = plain("") else { return };
+    let Some(elf) = built() else { return };
     let mut bench = board();
     flash(&mut bench.session(), &blocks(&elf), &FlashOptions::default().start(false), &mut |_| {}).unwrap();
     for confirms in [false, true] {
@@ -122,17 +148,24 @@ fn a_trial_confirms_itself_when_its_master_has_started_it() {
     }
 }
 
+const LABEL: &str = "coboot_app::label!(vendor_id: VENDOR_ID, product_code: PRODUCT_CODE, version: VERSION);";
+/// What the program does first.
+const FIRST: &str = "    let mut rcc = ";
+/// VTOR at the vectors of the bootloader, as start-up code leaves it that was made for a program at
+/// the start of the flash.
+const WRONG_VTOR: &str = "    unsafe { (*SCB::PTR).vtor.write(0x0800_0000) };\n    let mut rcc = ";
+
 /// It is taken, and tells nobody whom it is for.
 #[test]
 fn a_program_without_a_label_is_taken_by_every_device() {
-    let Some(elf) = plain("") else { return };
+    let Some(elf) = built() else { return };
     let labelled = |elf: &[u8]| match read(elf, None, None).expect("an ELF") {
         Firmware::Image(image) => label_of(&image, LAYOUT.programs[0].base),
         Firmware::Blocks(_) => panic!("an ELF is no block file"),
     };
     let label = labelled(&elf).expect("label! puts one there");
     assert_eq!((label.vendor_id, label.product_code, label.version), (0, bsp::IDENTITY.product_code, 1));
-    let Some(without) = plain("without-label") else { return };
+    let Some(without) = altered("without-label", LABEL, "") else { return };
     assert_eq!(labelled(&without), None);
     let mut bench = board();
     flash(&mut bench.session(), &blocks(&without), &FlashOptions::default(), &mut |_| {}).unwrap();
@@ -143,7 +176,7 @@ fn a_program_without_a_label_is_taken_by_every_device() {
 /// one comes.
 #[test]
 fn a_program_with_vtor_at_the_bootloader_is_told_to_be_silent_and_is_replaced() {
-    let (Some(good), Some(wrong)) = (plain(""), plain("wrong-vtor")) else { return };
+    let (Some(good), Some(wrong)) = (built(), altered("wrong-vtor", FIRST, WRONG_VTOR)) else { return };
     let mut bench = board();
     let error =
         flash(&mut bench.session(), &blocks(&wrong), &FlashOptions::default(), &mut |_| {}).unwrap_err();

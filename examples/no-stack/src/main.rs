@@ -11,7 +11,7 @@ use bxcan::{Can, Fifo, Frame, Id, StandardId};
 use coboot_app::layout::Layout;
 use coboot_app::responder::{self, Device, Responder};
 use coboot_app::warm_start::BootRequest;
-use coboot_app::{Bootloader, Defaults, Next, ProgramControl, ReentryPath, Start};
+use coboot_app::{BitTiming, Bootloader, Defaults, Next, ProgramControl, ReentryPath, Start};
 use cortex_m::peripheral::syst::SystClkSource;
 use cortex_m::peripheral::SCB;
 use cortex_m_rt::{entry, exception, ExceptionFrame};
@@ -63,20 +63,22 @@ fn main() -> ! {
         heartbeat_ms: 500,
     };
     let responder = start.node_id.and_then(|node_id| Responder::new(device, node_id, control));
-    let (Some(mut responder), Some(timing)) = (responder, bit_timing(can_clock, start.bit_rate)) else {
+    let timing = BitTiming::new(can_clock, start.bit_rate);
+    let (Some(mut responder), Some(timing)) = (responder, timing) else {
         // A node-ID or a bit rate that has to be found out first: the bootloader can.
         bootloader.leave(ReentryPath::SystemReset, BootRequest::Stay);
     };
 
     let port = chip.GPIOD.split(&mut rcc);
-    let mut can =
-        Can::builder(chip.CAN1.can((port.pd1, port.pd0), &mut rcc)).set_bit_timing(timing).leave_disabled();
+    let can = chip.CAN1.can((port.pd1, port.pd0), &mut rcc);
+    let mut can = Can::builder(can).set_bit_timing(timing.register()).leave_disabled();
     let [nmt, sdo] = responder.identifiers().map(data_frames);
     can.modify_filters().enable_bank(0, Fifo::Fifo0, BankConfig::List16([nmt, sdo, nmt, sdo]));
     // It joins as soon as the bus is idle: nothing waits for that here.
     let _ = can.enable_non_blocking();
 
     let mut led = port.pd12.into_push_pull_output();
+    let mut confirmed = false;
     loop {
         let now = NOW.load(Ordering::Relaxed);
         // An overrun has lost a frame: the client asks again.
@@ -91,6 +93,10 @@ fn main() -> ! {
         while let Some(frame) = responder.poll(now) {
             send(&mut can, &frame);
         }
+        // The trial is over when the NMT master has started the node: it is content with it.
+        if responder.is_operational() && !confirmed {
+            confirmed = responder.control().confirm(now, &mut bootloader).is_ok();
+        }
         if let Next::Leave(request) = responder.proceed(can.is_transmitter_idle(), now) {
             bootloader.leave(ReentryPath::SystemReset, request);
         }
@@ -101,18 +107,6 @@ fn main() -> ! {
         // Until the next millisecond.
         cortex_m::asm::wfi();
     }
-}
-
-/// `CAN_BTR` for a bit rate in bit/s, sampled at about 7/8 of the bit (CiA 301 table 1). `None` for
-/// one that cannot be made of this clock.
-fn bit_timing(clock: u32, rate: u32) -> Option<u32> {
-    (8..=19).rev().find_map(|quanta: u32| {
-        let prescaler = clock.checked_div(rate * quanta)?;
-        let (second, exact) = (quanta / 8, prescaler * rate * quanta == clock);
-        let first = quanta - 1 - second;
-        ((1..=1024).contains(&prescaler) && exact)
-            .then(|| (second - 1) << 20 | (first - 1) << 16 | (prescaler - 1))
-    })
 }
 
 /// A filter for data frames with this identifier of 11 bits.

@@ -43,7 +43,7 @@ mod app {
 
     use bxcan::Interrupt;
     use coboot_app::warm_start::BootRequest;
-    use coboot_app::{Defaults, Start};
+    use coboot_app::{BitTiming, Defaults, Start};
     use stm32f4xx_hal::can::CanExt;
     use stm32f4xx_hal::gpio::{Output, PD12};
     use stm32f4xx_hal::pac;
@@ -72,7 +72,7 @@ mod app {
         let start = Start::read(&LAYOUT, defaults);
         let bootloader = Bootloader::new(&LAYOUT);
         let node = start.node_id.and_then(|node_id| Node::new(node_id, HEARTBEAT_MS));
-        let timing = bit_timing(rcc.clocks.pclk1().raw(), start.bit_rate);
+        let timing = BitTiming::new(rcc.clocks.pclk1().raw(), start.bit_rate);
         let (Some(node), Some(timing)) = (node, timing) else {
             // A node-ID or a bit rate that has to be found out first: the bootloader can.
             bootloader.leave(ReentryPath::SystemReset, BootRequest::Stay);
@@ -80,8 +80,8 @@ mod app {
 
         let port = cx.device.GPIOD.split(&mut rcc);
         let pins = (port.pd1, port.pd0);
-        let mut can =
-            Can::builder(cx.device.CAN1.can(pins, &mut rcc)).set_bit_timing(timing).leave_disabled();
+        let can = cx.device.CAN1.can(pins, &mut rcc);
+        let mut can = Can::builder(can).set_bit_timing(timing.register()).leave_disabled();
         let [nmt, sdo] = node.identifiers().map(data_frames);
         can.modify_filters().enable_bank(0, Fifo::Fifo0, BankConfig::List16([nmt, sdo, nmt, sdo]));
         can.enable_interrupt(Interrupt::Fifo0MessagePending);
@@ -170,18 +170,6 @@ impl Bus {
         // identifier.
         let _ = self.can.transmit(&Frame::new_data(id, data));
     }
-}
-
-/// `CAN_BTR` for a bit rate in bit/s, sampled at about 7/8 of the bit (CiA 301 table 1). `None` for
-/// one that cannot be made of this clock.
-fn bit_timing(clock: u32, rate: u32) -> Option<u32> {
-    (8..=19).rev().find_map(|quanta: u32| {
-        let prescaler = clock.checked_div(rate * quanta)?;
-        let (second, exact) = (quanta / 8, prescaler * rate * quanta == clock);
-        let first = quanta - 1 - second;
-        ((1..=1024).contains(&prescaler) && exact)
-            .then(|| (second - 1) << 20 | (first - 1) << 16 | (prescaler - 1))
-    })
 }
 
 /// A filter for data frames with this identifier of 11 bits.

@@ -1,6 +1,0 @@
-//! Links the program for its place behind the bootloader.
-
-fn main() {
-    // Written by `cargo xtask layout --toml --board stm32f407g-disc1 > board.toml`.
-    coboot_linker::Application::of_file("board.toml").emit();
-}
