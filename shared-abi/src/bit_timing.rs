@@ -17,7 +17,7 @@ impl BitTiming {
     /// `None` where the clock cannot make it.
     #[must_use]
     pub const fn new(clock: u32, bit_rate: u32) -> Option<Self> {
-        if bit_rate == 0 || !clock.is_multiple_of(bit_rate) {
+        if bit_rate == 0 || clock < bit_rate || !clock.is_multiple_of(bit_rate) {
             return None;
         }
         let cycles = clock / bit_rate;
