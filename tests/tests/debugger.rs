@@ -685,8 +685,8 @@ fn coflash_debug_reads_writes_breaks_and_continues() {
     for (words, exit, says) in [
         (&["continue"][..], 2, "the program is not stopped"),
         (&["registers"], 2, "the program is not stopped"),
-        (&["read", "0x60000000"], 6, "must not be touched"),
-        (&["write", "0x08000000", "0"], 6, "must not be touched"),
+        (&["read", "0x60000000"], 6, "cannot be accessed"),
+        (&["write", "0x08000000", "0"], 6, "cannot be accessed"),
         (&["break", "0x20000000"], 2, "cannot have a breakpoint"),
         (&["break", &hex(at), "--clear"], 2, "there is no breakpoint"),
         (&["read", "20000000h"], 2, "number"),

@@ -89,7 +89,7 @@ fn gdb_stops_in_the_callback_of_the_application_and_in_the_bootloader() {
     for command in [
         "set pagination off",
         &format!("target remote {}", desk.door.address()),
-        "break app_template::objects::Application::program_control",
+        "break app_template::objects::{impl#1}::write",
         "continue",
         "backtrace 1",
         "delete",
@@ -118,9 +118,7 @@ fn gdb_stops_in_the_callback_of_the_application_and_in_the_bootloader() {
 
     let (said, told) = (fs::read_to_string(said).unwrap(), fs::read_to_string(told).unwrap());
     let mut rest = said.as_str();
-    for words in
-        ["Breakpoint 1", "#0  app_template::objects::Application::program_control", "Breakpoint 2", "main + "]
-    {
+    for words in ["Breakpoint 1", "#0  app_template::objects::{impl#1}::write", "Breakpoint 2", "main + "] {
         let at = rest.find(words).unwrap_or_else(|| panic!("{words:?} is missing:\n{said}"));
         rest = &rest[at + words.len()..];
     }

@@ -864,7 +864,9 @@ impl Chip {
         // What came due within the block that writes has not happened yet, and no slice would end
         // for it any more.
         let now = self.now();
-        self.leave |= self.tims.iter().filter_map(Peripheral::next_event).any(|event| event <= now);
+        let tims = self.tims.iter().filter_map(Peripheral::next_event);
+        let usarts = self.usarts.iter().filter_map(Peripheral::next_event);
+        self.leave |= tims.chain(usarts).any(|event| event <= now);
     }
 
     /// The reset bits of the modelled blocks: each sits 20h before the enable bit.
