@@ -49,7 +49,7 @@ mod app {
     const RX_QUEUE: usize = 16;
     /// How often the protocol looks at its deadlines, in ms.
     const TICK_MS: u32 = 5;
-    /// The values that the program uses when no bootloader has started it.
+    /// The bit rate that the program uses when no bootloader has started it.
     const DEFAULT_BIT_RATE: BitRate = match BitRate::from_bits_per_second(BIT_RATE) {
         Some(rate) => rate,
         None => panic!("board: the bit rate must be one of CANopen's, or 0 to find it out"),
