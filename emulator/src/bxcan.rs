@@ -328,7 +328,7 @@ impl Fifo {
 #[derive(Clone, Debug)]
 pub struct BxCan {
     share: Share,
-    /// Whether CAN1, which manages the memory, has a clock. CAN2 alone uses it.
+    /// Whether CAN1, which manages the memory, has a clock. Only CAN2 checks it.
     master_clocked: bool,
     clock_hz: u32,
     on_bus: bool,
