@@ -137,15 +137,15 @@ impl Line {
         }
     }
 
-    /// Gives the client as many bytes as it takes. Without a client all bytes are lost.
+    /// Gives the client as many bytes as it takes. Without a TCP client all bytes are lost.
     fn write(&mut self, bytes: &[u8]) -> usize {
         if bytes.is_empty() {
             return 0;
         }
         match self {
             #[cfg(unix)]
-            // Writing waits for as long as not all of it finds room, and only that there is some is
-            // asked before: a byte at a time.
+            // A write waits until all bytes find room, and the check before it only tells that
+            // there is some room. So write a byte at a time.
             Self::Terminal(terminal) => {
                 bytes.iter().take_while(|byte| matches!(terminal.ours.write(&[**byte]), Ok(1))).count()
             }
