@@ -1,6 +1,6 @@
 //! The debugger interface, 1025h, and breakpoints, with the feature `debugger` alone: **everybody
 //! on the bus reads and writes this device's memory, and stops its program**. Without the feature
-//! nothing of it is there.
+//! the program contains none of it.
 
 #[cfg(not(feature = "debugger"))]
 pub use off::*;
@@ -23,7 +23,7 @@ mod off {
             Self
         }
 
-        /// The device as it is.
+        /// The device, unchanged.
         pub fn attach<'a, D>(&'a mut self, device: &'a mut D) -> &'a mut D {
             device
         }
@@ -48,17 +48,18 @@ mod on {
 
     pub use canopen::debugger::ENTRIES;
 
-    /// Tasks of this priority can be stopped no more, those of 1 and `idle` can. The tasks that
-    /// serve the bus have higher ones.
+    /// Tasks of this priority and above cannot be stopped. Tasks of priority 1 and `idle` can. The
+    /// tasks that serve the bus have higher priorities.
     const PRIORITY: u8 = 2;
 
     /// The interface.
     pub struct Debugger(debugger::Debugger<Chip>);
 
     impl Debugger {
-        /// The interface to this chip's memory; from now on breakpoints stop the program.
+        /// Makes the interface to this chip's memory. From now on breakpoints stop the program.
         pub fn start() -> Self {
-            // As the core counts them: 0 is the most urgent, and there are the upper four bits.
+            // The priority as the core counts it: 0 is the most urgent, and only the upper four
+            // bits exist.
             monitor::arm((16 - PRIORITY) << 4, pac::Interrupt::CAN1_TX as u16);
             Self(debugger::Debugger::new(Chip))
         }
@@ -74,21 +75,21 @@ mod on {
         }
     }
 
-    /// The device is about to leave, which `idle` does: a program that is stopped goes on, and is
-    /// stopped no more.
+    /// The device is about to leave, which `idle` does. A stopped program goes on and cannot be
+    /// stopped any more.
     pub fn release_program() {
         monitor::release_program();
     }
 
-    /// Calls of [`example`].
+    /// The number of calls of [`example`].
     #[unsafe(no_mangle)]
     static DEBUGGER_EXAMPLE_CALLS: AtomicU32 = AtomicU32::new(0);
 
-    /// Something to stop at, every half a second, and something to look at.
+    /// A function for a breakpoint, called every half second, and a variable to watch.
     #[unsafe(export_name = "debugger_example")]
     #[inline(never)]
     pub extern "C" fn example() {
-        // In two steps: an exclusive access that is stepped through never succeeds.
+        // Load and store apart: an exclusive access never succeeds when it is stepped through.
         let calls = DEBUGGER_EXAMPLE_CALLS.load(Ordering::Relaxed);
         DEBUGGER_EXAMPLE_CALLS.store(calls.wrapping_add(1), Ordering::Relaxed);
     }

@@ -1,5 +1,5 @@
-//! The table of the application's object dictionary. It needs nothing of the chip, so that the EDS
-//! file can be made from it on the host.
+//! The table of the application's object dictionary. It uses nothing of the chip, so that the EDS
+//! file can be generated from it on the host.
 
 use canopen::device;
 use canopen::emcy;
@@ -8,11 +8,11 @@ use canopen::program::control_count;
 
 /// How 1F51h = 80h leads back into the bootloader: 0 system reset, 1 watchdog reset, 2 jump.
 pub const REENTRY_PATH: u16 = 0x2000;
-/// What the bootloader knows of this program: bit 0 installed, bit 1 signed. Writing with bit 1 set
-/// confirms it, without takes the signature away.
+/// The bootloader's state of this program: bit 0 installed, bit 1 signed. A write with bit 1 set
+/// confirms the program; a write without it removes the signature.
 pub const CONFIRMATION: u16 = 0x2001;
 
-/// What shows the rest of coboot's services. A product has its own use for them.
+/// Objects that demonstrate the other services of coboot. A product replaces them.
 const SHOW_ENTRIES: [Entry; 2] = [
     Entry::var(REENTRY_PATH, "Re-entry path into the bootloader", DataType::Unsigned8, Access::Rw).default(0),
     Entry::var(CONFIRMATION, "Confirmation", DataType::Unsigned8, Access::Rw),
@@ -23,8 +23,8 @@ pub const fn entry_count(programs: u8) -> usize {
     device::ENTRIES.len() + emcy::ENTRIES.len() + SHOW_ENTRIES.len() + control_count(programs)
 }
 
-/// The object dictionary of a device with `programs` programs, of [`entry_count`]. What coboot needs
-/// of an application is program control: keep it when you add your own objects.
+/// The object dictionary of a device with `programs` programs, [`entry_count`] entries long. coboot
+/// needs program control in an application: keep it when you add your own objects.
 pub const fn entries<const LEN: usize>(programs: u8) -> Table<LEN> {
     Table::EMPTY
         .with(&device::ENTRIES)

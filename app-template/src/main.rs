@@ -21,8 +21,8 @@ use rtic_monotonics::systick::prelude::*;
 
 systick_monotonic!(Mono, 1_000);
 
-/// A fault or a panic (which ends in one) starts the device again; what runs then is the
-/// bootloader's decision.
+/// A fault, or a panic (which ends in a fault), restarts the device. The bootloader decides which
+/// program runs then.
 #[cfg(not(feature = "debugger"))]
 #[cortex_m_rt::exception]
 unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
@@ -45,16 +45,16 @@ mod app {
     use crate::debugger::{self, Debugger};
     use crate::objects::{Application, HEARTBEAT_MS};
 
-    /// Frames that may wait for the protocol task.
+    /// Received frames that may wait for the protocol task.
     const RX_QUEUE: usize = 16;
     /// How often the protocol looks at its deadlines, in ms.
     const TICK_MS: u32 = 5;
-    /// What the program goes by where no bootloader has started it.
+    /// The bit rate that the program uses when no bootloader has started it.
     const DEFAULT_BIT_RATE: BitRate = match BitRate::from_bits_per_second(BIT_RATE) {
         Some(rate) => rate,
         None => panic!("board: the bit rate must be one of CANopen's, or 0 to find it out"),
     };
-    /// From the protocol task to `idle`, where no exception is active: how the device is to leave.
+    /// How the device is to leave: from the protocol task to `idle`, where no exception is active.
     static EXIT: Exit = Exit::new();
 
     #[shared]
@@ -82,8 +82,8 @@ mod app {
         let can = CanPort::new(board.uart);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
-        // Same node-ID and bit rate as the bootloader: whoever talked to it goes on talking to
-        // this.
+        // Same node-ID and bit rate as the bootloader, so that a client of the bootloader can go on
+        // with the application.
         let start = Start::read(
             LAYOUT,
             Defaults {
@@ -128,14 +128,14 @@ mod app {
         }
     }
 
-    /// Empties the controller's FIFO: three frames deep, so nothing may hold this task up.
+    /// Empties the controller's FIFO. It holds three frames only, so nothing may delay this task.
     #[task(binds = CAN1_RX0, shared = [can], local = [received], priority = 4)]
     fn can_rx(mut cx: can_rx::Context) {
         cx.shared.can.lock(|can| line::receive(can, |frame| cx.local.received.enqueue(frame).is_ok()));
         rtic::pend(pac::Interrupt::CAN1_TX);
     }
 
-    /// Speaks CANopen: whenever a frame came in, a mailbox became free or time has passed.
+    /// Runs the protocol when a frame came in, a mailbox became free or time has passed.
     #[task(binds = CAN1_TX, shared = [can], local = [to_handle, slave, application, debugger], priority = 3)]
     fn protocol(cx: protocol::Context) {
         let now = Instant::from_millis(Mono::now().ticks());
@@ -168,7 +168,7 @@ mod app {
         }
     }
 
-    /// Goes on with the way out, if the device is on it. Whether requests are served.
+    /// Advances the departure, if one is in progress. Returns whether requests are served.
     fn serves(slave: &Slave, can: &mut impl Mutex<T = CanPort>, application: &mut Application) -> bool {
         let bus_idle = slave.is_idle() && can.lock(CanPort::is_idle);
         match application.proceed(bus_idle) {
@@ -182,7 +182,7 @@ mod app {
         false
     }
 
-    /// Does what the slave says, until it says nothing.
+    /// Carries out the slave's actions until there are none left.
     fn carry_out(
         slave: &mut Slave,
         can: &mut impl Mutex<T = CanPort>,

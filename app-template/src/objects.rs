@@ -1,5 +1,5 @@
-//! The values behind the application's object dictionary. Those of 1F51h, 1F56h and 1F57h come from
-//! `coboot-app`, which also says when the device is to go back to its bootloader.
+//! The values of the application's object dictionary. The values of 1F51h, 1F56h and 1F57h come
+//! from `coboot-app`, which also decides when the device goes back to its bootloader.
 
 use core::task::Poll;
 
@@ -70,7 +70,7 @@ static MARKED_VERSION: &str = concat!("$CANopenSoftwareVersion\0", version!(), "
 /// The bootloader underneath.
 const BOOTLOADER: Bootloader = Bootloader::new(LAYOUT);
 
-/// The application's state, as far as the bus sees it.
+/// The application's state that is visible on the bus.
 pub struct Application {
     device: Device,
     /// 1F51h, 1F56h, 1F57h, and the way back.
@@ -78,11 +78,11 @@ pub struct Application {
     bootloader: Bootloader,
     /// The re-entry path (2000h).
     path: ReentryPath,
-    /// An answer that the SDO server has yet to withhold.
+    /// An answer that the SDO server still has to withhold.
     owed: Option<Owed>,
     #[cfg(feature = "lift")]
     lock: Lock,
-    /// The time that was told last.
+    /// The time of the last call of [`Self::set_time`].
     now: Instant,
     emcy: Emcy,
     /// Node-ID in force.
@@ -92,7 +92,8 @@ pub struct Application {
 }
 
 impl Application {
-    /// From how the device came up. Asks the bootloader for the CRC over this program, once.
+    /// Builds the state from the bootloader's values. Asks the bootloader for the CRC over this
+    /// program, once.
     pub fn new(start: &Start, bit_rate: BitRate) -> Self {
         let device = Device {
             device_type: DEVICE_TYPE,
@@ -106,7 +107,7 @@ impl Application {
             serial_number: start.serial_number,
         };
         let control = ProgramControl::new(start, PROGRAMS, BOOTLOADER.program_crc(start.program));
-        // The bootloader of a lift is node 126, whatever this program is.
+        // The bootloader of a lift is node 126, whatever the node-ID of this program.
         let control = if cfg!(feature = "lift") { control.answering_itself() } else { control };
         Self {
             device,
@@ -123,12 +124,12 @@ impl Application {
         }
     }
 
-    /// Who the device is, for layer setting services.
+    /// The identity of the device for layer setting services.
     pub fn lss_address(&self) -> LssAddress {
         self.device.lss_address()
     }
 
-    /// Tells the time: at least every few milliseconds.
+    /// Passes the time in: call it at least every few milliseconds.
     pub fn set_time(&mut self, now: Instant) {
         self.now = now;
         // Asked at least now and then, as it wants.
@@ -136,12 +137,12 @@ impl Application {
         let _ = self.lock.is_waiting(now);
     }
 
-    /// Goes on with the way out, if the device is on it.
+    /// Advances the departure, if one is in progress.
     pub fn proceed(&mut self, bus_idle: bool) -> Next<BootRequest> {
         self.control.proceed(bus_idle, self.now.as_millis())
     }
 
-    /// On which path the device leaves with this request: an NMT master gets a reset.
+    /// The path on which the device leaves with this request: an NMT master gets a reset.
     pub fn path(&self, request: BootRequest) -> ReentryPath {
         match request {
             BootRequest::PowerOn => ReentryPath::SystemReset,
@@ -149,8 +150,8 @@ impl Application {
         }
     }
 
-    /// To be called behind every frame: takes an answer back that the bootloader is to send. Where the
-    /// client has written in segments that cannot be, so the command is judged once more.
+    /// Call it after every frame. Withdraws an answer that the bootloader is to send. If the client
+    /// has written in segments, the answer cannot be withdrawn, so the command is judged once more.
     pub fn leave_owed(&mut self, slave: &mut Slave) {
         let Some(owed) = self.owed.take() else { return };
         let now = self.now.as_millis();
@@ -207,7 +208,7 @@ impl Objects for Application {
         }
         let now = self.now.as_millis();
         match (at.index, data) {
-            // The callback runs before the SDO answer is sent. So it takes a note, and no more.
+            // The callback runs before the SDO answer is sent, so it only takes a note.
             (PROGRAM_CONTROL, data) => {
                 match self.control.write(at.sub, data, now, &mut self.bootloader)? {
                     Answer::Send => {}
@@ -247,7 +248,7 @@ impl LssDevice for Application {
         line::supports(rate)
     }
 
-    /// Storing is the bootloader's: its journal lies in flash that this program does not own.
+    /// The bootloader stores the values: its journal lies in flash that this program does not own.
     fn store(&mut self, id: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {
         let rate = rate.unwrap_or(self.bit_rate);
         let id = id.map(NodeId::get);

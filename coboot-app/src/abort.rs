@@ -1,6 +1,6 @@
 //! Why an SDO transfer ends early.
 
-/// The code of an SDO abort (CiA 301 table 22), of those that this crate answers with.
+/// The code of an SDO abort (CiA 301 table 22): the codes that this crate uses.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Abort(pub u32);
 
@@ -11,7 +11,7 @@ impl Abort {
     pub const READ_ONLY: Self = Self(0x0601_0002);
     /// The object does not exist.
     pub const NO_OBJECT: Self = Self(0x0602_0000);
-    /// Access failed due to a hardware error: the bootloader could not store what it was asked to.
+    /// Access failed due to a hardware error: the bootloader could not store the value.
     pub const HARDWARE: Self = Self(0x0606_0000);
     /// The value is too long.
     pub const LENGTH_TOO_HIGH: Self = Self(0x0607_0012);
@@ -19,9 +19,9 @@ impl Abort {
     pub const LENGTH_TOO_LOW: Self = Self(0x0607_0013);
     /// The sub-index does not exist.
     pub const NO_SUB_INDEX: Self = Self(0x0609_0011);
-    /// The value is none that the object takes.
+    /// The value is outside the range of the object.
     pub const INVALID_VALUE: Self = Self(0x0609_0030);
-    /// Not in the present state of the device.
+    /// The request is not possible in the present state of the device.
     pub const DEVICE_STATE: Self = Self(0x0800_0022);
 }
 

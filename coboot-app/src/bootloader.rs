@@ -1,5 +1,5 @@
-//! The bootloader underneath: its services, which are called like functions (the callgate), and the
-//! way into it.
+//! The services of the bootloader, which an application calls like functions (the callgate), and
+//! the re-entry into the bootloader.
 
 use core::sync::atomic::{AtomicU32, Ordering};
 
@@ -7,37 +7,37 @@ use shared_abi::callgate::{Callgate, CallgateError, NodeArgs, ProgramArgs, Statu
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::{BootRequest, WarmStart};
 
-/// What [`ProgramControl`](crate::ProgramControl) asks the bootloader for. [`Bootloader`] does it; a
-/// test has its own.
+/// The services that [`ProgramControl`](crate::ProgramControl) needs from the bootloader.
+/// [`Bootloader`] implements them for the chip; a test implements its own.
 pub trait Services {
-    /// What the bootloader knows of a program, 1 to 254.
+    /// The bootloader's data about a program, 1 to 254.
     ///
     /// # Errors
-    /// What the bootloader says.
+    /// The error of the bootloader.
     fn program_info(&mut self, number: u8) -> Result<ProgramArgs, CallgateError>;
 
-    /// Confirms a program: a trial that is content with itself is one no more.
+    /// Confirms a program: a program on trial becomes a permanent one.
     ///
     /// # Errors
-    /// What the bootloader says.
+    /// The error of the bootloader.
     fn confirm(&mut self, number: u8) -> Result<Confirmed, CallgateError>;
 }
 
-/// What came of a confirmation.
+/// The result of a confirmation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Confirmed {
-    /// It is stored.
+    /// The confirmation is stored.
     Now,
-    /// The flash is locked in front of a sealed program: the bootloader stores it when the device
-    /// leaves with [`BootRequest::Confirm`].
+    /// The flash is locked because the program is sealed. The bootloader stores the confirmation
+    /// when the device leaves with [`BootRequest::Confirm`].
     AtReset,
 }
 
 impl Confirmed {
-    /// From what the callgate said to a confirmation.
+    /// The result that belongs to the callgate's answer to a confirmation.
     ///
     /// # Errors
-    /// What it said, unless it stored the confirmation or the flash was locked.
+    /// The callgate's error, unless the confirmation was stored or the flash was locked.
     pub const fn from_outcome(outcome: Result<(), CallgateError>) -> Result<Self, CallgateError> {
         const LOCKED: i32 = Status::Locked as i32;
         match outcome {
@@ -51,8 +51,8 @@ impl Confirmed {
 /// The bootloader of a board.
 ///
 /// Each service uses up to [`callgate::STACK`](shared_abi::callgate::STACK) bytes of the caller's
-/// stack and nothing else of its RAM. One service at a time, from one priority, with the flash
-/// controller left alone meanwhile. On a bootloader without a callgate every service gives
+/// stack and no other RAM of the caller. Call one service at a time, from one priority, and do not
+/// use the flash controller meanwhile. If the bootloader has no callgate, every service returns
 /// [`CallgateError::Absent`] or [`CallgateError::Version`], and the application goes on.
 #[derive(Clone, Copy, Debug)]
 pub struct Bootloader {
@@ -66,28 +66,29 @@ impl Bootloader {
         Self { layout }
     }
 
-    /// Stores node-ID and bit rate for bootloader and application, in force from the next reset on:
-    /// node-ID 1 to 127, `None` for a device that waits for layer setting services; bit rate in bit/s,
-    /// 0 for one that is found out by listening.
+    /// Stores node-ID and bit rate for bootloader and application. They are in force from the next
+    /// reset on. The node-ID is 1 to 127, or `None` for a device that waits for layer setting
+    /// services. The bit rate is in bit/s; 0 means that the device detects it by listening.
     ///
-    /// Writes flash: the whole chip waits some 100 µs for it, and once in several hundred stores up to
-    /// half a second, when a sector of 16 KiB is erased (datasheet DS8626 table 40).
+    /// Writes flash. The whole chip waits some 100 µs for it. Once in several hundred stores a
+    /// sector of 16 KiB is erased, and the chip waits up to half a second (datasheet DS8626 table
+    /// 40).
     ///
     /// # Errors
-    /// What the bootloader says. A sealed device stores them for the holder of a root key alone, in the
-    /// bootloader.
+    /// The error of the bootloader. A sealed device stores these values in the bootloader only, and
+    /// only for the holder of a root key.
     pub fn store_node(&self, node_id: Option<u8>, bit_rate: u32) -> Result<(), CallgateError> {
         const NO_NODE_ID: u8 = 255;
         let node_id = node_id.unwrap_or(NO_NODE_ID).into();
         Callgate::find(self.layout)?.store_node(NodeArgs { node_id, bit_rate })
     }
 
-    /// Takes a program's signature away: it does not start by itself any more. Writes flash, as
-    /// [`store_node`](Self::store_node).
+    /// Removes a program's signature: the program does not start by itself any more. Writes flash,
+    /// as [`store_node`](Self::store_node) does.
     ///
     /// # Errors
-    /// What the bootloader says. In a sealed device the holder of a root key alone does that, in the
-    /// bootloader.
+    /// The error of the bootloader. In a sealed device only the holder of a root key removes a
+    /// signature, and only in the bootloader.
     pub fn invalidate(&self, number: u8) -> Result<(), CallgateError> {
         Callgate::find(self.layout)?.invalidate(number)
     }
@@ -98,7 +99,7 @@ impl Services for Bootloader {
         Callgate::find(self.layout)?.program_info(number)
     }
 
-    /// Writes flash, as [`Bootloader::store_node`].
+    /// Writes flash, as [`Bootloader::store_node`] does.
     fn confirm(&mut self, number: u8) -> Result<Confirmed, CallgateError> {
         Confirmed::from_outcome(Callgate::find(self.layout)?.confirm(number))
     }
@@ -106,10 +107,10 @@ impl Services for Bootloader {
 
 #[cfg(target_arch = "arm")]
 impl Bootloader {
-    /// What 1F56h reads in the bootloader as well: the CRC over what was downloaded as this program.
-    /// Without that (a debugger has put the program there), over the program as it was linked, computed
-    /// through the callgate; 0 without a bootloader. It takes as long as the program is: once, at the
-    /// start.
+    /// The value of 1F56h, the same as in the bootloader: the CRC over the data that was downloaded
+    /// as this program. If a debugger wrote the program, there is no such CRC; then it is the CRC
+    /// over the program as it was linked, computed through the callgate. The value is 0 without a
+    /// bootloader. The time grows with the size of the program: call it once, at the start.
     #[must_use]
     pub fn program_crc(mut self, number: u8) -> u32 {
         // `application.x` defines the second.
@@ -122,8 +123,8 @@ impl Bootloader {
         self.program_info(number).map(|info| info.crc).or_else(|_| computed()).unwrap_or(0)
     }
 
-    /// Leaves for the bootloader. What has to be on the bus is there already
-    /// ([`Next::Leave`](crate::Next::Leave)), and outputs are in a safe state.
+    /// Leaves for the bootloader. Before the call, all frames must be on the bus
+    /// ([`Next::Leave`](crate::Next::Leave)), and the outputs must be in a safe state.
     pub fn leave(self, path: ReentryPath, request: BootRequest) -> ! {
         use shared_abi::reentry;
 
@@ -138,14 +139,14 @@ impl Bootloader {
 /// How the device goes back into the bootloader (`shared_abi::reentry`).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ReentryPath {
-    /// Through a system reset: the right one, unless there is a reason for another.
+    /// By a system reset. Use it unless there is a reason for another path.
     #[default]
     SystemReset = 0,
-    /// Through a reset by the independent watchdog, for code that may not write the system control
-    /// block. Takes a millisecond; longer if the watchdog runs already.
+    /// By a reset of the independent watchdog, for code that may not write the system control
+    /// block. It takes a millisecond, or longer if the watchdog already runs.
     Watchdog = 1,
-    /// By a jump, all resources released, for a chip whose reset would switch something off. From
-    /// thread mode; in a handler it is a system reset.
+    /// By a jump, with all resources released, for a chip on which a reset would switch something
+    /// off. Call it in thread mode; in a handler it becomes a system reset.
     Jump = 2,
 }
 
@@ -162,11 +163,13 @@ impl ReentryPath {
     }
 }
 
-/// Carries the request to leave from the task that serves the bus to the one that leaves: for
-/// [`ReentryPath::Jump`], which starts in thread mode. A `static` of the program.
+/// Carries the request to leave from the task that serves the bus to the task that leaves.
+/// [`ReentryPath::Jump`] needs it, because it starts in thread mode. Make it a `static` of the
+/// program.
 #[derive(Debug)]
 pub struct Exit {
-    /// 0 to stay, else the path (1 to 3), and from bit 8 on the request as the warm-start cell has it.
+    /// 0: stay. Otherwise the path (1 to 3), and from bit 8 on the request as in the warm-start
+    /// cell.
     request: AtomicU32,
     /// The argument of the request.
     argument: AtomicU32,
@@ -179,20 +182,20 @@ impl Default for Exit {
 }
 
 impl Exit {
-    /// Nobody has asked.
+    /// No request to leave.
     #[must_use]
     pub const fn new() -> Self {
         Self { request: AtomicU32::new(0), argument: AtomicU32::new(0) }
     }
 
-    /// The device is to leave.
+    /// Asks the device to leave.
     pub fn ask(&self, path: ReentryPath, request: BootRequest) {
         let WarmStart { request, argument, .. } = WarmStart::new(request);
         self.argument.store(argument, Ordering::Relaxed);
         self.request.store((path as u32 + 1) | request << 8, Ordering::Release);
     }
 
-    /// Whether and how the device is to leave.
+    /// The path and the request, if the device is to leave.
     pub fn asked(&self) -> Option<(ReentryPath, BootRequest)> {
         let told = self.request.load(Ordering::Acquire);
         let path = (told as u8).checked_sub(1).and_then(ReentryPath::from_number)?;

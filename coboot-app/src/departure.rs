@@ -1,37 +1,38 @@
-//! The way back: when the device may leave, as a state machine over "is the bus idle?".
+//! The departure to the bootloader: a state machine that decides when the device may leave.
 //!
-//! Where the application has answered, the answer goes onto the bus first, and what is asked meanwhile
-//! is served ([`Departure::begin`]). Where it has left the answer to the bootloader, it says nothing
-//! any more ([`Departure::begin_silent`]).
+//! If the application answers the command, the answer goes onto the bus first, and the application
+//! still serves requests meanwhile ([`Departure::begin`]). If the bootloader is to answer, the
+//! application sends nothing any more ([`Departure::begin_silent`]).
 
 use crate::has_reached;
 
-/// How long the device stays when its answer is on the bus, in ms: at least 10 (SYS TEC manual
-/// L-1112d_10, 4.5), and one that may be almost over.
+/// How long the device stays after its answer is on the bus, in ms. At least 10 are required (SYS
+/// TEC manual L-1112d_10, 4.5); one more is added because the present millisecond may be almost
+/// over.
 pub const ANSWER_TO_RESET_MS: u32 = 11;
-/// The longest that it stays after a command, in ms: a bus on which nobody acknowledges the answer
-/// keeps it no longer, and neither does a client that asks without end.
+/// The longest time that the device stays after a command, in ms. It leaves then even if no node
+/// acknowledges the answer, or if a client sends requests without end.
 pub const ANSWERED_MOST_MS: u32 = 500;
-/// The longest that a command waits whose answer is left to the bootloader, in ms, for a frame that is
-/// on its way. The client is to have its answer within 25.
+/// The longest time that the device waits for frames on their way to the bus when the bootloader is
+/// to answer, in ms. The client must get its answer within 25 ms.
 pub const SILENT_MOST_MS: u32 = 15;
 
-/// Where the device is on its way out. `R` is what is asked of the bootloader.
+/// The state of the departure. `R` is the request to the bootloader.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Departure<R> {
-    /// It stays.
+    /// The device stays.
     #[default]
     Staying,
-    /// Its answer is on the way to the bus.
+    /// The answer is on its way to the bus.
     Answering {
-        /// What is asked of the bootloader.
+        /// The request to the bootloader.
         request: R,
-        /// A master was promised it, whatever another one asks.
+        /// A master was promised this request, so another master cannot replace it.
         promised: bool,
-        /// The device leaves at this time, whatever waits to be sent.
+        /// The device leaves at this time, even if frames still wait to be sent.
         latest: u32,
     },
-    /// Its answer is on the bus. It serves requests in the pause behind it.
+    /// The answer is on the bus. The device serves requests during the pause behind it.
     Pausing {
         /// As for [`Answering`](Self::Answering).
         request: R,
@@ -39,40 +40,41 @@ pub enum Departure<R> {
         promised: bool,
         /// As for [`Answering`](Self::Answering).
         latest: u32,
-        /// The pause is over then.
+        /// The pause ends at this time.
         until: u32,
     },
-    /// It takes and sends nothing any more; the frames that the controller has already go out.
+    /// The device takes and sends nothing any more. The controller still sends the frames that it
+    /// has.
     Silent {
-        /// What is asked of the bootloader.
+        /// The request to the bootloader.
         request: R,
-        /// How a command is treated that was answered before.
+        /// The pause that an earlier command still needs.
         before: Before,
-        /// The device leaves at this time, whatever waits to be sent.
+        /// The device leaves at this time, even if frames still wait to be sent.
         latest: u32,
     },
-    /// It is to leave now.
+    /// The device is to leave now.
     Leaving {
-        /// What is asked of the bootloader.
+        /// The request to the bootloader.
         request: R,
     },
 }
 
-/// What a silent device owes to a command that it answered before.
+/// The pause that a silent device still owes to a command that it answered earlier.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Before {
-    /// Nothing: there was none.
+    /// No pause: no command was answered earlier.
     Nothing,
-    /// The pause, which begins when the answer is on the bus.
+    /// The whole pause, which begins when the answer is on the bus.
     Pause,
-    /// The rest of the pause, until then.
+    /// The rest of the pause, until this time.
     Until(u32),
 }
 
-/// What the owner does next.
+/// What the owner has to do next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Next<R> {
-    /// Serve as always.
+    /// Serve requests as usual.
     Serve,
     /// Take no request and send nothing; the frames in the mailboxes go out.
     Wait,
@@ -81,9 +83,9 @@ pub enum Next<R> {
 }
 
 impl<R: Copy> Departure<R> {
-    /// A command was taken whose answer this program sends. `promised`: the device is to come up in
-    /// the bootloader, or something is to be stored. A master that was promised that is not let down
-    /// by another one, whose command starts the program anew.
+    /// The device took a command that this program answers. `promised`: the device is to come up in
+    /// the bootloader, or the bootloader is to store something. A later command of another master
+    /// that restarts the program does not replace a promised request.
     pub fn begin(&mut self, request: R, promised: bool, now: u32) {
         *self = match *self {
             Self::Staying => {
@@ -98,13 +100,13 @@ impl<R: Copy> Departure<R> {
                     Self::Answering { request: before, promised: was_promised, latest }
                 }
             }
-            // Nothing is served any more, so nothing can be asked.
+            // The device serves no requests any more, so there cannot be a new one.
             gone @ (Self::Silent { .. } | Self::Leaving { .. }) => gone,
         };
     }
 
-    /// A command was taken whose answer is left to the bootloader. One that was answered before still
-    /// has its pause.
+    /// The device took a command that the bootloader is to answer. A command that was answered
+    /// earlier still gets its pause.
     pub fn begin_silent(&mut self, request: R, now: u32) {
         let before = match *self {
             Self::Staying => Before::Nothing,
@@ -115,8 +117,8 @@ impl<R: Copy> Departure<R> {
         *self = Self::Silent { request, before, latest: now.wrapping_add(SILENT_MOST_MS) };
     }
 
-    /// Goes on with it. `bus_idle`: no answer waits to be sent, and everything is on the bus and was
-    /// acknowledged. To be asked behind every frame that was handled, and every few milliseconds.
+    /// Advances the departure. `bus_idle`: no answer waits to be sent, and all frames are on the
+    /// bus and were acknowledged. Call it after every frame and every few milliseconds.
     pub fn proceed(&mut self, bus_idle: bool, now: u32) -> Next<R> {
         *self = self.after(bus_idle, now);
         match *self {
@@ -126,7 +128,7 @@ impl<R: Copy> Departure<R> {
         }
     }
 
-    /// The state behind this one.
+    /// The state that follows this one.
     fn after(self, bus_idle: bool, now: u32) -> Self {
         let pause_end = now.wrapping_add(ANSWER_TO_RESET_MS);
         match self {
@@ -185,7 +187,8 @@ mod tests {
         assert_eq!(departure.proceed(true, 7), Next::Leave('b'));
     }
 
-    /// Each answer is followed by the pause; somebody who asks without end is not waited for.
+    /// Each answer is followed by the pause; a client that sends requests without end does not
+    /// delay the departure.
     #[test]
     fn a_command_in_quick_succession_prolongs_the_pause_and_not_for_ever() {
         let mut departure = Departure::Staying;
@@ -220,15 +223,15 @@ mod tests {
         departure.begin_silent('o', 7);
         assert_eq!(departure.proceed(false, 7), Next::Wait, "a heartbeat is on its way");
         assert_eq!(departure.proceed(true, 8), Next::Leave('o'));
-        // Nobody acknowledges the heartbeat.
+        // No node acknowledges the heartbeat.
         let mut departure = Departure::Staying;
         departure.begin_silent('o', 7);
         assert_eq!(departure.proceed(false, 21), Next::Wait);
         assert_eq!(departure.proceed(false, 22), Next::Leave('o'));
     }
 
-    /// Two masters: the first was answered, and has its 10 ms; the second is answered by the
-    /// bootloader, within 25 ms still.
+    /// Two masters: the application answers the first one, which gets its 10 ms. The bootloader
+    /// answers the second one, still within 25 ms.
     #[test]
     fn a_command_that_is_handed_over_keeps_the_pause_of_the_one_before() {
         let mut departure = Departure::Staying;
@@ -237,7 +240,7 @@ mod tests {
         departure.begin_silent('o', 3);
         assert_eq!(departure.proceed(true, 10), Next::Wait);
         assert_eq!(departure.proceed(true, 11), Next::Leave('o'));
-        // The answer before was not even on the bus.
+        // The earlier answer was not even on the bus.
         let mut departure = Departure::Staying;
         departure.begin('b', true, 0);
         departure.begin_silent('o', 1);

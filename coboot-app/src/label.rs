@@ -1,5 +1,5 @@
-//! The label: what a program image says of itself, so that the bootloader can refuse one that is for
-//! another device before it touches the program that is there.
+//! The label: the data in a program image that identifies its device. With it the bootloader can
+//! refuse an image for another device before it erases the installed program.
 
 pub use shared_abi::label::{Label, OFFSET, SIZE};
 

@@ -1,5 +1,5 @@
-//! What an application needs to live on the coboot bootloader, whichever CANopen stack and whichever
-//! executor it has.
+//! What an application needs to run under the coboot bootloader, with any CANopen stack and any
+//! executor.
 //!
 //! | module | what it is |
 //! |---|---|
@@ -11,8 +11,8 @@
 //! | [`layout!`](layout!) | the memory map of the board, as the build script has written it |
 //! | `responder` | a small SDO server for applications without a CANopen stack (feature `responder`) |
 //!
-//! Nothing here waits, allocates or reads a clock. Time is passed in as the reading of a counter of
-//! milliseconds in 32 bits, which may wrap.
+//! This crate does not wait, allocate or read a clock. The caller passes in the time, as the value
+//! of a 32-bit counter of milliseconds, which may wrap.
 //!
 //! In the order of use:
 //!
@@ -56,7 +56,7 @@ macro_rules! layout {
     };
 }
 
-/// Whether `deadline` has come, of a counter of milliseconds that wraps.
+/// Whether the counter of milliseconds, which wraps, has reached `deadline`.
 const fn has_reached(now: u32, deadline: u32) -> bool {
     now.wrapping_sub(deadline) < 1 << 31
 }

@@ -29,11 +29,11 @@ pub const PROGRAM_ID: u16 = 0x1F56;
 /// 1F57h: flash status identification.
 pub const FLASH_STATUS: u16 = 0x1F57;
 
-/// What 1F51h reads for a program that is there and does not run.
+/// The value of 1F51h for a program that is installed and does not run.
 const STOPPED: u8 = 0;
-/// What 1F51h reads for the program that runs.
+/// The value of 1F51h for the program that runs.
 const RUNNING: u8 = 1;
-/// What 1F51h reads where there is no program.
+/// The value of 1F51h where no program is installed.
 const ABSENT: u8 = 3;
 
 /// How a download to 1F51h is answered that was taken.
@@ -53,20 +53,20 @@ pub enum Answer {
 pub struct ProgramControl {
     /// The program that runs.
     program: u8,
-    /// Programs of the device.
+    /// The number of programs of the device.
     programs: u8,
     /// 1F56h of the program that runs.
     crc: u32,
     /// The next 80h to this program confirms it.
     fresh: bool,
-    /// The password came (lifts): 1F51h = 2 and NMT reset node lead into the bootloader.
+    /// The password of a lift came: 1F51h = 2 and NMT reset node lead into the bootloader.
     armed: bool,
-    /// What a master was promised of the reset that is due: the bootloader, or that this program is
-    /// confirmed by it. Nobody else takes that away.
+    /// The request that a master was promised for the coming reset: the bootloader, or the
+    /// confirmation of this program. No other master can replace it.
     promised: Option<BootRequest>,
     /// Node-ID in force.
     node_id: Option<u8>,
-    /// The node-ID as which the bootloader can answer in this program's place.
+    /// The node-ID with which the bootloader can answer in this program's place.
     bootloader_node: Option<u8>,
     departure: Departure<BootRequest>,
 }
@@ -90,8 +90,9 @@ impl ProgramControl {
         }
     }
 
-    /// Of a device whose bootloader is another node than this program (a lift's is node 126), or whose
-    /// SDO server cannot withhold an answer: STOP is answered here, and CLEAR is refused.
+    /// For a device whose bootloader has another node-ID than this program (126 on a lift), or
+    /// whose SDO server cannot withhold an answer: the application answers STOP itself and refuses
+    /// CLEAR.
     #[must_use]
     pub const fn answering_itself(self) -> Self {
         Self { bootloader_node: None, ..self }
@@ -114,8 +115,9 @@ impl ProgramControl {
         self.node_id = node_id;
     }
 
-    /// The bootloader has stored this node-ID ([`Bootloader::store_node`](crate::Bootloader)), together
-    /// with the bit rate in force (`same_bit_rate`) or another one: it comes up with these from now on.
+    /// The bootloader has stored this node-ID ([`Bootloader::store_node`](crate::Bootloader)),
+    /// together with the bit rate in force (`same_bit_rate`) or another one. It uses them from now
+    /// on.
     pub fn node_stored(&mut self, node_id: Option<u8>, same_bit_rate: bool) {
         if self.bootloader_node.is_some() {
             self.bootloader_node = if same_bit_rate { node_id } else { None };
@@ -164,10 +166,10 @@ impl ProgramControl {
         self.check(sub).map(|()| 0)
     }
 
-    /// A download of `data` to 1F51h/`sub`. To be called before the SDO answer is sent.
+    /// Handles a download of `data` to 1F51h/`sub`. Call it before the SDO answer is sent.
     ///
     /// # Errors
-    /// The code of the SDO abort that is the answer; nothing has happened.
+    /// The code of the SDO abort to answer with; nothing was changed.
     pub fn write(
         &mut self,
         sub: u8,
@@ -179,8 +181,8 @@ impl ProgramControl {
         self.take(sub, data, now, answers, services)
     }
 
-    /// As [`write`](Self::write), for a server that sends its answer whatever happens (the client has
-    /// written the byte in segments, say, whose end only this program can acknowledge).
+    /// As [`write`](Self::write), for a server that always sends its answer. Example: the client
+    /// wrote the byte in segments, and only this program can acknowledge their end.
     ///
     /// # Errors
     /// As for [`write`](Self::write).
@@ -228,7 +230,8 @@ impl ProgramControl {
         Ok(Answer::Send)
     }
 
-    /// The answer was withheld ([`Answer::Withhold`]): from now on nothing is taken or sent.
+    /// The answer was withheld ([`Answer::Withhold`]): from now on the device takes and sends
+    /// nothing.
     pub fn leave_owed(&mut self, owed: Owed, now: u32) {
         self.departure.begin_silent(BootRequest::Owed(owed), now);
     }
@@ -251,15 +254,14 @@ impl ProgramControl {
         }
     }
 
-    /// NMT reset node came: the device restarts as after a power-on, so that the bootloader counts no
-    /// crash. An armed lift goes into the bootloader.
+    /// An NMT reset node command came. The device restarts as after a power-on, so that the
+    /// bootloader counts no crash. A lift that has its password goes into the bootloader.
     pub fn restart(&mut self, now: u32) {
         self.leave(if self.armed { BootRequest::Stay } else { BootRequest::PowerOn }, now);
     }
 
-    /// Goes on with the way out. `bus_idle`: no answer waits to be sent, and everything is on the bus
-    /// and was acknowledged. To be asked behind every frame that was handled, and every few
-    /// milliseconds.
+    /// Advances the departure. `bus_idle`: no answer waits to be sent, and all frames are on the
+    /// bus and were acknowledged. Call it after every frame and every few milliseconds.
     pub fn proceed(&mut self, bus_idle: bool, now: u32) -> Next<BootRequest> {
         self.departure.proceed(bus_idle, now)
     }

@@ -58,7 +58,7 @@ impl Frame {
     }
 }
 
-/// What the device says of itself.
+/// The values by which the device identifies itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Device {
     /// 1000h: 0 for a device without a standardised profile. Not 10000000h, by which a host recognises
@@ -99,7 +99,7 @@ pub struct Responder {
     nmt: Nmt,
     /// The time of the last heartbeat.
     beaten: u32,
-    /// The device says and takes nothing any more.
+    /// No frame is taken or sent any more.
     silent: bool,
 }
 
@@ -173,7 +173,7 @@ impl Responder {
         }
     }
 
-    /// The next frame to send of its own accord, boot-up or heartbeat, until there is none.
+    /// The next boot-up or heartbeat to send; `None` if none is due.
     pub fn poll(&mut self, now: u32) -> Option<Frame> {
         if self.silent {
             return None;
@@ -265,7 +265,7 @@ impl Responder {
             // Its data would come in segments.
             return Err(Abort::COMMAND);
         }
-        // A client that does not tell the size means that of the object.
+        // If the client does not give the size, the size of the object counts.
         let len = if command & SIZE_TOLD == 0 { own_len } else { 4 - (command >> 2 & 3) };
         let data = &data[..usize::from(len)];
         if index == PROGRAM_CONTROL {

@@ -1,4 +1,5 @@
-//! What an application does about a command of 1F51h: the rule, without the chip and without a state.
+//! The rule that tells how an application reacts to a command of 1F51h. It has no state and does
+//! not use the chip.
 
 use crate::abort::Abort;
 
@@ -39,10 +40,11 @@ impl Command {
     }
 }
 
-/// What an application knows of itself when a command comes.
+/// The state of an application when a command comes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Standing {
-    /// It was started right behind its download in one go, and nobody has written 80h since.
+    /// It was started right after its download in one sequence, and no master has written 80h
+    /// since.
     pub fresh: bool,
     /// A password came before, for a tool that wants the bootloader (CiA 814-1 clause 6.3).
     pub armed: bool,
@@ -51,10 +53,10 @@ pub struct Standing {
     pub can_hand_over: bool,
 }
 
-/// What an application does about a command that it takes.
+/// The reaction of an application to a command that it accepts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reaction {
-    /// It is so already: answer.
+    /// The command changes nothing: answer.
     Nothing,
     /// Confirm this program through the callgate, then answer. It is fresh no more, whatever comes of
     /// it.

@@ -1,9 +1,9 @@
-//! How the program came up.
+//! How the program was started.
 
 use shared_abi::handoff::{BootInfo, Handoff};
 use shared_abi::layout::Layout;
 
-/// What holds where no bootloader has started the program (a debugger did, say).
+/// The values to use when no bootloader has started the program (but a debugger, for example).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Defaults {
     /// Node-ID, 1 to 127; `None` for a device that waits for layer setting services.
@@ -14,10 +14,10 @@ pub struct Defaults {
     pub serial_number: u32,
 }
 
-/// How the program came up: as the bootloader told, or by the defaults.
+/// How the program was started: the bootloader's values, or the defaults.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Start {
-    /// Node-ID to use, 1 to 127, unless there is none.
+    /// Node-ID to use, 1 to 127; `None` if there is none.
     pub node_id: Option<u8>,
     /// Bit rate to use, in bit/s; 0 for a device that finds it out by listening.
     pub bit_rate: u32,
@@ -28,7 +28,7 @@ pub struct Start {
     /// It was started right behind its download in one go (raw image, Intel HEX or sealed image): the
     /// first 1F51h = 80h confirms it.
     pub fresh: bool,
-    /// All that the bootloader told; `None` where no bootloader started the program.
+    /// All values of the bootloader; `None` if no bootloader started the program.
     pub told: Option<BootInfo>,
 }
 

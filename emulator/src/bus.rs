@@ -1,8 +1,8 @@
-//! The CAN bus in virtual time: who sends, for how long, and what everybody makes of it (ISO
+//! The CAN bus in virtual time: which node sends, for how long, and what each node receives (ISO
 //! 11898-1:2015).
 //!
-//! The model works in whole frames, not in bits: at the start of a frame it knows who takes part,
-//! and works out from the frame's own bits when it ends and how. What follows from that:
+//! The model works in whole frames, not in bits. At the start of a frame it knows which nodes take
+//! part, and computes from the frame's bits when and how the frame ends. The consequences:
 //!
 //! - Start and end of frames are exact to the bit: stuff bits, error flags, intermission, and the
 //!   eight bits that an error passive transmitter leaves free. Received frames are valid one bit
@@ -37,7 +37,7 @@ use confinement::ErrorState;
 use fault::{Fault, FaultAction, Faults};
 use node::{BusEvent, BusNode, ErrorKind, Line};
 
-/// Bits of an error flag that everybody sends together.
+/// Bits of an error flag that all nodes send together.
 const FLAG_BITS: u32 = 6;
 /// Bits of an error flag whose echo follows a bit later.
 const FLAG_ONE_LATE_BITS: u32 = 7;
@@ -54,14 +54,15 @@ const CLASH_BITS: u32 = 12;
 /// Bit rates that differ by more than this part are different.
 const TOLERANCE_PARTS: u64 = 100;
 
-/// No node notices earlier than so many bits behind the start of a frame what has become of it: six
-/// of an error flag and eight of its delimiter. Nodes may run ahead of each other by this much.
+/// The earliest time, in bits after the start of a frame, at which a node notices the result of the
+/// frame: six bits of an error flag and eight of its delimiter. Nodes may run ahead of each other
+/// by this much.
 pub const SHORTEST_CONSEQUENCE_BITS: u64 = 14;
 
-/// How a frame came out.
+/// The result of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Outcome {
-    /// Everybody in tune has it.
+    /// All nodes with the same bit rate have received it.
     Good,
     /// Acknowledged, but an injected fault kept it from the receivers (for good, or for now).
     KeptBack,
@@ -81,11 +82,11 @@ pub struct Record {
     /// Its transmitter's place among the nodes; `None` for a frame that an injected fault repeats
     /// or delays.
     pub from: Option<usize>,
-    /// How it came out.
+    /// The result.
     pub outcome: Outcome,
 }
 
-/// A node that has a part in the frame on the wire.
+/// A node that takes part in the frame on the wire.
 #[derive(Clone, Copy, Debug)]
 struct Party {
     node: usize,
@@ -104,11 +105,11 @@ enum Plan {
     Good { valid: Time, end: Time },
     /// Receivers have it; the end of frame is running out.
     Delivered { end: Time },
-    /// With an error frame whose delimiter ends at `end`.
+    /// Ends with an error frame, and its delimiter ends at `end`.
     Bad { end: Time, error: Error },
 }
 
-/// What becomes of a bad frame.
+/// The course of a bad frame.
 #[derive(Clone, Copy, Debug)]
 struct Error {
     /// When the error flag begins.
@@ -169,7 +170,7 @@ struct Inner {
     bit: Span,
 }
 
-/// Who wants to start a frame.
+/// A node that wants to start a frame.
 #[derive(Clone, Copy, Debug)]
 struct Contender {
     /// `None`: the gateway.
@@ -180,7 +181,7 @@ struct Contender {
 
 type Sink = Box<dyn FnMut(&Record)>;
 
-/// The wire, and everything that runs on it. The nodes are lent to it for each call, always in the
+/// The wire and the state of its frames. The caller passes the nodes to each call, always in the
 /// same order.
 #[derive(Default)]
 pub struct Bus {
@@ -240,7 +241,7 @@ impl Bus {
         Self::default()
     }
 
-    /// Up to when everything on the bus is decided.
+    /// The time up to which everything on the bus is decided.
     #[must_use]
     pub fn now(&self) -> Time {
         self.now
@@ -251,7 +252,7 @@ impl Bus {
         self.sinks.push(Box::new(sink));
     }
 
-    /// Makes something go wrong from now on. Gives a number for [`fault_hits`](Self::fault_hits).
+    /// Injects a fault from now on. Returns a number for [`fault_hits`](Self::fault_hits).
     pub fn inject(&mut self, fault: Fault) -> usize {
         self.faults.add(fault)
     }
@@ -262,18 +263,18 @@ impl Bus {
         self.faults.hits(fault)
     }
 
-    /// Makes nothing go wrong any more. Frames held back still come.
+    /// Removes all faults. Frames that are held back are still sent.
     pub fn clear_faults(&mut self) {
         self.faults.clear();
     }
 
-    /// Frames that came out well, and frames that did not.
+    /// The number of good frames and of bad ones.
     #[must_use]
     pub fn totals(&self) -> (u64, u64) {
         (self.frames, self.errors)
     }
 
-    /// When something will happen next if no node asks for anything else.
+    /// When the next event happens if no node requests anything else.
     #[must_use]
     pub fn next_event(&self, nodes: &[&mut dyn BusNode]) -> Option<Time> {
         let flight = self.flight.as_ref().map(Flight::next);
@@ -299,7 +300,7 @@ impl Bus {
         [leaves, joins, starts].into_iter().flatten().min()
     }
 
-    /// When the node could start a frame.
+    /// The earliest time at which the node could start a frame.
     fn next_start(&self, n: usize, node: &dyn BusNode) -> Option<Time> {
         let line = node.line()?;
         let request = match node.request(self.now) {
@@ -314,7 +315,7 @@ impl Bus {
         }
     }
 
-    /// Lets everything happen up to and including `to`. Every node must have come to `to`.
+    /// Processes all events up to and including `to`. Every node must have reached `to`.
     pub fn advance(&mut self, to: Time, nodes: &mut [&mut dyn BusNode]) {
         self.suspended.resize(nodes.len().max(self.suspended.len()), Time(0));
         while let Some(at) = self.next_event(nodes) {
@@ -330,7 +331,7 @@ impl Bus {
         }
     }
 
-    /// Everything that is due now, in the order: ends, leaving, joining, starts.
+    /// Processes everything that is due now, in this order: ends, leaving, joining, starts.
     fn step(&mut self, nodes: &mut [&mut dyn BusNode]) {
         let now = self.now;
         if self.flight.as_ref().is_some_and(|flight| flight.next() <= now) {
@@ -355,7 +356,7 @@ impl Bus {
         }
     }
 
-    /// Tells the nodes that wait for recessive bits how many there have been.
+    /// Tells the nodes that wait for recessive bits how many have passed.
     fn count_recessive(&mut self, nodes: &mut [&mut dyn BusNode]) {
         for node in nodes {
             let Some(wait) = node.wait() else { continue };
@@ -427,7 +428,8 @@ impl Bus {
         let (frame, bit) = (strongest.frame, strongest.bit);
         let key = frame.arbitration_key();
         let clash = contenders.iter().any(|other| !in_tune(other.bit, bit));
-        // Whoever does not hear the others' bits as bits does not lose against them either.
+        // A node that does not read the others' bits as bits does not lose the arbitration against
+        // them.
         let (winners, losers): (Vec<&Contender>, Vec<&Contender>) =
             contenders.iter().partition(|contender| clash || contender.frame.arbitration_key() == key);
         let transmitters: Vec<Party> = winners.iter().filter_map(|winner| winner.party).collect();
@@ -490,7 +492,7 @@ impl Bus {
         self.held.remove(n)
     }
 
-    /// What goes wrong first with the frame that starts now, if anything does.
+    /// The first error of the frame that starts now, if there is one.
     fn foresee(
         &self,
         winners: &[&Contender],
@@ -561,7 +563,7 @@ impl Bus {
 
     fn deliver(&mut self, mut flight: Flight, end: Time, nodes: &mut [&mut dyn BusNode]) {
         let now = self.now;
-        // Who left in the meantime neither sends nor acknowledges.
+        // A node that has left in the meantime neither sends nor acknowledges.
         let there = |party: &Party| {
             nodes.get(party.node).is_some_and(|node| node.epoch() == party.epoch && node.line().is_some())
         };
@@ -634,8 +636,8 @@ impl Bus {
         let passive = |party: &Party| {
             nodes.get(party.node).is_some_and(|node| node.confinement().state() == ErrorState::Passive)
         };
-        // An error passive transmitter's flag is recessive: who only listens takes the frame for a
-        // good one.
+        // An error passive transmitter's flag is recessive: a node that only listens takes the
+        // frame for a good one.
         let unheard = error.transmit == ErrorKind::Acknowledge
             && error.receive == ErrorKind::Form
             && flight.transmitters.iter().all(passive);
@@ -690,7 +692,7 @@ impl Bus {
         }
     }
 
-    /// Tells the party, if it is still the one that the frame began with.
+    /// Sends the event to the party, if the node has not been reset since the frame began.
     fn notify(&self, party: &Party, event: BusEvent, nodes: &mut [&mut dyn BusNode]) {
         if let Some(node) = nodes.get_mut(party.node).filter(|node| node.epoch() == party.epoch) {
             node.event(event, self.now);

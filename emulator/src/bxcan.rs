@@ -2,13 +2,13 @@
 //! (bxCAN)"), registers and behaviour taken from the manual.
 //!
 //! CAN1 is the master: it has the filter registers of both, and manages the memory that both have
-//! their mailboxes, FIFOs and filters in. Without its clock CAN2 receives nothing, and its
-//! mailboxes are not to be reached.
+//! their mailboxes, FIFOs and filters in. Without the clock of CAN1, CAN2 receives nothing, and its
+//! mailboxes cannot be accessed.
 //!
-//! The controller itself never decides what is on the wire. It offers frames and counters to the
-//! [`Bus`](crate::bus::Bus) through [`BusNode`], and the bus tells it what happened and when. As
-//! long as no bus has looked at it, it behaves like a controller whose transceiver hears a
-//! recessive line: it can be set up and comes out of initialisation, and its frames wait.
+//! The controller does not decide which frame is on the wire. It offers frames and counters to the
+//! [`Bus`](crate::bus::Bus) through [`BusNode`], and the bus reports the events and their times.
+//! Before a bus has called it, the controller behaves as if its transceiver saw a recessive line:
+//! it can be set up and leaves initialisation, and its frames wait.
 //!
 //! Not modelled, and reported when asked for: time-triggered mode. MSR.SAMP and MSR.RX always
 //! read recessive.
@@ -170,7 +170,7 @@ enum Recovery {
     Counting { since: Time, left: u32 },
 }
 
-/// What the protocol engine is doing: MSR.TXM and MSR.RXM.
+/// The activity of the protocol engine: MSR.TXM and MSR.RXM.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Activity {
     Idle,
@@ -328,14 +328,14 @@ impl Fifo {
 #[derive(Clone, Debug)]
 pub struct BxCan {
     share: Share,
-    /// Whether CAN1, which manages the memory, has a clock; CAN1 is not asked without one.
+    /// Whether CAN1, which manages the memory, has a clock. Only CAN2 checks it.
     master_clocked: bool,
     clock_hz: u32,
     on_bus: bool,
     attention: Option<Time>,
     epoch: u32,
     mode: Mode,
-    /// A wish to leave normal mode, and since when.
+    /// The mode to enter when the controller leaves normal mode, and since when it waits for that.
     leaving: Option<(Time, Rest)>,
     recovery: Recovery,
     activity: Activity,
@@ -392,7 +392,7 @@ impl BxCan {
         Self { share: Share::Can2, master_clocked: false, ..Self::new() }
     }
 
-    /// CAN2 hears of its master: the filters as they are now, and whether there is a clock.
+    /// CAN2 takes over the state of CAN1: its filters, and whether it has a clock.
     pub fn follow(&mut self, master: &Self, clocked: bool) {
         self.filters.clone_from(&master.filters);
         self.master_clocked = clocked;
@@ -407,7 +407,7 @@ impl BxCan {
         }
     }
 
-    /// Whether `offset` is one of a register that this controller has; which it has not is told.
+    /// Checks that this controller has a register at `offset`.
     fn check(&self, offset: u32) -> Result<(), Unmodelled> {
         match (self.share, offset) {
             (Share::Can2, 0x200..) => Err(Unmodelled(format!(
@@ -425,8 +425,8 @@ impl BxCan {
         self.clock_hz = hz;
     }
 
-    /// Whether the bus has to look before the CPU may go on: a transmission is requested, or the
-    /// mode changes.
+    /// Whether the bus must process a change before the CPU may go on: a transmission is requested,
+    /// or the mode changes.
     #[must_use]
     pub fn wants_attention(&self) -> bool {
         self.on_bus && self.attention.is_some()
@@ -485,7 +485,7 @@ impl BxCan {
     // --- modes
     // -----------------------------------------------------------------------------------------------------
 
-    /// Goes where INRQ and SLEEP say, at once where the bus has no part in it.
+    /// Enters the mode that INRQ and SLEEP select, at once where the bus is not involved.
     fn follow_mode_bits(&mut self, now: Time) {
         let target = match (self.mcr & mcr::INRQ != 0, self.mcr & mcr::SLEEP != 0) {
             // With SLEEP, too: no arrow of the mode diagram (RM0090, figure "bxCAN operating modes")
@@ -548,7 +548,7 @@ impl BxCan {
         self.fifos = [Fifo::default(), Fifo::default()];
     }
 
-    /// Without a bus the line is recessive for ever.
+    /// Without a bus the line stays recessive.
     fn hear_nothing(&mut self, now: Time) {
         if let Some((_, rest)) = self.leaving {
             self.rest(rest);
@@ -579,7 +579,7 @@ impl BxCan {
         }
     }
 
-    /// The mailbox that would go last, if any waits.
+    /// The mailbox that would be sent last, if any waits.
     fn last_mailbox(&self) -> Option<usize> {
         let waiting = (0..3).filter_map(|n| self.mailboxes[n].order().map(|order| (n, order)));
         if self.mcr & mcr::TXFP != 0 {
@@ -911,7 +911,7 @@ impl Peripheral for BxCan {
 
     fn reset(&mut self) {
         self.reset_state();
-        // The filters are reset with the master alone.
+        // Only a reset of CAN1 resets the filters.
         let filters = match self.share {
             Share::Can1 => Filters::default(),
             Share::Can2 => self.filters.clone(),

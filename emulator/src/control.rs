@@ -4,9 +4,9 @@
 //! power off|on | reset | pin PC13 low|high|open | status
 //! ```
 //!
-//! Each line gets one line back, which begins with `ok` or `error`. `board 2` in front names another
-//! board than the first one. Who owns the boards answers ([`Server::take`]); the threads only carry
-//! lines.
+//! Each line gets one line back, which begins with `ok` or `error`. A prefix `board 2` selects a
+//! board other than the first one. The owner of the boards answers ([`Server::take`]); the threads
+//! only carry lines.
 
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream, ToSocketAddrs};
@@ -22,19 +22,19 @@ const LONGEST: u64 = 256;
 const MAX_CLIENTS: usize = 16;
 /// Requests that wait for the boards' owner.
 const REQUESTS: usize = 64;
-/// A client that takes nothing for so long is disconnected.
+/// The server disconnects a client that does not read for this long.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// What is to be done to a board.
+/// An action on a board.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Action {
     /// Switches the power.
     Power(bool),
-    /// Switches the power over.
+    /// Switches the power on if it is off, and off if it is on.
     TogglePower,
     /// Pulls NRST low for a moment.
     Reset,
-    /// Drives a pin from outside; with `None` lets it go.
+    /// Drives a pin from outside; `None` releases it.
     Pin {
         /// `'A'` to `'K'`.
         port: char,
@@ -43,16 +43,16 @@ pub enum Action {
         /// Its level.
         level: Option<bool>,
     },
-    /// Only asks.
+    /// Changes nothing and reports the state.
     Status,
 }
 
-/// A line that was understood.
+/// A command that was parsed from a line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Command {
-    /// Which board; the first one is 0.
+    /// The board; the first one is 0.
     pub board: usize,
-    /// What is to be done.
+    /// The action.
     pub action: Action,
 }
 
@@ -102,7 +102,7 @@ fn pin(name: &str) -> Option<(char, u8)> {
     Some((port, pin))
 }
 
-/// A command, and where its answer goes.
+/// A command and the channel for its answer.
 pub struct Request {
     /// The command.
     pub command: Command,
@@ -110,14 +110,14 @@ pub struct Request {
 }
 
 impl Request {
-    /// Answers: in words what was done, or why not.
+    /// Answers with a description of what was done, or with the reason why not.
     pub fn answer(self, outcome: Result<String, String>) {
-        // Who asked may have gone.
+        // The client may have disconnected.
         let _ = self.answer.send(outcome);
     }
 }
 
-/// What clients ask for.
+/// The server of the control socket.
 pub struct Server {
     requests: Receiver<Request>,
     asking: Asking,
@@ -131,7 +131,7 @@ struct Asking {
 }
 
 impl Asking {
-    /// The answer to a line; `None` when nobody answers any more.
+    /// The answer to a line; `None` if the owner of the boards is gone.
     fn ask(&self, line: &str) -> Option<Result<String, String>> {
         let command = match line.parse() {
             Ok(command) => command,
@@ -151,7 +151,7 @@ impl Default for Server {
 }
 
 impl Server {
-    /// Nobody can ask yet. The calling thread is unparked when somebody does.
+    /// A server that no client can reach yet. A request unparks the calling thread.
     #[must_use]
     pub fn new() -> Self {
         let (sender, requests) = sync_channel(REQUESTS);
@@ -163,10 +163,10 @@ impl Server {
         self.requests.try_recv().ok()
     }
 
-    /// Listens; gives the address.
+    /// Listens for clients and returns the address.
     ///
     /// # Errors
-    /// What the operating system says, for instance that the address is in use.
+    /// The operating system's error, for instance that the address is in use.
     pub fn listen(&self, address: impl ToSocketAddrs) -> io::Result<SocketAddr> {
         let listener = TcpListener::bind(address)?;
         let address = listener.local_addr()?;
@@ -175,10 +175,10 @@ impl Server {
         Ok(address)
     }
 
-    /// Takes lines from a terminal; answers go to its screen.
+    /// Reads lines from the terminal and prints the answers to it.
     ///
     /// # Errors
-    /// When there can be no thread for it.
+    /// The operating system cannot start a thread for it.
     pub fn read_terminal(&self) -> io::Result<()> {
         let asking = self.asking.clone();
         thread::Builder::new().name("keys".into()).spawn(move || {
@@ -192,12 +192,12 @@ fn accept(listener: &TcpListener, asking: &Asking) {
     let connected = Arc::new(AtomicUsize::new(0));
     loop {
         let Ok((stream, _)) = listener.accept() else {
-            // Out of file descriptors, perhaps: some client will leave.
+            // Perhaps the process is out of file descriptors: it goes on when a client leaves.
             thread::sleep(Duration::from_millis(50));
             continue;
         };
         if connected.load(Ordering::Relaxed) >= MAX_CLIENTS {
-            // If not even that reaches it, it sees the end of the connection.
+            // If the client cannot receive this, it sees the end of the connection.
             let _ = (&stream).write_all(b"error: too many clients\n");
             continue;
         }
@@ -220,7 +220,7 @@ fn serve(stream: &TcpStream, asking: &Asking) {
     talk(&mut BufReader::new(stream), &mut writing, asking);
 }
 
-/// Answers lines until one side has enough.
+/// Answers lines until one side closes the connection.
 fn talk(lines: &mut impl BufRead, answers: &mut impl Write, asking: &Asking) {
     loop {
         let mut line = Vec::new();
@@ -252,7 +252,7 @@ fn talk(lines: &mut impl BufRead, answers: &mut impl Write, asking: &Asking) {
     }
 }
 
-/// Reads on to the end of a line, keeping nothing; whether it came.
+/// Reads to the end of a line without keeping it. Returns whether the end came.
 fn skip_line(lines: &mut impl BufRead) -> bool {
     loop {
         let Ok(buffer) = lines.fill_buf() else { return false };

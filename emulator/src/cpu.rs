@@ -1,4 +1,4 @@
-//! The Cortex-M4: instructions by Unicorn, exceptions by us.
+//! The Cortex-M4: Unicorn runs the instructions, this module handles the exceptions.
 //!
 //! Unicorn runs instructions and nothing else: it stacks nothing, knows no priorities and no NVIC.
 //! This module enters and leaves exceptions (DDI 0403E section B1.5) and turns what stops Unicorn
@@ -60,7 +60,7 @@ const CONTROL_FPCA: u32 = 1 << 2;
 const BASIC_FRAME: u32 = 8;
 const EXTENDED_FRAME: u32 = 26;
 
-/// Why the CPU came back from translated code.
+/// Why translated code stopped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Exit {
     /// The slice is over, or the chip wanted to leave.
@@ -73,7 +73,7 @@ pub enum Exit {
     SupervisorCall,
     /// An exception return; the value that went to the PC.
     ExceptionReturn(u32),
-    /// The program wanted flash that is busy.
+    /// The program accessed the flash while it was busy.
     FlashBusy,
     /// The next instruction has a breakpoint, or is one.
     Breakpoint,
@@ -107,7 +107,7 @@ impl Fault {
     }
 }
 
-/// What became of an attempt to enter an exception.
+/// The result of an attempt to enter an exception.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Entry {
     /// The CPU is in the handler.
@@ -118,7 +118,7 @@ pub enum Entry {
     Lockup,
 }
 
-/// What the hooks leave for the caller.
+/// The data that the hooks leave for the caller.
 #[derive(Default)]
 struct Notes {
     exception: Option<u32>,
@@ -130,7 +130,7 @@ struct Notes {
     masks: Option<Masks>,
     /// An instruction of the FPU that is switched off lies in the block, at this address.
     fpu_instruction: Option<u32>,
-    /// One instruction is wanted, and nothing may hold it up.
+    /// Only one instruction is to run, and breakpoints do not stop it.
     single: bool,
     /// Blocks looked at.
     blocks: Blocks,
@@ -595,7 +595,7 @@ impl Cpu {
         self.uc.emu_start(u64::from(begin), 0, 0, count)
     }
 
-    /// Whether code stops there, for the program's own comparators or for a debugger.
+    /// Whether code stops at this address, by the program's own comparators or by a debugger.
     fn is_stop(&self, address: u32) -> bool {
         self.has_breakpoint(address) || self.chip().stops.contains(&address)
     }
@@ -629,7 +629,7 @@ impl Cpu {
         chip.check_exceptions = true;
         match exit {
             Exit::SupervisorCall | Exit::ExceptionReturn(_) | Exit::Breakpoint => exit,
-            // Who steps does not sleep.
+            // A step does not sleep.
             _ => Exit::Slice,
         }
     }

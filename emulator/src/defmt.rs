@@ -1,5 +1,5 @@
-//! What a program tells by `defmt`: frames whose words stand in its ELF file, as a debug probe's
-//! viewer decodes them.
+//! The messages that a program sends with `defmt`: frames whose texts are in the program's ELF
+//! file. They are decoded as the viewer of a debug probe does it.
 
 use defmt_decoder::{DecodeError, StreamDecoder, Table};
 
@@ -8,24 +8,25 @@ const END: u8 = 0;
 /// No frame is longer than the ring that it comes through.
 const LONGEST_FRAME: usize = 64 * 1024;
 
-/// The words of one program, and what was read of a frame that is not complete.
+/// The texts of one program, and the bytes of a frame that is not complete.
 pub struct Decoder {
     table: Table,
     frame: Vec<u8>,
 }
 
 impl Decoder {
-    /// For the program of this ELF file; `None` where it has no words for frames.
+    /// The decoder for the program of this ELF file; `None` if the file has no texts for frames.
     ///
     /// # Errors
-    /// What is wrong with its words, or that they are of a version of `defmt` that is not known.
+    /// The error in the texts, or that they are of an unknown version of `defmt`.
     pub fn of_elf(elf: &[u8]) -> Result<Option<Self>, String> {
         let table =
             Table::parse(elf).map_err(|error| format!("the words of defmt in the ELF file: {error:#}"))?;
         Ok(table.map(|table| Self { table, frame: Vec::new() }))
     }
 
-    /// The messages that are complete with these bytes. A frame that means nothing is told as one.
+    /// The messages that are complete with these bytes. A frame that cannot be decoded gives a
+    /// message that says so.
     pub fn messages(&mut self, bytes: &[u8]) -> Vec<String> {
         let mut messages = Vec::new();
         for &byte in bytes {

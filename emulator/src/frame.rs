@@ -186,8 +186,8 @@ impl Frame {
         u32::try_from(self.wire_bits().len()).unwrap_or(u32::MAX)
     }
 
-    /// What the frame takes of the bus, in bits: [`wire_len`](Self::wire_len) and the intermission
-    /// behind it.
+    /// The bits that the frame occupies on the bus: [`wire_len`](Self::wire_len) and the
+    /// intermission behind it.
     #[must_use]
     pub fn bus_bits(&self) -> u32 {
         self.wire_len() + INTERMISSION_BITS

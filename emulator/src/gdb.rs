@@ -1,8 +1,9 @@
 //! The gdb door: the remote serial protocol of gdb over TCP, for one machine.
 //!
-//! A debugger that connects halts the machine, and with it all virtual time. One that goes away, in
-//! whatever state, lets it go on without breakpoints. One is served at a time; the next one waits
-//! until the first has left. The protocol itself is the crate `gdbstub`'s.
+//! A debugger that connects halts the machine, and with it all virtual time. When the debugger
+//! disconnects, in whatever state, the machine goes on without breakpoints. One debugger is served
+//! at a time; the next one waits until the first has left. The crate `gdbstub` implements the
+//! protocol itself.
 
 use std::convert::Infallible;
 use std::io::{self, Read, Write};
@@ -30,9 +31,9 @@ use gdbstub::target::{Target, TargetError, TargetResult};
 
 use crate::machine::{Halt, Machine};
 
-/// Pieces of the debugger's bytes that wait for the world.
+/// Pieces of received bytes that may wait for the owner of the machine.
 const EVENTS: usize = 64;
-/// A debugger that does not take an answer for so long is disconnected.
+/// A debugger that does not read an answer for this long is disconnected.
 const PATIENCE: Duration = Duration::from_secs(5);
 
 /// A Cortex-M as gdb sees it.
@@ -137,7 +138,7 @@ impl SingleThreadBase for Machine {
             *byte = one[0];
             read += 1;
         }
-        // What a load does to a register is done once for each word.
+        // The side effect of a load on a register must happen once for each word.
         let mut word = None;
         for (n, byte) in data.iter_mut().enumerate().skip(read) {
             let address = start.wrapping_add(n as u32);
@@ -191,7 +192,7 @@ impl Breakpoints for Machine {
     }
 }
 
-// Both kinds are the same here: nothing is written into memory.
+// Both kinds are the same here: no breakpoint is written into memory.
 
 impl SwBreakpoint for Machine {
     fn add_sw_breakpoint(&mut self, address: u32, _kind: usize) -> TargetResult<bool, Self> {
@@ -256,7 +257,7 @@ enum Event {
 
 type Session = GdbStubStateMachine<'static, Machine, Line>;
 
-/// The door. Its thread only carries bytes; whoever owns the machine calls
+/// The server for gdb. Its thread only carries bytes; the owner of the machine calls
 /// [`exchange`](Self::exchange).
 pub struct Door {
     address: SocketAddr,
@@ -266,10 +267,10 @@ pub struct Door {
 }
 
 impl Door {
-    /// Listens. The calling thread is unparked when there is something to exchange.
+    /// Listens for debuggers. The calling thread is unparked when there is something to exchange.
     ///
     /// # Errors
-    /// What the operating system says, for instance that the address is in use.
+    /// The operating system's error, for instance that the address is in use.
     pub fn bind(address: impl ToSocketAddrs) -> io::Result<Self> {
         let listener = TcpListener::bind(address)?;
         let address = listener.local_addr()?;
@@ -279,18 +280,18 @@ impl Door {
         Ok(Self { address, events, session: None, notices: Vec::new() })
     }
 
-    /// Where it listens.
+    /// The address at which it listens.
     #[must_use]
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// What happened since the last call, in a person's words.
+    /// The events since the last call, as sentences for people to read.
     pub fn notices(&mut self) -> Vec<String> {
         std::mem::take(&mut self.notices)
     }
 
-    /// Carries over what debugger and machine have to say to each other; waits for nothing.
+    /// Passes data between debugger and machine in both directions; does not wait.
     pub fn exchange(&mut self, machine: &mut Machine) {
         self.report_halt(machine);
         while let Ok(event) = self.events.try_recv() {
@@ -321,11 +322,11 @@ impl Door {
         }
     }
 
-    /// The session is over, if there is one: the machine goes on.
+    /// Ends the session, if there is one: the machine goes on.
     fn close(&mut self, machine: &mut Machine, why: &str) {
         if let Some((_, stream)) = self.session.take() {
             machine.detach_debugger();
-            // It may have hung up itself.
+            // The debugger may have closed the connection itself.
             let _ = stream.shutdown(Shutdown::Both);
             self.notices.push(format!("{why}: the board goes on"));
         }
@@ -384,7 +385,7 @@ impl Door {
     }
 }
 
-/// Takes one debugger after the other.
+/// Serves one debugger after the other.
 fn serve(listener: &TcpListener, events: &SyncSender<Event>, owner: &Thread) {
     let tell = |event| {
         let told = events.send(event).is_ok();
@@ -393,7 +394,7 @@ fn serve(listener: &TcpListener, events: &SyncSender<Event>, owner: &Thread) {
     };
     loop {
         let Ok((stream, peer)) = listener.accept() else {
-            // Out of file descriptors, perhaps: some client will leave.
+            // Perhaps the process is out of file descriptors: it goes on when a client leaves.
             thread::sleep(Duration::from_millis(50));
             continue;
         };

@@ -70,48 +70,48 @@ pub enum ResetCause {
 /// Why [`Machine::run_until`] came back.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stop {
-    /// The deadline is reached (or passed by a block of code at most).
+    /// The deadline is reached, or passed by less than one block of code.
     Deadline,
-    /// The CAN controller wants something of the bus: a frame is to be sent, or its mode changes.
+    /// The CAN controller needs the bus: a frame is to be sent, or its mode changes.
     Attention,
     /// The chip went through a reset; it is at its first instruction again.
     Reset(ResetCause),
-    /// The power cut that was armed struck; the machine is off.
+    /// The armed power cut happened; the machine is off.
     PowerCut,
-    /// The CPU has locked up: a fault within the HardFault handler. Only a reset (the watchdog's,
-    /// perhaps) helps. Told once; the machine can be run on.
+    /// The CPU has locked up: a fault within the HardFault handler. Only a reset (by the watchdog,
+    /// for example) ends it. It is reported once; the machine can be run on.
     Lockup,
-    /// A debugger has halted it ([`Machine::halted`]): it comes no further.
+    /// A debugger has halted the machine ([`Machine::halted`]): it does not run.
     Halted,
 }
 
-/// What can go wrong with setting up a machine.
+/// An error in setting up a machine.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The CPU emulation refused.
     #[error("{doing}: {error}")]
     Engine {
-        /// What was being done.
+        /// The action that failed.
         doing: &'static str,
-        /// Its own word.
+        /// The error of the CPU emulation.
         error: String,
     },
     /// The image cannot be used.
     #[error("{0}")]
     Image(String),
-    /// An address is not where it has to be.
+    /// An address lies outside the required memory.
     #[error("{len} bytes at {address:08X}h are not all in {wanted}")]
     Address {
         /// First address.
         address: u32,
         /// Length.
         len: usize,
-        /// What they should have been in.
+        /// The memory that they must be in.
         wanted: &'static str,
     },
 }
 
-/// What the CPU does when it does not execute.
+/// The state of the CPU: executing or waiting.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Activity {
     Off,
@@ -157,7 +157,7 @@ impl Machine {
         })
     }
 
-    /// Stores an ELF file in flash as a debug probe does: what it does not cover stays.
+    /// Stores an ELF file in flash as a debug probe does: bytes outside the image stay unchanged.
     ///
     /// # Errors
     /// [`Error::Image`] or [`Error::Address`]; the flash is as before then.
@@ -227,7 +227,7 @@ impl Machine {
         self.start();
     }
 
-    /// The power goes; a flash operation that runs is torn.
+    /// The power goes off; a running flash operation is torn.
     pub fn power_off(&mut self) {
         if self.activity != Activity::Off {
             self.off_time = self.now();
@@ -235,7 +235,7 @@ impl Machine {
             let seed = self.options.seed ^ self.power_cycles;
             let chip = self.cpu.chip_mut();
             chip.flash.lose_power(seed);
-            // Off, a controller is recessive: as behind a reset.
+            // A controller without power is recessive, as after a reset.
             for can in &mut chip.can {
                 can.reset();
             }
@@ -290,9 +290,9 @@ impl Machine {
         }
     }
 
-    /// Runs until `deadline`, or until something the outside must see, and says which. Where it
-    /// says [`Stop::Deadline`], [`Self::now`] is at `deadline` or less than a block of code past
-    /// it.
+    /// Runs until `deadline`, or until an event that the owner must handle, and returns the reason.
+    /// If it returns [`Stop::Deadline`], [`Self::now`] is at `deadline` or less than a block of
+    /// code past it.
     pub fn run_until(&mut self, deadline: Time) -> Stop {
         self.cpu.chip_mut().deadline = deadline;
         loop {
@@ -327,7 +327,7 @@ impl Machine {
         }
     }
 
-    /// Lets one thing happen: a run of code, an exception taken, or time passing.
+    /// Makes one thing happen: code runs, an exception is taken, or time passes.
     fn step(&mut self) -> Entry {
         let chip = self.cpu.chip_mut();
         let now = chip.now();
@@ -427,7 +427,7 @@ impl Machine {
         }
     }
 
-    /// Whether reading `address` has to wait for the flash; the wait begins then.
+    /// Whether a read of `address` has to wait for the flash. The wait begins with this call.
     fn flash_holds(&mut self, address: u32) -> bool {
         let chip = self.cpu.chip_mut();
         let in_flash = chip.geometry.flash.contains(address, 4) || address < chip.geometry.flash.size;
@@ -442,8 +442,8 @@ impl Machine {
     // --- looking and touching
     // ----------------------------------------------------------------------------------------
 
-    /// Starts the independent watchdog with this reload value, as code would that then never feeds
-    /// it; the prescaler stays.
+    /// Starts the independent watchdog with this reload value, as code that never feeds it would
+    /// do. The prescaler stays.
     pub fn start_watchdog(&mut self, reload: u32) {
         let chip = self.cpu.chip_mut();
         let now = chip.now();
@@ -554,7 +554,7 @@ impl Machine {
         port_index(port).and_then(|index| self.cpu.chip().gpio.get(index)).is_some_and(|port| port.level(pin))
     }
 
-    /// What the program did that the model does not cover, or that the chip would punish.
+    /// The accesses of the program that the model does not cover, or that the chip would punish.
     #[must_use]
     pub fn reports(&self) -> &[Report] {
         self.cpu.chip().reports.as_slice()
@@ -565,26 +565,26 @@ impl Machine {
         self.cpu.chip_mut().reports.clear();
     }
 
-    /// Notes from now on where in RAM the code in this region goes.
+    /// Records from now on which RAM the code in this region accesses.
     pub fn watch(&mut self, code: Region) {
         self.cpu.chip_mut().watch = Some(Watch { code, inside: false, touched: BTreeSet::new() });
     }
 
-    /// Hands out which pages of RAM (4 KiB, by their first addresses) the code that is watched has
-    /// accessed since the last time.
+    /// Returns the pages of RAM (4 KiB, by their first addresses) that the watched code has
+    /// accessed since the last call.
     pub fn take_touched(&mut self) -> Vec<u32> {
         let watch = self.cpu.chip_mut().watch.as_mut();
         watch.map(|watch| std::mem::take(&mut watch.touched).into_iter().collect()).unwrap_or_default()
     }
 
-    /// What was counted.
+    /// The counters.
     #[must_use]
     pub fn counters(&self) -> Counters {
         let chip = self.cpu.chip();
         Counters { cycles: chip.clock.cycles, ..chip.counters.clone() }
     }
 
-    /// How often translated code was entered: what an idle machine costs the host.
+    /// How often translated code was entered: the measure of what an idle machine costs the host.
     #[must_use]
     pub fn entries(&self) -> u64 {
         self.cpu.chip().entries

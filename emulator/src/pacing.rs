@@ -1,4 +1,4 @@
-//! How virtual time follows the wall clock for clients that live in real time.
+//! How virtual time follows the wall clock, for clients that run in real time.
 
 use std::time::{Duration, Instant};
 
@@ -33,13 +33,13 @@ impl std::str::FromStr for Speed {
 
 const MIN_TIMES: f64 = 0.001;
 const MAX_TIMES: f64 = 1000.0;
-/// The world is never sent further than this in one go, so that clients are heard in time.
+/// The longest step of the world, so that clients are served in time.
 const MOST: Span = Span::from_millis(2);
 /// How long an idle world sleeps on the wall clock before it goes on.
 pub const NAP: Duration = Duration::from_millis(2);
-/// In one go at [`Speed::Max`].
+/// The longest step at [`Speed::Max`].
 const MOST_AT_MAX: Span = Span::from_millis(10);
-/// What a client gets of wall-clock time to react to a frame at [`Speed::Max`].
+/// The wall-clock time that a client gets to react to a frame at [`Speed::Max`].
 const GRACE: Duration = Duration::from_millis(5);
 /// A world that is further behind than this (of wall-clock time) does not catch up: the host is too
 /// slow, or slept.
@@ -61,7 +61,7 @@ impl Pacer {
         Self { speed, anchor: (wall, now), delivered: None }
     }
 
-    /// A client has got a frame.
+    /// A client has received a frame.
     pub fn delivered(&mut self, wall: Instant) {
         self.delivered = Some(wall);
     }
@@ -87,8 +87,9 @@ impl Pacer {
         due.max(now).min(now + MOST)
     }
 
-    /// Whether a world in which nobody is about to answer anybody should go on to `target` now. If
-    /// not, there is more to do at once after [`NAP`]: what comes every millisecond is done by twos.
+    /// Whether a world in which no answer is due should go on to `target` now. If not, there is
+    /// more to do at once after [`NAP`]: events of every millisecond are then processed two at a
+    /// time.
     #[must_use]
     pub fn is_worth_it(&self, now: Time, target: Time) -> bool {
         match self.speed {
@@ -102,17 +103,17 @@ impl Pacer {
     }
 }
 
-/// Notices when the world does not keep the speed that is asked for.
+/// Detects that the world does not keep the requested speed.
 #[derive(Clone, Debug)]
 pub struct Lag {
     speed: Speed,
     /// Where the present window began.
     since: Option<(Instant, Time)>,
-    /// What was said last, in tenths of the speed asked for.
+    /// The pace that was reported last, in tenths of the requested speed.
     said: u32,
 }
 
-/// How long the world is watched before anything is said.
+/// How long the world is watched before the first report.
 const WINDOW: Duration = Duration::from_secs(2);
 
 impl Lag {
@@ -214,7 +215,7 @@ mod tests {
         assert_eq!(pacer.target(woken, now), now, "and waits for the wall clock again");
     }
 
-    /// What is said of a world that makes so many milliseconds in each of so many seconds.
+    /// The reports about a world that makes so many milliseconds in each of so many seconds.
     fn lags(speed: Speed, paces: &[u64]) -> Vec<(usize, String)> {
         let start = Instant::now();
         let mut lag = Lag::new(speed);

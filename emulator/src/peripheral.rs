@@ -1,4 +1,4 @@
-//! What every modelled block of the chip offers to the machine around it.
+//! The interface of every modelled block of the chip to the machine.
 
 use crate::time::Time;
 
@@ -20,17 +20,17 @@ pub trait Peripheral {
     /// The CPU writes the register at `offset`.
     fn write(&mut self, offset: u32, value: u32, now: Time) -> Result<(), Unmodelled>;
 
-    /// Lets everything happen that is due up to and including `now`.
+    /// Processes all events that are due up to and including `now`.
     fn advance(&mut self, now: Time);
 
-    /// When something will happen next without anybody's doing, if it will: a timer runs out, an
-    /// operation ends.
+    /// The time of the next event that happens without an access, if there is one: a timer runs
+    /// out, an operation ends.
     fn next_event(&self) -> Option<Time>;
 
     /// The NVIC lines that this block holds active (level), as interrupt numbers.
     fn interrupts(&self, active: &mut Vec<u16>);
 
-    /// System reset. What survives it (RAM, the reset flags, the watchdog's start) is the model's
-    /// to know.
+    /// System reset. The model decides what survives it (RAM, the reset flags, the watchdog's
+    /// start).
     fn reset(&mut self);
 }

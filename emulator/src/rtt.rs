@@ -1,12 +1,12 @@
-//! What a program writes for a debug probe: SEGGER's RTT (J-Link manual UM08001, chapter 16), read
-//! from RAM as a probe does it.
+//! The text that a program writes for a debug probe: SEGGER's RTT (J-Link manual UM08001, chapter
+//! 16), read from RAM as a probe does it.
 
 use shared_abi::geometry::Region;
 
 use crate::defmt::Decoder;
 use crate::machine::Machine;
 
-/// How a control block begins.
+/// The first bytes of a control block.
 const ID: &[u8; 16] = b"SEGGER RTT\0\0\0\0\0\0";
 /// Number of buffers up behind it.
 const UP_BUFFERS: u32 = 16;
@@ -27,23 +27,23 @@ const FRAMES: &[u8; 6] = b"defmt\0";
 /// Reads the first buffer of a board's control block.
 #[derive(Default)]
 pub struct Reader {
-    /// Where the block was last.
+    /// The address at which the block was found last.
     block: Option<u32>,
-    /// What was read of a line that is not complete.
+    /// The text of a line that is not complete.
     line: Vec<u8>,
-    /// What explains frames of `defmt`.
+    /// The decoder for frames of `defmt`.
     decoder: Option<Decoder>,
 }
 
 impl Reader {
-    /// A reader that decodes frames of `defmt`, too, if the program tells by them.
+    /// A reader that also decodes frames of `defmt` if the program writes them.
     #[must_use]
     pub fn with(decoder: Option<Decoder>) -> Self {
         Self { decoder, ..Self::default() }
     }
 
-    /// The lines that the program has written since the last time. `sram` is where the block is
-    /// looked for. A block of noise gives nothing.
+    /// The lines that the program has written since the last call. The block is searched in `sram`.
+    /// A block whose content is invalid gives no lines.
     pub fn lines(&mut self, machine: &mut Machine, sram: Region) -> Vec<String> {
         let is_there = |block: &u32| read::<16>(machine, *block).as_ref() == Some(ID);
         // A reset may have brought another program.
@@ -95,7 +95,7 @@ fn holds_frames(machine: &Machine, block: u32) -> bool {
     name.and_then(|name| read(machine, name)).as_ref() == Some(FRAMES)
 }
 
-/// Takes what lies between the two offsets, and moves the probe's one.
+/// Takes the bytes between the two offsets, and advances the probe's offset.
 fn take(machine: &mut Machine, block: u32) -> Option<Vec<u8>> {
     let word = |machine: &Machine, offset: u32| {
         read::<4>(machine, block.checked_add(offset)?).map(u32::from_le_bytes)

@@ -7,9 +7,9 @@ use std::net::{SocketAddr, TcpListener, TcpStream, ToSocketAddrs};
 
 use crate::machine::Machine;
 
-/// Bytes of the board that a client has not read; the oldest are lost.
+/// The most bytes of the board that wait for a client to read them; the oldest are lost.
 const MOST_UNREAD: usize = 16 * 1024;
-/// Bytes of a client that are not on their way to the board yet.
+/// The most bytes of a client that wait to be sent to the board.
 const MOST_UNHEARD: usize = 4 * 1024;
 
 /// The other end of a USART's line.
@@ -35,7 +35,7 @@ enum Line {
 struct Terminal {
     ours: serialport::TTYPort,
     name: String,
-    /// The clients' end: as long as it is open here, they may come and go.
+    /// The clients' end. Because it stays open here, clients may connect and disconnect.
     _theirs: serialport::TTYPort,
 }
 
@@ -43,7 +43,7 @@ impl Serial {
     /// A pseudo-terminal for a USART.
     ///
     /// # Errors
-    /// When the system gives none.
+    /// The operating system's error.
     #[cfg(unix)]
     pub fn terminal(usart: &'static str) -> io::Result<Self> {
         use serialport::SerialPort;
@@ -56,7 +56,7 @@ impl Serial {
     /// A USART for one client at a time that connects to this address.
     ///
     /// # Errors
-    /// When it cannot be listened at.
+    /// The operating system's error: it cannot listen at the address.
     pub fn listen(usart: &'static str, address: impl ToSocketAddrs) -> io::Result<Self> {
         let listener = TcpListener::bind(address)?;
         listener.set_nonblocking(true)?;
@@ -73,7 +73,7 @@ impl Serial {
         self.usart
     }
 
-    /// Where clients find it: the name of the terminal, or `tcp://` and the address.
+    /// The address for clients: the name of the terminal, or `tcp://` and the address.
     #[must_use]
     pub fn place(&self) -> String {
         match &self.line {
@@ -86,8 +86,8 @@ impl Serial {
         }
     }
 
-    /// Carries over what the board and the client have to say to each other; waits for nothing.
-    /// Gives the number of bytes that the client got.
+    /// Passes bytes between board and client in both directions; does not wait. Returns the number
+    /// of bytes that the client got.
     pub fn exchange(&mut self, machine: &mut Machine) -> usize {
         let now = machine.now();
         let powered = machine.is_powered();
@@ -113,7 +113,7 @@ impl Serial {
 }
 
 impl Line {
-    /// What the client says; nothing where there is none.
+    /// Reads the client's bytes; returns 0 if there are none.
     fn read(&mut self, bytes: &mut [u8]) -> usize {
         match self {
             #[cfg(unix)]
@@ -137,15 +137,15 @@ impl Line {
         }
     }
 
-    /// Gives the client as much as it takes. A line that nobody is at takes everything.
+    /// Gives the client as many bytes as it takes. Without a TCP client all bytes are lost.
     fn write(&mut self, bytes: &[u8]) -> usize {
         if bytes.is_empty() {
             return 0;
         }
         match self {
             #[cfg(unix)]
-            // Writing waits for as long as not all of it finds room, and only that there is some is
-            // asked before: a byte at a time.
+            // A write waits until all bytes find room, and the check before it only tells that
+            // there is some room. So write a byte at a time.
             Self::Terminal(terminal) => {
                 bytes.iter().take_while(|byte| matches!(terminal.ours.write(&[**byte]), Ok(1))).count()
             }
@@ -164,7 +164,7 @@ impl Line {
     }
 }
 
-/// Nothing is wrong, there is only nothing to do.
+/// Whether the error only means that there is nothing to do at present.
 fn is_patient(error: &io::Error) -> bool {
     matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted | ErrorKind::TimedOut)
 }
@@ -216,7 +216,7 @@ mod tests {
         let mut machine = board();
         let mut serial = Serial::listen("USART2", "127.0.0.1:0").unwrap();
         let address = serial.place().replace("tcp://", "");
-        // Nobody is there: what is said is lost, and nothing waits.
+        // No client is connected: the bytes are lost, and nothing waits.
         say(&mut machine, b'a');
         assert_eq!(serial.exchange(&mut machine), 1);
         for byte in [b'b', b'c'] {

@@ -10,8 +10,8 @@
 //! frame goes out for [`HOLD`] behind the answer to `rawmode`; and without TCP_NODELAY every
 //! exchange waits for delayed acknowledges.
 //!
-//! No client can hold up the world: who does not read is disconnected, and who sends more than the
-//! bus takes is read more slowly.
+//! No client can hold up the world: a client that does not read is disconnected, and a client that
+//! sends more than the bus takes is read more slowly.
 
 pub mod protocol;
 #[cfg(test)]
@@ -40,14 +40,14 @@ const QUEUE: usize = 8192;
 const CREDIT: usize = 256;
 /// Events that wait for the world.
 const EVENTS: usize = 1024;
-/// A client that takes nothing for so long while something waits for it is disconnected.
+/// A client that reads nothing for this long while data waits for it is disconnected.
 const PATIENCE: Duration = Duration::from_secs(10);
 /// A write takes up to so many bytes of waiting texts at once.
 const WRITE: usize = 16 * 1024;
 
 type ClientId = u64;
 
-/// What the threads of the connections tell the world's thread.
+/// An event that the connections' threads report to the world's thread.
 enum Event {
     Connected { id: ClientId, peer: SocketAddr, out: SyncSender<Out>, stream: TcpStream, credit: Arc<Credit> },
     Frame { id: ClientId, frame: Frame },
@@ -55,7 +55,7 @@ enum Event {
     Gone { id: ClientId },
 }
 
-/// The way of the connections' threads to the world's thread.
+/// The channel from the connections' threads to the world's thread.
 #[derive(Clone)]
 struct Events {
     sender: SyncSender<Event>,
@@ -64,7 +64,7 @@ struct Events {
 }
 
 impl Events {
-    /// Hands in an event; whether anybody will look at it.
+    /// Hands in an event. Returns whether the world's thread still receives events.
     fn send(&self, event: Event) -> bool {
         let sent = self.sender.send(event).is_ok();
         self.owner.unpark();
@@ -72,7 +72,7 @@ impl Events {
     }
 }
 
-/// What a client's writing thread has to do.
+/// A task for a client's writing thread.
 enum Out {
     Text(String),
     Hold,
@@ -121,19 +121,19 @@ struct Client {
 impl Client {
     fn hang_up(&self) {
         self.credit.close();
-        // It may have hung up itself.
+        // The client may have closed the connection itself.
         let _ = self.stream.shutdown(Shutdown::Both);
     }
 }
 
-/// The server. Its threads only carry texts; whoever owns the world calls
+/// The server. Its threads only carry texts; the owner of the world calls
 /// [`exchange`](Self::exchange).
 pub struct Server {
     address: SocketAddr,
     events: Receiver<Event>,
     early: VecDeque<Event>,
     clients: BTreeMap<ClientId, Client>,
-    /// Who handed in the frame of which ticket.
+    /// The client that handed in the frame, by ticket.
     owners: HashMap<u64, ClientId>,
     notices: Vec<String>,
     stop: Arc<AtomicBool>,
@@ -144,7 +144,7 @@ impl Server {
     /// unparked when a client wants something.
     ///
     /// # Errors
-    /// What the operating system says, for instance that the address is in use.
+    /// The operating system's error, for instance that the address is in use.
     pub fn bind(address: impl ToSocketAddrs, bus: &str) -> io::Result<Self> {
         let listener = TcpListener::bind(address)?;
         let address = listener.local_addr()?;
@@ -166,7 +166,7 @@ impl Server {
         })
     }
 
-    /// Where it listens.
+    /// The address at which it listens.
     #[must_use]
     pub fn address(&self) -> SocketAddr {
         self.address
@@ -178,7 +178,7 @@ impl Server {
         self.clients.len()
     }
 
-    /// What happened to clients since the last call, in a person's words.
+    /// The events of clients since the last call, as sentences for people to read.
     pub fn notices(&mut self) -> Vec<String> {
         std::mem::take(&mut self.notices)
     }
@@ -280,7 +280,7 @@ fn accept(listener: &TcpListener, bus: &str, events: &Events, stop: &AtomicBool)
     let mut next_id: ClientId = 1;
     while !stop.load(Ordering::Relaxed) {
         let Ok((stream, peer)) = listener.accept() else {
-            // Out of file descriptors, perhaps: some client will leave.
+            // Perhaps the process is out of file descriptors: it goes on when a client leaves.
             thread::sleep(Duration::from_millis(50));
             continue;
         };
@@ -288,7 +288,7 @@ fn accept(listener: &TcpListener, bus: &str, events: &Events, stop: &AtomicBool)
             return;
         }
         if connected.load(Ordering::Relaxed) >= MAX_CLIENTS {
-            // If not even that reaches it, it sees the end of the connection.
+            // If the client cannot receive this, it sees the end of the connection.
             let _ = (&stream).write_all(b"< error too many clients >");
             continue;
         }
@@ -370,7 +370,7 @@ fn read(
                     Event::Frames { id, on: true }
                 }
                 Effect::StopFrames => Event::Frames { id, on: false },
-                // The writing thread ends the connection when all is said.
+                // The writing thread ends the connection after the last text.
                 Effect::Close => return,
             };
             if !events.send(event) {
@@ -404,6 +404,6 @@ fn write(mut stream: TcpStream, texts: &Receiver<Out>) {
         }
         next = next.or_else(|| texts.recv().ok());
     }
-    // The client may have hung up itself.
+    // The client may have closed the connection itself.
     let _ = stream.shutdown(Shutdown::Both);
 }

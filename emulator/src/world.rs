@@ -1,9 +1,9 @@
 //! Machines and host ports on one bus, in one virtual time.
 //!
 //! The rule that makes it deterministic: the bus decides about a point of time when every machine
-//! has come to it. A machine stops where it asks the bus for something, and waits there until the
-//! bus has answered. Until then the others may be ahead of it by less than the shortest time in
-//! which the bus can let them feel anything of it.
+//! has reached it. A machine stops where it requests something of the bus, and waits until the bus
+//! has answered. Meanwhile the others may be ahead of it by less than the shortest time in which
+//! the bus can affect them.
 
 use std::collections::VecDeque;
 
@@ -25,14 +25,14 @@ pub trait Computer {
     /// Whether it has power. Without, it is not on the bus and does not run.
     fn is_powered(&self) -> bool;
 
-    /// How far it has come.
+    /// The time that it has reached.
     fn now(&self) -> Time;
 
-    /// Runs until `deadline` or a little further; less far only if its CAN controller wants
-    /// attention, or to say that something happened.
+    /// Runs until `deadline` or a little further. Stops earlier only if its CAN controller wants
+    /// attention, or to report an event.
     fn run_until(&mut self, deadline: Time) -> Self::Stop;
 
-    /// Whether a debugger holds it, and all time with it.
+    /// Whether a debugger has halted it, and all time with it.
     fn is_halted(&self) -> bool {
         false
     }
@@ -40,7 +40,7 @@ pub trait Computer {
     /// Its CAN controller.
     fn can(&mut self) -> &mut BxCan;
 
-    /// Whether the world's user should hear of the stop (a reset, a lock-up) or it is part of
+    /// Whether the stop is reported to the world's user (a reset, a lock-up) or is part of normal
     /// running.
     fn is_news(stop: &Self::Stop) -> bool;
 }
@@ -69,14 +69,14 @@ impl PortId {
     }
 }
 
-/// What happened to a machine.
+/// An event of a machine.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct News<Stop> {
-    /// Which machine.
+    /// The machine.
     pub machine: MachineId,
-    /// When.
+    /// The time.
     pub at: Time,
-    /// What.
+    /// The event.
     pub stop: Stop,
 }
 
@@ -89,19 +89,19 @@ struct Slot<M> {
     plug: Plug<M>,
     /// What the bus sees while a machine has no power.
     unplugged: Unplugged,
-    /// Times in a row that a machine ran and came no further.
+    /// The number of runs in a row in which a machine made no progress.
     stuck: u32,
 }
 
-/// A machine that runs so often without coming further is left behind.
+/// A machine that runs so often without progress is left behind.
 const STUCK: u32 = 10_000;
-/// News that nobody fetched.
+/// The most events that wait to be fetched.
 const MAX_NEWS: usize = 4096;
 /// The bit time that bounds how far machines may be apart while nobody is on the bus: 1 Mbit/s, the
 /// fastest there is.
 const FASTEST_BIT: Span = Span::from_micros(1);
 
-/// The bench: a bus and all that is plugged into it.
+/// The bench: a bus and all nodes on it.
 pub struct World<M: Computer = Machine> {
     bus: Bus,
     slots: Vec<Slot<M>>,
@@ -192,7 +192,7 @@ impl<M: Computer> World<M> {
         Self::default()
     }
 
-    /// Up to when everything has happened.
+    /// The time up to which everything has happened.
     #[must_use]
     pub fn now(&self) -> Time {
         self.now
@@ -209,12 +209,12 @@ impl<M: Computer> World<M> {
         self.bus.add_sink(sink);
     }
 
-    /// Makes something go wrong on the bus from now on. Gives a number for [`Bus::fault_hits`].
+    /// Injects a fault on the bus from now on. Returns a number for [`Bus::fault_hits`].
     pub fn inject(&mut self, fault: Fault) -> usize {
         self.bus.inject(fault)
     }
 
-    /// Makes nothing go wrong any more.
+    /// Removes all faults.
     pub fn clear_faults(&mut self) {
         self.bus.clear_faults();
     }
@@ -281,7 +281,7 @@ impl<M: Computer> World<M> {
         self.port_mut(port).receive()
     }
 
-    /// The oldest thing that happened to a machine and nobody has fetched.
+    /// The oldest event of a machine that was not fetched yet.
     pub fn news(&mut self) -> Option<News<M::Stop>> {
         self.news.pop_front()
     }
@@ -292,14 +292,14 @@ impl<M: Computer> World<M> {
         self.slots.iter().any(|slot| matches!(&slot.plug, Plug::Machine(machine) if machine.is_halted()))
     }
 
-    /// Lets everything happen up to and including `time`, or until a debugger halts a machine.
+    /// Processes everything up to and including `time`, or until a debugger halts a machine.
     pub fn run_until(&mut self, time: Time) {
         while self.now < time && !self.is_halted() {
             self.step(time);
         }
     }
 
-    /// Lets `span` go by.
+    /// Lets `span` pass.
     pub fn run_for(&mut self, span: Span) {
         self.run_until(self.now + span);
     }

@@ -1,4 +1,4 @@
-//! Reads a board's memory map from a file, for boards that the tool was not built with.
+//! Reads a board's memory map from a file, for boards that are not built into the tool.
 //!
 //! `cargo xtask layout --toml` writes such a file. It must meet the same rules as the compiled
 //! layouts of this repository.
@@ -7,13 +7,13 @@ use serde::Deserialize;
 use shared_abi::geometry::{self, Geometry, Line, SectorRun};
 use shared_abi::layout::Layout;
 
-/// The most bytes of such a file.
+/// The largest size of such a file, in bytes.
 pub const MAX: usize = 64 * 1024;
 
-/// What is wrong with a memory map.
+/// An error in a memory map.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum BoardError {
-    /// The file is not TOML, or an entry is missing or invalid; with the number of the line.
+    /// The file is not TOML, or an entry is missing or invalid. The number is that of the line.
     #[error("line {0}: {1}")]
     Syntax(usize, String),
     /// The memory map breaks this rule.

@@ -1,5 +1,5 @@
-//! A build-script helper for applications that run under the coboot bootloader: it gives the linker
-//! the place of the program, and the program the memory map of its board.
+//! A build-script helper for applications that run under the coboot bootloader. It gives the linker
+//! the address of the program, and gives the program the memory map of its board.
 //!
 //! ```no_run
 //! // build.rs
@@ -26,7 +26,7 @@ use std::{env, fmt, fs};
 
 use shared_abi::layout::{self, Image, Layout, BOARDS};
 
-/// What cannot be done for an application.
+/// Why the helper cannot prepare an application.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Error {
     /// No board has this name.
@@ -40,7 +40,7 @@ pub enum Error {
         board: &'static str,
         /// The number that was asked for.
         number: u8,
-        /// How many there are.
+        /// How many programs the device has.
         programs: usize,
     },
     /// A file cannot be read or written, or says something wrong.
@@ -83,12 +83,12 @@ impl Error {
     }
 }
 
-/// What stands in the file that `coboot_app::layout!()` includes.
+/// The name of the file that `coboot_app::layout!()` includes.
 pub const LAYOUT_FILE: &str = "coboot_layout.rs";
 /// The linker script of an application.
 const TEMPLATE: &str = include_str!("../application.x");
 
-/// An application, and where it gets its place from.
+/// An application and the source of its memory map.
 #[derive(Clone, Debug)]
 #[must_use = "`emit` does the work"]
 pub struct Application {
@@ -126,14 +126,14 @@ impl Application {
         Self { layout, file: Some(path.to_owned()), program: 1 }
     }
 
-    /// Linked for the place of program `number`: 1 (the default) is the first.
+    /// Links for the place of program `number`; 1 (the default) is the first.
     pub const fn program(mut self, number: u8) -> Self {
         self.program = number;
         self
     }
 
-    /// Writes the files into `OUT_DIR` and tells cargo to link with them. What cannot be done ends the
-    /// build with a message that says why.
+    /// Writes the files into `OUT_DIR` and tells cargo to link with them. An error ends the build
+    /// with a message that gives the reason.
     pub fn emit(self) {
         if let Err(error) = self.try_emit() {
             println!("cargo::error={error}");
@@ -200,12 +200,12 @@ pub fn write_memory(layout: &Layout, image: Image, folder: &Path) -> Result<(), 
     write(&folder.join("memory.x"), &layout.linker_script(image).to_string())
 }
 
-/// Tells cargo to link the binaries of this package with `script`, which is in `folder` like what it
-/// includes.
+/// Tells cargo to link the binaries of this package with `script`, which is in `folder` together
+/// with the files that it includes.
 pub fn link(folder: &Path, script: &str) {
     println!("cargo::rustc-link-search={}", folder.display());
     println!("cargo::rustc-link-arg-bins=-T{script}");
-    // Without it the linker aligns segments to pages of 64 KiB, and the file tells more flash than
+    // Without it the linker aligns segments to pages of 64 KiB, and the file claims more flash than
     // the program fills.
     println!("cargo::rustc-link-arg-bins=--nmagic");
 }
@@ -218,7 +218,7 @@ fn write(path: &Path, text: &str) -> Result<(), Error> {
 mod tests {
     use super::*;
 
-    /// A folder that is this test's alone.
+    /// A folder that only this test uses.
     fn folder(name: &str) -> PathBuf {
         let folder = env::temp_dir().join(format!("coboot-linker-{}-{name}", std::process::id()));
         fs::create_dir_all(&folder).unwrap();

@@ -1,7 +1,7 @@
-//! Fault confinement: the error counters of a node and what follows from them (ISO 11898-1:2015,
-//! 12.1.4).
+//! Fault confinement: the error counters of a node and the states that follow from them (ISO
+//! 11898-1:2015, 12.1.4).
 
-/// What a node's counters allow it.
+/// The error state of a node, which follows from its counters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ErrorState {
     /// Takes part, and answers errors with six dominant bits that destroy the frame for everyone.
@@ -47,7 +47,7 @@ impl Confinement {
         self.rec
     }
 
-    /// What the counters allow.
+    /// The error state that follows from the counters.
     #[must_use]
     pub fn state(&self) -> ErrorState {
         if self.tec > BUS_OFF_LIMIT {
@@ -78,12 +78,12 @@ impl Confinement {
         self.tec = self.tec.saturating_sub(1);
     }
 
-    /// A frame of somebody else was bad; `first`: this node saw it before the others.
+    /// A frame of another node was bad; `first`: this node saw the error before the others.
     pub fn receive_failed(&mut self, first: bool) {
         self.rec = self.rec.saturating_add(if first { 9 } else { 1 });
     }
 
-    /// A frame of somebody else was good.
+    /// A frame of another node was good.
     pub fn received(&mut self) {
         self.rec = if self.rec > 127 { AFTER_PASSIVE } else { self.rec.saturating_sub(1) };
     }

@@ -1,31 +1,31 @@
-//! Injected faults: what a test makes go wrong on the bus, and with which frames.
+//! Injected faults: the errors that a test causes on the bus, and the frames that they affect.
 
 use crate::frame::{Frame, Id};
 use crate::time::Span;
 
-/// What happens to a frame.
+/// The effect of a fault on a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FaultAction {
     /// The frame is acknowledged, and no receiver gets it: a gateway or a receive queue lost it.
     Drop,
     /// The receivers see a CRC error: error frame, counters, and the controller repeats the frame.
     Disturb,
-    /// The receivers get other bits in one data byte, with a CRC that matches: what only an
-    /// end-to-end check finds.
+    /// The receivers get other bits in one data byte, with a CRC that matches. Only an end-to-end
+    /// check finds this fault.
     Alter {
         /// Which data byte, from 0. A frame without it passes unchanged.
         byte: usize,
         /// The bits to flip.
         mask: u8,
     },
-    /// As by a store-and-forward gateway: acknowledged, kept back, and sent again so much later as
-    /// a frame of its own.
+    /// The frame is acknowledged, held back, and sent again after this time as a frame of its own,
+    /// as a store-and-forward gateway does.
     Delay(Span),
-    /// The frame gets through, and once more right behind.
+    /// The frame gets through, and is sent once more right behind.
     Duplicate,
 }
 
-/// Which frames a fault is for. Everything left open matches.
+/// The frames that a fault is for. A field that is left open matches every frame.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct FrameMatch {
     /// The identifier.
@@ -50,8 +50,8 @@ impl FrameMatch {
     }
 }
 
-/// Which of the matching frames are hit. Every attempt counts, so a frame that the controller
-/// repeats counts again.
+/// Which of the matching frames the fault hits. Every attempt counts, so a frame that the
+/// controller repeats counts again.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum When {
     /// All.
@@ -71,7 +71,7 @@ pub enum When {
     },
 }
 
-/// A rule: which frames, how often, and what happens to them.
+/// A rule: which frames it is for, how often it hits, and its effect.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Fault {
     /// Which frames.
@@ -114,7 +114,7 @@ impl Faults {
         self.rules.get(rule).map_or(0, |rule| rule.hits)
     }
 
-    /// What happens to this frame: the first rule that hits it. All rules count it.
+    /// The effect on this frame: that of the first rule that hits it. All rules count the frame.
     pub(super) fn decide(&mut self, frame: &Frame, from: usize) -> Option<FaultAction> {
         let mut action = None;
         for rule in &mut self.rules {

@@ -1,4 +1,4 @@
-//! What a CAN controller shows the bus and what the bus tells it.
+//! The interface between a CAN controller and the bus.
 
 use crate::bus::confinement::Confinement;
 use crate::frame::Frame;
@@ -9,7 +9,7 @@ use crate::time::{Span, Time};
 pub struct Line {
     /// Nominal bit time.
     pub bit: Span,
-    /// Where in the bit it samples.
+    /// The sample point within the bit.
     pub sample: Span,
     /// It never drives the bus dominant: no frames, no acknowledge, no error flags.
     pub silent: bool,
@@ -44,7 +44,7 @@ pub struct Wait {
     pub bit: Span,
 }
 
-/// What went wrong with a frame, as the node that counts it sees it.
+/// The error of a frame, as the node that counts it sees it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ErrorKind {
     /// Six equal bits in a row.
@@ -62,7 +62,7 @@ pub enum ErrorKind {
 }
 
 impl ErrorKind {
-    /// In a person's words.
+    /// The error as a phrase for people to read.
     #[must_use]
     pub fn words(self) -> &'static str {
         match self {
@@ -75,7 +75,7 @@ impl ErrorKind {
     }
 }
 
-/// What the bus tells a node.
+/// An event that the bus reports to a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BusEvent {
     /// A frame begins. `own`: it is the one that the node's [`BusNode::request`] named (the node
@@ -114,19 +114,18 @@ pub enum BusEvent {
     },
     /// The node asked to leave the bus, and no frame of or for it is under way any more.
     Released,
-    /// The frame is over, well or badly, and the bus is free to stop or start something.
+    /// The frame is over, good or bad, and the node may change its mode or request a frame.
     Ended,
 }
 
-/// A controller on the bus. Its answers are about one point of virtual time; the bus asks in the
+/// A controller on the bus. Its answers hold for one point of virtual time; the bus asks in the
 /// order of time.
 pub trait BusNode {
     /// How it takes part; `None` while it does not (off, initialising, asleep, not synchronised,
     /// bus-off).
     fn line(&self) -> Option<Line>;
 
-    /// Changes whenever the node forgets what it was doing (reset, power): a frame begun before is
-    /// lost.
+    /// Changes whenever the node loses its state (reset, power): a frame begun before is lost.
     fn epoch(&self) -> u32;
 
     /// Its error counters.
@@ -135,18 +134,19 @@ pub trait BusNode {
     /// The frame that it wants to send at `now`, if any.
     fn request(&self, now: Time) -> Option<Frame>;
 
-    /// When it will want to send something that it does not want to send at `now` yet.
+    /// The time of its next request, if it has none at `now` but will have one later.
     fn next_request(&self, now: Time) -> Option<Time>;
 
     /// Recessive bits that it waits for.
     fn wait(&self) -> Option<Wait>;
 
-    /// Since when it wants to leave the bus as soon as no frame of or for it is under way.
+    /// The time from which on it wants to leave the bus, as soon as no frame of or for it is under
+    /// way.
     fn leaving(&self) -> Option<Time>;
 
     /// Something happened on the bus at `now`.
     fn event(&mut self, event: BusEvent, now: Time);
 
-    /// The bus has looked at everything up to and including `now`.
+    /// The bus has processed everything up to and including `now`.
     fn resolved(&mut self, now: Time);
 }

@@ -13,7 +13,7 @@ pub const QUEUE: usize = 1 << 16;
 const RECOVERY_SEQUENCES: u32 = 128;
 const PICOS: u64 = 1_000_000_000_000;
 
-/// A frame to be sent, and what its sender calls it.
+/// A frame to be sent, and the ticket that identifies it for its sender.
 #[derive(Clone, Copy, Debug)]
 struct Outgoing {
     at: Time,
@@ -56,7 +56,7 @@ impl HostPort {
         }
     }
 
-    /// Makes it listen only, without acknowledging, or take part.
+    /// Sets whether the port only listens, without acknowledging.
     pub fn set_silent(&mut self, silent: bool) {
         self.silent = silent;
     }
@@ -80,7 +80,7 @@ impl HostPort {
         self.outgoing.len()
     }
 
-    /// Takes back everything that has not gone out, but for a frame on the wire.
+    /// Withdraws all frames that have not gone out, except a frame on the wire.
     pub fn cancel(&mut self) {
         self.outgoing.truncate(usize::from(self.sending));
     }
@@ -102,7 +102,7 @@ impl HostPort {
         self.sent.pop_front()
     }
 
-    /// Received frames that nobody fetched in time.
+    /// The number of received frames that were dropped because they were not fetched in time.
     #[must_use]
     pub fn lost(&self) -> u64 {
         self.lost
@@ -201,7 +201,7 @@ impl BusNode for HostPort {
     fn resolved(&mut self, _now: Time) {}
 }
 
-/// A place on the bus with nothing plugged in.
+/// A place on the bus without a node.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Unplugged;
 

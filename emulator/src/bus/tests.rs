@@ -13,7 +13,7 @@ use crate::peripheral::Peripheral;
 
 const US: u64 = 1_000_000;
 
-/// Anything that can be plugged in.
+/// A node for the tests.
 enum Node {
     Port(HostPort),
     Can(Box<BxCan>),
@@ -39,7 +39,7 @@ impl Bench {
         Self::new(rates.iter().map(|rate| Node::Port(HostPort::new(*rate))).collect())
     }
 
-    /// Until so many microseconds.
+    /// Runs until so many microseconds.
     fn run(&mut self, until: u64) {
         let mut nodes: Vec<&mut dyn BusNode> = self
             .nodes
@@ -185,7 +185,7 @@ fn same_identifier_with_other_data_is_a_bit_error() {
     assert_eq!(end, 23 + 12 + 8, "flag and echo, delimiter");
     assert_eq!(bench.port(0).error_counters().tec(), 8);
     assert_eq!(bench.port(2).error_counters().rec(), 1);
-    // Neither gives way: both go on until they are error passive, then bus-off.
+    // Neither node gives way: both go on until they are error passive, then bus-off.
     bench.run(20_000);
     assert_eq!(bench.received(2), []);
     assert_eq!(bench.port(0).error_counters().state(), ErrorState::BusOff);

@@ -13,7 +13,7 @@ const FMR_RESET: u32 = 0x2A1C_0E01;
 const FINIT: u32 = 1;
 const CAN2SB: u32 = 0x3F << 8;
 
-/// Where a frame goes that a filter lets through.
+/// The place of a frame that a filter lets through.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Match {
     /// FIFO 0 or 1.
@@ -22,7 +22,8 @@ pub struct Match {
     pub index: u8,
 }
 
-/// Whose banks: those below CAN2SB are CAN1's, those from it on CAN2's.
+/// The controller that a bank belongs to: banks below CAN2SB belong to CAN1, those from it on to
+/// CAN2.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Share {
     /// The master's.
@@ -46,7 +47,7 @@ pub struct Filters {
     banks: [[u32; 2]; BANKS],
 }
 
-/// How one bank looks at identifiers.
+/// The kind of a bank: how it compares identifiers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Kind {
     Mask16,
@@ -120,8 +121,8 @@ impl Filters {
         })
     }
 
-    /// Writes the register at `offset` of the CAN block. What the hardware ignores comes back as an
-    /// error.
+    /// Writes the register at `offset` of the CAN block. A write that the hardware ignores is
+    /// returned as an error.
     pub fn write(&mut self, offset: u32, value: u32) -> Result<(), Unmodelled> {
         let configuration = |name: &str| {
             if self.fmr & FINIT != 0 {
@@ -165,7 +166,7 @@ impl Filters {
         let [first, second] = self.banks[bank];
         let halves = |word: u32| [word as u16, (word >> 16) as u16];
         let narrow = narrow_word(frame);
-        // Bit 0 of a 32-bit filter belongs to nothing.
+        // Bit 0 of a 32-bit filter is not part of the comparison.
         let wide = wide_word(frame);
         let position = |matches: &[bool]| matches.iter().position(|&hit| hit).map(|n| n as u8);
         match self.kind(bank) {

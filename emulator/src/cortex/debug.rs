@@ -17,8 +17,8 @@ const DEMCR_MON_PEND: u32 = 1 << 17;
 const DEMCR_MON_STEP: u32 = 1 << 18;
 const DEMCR_MON_REQ: u32 = 1 << 19;
 const DEMCR_TRCENA: u32 = 1 << 24;
-/// What a system reset clears (C1.6): everything of the monitor. The rest goes with the power
-/// alone.
+/// The bits that a system reset clears (C1.6): all bits of the monitor. Only a power-on reset
+/// clears the rest.
 const DEMCR_MON: u32 = DEMCR_MON_EN | DEMCR_MON_STEP | DEMCR_MON_REQ;
 
 const ENABLE: u32 = 1 << 0;
@@ -58,13 +58,13 @@ impl Debug {
         self.demcr & DEMCR_MON_EN != 0
     }
 
-    /// Whether the exception follows the next instruction that its priority is above of.
+    /// Whether the exception follows the next instruction that runs below its priority.
     #[must_use]
     pub fn steps(&self) -> bool {
         self.monitors() && self.demcr & DEMCR_MON_STEP != 0
     }
 
-    /// A debug event was taken.
+    /// Records a debug event in `DFSR`.
     pub fn note(&mut self, event: u32) {
         self.dfsr |= event;
     }

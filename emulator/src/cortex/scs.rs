@@ -68,7 +68,7 @@ const CCR_RESET: u32 = 1 << 9;
 const CPACR_MASK: u32 = 0xF << 20;
 const FPCCR_RESET: u32 = 0xC000_0000;
 
-/// What a write asks of the machine.
+/// The action that a write requires of the machine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Effect {
     /// Nothing.
@@ -81,13 +81,13 @@ pub enum Effect {
     Stepping,
 }
 
-/// What the core makes of a store that the bus refused.
+/// The effect of a store that the bus refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RefusedStore {
     /// The store went through the write buffer and the CPU has gone on: the fault is imprecise and
     /// pending.
     Pended,
-    /// The fault is precise, and nobody hears of it but BFSR and BFAR.
+    /// The fault is precise, and only BFSR and BFAR show it.
     Ignored,
     /// The fault is precise, and taken at the store.
     Taken,

@@ -1,5 +1,5 @@
-//! Everything of the chip that is not the instruction set: memories, peripherals, clocks, and who
-//! answers where.
+//! Everything of the chip except the instruction set: memories, peripherals, clocks, and the
+//! address map.
 
 use std::collections::BTreeSet;
 
@@ -70,17 +70,17 @@ enum Block {
     Tim(usize),
 }
 
-/// Where in RAM a piece of code goes.
+/// The record of the RAM that a piece of code accesses.
 pub struct Watch {
     /// The code.
     pub code: Region,
-    /// It runs.
+    /// The code runs at present.
     pub inside: bool,
     /// The pages of RAM that it accessed, by their addresses.
     pub touched: BTreeSet<u32>,
 }
 
-/// Who answers at an address, with the offset in its registers.
+/// The block that answers at an address, with the offset in its registers.
 enum Place {
     Block { block: Block, offset: u32, enable: ClockEnable },
     Scs(u32),
@@ -168,7 +168,7 @@ const UNMODELLED: [(u32, &str); 24] = [
     (0x5006_0800, "RNG"),
 ];
 
-/// What the machine counts.
+/// The counters of the machine.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Counters {
     /// Instructions executed since the machine was made.
@@ -227,40 +227,40 @@ pub struct Chip {
     pub system: HostMemory,
     /// The page with the option bytes.
     pub options: HostMemory,
-    /// What went wrong.
+    /// The reports of accesses that went wrong.
     pub reports: Reports,
     /// Reports of accesses to peripherals whose instruction is still to be found; their address is
     /// the one that the program used.
     pub unlocated: Vec<Report>,
-    /// What was done.
+    /// The counters.
     pub counters: Counters,
 
     /// The CPU goes on until its cycle count reaches this.
     pub slice_end: u64,
-    /// The owner's deadline, which the slice never passes.
+    /// The deadline of the machine's owner, which the slice never passes.
     pub deadline: Time,
     /// The CPU leaves translated code at the end of the present block.
     pub leave: bool,
     /// An exception is pending that might be taken when the masks allow.
     pub check_exceptions: bool,
-    /// The bus (CAN) must look.
+    /// The CAN bus must process a change.
     pub attention: bool,
     /// A system reset was asked for.
     pub reset_request: Option<ResetCause>,
-    /// The CPU stands still until then: the bus to the flash is held.
+    /// The CPU stands still until this time, because the bus to the flash is held.
     pub hold_until: Option<Time>,
     /// A bus error came back for the last store, to this address.
     pub bus_error: Option<u32>,
-    /// Translations hold code that has changed since: (address, length).
+    /// Code that has changed since it was translated: (address, length).
     pub stale: Vec<(u32, u32)>,
-    /// The translator's memory of what may be read must go: an operation started, and loads from
-    /// flash must be noticed.
+    /// The translator must forget which memory may be read: a flash operation started, and loads
+    /// from flash must be noticed.
     pub flush_tlb: bool,
-    /// That was done for the operation that runs.
+    /// This was done for the running operation.
     guarded: bool,
-    /// Translations go on where code has to stop now, or stop where it has not any more.
+    /// Breakpoints were set or removed, so translations of code may stop at the wrong places.
     pub breakpoints_changed: bool,
-    /// Where a debugger wants code to stop.
+    /// The addresses at which a debugger wants code to stop.
     pub stops: BTreeSet<u32>,
     /// How often translated code was entered.
     pub entries: u64,
@@ -388,14 +388,14 @@ impl Chip {
         self.bus_error = None;
         if self.flash.hardware_watchdog() {
             let now = self.now();
-            // The key that starts it cannot be refused.
+            // The key that starts the watchdog is always accepted.
             let _ = self.iwdg.write(0x00, 0xCCCC, now);
             self.rcc.force_lsi(now);
         }
         self.take_flash_changes();
     }
 
-    /// Power-on: as a reset, but nothing is remembered.
+    /// Power-on: as a reset, but all state is lost.
     pub fn power_on(&mut self, now: Time, hse_hz: u32) {
         self.clock = CycleClock::new(now, HSI_HZ);
         self.rcc = Rcc::new(self.variant, hse_hz);
@@ -431,14 +431,14 @@ impl Chip {
         self.tell_slave();
     }
 
-    /// After a change of CAN1's filters or clock: CAN2 has them from there.
+    /// Passes a change of CAN1's filters or clock on to CAN2.
     fn tell_slave(&mut self) {
         let clocked = self.rcc.plain(rcc::APB1ENR) & 1 << 25 != 0;
         let [master, slave] = &mut self.can;
         slave.follow(master, clocked);
     }
 
-    /// Looks which pins the program has given to the USARTs.
+    /// Finds the pins that the program has assigned to the USARTs.
     fn wire_usarts(&mut self) {
         let Self { gpio, usarts, .. } = self;
         let is_given = |&(port, pin, function): &(char, u8, u8)| {
@@ -486,7 +486,7 @@ impl Chip {
         self.clocks
     }
 
-    /// Lets everything happen that is due, and finds out what interrupts follow.
+    /// Processes all events that are due, and derives the interrupts.
     pub fn advance(&mut self) {
         let now = self.now();
         let hclk = self.clocks;
@@ -548,7 +548,7 @@ impl Chip {
         self.counters.flash_refused = self.flash.counters.refused;
     }
 
-    /// When something happens next without the CPU's doing.
+    /// The time of the next event that the CPU does not cause.
     #[must_use]
     pub fn next_event(&self) -> Option<Time> {
         [
@@ -566,8 +566,8 @@ impl Chip {
         .min()
     }
 
-    /// The deadline or the next event, whichever comes first. An event that is due already has had
-    /// its chance.
+    /// The deadline or the next event, whichever comes first. An event that is due already is not
+    /// counted, because it was processed.
     #[must_use]
     pub fn next_stop(&self) -> Time {
         let now = self.now();
@@ -580,7 +580,7 @@ impl Chip {
         self.slice_end = self.clock.cycle_at(until);
     }
 
-    /// Notes an access that is not as it should be.
+    /// Reports an access that is wrong or not modelled.
     pub fn report(&mut self, access: Access, address: u32, size: u8, value: u32, pc: u32, what: String) {
         let time = self.now();
         self.reports.add(Report { time, address, pc, size, access, value, what, count: 1 });
@@ -654,7 +654,7 @@ impl Chip {
         (byte < self.sram.size()).then_some((byte, offset / 4 % 8))
     }
 
-    /// Who answers at a word-aligned peripheral address.
+    /// The block that answers at a word-aligned peripheral address.
     fn place(&self, address: u32) -> Place {
         let within = |base: u32, size: u32| Some(address.wrapping_sub(base)).filter(|&offset| offset < size);
         let there = |block: Block| !matches!(block, Block::Gpio(port) if port >= self.gpio.len());
@@ -816,7 +816,7 @@ impl Chip {
         })
     }
 
-    /// Levels at pins may have changed.
+    /// Updates the levels at the pins, which may have changed.
     pub fn show_pins(&mut self) {
         if self.exti.listens() {
             let levels = self.exti_levels();
@@ -824,7 +824,7 @@ impl Chip {
         }
     }
 
-    /// After anything that may have started, ended or waited for a flash operation.
+    /// Call it after anything that may have started, ended or waited for a flash operation.
     fn settle_flash(&mut self) {
         if let Some(until) = self.flash.take_wait() {
             self.hold_until = Some(until);

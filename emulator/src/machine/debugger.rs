@@ -1,9 +1,9 @@
-//! What a debugger outside the chip does to a machine: it halts it, lets it go on or lets it make
-//! one step, and sets breakpoints.
+//! The control of a machine by a debugger outside the chip: halt, continue, single step,
+//! breakpoints.
 //!
-//! A breakpoint belongs to an address, not to what lies there: it holds in RAM that is overwritten
-//! and in flash that is programmed later. The program sees nothing of it. While a machine is halted,
-//! no virtual time goes by.
+//! A breakpoint belongs to an address, not to the code there: it stays in force in RAM that is
+//! overwritten and in flash that is programmed later. The program cannot see it. While a machine is
+//! halted, no virtual time passes.
 
 use super::{Entry, Error, Machine, Stop};
 use crate::cpu::Exit;
@@ -21,13 +21,13 @@ pub enum Halt {
     Lockup,
 }
 
-/// The state of the debugger's side.
+/// The state of the debugger's control.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Debugger {
     attached: bool,
     pub(super) halted: Option<Halt>,
     step: bool,
-    /// The address at which it went on: a breakpoint there does not hold the CPU up at once.
+    /// The address at which the machine went on: a breakpoint there does not stop the CPU at once.
     over: Option<u32>,
 }
 
@@ -122,12 +122,12 @@ impl Machine {
         }
         let chip = self.cpu.chip_mut();
         chip.store(address, 4, u32::from_le_bytes([a, b, c, d]));
-        // No instruction did it.
+        // No instruction made these accesses.
         chip.unlocated.clear();
         Ok(())
     }
 
-    /// What is left to say where the machine is to run and is halted.
+    /// The stop to report where the machine is to run and is halted.
     pub(super) fn is_held(&self) -> Option<Stop> {
         self.debugger.halted.map(|_| Stop::Halted)
     }
@@ -151,7 +151,7 @@ impl Machine {
                 self.debugger.halted = Some(Halt::Breakpoint);
                 None
             }
-            // Who steps does not sleep.
+            // A step does not sleep.
             Exit::WaitForInterrupt | Exit::WaitForEvent if step => None,
             exit => Some(exit),
         }

@@ -1,4 +1,4 @@
-//! What the machine tells its owner about a program that leaves the path.
+//! The reports to the owner about accesses of a program that are wrong or not modelled.
 
 use crate::time::Time;
 
@@ -27,7 +27,7 @@ impl std::fmt::Display for Access {
 /// address and program counter is reported once, with a count.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Report {
-    /// When it happened first.
+    /// The time of the first occurrence.
     pub time: Time,
     /// The address accessed.
     pub address: u32,
@@ -40,7 +40,7 @@ pub struct Report {
     pub access: Access,
     /// What a store wrote, at the first time.
     pub value: u32,
-    /// What is wrong, in words.
+    /// The fault, in words.
     pub what: String,
     /// How often it happened.
     pub count: u64,

@@ -1,5 +1,5 @@
-//! What differs between the lines of the family beside what `shared_abi::geometry` has: which
-//! registers and bits exist, and what they say of themselves.
+//! The differences between the lines of the family beside those in `shared_abi::geometry`: the
+//! registers and bits that exist, and the identification values.
 
 use shared_abi::geometry::{Geometry, Line};
 
@@ -9,7 +9,7 @@ pub type Plain = (u32, u32, u32);
 /// One line of the family.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Variant {
-    /// What the chips are called in reports.
+    /// The name of the chips in reports.
     pub name: &'static str,
     /// DBGMCU_IDCODE: device and revision.
     pub idcode: u32,

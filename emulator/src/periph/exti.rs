@@ -34,20 +34,20 @@ pub struct Exti {
 }
 
 impl Exti {
-    /// Whether an edge at a pin makes a difference. Only then the pins need to be shown.
+    /// Whether an edge at a pin has an effect. Only then the pins need to be shown.
     #[must_use]
     pub fn listens(&self) -> bool {
         (self.rtsr | self.ftsr) & PINS != 0
     }
 
-    /// These are the levels at lines 0 to 15 now; edges since the last time count.
+    /// Sets the present levels at lines 0 to 15; edges since the last call count.
     pub fn show(&mut self, levels: u16) {
         let (new, old) = (u32::from(levels), u32::from(self.levels));
         self.pr |= new & !old & self.rtsr | old & !new & self.ftsr;
         self.levels = levels;
     }
 
-    /// These are the levels at lines 0 to 15; no edge led there.
+    /// Sets the present levels at lines 0 to 15 without an edge.
     pub fn settle(&mut self, levels: u16) {
         self.levels = levels;
     }

@@ -69,7 +69,7 @@ const ERASE_MASS: [(u64, u64); 4] = [(16_000, 32_000), (11_000, 22_000), (8_000,
 /// worst).
 const PROGRAM: (u64, u64) = (16, 100);
 
-/// What an operation does to the array when it ends.
+/// The effect of an operation on the array when it ends.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Operation {
     /// These bytes are programmed at this offset of the array.
@@ -91,7 +91,7 @@ pub enum Operation {
     },
 }
 
-/// Where within an operation the power fails.
+/// The point within an operation at which the power fails.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Cut {
     /// Before it changed anything.
@@ -115,7 +115,7 @@ pub struct FlashCut {
     pub when: Cut,
 }
 
-/// How often the flash was used.
+/// The counters of flash operations.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct FlashCounters {
     /// Sectors erased.
@@ -132,7 +132,7 @@ struct Running {
     ends: Time,
 }
 
-/// What a store by the CPU to the array came to.
+/// The result of a store by the CPU to the array.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Store {
     /// An operation started.
@@ -221,7 +221,7 @@ impl Flash {
         self.cut = cut;
     }
 
-    /// Whether the armed power cut struck; [`Self::lose_power`] clears it.
+    /// Whether the armed power cut happened; [`Self::lose_power`] clears it.
     #[must_use]
     pub fn power_has_failed(&self) -> bool {
         self.power_failed
@@ -240,7 +240,7 @@ impl Flash {
         self.options.preset_read_protection(rdp);
     }
 
-    /// The power fails now: what runs is torn. `seed` chooses how.
+    /// The power fails now: the running operation is torn. `seed` chooses how.
     pub fn lose_power(&mut self, seed: u64) {
         if let Some(running) = self.running.take() {
             self.tear(&running.operation, seed);
@@ -278,7 +278,7 @@ impl Flash {
         !second && self.options.protects(sector.number)
     }
 
-    /// Sets the option bytes as a debug probe does: in no time, and whoever runs does not notice.
+    /// Sets the option bytes as a debug probe does: at once, and unnoticed by the running program.
     ///
     /// # Panics
     /// For a sector of a second bank, whose option bytes are not modelled.

@@ -3,7 +3,7 @@
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::Time;
 
-/// What drives a pin from outside, in one word per level.
+/// The levels that drive the pins from outside, in one word per level.
 #[derive(Clone, Copy, Debug, Default)]
 struct Outside {
     driven: u16,
@@ -70,7 +70,7 @@ impl Gpio {
         word >> (2 * u32::from(pin & 15)) & 3
     }
 
-    /// Drives `pin` from outside, or lets it go.
+    /// Drives `pin` from outside; `None` releases it.
     pub fn set_outside(&mut self, pin: u8, level: Option<bool>) {
         let bit = 1 << (pin & 15);
         self.outside.driven &= !bit;

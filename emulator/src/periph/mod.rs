@@ -1,4 +1,4 @@
-//! The chip's peripherals but CAN, each after its section of RM0090.
+//! The chip's peripherals except CAN, each modelled after its section of RM0090.
 
 pub mod crc;
 pub mod exti;

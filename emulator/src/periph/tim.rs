@@ -1,8 +1,8 @@
 //! The general-purpose and basic timers TIM2 to TIM7 and TIM9 to TIM14 (RM0090 sections 18 to 20),
-//! as far as programs tell the time with them: a counter with prescaler, auto-reload, update event,
+//! with the functions that measure time: a counter with prescaler, auto-reload, update event,
 //! one-pulse mode and output compare.
 //!
-//! The counter is computed from the time that has gone by, so a timer that runs costs nothing.
+//! The counter is computed from the elapsed time, so a running timer costs nothing.
 //!
 //! **What is missing.** The pins (PWM, input capture, encoders), counting down, triggers between
 //! timers and DMA requests. Each is reported when a program sets it up.
@@ -213,7 +213,7 @@ impl Tim {
         self.comparing().filter(beyond).fold(0, |flags, (flag, _)| flags | flag)
     }
 
-    /// The update event: what was preloaded comes into force; one-pulse mode ends (sections 18.3.1
+    /// The update event: preloaded values come into force, and one-pulse mode ends (sections 18.3.1
     /// and 18.3.10).
     fn update(&mut self) {
         if self.cr1 & CR1_UDIS != 0 {

@@ -1,10 +1,10 @@
 //! Universal (synchronous) asynchronous receiver transmitter (RM0090 section 30), and the line at
 //! its two pins.
 //!
-//! The outside speaks 8N1 at a bit rate of its own. Modelled is what makes a serial port of it:
-//! start bit, eight data bits, stop bits, one register and one shift register each way, their flags
-//! and interrupts. Parity, nine bits, idle and break detection, flow control, LIN, IrDA, smart
-//! cards, the synchronous mode and DMA are reported when asked for.
+//! The outside uses 8N1 at a bit rate of its own. The model covers a serial port: start bit, eight
+//! data bits, stop bits, one data register and one shift register each way, their flags and
+//! interrupts. Parity, nine bits, idle and break detection, flow control, LIN, IrDA, smart cards,
+//! the synchronous mode and DMA are reported when a program uses them.
 
 use std::collections::VecDeque;
 
@@ -12,7 +12,7 @@ use crate::machine::clock::picos_of;
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::{Span, Time};
 
-/// Where a USART is in the chip.
+/// The place of a USART in the chip.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Instance {
     /// Name as in the reference manual.
@@ -28,7 +28,7 @@ pub struct Instance {
     pub rx: &'static [(char, u8, u8)],
 }
 
-/// Those that every chip known here has; the pins are those that they have in common.
+/// The USARTs that every known chip has, with the pins that the chips have in common.
 pub static INSTANCES: [Instance; 6] = [
     Instance {
         name: "USART1",
@@ -111,7 +111,7 @@ const OUTSIDE_BITS: u64 = 10;
 /// A receiver whose bit rate is further off than this many parts in a thousand cannot read the
 /// character (section 30.3.5, tolerance with eight bits and the fraction in use, rounded).
 const TOLERANCE: u64 = 38;
-/// Characters that nobody took from the line.
+/// The most characters that wait for [`Usart::take_sent`].
 const MOST_HEARD: usize = 64 * 1024;
 /// Characters that wait outside to be sent to the chip.
 const MOST_WAITING: usize = 64 * 1024;
@@ -127,7 +127,7 @@ pub struct Character {
     pub bit_rate: u32,
 }
 
-/// What leaves the transmitter's shift register; without a word it is the idle frame behind TE.
+/// The content of the transmitter's shift register; without a word it is the idle frame behind TE.
 #[derive(Clone, Copy, Debug)]
 struct Shift {
     word: Option<u8>,
@@ -143,7 +143,7 @@ struct Incoming {
     heard: bool,
 }
 
-/// The outside's end of the line.
+/// The outside end of the line.
 #[derive(Clone, Debug)]
 struct Outside {
     bit_rate: u32,
@@ -224,7 +224,7 @@ impl Usart {
         self.wired = (tx, rx);
     }
 
-    /// The bit rate in which the outside speaks, in bit/s; 115 200 until it is told another one.
+    /// Sets the bit rate of the outside, in bit/s; 115 200 before the first call.
     ///
     /// # Panics
     /// For 0.
@@ -233,8 +233,8 @@ impl Usart {
         self.outside.bit_rate = bit_rate;
     }
 
-    /// The outside sends bytes, one behind the other, from `now` on. Gives how many it takes; the
-    /// rest has to come again.
+    /// The outside sends bytes, one behind the other, from `now` on. Returns how many it takes; the
+    /// caller has to pass the rest again.
     pub fn receive(&mut self, bytes: &[u8], now: Time) -> usize {
         let room = MOST_WAITING - self.outside.waiting.len();
         let taken = bytes.len().min(room);
@@ -251,12 +251,13 @@ impl Usart {
         self.outside.waiting.len() + usize::from(self.outside.incoming.is_some())
     }
 
-    /// What the chip has sent since the last time; the oldest is lost where nobody asked for long.
+    /// The characters that the chip has sent since the last call. The oldest are lost if there was
+    /// no call for long.
     pub fn take_sent(&mut self) -> Vec<Character> {
         self.outside.heard.drain(..).collect()
     }
 
-    /// The power goes: what was on the line is lost.
+    /// The power goes off: the characters on the line are lost.
     pub fn lose_power(&mut self) {
         self.outside.waiting.clear();
         self.outside.incoming = None;

@@ -17,7 +17,7 @@ pub struct Splitter {
     too_long: bool,
 }
 
-/// What came where an element should have been.
+/// An invalid element.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BadElement {
     /// More than [`MAX_ELEMENT`] bytes.
@@ -62,7 +62,7 @@ impl Splitter {
     }
 }
 
-/// What a connection may do.
+/// The mode of a connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mode {
     /// No bus is open.
@@ -73,7 +73,7 @@ pub enum Mode {
     Raw,
 }
 
-/// What an element makes the server do besides answering.
+/// The action that an element requires of the server besides the answer.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Effect {
     /// Nothing.
@@ -88,7 +88,7 @@ pub enum Effect {
     Close,
 }
 
-/// What comes of an element.
+/// The result of an element.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Reaction {
     /// Text for the client.
@@ -111,7 +111,7 @@ impl Reaction {
     }
 }
 
-/// What the server says first.
+/// The first text of the server.
 pub const HELLO: &str = "< hi >";
 
 /// One connection, as the protocol sees it.
@@ -128,13 +128,13 @@ impl Session {
         Self { mode: Mode::NoBus, bus: bus.into() }
     }
 
-    /// What the connection may do.
+    /// The mode of the connection.
     #[must_use]
     pub fn mode(&self) -> Mode {
         self.mode
     }
 
-    /// What comes of one element.
+    /// Handles one element.
     pub fn handle(&mut self, element: Result<&str, BadElement>) -> Reaction {
         let text = match element {
             Ok(text) => text,

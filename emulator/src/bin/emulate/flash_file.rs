@@ -11,19 +11,19 @@ use shared_abi::geometry::Geometry;
 /// The file: the bytes of the flash and nothing else.
 pub struct FlashFile {
     path: PathBuf,
-    /// What is in the file.
+    /// The content of the file.
     kept: Vec<u8>,
 }
 
 impl FlashFile {
-    /// Puts the file's bytes into the flash. Without such a file the flash is erased, and the file
-    /// comes when it is kept first.
+    /// Writes the file's bytes into the flash. If the file does not exist, the flash is erased, and
+    /// the first [`keep`](Self::keep) creates the file.
     pub fn open(path: &Path, chip: &Geometry, machine: &mut Machine) -> Result<Self> {
         let name = path.display();
         let kept = match fs::metadata(path) {
             Err(error) if error.kind() == ErrorKind::NotFound => Vec::new(),
             Err(error) => return Err(error).with_context(|| format!("{name}")),
-            // Not read before its size is known: it may be anything.
+            // Do not read the file before its size is known: it may be anything.
             Ok(file) if !file.is_file() || file.len() != u64::from(chip.flash.size) => bail!(
                 "{name}: {} bytes are not the flash of this board's chip, which has {}; is it of another \
                  board? name another file, or delete this one to start with an erased flash",
@@ -36,13 +36,13 @@ impl FlashFile {
             machine.load_bin(chip.flash.base, &kept).with_context(|| format!("{name}"))?;
         }
         let file = Self { path: path.to_path_buf(), kept };
-        // Whether it can be written is better known now than at the end.
+        // Find out now, not at the end, whether the file can be written.
         drop(File::create(file.beside()).with_context(|| format!("{name} cannot be written"))?);
         fs::remove_file(file.beside()).with_context(|| format!("{name}"))?;
         Ok(file)
     }
 
-    /// Whether it had bytes for the flash.
+    /// Whether the file had content for the flash.
     pub fn is_filled(&self) -> bool {
         !self.kept.is_empty()
     }

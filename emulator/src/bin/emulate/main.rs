@@ -131,7 +131,7 @@ struct Args {
     run_for: Option<Time>,
 }
 
-/// What is known of a board here: its chip, pins that a resistor pulls up, its serial port.
+/// The properties of a board: its chip, pins that a resistor pulls up, its serial port.
 #[derive(Clone, Copy, Debug)]
 struct Board {
     chip: &'static Geometry,
@@ -142,8 +142,8 @@ struct Board {
     transceiver: usize,
 }
 
-/// A board has its serial port at USART2, its transceiver at CAN1 and no resistors at its pins, unless
-/// it stands here.
+/// A board has its serial port at USART2, its transceiver at CAN1 and no resistors at its pins,
+/// unless it is listed here.
 fn board(name: &str) -> Result<Board, String> {
     let names = || BOARDS.iter().map(|layout| layout.board).collect::<Vec<_>>().join(", ");
     let layout = layout::by_name(name).ok_or_else(|| format!("known boards: {}", names()))?;
@@ -170,21 +170,21 @@ fn seconds(text: &str) -> Result<Time, String> {
 
 /// No image of a chip with 1 MiB of flash is larger, ELF with all its debug information included.
 const LARGEST_IMAGE: u64 = 256 << 20;
-/// How often files are brought up to date.
+/// The interval at which files are brought up to date.
 const FLUSH: Duration = Duration::from_millis(200);
-/// How long the world is looked after without a nap behind something that a client said or got: its
-/// next word is on its way, perhaps.
+/// How long the world runs without a nap after a client has sent or received something: the
+/// client's next message may be on its way.
 const AWAKE: Duration = Duration::from_millis(20);
-/// How long the world sleeps where a client cannot wake it: one at a serial port.
+/// The nap while a client at a serial port is possible: such a client cannot wake the world.
 const SHORT_NAP: Duration = Duration::from_micros(500);
 
 fn main() -> ExitCode {
     match run(&Args::parse()) {
         Ok(()) => ExitCode::SUCCESS,
-        // Whoever read the output has enough of it.
+        // The reader of the output has closed it.
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
-            // If that cannot be written either, the exit code has to do.
+            // If that cannot be written either, only the exit code tells it.
             let _ = writeln!(io::stderr(), "emulate: {error:#}");
             ExitCode::FAILURE
         }
@@ -195,7 +195,7 @@ fn is_broken_pipe(error: &anyhow::Error) -> bool {
     error.downcast_ref::<Unheard>().is_some()
 }
 
-/// Nobody reads what is said.
+/// The reader of the output has closed it.
 #[derive(Debug, thiserror::Error)]
 #[error("the standard output is closed")]
 struct Unheard;
@@ -216,7 +216,7 @@ fn run(args: &Args) -> Result<()> {
     bench.listen(args)?;
     bench.power_on()?;
     let outcome = bench.live(args, &end);
-    // What has happened is told and written down even if something went wrong.
+    // The report and the files are written even if an error occurred.
     let told = bench.print_report();
     let flushed = bench.flush();
     let kept = bench.keep_flash();
@@ -224,7 +224,7 @@ fn run(args: &Args) -> Result<()> {
     bench.sum_up()
 }
 
-/// Images are loaded in this order; a later one wins where they overlap.
+/// The images in the order of loading; a later one wins where they overlap.
 fn images(args: &Args) -> impl Iterator<Item = &Path> {
     let named = args.bootloader.iter().chain(&args.app);
     named.chain(&args.images).map(PathBuf::as_path)
@@ -286,7 +286,7 @@ fn decoder(args: &Args) -> Result<Option<Decoder>> {
     Ok(None)
 }
 
-/// The boards, the bus, and who listens.
+/// The boards, the bus, and the clients.
 struct Bench {
     world: World,
     boards: Vec<Watched>,
@@ -298,19 +298,20 @@ struct Bench {
     gdb: Option<emulator::gdb::Door>,
     flash: Option<FlashFile>,
     trace: Option<(PathBuf, Handle<BufWriter<File>>)>,
-    /// What was to be said and when, not printed yet.
+    /// The messages that are not printed yet, with their times.
     said: Rc<RefCell<Vec<(Time, String)>>>,
 }
 
-/// A board, how many of its reports have been shown, and what it tells a debug probe.
+/// A board, how many of its reports have been shown, and the messages that it writes for a debug
+/// probe.
 struct Watched {
     id: MachineId,
     shown: usize,
     sram: Region,
     log: rtt::Reader,
-    /// When its RAM is looked at next.
+    /// The time of the next look at its RAM.
     look: Time,
-    /// What has come out of its USARTs of lines that are not complete, by name and bit rate.
+    /// The incomplete lines that its USARTs have sent, by name and bit rate.
     serial: BTreeMap<(&'static str, u32), Vec<u8>>,
 }
 
@@ -318,7 +319,7 @@ struct Watched {
 const LONGEST_LINE: usize = 256;
 
 impl Watched {
-    /// What its USARTs have said since the last time, with the time of its end and in words.
+    /// The text that its USARTs have sent since the last call, with the time of its end.
     fn serial(&mut self, machine: &mut Machine) -> Vec<(Time, String)> {
         let mut said = Vec::new();
         for usart in machine.usarts_mut() {
@@ -480,7 +481,7 @@ impl Bench {
         }
     }
 
-    /// Lets the world go on until the end is asked for or due.
+    /// Runs the world until its end is requested or due.
     fn live(&mut self, args: &Args, end: &AtomicBool) -> Result<()> {
         let last = args.run_for.unwrap_or(Time(u64::MAX));
         let mut pacer = Pacer::new(args.speed, Instant::now(), self.world.now());
@@ -535,7 +536,7 @@ impl Bench {
             let now = self.world.now();
             self.said.borrow_mut().extend(server.notices().into_iter().map(|notice| (now, notice)));
         } else {
-            // Nobody wants the frames.
+            // These frames have no receiver.
             while self.world.receive(self.port).is_some() {}
         }
         if delivered > 0 {
@@ -564,11 +565,12 @@ impl Bench {
         self.said.borrow_mut().extend(door.notices().into_iter().map(|notice| (now, notice)));
     }
 
-    /// Does what was asked for at the control socket or the terminal.
+    /// Carries out the requests of the control socket and the terminal.
     fn obey(&mut self) -> Result<()> {
         while let Some(request) = self.control.take() {
             let outcome = self.act(request.command);
-            // The client hears of a failure; whoever started the emulator does too.
+            // The client gets the failure as its answer; it is also printed for the emulator's
+            // user.
             let failed = outcome.as_ref().err().map(|error| format!("{error:#}"));
             request.answer(outcome.map_err(|error| format!("{error:#}")));
             if let Some(text) = failed {
@@ -635,7 +637,7 @@ impl Bench {
         }
     }
 
-    /// Says what has happened since the last time, in the order in which it did.
+    /// Prints the events since the last call, in their order in time.
     fn print_report(&mut self) -> Result<()> {
         let mut lines = std::mem::take(&mut *self.said.borrow_mut());
         while let Some(news) = self.world.news() {
@@ -692,7 +694,7 @@ impl Bench {
     }
 }
 
-/// What happened to a board, in words; nothing where it did not happen to it but was asked for.
+/// The event of a board in words; `None` for an event that was requested.
 fn happened(stop: Stop, (cfsr, hfsr): (u32, u32)) -> Option<String> {
     Some(match stop {
         Stop::Deadline | Stop::Attention | Stop::Halted | Stop::Reset(ResetCause::PowerOn) => return None,

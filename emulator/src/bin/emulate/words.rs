@@ -1,12 +1,12 @@
-//! What is on the bus, in a person's words. Only what a person wants to hear of: who starts, who
-//! changes state, who has an emergency, and when frames do not get through. Meanings are CiA 301's
-//! (7.2.5 and 7.3.5).
+//! The events on the bus as sentences for people to read. Only notable events are reported: a node
+//! starts, changes its state or has an emergency, or frames do not get through. The meanings are
+//! those of CiA 301 (7.2.5 and 7.3.5).
 
 use std::collections::BTreeMap;
 
 use emulator::bus::{Outcome, Record};
 
-/// Remembers what it has said, so that it says it once.
+/// Remembers the states that it has reported, so that it reports each once.
 #[derive(Default)]
 pub struct Words {
     /// The NMT state that each node last reported.

@@ -16,10 +16,10 @@ pub enum Lock {
 }
 
 impl Lock {
-    /// Takes what was written to the key register. Where that leaves the lock [`Self::Barred`], the
-    /// chip answers with a bus error.
+    /// Takes a value written to the key register. If the lock becomes [`Self::Barred`], the chip
+    /// answers with a bus error.
     ///
-    /// A lock that is open takes no key: writing one is a wrong sequence, too.
+    /// An open lock accepts no key: a key is then a wrong sequence, too.
     #[must_use]
     pub fn turn(self, value: u32, keys: [u32; 2]) -> Self {
         match (self, value) {
@@ -39,7 +39,7 @@ impl Lock {
         }
     }
 
-    /// Whether what it guards may be written.
+    /// Whether the registers behind the lock may be written.
     #[must_use]
     pub fn is_open(self) -> bool {
         self == Self::Open

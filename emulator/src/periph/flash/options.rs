@@ -139,7 +139,7 @@ impl OptionBytes {
         self.programmed >> 16 & 1 << sector == 0
     }
 
-    /// Sets nWRP of a sector as a debug probe does: at once, and whoever runs does not notice.
+    /// Sets nWRP of a sector as a debug probe does: at once, and unnoticed by the running program.
     pub fn preset_protection(&mut self, sector: u8, protected: bool) {
         let bit = 1 << (16 + sector);
         self.preset(bit, if protected { 0 } else { bit });
