@@ -110,8 +110,8 @@ impl<I: Controller> Port<I> {
     pub fn configure(&mut self, timing: BitTiming, mode: Mode) {
         let config = self.can.modify_config();
         config.set_bit_timing(timing.register()).set_silent(mode == Mode::Silent).leave_disabled();
-        // The abort comes after the mode change: while a frame without acknowledgement is being
-        // sent, an abort would wait for the frame.
+        // The abort comes now, after the controller has left the bus: before, it would wait for a
+        // frame that no other node acknowledges.
         self.waiting = None;
         self.write(TSR, ABRQ);
         while self.read(TSR) & ABRQ != 0 {}
