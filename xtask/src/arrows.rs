@@ -230,8 +230,8 @@ fn sources(folder: &Path) -> Outcome<Vec<PathBuf>> {
     Ok(sources)
 }
 
-/// Uses of shared-abi other than `shared_abi::geometry`, with their line numbers. Of a group (`use
-/// shared_abi::{…}`) it returns each foreign member; an alias of the whole crate counts as foreign.
+/// Uses of shared-abi other than `shared_abi::geometry`, with their line numbers. Each foreign
+/// member of a group (`use shared_abi::{…}`) counts; so does an alias of the whole crate.
 fn foreign_modules(source: &str) -> Vec<(usize, String)> {
     let mut found = Vec::new();
     // Comments are removed (in place, to keep the line numbers): they may name any module.

@@ -89,8 +89,8 @@ impl Line {
 
     /// Size in bytes of the SRAM for both the CPU and the bus masters, from 2000_0000h on.
     ///
-    /// Memory maps of RM0090 (SRAM1, SRAM2 and SRAM3 follow one another), RM0402, RM0430, RM0390 and
-    /// RM0386.
+    /// Memory maps of RM0090 (SRAM1, SRAM2 and SRAM3 follow one another), RM0402, RM0430, RM0390
+    /// and RM0386.
     #[must_use]
     pub const fn sram(self) -> u32 {
         const KIB: u32 = 1024;
