@@ -333,9 +333,9 @@ mod app {
             Mono::delay(TICK_MS.millis()).await;
         }
     }
+
     /// Leaves the bootloader by a reset: the boot stage decides again, on a chip in its reset
     /// state.
-    /// Out of the bootloader: the boot stage decides anew, on a clean chip.
     fn reset_with(request: BootRequest) -> ! {
         product::warm_start_cell().put(request);
         SCB::sys_reset()

@@ -37,8 +37,7 @@ def run(address, act, number=1, dictionary=None, timeout=2.0):
     """Calls `act` with a node on the bus; returns the exit code: 0, or 1 after an error.
 
     The SDO time-out uses the clock of a machine that may have other work: tests in virtual time
-    show that no
-    answer takes 5 ms. Without a time-out the library's default applies.
+    show that no answer takes 5 ms. Without a time-out the library's default applies.
     """
     host, port = address.rsplit(":", 1)
     network = canopen.Network()

@@ -25,7 +25,7 @@ fn port() -> Port<UartController> {
 
 /// Writes a line, if there is room for all of it.
 pub fn write(line: impl Iterator<Item = u8> + Clone) {
-        // Interrupts are off, so that lines of different tasks do not mix.
+    // Interrupts are off, so that lines of different tasks do not mix.
     interrupt::free(|_| {
         if line.clone().count() <= RING.room() {
             for byte in line {
