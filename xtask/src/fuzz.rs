@@ -121,7 +121,8 @@ fn unwritable(path: &Path, error: &std::io::Error) -> String {
     format!("{} cannot be written: {error}.", workspace::shown(path))
 }
 
-/// Checks for the nightly compiler: the sanitizer and the coverage counters need it.
+/// Checks for the nightly compiler, which the sanitizer and the coverage counters need, and for a C++
+/// compiler, which the fuzzer's library needs.
 fn toolchain() -> Outcome {
     if !process::succeeds("rustup", &["run", "nightly", "rustc", "--version"]) {
         return Err("fuzzing needs a nightly toolchain. Run this line and try again:\n\n    \

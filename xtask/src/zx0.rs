@@ -56,7 +56,7 @@ struct Piece {
 struct Offset {
     /// The number of bytes up to here that equal the bytes at this distance before.
     equal: usize,
-    /// The last copy of the cheapest stream that ends here with a copy from this offset.
+    /// The last copy of the cheapest stream whose last offset is this one.
     copy: Option<usize>,
     /// The same with literals after the copy, up to the start of the equal bytes.
     literals: Option<usize>,
